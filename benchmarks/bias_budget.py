@@ -18,7 +18,7 @@ import numpy as np
 from machine import describe
 
 import orthaug as oa
-from orthaug.analysis.budget import ground_of, left_over, named_cause
+from orthaug.analysis.budget import left_over, linearization_of, named_cause
 from orthaug.analysis.suspects import Suspect
 
 SAMPLES, TS = 2000, 0.01
@@ -177,7 +177,7 @@ def look(seed: int) -> Looked:
     for cause, coefficient in made.causes:
         values = coefficient * cause.values(problem.rows.x, problem.layout, problem.outputs)
         true = true + problem.projection.solve(problem.weight.rows(values))
-    ground, told = ground_of(fit, oa.Training()), []
+    ground, told = linearization_of(fit, oa.Training()), []
     for declared in (tuple(cause for cause, _ in made.causes[:1]), ()):
         best = named_cause(ground, declared, 0.0)
         if best is None or not best.explained or not best.coefficient_found:

@@ -112,7 +112,7 @@ def try_state(seed: int, folder: Path) -> str:
     checkpoints = Checkpoints(folder / "kept", "fuzz", every=0.0)
     kept = checkpoints.of_run("x", form=OF_DESCENT)
     leaves = [rng.normal(size=rng.integers(1, 5)) for _ in range(13)]
-    state = OF_DESCENT._replace(flown=tuple(leaves[:5]), **dict(zip(OF_DESCENT._fields[1:], leaves[5:], strict=True)))
+    state = OF_DESCENT._replace(point=tuple(leaves[:5]), **dict(zip(OF_DESCENT._fields[1:], leaves[5:], strict=True)))
     kept.keep(state)
     content = kept.path.read_bytes()
     kept.path.write_bytes(content if seed % 10 == 0 else mutated(content, rng))
@@ -122,7 +122,7 @@ def try_state(seed: int, folder: Path) -> str:
         found = kept.state()
         if found is None:
             return "refused" if checkpoints.spoilt and not same else "a sound state was dropped"
-        held = [*found.flown, *found[1:]]
+        held = [*found.point, *found[1:]]
         return "equal" if same and all(map(np.array_equal, held, leaves)) else "a spoilt state was taken"
 
     return refusal_or(judge)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from orthaug._base.errors import InputError
-from orthaug.analysis.budget import SURE_SHARE, budget_on, ground_of, near_causes
+from orthaug.analysis.budget import SURE_SHARE, budget_on, linearization_of, near_causes
 from orthaug.analysis.budgets import bias_budget
 from orthaug.analysis.measure_bias import Ground
 from orthaug.analysis.missing_lags import missing_lags
@@ -53,7 +53,7 @@ def system(text, noise=0.0):
 def test_biases_beside_a_learner_that_sees_the_velocity_alone(text, seen):
     """What the learner sees moves only what it could imitate; what it does not see is a partially linear regression."""
     fit = system(text)
-    (found,) = ground_of(fit, Training()).table((Suspect("missing", text),), certify=True)
+    (found,) = linearization_of(fit, Training()).table((Suspect("missing", text),), certify=True)
     error, bias = fit.theta - THETA, SIZE * np.array(found.bias)
     assert found.seen == seen
     assert np.linalg.norm(bias - error) < 0.05 * np.linalg.norm(error)
@@ -68,7 +68,7 @@ def test_biases_beside_a_learner_that_sees_the_velocity_alone(text, seen):
 
 def test_what_nothing_is_shared_with_is_removed_by_the_learner():
     fit = system(f"({VELOCITY})**3")
-    (even,) = ground_of(fit, Training()).table((Suspect("even", f"({VELOCITY})**2"),), certify=True)
+    (even,) = linearization_of(fit, Training()).table((Suspect("even", f"({VELOCITY})**2"),), certify=True)
     assert even.seen and even.removed_by == "learner and measure"
     problem = pose(fit.problem.record, Baseline.from_terms([Term("c", "u[k-1]")]), Lags(1, 1, 1), ("y[k-1]",))
     ground = Ground(weigh_problem(Training(), problem), problem, problem.least_squares, directions=problem.shared.basis)
@@ -211,7 +211,7 @@ def test_a_cause_that_is_not_sure_is_told_with_those_close_to_it():
     fit = tank(zone=5.0)
     found = bias_budget(fit)
     assert found is not None and found.share < SURE_SHARE
-    ground = ground_of(fit, Training())
+    ground = linearization_of(fit, Training())
     near = near_causes(ground, found.cause, ())
     assert near and all(0.5 * found.share <= (entry.explained or 0) <= found.share for entry in near)
     warning = found.warnings[0]
@@ -275,7 +275,7 @@ def test_an_output_without_a_cause_widens_what_it_could_bias():
     record = Record.from_arrays(u, y, inputs=("u1", "u2"), outputs=("y1", "y2"))
     physics = Baseline.from_terms([Term(f"b{i}", f"u{i}[k-1]", output=f"y{i}") for i in (1, 2)])
     fit = estimate(record, physics, learner=MLP((6,)), solver=LevenbergMarquardt(40))
-    ground = ground_of(fit, Training())
+    ground = linearization_of(fit, Training())
     x, size = ground.weighed.points.x, np.abs(ground.learned[:, 0]).max()
     at = [str(lag) for lag in ground.problem.layout].index("u2[k-1]")
     parts = np.sign(np.sin(9 * x[:, at])) + np.sign(x[:, at])

@@ -113,7 +113,7 @@ def changes_of(fit):
     simulated = fit.criterion.simulates
     one_step, free_run = fit.model.predict(fit.problem.record), fit.model.simulate(fit.problem.record)
     skip = fit.criterion.washout
-    return model_changes(fit, free_run if simulated else one_step, flown=simulated, skip=skip, one_step=one_step)
+    return model_changes(fit, free_run if simulated else one_step, simulates=simulated, skip=skip, one_step=one_step)
 
 
 @pytest.mark.parametrize("criterion", [None, Simulation(0, 40)], ids=["one step", "free run"])

@@ -11,7 +11,7 @@ import pytest
 from orthaug._base.jax import jax, jnp
 from orthaug.data.record import Record
 from orthaug.data.regressors import Lags
-from orthaug.fitting.segments import lay_segments, respond, sensitivity
+from orthaug.fitting.segments import build_segments, respond, sensitivity
 from orthaug.models.dynamics import Differentiated, Dynamics, Numbers, Parts
 from orthaug.models.lagged import Lagged
 from orthaug.models.learners import MLP, Bound
@@ -99,7 +99,7 @@ def test_sensitivities_are_those_of_the_generic_form(name):
     """The Gram matrices too, which the layout of the slopes must not change."""
     form, numbers, record = form_of(name)
     generic = Generic(form.baseline, form.features, form.layout, form.outputs, form.bound)
-    segments = lay_segments(record, form, 9, 3)
+    segments = build_segments(record, form, 9, 3)
     weight = jnp.asarray(np.random.default_rng(0).normal(size=(len(form.outputs),) * 2))
     found, other = (sensitivity(d, numbers, segments, segments.start, weight) for d in (form, generic))
     for one, two in zip(found, other, strict=True):
@@ -164,7 +164,7 @@ def state_space(ny):
     pieces = [Record.from_arrays(rng.normal(size=(n, 2)), rng.normal(size=(n, ny))) for n in (19, 11)]
     record = Record.join(pieces)
     theta = 0.4 * rng.normal(size=dynamics.unknowns)
-    segments = lay_segments(record, dynamics, SEGMENT, WASHOUT)
+    segments = build_segments(record, dynamics, SEGMENT, WASHOUT)
     states = rng.normal(size=segments.start.shape)
     numbers = Numbers(theta, 0 * theta, *NO_LEARNER, np.zeros(ny))
     return dynamics, numbers, record, segments, states
@@ -196,7 +196,7 @@ def test_segments_of_a_state_space(ny):
     first = np.asarray(segments.inputs)[0, :, :, 0]
     np.testing.assert_array_equal(first, record.experiments[0].inputs[:SEGMENT])
     np.testing.assert_array_equal(np.asarray(segments.target)[0, :, :, 0], record.experiments[0].outputs[:SEGMENT])
-    whole = lay_segments(record, replace(dynamics, first_row=4), 0, 0)
+    whole = build_segments(record, replace(dynamics, first_row=4), 0, 0)
     assert whole.count == sum(len(e) - 4 for e in record.experiments)
 
 

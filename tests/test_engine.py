@@ -262,7 +262,7 @@ def test_sums_over_lists_are_sums_over_chunks():
     w, mix = jnp.asarray(bound.init(jax.random.key(0))), jnp.asarray(rng.normal(size=(ny, ny)))
     found = []
     for engine in (InMemory(limit=16), InMemory(), Streaming()):
-        laid = engine.lay(*rows)
+        laid = engine.build_rows(*rows)
         found.append((engine.sum(Overlaps(bound), laid, w), engine.sum(MixedGram(bound), laid, w, mix)))
     for other in found[1:]:
         for one, two in zip(jax.tree.leaves(found[0]), jax.tree.leaves(other), strict=True):

@@ -15,8 +15,8 @@ from orthaug.commands.spec import load_spec
 from orthaug.data.expressions import parse_named
 from orthaug.physics.motion import Output, State
 from orthaug.selection.added_physics import Added, added_to_motion
-from orthaug.selection.explained_ground import MotionResponse, _moved, ground_of
 from orthaug.selection.explaining import _written, candidates_of
+from orthaug.selection.learned_linearization import MotionResponse, _moved, linearization_of
 
 ROWS = 600
 SPEC = """
@@ -123,7 +123,7 @@ def test_of_a_level_a_root_is_tried_and_no_friction_and_of_a_velocity_the_revers
         baseline = oa.Baseline.from_terms([oa.Term("a", "y[k-1]"), oa.Term("g", "u[k-1]")])
         plant = lambda x: (x @ [0.8, 0.5] - 0.1 * np.sign(x[:, 0]) * np.sqrt(np.abs(x[:, 0])))[:, None]  # noqa: E731
         fit = oa.orthogonalize(oa.Record.from_arrays(u, y), baseline, plant)
-        tried = candidates_of(ground_of(fit.model, fit.problem.record), 2, (), ())
+        tried = candidates_of(linearization_of(fit.model, fit.problem.record), 2, (), ())
         kinds[low] = {one.kind for one in tried if one.on == "y[k-1]"}
         if low == 0.0:
             (term,) = oa.explain(fit).terms

@@ -214,4 +214,4 @@ def test_auto_needs_what_can_be_trained_on_the_free_run():
 
 def test_a_motion_is_trained_on_its_free_run():
     found = replace(oa.Auto(), segment=100)
-    assert found.simulation == oa.Simulation(100) and found.flown is None
+    assert found.simulation == oa.Simulation(100) and found.free_run is None

@@ -15,8 +15,8 @@ from orthaug._base.progress import Enough
 from orthaug.data.record import Record
 from orthaug.fitting.criteria import Prediction, Simulation
 from orthaug.fitting.estimation import estimate as choosing
-from orthaug.fitting.flight_plan import FlightPlan
 from orthaug.fitting.one_step import OneStepTask
+from orthaug.fitting.segmented_lagged import SegmentedLagged
 from orthaug.fitting.segments import respond
 from orthaug.fitting.solvers.adam_lbfgs import AdamLBFGS
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
@@ -203,7 +203,7 @@ def bounded(structure):
 def reparametrised(found, orthogonal):
     """(residual, Jacobian) of the segments' errors over (θ, w), with `c = θ − Φ⁺F(w)` where θ is orthogonal."""
     problem = found.problem
-    flown = FlightPlan.of(OneStepTask.of(problem, MLP((2,))), SMALL)
+    flown = SegmentedLagged.of(OneStepTask.of(problem, MLP((2,))), SMALL)
     phi = problem.baseline.phi(problem.rows.x, problem.layout, ("y",), np)[:, 0]
     pseudo, z = np.linalg.pinv(phi), jnp.asarray(flown.task.scaling(problem.feature_rows()))
 
@@ -554,13 +554,13 @@ def unstable(rows=300):
 
 
 def test_physics_alone_that_runs_away_trains_over_segments_that_lengthen(monkeypatch):
-    steps, over = [], FlightPlan.over
+    steps, over = [], SegmentedLagged.over
 
     def counted(self, segment):
         steps.append(segment)
         return over(self, segment)
 
-    monkeypatch.setattr(FlightPlan, "over", counted)
+    monkeypatch.setattr(SegmentedLagged, "over", counted)
     physics = Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "u[k-1]")])
     found = estimate(unstable(), physics, learner=None, criterion=Simulation(256, 8), solver=LM)
     assert found.status.ok and found.status.loss == found.status.start_loss < 1 and steps[0] == 4 and len(steps) > 2
@@ -630,7 +630,7 @@ def test_a_run_that_is_stopped_is_kept_and_tried_on_no_block():
 
 def test_a_theta_that_the_data_do_not_determine_beside_the_learner_has_a_sentence(monkeypatch):
     nothing = np.full((3, 3), np.nan)
-    monkeypatch.setattr("orthaug.fitting.flights.theta_block", lambda *_: nothing)
+    monkeypatch.setattr("orthaug.fitting.simulation_task.theta_block", lambda *_: nothing)
     fit = choosing(nonlinear(), PHYSICS, learner=NETWORK, criterion=FREE, blocks=0)
     assert np.isnan(fit.std).all()
     assert [w.text[:60] for w in fit.warnings if w.code == "no_standard_errors"] == [

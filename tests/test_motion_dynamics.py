@@ -14,7 +14,7 @@ import orthaug as oa
 import orthaug.fitting.segments as laid
 from orthaug._base.jax import jax
 from orthaug.data.expressions import parse_named
-from orthaug.fitting.segments import lay_segments, respond, sensitivity
+from orthaug.fitting.segments import build_segments, respond, sensitivity
 from orthaug.models.dynamics import Differentiated, Numbers
 from orthaug.models.integrators import held
 from orthaug.models.learners import Bound
@@ -138,7 +138,7 @@ def test_sensitivities_over_segments_are_those_of_forward_differentiation(integr
         motion = replace(motion, states=tuple(states))
     form, made = with_learner(motion, 1)
     data = record(40)
-    segments = lay_segments(data, form, 20, 0)
+    segments = build_segments(data, form, 20, 0)
     states = np.asarray(segments.start) + 0.1
     gram = np.asarray(sensitivity(form, made, segments, states, np.eye(1)).shared)
 
@@ -154,7 +154,7 @@ def test_sensitivities_over_segments_are_those_of_forward_differentiation(integr
 
 def test_sensitivities_of_steps_at_once_are_those_step_by_step(monkeypatch: pytest.MonkeyPatch) -> None:
     form, made = with_learner(spring(learned=True), 1)
-    segments = lay_segments(record(40), form, 19, 3)
+    segments = build_segments(record(40), form, 19, 3)
     given = (form, made, segments, segments.start, np.array([[2.0]]))
     told = []
     for block, fewest in ((1 << 15, 1), (8 * 3 * (2 + form.unknowns) * segments.scored.shape[2], 8), (1, 8)):

@@ -12,7 +12,7 @@ from orthaug.data.expressions import parse_named
 from orthaug.inference.motion_split import shared_of_motion
 from orthaug.models.learners import Bound
 from orthaug.models.moving import Moving
-from orthaug.selection.explained_ground import ground_of
+from orthaug.selection.learned_linearization import linearization_of
 
 TS = 0.05
 WHOLE = oa.Simulation(0, 0)
@@ -82,7 +82,7 @@ def test_a_linear_motion_is_the_output_error_fit_of_the_lagged_form(record_prope
     terms = [oa.Term(f"{n}{i}", f"{signal}[k-{i}]") for n, signal in (("a", "y"), ("b", "u")) for i in (1, 2)]
     theirs = oa.estimate(record, oa.Baseline.from_terms(terms), learner=None, criterion=WHOLE, solver=solver)
     # the motion's loss counts the first rows, which the lagged form takes as its starts
-    a = ours.course.objective().errors(ours.theta, np.zeros(0), ours.states, ours.course.segments)[0, 2:, 0, 0]
+    a = ours.segmented.objective().errors(ours.theta, np.zeros(0), ours.states, ours.segmented.segments)[0, 2:, 0, 0]
     root = np.sqrt(np.mean(a**2))
     noise = float(np.sqrt(theirs.model.statistics.noise[0, 0] * theirs.freedom / len(a)))
     assert root == pytest.approx(noise, rel=1e-6)
@@ -110,7 +110,7 @@ def test_on_its_training_data_a_motion_does_not_extrapolate(fitted: oa.MotionEst
         assert isinstance(model, oa.MotionModel)
         (run,) = model.simulate(data()).trajectories
         assert run.outside is not None and not run.outside.any()
-        assert ground_of(model, data()).outside == 0
+        assert linearization_of(model, data()).outside == 0
         (wider,) = model.simulate(oa.Record.from_arrays(u=100 * np.ones(40), sampling_time=TS), "zero").trajectories
         assert wider.outside is not None and wider.outside.any()
     before = replace(fitted.model, seen=None)  # as a file of an earlier version gives it
@@ -122,7 +122,7 @@ def test_on_its_training_data_a_motion_does_not_extrapolate(fitted: oa.MotionEst
 def test_the_damping_is_that_of_the_nearest_physics(fitted: oa.MotionEstimate) -> None:
     """Linear along the shared direction: c − c_fit is the least-squares slope of −m g on v over the runs."""
     model = fitted.model
-    x, u = fitted.course.trajectory(model.theta - model.numbers.theta_aux, model.numbers.weights, fitted.states)
+    x, u = fitted.segmented.trajectory(model.theta - model.numbers.theta_aux, model.numbers.weights, fitted.states)
     learned = np.array([model.form.learned(model.numbers, a, b)[0] for a, b in zip(x, u, strict=True)])
     c = model.form.motion.coordinates.physical(model.theta - model.numbers.theta_aux)
     v = x[:, 1]
@@ -150,7 +150,7 @@ def test_standard_errors_of_a_split_are_those_of_its_slope(fitted: oa.MotionEsti
     from orthaug.fitting.motion_measures import field_under
     from orthaug.inference.motion_split import nearest
 
-    course, numbers = fitted.course, fitted_numbers(fitted.model.numbers)
+    segmented, numbers = fitted.segmented, fitted_numbers(fitted.model.numbers)
     unknowns = np.concatenate([numbers.theta, numbers.weights])
     bounds = fitted.problem.motion.coordinates.bounds
     size = fitted.split_by.field.size
@@ -158,8 +158,8 @@ def test_standard_errors_of_a_split_are_those_of_its_slope(fitted: oa.MotionEsti
     def q_at(unknowns: np.ndarray, moved: np.ndarray) -> np.ndarray:
         own = numbers._replace(theta=unknowns[:3], weights=unknowns[3:])
         states = fitted.states - np.moveaxis(fitted.slope @ moved, 1, -1)
-        field = field_under(oa.Training(), course, own, states)[0]._replace(size=size)
-        return nearest(course.dynamics, own, fitted.alone, field, bounds)[0]
+        field = field_under(oa.Training(), segmented, own, states)[0]._replace(size=size)
+        return nearest(segmented.dynamics, own, fitted.alone, field, bounds)[0]
 
     rng = np.random.default_rng(0)
     for _ in range(3):
@@ -415,7 +415,7 @@ def test_a_term_that_is_there_already_moves_the_run_as_its_parameter_does() -> N
     own, added = found.columns[..., 4], found.columns[..., 5]
     m, _, k = fit.values
     np.testing.assert_allclose(-k / m * added, own, rtol=0, atol=0.02 * np.abs(own).max())
-    errors = fit.course.objective().errors(fit.theta, np.zeros(0), fit.states, fit.course.segments)
+    errors = fit.segmented.objective().errors(fit.theta, np.zeros(0), fit.states, fit.segmented.segments)
     np.testing.assert_allclose(np.ravel(errors), np.ravel(found.errors), rtol=1e-9)
 
 

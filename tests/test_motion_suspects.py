@@ -12,7 +12,7 @@ import orthaug as oa
 from orthaug._base.errors import InputError
 from orthaug._base.jax import jnp
 from orthaug.analysis.budget import AS_MUCH
-from orthaug.analysis.motion_bias import ground_after, softened_bias, usual_biases
+from orthaug.analysis.motion_bias import linearize_fit, softened_bias, usual_biases
 from orthaug.analysis.motion_budget import motion_budget, one_of_each, rivals_of, told_budget
 from orthaug.analysis.motion_suspects import check_motion_suspects, usual_motion_suspects
 from orthaug.physics.motion_problem import MotionProblem, pose_motion
@@ -274,7 +274,7 @@ def test_states_that_nobody_guessed_have_suspects_where_the_run_goes() -> None:
     )  # fmt: skip
     fit = oa.estimate(data(), still, learner=None, criterion=WHOLE)
     assert "coulomb of v" not in usual_of(fit.problem)
-    assert "coulomb of v" in [suspect.name for suspect in ground_after(fit).usual()]
+    assert "coulomb of v" in [suspect.name for suspect in linearize_fit(fit).usual()]
 
 
 def test_a_rival_leaves_about_as_little_of_the_learner(learned: oa.MotionEstimate) -> None:
@@ -286,7 +286,7 @@ def test_a_rival_leaves_about_as_little_of_the_learner(learned: oa.MotionEstimat
 
 def test_what_a_cause_leaves_of_the_learner_may_be_another_s(learned: oa.MotionEstimate) -> None:
     """A cause that explains all but a drag of half its size: the interval counts what that would do."""
-    ground = ground_after(learned)
+    ground = linearize_fit(learned)
     kinds = ("coulomb", "quadratic_drag")
     dry, drag = (oa.MotionSuspect.of(kind, "v", factor="-1/m", name=kind) for kind in kinds)
     rows = [suspect.values(ground.motion, learned.values, ground.field.x, ground.field.u) for suspect in (dry, drag)]
@@ -363,7 +363,7 @@ def test_a_force_between_two_masses_is_named_in_both_equations(masses: oa.Motion
 def test_terms_of_each_equation_are_chosen_beside_those_of_the_others(masses, points, monkeypatch) -> None:
     """What two terms make together is found though another one explains more alone; their order tells nothing."""
     monkeypatch.setattr("orthaug.analysis.motion_budget.CERTIFIED_POINTS", points)
-    ground, table = ground_after(masses), usual_biases(masses)[0]
+    ground, table = linearize_fit(masses), usual_biases(masses)[0]
     names = [entry.suspect.name for entry in table]
     one, two = (table[names.index(f"{kind} of x1-x2 in {v}")] for kind, v in (("dead_zone", "v1"), ("cubic", "v2")))
     values = 3.0 * ground._rows(one.suspect, 1) - 40.0 * ground._rows(two.suspect, 3)

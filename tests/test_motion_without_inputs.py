@@ -178,6 +178,6 @@ def test_starts_that_settle_slowly_are_no_poor_minimum():
     record = oa.Record.from_arrays(None, run, outputs=["prey", "pred"], sampling_time=0.1)
     fit = oa.estimate(record, motion, learner=None)
     assert fit.status.code == "converged"
-    errors = fit.course.objective().errors(fit.alone, (), fit.states, fit.course.segments)
+    errors = fit.segmented.objective().errors(fit.alone, (), fit.states, fit.segmented.segments)
     left = np.sqrt(np.mean((errors / run.std(axis=0)[:, None]) ** 2))
     assert left < 0.46

@@ -299,7 +299,7 @@ def test_a_model_by_itself_goes_by_how_it_was_trained():
     both = by_verdict(replace(model, statistics=replace(model.statistics, verdict="equation_noise")))
     assert both.state[0, 0] == pytest.approx(30 * sensor.state[0, 0])
     assert both.output[0, 0] == pytest.approx(sensor.output[0, 0] * 0.1 / 0.97)
-    free = replace(model.statistics, flown=False)
+    free = replace(model.statistics, simulated=False)
     assert by_verdict(replace(model, statistics=free)).output == 0
 
 
@@ -489,7 +489,7 @@ def test_wrong_options_are_told(fitted, options, words, tmp_path):
 def test_a_saved_model_carries_the_verdict(fitted, tmp_path):
     model = oa.load(fitted / "out")
     assert model.statistics.verdict == finite_json((fitted / "out" / "result.json").read_text())["residuals"]["verdict"]
-    assert model.statistics.flown is False
+    assert model.statistics.simulated is False
     oa.save(model, tmp_path / "model")
     assert oa.load(tmp_path / "model").statistics.verdict == model.statistics.verdict != ""
 

@@ -31,22 +31,22 @@ class LeastSquares:
     def loss(self, p):
         return float(np.sum(self.residual(p) ** 2))
 
-    def fly(self, p, start):
+    def evaluate(self, p, start):
         self.trials.append(p.copy())
-        return Flown(p, self.loss(p))
+        return TrialPoint(p, self.loss(p))
 
     def normal(self, p):
         j = self.jacobian(p)
         return j.T @ j, self.sign * j.T @ self.residual(p)
 
-    def linearise(self, flown):
-        return Linear(*self.normal(flown.p), None)
+    def linearise(self, point):
+        return Linear(*self.normal(point.p), None)
 
-    def samples(self, flown):
+    def samples(self, point):
         return self.independent
 
 
-class Flown(NamedTuple):
+class TrialPoint(NamedTuple):
     p: np.ndarray
     loss: float
 
@@ -74,7 +74,7 @@ def run(objective, p, *, physics=None, iterations=200, **options):
     objective.physics = len(p) if physics is None else physics
     end = descend(objective, np.array(p, dtype=float), None, **options)
     hessian = None if end.linear is None else end.linear.hessian
-    return Outcome(end.flown.p, hessian, end.flown.loss, end.ridge, end.effective, end.iterations, end.ending)
+    return Outcome(end.point.p, hessian, end.point.loss, end.ridge, end.effective, end.iterations, end.ending)
 
 
 def linear(rows=30, columns=4, seed=0, **options):

@@ -16,7 +16,7 @@ from orthaug._base.jax import jax, jnp
 from orthaug.data.record import Record
 from orthaug.data.regressors import Lags
 from orthaug.fitting.estimation import estimate
-from orthaug.fitting.segments import Segments, lay_segments, respond, sensitivity
+from orthaug.fitting.segments import Segments, build_segments, respond, sensitivity
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.models.dynamics import Numbers
 from orthaug.models.lagged import Lagged
@@ -87,7 +87,7 @@ def case(name):
         scaling = (rng.normal(size=nz), 1 + rng.random(nz), 0.5 * (1 + rng.random(ny)))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(orthaug.fitting.segments, "CHUNK", 9)
-        segments = lay_segments(posed.record, form, SEGMENT, WASHOUT)
+        segments = build_segments(posed.record, form, SEGMENT, WASHOUT)
     states = np.asarray(segments.start) + 0.3 * rng.normal(size=segments.start.shape)
     return Case(posed.record, form, Numbers(c, 0 * c, w, *scaling), segments, states, rng.normal(size=(ny, ny)))
 
@@ -100,7 +100,7 @@ def spread_out(part):
 # --- layout
 
 
-def laid_out(record, start, memory, segment, washout):
+def build_chunk(record, start, memory, segment, washout):
     """[(experiment, first row, scored rows)] of all segments, by counting."""
     longest = max(len(e) - start for e in record.experiments)
     steps = min(segment, longest) if segment else longest
@@ -121,8 +121,8 @@ SIZES = [(0, 0), (1, 0), (5, 0), (7, 0), (500, 0), (0, 3), (5, 3), (7, 3), (7, 6
 @pytest.mark.parametrize("name", ["gaps between lags", "two outputs share theta", "no feedback"])
 def test_layout_by_a_double_loop(name, segment, washout):
     record, form = case(name).record, case(name).form
-    found = lay_segments(record, form, segment, washout)
-    expected, steps, _ = laid_out(record, form.first_row, form.memory, segment, washout)
+    found = build_segments(record, form, segment, washout)
+    expected, steps, _ = build_chunk(record, form.first_row, form.memory, segment, washout)
     start, inputs, target, scored = map(spread_out, found)
     assert inputs.shape[1] == target.shape[1] == scored.shape[1] == steps
     assert start.shape[1:] == (form.states,) == (form.memory * OUTPUTS[name],)
@@ -142,22 +142,22 @@ def test_layout_by_a_double_loop(name, segment, washout):
 @pytest.mark.parametrize(("segment", "washout"), [(0, 0), (0, 4), (7, 3), (7, 0), (9, 8)])
 def test_every_usable_row_is_scored_once_but_the_first_washout(segment, washout):
     record, form = case("one output").record, case("one output").form
-    layout, _, washout = laid_out(record, form.first_row, form.memory, segment, washout)
+    layout, _, washout = build_chunk(record, form.first_row, form.memory, segment, washout)
     rows = [(i, k) for i, _, scored in layout for k in scored]
     usable = [(i, k) for i, e in enumerate(record.experiments) for k in range(form.first_row + washout, len(e))]
     assert sorted(rows) == usable
-    assert lay_segments(record, form, segment, washout).count == len(usable)
+    assert build_segments(record, form, segment, washout).count == len(usable)
 
 
 def test_segments_stand_in_chunks_of_one_width(monkeypatch):
     record, form = case("one output").record, case("one output").form
     monkeypatch.setattr(orthaug.fitting.segments, "CHUNK", 4)
-    chunked = lay_segments(record, form, SEGMENT, WASHOUT)
+    chunked = build_segments(record, form, SEGMENT, WASHOUT)
     monkeypatch.undo()
-    one = lay_segments(record, form, SEGMENT, WASHOUT)
+    one = build_segments(record, form, SEGMENT, WASHOUT)
     assert one.start.shape[0] == 1 and chunked.start.shape[0] == 4 and chunked.start.shape[-1] <= 4
     assert {part.shape[0] for part in chunked} == {4} and {part.shape[-1] for part in one} == {one.start.shape[-1]}
-    count = len(laid_out(record, form.first_row, form.memory, SEGMENT, WASHOUT)[0])
+    count = len(build_chunk(record, form.first_row, form.memory, SEGMENT, WASHOUT)[0])
     for found, expected in zip(chunked, one, strict=True):
         np.testing.assert_array_equal(spread_out(found)[:count], spread_out(expected)[:count])
 
@@ -165,7 +165,7 @@ def test_segments_stand_in_chunks_of_one_width(monkeypatch):
 def test_an_experiment_shorter_than_the_washout_is_not_scored():
     form = case("one output").form
     record = record_of(1, (30, 5))
-    found = lay_segments(record, form, 7, 4)
+    found = build_segments(record, form, 7, 4)
     assert found.count == 30 - form.first_row - 4
 
 
@@ -177,7 +177,7 @@ def test_respond_is_a_loop_over_time(name):
     given = case(name)
     found = spread_out(respond(given.form, given.numbers, given.segments, given.states))
     model, start = SimpleNamespace(form=given.form, numbers=given.numbers), given.form.first_row
-    layout, steps, _ = laid_out(given.record, start, given.form.memory, SEGMENT, WASHOUT)
+    layout, steps, _ = build_chunk(given.record, start, given.form.memory, SEGMENT, WASHOUT)
     past = spread_out(given.states)
     past = past.reshape(len(past), given.form.memory, OUTPUTS[name])
     for s, (i, first, _) in enumerate(layout):
@@ -201,7 +201,7 @@ def test_respond_over_whole_experiments_is_simulate(ny):
     options = {"lags": lags, "learner": learner, "solver": LevenbergMarquardt(5), "regularization": 1.0}
     model = estimate(record, Baseline.from_terms(terms), **options).model
     assert np.abs(model.theta_aux).max() > 1e-3
-    whole = lay_segments(record, model.form, 0, 0)
+    whole = build_segments(record, model.form, 0, 0)
     found = spread_out(respond(model.form, model.numbers, whole, whole.start))
     for s, trajectory in enumerate(model.simulate(record).trajectories):
         expected = trajectory.model[model.form.first_row :]
@@ -295,7 +295,7 @@ def test_a_kink_without_a_derivative_counts_as_flat():
     record = Record.from_arrays(np.arange(9.0), np.r_[0.0, np.arange(8.0)], outputs=["y1"])
     form = replace(case("no learner").form, baseline=Baseline.from_terms([Term("a", "sqrt(max(y1[k-1], 0))")]),
                    layout=case("gaps between lags").form.layout[:1])  # fmt: skip
-    segments = lay_segments(record, form, 0, 0)
+    segments = build_segments(record, form, 0, 0)
     numbers = case("no learner").numbers._replace(theta=np.ones(1), theta_aux=np.zeros(1))
     found = sensitivity(form, numbers, segments, segments.start, jnp.eye(1))
     assert np.isfinite(found.shared).all() and np.isfinite(found.own).all()

@@ -97,9 +97,9 @@ def test_a_start_that_fails_is_told_and_replaced(monkeypatch):
     run = FreeRunTask.run
 
     def failing(self, solver, w, *rest):
-        flight = run(self, solver, w, *rest)
+        free_fit = run(self, solver, w, *rest)
         first = np.array_equal(np.asarray(w), np.asarray(self.bound.init(jax.random.key(1))))
-        return flight._replace(end=flight.end._replace(ending=Ending.NON_FINITE)) if first else flight
+        return free_fit._replace(end=free_fit.end._replace(ending=Ending.NON_FINITE)) if first else free_fit
 
     monkeypatch.setattr(FreeRunTask, "run", failing)
     found = estimate(record(), PHYSICS, restarts=2, seed=1, blocks=0, **OPTIONS)

@@ -30,7 +30,7 @@ from orthaug.analysis.bias_hull import (
     undetermined_warning,
 )
 from orthaug.analysis.catalogue import catalogue
-from orthaug.analysis.measure_bias import Ground, physical_with_bias
+from orthaug.analysis.measure_bias import MeasureLinearization, physical_with_bias
 from orthaug.analysis.remedies import remedies
 from orthaug.analysis.suspects import Suspect, saturations, usual_suspects, usual_terms
 from orthaug.fitting.estimates import Estimate
@@ -93,12 +93,12 @@ class Budget:
         return next((entry for entry in (*self.parameters, *self.physical) if entry.name == name), None)
 
 
-def ground_of(fit: Estimate, measure: Measure, physics: PhysicsMap | None = None) -> Ground:
+def linearization_of(fit: Estimate, measure: Measure, physics: PhysicsMap | None = None) -> MeasureLinearization:
     """What biases of a fit are computed on; `measure` is the one that θ was split under."""
     weighed = weigh_problem(measure, fit.problem)
     learns = fit.model.form.bound is not None
     learned = fit.model.learner_at(weighed.points.x) if learns else None
-    return Ground(weighed, fit.problem, fit.theta, physics, learned, fit.model.shared)
+    return MeasureLinearization(weighed, fit.problem, fit.theta, physics, learned, fit.model.shared)
 
 
 def lagged_budget(
@@ -115,19 +115,23 @@ def lagged_budget(
     name = "training" if fit.measure is None else fit.measure.name
     if measure.name != name:
         raise InputError(f"`measure` is the {measure.name} measure, but θ was split under the {name} measure.")
-    return budget_on(ground_of(fit, measure, physics), fit, suspects)
+    return budget_on(linearization_of(fit, measure, physics), fit, suspects)
 
 
-def budget_on(ground: Ground, fit: Estimate, suspects: Sequence[Suspect]) -> Budget | None:
+def budget_on(linearization: MeasureLinearization, fit: Estimate, suspects: Sequence[Suspect]) -> Budget | None:
     """The same on a ground that is there already."""
-    if not ground.problem.baseline.names or ground.learned is None or not np.all(np.isfinite(ground.learned)):
+    if (
+        not linearization.problem.baseline.names
+        or linearization.learned is None
+        or not np.all(np.isfinite(linearization.learned))
+    ):
         return None
     if fit.freedom < _FEWEST_LEFT:
         return None
     noise = fit.model.statistics.noise
     least = 0.0 if noise is None else _NOTHING**2 * np.diag(noise)
-    something = np.mean(ground.learned**2, axis=0) >= least
-    found, nameless = _causes(ground, suspects, something) if something.any() else ([], [])
+    something = np.mean(linearization.learned**2, axis=0) >= least
+    found, nameless = _causes(linearization, suspects, something) if something.any() else ([], [])
     if not found:
         return None
     causes, moved = tuple(cause for _, cause in found), np.array([_moved(cause) for _, cause in found])
@@ -137,12 +141,12 @@ def budget_on(ground: Ground, fit: Estimate, suspects: Sequence[Suspect]) -> Bud
     std = np.full(len(bias), np.nan) if fit.std is None else fit.std
     other = _norm([_moved(cause) for cause in nameless])
     ends = hull(fit.theta, std, fit.freedom, candidates, other)
-    names = ground.problem.baseline.names
+    names = linearization.problem.baseline.names
     parameters = parameter_biases(names, fit.theta, std, bias, ends, _owners(causes, moved), fit.freedom)
     rows, warnings = (), []
-    if ground.physics is not None:
-        rows, warnings = _physical_rows(ground, fit, candidates, moved, causes, other)
-    told = (_warning(own, cause, (*rows, *parameters), suspects, own is not ground) for own, cause in found)
+    if linearization.physics is not None:
+        rows, warnings = _physical_rows(linearization, fit, candidates, moved, causes, other)
+    told = (_warning(own, cause, (*rows, *parameters), suspects, own is not linearization) for own, cause in found)
     told = [warning for warning in told if warning is not None]
     open_ones = [row.name for row in (*rows, *parameters) if not row.determined]
     if open_ones:
@@ -155,20 +159,22 @@ def _norm(rows: Sequence[Vector]) -> Vector | float:
     return np.linalg.norm(np.array(rows), axis=0) if len(rows) else 0.0
 
 
-def noise_share(ground: Ground, fit: Estimate) -> float:
+def noise_share(linearization: MeasureLinearization, fit: Estimate) -> float:
     """ν: how much of what the learner holds beside the physics is noise, of which it takes σ² a weight that it uses."""
     noise = fit.model.statistics.noise
     if noise is None:
         return 0.0
-    unit = ground.weighed.unit
-    own = orthogonal_part(ground.weighed.projection, times(unit, np.asarray(ground.learned)), ground.directions)
+    unit = linearization.weighed.unit
+    own = orthogonal_part(
+        linearization.weighed.projection, times(unit, np.asarray(linearization.learned)), linearization.directions
+    )
     rows = np.ones((len(own), 1)) * np.sqrt(np.diag(noise))
-    taken = fit.effective_weights / ground.problem.count * np.sum(times(unit, rows) ** 2) / own.shape[1]
+    taken = fit.effective_weights / linearization.problem.count * np.sum(times(unit, rows) ** 2) / own.shape[1]
     return float(taken / max(np.sum(own**2), np.finfo(float).tiny))
 
 
 def _candidates(
-    found: Sequence[tuple[Ground, SuspectedBias]],
+    found: Sequence[tuple[MeasureLinearization, SuspectedBias]],
     bias: Vector,
     rest: Vector,
     suspects: Sequence[Suspect],
@@ -191,7 +197,7 @@ def _candidates(
 
 
 def _physical_rows(
-    ground: Ground,
+    linearization: MeasureLinearization,
     fit: Estimate,
     candidates: Sequence[Candidate],
     moved: Float[np.ndarray, "k n"],
@@ -199,8 +205,8 @@ def _physical_rows(
     other: Vector | float,
 ) -> tuple[tuple[ParameterBias, ...], list[Warning]]:
     """The biases of the physical parameters: the hull over the causes that move any of them farthest."""
-    assert ground.physics is not None
-    physical, slopes, bias = fit.physical(ground.physics), ground.slopes, moved.sum(axis=0)
+    assert linearization.physics is not None
+    physical, slopes, bias = fit.physical(linearization.physics), linearization.slopes, moved.sum(axis=0)
     own = np.array([np.nan if s is None else s for s in physical.std])
     turned = np.array([slopes[0][name] for name in physical.names]) if slopes else np.zeros((0, len(bias)))
     chosen = [candidates[0]]
@@ -212,7 +218,7 @@ def _physical_rows(
     for i, c in enumerate({id(c): c for c in chosen}.values()):
         spread = np.outer(c.unsure, c.unsure) + np.diag(np.zeros(len(bias)) + other) ** 2
         spread = spread + (0.0 if fit.covariance is None else fit.covariance)
-        moves, limits = physical_with_bias(ground, c.moved, fit.covariance, spread, fit.freedom)
+        moves, limits = physical_with_bias(linearization, c.moved, fit.covariance, spread, fit.freedom)
         shifts = shifts if i else moves
         ends.append(limits)
     ends = np.stack([np.min(ends, axis=0)[:, 0], np.max(ends, axis=0)[:, 1]], axis=-1)  # NaN where one has none
@@ -222,8 +228,8 @@ def _physical_rows(
 
 
 def _causes(
-    ground: Ground, suspects: Sequence[Suspect], something: Bool[np.ndarray, "ny"]
-) -> tuple[list[tuple[Ground, SuspectedBias]], list[SuspectedBias]]:
+    linearization: MeasureLinearization, suspects: Sequence[Suspect], something: Bool[np.ndarray, "ny"]
+) -> tuple[list[tuple[MeasureLinearization, SuspectedBias]], list[SuspectedBias]]:
     """What explains the learner, with the ground that it does so on: all of it, or what is learned of one output.
 
     Args:
@@ -232,19 +238,19 @@ def _causes(
     Returns:
         The causes; and of each output without one what explains most, where that is less than half.
     """
-    whole, outputs = named_cause(ground, suspects), ground.problem.outputs
-    found = [] if whole is None else [(ground, whole)]
+    whole, outputs = named_cause(linearization, suspects), linearization.problem.outputs
+    found = [] if whole is None else [(linearization, whole)]
     if len(outputs) == 1 or (whole is not None and explains(whole) >= SURE_SHARE):
         return found, []
     each, nameless = [], []
     for i in np.flatnonzero(something):
-        own = replace(ground, learned=np.asarray(ground.learned) * np.eye(len(outputs))[i])
+        own = replace(linearization, learned=np.asarray(linearization.learned) * np.eye(len(outputs))[i])
         cause = named_cause(own, suspects) or _likeliest(own, suspects)
         if cause is not None and explains(cause) < LEAST_SHARE:
             nameless.append(cause)
         elif cause is not None and cause.suspect.column_of(outputs) == i:
             each.append((own, cause))
-    each.sort(key=lambda part: -np.linalg.norm(times(ground.weighed.unit, np.asarray(part[0].learned))))
+    each.sort(key=lambda part: -np.linalg.norm(times(linearization.weighed.unit, np.asarray(part[0].learned))))
     return each if len(each) > len(found) else found, nameless
 
 
@@ -253,12 +259,17 @@ def _owners(causes: Sequence[SuspectedBias], moved: Float[np.ndarray, "k n"]) ->
     return [(causes[i].suspect.name, explains(causes[i])) for i in np.argmax(np.abs(moved), axis=0)]
 
 
-def named_cause(ground: Ground, suspects: Sequence[Suspect], least: float = LEAST_SHARE) -> SuspectedBias | None:
+def named_cause(
+    linearization: MeasureLinearization, suspects: Sequence[Suspect], least: float = LEAST_SHARE
+) -> SuspectedBias | None:
     """The cause that explains most of the learner, the declared ones first; None where that is less than `least`.
 
     Of what no one declared only what the learner sees counts: the rest is no likely cause of what it found.
     """
-    for table, families in ((_declared(ground, suspects), ()), (_usual(ground), _families(ground))):
+    for table, families in (
+        (_declared(linearization, suspects), ()),
+        (_usual(linearization), _families(linearization)),
+    ):
         best, other = max(table, key=explains, default=None), max(families, key=explains, default=None)
         if other is not None and (best is None or explains(best) < AS_MUCH * explains(other)):
             best = other
@@ -267,9 +278,9 @@ def named_cause(ground: Ground, suspects: Sequence[Suspect], least: float = LEAS
     return None
 
 
-def _likeliest(ground: Ground, suspects: Sequence[Suspect]) -> SuspectedBias | None:
+def _likeliest(linearization: MeasureLinearization, suspects: Sequence[Suspect]) -> SuspectedBias | None:
     """What explains most of the learner, however little, declared or not."""
-    found = (*_declared(ground, suspects), *_usual(ground))
+    found = (*_declared(linearization, suspects), *_usual(linearization))
     return max((entry for entry in found if entry.explained), key=explains, default=None)
 
 
@@ -278,22 +289,24 @@ def explains(entry: SuspectedBias | TermBias) -> float:
     return entry.explained or 0.0
 
 
-def _declared(ground: Ground, suspects: Sequence[Suspect]) -> tuple[SuspectedBias, ...]:
-    return ground.table(tuple(suspects), certify=False, every=False) if suspects else ()
+def _declared(linearization: MeasureLinearization, suspects: Sequence[Suspect]) -> tuple[SuspectedBias, ...]:
+    return linearization.table(tuple(suspects), certify=False, every=False) if suspects else ()
 
 
-def _usual(ground: Ground) -> tuple[SuspectedBias, ...]:
-    terms = (*usual_suspects(ground.problem), *usual_terms(ground.problem))
-    return tuple(entry for entry in ground.table(terms, certify=False, every=False) if entry.seen is not False)
+def _usual(linearization: MeasureLinearization) -> tuple[SuspectedBias, ...]:
+    terms = (*usual_suspects(linearization.problem), *usual_terms(linearization.problem))
+    return tuple(entry for entry in linearization.table(terms, certify=False, every=False) if entry.seen is not False)
 
 
-def _families(ground: Ground) -> tuple[SuspectedBias, ...]:
+def _families(linearization: MeasureLinearization) -> tuple[SuspectedBias, ...]:
     """What every member of the catalogue does that the learner sees."""
-    table = ground.table(catalogue(ground.problem), certify=False, every=False)
+    table = linearization.table(catalogue(linearization.problem), certify=False, every=False)
     return tuple(entry for entry in table if entry.seen is not False and (entry.cosine or 0.0) <= MOST_PHYSICS)
 
 
-def rival_of(ground: Ground, cause: SuspectedBias, suspects: Sequence[Suspect]) -> SuspectedBias | None:
+def rival_of(
+    linearization: MeasureLinearization, cause: SuspectedBias, suspects: Sequence[Suspect]
+) -> SuspectedBias | None:
     """A term that explains as much as a cause that no one declared, and moves θ elsewhere; None where there is none.
 
     As a dead zone and a saturation of what the physics has a term in: their sum is that term.
@@ -301,10 +314,10 @@ def rival_of(ground: Ground, cause: SuspectedBias, suspects: Sequence[Suspect]) 
     assert cause.explained
     if cause.suspect in suspects:
         return None
-    usual = _usual(ground)
-    usual += ground.table(saturations([entry.suspect for entry in usual]), certify=False, every=False)
+    usual = _usual(linearization)
+    usual += linearization.table(saturations([entry.suspect for entry in usual]), certify=False, every=False)
     equal = [entry for entry in usual if explains(entry) >= AS_MUCH * cause.explained]
-    to_coordinates, own = ground.weighed.projection.to_coordinates, _moved(cause)
+    to_coordinates, own = linearization.weighed.projection.to_coordinates, _moved(cause)
 
     def apart(entry: SuspectedBias) -> float:
         return float(np.linalg.norm(to_coordinates @ (_moved(entry) - own)))
@@ -313,12 +326,14 @@ def rival_of(ground: Ground, cause: SuspectedBias, suspects: Sequence[Suspect]) 
     return farthest if farthest and apart(farthest) > 0.5 * np.linalg.norm(to_coordinates @ own) else None
 
 
-def near_causes(ground: Ground, cause: SuspectedBias, suspects: Sequence[Suspect]) -> list[SuspectedBias]:
+def near_causes(
+    linearization: MeasureLinearization, cause: SuspectedBias, suspects: Sequence[Suspect]
+) -> list[SuspectedBias]:
     """The next best causes, one of each variable, beside one that no one declared and that is not sure."""
     assert cause.explained
     if cause.suspect in suspects or cause.explained >= SURE_SHARE:
         return []
-    others = [entry for entry in _usual(ground) if entry.suspect != cause.suspect and entry.explained]
+    others = [entry for entry in _usual(linearization) if entry.suspect != cause.suspect and entry.explained]
     near = [entry for entry in others if explains(entry) >= _NEAR * cause.explained]
     best: dict[str, SuspectedBias] = {}
     for entry in sorted(near, key=explains, reverse=True):
@@ -326,14 +341,16 @@ def near_causes(ground: Ground, cause: SuspectedBias, suspects: Sequence[Suspect
     return list(best.values())[:_MOST_RIVALS]
 
 
-def left_over(ground: Ground, cause: SuspectedBias, suspects: Sequence[Suspect]) -> Float[np.ndarray, "k nt"]:
+def left_over(
+    linearization: MeasureLinearization, cause: SuspectedBias, suspects: Sequence[Suspect]
+) -> Float[np.ndarray, "k nt"]:
     """Standard deviations of the bias of θ that the cause does not tell: k directions, each of one unknown size.
 
     What it leaves of the learner counts as biased by as much for its size as the cause, of unknown sign; beside that by
     what the next best cause makes of it. What may stand instead of the cause is in the hull.
     """
     assert cause.explained
-    after = _likeliest(ground.without(cause), [suspect for suspect in suspects if suspect != cause.suspect])
+    after = _likeliest(linearization.without(cause), [suspect for suspect in suspects if suspect != cause.suspect])
     rows = [_moved(cause) * np.sqrt((1 - cause.explained) / cause.explained)]
     return np.array([*rows, *([] if after is None else [_moved(after)])])
 
@@ -373,7 +390,11 @@ def _unbounded(names: Sequence[str], std: Vector, ends: Matrix) -> list[Warning]
 
 
 def _warning(
-    ground: Ground, cause: SuspectedBias, rows: Sequence[ParameterBias], suspects: Sequence[Suspect], of_one: bool
+    linearization: MeasureLinearization,
+    cause: SuspectedBias,
+    rows: Sequence[ParameterBias],
+    suspects: Sequence[Suspect],
+    of_one: bool,
 ) -> Warning | None:
     """What a cause biases by more than the standard error: its size, remedies; and how sure the cause is."""
     own, name = [row for row in rows if row.cause == cause.suspect.name], cause.suspect.name
@@ -381,10 +402,13 @@ def _warning(
     if not large:
         return None
     listed, share, there = told_biases(large), explains(cause), f" in {cause.suspect.output}" if of_one else ""
-    rival, cure = rival_of(ground, cause, suspects), " or ".join(remedies(ground, cause, [row.name for row in large]))
+    rival, cure = (
+        rival_of(linearization, cause, suspects),
+        " or ".join(remedies(linearization, cause, [row.name for row in large])),
+    )
     other = "" if rival is None else f" ({rival.suspect.name} explains as much and would move them elsewhere)"
     if share < SURE_SHARE:
-        near = near_causes(ground, cause, suspects)
+        near = near_causes(linearization, cause, suspects)
         close = ", ".join(f"{entry.suspect.name} {percent(explains(entry))}" for entry in near)
         beside = f"; next: {close}" if near else ""
         return Warning(

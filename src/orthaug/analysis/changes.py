@@ -88,7 +88,7 @@ def model_changes(
     fit: Estimate,
     response: Response,
     *,
-    flown: bool,
+    simulates: bool,
     skip: int = 0,
     one_step: Response | None = None,
     functions: float = 0.0,
@@ -96,7 +96,7 @@ def model_changes(
     """The best change of each kind that is worth making, the best one first.
 
     Args:
-        response: of the training data, whose errors are to be explained: the prediction, or with `flown` the free run.
+        response: of the training data, whose errors are to be explained: the prediction, or with `simulates` the free run.
         skip: its leading rows that do not count.
         one_step: the prediction, for a free run that is far from what was measured; None to go along it all the same.
         functions: what functions of the regressor are known to explain of the errors one step ahead.
@@ -104,9 +104,9 @@ def model_changes(
     off = float(np.max(rms_errors(response, skip) / fit.problem.deviation))
     with one_blas_thread():
         found: tuple[Change, ...] = ()
-        if flown and one_step is not None and off > _FAR:
+        if simulates and one_step is not None and off > _FAR:
             found = Candidates(fit, one_step, True, skip, measured=True).changes()
-        return found or Candidates(fit, response, flown, skip).changes(functions)
+        return found or Candidates(fit, response, simulates, skip).changes(functions)
 
 
 def own_share(fit: Estimate, one_step: Response) -> Share:
@@ -122,7 +122,7 @@ class Candidates:
 
     fit: Estimate
     response: Response
-    flown: bool
+    simulates: bool
     skip: int
     own: bool = False
     measured: bool = False
@@ -193,7 +193,7 @@ class Candidates:
         problem, record, first = self.fit.problem, self.fit.problem.record, self.first
         there = slice(begin, begin + len(piece) - first)
         error = (piece.outputs[first:] - run.model[there])[:, :, None]
-        if self.flown and not self.measured:
+        if self.simulates and not self.measured:
             assert run.measured is not None
             ran = np.where(np.isfinite(run.model), run.model, run.measured)[begin - first : there.stop]
             piece = Experiment(piece.inputs, ran)
@@ -201,7 +201,7 @@ class Candidates:
         if self.measured:
             carried = self._carried(np.concatenate([columns, error], axis=2), piece, record)
             columns, error = carried[:, :, :-1], carried[:, :, -1:]
-        elif self.flown:
+        elif self.simulates:
             columns = self._carried(columns, piece, record)
         error, scaled = error[skip:, :, 0] / problem.deviation, columns[skip:] / problem.deviation[:, None]
         return scaled.reshape(-1, columns.shape[2]), error.reshape(-1)
@@ -244,7 +244,7 @@ class Candidates:
         """The best of each kind that is worth making, the best one first; as `model_changes`."""
         if not self.usable or not np.isfinite(self.sums.grams).all():
             return ()
-        problem, of = self.fit.problem, "simulation" if self.flown else "prediction"
+        problem, of = self.fit.problem, "simulation" if self.simulates else "prediction"
         nt, outputs, base = len(self.fit.theta), problem.outputs, range(self.base)
         width = len(self.lags) + len(self.functions)
         found: list[tuple[float, Change]] = []

@@ -85,7 +85,7 @@ def _of_lagged(fit: Estimate, one_step: Response | None, free_run: Response | No
     A one-step fit whose residual is coloured is set beside the free run of the physics alone, trained on it: that is
     what sensor noise asks for, and it does not suffer from the bias of the fit in question.
     """
-    problem, model, simulated = fit.problem, fit.model, fit.criterion.flown is not None
+    problem, model, simulated = fit.problem, fit.model, fit.criterion.free_run is not None
     one_step = model.predict(problem.record) if one_step is None else one_step
     tests = _tests(problem, one_step)
     if any(test.white is None for test in tests) or np.all(rms_errors(one_step) / problem.deviation < ROUNDING):
@@ -97,13 +97,13 @@ def _of_lagged(fit: Estimate, one_step: Response | None, free_run: Response | No
         return _concluded(replace(seen, **_effects(fit, one_step, one_step, False)))
     free_run = model.simulate(problem.record) if free_run is None else free_run
     skip = fit.criterion.washout
-    flown = [(free_run, skip)] if not any(t.diverged for t in free_run.trajectories) else []
-    free_tests = _tests(problem, free_run, skip) if flown else None
-    trained = _physics_flown(fit) if not simulated and not white else []
-    ratios = [_ratio(run, one_step, first) for run, first in flown + trained]
+    free_runs = [(free_run, skip)] if not any(t.diverged for t in free_run.trajectories) else []
+    free_tests = _tests(problem, free_run, skip) if free_runs else None
+    trained = _physics_runs(fit) if not simulated and not white else []
+    ratios = [_ratio(run, one_step, first) for run, first in free_runs + trained]
     good = [
         ratio
-        for ratio, (run, first) in zip(ratios, flown + trained, strict=True)
+        for ratio, (run, first) in zip(ratios, free_runs + trained, strict=True)
         if ratio and ratio < _AS_GOOD and _accounts(problem, run, first)
     ]
     sensor = not white and bool(good)
@@ -115,11 +115,11 @@ def _of_lagged(fit: Estimate, one_step: Response | None, free_run: Response | No
         noise=_noise_in_lags(problem, ratio, one_step) if sensor else None,
         free_white=free_tests is not None and all(test.practically_white() for test in free_tests),
         free_tests=free_tests,
-        **_effects(fit, one_step, free_run if flown else None, fit.criterion.simulates),
-        inconsistent=None if sensor or seen.steps else _inconsistent(fit, one_step, free_run if flown else None),
+        **_effects(fit, one_step, free_run if free_runs else None, fit.criterion.simulates),
+        inconsistent=None if sensor or seen.steps else _inconsistent(fit, one_step, free_run if free_runs else None),
     )
     if not simulated and not white:
-        seen = replace(seen, changes=_with_criterion(seen, free_run if flown else None, trained))
+        seen = replace(seen, changes=_with_criterion(seen, free_run if free_runs else None, trained))
     return _concluded(seen)
 
 
@@ -177,17 +177,17 @@ def _is_small(seen: Finding) -> bool:
     return max(shares) < _SMALL and small
 
 
-def _effects(fit: Estimate, one_step: Response, free_run: Response | None, flown: bool) -> dict:
+def _effects(fit: Estimate, one_step: Response, free_run: Response | None, simulates: bool) -> dict:
     """What could be predicted of the error that was minimised, and which changes would do it."""
-    response, skip = (free_run, fit.criterion.washout) if flown else (one_step, 0)
-    several = fit.criterion.flown is not None and not fit.criterion.simulates
+    response, skip = (free_run, fit.criterion.washout) if simulates else (one_step, 0)
+    several = fit.criterion.free_run is not None and not fit.criterion.simulates
     if response is None or several:  # it ran away, or is the error of some steps ahead
         return {}
     with one_blas_thread():
-        shares = predictable(fit.problem, response, skip, flown=flown)
+        shares = predictable(fit.problem, response, skip, simulates=simulates)
     squares = [(one.rms / deviation) ** 2 for one, deviation in zip(shares, fit.problem.deviation, strict=True)]
-    functions = 0.0 if flown else float(np.average([one.functions for one in shares], weights=squares))
-    told: dict[str, Any] = {"flown": flown, "skip": skip, "one_step": one_step, "functions": functions}
+    functions = 0.0 if simulates else float(np.average([one.functions for one in shares], weights=squares))
+    told: dict[str, Any] = {"simulates": simulates, "skip": skip, "one_step": one_step, "functions": functions}
     return {"predictable": shares, "changes": model_changes(fit, response, **told)}
 
 
@@ -221,7 +221,7 @@ def _accounts(problem: Problem, free_run: Response, skip: int) -> bool:
     return all(test.practically_white(_LITTLE_COLOUR) and not test.follows(_LITTLE_FOLLOWED) for test in tests)
 
 
-def _physics_flown(fit: Estimate) -> list[tuple[Response, int]]:
+def _physics_runs(fit: Estimate) -> list[tuple[Response, int]]:
     """The free run of the physics alone, trained on the free run; with the rows to skip."""
     problem, criterion = fit.problem, Simulation()
     longest = max(len(e) for e in problem.record.experiments) - fit.model.form.first_row

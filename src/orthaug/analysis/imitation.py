@@ -74,8 +74,8 @@ class Imitation:
         if self.everything:
             return f"{sees} and could imitate all of the physics: θ is split off along every direction."
         if self.held:
-            stand, them = ("stands", "it") if len(self.held) == 1 else ("stand", "them")
-            sees = f"{_listed(self.held)} {stand} at a bound: θ is not split off along {them}. {sees}"
+            columns, them = ("stands", "it") if len(self.held) == 1 else ("stand", "them")
+            sees = f"{_listed(self.held)} {columns} at a bound: θ is not split off along {them}. {sees}"
         if not self.directions:
             rest = " other" if self.held else ""
             told = f"{sees} and could imitate nothing of the{rest} physics"

@@ -182,7 +182,7 @@ def _rows(fit: Estimate, one_step: Response) -> _Rows | None:
     problem, model, statistics = fit.problem, fit.model, fit.model.statistics
     plain = fit.plain_statistics or statistics
     rows = len(problem.rows) if problem.rows is not None else 0
-    if not model.form.states or fit.criterion.flown is not None or plain.gram is None or not len(fit.theta):
+    if not model.form.states or fit.criterion.free_run is not None or plain.gram is None or not len(fit.theta):
         return None
     if isinstance(problem, StreamedProblem) or fit.std is None or model.numbers.tilt is not None:
         return None

@@ -10,10 +10,10 @@ import numpy as np
 
 from orthaug._base.errors import InputError, Warning
 from orthaug.data.record import Record
-from orthaug.fitting.course import Flight
 from orthaug.fitting.criteria import Criterion
-from orthaug.fitting.motion_course import MotionCourse
 from orthaug.fitting.motion_task import MotionTask
+from orthaug.fitting.segmented_motion import SegmentedMotion
+from orthaug.fitting.segmented_problem import FreeRunFit
 from orthaug.fitting.structures import Structure
 from orthaug.models.learners import Learner
 from orthaug.physics.motion import HOLDS, Motion
@@ -69,13 +69,13 @@ def try_holds(
         learner: what the trial's task has beside the physics; it is not trained.
     """
     task = on_longest(problem, criterion, solver, structure, learner)
-    motion, flight = problem.motion, task.physics
-    found = [_held(task.plan, flight, declared=True)]
-    several = motion.integrator != "discrete" and bool(motion.inputs) and flight is not None
+    motion, free_fit = problem.motion, task.physics
+    found = [_held(task.plan, free_fit, declared=True)]
+    several = motion.integrator != "discrete" and bool(motion.inputs) and free_fit is not None
     for hold in HOLDS if several else ():
         if hold != motion.hold:
             found.append(_under(hold, task, solver))
-    substeps = None if flight is None else task.plan.dynamics.substeps
+    substeps = None if free_fit is None else task.plan.dynamics.substeps
     return Trial(len(task.problem.record), substeps, tuple(found), task)
 
 
@@ -98,33 +98,35 @@ def _under(hold: str, task: MotionTask, solver: Any) -> Held:
 
 
 def refitted(
-    task: MotionTask, flight: Flight, motion: Motion, record: Record, solver: Any
-) -> tuple[MotionCourse, Flight | None]:
+    task: MotionTask, free_fit: FreeRunFit, motion: Motion, record: Record, solver: Any
+) -> tuple[SegmentedMotion, FreeRunFit | None]:
     """Physics alone, trained on from where a flight ended, with another motion or record; None without a usable end.
 
     Raises:
         InputError: the motion does not take the record.
     """
     plan = task.plan
-    course = MotionCourse.of(replace(plan.problem, motion=motion, record=record), None, plan.criterion)
-    course = course.alone.refined(plan.dynamics.substeps).from_states(flight.end.flown.states)
-    again = course.descend(course.objective(), flight.end.flown.theta, solver.at_most(_REFITTED))
-    return course, again if again.ending.usable else None
+    segmented = SegmentedMotion.of(replace(plan.problem, motion=motion, record=record), None, plan.criterion)
+    segmented = segmented.alone.refined(plan.dynamics.substeps).from_states(free_fit.end.point.states)
+    again = segmented.descend(segmented.objective(), free_fit.end.point.theta, solver.at_most(_REFITTED))
+    return segmented, again if again.ending.usable else None
 
 
-def residual_of(course: MotionCourse, flight: Flight | None) -> float:
+def residual_of(segmented: SegmentedMotion, free_fit: FreeRunFit | None) -> float:
     """RMS of what a flight leaves, in deviations of the outputs; inf without a flight."""
-    if flight is None:
+    if free_fit is None:
         return float("inf")
-    value = float(np.sqrt(np.sum((flight.end.flown.errors / course.deviation[:, None]) ** 2) / course.residuals))
+    value = float(
+        np.sqrt(np.sum((free_fit.end.point.errors / segmented.deviation[:, None]) ** 2) / segmented.residuals)
+    )
     return value if np.isfinite(value) else float("inf")
 
 
-def _held(course: MotionCourse, flight: Flight | None, *, declared: bool) -> Held:
-    motion, value = course.problem.motion, residual_of(course, flight)
-    if flight is None or value == float("inf"):
+def _held(segmented: SegmentedMotion, free_fit: FreeRunFit | None, *, declared: bool) -> Held:
+    motion, value = segmented.problem.motion, residual_of(segmented, free_fit)
+    if free_fit is None or value == float("inf"):
         return Held(motion.hold, None, declared)
-    p = motion.coordinates.physical(flight.end.flown.theta)
+    p = motion.coordinates.physical(free_fit.end.point.theta)
     return Held(motion.hold, value, declared, dict(zip(motion.names, map(float, p), strict=True)))
 
 
@@ -184,7 +186,7 @@ class _Delays:
     task: MotionTask
     solver: Any
     number: int
-    tried: dict[int, tuple[float, Flight]]
+    tried: dict[int, tuple[float, FreeRunFit]]
     """What each delay leaves, and where it ended; none is there from the start."""
 
     def leaves(self, samples: int) -> float:
@@ -193,8 +195,8 @@ class _Delays:
             near = self.tried[min(self.tried, key=lambda known: (abs(known - samples), self.tried[known][0]))][1]
             problem = self.task.problem
             late = _delayed(problem.record, self.number, samples)
-            course, flight = refitted(self.task, near, problem.motion, late, self.solver)
-            self.tried[samples] = residual_of(course, flight), flight or self.tried[0][1]
+            segmented, free_fit = refitted(self.task, near, problem.motion, late, self.solver)
+            self.tried[samples] = residual_of(segmented, free_fit), free_fit or self.tried[0][1]
         return self.tried[samples][0]
 
 

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from orthaug._base.checks import Vector
 from orthaug._base.jax import Array, jax, jnp
 from orthaug.analysis.feedback import by_differences
-from orthaug.fitting.motion_course import LOOSE
+from orthaug.fitting.segmented_motion import LOOSE
 from orthaug.models.dynamics import Numbers
 from orthaug.models.lagged import Lagged
 from orthaug.models.model import Model
@@ -186,24 +186,24 @@ def _of_point(step: Step, field: bool, numbers: Numbers) -> Callable[[Any], Any]
     return lambda point: jnp.concatenate(function(numbers, point[:n], point[n:]))
 
 
-def _laid_out(step: Step, field: bool, rest: Any, inputs: Any) -> Any:
+def _build_rows(step: Step, field: bool, rest: Any, inputs: Any) -> Any:
     """State and inputs of a step in one vector; of the field the inputs stand at one instant."""
     return jnp.concatenate([step.state_at(rest, inputs), *([inputs] * (1 if field else step.ends))])
 
 
 def _slope(step: Step, field: bool, numbers: Numbers, rest: Any, inputs: Any, width: Any) -> Any:
     """`[[A, B], [C, D]]` of a step, or of the field."""
-    both, point = _of_point(step, field, numbers), _laid_out(step, field, rest, inputs)
+    both, point = _of_point(step, field, numbers), _build_rows(step, field, rest, inputs)
     if step.form.differentiable:
         return jax.jacfwd(both)(point)
-    return by_differences(both, point, _laid_out(step, field, width[: len(rest)], width[len(rest) :]))
+    return by_differences(both, point, _build_rows(step, field, width[: len(rest)], width[len(rest) :]))
 
 
 @partial(jax.jit, static_argnames="step")
 def one_sided(step: Step, numbers: Numbers, rest: Any, inputs: Any, width: Any) -> tuple[Any, Any]:
     """`[A B]` by differences to each side, (2, n, k), and how far these reach, (k,)."""
-    both, point = _of_point(step, False, numbers), _laid_out(step, False, rest, inputs)
-    full = _laid_out(step, False, width[: len(rest)], width[len(rest) :])
+    both, point = _of_point(step, False, numbers), _build_rows(step, False, rest, inputs)
+    full = _build_rows(step, False, width[: len(rest)], width[len(rest) :])
     each, middle, n = jax.vmap(both), both(point), len(step.states)
     sides = [(each(point + sign * jnp.diag(full)) - middle) / (sign * full[:, None]) for sign in (-1, 1)]
     return jnp.stack([side.T[:n] for side in sides]), full

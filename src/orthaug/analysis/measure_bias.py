@@ -26,7 +26,7 @@ _ROUNDING = 1e-9  # of a parameter: an end of its interval that lies so little o
 
 
 @dataclass(frozen=True, eq=False)
-class Ground:
+class MeasureLinearization:
     """What biases are computed on.
 
     Args:
@@ -75,7 +75,7 @@ class Ground:
             absorbed=None if self.directions is None else self._absorbed(chosen),
         )
 
-    def without(self, entry: SuspectedBias) -> Ground:
+    def without(self, entry: SuspectedBias) -> MeasureLinearization:
         """The same with what a suspect explains of the learner taken off it."""
         held = (
             entry.suspect.values(self.weighed.points.x, self.problem.layout, self.problem.outputs)
@@ -98,15 +98,17 @@ class Ground:
         return absorbed(problem, map(term, suspects), visible, self.weighed.points.x)
 
 
-def bias_under(ground: Ground, suspects: Sequence[Suspect] = (), *, certify_usual: bool = True) -> list[dict[str, Any]]:
+def bias_under(
+    linearization: MeasureLinearization, suspects: Sequence[Suspect] = (), *, certify_usual: bool = True
+) -> list[dict[str, Any]]:
     """The bias of every suspect under a measure, for θ and, to first order, for the physical parameters; for JSON.
 
     Args:
         suspects: those that were named; without any, the usual ones that have an effect.
         certify_usual: seek certificates, a linear program each, for suspects that no one named, too.
     """
-    named, problem, points = bool(suspects), ground.problem, ground.weighed.points
-    table = ground.table(
+    named, problem, points = bool(suspects), linearization.problem, linearization.weighed.points
+    table = linearization.table(
         suspects or usual_suspects(problem),
         certify=named or (certify_usual and len(points.x) <= CERTIFIED_ROWS),
         every=named,
@@ -115,9 +117,9 @@ def bias_under(ground: Ground, suspects: Sequence[Suspect] = (), *, certify_usua
     for entry in table:
         delta = entry.suspect.values(points.x, problem.layout, problem.outputs)
         own = {
-            "relative_physical_bias": _relative(entry, ground.slopes),
-            "size": float(np.linalg.norm(times(ground.weighed.unit, delta))),
-            "expected_physical_bias": _expected(entry, ground.physics, problem, ground.theta),
+            "relative_physical_bias": _relative(entry, linearization.slopes),
+            "size": float(np.linalg.norm(times(linearization.weighed.unit, delta))),
+            "expected_physical_bias": _expected(entry, linearization.physics, problem, linearization.theta),
         }
         found.append(entry.as_dict() | own)
     return found
@@ -170,7 +172,7 @@ def _solved(physics: PhysicsMap, problem: Problem, theta: Vector, covariance: Ma
 
 
 def physical_with_bias(
-    ground: Ground, bias: Vector, covariance: Matrix | None, spread: Matrix, freedom: float
+    linearization: MeasureLinearization, bias: Vector, covariance: Matrix | None, spread: Matrix, freedom: float
 ) -> tuple[Vector, Matrix]:
     """Biases of the physical parameters (np,), and ends (np, 2) of 95 % intervals that cover bias and noise.
 
@@ -181,10 +183,10 @@ def physical_with_bias(
         bias: of θ̂.
         covariance: of θ̂, by which p is weighted; `spread` counts also what is not known of the bias.
     """
-    physics, problem = ground.physics, ground.problem
+    physics, problem = linearization.physics, linearization.problem
     assert physics is not None
-    centre, order = ground.theta - bias, _order(physics, problem)
-    now, free = (_solved(physics, problem, theta, covariance) for theta in (ground.theta, centre))
+    centre, order = linearization.theta - bias, _order(physics, problem)
+    now, free = (_solved(physics, problem, theta, covariance) for theta in (linearization.theta, centre))
     ends = np.full((len(free.value), 2), np.nan)
     if not _met(free):
         return ends[:, 0], ends

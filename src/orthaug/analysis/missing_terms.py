@@ -109,7 +109,7 @@ def missing_terms(fit: MotionEstimate) -> MissingTest | None:
     None where the runs have no slopes, or there are too few rows.
     """
     motion = fit.problem.motion
-    if not fit.course.dynamics.differentiable:
+    if not fit.segmented.dynamics.differentiable:
         return None
     names = (*motion.names_of_states, *motion.inputs)
     equations = doubted(fit)
@@ -136,10 +136,10 @@ def missing_terms(fit: MotionEstimate) -> MissingTest | None:
 
 def doubted(fit: MotionEstimate) -> tuple[int, ...]:
     """Equations with a parameter or a learner; others, such as ẋ = v, say what a state is. All, if there is none."""
-    motion, course = fit.problem.motion, fit.course
+    motion, segmented = fit.problem.motion, fit.segmented
     c = np.asarray(fit.model.numbers.theta - fit.model.numbers.theta_aux)
     p = motion.coordinates.physical(c)
-    x, u = course.trajectory(c, fit.model.numbers.weights, fit.states)
+    x, u = segmented.trajectory(c, fit.model.numbers.weights, fit.states)
     every = np.unique(np.linspace(0, len(x) - 1, _PROBED).astype(int))
     moved = set(motion.learned[0])
     with np.errstate(all="ignore"):

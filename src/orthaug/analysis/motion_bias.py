@@ -109,7 +109,7 @@ class TermBias:
 
 
 @dataclass(frozen=True, eq=False)
-class MotionGround:
+class MotionLinearization:
     """What biases of a motion are computed on: where it is linearised, and the points that p̂ was split over.
 
     Args:
@@ -130,17 +130,17 @@ class MotionGround:
 
     @property
     def motion(self) -> Motion:
-        return self.place.course.problem.motion
+        return self.place.segmented.problem.motion
 
     @property
     def learns(self) -> bool:
         """Whether there is a learner."""
-        return self.place.course.bound is not None
+        return self.place.segmented.bound is not None
 
     @cached_property
     def phi(self) -> Projection:
         """∂f/∂q of the learned equations over the points, rows times the root of their weights over their sizes."""
-        slopes = np.asarray(slopes_at(self.place.course.dynamics.alone, self.q, self.field.x, self.field.u))
+        slopes = np.asarray(slopes_at(self.place.segmented.dynamics.alone, self.q, self.field.x, self.field.u))
         slopes = slopes[:, learned_places(self.motion)]
         return Projection.factor(self.weighed(np.moveaxis(slopes, 2, 0)).transpose(1, 2, 0))
 
@@ -151,10 +151,10 @@ class MotionGround:
     def usual(self) -> tuple[MotionSuspect, ...]:
         """What is often missing, with widths by where its run goes."""
         place = self.place
-        course = place.course if len(place.w) else place.course.alone
-        x, u = course.trajectory(place.c, place.w, place.states)
+        segmented = place.segmented if len(place.w) else place.segmented.alone
+        x, u = segmented.trajectory(place.c, place.w, place.states)
         there = np.isfinite(x).all(axis=1)
-        on = [entry.text for entry in course.problem.features]
+        on = [entry.text for entry in segmented.problem.features]
         return usual_motion_suspects(self.motion, x[there], u[there], on)
 
     def table(
@@ -289,7 +289,7 @@ class MotionGround:
     @cached_property
     def _moves(self) -> tuple[Matrix, Matrix]:
         """Pairs of points that the learner does not tell apart."""
-        form, nx = self.place.course.dynamics, len(self.motion.states)
+        form, nx = self.place.segmented.dynamics, len(self.motion.states)
         points = np.concatenate([self.field.x, self.field.u], axis=1)
         return moves(lambda rows: np.asarray(form.seen(rows[:, :nx].T, rows[:, nx:].T, np)).T, points)
 
@@ -301,7 +301,7 @@ def told_by_residual(response: TermsResponse, used: float, steps: int | None) ->
         used: weights that the fit used.
     """
     whole, noise = response.squares()
-    free = max(response.place.course.residuals - response.parameters - used, 1.0)
+    free = max(response.place.segmented.residuals - response.parameters - used, 1.0)
     middle = None if steps is None else response.scores().middle(steps, response.parameters + used)[0]
     found: list[Told | None] = []
     for k in range(response.terms):
@@ -327,11 +327,11 @@ def suspected_bias(fit: MotionEstimate, suspects: Sequence[MotionSuspect]) -> li
         fit, MotionEstimate, "fit", "a fit of equations of motion (of difference equations `bias_budget` tells it)"
     )
     check_motion_suspects(suspects, fit.problem)
-    ground = ground_after(fit)
-    if ground is None or not suspects:
+    linearization = linearize_fit(fit)
+    if linearization is None or not suspects:
         return []
     steps = block_of(fit) if fit.plain_covariance is not None else None
-    return ground.table(suspects, fit.effective_weights, steps)
+    return linearization.table(suspects, fit.effective_weights, steps)
 
 
 def softened_bias(fit: MotionEstimate, suspects: Sequence[MotionSuspect]) -> list[TermBias]:
@@ -352,42 +352,44 @@ def usual_biases(fit: MotionEstimate) -> tuple[list[TermBias], list[TermBias]]:
     Of these only what the learner sees counts: the rest is no likely cause of what it found. Nothing where it could
     imitate no change of a parameter.
     """
-    ground = ground_after(fit)
-    if ground is None or not ground.learns or not fit.shared.basis.shape[1]:
+    linearization = linearize_fit(fit)
+    if linearization is None or not linearization.learns or not fit.shared.basis.shape[1]:
         return [], []
-    seen = [suspect for suspect in ground.usual() if ground.sees(suspect)]
-    smooth = softened(seen, fit.problem.motion, fit.values, ground.field.x, ground.field.u)
-    table = ground.table((*seen, *smooth))  # one program for all
+    seen = [suspect for suspect in linearization.usual() if linearization.sees(suspect)]
+    smooth = softened(seen, fit.problem.motion, fit.values, linearization.field.x, linearization.field.u)
+    table = linearization.table((*seen, *smooth))  # one program for all
     return table[: len(seen)], table[len(seen) :]
 
 
-def ground_after(fit: MotionEstimate) -> MotionGround | None:
+def linearize_fit(fit: MotionEstimate) -> MotionLinearization | None:
     """Of a fitted motion under the measure that it was split under; None where it has no normal equations."""
     if not fit.status.ok or fit.scores is None:
         return None
     numbers, field, learned = fit.model.numbers, fit.split_by.field, None
     ridge = fit.model.statistics.ridge / fit.scores.unit
     c, w = np.asarray(numbers.theta - numbers.theta_aux), np.asarray(numbers.weights)
-    place = Place(fit.course, c, w, fit.states, fit.scores.weight, ridge)
+    place = Place(fit.segmented, c, w, fit.states, fit.scores.weight, ridge)
     if fit.model.form.bound is not None:
         learned = parts_at(fit.model.form, fit.model.numbers, field.x, field.u)[1]
         learned = np.where(np.isfinite(learned), learned, 0.0)
     unknown = (*fit.unidentified, *fit.at_bound)
-    return MotionGround(place, fit.theta, fit.shared, field, learned, unknown, fit.split_by.slope)
+    return MotionLinearization(place, fit.theta, fit.shared, field, learned, unknown, fit.split_by.slope)
 
 
-def ground_before(task: MotionTask, structure: Structure) -> MotionGround | None:
+def linearize_physics(task: MotionTask, structure: Structure) -> MotionLinearization | None:
     """Of physics alone, with what a learner of the task's features could hold; None where it has no run."""
     if task.physics is None:
         return None
-    course, flown = task.plan, task.physics.end.flown
-    form, names = course.dynamics, course.problem.motion.names
+    segmented, point = task.plan, task.physics.end.point
+    form, names = segmented.dynamics, segmented.problem.motion.names
     weights = np.zeros(0)
-    place = Place(course, flown.theta, weights, flown.states, task.physics.objective.weight)
-    none = MotionSplit.none("training", form, flown.theta)
-    if course.bound is None:
-        return MotionGround(place, flown.theta, none.shared, none.field)
-    field = field_under(structure.measure, course.alone, course.alone.numbers(flown.theta, weights), flown.states)[0]
+    place = Place(segmented, point.theta, weights, point.states, task.physics.objective.weight)
+    none = MotionSplit.none("training", form, point.theta)
+    if segmented.bound is None:
+        return MotionLinearization(place, point.theta, none.shared, none.field)
+    field = field_under(
+        structure.measure, segmented.alone, segmented.alone.numbers(point.theta, weights), point.states
+    )[0]
     if structure.shared == "all":
-        return MotionGround(place, flown.theta, Shared(names, np.eye(len(names))), field)
-    return MotionGround(place, flown.theta, shared_of_motion(form, flown.theta, field.x, field.u), field)
+        return MotionLinearization(place, point.theta, Shared(names, np.eye(len(names))), field)
+    return MotionLinearization(place, point.theta, shared_of_motion(form, point.theta, field.x, field.u), field)

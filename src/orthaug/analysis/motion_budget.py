@@ -35,9 +35,9 @@ from orthaug.analysis.catalogue import motion_catalogue
 from orthaug.analysis.learned_part import learned_reach
 from orthaug.analysis.motion_bias import (
     CERTIFIED_POINTS,
-    MotionGround,
+    MotionLinearization,
     TermBias,
-    ground_after,
+    linearize_fit,
     softened_bias,
     usual_biases,
 )
@@ -88,8 +88,8 @@ def told_budget(
         table: what every declared suspect does to the fit.
     """
     smooth = softened_bias(fit, declared)
-    ground = ground_after(fit)
-    families = [] if ground is None else families_of(ground)
+    linearization = linearize_fit(fit)
+    families = [] if linearization is None else families_of(linearization)
     budget = motion_budget(fit, table, smooth, families)
     if budget is not None and budget.share >= SURE_SHARE and table:
         return budget
@@ -97,24 +97,24 @@ def told_budget(
     return motion_budget(fit, (*table, *usual), (*smooth, *softer), families, declared) if usual else budget
 
 
-def families_of(ground: MotionGround) -> list[TermBias]:
+def families_of(linearization: MotionLinearization) -> list[TermBias]:
     """What every member of the catalogue does that the learner sees; nothing where it could imitate no parameter."""
-    if ground.learned is None or not ground.shared.basis.shape[1]:
+    if linearization.learned is None or not linearization.shared.basis.shape[1]:
         return []
-    motion, field = ground.motion, ground.field
-    on = [entry.text for entry in ground.place.course.problem.features]
-    terms = motion_catalogue(motion, motion.coordinates.physical(ground.q), field.x, field.u, on)
-    entries = [ground.seen_entry(term) for term in terms if ground.sees(term)]
-    return [entry for entry in entries if ground.physics_cosine(entry.suspect) <= MOST_PHYSICS]
+    motion, field = linearization.motion, linearization.field
+    on = [entry.text for entry in linearization.place.segmented.problem.features]
+    terms = motion_catalogue(motion, motion.coordinates.physical(linearization.q), field.x, field.u, on)
+    entries = [linearization.seen_entry(term) for term in terms if linearization.sees(term)]
+    return [entry for entry in entries if linearization.physics_cosine(entry.suspect) <= MOST_PHYSICS]
 
 
-def noise_share(fit: MotionEstimate, ground: MotionGround) -> float:
+def noise_share(fit: MotionEstimate, linearization: MotionLinearization) -> float:
     """ν: how much of what the learner holds beside the physics is noise, by the band of the learned curve."""
-    half = learned_reach(fit, ground.field.x, ground.field.u)
+    half = learned_reach(fit, linearization.field.x, linearization.field.u)
     if half is None or not np.isfinite(half).all():
         return 0.0
-    own = np.sum(ground.told() ** 2)
-    return float(np.sum(ground.weighed(half / reach(fit.freedom)) ** 2) / max(own, np.finfo(float).tiny))
+    own = np.sum(linearization.told() ** 2)
+    return float(np.sum(linearization.weighed(half / reach(fit.freedom)) ** 2) / max(own, np.finfo(float).tiny))
 
 
 def motion_budget(
@@ -158,16 +158,16 @@ def motion_budget(
 
 def _instead(fit: MotionEstimate, table: Sequence[TermBias], declared: set[MotionSuspect]) -> list[Candidate]:
     """Return what may be the cause as well as the one that is named."""
-    ground = ground_after(fit)
-    assert ground is not None
+    linearization = linearize_fit(fit)
+    assert linearization is not None
     likely = [
         Candidate(entry.suspect.name, explains(entry), _moved(entry), entry.suspect in declared)
         for entry in table
         if entry.seen
         and entry.explained
-        and (entry.suspect in declared or ground.physics_cosine(entry.suspect) <= MOST_PHYSICS)
+        and (entry.suspect in declared or linearization.physics_cosine(entry.suspect) <= MOST_PHYSICS)
     ]
-    return compatible(likely, noise_share(fit, ground))
+    return compatible(likely, noise_share(fit, linearization))
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,31 +211,31 @@ def _of_learner(
     best, other = max(table, key=explains, default=None), max((*smooth, *families), key=explains, default=None)
     if other is not None and (best is None or _is_clearly_less(explains(best), explains(other))):
         best = other
-    ground, every = ground_after(fit), (*table, *smooth)
+    linearization, every = linearize_fit(fit), (*table, *smooth)
     alone = [] if best is None else [[best, *(entry for entry in every if entry is not best)]]
     share = 0.0 if best is None else explains(best)
-    if ground is not None and share < SURE_SHARE:
+    if linearization is not None and share < SURE_SHARE:
         tables = (table, every) if smooth else (table,)
-        found = [(explains(each[0][0]), each) for terms in tables if (each := one_of_each(ground, terms))]
+        found = [(explains(each[0][0]), each) for terms in tables if (each := one_of_each(linearization, terms))]
         joint, each = next((pair for pair in found if pair[0] >= AS_MUCH * found[-1][0]), (0.0, []))
         enough = 1 - (1 - LEAST_SHARE) ** len(each)  # as much of what the others leave as one must explain of all
         if joint >= enough and (share < LEAST_SHARE or 1 - share >= _AS_CLOSE * (1 - joint)):
             alone, share = each, joint
-    return None if share < LEAST_SHARE else _weighed(ground, alone, share, every)
+    return None if share < LEAST_SHARE else _weighed(linearization, alone, share, every)
 
 
-def one_of_each(ground: MotionGround, table: Sequence[TermBias]) -> list[list[TermBias]]:
+def one_of_each(linearization: MotionLinearization, table: Sequence[TermBias]) -> list[list[TermBias]]:
     """Terms of each learned equation by what they explain of the learner beside the first of the others, best first.
 
     The first ones explain most together, over 20,000 points at most. Nothing where terms of one
     equation alone explain any of it.
     """
     seen = [entry for entry in table if entry.seen and entry.explained]
-    places = [entry.suspect.place(ground.motion) for entry in seen]
+    places = [entry.suspect.place(linearization.motion) for entry in seen]
     groups = [np.flatnonzero(np.equal(places, place)) for place in dict.fromkeys(places)]
     if len(groups) < 2:
         return []
-    values = (*(ground.beside(ground.held(entry.suspect)) for entry in seen), ground.told())
+    values = (*(linearization.beside(linearization.held(entry.suspect)) for entry in seen), linearization.told())
     rows = np.stack([row[:: 1 + len(row) // CERTIFIED_POINTS].ravel() for row in values])
     sizes = np.linalg.norm(rows, axis=1)
     cosines = (rows @ rows.T) / np.outer(sizes, sizes)
@@ -264,7 +264,10 @@ def one_of_each(ground: MotionGround, table: Sequence[TermBias]) -> list[list[Te
 
 
 def _weighed(
-    ground: MotionGround | None, each: Sequence[Sequence[TermBias]], share: float, table: Sequence[TermBias]
+    linearization: MotionLinearization | None,
+    each: Sequence[Sequence[TermBias]],
+    share: float,
+    table: Sequence[TermBias],
 ) -> _Found:
     """Causes with how unsure their sizes are, what the next one makes of the rest, and what they cannot be told from.
 
@@ -280,7 +283,7 @@ def _weighed(
         if len(each) > 1:  # of a single cause they are in the hull
             unsure.append(np.max([np.zeros(len(bias)), *apart], axis=0))
         rivals += [rival for rival, by in zip(near, apart, strict=True) if np.any(by > _ELSEWHERE * np.abs(bias))]
-    after = [] if ground is None else ground.after(causes, table)
+    after = [] if linearization is None else linearization.after(causes, table)
     unsure += [_moved(max(after, key=explains))] if after else []
     return _Found(causes, share, bias, np.array(unsure), tuple(rivals))
 

@@ -15,7 +15,7 @@ import numpy as np
 from orthaug._base.checks import Matrix, Vector
 from orthaug.data.record import Record
 from orthaug.fitting.initial_states import Start
-from orthaug.fitting.motion_course import MotionCourse
+from orthaug.fitting.segmented_motion import SegmentedMotion
 from orthaug.physics.excitation import Excitation, of_gram
 
 _DRAWS = 3  # parameters near the initial ones
@@ -41,36 +41,36 @@ class Identified:
     inputs: Matrix
 
 
-def identified(course: MotionCourse) -> Identified | None:
+def identified(segmented: SegmentedMotion) -> Identified | None:
     """Of the physics alone of a course, over shorter segments where it runs away; None where no run is finite."""
-    course = course.alone
-    steps = course.segments.steps
-    for flying in (course, *(course.over(shorter) for shorter in _SHORTER if shorter < steps)):
-        on_data = _rank(flying)
+    segmented = segmented.alone
+    steps = segmented.segments.steps
+    for shorter_runs in (segmented, *(segmented.over(shorter) for shorter in _SHORTER if shorter < steps)):
+        on_data = _rank(shorter_runs)
         if on_data is not None:
             break
     else:
         return None
-    tried = (_rank(_richly_excited(flying, wide)) for wide in _WIDTHS)
+    tried = (_rank(_richly_excited(shorter_runs, wide)) for wide in _WIDTHS)
     by_any = next((found for found in tried if found is not None), None)
     if by_any is not None and by_any.rank < on_data.rank:
         by_any = on_data
-    initial = course.problem.motion.coordinates.initial
-    x, u = flying.trajectory(initial, (), np.asarray(flying.segments.start))
+    initial = segmented.problem.motion.coordinates.initial
+    x, u = shorter_runs.trajectory(initial, (), np.asarray(shorter_runs.segments.start))
     finite = np.isfinite(x).all(axis=1)
     return Identified(on_data, by_any, x[finite], u[finite])
 
 
-def _rank(course: MotionCourse) -> Excitation | None:
+def _rank(segmented: SegmentedMotion) -> Excitation | None:
     """The highest rank of some points near the initial parameters; None where no run is finite.
 
     Of several of that rank the one that ties most: of `a*b` with a = 0 it looks as if b alone were idle.
     """
     best: Excitation | None = None
-    for q in _near(course):
-        gram = information(course, q)
+    for q in _near(segmented):
+        gram = information(segmented, q)
         if gram is not None:
-            found = of_gram(gram, course.problem.motion.names)
+            found = of_gram(gram, segmented.problem.motion.names)
             best = found if best is None else max(best, found, key=_telling)
         if best is not None and best.full_rank:
             break
@@ -81,20 +81,20 @@ def _telling(found: Excitation) -> tuple[int, int]:
     return found.rank, sum(map(len, found.collinear))
 
 
-def information(course: MotionCourse, q: Vector) -> Matrix | None:
+def information(segmented: SegmentedMotion, q: Vector) -> Matrix | None:
     """Gram matrix (np, np) of the outputs' sensitivities to the parameters' coordinates; None where a run diverges."""
-    objective = course.objective()
+    objective = segmented.objective()
     objective = replace(objective, loose=_LOOSER * objective.loose)
     with np.errstate(all="ignore"):
-        flown = objective.fly(q, Start(np.asarray(course.segments.start)))
-        if not np.isfinite(flown.loss):
+        point = objective.evaluate(q, Start(np.asarray(segmented.segments.start)))
+        if not np.isfinite(point.loss):
             return None
-        gram = objective.linearise(flown).information
+        gram = objective.linearise(point).information
     return gram if np.isfinite(gram).all() else None
 
 
-def _near(course: MotionCourse) -> Iterator[Vector]:
-    coordinates, random = course.problem.motion.coordinates, np.random.default_rng(_SEED)
+def _near(segmented: SegmentedMotion) -> Iterator[Vector]:
+    coordinates, random = segmented.problem.motion.coordinates, np.random.default_rng(_SEED)
     low, high = coordinates.bounds
     first = coordinates.initial
     size = np.where(coordinates.positive, 1.0, np.where(first != 0, np.abs(first), 1.0))
@@ -103,9 +103,9 @@ def _near(course: MotionCourse) -> Iterator[Vector]:
         yield np.clip(first + _NEAR * size * random.normal(size=len(first)), low, high)
 
 
-def _richly_excited(course: MotionCourse, wide: float) -> MotionCourse:
+def _richly_excited(segmented: SegmentedMotion, wide: float) -> SegmentedMotion:
     """The same rows with inputs of random levels, each for a random time, and starts a little off their guesses."""
-    record, random = course.record, np.random.default_rng(_SEED)
+    record, random = segmented.record, np.random.default_rng(_SEED)
     every = np.concatenate([e.inputs for e in record.experiments])
     low, high = every.min(axis=0), every.max(axis=0)
     half = wide * np.where(high > low, (high - low) / 2, 1.0)
@@ -115,16 +115,16 @@ def _richly_excited(course: MotionCourse, wide: float) -> MotionCourse:
         for column in inputs.T:
             column[:] = _levels(len(column), random)
         experiments.append(replace(experiment, inputs=(low + high) / 2 + half * inputs))
-    excited = _on(course, replace(record, experiments=tuple(experiments)))
+    excited = _on(segmented, replace(record, experiments=tuple(experiments)))
     start = np.asarray(excited.segments.start)
     size = np.abs(start).max(axis=(0, 2), keepdims=True)
     return excited.from_states(start + _NEAR * size * random.normal(size=start.shape))
 
 
-def _on(course: MotionCourse, record: Record) -> MotionCourse:
+def _on(segmented: SegmentedMotion, record: Record) -> SegmentedMotion:
     """The same segments on another record."""
-    whole = MotionCourse.of(course.problem.on(record), None, course.criterion)
-    return whole if course.flown == course.criterion.flown else whole.over(course.flown.steps)
+    whole = SegmentedMotion.of(segmented.problem.on(record), None, segmented.criterion)
+    return whole if segmented.free_run == segmented.criterion.free_run else whole.over(segmented.free_run.steps)
 
 
 def _levels(count: int, random: np.random.Generator) -> Vector:

@@ -27,8 +27,8 @@ from orthaug._base.lines import percent
 from orthaug.analysis.absorbed import Waves
 from orthaug.fitting.block_scores import FreeRunScores
 from orthaug.fitting.initial_states import InitialStates
-from orthaug.fitting.motion_course import MotionCourse
 from orthaug.fitting.motion_estimates import MotionEstimate
+from orthaug.fitting.segmented_motion import SegmentedMotion
 from orthaug.fitting.segments import respond, sensitivity
 from orthaug.models.dynamics import Numbers
 from orthaug.models.learners import Bound
@@ -47,7 +47,7 @@ _LARGE_SHARE = 1e-3  # of a parameter that has no standard error
 class Place:
     """Where a free run is linearised: a course with its coordinates, its learner's weights and its segments' starts."""
 
-    course: MotionCourse
+    segmented: SegmentedMotion
     c: Vector
     w: Vector
     states: Any
@@ -107,8 +107,8 @@ class TermsResponse:
 
     def size(self, k: int) -> float:
         """RMS effect of a unit of the term on the outputs, in their deviations."""
-        course, weight = self.place.course, self.place.weight
-        whole = course.segments.count * float(np.sum((weight * course.deviation) ** 2))
+        segmented, weight = self.place.segmented, self.place.weight
+        whole = segmented.segments.count * float(np.sum((weight * segmented.deviation) ** 2))
         return float(np.sqrt(max(self.information[self.parameters + k, self.parameters + k], 0.0) / whole))
 
     def step(self, k: int) -> tuple[float, float, Vector] | None:
@@ -131,9 +131,9 @@ class TermsResponse:
         leaves out.
         """
         place = self.place
-        errors = place.course.objective().errors(place.c, place.w, place.states, place.course.segments)
+        errors = place.segmented.objective().errors(place.c, place.w, place.states, place.segmented.segments)
         errors = np.einsum("oi,ktim->ktom", place.weight, errors)
-        scored = np.asarray(place.course.segments.scored)[:, :, None]
+        scored = np.asarray(place.segmented.segments.scored)[:, :, None]
         pairs = scored[:, 1:] & scored[:, :-1]
         apart = float(np.sum(np.where(pairs, np.diff(errors, axis=1), 0.0) ** 2)) / 2
         whole = float(np.sum(errors**2))
@@ -141,10 +141,10 @@ class TermsResponse:
 
     def scores(self) -> FreeRunScores:
         """The scores of all unknowns, for standard errors that hold for coloured errors."""
-        place, objective = self.place, self.place.course.objective()
-        missed = np.moveaxis(np.asarray(place.course.segments.start) - place.states, -1, 1)
+        place, objective = self.place, self.place.segmented.objective()
+        missed = np.moveaxis(np.asarray(place.segmented.segments.start) - place.states, -1, 1)
         prior = LOOSER**2 * objective.start_rows.T @ objective.start_rows
-        made = (self.form, self.numbers, place.course.segments, place.states, place.weight)
+        made = (self.form, self.numbers, place.segmented.segments, place.states, place.weight)
         return FreeRunScores(*made, 1.0, self.slope, missed @ prior)
 
     def _beside(self, k: int) -> tuple[Vector, float]:
@@ -159,16 +159,16 @@ class TermsResponse:
 
 def respond_to(place: Place, added: tuple[AddedTerm, ...]) -> TermsResponse:
     """Linearise a free run with further terms, and with all that its learner could hold."""
-    course, motion = place.course, place.course.problem.motion
+    segmented, motion = place.segmented, place.segmented.problem.motion
     suspected = SuspectedMotion.of(motion, added)
-    bound, w = course.bound, place.w
+    bound, w = segmented.bound, place.w
     if bound is not None and not len(w):
         bound = Bound(Waves(), bound.nz, bound.ny)
         w = np.zeros(bound.size)
-    form = replace(course.dynamics, motion=suspected, bound=bound)
-    numbers = course.numbers(np.concatenate([place.c, np.zeros(len(added))]), w)
-    slopes = sensitivity(form, numbers, course.segments, place.states, place.weight)
-    objective = course.objective()
+    form = replace(segmented.dynamics, motion=suspected, bound=bound)
+    numbers = segmented.numbers(np.concatenate([place.c, np.zeros(len(added))]), w)
+    slopes = sensitivity(form, numbers, segmented.segments, place.states, place.weight)
+    objective = segmented.objective()
     rows = LOOSER * objective.start_rows
     information, gradient, _, slope = objective.initial.eliminate(slopes, place.states, rows)
     low, high = motion.coordinates.bounds
@@ -223,16 +223,16 @@ def substep_bias(fit: MotionEstimate) -> SubstepBias | None:
     Returns:
         p̂ less what a fit with twice the substeps would give, to first order, in the units of p and in standard errors.
     """
-    motion, course, numbers = fit.problem.motion, fit.course, fit.model.numbers
-    slope, substeps = fit.split_by.slope, course.dynamics.substeps
+    motion, segmented, numbers = fit.problem.motion, fit.segmented, fit.model.numbers
+    slope, substeps = fit.split_by.slope, segmented.dynamics.substeps
     if motion.integrator == "discrete" or fit.scores is None or slope is None or 2 * substeps > MOST_SUBSTEPS:
         return None
     c, w = np.asarray(numbers.theta - numbers.theta_aux), np.asarray(numbers.weights)
-    finer = course.refined(2 * substeps)
+    finer = segmented.refined(2 * substeps)
     outputs = respond(finer.dynamics, finer.numbers(c, w), finer.segments, fit.states)
-    moved = course.segments._replace(target=outputs)  # whose errors are what the finer steps add
-    slopes = sensitivity(course.dynamics, course.numbers(c, w), moved, fit.states, fit.scores.weight)
-    rows = LOOSER * course.objective().start_rows
+    moved = segmented.segments._replace(target=outputs)  # whose errors are what the finer steps add
+    slopes = sensitivity(segmented.dynamics, segmented.numbers(c, w), moved, fit.states, fit.scores.weight)
+    rows = LOOSER * segmented.objective().start_rows
     at = np.asarray(fit.states)
     information, gradient = InitialStates(at, free=True).eliminate(slopes, at, rows)[:2]
     if not np.isfinite(information).all() or not np.isfinite(gradient).all():

@@ -61,10 +61,10 @@ def sensitivities(
         terms: makes the terms, given the points (n, M) of the runs.
         count: of terms.
     """
-    course, numbers = fit.course, fitted_numbers(fit.model.numbers)
-    form = course.dynamics
-    runs = np.moveaxis(course.runs(numbers.theta, numbers.weights, fit.states), -1, 1)  # (k, m, T, n0)
-    segments = [np.moveaxis(np.asarray(part), -1, 1) for part in course.segments[1:]]
+    segmented, numbers = fit.segmented, fitted_numbers(fit.model.numbers)
+    form = segmented.dynamics
+    runs = np.moveaxis(segmented.runs(numbers.theta, numbers.weights, fit.states), -1, 1)  # (k, m, T, n0)
+    segments = [np.moveaxis(np.asarray(part), -1, 1) for part in segmented.segments[1:]]
     k, m = runs.shape[:2]
     x, u, target, scored = (part.reshape(k * m, *part.shape[2:]) for part in (runs, *segments))
     n0, n, q = form.states, form.unknowns, count * len(equations)

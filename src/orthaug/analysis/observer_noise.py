@@ -50,7 +50,7 @@ def by_verdict(model: Model | MotionModel, verdict: str | None = None) -> Noise:
             "such as oa.Noise(state, output) with two covariances."
         )
     verdict, nothing = kept.verdict if verdict is None else verdict, np.zeros_like(kept.noise)
-    if not kept.flown and verdict != "sensor_noise":
+    if not kept.simulated and verdict != "sensor_noise":
         return Noise(np.array(kept.noise), nothing)
     return with_share(model, kept.noise, _MOST if verdict in BOTH else _LITTLE)
 
@@ -97,7 +97,7 @@ def to_keep(fit: Estimate | MotionEstimate, verdict: str) -> Noise | None:
     None where the verdict's rule is as good, without an estimate of the noise, and where a filter takes long.
     """
     model, kept = fit.model, fit.model.statistics
-    if not _known(kept.noise) or not kept.flown or verdict not in BOTH or not model.form.differentiable:
+    if not _known(kept.noise) or not kept.simulated or verdict not in BOTH or not model.form.differentiable:
         return None
     if len(model.filtering[0].names) > _KEPT_STATES:
         return None

@@ -184,11 +184,13 @@ class Predictable:
         return max(self.inputs, self.functions, self.own_past if own_past else 0.0)
 
 
-def predictable(problem: Problem, response: Response, skip: int = 0, *, flown: bool = False) -> tuple[Predictable, ...]:
+def predictable(
+    problem: Problem, response: Response, skip: int = 0, *, simulates: bool = False
+) -> tuple[Predictable, ...]:
     """What could be predicted of a response's errors on the training data, after the first `skip` rows.
 
     Args:
-        flown: a free run, whose errors are no function of the regressor.
+        simulates: a free run, whose errors are no function of the regressor.
     """
     errors, functions, found = errors_of(response, skip), SimpleFunctions.of(problem), []
     starts = [run.start + skip for run in response.trajectories]
@@ -206,7 +208,7 @@ def predictable(problem: Problem, response: Response, skip: int = 0, *, flown: b
         curved = Share(0.0, 0.0)
         if len(columns) > 5 * columns.shape[1] > 5:
             curved = BlockSums.of(columns, whole[every]).share(range(1, columns.shape[1]), [0])
-        near = 0.0 if flown else from_neighbours(x[few][:, read], whole[few]).sure
+        near = 0.0 if simulates else from_neighbours(x[few][:, read], whole[few]).sure
         rms = float(np.sqrt(np.mean(whole**2)))
         found.append(Predictable(name, rms, own.sure, driven.sure, max(curved.sure, near)))
     return tuple(found)

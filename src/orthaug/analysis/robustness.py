@@ -36,7 +36,7 @@ def robust_where_asked(fit: Estimate, response: Response) -> Estimate:
     """
     if not fit.status.ok or fit.covariance is None or fit.at_bound:
         return fit
-    if fit.criterion.flown is not None:
+    if fit.criterion.free_run is not None:
         return robust_free_run(fit)
     lags, rows = _memory(fit, response), len(fit.problem.rows)
     if lags is not None:

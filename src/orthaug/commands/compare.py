@@ -95,8 +95,8 @@ def _verdicts(job: Job, fitted: dict[str, Fitted]) -> dict[str, Verdict]:
     if not kinds or not alone.status.ok:
         return {}
     criterion = alone.criterion
-    blocks, flown = wanted_blocks(job), criterion.simulates
-    if flown or not blocks:  # free runs were chosen by the same trials
+    blocks, simulates = wanted_blocks(job), criterion.simulates
+    if simulates or not blocks:  # free runs were chosen by the same trials
         trials = [None] * len(kinds)
     else:
         trials = cross_validated(job, blocks, [Variant(kind, criterion=criterion) for kind in kinds])

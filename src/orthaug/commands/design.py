@@ -73,8 +73,8 @@ def _of_motion(job: MotionJob, asked: dict[str, Any], noise: float | None) -> De
         raise InputError("physics alone has no finite free run from its initial values; give others.")
     left: Any = noise
     if noise is None:
-        left = tuple(np.sqrt(np.sum(task.physics.end.flown.errors**2, axis=(0, 1, 3)) / task.plan.segments.count))
-    p = motion.coordinates.physical(task.physics.end.flown.theta)
+        left = tuple(np.sqrt(np.sum(task.physics.end.point.errors**2, axis=(0, 1, 3)) / task.plan.segments.count))
+    p = motion.coordinates.physical(task.physics.end.point.theta)
     own = {"parameters": p, "noise": left, "substeps": task.plan.dynamics.substeps}
     return design_motion_input(motion, suspects=job.suspects, **own, **asked)
 

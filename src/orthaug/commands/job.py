@@ -169,8 +169,8 @@ class Job(ABC):
     @property
     def iterations(self) -> int:
         """Steps of a run at most."""
-        flown = self.spec.declared_criterion().flown
-        return self.spec.declared_solver().iterations + (flown.start_iterations if flown else 0)
+        free_run = self.spec.declared_criterion().free_run
+        return self.spec.declared_solver().iterations + (free_run.start_iterations if free_run else 0)
 
     @property
     def files(self) -> tuple[Path, ...]:

@@ -11,7 +11,7 @@ import numpy as np
 from orthaug._base.errors import InputError, Warning
 from orthaug.analysis.closed_loop import closed_loop
 from orthaug.analysis.imitation import Imitation, imitation
-from orthaug.analysis.measure_bias import Ground, bias_under
+from orthaug.analysis.measure_bias import MeasureLinearization, bias_under
 from orthaug.commands.attempt import attempt, attempt_warned
 from orthaug.commands.lagged_job import LaggedJob
 from orthaug.commands.suspects import declared
@@ -195,8 +195,8 @@ def _bias_of(job: LaggedJob, fit: Estimate | None = None) -> list[dict[str, Any]
     """
     if not job.problem.baseline.names:
         return []
-    ground = _ground(job, fit)
-    return bias_under(ground, declared(job.spec.suspects, ground.problem), certify_usual=fit is None)
+    linearization = _linearization(job, fit)
+    return bias_under(linearization, declared(job.spec.suspects, linearization.problem), certify_usual=fit is None)
 
 
 def _budget_of(job: LaggedJob, fit: Estimate) -> Budget | None:
@@ -205,8 +205,8 @@ def _budget_of(job: LaggedJob, fit: Estimate) -> Budget | None:
 
     if fit.model.structure != "orthogonal" or fit.model.form.bound is None:
         return None
-    ground = _ground(job, fit)
-    return budget_on(ground, fit, declared(job.spec.suspects, ground.problem))
+    linearization = _linearization(job, fit)
+    return budget_on(linearization, fit, declared(job.spec.suspects, linearization.problem))
 
 
 def _with_biases(
@@ -221,16 +221,16 @@ def _with_biases(
     return [row.told(imitated, bias) for row, imitated, bias in zip(rows, shared, biases, strict=True)]
 
 
-def _ground(job: LaggedJob, fit: Estimate | None) -> Ground:
+def _linearization(job: LaggedJob, fit: Estimate | None) -> MeasureLinearization:
     problem, weighed, structure = job.problem, job.weighed, job.spec.declared_structure()
     if fit is None:
         along = directions(structure, problem) if job.spec.declared_learner() is not None else None
-        return Ground(weighed, problem, problem.least_squares, job.physics, None, along)
+        return MeasureLinearization(weighed, problem, problem.least_squares, job.physics, None, along)
     if fit.problem.weight.kind != problem.weight.kind:  # weighed by the errors that the fit left
         problem = fit.problem
         weighed = weigh_problem(job.measure, problem)
     learned = None if fit.model.form.bound is None else fit.model.learner_at(weighed.points.x)
-    return Ground(weighed, problem, fit.theta, job.physics, learned, fit.model.shared)
+    return MeasureLinearization(weighed, problem, fit.theta, job.physics, learned, fit.model.shared)
 
 
 def _said_of_shared(job: LaggedJob, fit: Estimate | None = None) -> list[Warning]:

@@ -39,16 +39,16 @@ def checked(job: MotionJob) -> CheckResult:
     from orthaug.analysis.imitation import imitation_before
     from orthaug.analysis.input_timing import dead_times, try_holds
     from orthaug.analysis.motion_identifiability import identified
-    from orthaug.fitting.motion_course import MotionCourse
     from orthaug.fitting.motion_estimation import without_learner
+    from orthaug.fitting.segmented_motion import SegmentedMotion
     from orthaug.inference.motion_split import shared_of_motion
     from orthaug.inference.nearly_shared import shared_warnings
     from orthaug.models.moving import Moving
 
     problem, spec = job.problem, job.spec
     motion, criterion = problem.motion, spec.declared_criterion()
-    course = MotionCourse.of(without_learner(problem), None, criterion)
-    told = identified(course)
+    segmented = SegmentedMotion.of(without_learner(problem), None, criterion)
+    told = identified(segmented)
     if told is None:
         wild = "".join(f" {warning.text}" for warning in job.warnings if warning.code == "wild_samples")
         scales = describe_scales(problem.record)
@@ -97,12 +97,12 @@ def _biases(job: MotionJob, trial: Trial) -> list[dict[str, Any]] | None:
 
     None where physics alone has no run.
     """
-    from orthaug.analysis.motion_bias import ground_before
+    from orthaug.analysis.motion_bias import linearize_physics
 
-    ground = ground_before(trial.task, job.structure)
-    if ground is None:
+    linearization = linearize_physics(trial.task, job.structure)
+    if linearization is None:
         return None
-    table = ground.table(job.suspects or ground.usual())
+    table = linearization.table(job.suspects or linearization.usual())
     return [entry.as_dict() for entry in table if job.suspects or entry.size]
 
 

@@ -330,8 +330,8 @@ class Spec(Section):
     @property
     def brought(self) -> bool:
         """Whether training reads all rows into memory: of a motion, and of free runs over whole experiments."""
-        flown = self.declared_criterion().flown
-        return self.motion is not None or (flown is not None and not flown.steps)
+        free_run = self.declared_criterion().free_run
+        return self.motion is not None or (free_run is not None and not free_run.steps)
 
     def regularizations(self, *, linear: bool, validated: bool, kind: str | None = None) -> tuple[str | float, ...]:
         """Those that every start is run with, in the structure that is declared or another kind."""

@@ -17,12 +17,12 @@ from orthaug.data.record import Record
 from orthaug.data.regressors import Lags
 from orthaug.fitting.elimination import Fixed, ThetaSplit, directions, eliminate, split_theta
 from orthaug.fitting.estimates import NOT_UNIQUE, Estimate
-from orthaug.fitting.laid_rows import Share
 from orthaug.fitting.learned import ErrorStatistics, Learned
 from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.silence import learner_silent
 from orthaug.fitting.status import ALONE, Ending, Status
 from orthaug.fitting.structures import Orthogonal, Structure
+from orthaug.fitting.training_rows import Share
 from orthaug.fitting.unfinished import (
     NOT_CONVERGED,
     ending_in_words,
@@ -303,7 +303,7 @@ def orthogonalize(
     scaling, unit = Scaling(np.zeros(nz), np.ones(nz)), np.ones(ny)
     task = OneStepTask.of(problem, None)
     gain = np.broadcast_to(problem.weight.matrix / task.rms, (*values.shape, ny))
-    rows = task.engine.lay(values, problem.projection.q, problem.unexplained / task.rms, gain)
+    rows = task.engine.build_rows(values, problem.projection.q, problem.unexplained / task.rms, gain)
     task = replace(task, rows=rows, unit=unit, bound=Bound(_GIVEN, ny, ny))
     concluded = conclude(task, Orthogonal(), Learned(task.bound, np.zeros(0), scaling, unit, elsewhere=True))
     form = replace(concluded.model.form, bound=Bound(external, nz, ny))

@@ -44,7 +44,7 @@ class Criterion(Protocol):
         ...
 
     @property
-    def flown(self) -> Simulation | None:
+    def free_run(self) -> Simulation | None:
         """The free run that training makes; None for one step ahead."""
         ...
 
@@ -73,7 +73,7 @@ class Prediction:
     """Declaration: the error of the prediction `horizon` steps ahead; 1 is the paper's criterion (eq:cost_fun).
 
     Examples:
-        >>> Prediction(10).flown
+        >>> Prediction(10).free_run
         Simulation(segment=10, washout=9, start_iterations=20, exact_start=True)
     """
 
@@ -92,7 +92,7 @@ class Prediction:
         return self.horizon == 1
 
     @property
-    def flown(self) -> Simulation | None:
+    def free_run(self) -> Simulation | None:
         """The free run that gives it: segments of `horizon` steps whose last one is scored; None for one step."""
         return Simulation(self.horizon, self.horizon - 1, exact_start=True) if self.horizon > 1 else None
 
@@ -149,7 +149,7 @@ class Simulation:
             )
 
     @property
-    def flown(self) -> Simulation:
+    def free_run(self) -> Simulation:
         """Itself: the free run that training makes."""
         return self
 
@@ -208,7 +208,7 @@ class Auto:
         Simulation(self.segment, self.washout, self.start_iterations)
 
     @property
-    def flown(self) -> None:
+    def free_run(self) -> None:
         """None: it begins one step ahead."""
         return None
 

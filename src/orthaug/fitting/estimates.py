@@ -154,7 +154,7 @@ class Estimate(AnyFit):
     @property
     def one_step_theta(self) -> Vector | None:
         """Φ⁺Y (nθ,), what one-step least squares gives, where θ was trained on something else; None otherwise."""
-        if self.criterion.flown is None:
+        if self.criterion.free_run is None:
             return None
         return self.problem.least_squares
 
@@ -215,7 +215,9 @@ class Estimate(AnyFit):
 
     def joint_covariance(self, convention: str = "calibrated") -> Matrix:
         """Cov of θ̂ and the weights from the raw `[Φ P⊥J]`, (nθ + nw)²; convention "paper" for eq:cov_approx / N."""
-        if self.criterion.flown is not None or (self.model.statistics.gram is None and self.model.numbers.tilt is None):
+        if self.criterion.free_run is not None or (
+            self.model.statistics.gram is None and self.model.numbers.tilt is None
+        ):
             raise InputError("the joint covariance is that of a one-step fit with statistics of its own.")
         return joint_covariance(self.problem, self.model, convention)
 
@@ -235,15 +237,15 @@ class Estimate(AnyFit):
             InputError: a fit without standard errors or with a parameter at a bound; errors that remember each other
                 for too long; a kind that is not for this criterion.
         """
-        flown = self.criterion.flown is not None
-        kinds = ("batch-means", "batch-means-uneven", "autoregressive") if flown else ("newey-west", "hc3")
+        simulates = self.criterion.free_run is not None
+        kinds = ("batch-means", "batch-means-uneven", "autoregressive") if simulates else ("newey-west", "hc3")
         kind = kinds[0] if kind is None else check_choice(kind, kinds, "`kind`")
-        if self.covariance is None or self.at_bound or (flown and self.scores is None):
+        if self.covariance is None or self.at_bound or (simulates and self.scores is None):
             raise InputError(
                 "robust standard errors are those of a fit that has standard errors, with no parameter at a bound."
             )
-        if flown:
-            return replace(self._robust_flown(lags, kind), std_kind=kind)
+        if simulates:
+            return replace(self._robust_free_run(lags, kind), std_kind=kind)
         if kind == "hc3":
             return self._hc3()
         trajectories = self.model.predict(self.problem.record).trajectories
@@ -280,7 +282,7 @@ class Estimate(AnyFit):
         """Return Cov θ̂, larger along directions that the learner could nearly imitate on the rows."""
         return grown(covariance, statistics, None if self.model.shared is None else self.problem.shared)
 
-    def _robust_flown(self, steps: int | None, kind: str) -> Estimate:
+    def _robust_free_run(self, steps: int | None, kind: str) -> Estimate:
         """From blocks of so many steps of the free run, or from the colour of its errors."""
         assert self.scores is not None
         statistics = self.model.statistics

@@ -57,9 +57,9 @@ def choose_focus(problem: Any, fit: Fit, options: Mapping[str, Any], criterion: 
         text = "one step ahead is enough: the free run holds where nothing was fitted, and the residual is white."
         return replace(first, focus=Focus(ONE_STEP, text))
     LOG.info("auto: %s; the free run is trained, too", reason)
-    flown = _free_run(criterion, problem)
+    free_run = _free_run(criterion, problem)
     try:
-        return _best(_Choosing(problem, first, fit, options, flown), reason)
+        return _best(_Choosing(problem, first, fit, options, free_run), reason)
     except InputError as error:  # too few rows for a free run
         text = f"trained one step ahead; {reason}, but the free run cannot be trained: {error}"
         return replace(first, focus=Focus(ONE_STEP, text))
@@ -149,7 +149,7 @@ class _Choosing:
     first: Any
     fit: Fit
     options: Mapping[str, Any]
-    flown: Any
+    free_run: Any
 
     @property
     def learns(self) -> bool:
@@ -160,7 +160,9 @@ class _Choosing:
     def free(self) -> Any:
         """The fit on the free run, from one start, for all begin at physics alone; within its limit, to save time."""
         chosen = {**self.options, "fallback": False, "blocks": 0, "restarts": 1}
-        return self.fit(self.problem, criterion=self.flown, **chosen | {"solver": self.options["solver"].within_limit})
+        return self.fit(
+            self.problem, criterion=self.free_run, **chosen | {"solver": self.options["solver"].within_limit}
+        )
 
     @cached_property
     def free_physics(self) -> Any:
@@ -168,7 +170,7 @@ class _Choosing:
         if "free" in vars(self) and self.free.physics_alone is not None:
             return self.free.physics_alone
         chosen = {**self.options, "learner": None, "fallback": False, "blocks": 0, "restarts": 1}
-        return self.fit(self.problem, criterion=self.flown, **chosen)
+        return self.fit(self.problem, criterion=self.free_run, **chosen)
 
     def estimate(self, key: Key) -> Any:
         """Return the estimate of a candidate from all rows."""
@@ -187,7 +189,7 @@ class _Choosing:
         for training, held in records:
             whole = training is self.problem.record
             made = {} if whole else {ONE_STEP: self._made(training, Prediction()),
-                                     FREE_RUN: self._made(training, self.flown)}  # fmt: skip
+                                     FREE_RUN: self._made(training, self.free_run)}  # fmt: skip
             for key, found in pieces.items():
                 one = self.estimate(key) if whole else _without(made[key[0]], key[1])
                 found += _errors(one, held, self.problem)

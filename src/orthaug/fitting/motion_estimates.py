@@ -33,7 +33,7 @@ from orthaug.physics.shared import Shared
 if TYPE_CHECKING:
     import pandas as pd
 
-    from orthaug.fitting.motion_course import MotionCourse
+    from orthaug.fitting.segmented_motion import SegmentedMotion
 
 _UNSEEN = 1e-3  # share of a parameter in directions that no output shows, above which it is not identified
 _VAGUE = 1.0  # standard error of a logarithm above which only the order of magnitude is known
@@ -57,7 +57,7 @@ class MotionEstimate(AnyFit):
     problem: MotionProblem = field(repr=False)
     criterion: Criterion
     split_by: MotionSplit = field(repr=False)
-    course: MotionCourse = field(repr=False)
+    segmented: SegmentedMotion = field(repr=False)
     states: Any = field(repr=False)
     """The segments' starts, as estimated."""
     slope: Any = field(repr=False)
@@ -142,12 +142,12 @@ class MotionEstimate(AnyFit):
             InputError: a measure that does not fit the motion.
         """
         check_type(measure, Measure, "measure", "a measure such as Uniform()")
-        form, course = self.model.form, self.course
+        form, segmented = self.model.form, self.segmented
         whole = fitted_numbers(self.model.numbers)
-        field, support, told = field_under(measure, course, whole, self.states)
+        field, support, told = field_under(measure, segmented, whole, self.states)
         moving = None
         if isinstance(measure, Training) and self.slope is not None:
-            moving = partial(wobble, form, whole, course.segments, self.states, self.slope, field.size)
+            moving = partial(wobble, form, whole, segmented.segments, self.states, self.slope, field.size)
         bounds = self.problem.motion.coordinates.bounds
         options = {"everything": shared == "all", "wobble": moving}
         split = split_motion(measure.name, form, whole, self.alone, field, bounds, **options)

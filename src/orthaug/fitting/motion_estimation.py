@@ -17,10 +17,10 @@ from orthaug.fitting.conclusion import without_loss
 from orthaug.fitting.criteria import Criterion, Simulation
 from orthaug.fitting.kinds import Solver
 from orthaug.fitting.learned import Learned
-from orthaug.fitting.motion_course import MotionCourse
 from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.fitting.motion_task import MotionTask
 from orthaug.fitting.rules import check_motion_choices, check_solver, checked_starts, tried
+from orthaug.fitting.segmented_motion import SegmentedMotion
 from orthaug.fitting.silence import learner_silent, silenced
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.status import ALONE, Ending, Status
@@ -115,9 +115,9 @@ def conclude_motion(task: MotionTask, structure: Structure, learned: Learned) ->
     learned = withheld(learned) if unsettled else learned
     errors = learned.errors
     assert errors is not None and learned.coefficients is not None
-    alone = np.asarray(learned.coefficients if task.physics is None else task.physics.end.flown.theta)
-    laid = (plan.flown.steps, plan.flown.washout, plan.segments.count)
-    trained = Trained(*laid, np.asarray(states), slope, alone)
+    alone = np.asarray(learned.coefficients if task.physics is None else task.physics.end.point.theta)
+    layout = (plan.free_run.steps, plan.free_run.washout, plan.segments.count)
+    trained = Trained(*layout, np.asarray(states), slope, alone)
     model = replace(_model(plan, structure, learned), trained=trained)
     reason = ALONE.get(learned.ending, "") if learned.bound is None or task.physics is None else ""
     if reason and not learned.ending.usable and (where := task.problem.without_value(np.any)):
@@ -135,7 +135,7 @@ def conclude_motion(task: MotionTask, structure: Structure, learned: Learned) ->
         problem=task.problem,
         criterion=task.criterion,
         split_by=MotionSplit.none("training", plan.dynamics, learned.coefficients),
-        course=plan,
+        segmented=plan,
         states=states,
         slope=slope,
         alone=alone,
@@ -145,7 +145,7 @@ def conclude_motion(task: MotionTask, structure: Structure, learned: Learned) ->
     return fit.split(structure.measure, getattr(structure, "shared", "auto")) if learned.ending.usable else fit
 
 
-def _learner_values(plan: MotionCourse, learned: Learned) -> Matrix | None:
+def _learner_values(plan: SegmentedMotion, learned: Learned) -> Matrix | None:
     """Return the values (N, nl) of a learner with few effective weights along the training runs; None of others."""
     bound = plan.bound
     if bound is None or learned.scores is None or not silenced(learned.effective, bound.ny):
@@ -158,7 +158,7 @@ def _learner_values(plan: MotionCourse, learned: Learned) -> Matrix | None:
     return values if np.isfinite(values).all() else None
 
 
-def _model(plan: MotionCourse, structure: Structure, learned: Learned) -> MotionModel:
+def _model(plan: SegmentedMotion, structure: Structure, learned: Learned) -> MotionModel:
     record = plan.record
     assert learned.coefficients is not None and learned.errors is not None
     noise = learned.errors.noise
@@ -179,7 +179,7 @@ def _model(plan: MotionCourse, structure: Structure, learned: Learned) -> Motion
         window=_WINDOWS[0] * (plan.dynamics.states + 1),
         time_column=record.time_column,
         prepared=record.prepared,
-        statistics=Statistics(learned.gram, middle, noise, learned.ridge, learned.errors.freedom, flown=True),
+        statistics=Statistics(learned.gram, middle, noise, learned.ridge, learned.errors.freedom, simulated=True),
     )
     if not learned.ending.usable:
         return model
@@ -246,12 +246,12 @@ def reopened(model: MotionModel, record: Record) -> MotionEstimate:
     problem = pose_motion(record, form.motion, [entry.text for entry in form.features] or None)
     problem = replace(problem, weight=replace(problem.weight, matrix=model.weight))
     criterion = Simulation(kept.segment, kept.washout)
-    course = MotionCourse.of(problem, form.bound, criterion).refined(form.substeps)
+    segmented = SegmentedMotion.of(problem, form.bound, criterion).refined(form.substeps)
     centre, half = (numbers.centre, numbers.halfwidth) if form.bound is not None else (np.zeros(0), np.ones(0))
-    course = replace(course, scaling=Scaling(np.asarray(centre), np.asarray(half)), unit=np.asarray(numbers.gain))
-    if course.segments.count != kept.rows or np.shape(course.segments.start) != np.shape(kept.states):
+    segmented = replace(segmented, scaling=Scaling(np.asarray(centre), np.asarray(half)), unit=np.asarray(numbers.gain))
+    if segmented.segments.count != kept.rows or np.shape(segmented.segments.start) != np.shape(kept.states):
         raise InputError(
-            f"the model was trained on other rows: on {kept.rows} where these have {course.segments.count}, or in "
+            f"the model was trained on other rows: on {kept.rows} where these have {segmented.segments.count}, or in "
             "other experiments. Give the files, and --rows, that it was trained on."
         )
     c = np.asarray(numbers.theta - numbers.theta_aux)
@@ -266,7 +266,7 @@ def reopened(model: MotionModel, record: Record) -> MotionEstimate:
         problem=problem,
         criterion=criterion,
         split_by=MotionSplit.none(model.measure, form, c),
-        course=course,
+        segmented=segmented,
         states=kept.states,
         slope=kept.slope,
         alone=np.asarray(kept.alone),

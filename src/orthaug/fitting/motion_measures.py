@@ -19,27 +19,27 @@ from orthaug.models.dynamics import Numbers
 from orthaug.models.moving import Moving
 
 if TYPE_CHECKING:
-    from orthaug.fitting.motion_course import MotionCourse
+    from orthaug.fitting.segmented_motion import SegmentedMotion
 
 
 def field_under(
-    measure: Measure, course: MotionCourse, numbers: Numbers, states: Any
+    measure: Measure, segmented: SegmentedMotion, numbers: Numbers, states: Any
 ) -> tuple[Field, float, tuple[Warning, ...]]:
     """Points of a measure with the sizes of the learned equations, its support by the data, and what to tell.
 
     Raises:
         InputError: a measure that does not fit the motion, or points at which the motion has no value.
     """
-    motion, form = course.problem.motion, course.dynamics
+    motion, form = segmented.problem.motion, segmented.dynamics
     c, w = np.asarray(numbers.theta - numbers.theta_aux), numbers.weights
-    x, u = course.trajectory(c, w, states)
+    x, u = segmented.trajectory(c, w, states)
     finite = np.isfinite(x).all(axis=1)
     x, u = x[finite], u[finite]
     nx = x.shape[1]
     support = Support.of_motion(motion, x, u)
     points = measure.points(support)
     at, beside = points.x[:, :nx], points.x[:, nx:]
-    size = sizes_learned(course, c, x, u)
+    size = sizes_learned(segmented, c, x, u)
     found = np.asarray(motion.rates(at.T, beside.T, motion.coordinates.physical(c), np), dtype=float)
     if not np.isfinite(found).any():
         raise InputError(f"the motion has no value on the {measure.name} measure; narrow it.")
@@ -56,15 +56,15 @@ def field_under(
     return Field(at[finite], beside[finite], weight[finite] / weight.sum(), size), share, told
 
 
-def sizes_learned(course: MotionCourse, c: Any, x: Any, u: Any) -> Any:
+def sizes_learned(segmented: SegmentedMotion, c: Any, x: Any, u: Any) -> Any:
     """The size (nl,) of each learned equation and output over the runs."""
-    motion = course.problem.motion
+    motion = segmented.problem.motion
     with np.errstate(all="ignore"):
         rates = np.asarray(motion.rates(x.T, u.T, motion.coordinates.physical(c), np), dtype=float)
     if motion.integrator == "discrete":
         rates = rates - x.T
     states, outputs = motion.learned
-    size = np.concatenate([np.nanstd(rates[list(states)], axis=1), course.deviation[list(outputs)]])
+    size = np.concatenate([np.nanstd(rates[list(states)], axis=1), segmented.deviation[list(outputs)]])
     return np.where(np.isfinite(size) & (size > 0), size, 1.0)
 
 

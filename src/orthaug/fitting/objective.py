@@ -20,7 +20,7 @@ RUNAWAY = 1e6  # mean square in deviations of the output: a free run beyond it h
 _LARGEST_ERROR = 1e120
 
 
-class Flown(NamedTuple):
+class TrialPoint(NamedTuple):
     """A trial at p: the unknown θ, c and w, the states that its segments started from, and the errors (k, T, ny, m).
 
     Where an engine keeps the segments, their `squares` Σ e eᵀ (ny, ny) are known instead of the errors.
@@ -80,14 +80,14 @@ class FreeRunObjective:
         """(unknown θ, c, w) of p."""
         return p[: self.physics], p[: self.physics], p[self.physics :]
 
-    def fly(self, p: Vector, start: Start) -> Flown:
+    def evaluate(self, p: Vector, start: Start) -> TrialPoint:
         """A trial at p. The states follow p to first order. Where that does not lower the misfit, they stay."""
         theta, c, w = self.place(p)
-        trials: list[Flown] = []
+        trials: list[TrialPoint] = []
         for follows in (True, False) if self.initial.free and start.follows else (False,):
             total, states, errors, squares = self._tried(c, w, start, follows)
             misfit = total if total < self._largest else np.inf
-            trials.append(Flown(p, theta, c, w, states, errors, misfit, misfit, squares))
+            trials.append(TrialPoint(p, theta, c, w, states, errors, misfit, misfit, squares))
             if total < start.misfit:
                 break
         best = min(trials, key=lambda trial: trial.misfit)
@@ -113,28 +113,28 @@ class FreeRunObjective:
             total += self.initial.loss(states, self.start_rows)
         return total, states, errors, None
 
-    def linearise(self, flown: Flown) -> LinearisedFreeRun:
+    def linearise(self, point: TrialPoint) -> LinearisedFreeRun:
         """Normal equations about a trial, with its states at their best."""
-        information, gradient, following = self.eliminated(flown, self.start_rows)
-        start = Start(flown.states, flown.misfit, np.concatenate([flown.c, flown.w]), **following)
+        information, gradient, following = self.eliminated(point, self.start_rows)
+        start = Start(point.states, point.misfit, np.concatenate([point.c, point.w]), **following)
         return LinearisedFreeRun(information, gradient, information, start)
 
-    def kept(self, flown: Flown) -> tuple[Any, ...]:
+    def kept(self, point: TrialPoint) -> tuple[Any, ...]:
         """What `again` makes the trial of, bit by bit."""
-        squares = np.zeros((0, 0)) if flown.squares is None else flown.squares
-        return flown.p, np.asarray(flown.states), flown.misfit, flown.loss, squares
+        squares = np.zeros((0, 0)) if point.squares is None else point.squares
+        return point.p, np.asarray(point.states), point.misfit, point.loss, squares
 
-    def again(self, kept: tuple[Any, ...]) -> Flown:
+    def again(self, kept: tuple[Any, ...]) -> TrialPoint:
         """The trial that was `kept`."""
         p, states, misfit, loss, squares = kept
         theta, c, w = self.place(p)
         known = self.sums is not None
         errors = None if known else self.errors(c, w, states, self.segments)
-        return Flown(p, theta, c, w, states, errors, float(misfit), float(loss), squares if known else None)
+        return TrialPoint(p, theta, c, w, states, errors, float(misfit), float(loss), squares if known else None)
 
-    def eliminated(self, flown: Flown, rows: Matrix) -> tuple[Matrix, Vector, dict[str, Any]]:
+    def eliminated(self, point: TrialPoint, rows: Matrix) -> tuple[Matrix, Vector, dict[str, Any]]:
         """Normal matrix and right-hand side of (c, w), L = `rows`, and how the states follow, as `Start` has it."""
-        numbers, states = self.numbers(flown.c, flown.w), flown.states
+        numbers, states = self.numbers(point.c, point.w), point.states
         if self.sums is not None:
             made = (self.dynamics, numbers, self.segments, self.initial, states, self.weight, rows)
             information, gradient, there = self.sums.linearised(*made)
@@ -155,12 +155,12 @@ class FreeRunObjective:
         """Errors of every segment from its state, in the outputs' units; 0 where they are not scored."""
         return errors_of(self.dynamics, self.numbers(c, w), states, segments)
 
-    def samples(self, flown: Flown) -> tuple[float, float]:
+    def samples(self, point: TrialPoint) -> tuple[float, float]:
         """Number of residuals less the physics' own parameters, and the share of them that is independent."""
-        ny, errors = len(self.weight), flown.errors
-        segments, states = self.segments, flown.states
+        ny, errors = len(self.weight), point.errors
+        segments, states = self.segments, point.states
         if self.colour is not None:
-            long = self._colour_errors(flown)
+            long = self._colour_errors(point)
             if long is None:
                 segments, states = self.colour, self.colour.start
             else:
@@ -169,31 +169,31 @@ class FreeRunObjective:
             moved = np.moveaxis(errors, 1, -1).swapaxes(1, 2)  # (k, m, ny, T)
             shares = [independent_share(moved[:, :, i].reshape(-1, moved.shape[-1])) for i in range(ny)]
         else:
-            shares = self._shares(flown, segments, states)
+            shares = self._shares(point, segments, states)
         return self.segments.count * ny - self.physics, float(np.mean(shares))
 
-    def _colour_errors(self, flown: Flown) -> Any:
+    def _colour_errors(self, point: TrialPoint) -> Any:
         """Errors of the longer segments; None where they are not in memory, or the run is lost there."""
         if not isinstance(self.colour, Segments):
             return None
-        return self.errors(flown.c, flown.w, self.colour.start, self.colour)
+        return self.errors(point.c, point.w, self.colour.start, self.colour)
 
-    def _shares(self, flown: Flown, segments: Any, states: Any) -> list[float]:
+    def _shares(self, point: TrialPoint, segments: Any, states: Any) -> list[float]:
         """Independent shares of each output's errors, from sums; of the own segments where a longer run is lost."""
         assert self.sums is not None
-        numbers = self.numbers(flown.c, flown.w)
-        for one, start in ((segments, states), (self.segments, flown.states)):
+        numbers = self.numbers(point.c, point.w)
+        for one, start in ((segments, states), (self.segments, point.states)):
             found = self.sums.spectra(self.dynamics, numbers, one, start, spectrum_size(one.steps))
             if np.all(found[0] < _LARGEST_ERROR**2):
                 return [share_of(spectrum, one.steps, n) for spectrum, n in zip(*found, strict=True)]
         return [1.0] * len(self.weight)
 
-    def squares(self, flown: Flown) -> Matrix | None:
+    def squares(self, point: TrialPoint) -> Matrix | None:
         """Σ e eᵀ (ny, ny) of a trial's errors, in the outputs' units; None where they are too large to square."""
-        if flown.errors is None:
-            found = flown.squares
+        if point.errors is None:
+            found = point.squares
             return found if found is not None and np.abs(found).max(initial=0.0) < _LARGEST_ERROR**2 else None
-        errors = np.moveaxis(flown.errors, 2, -1).reshape(-1, len(self.weight))
+        errors = np.moveaxis(point.errors, 2, -1).reshape(-1, len(self.weight))
         return errors.T @ errors if np.abs(errors).max(initial=0.0) < _LARGEST_ERROR else None
 
     @property

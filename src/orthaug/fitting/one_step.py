@@ -18,7 +18,6 @@ from orthaug.data.sources import RecordSource, witness
 from orthaug.fitting.checkpoints import Checkpoints
 from orthaug.fitting.criteria import Criterion, Prediction
 from orthaug.fitting.elimination import Elimination, Fixed, eliminate, split_theta
-from orthaug.fitting.laid_rows import LaidRows
 from orthaug.fitting.learned import Learned
 from orthaug.fitting.normal_equations import Hold, OneStep, Summed, linearise
 from orthaug.fitting.paper_criterion import JointOneStep, PaperCriterion, Physics
@@ -27,6 +26,7 @@ from orthaug.fitting.solvers import compiled
 from orthaug.fitting.solvers.adam_lbfgs import GradientRun
 from orthaug.fitting.solvers.limit import noticeable_in
 from orthaug.fitting.structures import Additive, Orthogonal, Structure
+from orthaug.fitting.training_rows import TrainingRows
 from orthaug.fitting.unfinished import noticeable_fall
 from orthaug.models.learners import Bound, Learner, Scaling
 from orthaug.models.rows import Engine, InMemory, Overlap
@@ -41,7 +41,7 @@ OUTPUT_UNIT = 10.0
 
 
 @dataclass(frozen=True, eq=False)
-class OneStepTask(LaidRows):
+class OneStepTask(TrainingRows):
     """Training on rows that are laid out: what physics alone does on them, and where states of runs are kept."""
 
     criterion: Criterion = Prediction()  # noqa: RUF009  (frozen)
@@ -71,10 +71,10 @@ class OneStepTask(LaidRows):
         unit = np.asarray(OUTPUT_UNIT * spread if unit is None else unit) * (bound is not None)
         gain = problem.weight.matrix * unit / rms
         if isinstance(problem, StreamedProblem):
-            laying = problem.laying(scaling.centre, scaling.halfwidth, rms, gain)
-            return cls(problem, bound, scaling, unit, rms, engine, engine.draw(problem.source, laying))
+            row_builder = problem.row_builder(scaling.centre, scaling.halfwidth, rms, gain)
+            return cls(problem, bound, scaling, unit, rms, engine, engine.draw(problem.source, row_builder))
         e = problem.unexplained / rms
-        rows = engine.lay(scaling(z), problem.projection.q, e, np.broadcast_to(gain, (*e.shape, e.shape[1])))
+        rows = engine.build_rows(scaling(z), problem.projection.q, e, np.broadcast_to(gain, (*e.shape, e.shape[1])))
         return cls(problem, bound, scaling, unit, rms, engine, rows)
 
     @property

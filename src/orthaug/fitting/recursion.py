@@ -2,7 +2,7 @@
 
 With weights `w_i = λ^(k−i)` and `e₀ = y − φθ₀` the factor has `[R z]ᵀ[R z] = Σ w [φ e₀]ᵀ[φ e₀]`, so `θ = θ₀ + R⁻¹z`:
 `ΦᵀΦ` is never formed, and rounding adds up against the change of θ only. The covariance needs the squared weights too:
-`Cov θ = s² I⁻¹ M I⁻¹`, `I = RᵀR`, `M = Σ w² φᵀφ`. `Course` keeps what it is made of, row by row, within bounds.
+`Cov θ = s² I⁻¹ M I⁻¹`, `I = RᵀR`, `M = Σ w² φᵀφ`. `EstimateHistory` keeps what it is made of, row by row, within bounds.
 """
 
 from __future__ import annotations
@@ -196,7 +196,7 @@ def squares(phi: Float[np.ndarray, "N ny nt"], shape: Matrix) -> Matrix:
 
 
 @dataclass(eq=False)
-class Course:
+class EstimateHistory:
     """A row of numbers for each row of data that was used.
 
     Columns: the row's number, the level of the alarm (above 1 it stands), s², degrees of freedom, whether θ is told,

@@ -22,7 +22,7 @@ from orthaug._base.lines import percent
 from orthaug.data.record import Record
 from orthaug.fitting import recursive_storage
 from orthaug.fitting.estimates import Estimate, order_of, parameter_frame, parameter_lines
-from orthaug.fitting.recursion import Course, covariances
+from orthaug.fitting.recursion import EstimateHistory, covariances
 from orthaug.fitting.recursive_rows import Lagging, Whitened, begin, joined_rows, trained, whitened_rows
 from orthaug.fitting.residual_band import Watch
 from orthaug.inference.covariance import interval
@@ -102,7 +102,7 @@ class Recursive:
         self._numbers = jax.device_put(model.numbers)
         self._lagging = Lagging(model)
         self._tail = self._lagging.nothing
-        self._course = Course(len(model.outputs), len(model.theta))
+        self._rows_kept = EstimateHistory(len(model.outputs), len(model.theta))
         self.rows = self.outside = 0
         self.alarms: tuple[Alarm, ...] = ()
 
@@ -119,7 +119,7 @@ class Recursive:
         kept = recursive_storage.load(folder, baseline, learner)
         one = cls.__new__(cls)
         one._set(kept.model, kept.recursion, kept.watch, kept.inflation, kept.used)
-        one._tail, one._course, one.rows = kept.tail, kept.course, kept.rows
+        one._tail, one._rows_kept, one.rows = kept.tail, kept.kept_rows, kept.rows
         one.outside = kept.outside
         one.alarms = tuple(Alarm(int(row), row * kept.model.sampling_time) for row in kept.alarms)
         return one
@@ -138,7 +138,7 @@ class Recursive:
 
     def _kept(self) -> recursive_storage.Kept:
         alarms = np.array([alarm.row for alarm in self.alarms], dtype=float)
-        state = (self._fitted, self._recursion, self._watch, self._inflation, self._used, self._tail, self._course)
+        state = (self._fitted, self._recursion, self._watch, self._inflation, self._used, self._tail, self._rows_kept)
         return recursive_storage.Kept(*state, self.rows, self.outside, alarms)
 
     def update(
@@ -195,7 +195,7 @@ class Recursive:
         return used, whitened_rows(self._fitted, x[used], y, self._numbers), len(rows)
 
     def _follow(self, used: Any, whitened: Whitened | None) -> list[Alarm]:
-        recursion, watch, course = self._recursion, self._watch, self._course
+        recursion, watch, kept_rows = self._recursion, self._watch, self._rows_kept
         told: list[Alarm] = []
         if whitened is None:
             return told
@@ -209,8 +209,8 @@ class Recursive:
                 self.outside += 1
             elif watch.step(error, spread):
                 told.append(Alarm(row, row * self._fitted.sampling_time))
-            if row % course.stride == 0:
-                course.add(course.line(row, watch.level, self._freedom, error, recursion))
+            if row % kept_rows.stride == 0:
+                kept_rows.add(kept_rows.line(row, watch.level, self._freedom, error, recursion))
         return told
 
     @property
@@ -291,15 +291,15 @@ class Recursive:
         """
         import pandas as pd
 
-        course, model = self._course, self._fitted
-        rows = course.rows
-        residual = course.residual @ np.linalg.inv(model.weight).T
-        ci = course.intervals(self._inflation)
+        kept_rows, model = self._rows_kept, self._fitted
+        rows = kept_rows.rows
+        residual = kept_rows.residual @ np.linalg.inv(model.weight).T
+        ci = kept_rows.intervals(self._inflation)
         columns: dict[str, Any] = {"time": rows[:, 0] * model.sampling_time}
         columns |= {f"residual_{c.name}": residual[:, i] for i, c in enumerate(model.outputs)}
         for i, name in enumerate(model.form.baseline.names):
-            columns |= {name: course.theta[:, i], f"{name}_low": ci[:, i, 0], f"{name}_high": ci[:, i, 1]}
-        columns["alarm"] = course.alarm
+            columns |= {name: kept_rows.theta[:, i], f"{name}_low": ci[:, i, 0], f"{name}_high": ci[:, i, 1]}
+        columns["alarm"] = kept_rows.alarm
         return pd.DataFrame(columns, index=pd.Index(rows[:, 0].astype(int), name="row"))
 
     def physical(self, physics: PhysicsMap) -> PhysicalEstimate:
@@ -317,8 +317,8 @@ class Recursive:
         """
         import pandas as pd
 
-        order, course = self._in_order_of(physics), self._course
-        rows, theta, spread = course.rows, course.theta, course.covariances(self._inflation)
+        order, kept_rows = self._in_order_of(physics), self._rows_kept
+        rows, theta, spread = kept_rows.rows, kept_rows.theta, kept_rows.covariances(self._inflation)
         places = np.linspace(len(rows) - 1, 0, check_count(points, "points")) if len(rows) else np.zeros(0)
         chosen = np.unique(places.round().astype(int))
         lines = []

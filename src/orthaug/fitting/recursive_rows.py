@@ -187,7 +187,7 @@ def trained(fit: Any, training: Record | None) -> Trained:
         raise InputError(MOTION)
     covariance = None
     if isinstance(fit, Estimate):
-        if fit.criterion.flown is not None:
+        if fit.criterion.free_run is not None:
             raise InputError(
                 "the fit is one of the free run, and recursive least squares looks one step ahead: its θ would leave "
                 "this one. Fit with criterion = Prediction()."

@@ -11,7 +11,7 @@ import numpy as np
 from orthaug._base.checks import Matrix, Vector, check_type
 from orthaug._base.errors import InputError
 from orthaug._base.folders import whole_folder
-from orthaug.fitting.recursion import Course, Recursion
+from orthaug.fitting.recursion import EstimateHistory, Recursion
 from orthaug.fitting.residual_band import Reference, Watch
 from orthaug.models import storage
 from orthaug.models.learners import Learner
@@ -34,7 +34,7 @@ class Kept(NamedTuple):
     inflation: Matrix | None
     used: float
     tail: Matrix
-    course: Course
+    kept_rows: EstimateHistory
     rows: int
     outside: int
     alarms: Vector
@@ -56,7 +56,7 @@ def write(kept: Kept, folder: Path) -> None:
 
 
 def _arrays(kept: Kept) -> dict[str, Any]:
-    recursion, watch, course = kept.recursion, kept.watch, kept.course
+    recursion, watch, kept_rows = kept.recursion, kept.watch, kept.kept_rows
     optional = {"inflation": kept.inflation, "floor": recursion.floor}
     return {
         "sums": np.array([float(getattr(recursion, name)) for name in _SUMS]),
@@ -68,8 +68,8 @@ def _arrays(kept: Kept) -> dict[str, Any]:
         "counts": np.array(watch.counts),
         "totals": np.array(watch.totals),
         "tail": kept.tail,
-        "course": course.rows,
-        "counted": np.array([kept.used, kept.rows, kept.outside, course.stride, watch.level, watch.armed]),
+        "course": kept_rows.rows,
+        "counted": np.array([kept.used, kept.rows, kept.outside, kept_rows.stride, watch.level, watch.armed]),
         "alarms": kept.alarms,
         **{name: value for name, value in optional.items() if value is not None},
     }
@@ -113,6 +113,8 @@ def _rebuilt(model: Model, arrays: dict[str, np.ndarray]) -> Kept:
     watch.counts, watch.totals = [int(n) for n in arrays["counts"]], arrays["totals"].tolist()
     used, rows, outside, stride, watch.level, armed = arrays["counted"].tolist()
     watch.armed = bool(armed)
-    course = Course(len(model.outputs), len(model.theta), int(stride), list(arrays["course"]))
+    kept_rows = EstimateHistory(len(model.outputs), len(model.theta), int(stride), list(arrays["course"]))
     tail, alarms = arrays["tail"].copy(), arrays["alarms"]
-    return Kept(model, recursion, watch, arrays.get("inflation"), used, tail, course, int(rows), int(outside), alarms)
+    return Kept(
+        model, recursion, watch, arrays.get("inflation"), used, tail, kept_rows, int(rows), int(outside), alarms
+    )

@@ -47,18 +47,18 @@ def check_scored(criterion: Criterion, longest: int) -> None:
     Args:
         longest: usable rows of the longest experiment.
     """
-    flown = criterion.flown
-    if flown is None or flown.washout < longest:
+    free_run = criterion.free_run
+    if free_run is None or free_run.washout < longest:
         return
     text = (
         f"nothing is scored: the longest experiment has {longest} usable rows, and the first "
-        f"{flown.washout} of a segment are washout; shorten it, or the horizon."
+        f"{free_run.washout} of a segment are washout; shorten it, or the horizon."
     )
     if criterion.simulates:
         rows = f"the {longest} usable rows of the longest experiment, or nothing is scored"
-        raise KeyedError(text, "washout", f": found {flown.washout}; expected less than {rows}")
+        raise KeyedError(text, "washout", f": found {free_run.washout}; expected less than {rows}")
     rows = f"the longest experiment has {longest} usable rows"
-    raise KeyedError(text, "horizon", f": found {flown.steps}; {rows}")
+    raise KeyedError(text, "horizon", f": found {free_run.steps}; {rows}")
 
 
 def check_solver(solver: Solver, criterion: Criterion, regularizations: Sequence[object]) -> None:
@@ -137,7 +137,7 @@ def check_motion_choices(
             "learner",
             ": no state and no output has `learned = true`; expected one, or kind none",
         )
-    if criterion.flown is None or not criterion.simulates:
+    if criterion.free_run is None or not criterion.simulates:
         raise KeyedError(
             "a motion is trained on its free run; take `Simulation(…)`: its states are not measured, so there is no "
             "error one step ahead.",

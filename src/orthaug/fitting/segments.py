@@ -42,7 +42,7 @@ class Segments(NamedTuple):
         return self.scored.shape[1]
 
 
-def lay_segments(
+def build_segments(
     record: Record, dynamics: Dynamics, segment: int, washout: int, like: Segments | None = None, shares: int = 1
 ) -> Segments:
     """Segments of `segment` steps; 0 for whole experiments. The number of chunks is a multiple of `shares`.

@@ -51,8 +51,8 @@ def add_retries(
     usable = [end for end in ends if end.ending.usable]
     if not usable:
         return starts, runs
-    lowest = min(usable, key=lambda end: end.end.flown.loss)
-    ridge = float(f"{evidence_ridge(lowest.objective, lowest.end.flown, lowest.effective):.3g}")
+    lowest = min(usable, key=lambda end: end.end.point.loss)
+    ridge = float(f"{evidence_ridge(lowest.objective, lowest.end.point, lowest.effective):.3g}")
     more, others = make([start._replace(regularization=ridge) for start in starts])
     return starts + free + more, runs + ends + others
 

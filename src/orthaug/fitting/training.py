@@ -72,7 +72,7 @@ class Choice:
     def compares(self, task: Task, starts: Sequence[PlannedRun]) -> bool:
         """Whether there is something to choose by held-out errors: runs that fly, or several regularizations."""
         several = len({start.regularization for start in starts}) > 1
-        return task.bound is not None and (task.criterion.flown is not None or (several and not self.scored))
+        return task.bound is not None and (task.criterion.free_run is not None or (several and not self.scored))
 
     def ranking(self, task: Task, runs: Sequence[Any], errors: Sequence[float]) -> np.ndarray:
         """What is lowest for the best run: its held-out error, its score, or its loss.
@@ -121,7 +121,7 @@ def train(
     told = []
     if held_out is not None:
         held_out = replace(held_out, chosen=best)
-        runs_freely = task.criterion.flown is not None and task.start_loss is not None
+        runs_freely = task.criterion.free_run is not None and task.start_loss is not None
         if choice.fallback and runs_freely and not held_out.ratio.value < 1:
             told, best = [_fell_back(held_out)], -1
             LOG.info("no free run is better than physics alone where it was not fitted: physics alone is handed over")

@@ -22,7 +22,7 @@ from orthaug.models.streaming import chunks_of, summed
 from orthaug.physics.excitation import require_rank
 from orthaug.physics.output_weights import times
 from orthaug.physics.projection import Projection
-from orthaug.physics.streamed import Laying, StreamedProblem
+from orthaug.physics.streamed import RowBuilder, StreamedProblem
 
 SUPPORTED = 0.9  # share of a measure within reach of the data, below which it is warned of
 
@@ -100,12 +100,12 @@ def split_under(measure: Measure, model: Model, support: Support, joint: JointCo
 class _Overlapping:
     """QᵀJ over the rows of a partition; picklable if the learner is."""
 
-    laying: Laying
+    row_builder: RowBuilder
     bound: Bound
     weights: Vector
 
     def __call__(self, partition: Partition) -> Matrix | None:
-        chunks = chunks_of(self.laying(partition), chunk_shape(partition.rows)[1])
+        chunks = chunks_of(self.row_builder(partition), chunk_shape(partition.rows)[1])
         found = summed(Overlaps(self.bound), chunks, (self.weights,))
         return None if found is None else np.asarray(found.jacobian)
 
@@ -117,8 +117,8 @@ def streamed_slope(model: Model, problem: StreamedProblem) -> Matrix:
     if bound is None or not bound.size:
         return np.zeros((nt, 0))
     gain = problem.weight.matrix * np.asarray(numbers.gain)
-    laying = problem.laying(np.asarray(numbers.centre), np.asarray(numbers.halfwidth), 1.0, gain)
-    parts = problem.passes(_Overlapping(laying, bound, np.asarray(numbers.weights)), problem.source.partitions)
+    row_builder = problem.row_builder(np.asarray(numbers.centre), np.asarray(numbers.halfwidth), 1.0, gain)
+    parts = problem.passes(_Overlapping(row_builder, bound, np.asarray(numbers.weights)), problem.source.partitions)
     overlap = sum(part for part in parts if part is not None)
     return problem.projection.from_coordinates(problem.projection.along(model.shared) @ overlap)
 

@@ -25,8 +25,8 @@ from orthaug._base.errors import InputError
 from orthaug._base.jax import jax
 from orthaug._base.parallel import Threads
 from orthaug.data.sources import Source
-from orthaug.models.rows import CHUNK_ROWS, Chunk, Room, chunk_shape, laid_out, together
-from orthaug.models.streaming import Laid, apart, chunks_of, folded, summed
+from orthaug.models.rows import CHUNK_ROWS, Chunk, Room, build_chunk, chunk_shape, together
+from orthaug.models.streaming import RowArrays, apart, chunks_of, folded, summed
 
 _SINGLE_THREADED = {
     "OMP_NUM_THREADS": "1",
@@ -60,20 +60,22 @@ class Dask(Threads):
     limit: int = CHUNK_ROWS
     resident: bool = False
 
-    def lay(self, z: Matrix, q: Any, e: Matrix, gain: Float[np.ndarray, "N ny ny"]) -> list[Any]:
+    def build_rows(self, z: Matrix, q: Any, e: Matrix, gain: Float[np.ndarray, "N ny ny"]) -> list[Any]:
         """Rows that are in memory here, sent to the workers."""
         workers = self.shares
         shape = chunk_shape(len(z), min(self.limit, -(-len(z) // workers)))
-        chunks = apart(laid_out(z, q, e, gain, shape))
+        chunks = apart(build_chunk(z, q, e, gain, shape))
         each = -(-len(chunks) // workers)
         with told():
             groups = [chunks[i : i + each] for i in range(0, len(chunks), each)]
             return [self.client.submit(kept, group, pure=False) for group in groups]
 
-    def draw(self, source: Source, laying: Callable[[Any], Iterator[Laid]]) -> list[Any]:
+    def draw(self, source: Source, row_builder: Callable[[Any], Iterator[RowArrays]]) -> list[Any]:
         """The partitions of a source, laid out where they will be summed."""
         with told():
-            task = partial(_laid, laying=laying, size=self.limit)  # not scattered: what is lost can be made again
+            task = partial(
+                _build_chunks, row_builder=row_builder, size=self.limit
+            )  # not scattered: what is lost can be made again
             return [self._on(task, partition) for partition in source.partitions]
 
     def sum(self, function: Callable[..., Any], rows: Sequence[Any], *arguments: Any) -> Any:
@@ -145,9 +147,9 @@ class Dask(Threads):
         return self.client.submit(_where_held, function, replace(partition, held=()), *held, pure=False)
 
 
-def _laid(partition: Any, laying: Callable[[Any], Iterator[Laid]], size: int) -> list[Chunk]:
+def _build_chunks(partition: Any, row_builder: Callable[[Any], Iterator[RowArrays]], size: int) -> list[Chunk]:
     """The chunks of a partition."""
-    return list(chunks_of(laying(partition), chunk_shape(partition.rows, size)[1]))
+    return list(chunks_of(row_builder(partition), chunk_shape(partition.rows, size)[1]))
 
 
 def _where_held(function: Callable[[Any], Any], partition: Any, *held: Any) -> Any:

@@ -19,7 +19,7 @@ from orthaug._base.checks import Matrix
 from orthaug._base.jax import jax
 from orthaug._base.memory import available
 from orthaug._base.parallel import Heard, nobody
-from orthaug.models.rows import CHUNK_ROWS, Chunk, Here, Room, all_chunks, brought, chunk_shape, laid_out, row_fold
+from orthaug.models.rows import CHUNK_ROWS, Chunk, Here, Room, all_chunks, brought, build_chunk, chunk_shape, row_fold
 
 _ROWS = "rows"
 _ONE_AT_A_TIME = threading.Lock()  # devices that wait for each other in two programs would wait for ever
@@ -39,12 +39,12 @@ class Devices(Here):
     limit: int = CHUNK_ROWS
     resident: bool = False
 
-    def lay(self, z: Matrix, q: Any, e: Matrix, gain: Float[np.ndarray, "N ny ny"]) -> Chunk:
+    def build_rows(self, z: Matrix, q: Any, e: Matrix, gain: Float[np.ndarray, "N ny ny"]) -> Chunk:
         count, size = chunk_shape(-(-len(z) // self.shares), self.limit)  # of the chunks of one share
-        return self.place(laid_out(z, q, e, gain, (count * self.shares, size)))
+        return self.place(build_chunk(z, q, e, gain, (count * self.shares, size)))
 
-    def draw(self, source: Any, laying: Callable[[Any], Any]) -> Chunk:
-        return self.lay(*brought(source, laying))
+    def draw(self, source: Any, row_builder: Callable[[Any], Any]) -> Chunk:
+        return self.build_rows(*brought(source, row_builder))
 
     def sum(self, function: Callable[..., Any], rows: Chunk, *arguments: Any) -> Any:
         return self._run(function, rows, arguments, keeps=False)[1]

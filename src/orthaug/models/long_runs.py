@@ -18,7 +18,7 @@ from orthaug.models.response import Response, Scores, scores_of
 from orthaug.physics.problem import Moments
 
 
-class Flight(NamedTuple):
+class RunPiece(NamedTuple):
     """A piece, the free run over its rows behind the history (m, ny) in parts, and the state it began in."""
 
     piece: Experiment
@@ -32,7 +32,7 @@ def pieces_of(model: Model, source: Source) -> Iterator[Experiment]:
     return (piece for partition in source.partitions for piece in partition.pieces(first) if len(piece) > first)
 
 
-def flights(model: Model, source: Source) -> Iterator[Flight]:
+def run_pieces(model: Model, source: Source) -> Iterator[RunPiece]:
     """The free run along every experiment of a source, from the measured outputs of each."""
     record, first = as_record(source, (_nothing(source),)), model.form.first_row
     state: Any = None
@@ -40,8 +40,8 @@ def flights(model: Model, source: Source) -> Iterator[Flight]:
     for piece in pieces_of(model, source):
         if ended != (piece.source, piece.offset + first):
             state = model.form.start(piece.outputs[:first], [first])[0]
-        run = model.fly(state, model.form.inputs(piece, record))
-        yield Flight(piece, state, run)
+        run = model.run_parts(state, model.form.inputs(piece, record))
+        yield RunPiece(piece, state, run)
         state = _after(model, state, np.asarray(run.total))
         ended = piece.source, piece.offset + len(piece)
 
@@ -54,8 +54,8 @@ def responses(model: Model, source: Source, *, free: bool) -> Iterator[tuple[Exp
             yield piece, model.predict(replace(record, experiments=(piece,)))
         return
     lost: tuple[str, int] | None = None
-    for piece, state, run in flights(model, source):
-        told = model.flown(state, run, piece, record)
+    for piece, state, run in run_pieces(model, source):
+        told = model.as_trajectory(state, run, piece, record)
         before = lost == (piece.source, piece.offset + model.form.first_row)
         if before:
             told = replace(told, baseline=told.baseline * np.nan, learner=told.learner * np.nan, diverged=None)
@@ -114,7 +114,7 @@ def scores_along(model: Model, source: Source, skip: int = 0, watch: Watch | Non
     """Scores of the one-step prediction and the free run, without the first `skip` rows of each recording."""
     record, first = as_record(source, (_nothing(source),)), model.form.first_row
     one_step, free, diverged = RunningScores(), RunningScores(), None
-    for piece, _, parts in flights(model, source):
+    for piece, _, parts in run_pieces(model, source):
         kept = slice(max(skip - piece.offset - first, 0), None)
         measured, run = piece.outputs[first:], np.asarray(parts.total)
         ahead = np.asarray(model.parts_at(model.form.regressors(piece, record)).total)

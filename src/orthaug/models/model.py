@@ -171,11 +171,11 @@ class Model(OnRecords, Shown):
             self.check_rows(experiment, self.form.first_row)
             measured = experiment.outputs if record.outputs else None
             start = self._start(initial, measured)
-            parts = self.fly(start, self.form.inputs(experiment, record))
-            trajectories.append(self.flown(start, parts, experiment, record))
+            parts = self.run_parts(start, self.form.inputs(experiment, record))
+            trajectories.append(self.as_trajectory(start, parts, experiment, record))
         return Response(tuple(trajectories), None, self.outputs, record.sampling_time)
 
-    def flown(self, start: Vector, parts: Parts, experiment: Experiment, record: Record) -> Trajectory:
+    def as_trajectory(self, start: Vector, parts: Parts, experiment: Experiment, record: Record) -> Trajectory:
         """A free run from a state, cut where it left all bounds."""
         outside = self._outside(start, parts, experiment, record)
         return replace(self.bounded(parts, experiment, experiment.outputs if record.outputs else None), outside=outside)
@@ -235,7 +235,7 @@ class Model(OnRecords, Shown):
             )
         return rows
 
-    def fly(self, state: Vector, inputs: Matrix) -> Parts:
+    def run_parts(self, state: Vector, inputs: Matrix) -> Parts:
         """The free run from a state along lagged inputs (T, nu), in parts."""
         if not self.form.states:
             return self.parts_at(inputs)

@@ -26,7 +26,9 @@ def said_of(model: Any) -> dict[str, Any]:
     """What a file says of every model, whatever its physics."""
     channels = {kind: [asdict(channel) for channel in getattr(model, kind)] for kind in ("outputs", "inputs")}
     kept = model.statistics
-    said = {name: getattr(model, name) for name in _SAID} | channels | {"flown": kept.flown, "verdict": kept.verdict}
+    said = (
+        {name: getattr(model, name) for name in _SAID} | channels | {"flown": kept.simulated, "verdict": kept.verdict}
+    )
     return said | ({"prepared": [asdict(step) for step in model.prepared]} if model.prepared else {})
 
 
@@ -71,7 +73,7 @@ def statistics_from(arrays: dict[str, np.ndarray], declared: dict[str, Any]) -> 
         noise=arrays.get("noise"),
         ridge=arrays["ridge"] if "ridge" in arrays else float(arrays["scalars"][0]),
         freedom=float(arrays["scalars"][1]),
-        flown=bool(declared.get("flown", declared.get("kind") == "motion")),
+        simulated=bool(declared.get("flown", declared.get("kind") == "motion")),
         verdict=str(declared.get("verdict", "")),
         disturbance=arrays.get("disturbance"),
         sensor=arrays.get("sensor"),

@@ -19,7 +19,7 @@ from orthaug.physics.motion import Motion, Output, State
 from orthaug.physics.parameters import PhysicalParameter
 
 _LIMITS = {"min": -math.inf, "max": math.inf}
-_LAID = ("segment", "washout", "rows")  # of `Trained`
+_SEGMENTATION = ("segment", "washout", "rows")  # of `Trained`
 
 
 def declare(model: MotionModel) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -33,7 +33,7 @@ def declare(model: MotionModel) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         "learner": declaration_of(form.bound),
         "substeps": form.substeps,
         "window": model.window,
-        "trained": None if trained is None else {key: getattr(trained, key) for key in _LAID},
+        "trained": None if trained is None else {key: getattr(trained, key) for key in _SEGMENTATION},
     }
     arrays = arrays_of(model) | {"loose": np.asarray(model.loose)}
     arrays |= {} if model.seen is None else {"seen": np.asarray(model.seen)}
@@ -62,9 +62,9 @@ def rebuild(
     kept = declared["trained"]
     trained = None
     if kept is not None:
-        laid = {key: int(kept[key]) for key in _LAID}
+        layout = {key: int(kept[key]) for key in _SEGMENTATION}
         own = {key: arrays.get(f"trained.{key}") for key in ("states", "slope", "alone")}
-        trained = Trained(**laid, **own)  # type: ignore[arg-type]
+        trained = Trained(**layout, **own)  # type: ignore[arg-type]
     return MotionModel(
         form=form,
         **fields_from(declared, arrays),

@@ -68,11 +68,11 @@ class Engine(Protocol):
         """Whether all rows are one `Chunk` on the device, so that a whole training run may be compiled around a sum."""
         ...
 
-    def lay(self, z: Matrix, q: Any, e: Matrix, gain: Float[np.ndarray, "N ny ny"]) -> Any:
+    def build_rows(self, z: Matrix, q: Any, e: Matrix, gain: Float[np.ndarray, "N ny ny"]) -> Any:
         """Rows (N, …) as this engine keeps them."""
         ...
 
-    def draw(self, source: Any, laying: Callable[[Any], Any]) -> Any:
+    def draw(self, source: Any, row_builder: Callable[[Any], Any]) -> Any:
         """Rows of a source (`data.sources.Source`), laid out by `laying` of each of its partitions."""
         ...
 
@@ -145,11 +145,11 @@ class InMemory(Here):
     limit: int = CHUNK_ROWS
     resident: bool = True
 
-    def lay(self, z: Matrix, q: Any, e: Matrix, gain: Float[np.ndarray, "N ny ny"]) -> Chunk:
-        return self.place(laid_out(z, q, e, gain, chunk_shape(len(z), self.limit)))
+    def build_rows(self, z: Matrix, q: Any, e: Matrix, gain: Float[np.ndarray, "N ny ny"]) -> Chunk:
+        return self.place(build_chunk(z, q, e, gain, chunk_shape(len(z), self.limit)))
 
-    def draw(self, source: Any, laying: Callable[[Any], Any]) -> Chunk:
-        return self.lay(*brought(source, laying))
+    def draw(self, source: Any, row_builder: Callable[[Any], Any]) -> Chunk:
+        return self.build_rows(*brought(source, row_builder))
 
     def sum(self, function: Callable[..., Any], rows: Chunk, *arguments: Any) -> Any:
         return _compiled_sum(function, rows, arguments)
@@ -191,9 +191,9 @@ def together(chunks: Sequence[Any]) -> Any:
     return jax.tree.map(lambda *parts: np.stack(parts), *chunks)
 
 
-def brought(source: Any, laying: Callable[[Any], Any]) -> tuple[np.ndarray, ...]:
+def brought(source: Any, row_builder: Callable[[Any], Any]) -> tuple[np.ndarray, ...]:
     """All rows of a source laid out: features, Q, P⊥Y and gain, (N, …) each."""
-    pieces = [laid for partition in source.partitions for laid in laying(partition)]
+    pieces = [arrays for partition in source.partitions for arrays in row_builder(partition)]
     return tuple(np.concatenate(parts) for parts in zip(*pieces, strict=True))
 
 
@@ -238,7 +238,7 @@ def in_chunks(
     return padded
 
 
-def laid_out(z: Matrix, q: Any, e: Matrix, gain: Any, shape: tuple[int, int]) -> Chunk:
+def build_chunk(z: Matrix, q: Any, e: Matrix, gain: Any, shape: tuple[int, int]) -> Chunk:
     """Rows (N, …) as a chunk (k, …, m) of NumPy arrays."""
     padded = in_chunks(z, shape, repeat=True)  # zeros may be where the learner has no value
     pieces: Any = (padded, *(in_chunks(piece, shape) for piece in (q, e, gain)))
@@ -261,7 +261,7 @@ def learner_rows(engine: Engine, form: Lagged, numbers: Numbers, x: Matrix, q: A
     z = np.asarray(form.features.evaluate(x, form.layout, np))
     scaled = (z - np.asarray(numbers.centre)) / np.asarray(numbers.halfwidth) if form.bound else np.zeros((len(x), 0))
     gain = np.broadcast_to(weight * np.asarray(numbers.gain), (len(x), *2 * (len(form.outputs),)))
-    return engine.lay(scaled, q, np.zeros(gain.shape[:2]), gain)
+    return engine.build_rows(scaled, q, np.zeros(gain.shape[:2]), gain)
 
 
 @dataclass(frozen=True)

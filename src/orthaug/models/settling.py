@@ -66,9 +66,9 @@ def settle(
     begun = np.pad(np.asarray(states, dtype=float), ((0, 0), (0, -count % _LANES)), mode="edge")
     with np.errstate(over="ignore"):  # a start beyond all others has no prior
         prior = 1 / np.asarray(loose, dtype=float) ** 2
-    laid = windows.padded()  # once for all iterations
+    layout = windows.padded()  # once for all iterations
     best, damping = begun, np.full(begun.shape[1], _FIRST_DAMPING)
-    matrix, right, misfit = _linearised(form, numbers, begun, laid, weight, begun, prior)
+    matrix, right, misfit = _linearised(form, numbers, begun, layout, weight, begun, prior)
     for _ in range(iterations):
         step = _steps(matrix, right, damping)
         with np.errstate(all="ignore"):
@@ -76,7 +76,7 @@ def settle(
         if ended.all():
             break
         trial = np.where(ended, best, best + step)
-        there = _linearised(form, numbers, trial, laid, weight, begun, prior)
+        there = _linearised(form, numbers, trial, layout, weight, begun, prior)
         lower = there[2] < misfit
         best = np.where(lower, trial, best)
         matrix = np.where(lower[:, None, None], there[0], matrix)
@@ -100,10 +100,10 @@ def _steps(
 
 
 def _linearised(
-    form: Dynamics, numbers: Numbers, states: Matrix, laid: Any, weight: Matrix, begun: Matrix, prior: Vector
+    form: Dynamics, numbers: Numbers, states: Matrix, layout: Any, weight: Matrix, begun: Matrix, prior: Vector
 ) -> tuple[Any, Any, Any]:
     """Normal matrix (m, n0, n0), right-hand side (m, n0) and misfit (m,), infinite where a run is not finite."""
-    gram, square = (np.asarray(part) for part in _gram(form, numbers, states, *laid, weight))
+    gram, square = (np.asarray(part) for part in _gram(form, numbers, states, *layout, weight))
     n0, gone = len(states), begun - states
     matrix = np.moveaxis(gram[:, :n0], -1, 0) + np.diag(prior)
     right = np.moveaxis(gram[:, n0], -1, 0) + (prior[:, None] * gone).T

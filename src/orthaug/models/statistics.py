@@ -77,7 +77,7 @@ class Statistics:
     noise: Matrix | None = None
     ridge: float | Vector = 0.0
     freedom: float = np.inf
-    flown: bool = False
+    simulated: bool = False
     """Whether `noise` is of a free run's errors, and not of those one step ahead."""
     verdict: str = ""
     """What the residual says of the noise (`analysis.Diagnosis`); empty where nobody asked."""

@@ -18,11 +18,11 @@ from jaxtyping import Float
 from orthaug._base.checks import Matrix
 from orthaug._base.jax import jax
 from orthaug.data.sources import Source, rows_of
-from orthaug.models.rows import CHUNK_ROWS, Chunk, Here, chunk_shape, laid_out, together
+from orthaug.models.rows import CHUNK_ROWS, Chunk, Here, build_chunk, chunk_shape, together
 
 _AHEAD = 3  # chunks that wait to be summed
 
-Laid = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+RowArrays = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 """Features (m, nz), Q (m, ny, nθ), P⊥Y (m, ny) and gain (m, ny, ny) of some rows."""
 
 
@@ -31,11 +31,13 @@ class Drawn:
     """Rows of a source: where they are, how they are laid out, and in chunks of how many."""
 
     source: Source
-    laying: Callable[[Any], Iterator[Laid]]
+    row_builder: Callable[[Any], Iterator[RowArrays]]
     size: int
 
     def __iter__(self) -> Iterator[Chunk]:
-        return chunks_of((laid for partition in self.source.partitions for laid in self.laying(partition)), self.size)
+        return chunks_of(
+            (arrays for partition in self.source.partitions for arrays in self.row_builder(partition)), self.size
+        )
 
 
 @dataclass(frozen=True)
@@ -45,12 +47,12 @@ class Stream(Here):
     limit: int = CHUNK_ROWS
     resident: bool = False
 
-    def lay(self, z: Matrix, q: Any, e: Matrix, gain: Float[np.ndarray, "N ny ny"]) -> list[Chunk]:
+    def build_rows(self, z: Matrix, q: Any, e: Matrix, gain: Float[np.ndarray, "N ny ny"]) -> list[Chunk]:
         """Rows that are in memory, in chunks."""
-        return apart(laid_out(z, q, e, gain, chunk_shape(len(z), self.limit)))
+        return apart(build_chunk(z, q, e, gain, chunk_shape(len(z), self.limit)))
 
-    def draw(self, source: Source, laying: Callable[[Any], Iterator[Laid]]) -> Drawn:
-        return Drawn(source, laying, chunk_shape(rows_of(source), self.limit)[1])
+    def draw(self, source: Source, row_builder: Callable[[Any], Iterator[RowArrays]]) -> Drawn:
+        return Drawn(source, row_builder, chunk_shape(rows_of(source), self.limit)[1])
 
     def sum(self, function: Callable[..., Any], rows: Iterable[Chunk], *arguments: Any) -> Any:
         return summed(function, rows, arguments)
@@ -138,7 +140,7 @@ def _compiled(function: Callable[..., Any]) -> tuple[Any, Any]:
     return jax.jit(function), jax.jit(more, donate_argnums=0)
 
 
-def chunks_of(pieces: Iterable[Laid], size: int) -> Iterator[Chunk]:
+def chunks_of(pieces: Iterable[RowArrays], size: int) -> Iterator[Chunk]:
     """Rows in chunks of one size, the row index last; the last one is padded with rows that count for nothing."""
     parts: list[Any] = []
     held = 0

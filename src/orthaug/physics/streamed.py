@@ -203,7 +203,7 @@ def _merged(parts: Sequence[Any], merge: Callable[[Any, Any], Any]) -> Any:
 
 
 @dataclass(frozen=True, eq=False)
-class Laying:
+class RowBuilder:
     """Rows of a piece for training: scaled features, Q, P⊥Y and the learner's gain, (m, …) each."""
 
     basis: Basis
@@ -278,10 +278,10 @@ class StreamedProblem(Problem):
             extent = _survey(form, self.source, self.passes).features
         return np.stack(extent)
 
-    def laying(self, centre: Vector, halfwidth: Vector, rms: float, gain: Matrix) -> Laying:
+    def row_builder(self, centre: Vector, halfwidth: Vector, rms: float, gain: Matrix) -> RowBuilder:
         """How its rows are laid out for training."""
         basis = replace(self.basis, form=replace(self.basis.form, features=self.features))
-        return Laying(basis, self.target_coordinates, centre, halfwidth, rms, gain)
+        return RowBuilder(basis, self.target_coordinates, centre, halfwidth, rms, gain)
 
     def physics_alone(self) -> Problem:
         alone = super().physics_alone()

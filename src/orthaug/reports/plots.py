@@ -250,7 +250,7 @@ def selection_figure(result: SelectResult, unit: str) -> Figure:
 
 @plain
 def tracking_figure(
-    course: pd.DataFrame,
+    history: pd.DataFrame,
     parameters: Sequence[Any],
     alarms: Sequence[float],
     title: str | None = None,
@@ -266,15 +266,15 @@ def tracking_figure(
         physical: `Recursive.physical_history`, drawn above θ, of the `physical_parameters`.
     """
     panels = [(physical, p) for p in physical_parameters if physical is not None]
-    panels += [(course, p) for p in parameters]
+    panels += [(history, p) for p in parameters]
     figure = Figure(figsize=(SIZE[0], TOP + 1.25 * (len(panels) + 1)))
     axes = grid(figure, len(panels) + 1, 1, sharex=True, gap=(0.16, 0.0))[:, 0]
     headline(figure, _OVER_TIME if title is None else title)
     for axis, (frame, parameter) in zip(axes, panels, strict=False):
         _band(axis, frame, parameter.name)
         label(axis, y=with_unit(parameter.name, parameter.unit))
-    level = course["alarm"].to_numpy(dtype=float)
-    axes[-1].plot(*outline(course["time"].to_numpy(), level), color=BLACK, linewidth=0.8)
+    level = history["alarm"].to_numpy(dtype=float)
+    axes[-1].plot(*outline(history["time"].to_numpy(), level), color=BLACK, linewidth=0.8)
     axes[-1].axhline(1.0, color=ORANGE, linewidth=0.9, linestyle="--")
     axes[-1].set_ylim(0, max(1.2, 1.05 * level.max(initial=0.0)))
     label(axes[-1], x="time [s]", y="alarm (limit 1)")

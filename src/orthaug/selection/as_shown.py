@@ -18,7 +18,7 @@ import scipy.special
 from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug.selection.explained_ground import Ground
+from orthaug.selection.learned_linearization import LearnedLinearization
 
 _RANK = 1e-9  # of the largest singular value
 _ROUNDING = 1e-8  # of the largest variance
@@ -32,7 +32,7 @@ class Shown:
     they are taken as they are, less the physics. `size` is the norm of the learner with all that physics expresses.
     """
 
-    ground: Ground
+    linearization: LearnedLinearization
     q: Float[np.ndarray, "R s"]
     view: Float[np.ndarray, "P r"] | None
     target: Vector
@@ -40,13 +40,13 @@ class Shown:
     size: float
 
     @classmethod
-    def of(cls, ground: Ground) -> Shown:
+    def of(cls, linearization: LearnedLinearization) -> Shown:
         """By the learner's tangent space over the points, where it has one."""
-        q = basis_of(ground.physics_moves.T)
-        raw = ground.fitted(ground.learner)
-        rest, size, tangent = without(raw, q), float(np.linalg.norm(raw)), ground.tangent
+        q = basis_of(linearization.physics_moves.T)
+        raw = linearization.fitted(linearization.learner)
+        rest, size, tangent = without(raw, q), float(np.linalg.norm(raw)), linearization.tangent
         if tangent is None:
-            return cls(ground, q, None, rest, None, size)
+            return cls(linearization, q, None, rest, None, size)
         ridge: Any = np.broadcast_to(np.asarray(tangent.ridge, dtype=float), tangent.weights.shape)
         u, sigma, vt = np.linalg.svd(without(tangent.jacobian, q), full_matrices=False)
         kept = sigma > _RANK * sigma.max(initial=0.0)
@@ -60,8 +60,8 @@ class Shown:
             k = sigma[:, None] * (inner @ (sigma[:, None] ** 2 * v.T + v.T * ridge))
             covariance = tangent.joint.of(np.concatenate([np.zeros((len(k), tangent.joint.nt)), k], axis=1))
         view = u @ smooth.T
-        view = view if ground.response is None else ground.response.adjoint(view)
-        return cls(ground, q, view, target, covariance, size)
+        view = view if linearization.response is None else linearization.response.adjoint(view)
+        return cls(linearization, q, view, target, covariance, size)
 
     @property
     def noise(self) -> float:
@@ -85,7 +85,7 @@ class Shown:
         if not np.isfinite(column).all():
             return np.full(len(self.target), np.nan)
         if self.view is None:
-            return without(self.ground.fitted(column), self.q)
+            return without(self.linearization.fitted(column), self.q)
         return self.view.T @ column
 
 

@@ -20,7 +20,7 @@ from orthaug._base.errors import InputError
 from orthaug.analysis.suspects import ODD_JUMPS, WIDTHS, changes_sign, is_level, written
 from orthaug.data.terms import CONSTANT, TermLibrary, outside_brackets
 from orthaug.selection.as_shown import Shown, basis_of, least_squares, without
-from orthaug.selection.explained_ground import Ground
+from orthaug.selection.learned_linearization import LearnedLinearization
 
 MOST_CANDIDATES = 3000
 TERM = "term"
@@ -84,7 +84,7 @@ class Space:
     share by which two terms cannot be told apart.
     """
 
-    ground: Ground
+    linearization: LearnedLinearization
     shown: Shown
     target: Vector
     norm: float
@@ -93,13 +93,13 @@ class Space:
     tie: float
 
     @classmethod
-    def of(cls, ground: Ground, candidates: Sequence[Candidate]) -> Space:
+    def of(cls, linearization: LearnedLinearization, candidates: Sequence[Candidate]) -> Space:
         """Candidates without a value on some point, and those that physics expresses or no learner shows, are out."""
-        shown = Shown.of(ground)
+        shown = Shown.of(linearization)
         norm = float(np.linalg.norm(shown.target))
         kept, columns = [], []
         for candidate in candidates:
-            column = shown.unit(ground.column(ground.parse(candidate.text), candidate.place))
+            column = shown.unit(linearization.column(linearization.parse(candidate.text), candidate.place))
             if np.isfinite(column).all() and column @ column > _OWN:
                 kept.append(candidate)
                 columns.append(column)
@@ -107,7 +107,7 @@ class Space:
         target = shown.target / norm if norm > 1e-9 * shown.size else 0.0 * shown.target
         tie = _TIE_UNKNOWN if shown.covariance is None else _TIE
         tie = max(tie, _DRAWS * shown.noise / norm**2) if norm > 0 else tie
-        return cls(ground, shown, target, norm, tuple(kept), table, tie)
+        return cls(linearization, shown, target, norm, tuple(kept), table, tie)
 
     @property
     def empty(self) -> bool:
@@ -116,7 +116,7 @@ class Space:
 
     def column(self, candidate: Candidate) -> Vector:
         """A candidate as the learner would show it, (r,)."""
-        return self.shown.unit(self.ground.column(self.ground.parse(candidate.text), candidate.place))
+        return self.shown.unit(self.linearization.column(self.linearization.parse(candidate.text), candidate.place))
 
     def gains(self, chosen: Sequence[Vector]) -> Vector:
         """Share of the learner that each candidate would explain beside those that are chosen (K,)."""
@@ -133,7 +133,7 @@ class Space:
 
 
 def candidates_of(
-    ground: Ground, degree: int, functions: Sequence[str], suspects: Sequence[tuple[str, int]]
+    linearization: LearnedLinearization, degree: int, functions: Sequence[str], suspects: Sequence[tuple[str, int]]
 ) -> tuple[Candidate, ...]:
     """What could explain the learner, simple terms first.
 
@@ -144,17 +144,17 @@ def candidates_of(
     Raises:
         InputError: more than can be kept in memory.
     """
-    library = TermLibrary.of(ground.signals[: ground.seen], degree, functions)
-    plain = [(kind, on) for kind in _PLAIN for on in ground.signals if _likely(ground, kind, on)]
+    library = TermLibrary.of(linearization.signals[: linearization.seen], degree, functions)
+    plain = [(kind, on) for kind in _PLAIN for on in linearization.signals if _likely(linearization, kind, on)]
     known = {_written(kind, on) for kind, on in plain}
     texts = [text for text in library.texts if text != CONSTANT and text not in known]
-    wide = [(kind, on) for kind in _WIDE for on in ground.signals if _likely(ground, kind, on)]
-    wide = [(kind, on, width) for kind, on in wide for width in _grid(ground, on)]
-    places = range(len(ground.places))
+    wide = [(kind, on) for kind in _WIDE for on in linearization.signals if _likely(linearization, kind, on)]
+    wide = [(kind, on, width) for kind, on in wide for width in _grid(linearization, on)]
+    places = range(len(linearization.places))
     count = (len(texts) + len(wide)) * len(places)
     if count > MOST_CANDIDATES:
         raise InputError(
-            f"{ground.seen} signals to the degree {degree} make {count} candidate terms; at most {MOST_CANDIDATES} are "
+            f"{linearization.seen} signals to the degree {degree} make {count} candidate terms; at most {MOST_CANDIDATES} are "
             "looked at. Lower the degree, or give fewer functions."
         )
     found = [Candidate(TERM, None, None, place, text) for text, place in suspects]
@@ -166,22 +166,22 @@ def candidates_of(
     return tuple(found)
 
 
-def _likely(ground: Ground, kind: str, on: str) -> bool:
+def _likely(linearization: LearnedLinearization, kind: str, on: str) -> bool:
     """Friction only of what changes its sign, a root only of what has one."""
     if kind not in (*ODD_JUMPS, "square_root"):
         return True
-    values = _values(ground, on)
+    values = _values(linearization, on)
     return bool(np.isfinite(values).all()) and (is_level if kind == "square_root" else changes_sign)(values)
 
 
-def _values(ground: Ground, on: str) -> Vector:
+def _values(linearization: LearnedLinearization, on: str) -> Vector:
     with np.errstate(all="ignore"):
-        return np.asarray(ground.evaluate(ground.parse(on)), dtype=float)
+        return np.asarray(linearization.evaluate(linearization.parse(on)), dtype=float)
 
 
-def _grid(ground: Ground, on: str) -> Iterator[float]:
+def _grid(linearization: LearnedLinearization, on: str) -> Iterator[float]:
     """Widths that the data could tell; none for what is zero, or has no value somewhere."""
-    size = np.abs(_values(ground, on))
+    size = np.abs(_values(linearization, on))
     if np.isfinite(size).all() and np.any(size > 0):
         yield from (float(f"{share * np.median(size[size > 0]):.4g}") for share in _WIDTHS)
 
@@ -330,16 +330,16 @@ class Fit:
 
 def fit_terms(space: Space, chosen: Sequence[Candidate]) -> Fit:
     """Least squares of the learner on the terms as it would show them; the physics takes what they do not express."""
-    ground, shown = space.ground, space.shown
-    raw = [ground.column(ground.parse(one.text), one.place) for one in chosen]
+    linearization, shown = space.linearization, space.shown
+    raw = [linearization.column(linearization.parse(one.text), one.place) for one in chosen]
     size = np.array([np.linalg.norm(column) for column in raw])
     inverse = np.zeros((0, len(shown.target)))
     if chosen:
         inverse = np.linalg.pinv(np.column_stack([shown.unit(column) for column in raw])) / size[:, None]
     coefficients = inverse @ shown.target
-    rest = ground.learner - sum((b * c for b, c in zip(coefficients, raw, strict=True)), 0.0)
+    rest = linearization.learner - sum((b * c for b, c in zip(coefficients, raw, strict=True)), 0.0)
     covariance = None if shown.covariance is None else inverse @ shown.covariance @ inverse.T
-    return Fit(least_squares(ground.physics_moves, ground.fitted(rest)), coefficients, covariance)
+    return Fit(least_squares(linearization.physics_moves, linearization.fitted(rest)), coefficients, covariance)
 
 
 def settled(space: Space, chosen: list[Candidate]) -> tuple[list[Candidate], Fit, bool]:

@@ -27,7 +27,6 @@ from orthaug.selection.added_physics import (
     baseline_lines,
     names_for,
 )
-from orthaug.selection.explained_ground import Ground, ground_of
 from orthaug.selection.explaining import (
     TERM,
     Candidate,
@@ -39,6 +38,7 @@ from orthaug.selection.explaining import (
     select,
     settled,
 )
+from orthaug.selection.learned_linearization import LearnedLinearization, linearization_of
 
 LEAST = 0.005
 _HALF = 0.5  # of the learner, less its own errors: terms that explain less are none to be added
@@ -167,8 +167,8 @@ def explain(
         raise InputError(f"`least` must be a share between 0 and 1; got {shown(least)}.")
     if isinstance(functions, str) or any(not isinstance(name, str) for name in functions):
         raise InputError(f"`functions` must be a list of names, such as ['abs']; got {shown(functions)}.")
-    ground = ground_of(model, record)
-    space = Space.of(ground, candidates_of(ground, degree, functions, _declared(suspects, ground)))
+    linearization = linearization_of(model, record)
+    space = Space.of(linearization, candidates_of(linearization, degree, functions, _declared(suspects, linearization)))
     chosen, fitted, dropped = settled(space, select(space, most, least))
     told = _told(space, chosen, fitted, dropped)
     code = getattr(getattr(fit, "status", None), "code", "converged")
@@ -178,9 +178,9 @@ def explain(
     return told
 
 
-def _declared(suspects: Sequence[Any], ground: Ground) -> list[tuple[str, int]]:
+def _declared(suspects: Sequence[Any], linearization: LearnedLinearization) -> list[tuple[str, int]]:
     """Expressions of suspects with the number of their output or equation."""
-    names, found = [name for name, _ in ground.places], []
+    names, found = [name for name, _ in linearization.places], []
     for suspect in suspects:
         check_type(suspect, Suspect | MotionSuspect, "suspects", "a list of Suspects, or of MotionSuspects of a motion")
         where = suspect.equation if isinstance(suspect, MotionSuspect) else suspect.output
@@ -188,29 +188,29 @@ def _declared(suspects: Sequence[Any], ground: Ground) -> list[tuple[str, int]]:
             raise InputError(
                 f"suspect '{suspect.name}': the learner adds nothing to '{where}', but to {', '.join(names)}."
             )
-        ground.evaluate(ground.parse(suspect.expression))
+        linearization.evaluate(linearization.parse(suspect.expression))
         found.append((suspect.expression, 0 if where is None else names.index(where)))
     return found
 
 
 def _told(space: Space, chosen: list[Candidate], fitted: Fit, dropped: bool) -> Explanation:
-    ground, noise, p = space.ground, None, space.shown.p
+    linearization, noise, p = space.linearization, None, space.shown.p
     if space.shown.covariance is not None and space.norm > 0:
         noise = min(float(np.trace(space.shown.covariance)) / space.norm**2, 1.0)
     singles = tuple(
-        SingleTerm(one.name, one.text, ground.places[one.place][0], share) for one, share in alone(space, _SHOWN)
+        SingleTerm(one.name, one.text, linearization.places[one.place][0], share) for one, share in alone(space, _SHOWN)
     )
     share = space.explained([space.column(one) for one in chosen])
     real = p is None or p < _LEVEL
     if space.empty or not real or share < _HALF * (1 - (noise or 0.0)):
         chosen, text = [], _why_nothing(space, real, dropped, share, singles)
     terms = _terms(space, chosen, fitted)
-    moved = ground.moved(fitted.along) if chosen else ground.values
+    moved = linearization.moved(fitted.along) if chosen else linearization.values
     parameters = tuple(
         MovedParameter(p.name, p.unit, float(now), float(then))
-        for p, now, then in zip(ground.parameters, ground.values, moved, strict=True)
+        for p, now, then in zip(linearization.parameters, linearization.values, moved, strict=True)
     )
-    physics, spec = _physics(ground, terms, moved) if terms else (None, None)
+    physics, spec = _physics(linearization, terms, moved) if terms else (None, None)
     share = share if chosen else 0.0
     if terms:
         named = " and ".join(term.expression for term in terms) if len(terms) < 3 else ""
@@ -218,12 +218,12 @@ def _told(space: Space, chosen: list[Candidate], fitted: Fit, dropped: bool) -> 
         verb = "explains" if len(terms) == 1 else "explain"
         text = f"{what} {verb} {percent(share, 3)} of what the learner adds beside the physics."
     told = []
-    if ground.outside > _OUTSIDE:
-        reach = f"{100 * ground.outside:.0f} % of the rows lie beyond what the learner saw in training"
+    if linearization.outside > _OUTSIDE:
+        reach = f"{100 * linearization.outside:.0f} % of the rows lie beyond what the learner saw in training"
         told.append(Warning("beyond_training", f"{reach}: there it shows how it extrapolates."))
     if terms:
         told.append(Warning("conditional_on_selection", _CONDITIONAL))
-    points = len(ground.target)
+    points = len(linearization.target)
     return Explanation(terms, share, noise, p, singles, parameters, physics, spec, points, text, tuple(told))
 
 
@@ -243,17 +243,19 @@ def _why_nothing(space: Space, real: bool, dropped: bool, share: float, singles:
 
 
 def _terms(space: Space, chosen: Sequence[Candidate], fitted: Fit) -> tuple[ExplainingTerm, ...]:
-    ground, before, found = space.ground, 0.0, []
-    taken = [*ground.units, *(p.name for p in ground.parameters)]
-    if isinstance(ground.physics, Motion):
-        taken += list(ground.physics.known)
+    linearization, before, found = space.linearization, 0.0, []
+    taken = [*linearization.units, *(p.name for p in linearization.parameters)]
+    if isinstance(linearization.physics, Motion):
+        taken += list(linearization.physics.known)
     else:
-        taken += [name for name, _ in ground.physics.constants] + [term.parameter for term in ground.physics.terms]
+        taken += [name for name, _ in linearization.physics.constants] + [
+            term.parameter for term in linearization.physics.terms
+        ]
     names = names_for([_base_name(one) for one in chosen], taken)
     columns = [space.column(one) for one in chosen]
     std = None if fitted.covariance is None else np.sqrt(np.maximum(np.diag(fitted.covariance), 0.0))
     for i, one in enumerate(chosen):
-        place, unit = ground.places[one.place]
+        place, unit = linearization.places[one.place]
         whole = space.explained(columns[: i + 1])
         scale = _scale(one.kind, one.on, one.text)
         found.append(
@@ -265,7 +267,7 @@ def _terms(space: Space, chosen: Sequence[Candidate], fitted: Fit) -> tuple[Expl
                 width=one.width,
                 added_to=place,
                 coefficient=float(fitted.coefficients[i]),
-                unit=coefficient_unit(unit, ground.parse(scale), ground.units),
+                unit=coefficient_unit(unit, linearization.parse(scale), linearization.units),
                 std=None if std is None else float(std[i]),
                 share=whole - before,
                 alone=space.explained([columns[i]]),
@@ -286,24 +288,24 @@ def _base_name(candidate: Candidate) -> str:
 
 
 def _physics(
-    ground: Ground, terms: Sequence[ExplainingTerm], moved: Any
+    linearization: LearnedLinearization, terms: Sequence[ExplainingTerm], moved: Any
 ) -> tuple[Baseline | Motion | None, str | None]:
     """The physics with the terms added, and the lines that say so in a spec."""
-    several = len(ground.places) > 1
-    added = [_added(ground, term) for term in terms]
-    if isinstance(ground.physics, Motion):
-        changed = added_to_motion(ground.physics, moved, added, ground.units)
+    several = len(linearization.places) > 1
+    added = [_added(linearization, term) for term in terms]
+    if isinstance(linearization.physics, Motion):
+        changed = added_to_motion(linearization.physics, moved, added, linearization.units)
         return (None, None) if changed is None else (changed.motion, changed.lines())
-    baseline = added_to_baseline(ground.physics, moved, added, several)
+    baseline = added_to_baseline(linearization.physics, moved, added, several)
     return (None, None) if baseline is None else (baseline, baseline_lines(added, several))
 
 
-def _added(ground: Ground, term: ExplainingTerm) -> Added:
+def _added(linearization: LearnedLinearization, term: ExplainingTerm) -> Added:
     template = unit = None
     if term.width is not None:
         template = term.expression.replace(repr(term.width), "{width}")
-        unit = coefficient_unit("1", ground.parse(str(term.on)), ground.units)
-        unit = None if unit is None else ground.units.get(str(term.on), "")
+        unit = coefficient_unit("1", linearization.parse(str(term.on)), linearization.units)
+        unit = None if unit is None else linearization.units.get(str(term.on), "")
     where = (term.added_to, term.coefficient, term.unit)
-    scale = ground.parse(_scale(term.kind, term.on, term.expression))
+    scale = linearization.parse(_scale(term.kind, term.on, term.expression))
     return Added(term.parameter, term.expression, *where, term.width, unit, template, scale)

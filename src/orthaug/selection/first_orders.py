@@ -154,11 +154,11 @@ def _errors(record: Record, orders: Orders) -> tuple[float, ...] | None:
             return None
         theta = theta / scale
         if record.inputs:
-            flown = np.concatenate([_free_run(e, j, theta, orders, first) for e in usable])
+            simulated = np.concatenate([_free_run(e, j, theta, orders, first) for e in usable])
         else:
-            flown = phi @ theta
+            simulated = phi @ theta
         with np.errstate(all="ignore"):  # one that is not stable overflows
-            wrong = float(np.sqrt(np.mean((flown[cut:] - y[cut:]) ** 2)))
+            wrong = float(np.sqrt(np.mean((simulated[cut:] - y[cut:]) ** 2)))
         if not np.isfinite(wrong):
             return None
         found.append(wrong / max(float(y.std()), 1e-300))

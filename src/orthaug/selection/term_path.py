@@ -22,7 +22,7 @@ from orthaug._base.checks import Vector
 from orthaug._base.parallel import Threads, one_blas_thread
 from orthaug.data.expressions import Lag
 from orthaug.fitting.held_out import WORTH, blocked
-from orthaug.fitting.segments import Segments, lay_segments
+from orthaug.fitting.segments import Segments, build_segments
 from orthaug.selection.forward import Equations, forward
 from orthaug.selection.term_runs import Able, Point, TermRuns
 
@@ -120,9 +120,9 @@ class Blocks:
         self.folds: list[tuple[TermRuns, Segments]] = []
         held_shape: Segments | None = None
         for kept, held in blocked(runs.problem.record, blocks, first):
-            laid = lay_segments(held, runs.menu, 0, runs.flown.washout, held_shape)
-            held_shape = laid if held_shape is None else held_shape
-            self.folds.append((runs.on(kept), laid))
+            layout = build_segments(held, runs.menu, 0, runs.free_run.washout, held_shape)
+            held_shape = layout if held_shape is None else held_shape
+            self.folds.append((runs.on(kept), layout))
         self.given = runs, self.folds
 
     def along(self, points: Sequence[Point | None], count: int, able: Able) -> tuple[list[Point], Vector]:
@@ -154,7 +154,7 @@ def _on_all(given: _Given, chosen: Sequence[int], tell: Callable[..., None]) -> 
     """Chosen terms beside the physics, fitted from physics alone and from one step ahead; and what it took [s]."""
     runs, began = given[0], time.monotonic()
     point = runs.fit(runs.start(), chosen)
-    if runs.laid is not None and chosen:  # from physics alone a free run may end in a local minimum
+    if runs.layout is not None and chosen:  # from physics alone a free run may end in a local minimum
         nt = len(point.c)
         p = runs.step_equations.of([*range(nt), *(nt + i for i in chosen)]).solve()
         other = runs.fit(runs.start()._replace(chosen=tuple(chosen), c=p[:nt], w=p[nt:]), chosen)
@@ -166,7 +166,7 @@ def _on_fold(given: _Given, item: tuple[Point, int], tell: Callable[..., None]) 
     """The mean squared error on a block of a model that is fitted without it; and what it took [s]."""
     began, (point, number) = time.monotonic(), item
     runs, held = given[1][number]
-    own = point._replace(states=None if runs.laid is None else np.asarray(runs.laid.start))
+    own = point._replace(states=None if runs.layout is None else np.asarray(runs.layout.start))
     return runs.errors(runs.fit(own, point.chosen, _FOLD_ITERATIONS), held), time.monotonic() - began
 
 

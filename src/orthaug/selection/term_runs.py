@@ -22,8 +22,8 @@ from orthaug.data.regressors import Features, in_order
 from orthaug.data.terms import CONSTANT, TermLibrary, products_of
 from orthaug.fitting.criteria import Criterion, Simulation
 from orthaug.fitting.initial_states import InitialStates, Start
-from orthaug.fitting.objective import RUNAWAY, Flown, FreeRunObjective, LinearisedFreeRun, errors_of
-from orthaug.fitting.segments import Segments, lay_segments
+from orthaug.fitting.objective import RUNAWAY, FreeRunObjective, LinearisedFreeRun, TrialPoint, errors_of
+from orthaug.fitting.segments import Segments, build_segments
 from orthaug.fitting.solvers.descent import MARQUARDT
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.models.dynamics import Numbers, Parts
@@ -117,7 +117,7 @@ class TermRuns:
     criterion: Criterion
     menu: Menu
     sizes: Vector
-    laid: Segments | None
+    layout: Segments | None
     collinear: float = COLLINEAR
     """Share of a term's deviation that physics and the terms before it must leave, so that it is taken."""
 
@@ -146,15 +146,15 @@ class TermRuns:
             runs = replace(runs, sizes=np.where(np.isfinite(largest) & (largest > 0), largest, 1.0))
         if criterion.one_step:
             return runs
-        flown = criterion.flown
-        assert flown is not None
-        shape = None if like is None else like.laid
-        return replace(runs, laid=lay_segments(problem.record, menu, flown.steps, flown.washout, shape))
+        trial = criterion.free_run
+        assert trial is not None
+        shape = None if like is None else like.layout
+        return replace(runs, layout=build_segments(problem.record, menu, trial.steps, trial.washout, shape))
 
     @property
-    def flown(self) -> Simulation:
+    def free_run(self) -> Simulation:
         """How the free run is laid out, where held-out blocks are flown too."""
-        return self.criterion.flown or Simulation()
+        return self.criterion.free_run or Simulation()
 
     @cached_property
     def rms(self) -> float:
@@ -204,33 +204,33 @@ class TermRuns:
     def start(self) -> Point:
         """Physics alone, one step ahead."""
         return Point(
-            (), self.problem.least_squares, np.zeros(0), None if self.laid is None else np.asarray(self.laid.start)
+            (), self.problem.least_squares, np.zeros(0), None if self.layout is None else np.asarray(self.layout.start)
         )
 
     def fit(self, point: Point, chosen: Sequence[int], iterations: int = 30) -> Point:
         """Physics and the chosen terms, from a point with some of them."""
         before = dict(zip(point.chosen, point.w, strict=True))
         chosen, w = tuple(chosen), np.array([before.get(i, 0.0) for i in chosen])
-        if self.laid is None:
+        if self.layout is None:
             nt = len(point.c)
             own = self.step_equations.of([*range(nt), *(nt + i for i in chosen)])
             p = own.solve()
             return Point(chosen, p[:nt], p[nt:], None, max(own.miss(p), 0.0) / own.rows)
         objective = _Chosen.of(self, chosen)
         p = np.concatenate([point.c, w, np.zeros(objective.dynamics.unknowns - len(point.c) - len(w))])
-        states = point.states if point.states is not None else np.asarray(self.laid.start)
-        flown = _descended(objective, p, Start(states), iterations)
-        loss = flown.misfit * self.rms**2 / self.laid.count if np.isfinite(flown.misfit) else np.inf
-        return Point(chosen, flown.c, flown.w[: len(chosen)], flown.states, loss)
+        states = point.states if point.states is not None else np.asarray(self.layout.start)
+        trial = _descended(objective, p, Start(states), iterations)
+        loss = trial.misfit * self.rms**2 / self.layout.count if np.isfinite(trial.misfit) else np.inf
+        return Point(chosen, trial.c, trial.w[: len(chosen)], trial.states, loss)
 
     def independent_share(self, point: Point) -> float:
         """Return the share of a model's errors that is independent; one step ahead all of them count."""
-        if self.laid is None:
+        if self.layout is None:
             return 1.0
         objective = _Chosen.of(self, point.chosen)
         p = np.zeros(objective.physics + objective.dynamics.width)  # type: ignore[attr-defined]
         p[: len(point.c)], p[len(point.c) : len(point.c) + len(point.w)] = point.c, point.w
-        return objective.samples(objective.fly(p, Start(point.states)))[1]
+        return objective.samples(objective.evaluate(p, Start(point.states)))[1]
 
     def equations(self, point: Point, able: Able = None, scored: Any = None) -> Equations:
         """The normal equations of physics and all terms about a point, for p itself: its chosen terms are in the error.
@@ -242,30 +242,30 @@ class TermRuns:
         nt, terms = len(point.c), len(self.library)
         taken = range(terms) if able is None else sorted({*able, *point.chosen})
         columns = [*range(nt), *(nt + i for i in taken)]
-        if self.laid is None:
+        if self.layout is None:
             own = self.step_equations if scored is None else Equations.sum_of(self.step_blocks[scored])
             return own if able is None else own.of(columns).among(columns, nt + terms)
         objective = _Chosen.of(self, tuple(taken), exactly=True)
         if scored is not None:
-            objective = replace(objective, segments=self.laid._replace(scored=scored))
+            objective = replace(objective, segments=self.layout._replace(scored=scored))
         w = np.zeros(terms)
         w[list(point.chosen)] = point.w
         p = np.concatenate([point.c, w[list(taken)]])
-        flown = objective.fly(p, Start(point.states))
-        linear = objective.linearise(flown)
+        trial = objective.evaluate(p, Start(point.states))
+        linear = objective.linearise(trial)
         hessian, right = linear.information, linear.gradient
         bent = hessian @ p
-        square = flown.misfit + 2 * p @ right + p @ bent
+        square = trial.misfit + 2 * p @ right + p @ bent
         own = Equations(hessian, right + bent, float(square), objective.segments.count)
         return own.among(columns, nt + terms)
 
     def parts(self, point: Point, count: int, able: Able = None) -> list[Equations]:
         """Return the equations about a point over up to `count` parts of the data, one after another."""
-        if self.laid is None:
+        if self.layout is None:
             chunks = len(self.step_blocks)
             edges = np.linspace(0, chunks, min(count, chunks) + 1).astype(int)
             return [self.equations(point, able, slice(a, b)) for a, b in zip(edges[:-1], edges[1:], strict=True)]
-        scored = np.asarray(self.laid.scored)
+        scored = np.asarray(self.layout.scored)
         order = np.cumsum(np.moveaxis(scored, 1, -1).reshape(-1)).reshape(*scored.shape[::2], scored.shape[1])
         place = np.moveaxis((order - 1) * count // max(int(scored.sum()), 1), -1, 1)
         return [self.equations(point, able, scored & (place == part)) for part in range(count)]
@@ -301,31 +301,31 @@ class TermRuns:
         return mean if mean < RUNAWAY * float(self.problem.deviation[0]) ** 2 else np.inf
 
 
-def _descended(objective: FreeRunObjective, p: Vector, start: Start, iterations: int) -> Flown:
+def _descended(objective: FreeRunObjective, p: Vector, start: Start, iterations: int) -> TrialPoint:
     """Minimise the misfit by Gauss-Newton steps, and by Levenberg-Marquardt from where one of them does not descend.
 
     About a fitted model the misfit is nearly quadratic. A small step that lowers it by what was expected leaves nothing
     to gain, so no trial is linearised only to confirm that: a linearisation costs ten to thirty trials. After a large
     step the sensitivities are others: those of past outputs are zero where the model does nothing yet.
     """
-    flown = objective.fly(p, start)
-    for done in range(iterations if np.isfinite(flown.misfit) else 0):
-        linear = objective.linearise(flown)
+    trial = objective.evaluate(p, start)
+    for done in range(iterations if np.isfinite(trial.misfit) else 0):
+        linear = objective.linearise(trial)
         if not np.isfinite(linear.hessian).all():
             break
-        step = Equations(linear.hessian, linear.gradient, flown.misfit, objective.segments.count).solve()
+        step = Equations(linear.hessian, linear.gradient, trial.misfit, objective.segments.count).solve()
         expected = float(2 * step @ linear.gradient - step @ linear.hessian @ step)
-        if expected <= _TOLERANCE**2 * flown.misfit:
+        if expected <= _TOLERANCE**2 * trial.misfit:
             break
-        tried = objective.fly(flown.p + step, linear.start)
-        gained = flown.misfit - tried.misfit
+        tried = objective.evaluate(trial.p + step, linear.start)
+        gained = trial.misfit - tried.misfit
         if not gained > 0:
-            solver, start = LevenbergMarquardt(iterations - done, _TOLERANCE), Start(flown.states)
-            return solver.descend(objective, flown.p, start, damping=MARQUARDT).flown
-        before, flown = flown, tried
+            solver, start = LevenbergMarquardt(iterations - done, _TOLERANCE), Start(trial.states)
+            return solver.descend(objective, trial.p, start, damping=MARQUARDT).point
+        before, trial = trial, tried
         if gained <= _SETTLED * before.misfit and abs(expected - gained) <= _TOLERANCE * before.misfit:
             break
-    return flown
+    return trial
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -337,17 +337,17 @@ class _Chosen(FreeRunObjective):
     @classmethod
     def of(cls, runs: TermRuns, chosen: tuple[int, ...], *, exactly: bool = False) -> _Chosen:
         places = len(chosen) if exactly else runs.places(len(chosen))
-        menu, laid = replace(runs.menu, width=places), runs.laid
+        menu, layout = replace(runs.menu, width=places), runs.layout
         products = np.full((places, runs.menu.order), len(runs.library.factors))
         products[: len(chosen)] = runs.library.numbers[list(chosen)]
         nt = len(runs.problem.baseline.names)
-        segments: Any = laid
-        start = None if laid is None else np.asarray(laid.start)
+        segments: Any = layout
+        start = None if layout is None else np.asarray(layout.start)
         return cls(
             dynamics=menu,
             numbers=lambda c, w: menu.numbers(c, products, w, runs.sizes),
             segments=segments,
-            initial=InitialStates(start, start is not None and start.size > 0 and runs.flown.estimates_pasts),  # type: ignore[arg-type]
+            initial=InitialStates(start, start is not None and start.size > 0 and runs.free_run.estimates_pasts),  # type: ignore[arg-type]
             weight=np.eye(1) / runs.rms,
             rms=runs.rms,
             deviation=runs.problem.deviation,
@@ -355,8 +355,8 @@ class _Chosen(FreeRunObjective):
             taken=nt + len(chosen),
         )
 
-    def linearise(self, flown: Flown) -> LinearisedFreeRun:
-        linear = super().linearise(flown)
+    def linearise(self, trial: TrialPoint) -> LinearisedFreeRun:
+        linear = super().linearise(trial)
         hessian, gradient = linear.hessian.copy(), linear.gradient.copy()
         hessian[self.taken :], hessian[:, self.taken :], gradient[self.taken :] = 0.0, 0.0, 0.0
         return linear._replace(hessian=hessian, gradient=gradient)

@@ -83,15 +83,15 @@ class SquaredResiduals(Protocol):
         """How many leading entries of p are θ: they have bounds and no ridge."""
         ...
 
-    def fly(self, p: Vector, start: Any) -> Any:
+    def evaluate(self, p: Vector, start: Any) -> Any:
         """A trial (`Tried`) at p, from the `start` that the last accepted one left."""
         ...
 
-    def linearise(self, flown: Any) -> Any:
+    def linearise(self, point: Any) -> Any:
         """The derivative (`Linearised`) about a trial."""
         ...
 
-    def samples(self, flown: Any) -> tuple[float, float]:
+    def samples(self, point: Any) -> tuple[float, float]:
         """Number of residuals of a trial, and the share of them that is independent."""
         ...
 
@@ -99,7 +99,7 @@ class SquaredResiduals(Protocol):
 class Descent(NamedTuple):
     """Where a run ended: the last accepted trial and its derivative, which is None where the start has none."""
 
-    flown: Any
+    point: Any
     linear: Any | None
     ridge: float
     effective: float
@@ -115,7 +115,7 @@ class Descent(NamedTuple):
 class Pause(NamedTuple):
     """A descent between two steps, in arrays: it goes on from there at the same bits."""
 
-    flown: Any
+    point: Any
     """What the objective needs to make the last accepted trial again."""
     ridge: Any
     damping: Any
@@ -143,7 +143,7 @@ class _Counts(NamedTuple):
 class _Iterate(NamedTuple):
     """An accepted trial, and what the rest of the run knows of the way there."""
 
-    flown: Any
+    point: Any
     linear: Any
     ridge: float
     damping: float
@@ -196,17 +196,17 @@ def descend(
     if paused is not None:
         iterate, (done, taken, begun, first_loss, mark), ending = _resumed(objective, paused)
     else:
-        flown = objective.fly(np.clip(p, *limits), start)
-        linear = objective.linearise(flown) if np.isfinite(flown.loss) else None
+        point = objective.evaluate(np.clip(p, *limits), start)
+        linear = objective.linearise(point) if np.isfinite(point.loss) else None
         if linear is None or not np.isfinite(linear.hessian).all():
-            return Descent(flown, None, ridge, 0.0, 0, Ending.NON_FINITE, training_clock() - began)
+            return Descent(point, None, ridge, 0.0, 0, Ending.NON_FINITE, training_clock() - began)
         largest = 1.0 if damping.diagonal else float(np.diag(linear.hessian).max(initial=1e-300))
-        iterate, first_loss = _Iterate(flown, linear, ridge, damping.first * largest, path=(flown.p,)), flown.loss
+        iterate, first_loss = _Iterate(point, linear, ridge, damping.first * largest, path=(point.p,)), point.loss
         ending, done, taken, begun, mark = Ending.RUNNING, 0, 1, not evidence_settled, first_loss
-    while ending is Ending.RUNNING and not limit.reached(done, mark, iterate.flown.loss):
+    while ending is Ending.RUNNING and not limit.reached(done, mark, iterate.point.loss):
         iterate, ending = _trial(objective, iterate, limits, tolerance, damping, ceiling)
         if evidence and not begun:
-            lower = iterate.flown.loss < LEARNED * first_loss or iterate.small > 0
+            lower = iterate.point.loss < LEARNED * first_loss or iterate.small > 0
             begun = iterate.settled and lower or ending is Ending.CONVERGED
             if begun and ending is Ending.CONVERGED:  # under the first ridge; not yet under the one that follows
                 iterate, ending, taken = iterate._replace(small=0), Ending.RUNNING, 0
@@ -214,9 +214,9 @@ def descend(
             iterate = iterate._replace(ridge=_next_ridge(objective, iterate))
         taken = len(iterate.path)
         done += 1
-        mark = iterate.flown.loss if limit.begins_window(done) else mark
+        mark = iterate.point.loss if limit.begins_window(done) else mark
         try:
-            progress(done, iterate.flown.loss)
+            progress(done, iterate.point.loss)
         except Enough:
             ending = Ending.STOPPED if ending is Ending.RUNNING else ending
             break
@@ -225,21 +225,21 @@ def descend(
             kept.keep(partial(_paused, objective, iterate, counts, ending), ended=ending is not Ending.RUNNING)
     effective = effective_weights(iterate.linear.hessian, iterate.ridge, objective.physics)
     converged = ending not in (Ending.RUNNING, Ending.STOPPED)
-    tail, seconds = Tail.of(limit, done, mark, iterate.flown.loss, converged=converged), training_clock() - began
-    return Descent(iterate.flown, iterate.linear, iterate.ridge, effective, done, ending, seconds, iterate.path, tail)
+    tail, seconds = Tail.of(limit, done, mark, iterate.point.loss, converged=converged), training_clock() - began
+    return Descent(iterate.point, iterate.linear, iterate.ridge, effective, done, ending, seconds, iterate.path, tail)
 
 
 def _paused(objective: Any, iterate: _Iterate, counts: _Counts, ending: Ending) -> Pause:
     own = (iterate.ridge, iterate.damping, iterate.growth, iterate.small)
-    held = (objective.kept(iterate.flown), *own, np.stack(iterate.path), iterate.coloured)
+    held = (objective.kept(iterate.point), *own, np.stack(iterate.path), iterate.coloured)
     return Pause(*held, np.array(counts, dtype=float), int(ending))
 
 
 def _resumed(objective: Any, paused: Pause) -> tuple[_Iterate, _Counts, Ending]:
-    flown = objective.again(paused.flown)
+    point = objective.again(paused.point)
     ridge, damping, growth = (float(paused[i]) for i in (1, 2, 3))
     path, done = tuple(paused.path), paused.counts.tolist()
-    iterate = _Iterate(flown, objective.linearise(flown), ridge, damping, growth, int(paused.small), path)
+    iterate = _Iterate(point, objective.linearise(point), ridge, damping, growth, int(paused.small), path)
     counts = _Counts(int(done[0]), int(done[1]), bool(done[2]), done[3], done[4])
     return iterate._replace(coloured=bool(paused.coloured)), counts, Ending(int(paused.ending))
 
@@ -248,21 +248,21 @@ def _trial(
     objective: SquaredResiduals, iterate: _Iterate, limits: Any, tolerance: float, damping: Damping, ceiling: float
 ) -> tuple[_Iterate, Ending]:
     """One damped step: accept it, or damp more."""
-    flown, linear, ridge = iterate.flown, iterate.linear, iterate.ridge
-    p = flown.p
+    point, linear, ridge = iterate.point, iterate.linear, iterate.ridge
+    p = point.p
     penalty = np.concatenate([np.zeros(objective.physics), np.ones(len(p) - objective.physics)])
     downhill = linear.gradient - ridge * penalty * p
     step, expected = _step(linear.hessian + ridge * np.diag(penalty), downhill, iterate.damping, p, limits, damping)
     moves = bool(np.isfinite(step).all() and step.any())
-    tried = objective.fly(p + step, linear.start) if moves else None
-    before = flown.loss + ridge * float(penalty @ p**2)
+    tried = objective.evaluate(p + step, linear.start) if moves else None
+    before = point.loss + ridge * float(penalty @ p**2)
     after = np.nan if tried is None else tried.loss + ridge * float(penalty @ (p + step) ** 2)
     lower = tried is not None and tried.loss <= ceiling and np.isfinite(after) and after < before
     followed = objective.linearise(tried) if lower else None
     if tried is not None and followed is not None and np.isfinite(followed.hessian).all():
         gain = (before - after) / expected if expected > 0 else 1.0
         iterate = _Iterate(
-            flown=tried,
+            point=tried,
             linear=followed,
             ridge=ridge,
             damping=iterate.damping * max(1 / 3, 1 - (2 * gain - 1) ** 3),
@@ -281,10 +281,10 @@ def _trial(
 
 def _next_ridge(objective: SquaredResiduals, iterate: _Iterate) -> float:
     effective = effective_weights(iterate.linear.hessian, iterate.ridge, objective.physics)
-    return evidence_ridge(objective, iterate.flown, effective, coloured=iterate.coloured)
+    return evidence_ridge(objective, iterate.point, effective, coloured=iterate.coloured)
 
 
-def evidence_ridge(objective: SquaredResiduals, flown: Any, effective: float, *, coloured: bool = True) -> float:
+def evidence_ridge(objective: SquaredResiduals, point: Any, effective: float, *, coloured: bool = True) -> float:
     """Return MacKay's fixed point `α = γσ²/(κ‖w‖²)`, κ the share of the residuals that is independent.
 
     Residuals of a free run are coloured: N of them say as much as κN independent ones. So the data weigh less against
@@ -296,10 +296,10 @@ def evidence_ridge(objective: SquaredResiduals, flown: Any, effective: float, *,
         effective: number γ of effective weights there.
         coloured: whether the colour of the residuals counts.
     """
-    count, share = objective.samples(flown)
+    count, share = objective.samples(point)
     share = share if coloured else 1.0
-    variance = flown.loss / max(count - effective / share, 1.0)
-    size = float(np.sum(flown.p[objective.physics :] ** 2))
+    variance = point.loss / max(count - effective / share, 1.0)
+    size = float(np.sum(point.p[objective.physics :] ** 2))
     return float(np.clip(effective * variance / (share * max(size, 1e-300)), 1e-12, 1e12))
 
 

@@ -26,7 +26,7 @@ class Share(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class LaidRows:
+class TrainingRows:
     """A problem with its learner (None for physics alone), scaled for training.
 
     `unit` (ny,) is the learner's output unit in the outputs' units. `rms` is the RMS of the baseline's whitened

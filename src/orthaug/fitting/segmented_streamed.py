@@ -20,15 +20,15 @@ from orthaug._base.errors import InputError
 from orthaug._base.jax import jax, jnp, padded_length
 from orthaug.data.record import Experiment, Record
 from orthaug.data.sources import Source, Span, follows
-from orthaug.fitting.course import COLOUR_ROWS, COLOURED_STEPS, Looked
 from orthaug.fitting.criteria import Criterion
-from orthaug.fitting.flight_plan import FlightPlan, declared, lagged
 from orthaug.fitting.initial_states import InitialStates, Start
 from orthaug.fitting.objective import RUNAWAY, FreeRunObjective
 from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.rules import check_scored
 from orthaug.fitting.segment_sums import SegmentSums
-from orthaug.fitting.segments import CHUNK, Segments, begins_of, lay_segments, segment_of
+from orthaug.fitting.segmented_lagged import SegmentedLagged, declared, lagged
+from orthaug.fitting.segmented_problem import COLOUR_ROWS, COLOURED_STEPS, Looked
+from orthaug.fitting.segments import CHUNK, Segments, begins_of, build_segments, segment_of
 from orthaug.fitting.solvers.descent import Descent
 from orthaug.models.dynamics import Dynamics, Numbers
 from orthaug.models.rows import Engine
@@ -38,7 +38,7 @@ _SETTLING = 4  # Gauss-Newton steps of a witness's states
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class SourcePlan(FlightPlan):
+class SegmentedStreamed(SegmentedLagged):
     """A source's rows cut into segments where an engine reads or keeps them. `record` is a witness of them."""
 
     source: Source
@@ -46,26 +46,26 @@ class SourcePlan(FlightPlan):
     empty: Record
 
     @classmethod
-    def of(cls, task: OneStepTask, criterion: Criterion) -> SourcePlan:
+    def of(cls, task: OneStepTask, criterion: Criterion) -> SegmentedStreamed:
         """Cut the problem's source as a criterion of several steps declares.
 
         Raises:
             InputError: nothing would be scored; whole experiments as segments, which would have to fit into memory.
         """
-        problem, flown, sums = task.problem, criterion.flown, SegmentSums(task.engine)
-        assert flown is not None and isinstance(problem, StreamedProblem)
-        if not flown.steps:
+        problem, free_run, sums = task.problem, criterion.free_run, SegmentSums(task.engine)
+        assert free_run is not None and isinstance(problem, StreamedProblem)
+        if not free_run.steps:
             raise InputError(
                 "`segment` is 0, whole experiments, which need their rows in memory; give a number of steps, such as "
                 "512, or a Record."
             )
         dynamics = lagged(task)
-        empty, source, washout = problem.basis.form.empty, problem.source, flown.washout
+        empty, source, washout = problem.basis.form.empty, problem.source, free_run.washout
         found = Found.of(task.engine.passes(look, source.partitions))
         longest = max(found.rows) - dynamics.first_row
         check_scored(criterion, longest)
         made = (task.engine, source, found, dynamics, empty)
-        segments: Any = SourceSegments.cut(*made, flown.steps, washout)
+        segments: Any = SourceSegments.cut(*made, free_run.steps, washout)
         whole: Any = segments
         colour: Any = None
         if criterion.simulates:
@@ -73,15 +73,15 @@ class SourcePlan(FlightPlan):
             whole = WholeRuns(task.engine, source.partitions, empty, min(washout, longest - 1), count)
             if segments.steps < COLOURED_STEPS <= longest:
                 colour = SourceSegments.cut(*made, 0, washout, COLOUR_ROWS)
-        laid: dict[str, Any] = {"segments": segments, "whole": whole, "colour": colour}
+        layout: dict[str, Any] = {"segments": segments, "whole": whole, "colour": colour}
         cut = {"source": source, "found": found, "empty": empty}
-        return cls(**laid, **cut, **declared(task, criterion), dynamics=dynamics, sums=sums)
+        return cls(**layout, **cut, **declared(task, criterion), dynamics=dynamics, sums=sums)
 
     @property
     def lengthens(self) -> bool:
         return False
 
-    def _laid(self, segment: int, washout: int) -> Any:
+    def _build_segments(self, segment: int, washout: int) -> Any:
         made = (self.task.engine, self.source, self.found, self.dynamics, self.empty)
         return SourceSegments.cut(*made, segment, washout)
 
@@ -95,22 +95,22 @@ class SourcePlan(FlightPlan):
 
     def looked_at(self, objective: FreeRunObjective, end: Descent) -> Looked:
         """The segments of the witness; where that is all rows, with the states that were trained."""
-        flown = self.flown
-        segments = lay_segments(self.record, self.dynamics, flown.steps, flown.washout)
+        free_run = self.free_run
+        segments = build_segments(self.record, self.dynamics, free_run.steps, free_run.washout)
         initial = InitialStates(np.asarray(segments.start), objective.initial.free)
-        p, start = end.flown.p, Start(initial.measured)
+        p, start = end.point.p, Start(initial.measured)
         seen = replace(objective, segments=segments, initial=initial, sums=None, colour=None)
         if len(self.record) == sum(self.found.rows):
             trained: Any = self.segments
-            own = np.moveaxis(end.flown.states, 1, -1)[np.asarray(trained.there)]  # (segments, n0)
+            own = np.moveaxis(end.point.states, 1, -1)[np.asarray(trained.there)]  # (segments, n0)
             place = np.zeros((initial.measured.shape[0] * initial.measured.shape[2], own.shape[1]))
             place[: len(own)] = own
             k, n0, m = initial.measured.shape
             start = Start(np.moveaxis(place.reshape(k, m, n0), -1, 1))
         else:
             for _ in range(_SETTLING if initial.free else 0):
-                start = seen.linearise(seen.fly(p, start)).start
-        there = seen.fly(p, start)
+                start = seen.linearise(seen.evaluate(p, start)).start
+        there = seen.evaluate(p, start)
         linear = seen.linearise(there)
         return Looked(seen, there, linear.start.slope)
 

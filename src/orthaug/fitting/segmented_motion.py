@@ -11,12 +11,12 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.jax import Array, jax
-from orthaug.fitting.course import Course, Layout
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.initial_states import InitialStates
 from orthaug.fitting.objective import RUNAWAY, FreeRunObjective, errors_of
 from orthaug.fitting.segment_sums import SegmentSums
-from orthaug.fitting.segments import Segments, begins_of, lay_segments
+from orthaug.fitting.segmented_problem import Layout, SegmentedProblem
+from orthaug.fitting.segments import Segments, begins_of, build_segments
 from orthaug.fitting.structures import Structure
 from orthaug.models.dynamics import Numbers
 from orthaug.models.learners import Bound, Scaling
@@ -38,7 +38,7 @@ class MotionObjective(FreeRunObjective):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class MotionCourse(Course):
+class SegmentedMotion(SegmentedProblem):
     """A motion's record laid out in segments. `loose` (nx,) is how far a start may be from its guess."""
 
     dynamics: Moving
@@ -51,9 +51,9 @@ class MotionCourse(Course):
         problem: MotionProblem,
         bound: Bound | None,
         criterion: Criterion,
-        like: MotionCourse | None = None,
+        like: SegmentedMotion | None = None,
         sums: SegmentSums | None = None,
-    ) -> MotionCourse:
+    ) -> SegmentedMotion:
         """Lay a record out as a criterion of several steps declares, for the motion with a learner of unit scaling.
 
         With `like` in the shapes of another course, and with its substeps.
@@ -61,8 +61,8 @@ class MotionCourse(Course):
         Raises:
             InputError: nothing would be scored.
         """
-        record, flown = problem.record, criterion.flown
-        assert flown is not None, "a motion has no criterion one step ahead"
+        record, free_run = problem.record, criterion.free_run
+        assert free_run is not None, "a motion has no criterion one step ahead"
         features = () if bound is None else problem.features
         substeps = problem.substeps if like is None else like.dynamics.substeps
         dynamics = Moving(problem.motion, features, bound, record.sampling_time, substeps)
@@ -73,7 +73,7 @@ class MotionCourse(Course):
             dynamics=dynamics,
             **Layout.of(record, dynamics, criterion, like, shares)._asdict(),
             criterion=criterion,
-            flown=flown,
+            free_run=free_run,
             rms=1.0,
             deviation=problem.deviation,
             output_weights=problem.weight.choice,
@@ -89,28 +89,30 @@ class MotionCourse(Course):
         return self.dynamics.bound
 
     @property
-    def alone(self) -> MotionCourse:
+    def alone(self) -> SegmentedMotion:
         """The same segments without a learner."""
         nothing = Scaling(np.zeros(0), np.ones(0))
         return replace(self, dynamics=self.dynamics.alone, scaling=nothing, unit=np.ones(0))
 
-    def over(self, segment: int) -> MotionCourse:
+    def over(self, segment: int) -> SegmentedMotion:
         """The same over segments of another length, without washout; 0 for whole experiments."""
-        segments = lay_segments(self.record, self.dynamics, segment, 0, shares=self.shares)
-        return replace(self, segments=segments, flown=replace(self.flown, segment=segment, washout=0))
+        segments = build_segments(self.record, self.dynamics, segment, 0, shares=self.shares)
+        return replace(self, segments=segments, free_run=replace(self.free_run, segment=segment, washout=0))
 
-    def refined(self, substeps: int) -> MotionCourse:
+    def refined(self, substeps: int) -> SegmentedMotion:
         """The same with other substeps of the integrator."""
         dynamics = replace(self.dynamics, substeps=substeps)
         finer = replace(self, dynamics=dynamics)
         if dynamics.motion.hold != "spline":  # otherwise steps read the input at the points of the substeps
             return finer
-        laid = Layout.of(self.record, dynamics, self.criterion, self, self.shares)
-        segments = laid.segments if self.flown == self.criterion.flown else finer.over(self.flown.steps).segments
+        layout = Layout.of(self.record, dynamics, self.criterion, self, self.shares)
+        segments = (
+            layout.segments if self.free_run == self.criterion.free_run else finer.over(self.free_run.steps).segments
+        )
         start = np.asarray(self.segments.start)
-        return replace(finer, segments=segments._replace(start=start), whole=laid.whole, colour=laid.colour)
+        return replace(finer, segments=segments._replace(start=start), whole=layout.whole, colour=layout.colour)
 
-    def from_states(self, states: Float[np.ndarray, "k n0 m"]) -> MotionCourse:
+    def from_states(self, states: Float[np.ndarray, "k n0 m"]) -> SegmentedMotion:
         """The same with segments that start there."""
         return replace(self, segments=self.segments._replace(start=np.asarray(states)))
 
@@ -176,7 +178,7 @@ class MotionCourse(Course):
         """The states (N, nx) of every experiment, put together from the segments' runs."""
         runs = np.moveaxis(self.runs(c, w, states), -1, 1)
         rows, place, found = runs.reshape(-1, *runs.shape[2:]), 0, []
-        steps, washout = self.segments.steps, min(self.flown.washout, self.segments.steps - 1)
+        steps, washout = self.segments.steps, min(self.free_run.washout, self.segments.steps - 1)
         for experiment in self.record.experiments:
             own = np.zeros((len(experiment), self.dynamics.states))
             for begin in begins_of(len(experiment), steps, washout):
@@ -187,9 +189,9 @@ class MotionCourse(Course):
             found.append(own)
         return found
 
-    def starting_from(self, rows: list[Matrix]) -> MotionCourse:
+    def starting_from(self, rows: list[Matrix]) -> SegmentedMotion:
         """The same with segments that start at the states (N, nx) given for every row of every experiment."""
-        steps, washout = self.segments.steps, min(self.flown.washout, self.segments.steps - 1)
+        steps, washout = self.segments.steps, min(self.free_run.washout, self.segments.steps - 1)
         starts = []
         for experiment, own in zip(self.record.experiments, rows, strict=True):
             starts.append(own[begins_of(len(experiment), steps, washout)])

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug.fitting.course import Course, Layout
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.elimination import Elimination, Fixed, eliminate
 from orthaug.fitting.initial_states import InitialStates, Start
-from orthaug.fitting.objective import Flown, FreeRunObjective, LinearisedFreeRun
+from orthaug.fitting.objective import FreeRunObjective, LinearisedFreeRun, TrialPoint
 from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.segment_sums import SegmentSums
-from orthaug.fitting.segments import lay_segments
+from orthaug.fitting.segmented_problem import Layout, SegmentedProblem
+from orthaug.fitting.segments import build_segments
 from orthaug.fitting.solvers.descent import Descent
 from orthaug.fitting.structures import Structure
 from orthaug.models.lagged import Lagged
@@ -38,7 +38,7 @@ def declared(task: OneStepTask, criterion: Criterion) -> dict[str, Any]:
     return {
         "record": problem.record,
         "criterion": criterion,
-        "flown": criterion.flown,
+        "free_run": criterion.free_run,
         "rms": task.rms,
         "deviation": problem.deviation,
         "output_weights": problem.weight.choice,
@@ -49,7 +49,7 @@ def declared(task: OneStepTask, criterion: Criterion) -> dict[str, Any]:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class FlightPlan(Course):
+class SegmentedLagged(SegmentedProblem):
     """A problem laid out in segments, beside its rows laid out for one step."""
 
     dynamics: Lagged
@@ -58,7 +58,7 @@ class FlightPlan(Course):
     """Entries of an orthogonal θ that are known to stand at a bound beside the learner."""
 
     @classmethod
-    def of(cls, task: OneStepTask, criterion: Criterion, like: FlightPlan | None = None) -> FlightPlan:
+    def of(cls, task: OneStepTask, criterion: Criterion, like: SegmentedLagged | None = None) -> SegmentedLagged:
         """Lay the problem's record out as a criterion of several steps declares, in the shapes of a plan that is small.
 
         Raises:
@@ -66,8 +66,8 @@ class FlightPlan(Course):
         """
         dynamics, record, sums = lagged(task), task.problem.record, SegmentSums.of(task.engine)
         small = like is not None and like.segments.scored.size <= _SMALL
-        laid = Layout.of(record, dynamics, criterion, like if small else None, task.engine.shares)
-        return cls(**laid._asdict(), **declared(task, criterion), dynamics=dynamics, sums=sums)
+        layout = Layout.of(record, dynamics, criterion, like if small else None, task.engine.shares)
+        return cls(**layout._asdict(), **declared(task, criterion), dynamics=dynamics, sums=sums)
 
     @property
     def problem(self) -> Problem:
@@ -78,7 +78,7 @@ class FlightPlan(Course):
         return self.task.bound
 
     @cached_property
-    def alone(self) -> FlightPlan:
+    def alone(self) -> SegmentedLagged:
         """The same rows and segments without a learner."""
         alone, task = self.dynamics.alone, self.task.alone
         return replace(self, task=task, dynamics=alone, scaling=task.scaling, unit=task.unit, fixed={})
@@ -88,15 +88,15 @@ class FlightPlan(Course):
         """Whether whole experiments can be segments to train on."""
         return True
 
-    def over(self, segment: int) -> FlightPlan:
+    def over(self, segment: int) -> SegmentedLagged:
         """The same over segments of another length; 0 for whole experiments."""
-        washout = min(self.flown.washout, segment // 2) if segment else self.flown.washout
-        flown = replace(self.flown, segment=segment, washout=washout)
-        return replace(self, segments=self._laid(segment, washout), flown=flown)
+        washout = min(self.free_run.washout, segment // 2) if segment else self.free_run.washout
+        free_run = replace(self.free_run, segment=segment, washout=washout)
+        return replace(self, segments=self._build_segments(segment, washout), free_run=free_run)
 
-    def _laid(self, segment: int, washout: int) -> Any:
+    def _build_segments(self, segment: int, washout: int) -> Any:
         like = self.whole if self.criterion.simulates and not segment else None
-        return lay_segments(self.record, self.dynamics, segment, washout, like, self.shares)
+        return build_segments(self.record, self.dynamics, segment, washout, like, self.shares)
 
     def objective(self, structure: Structure) -> StructuredObjective:
         """The criterion as a function of θ and the weights."""
@@ -109,7 +109,7 @@ class FlightPlan(Course):
             dynamics=self.dynamics,
             numbers=self.numbers,
             segments=self.segments,
-            initial=InitialStates(start, start.size > 0 and self.flown.estimates_pasts),
+            initial=InitialStates(start, start.size > 0 and self.free_run.estimates_pasts),
             weight=self.problem.weight.matrix / self.rms,
             rms=self.rms,
             deviation=self.problem.deviation,
@@ -158,26 +158,26 @@ class StructuredObjective(FreeRunObjective):
         c = theta - self._taken(self.task.share_of(w)) if self.follows else theta
         return theta, c, w
 
-    def fly(self, p: Vector, start: Start) -> Flown:
+    def evaluate(self, p: Vector, start: Start) -> TrialPoint:
         """A trial at p, with the structure's rows."""
-        flown = super().fly(p, start)
+        point = super().evaluate(p, start)
         rows = self.elimination.rows
         if not len(rows.target):
-            return flown
-        miss = rows.target - rows.theta @ flown.theta - rows.learner @ self.task.share_of(flown.w)
-        return flown._replace(loss=flown.loss + float(miss @ miss) / self.rms**2)
+            return point
+        miss = rows.target - rows.theta @ point.theta - rows.learner @ self.task.share_of(point.w)
+        return point._replace(loss=point.loss + float(miss @ miss) / self.rms**2)
 
-    def linearise(self, flown: Flown) -> LinearisedFreeRun:
+    def linearise(self, point: TrialPoint) -> LinearisedFreeRun:
         """Normal equations about a trial, of the unknown θ and with the structure's rows."""
-        linear = super().linearise(flown)
+        linear = super().linearise(point)
         hessian, gradient = linear.hessian, linear.gradient
         rows, rms = self.elimination.rows, self.rms
         if self.follows:
-            change = self.change(flown.w)
+            change = self.change(point.w)
             hessian, gradient = change.T @ hessian @ change, change.T @ gradient
         if len(rows.target):
-            by_rows = np.column_stack([rows.theta, rows.learner @ self.task.share_slope(flown.w)]) / rms
-            miss = (rows.target - rows.theta @ flown.theta - rows.learner @ self.task.share_of(flown.w)) / rms
+            by_rows = np.column_stack([rows.theta, rows.learner @ self.task.share_slope(point.w)]) / rms
+            miss = (rows.target - rows.theta @ point.theta - rows.learner @ self.task.share_of(point.w)) / rms
             hessian, gradient = hessian + by_rows.T @ by_rows, gradient + by_rows.T @ miss
         return linear._replace(hessian=hessian, gradient=gradient)
 
@@ -208,15 +208,15 @@ class StructuredObjective(FreeRunObjective):
         Those that the learner could imitate stay where the nearest θ in the bounds does, the others where descent
         would leave the bounds.
         """
-        flown, elimination = end.flown, self.elimination
-        ends = enumerate(zip(flown.theta, elimination.lower, elimination.upper, strict=True))
+        point, elimination = end.point, self.elimination
+        ends = enumerate(zip(point.theta, elimination.lower, elimination.upper, strict=True))
         at = {i: float(value) for i, (value, *sides) in ends if value in sides}
         if not self.fixed or end.linear is None or elimination.shared is None:
             return at
-        f = self.task.share_of(flown.w)
-        nearest = replace(elimination, outputs=elimination.to_coordinates @ flown.c + f).active(f)
-        downhill = np.where(flown.theta == elimination.upper, end.linear.gradient[: self.physics], 0.0)
-        downhill = np.where(flown.theta == elimination.lower, -end.linear.gradient[: self.physics], downhill)
+        f = self.task.share_of(point.w)
+        nearest = replace(elimination, outputs=elimination.to_coordinates @ point.c + f).active(f)
+        downhill = np.where(point.theta == elimination.upper, end.linear.gradient[: self.physics], 0.0)
+        downhill = np.where(point.theta == elimination.lower, -end.linear.gradient[: self.physics], downhill)
         imitated = [bool(row.any()) for row in elimination.shared.basis]
         return {
             i: v for i, v in at.items() if i not in self.fixed or (i in nearest if imitated[i] else downhill[i] > 0)

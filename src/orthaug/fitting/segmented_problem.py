@@ -13,10 +13,10 @@ from orthaug.data.record import Record
 from orthaug.fitting.checkpoints import OF_DESCENT, Checkpoints, Kept
 from orthaug.fitting.criteria import Criterion, Simulation
 from orthaug.fitting.initial_states import Start
-from orthaug.fitting.objective import RUNAWAY, Flown, FreeRunObjective, errors_of
+from orthaug.fitting.objective import RUNAWAY, FreeRunObjective, TrialPoint, errors_of
 from orthaug.fitting.rules import check_scored
 from orthaug.fitting.segment_sums import SegmentSums
-from orthaug.fitting.segments import Segments, lay_segments
+from orthaug.fitting.segments import Segments, build_segments
 from orthaug.fitting.solvers.descent import MARQUARDT, Descent
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.solvers.limit import noticeable_in
@@ -29,7 +29,7 @@ COLOURED_STEPS = 256  # shorter segments do not show how long the errors remembe
 COLOUR_ROWS = 4096  # of each experiment: they show it instead
 
 
-class Flight(NamedTuple):
+class FreeRunFit(NamedTuple):
     """A finished run on the free-run criterion."""
 
     objective: FreeRunObjective
@@ -52,7 +52,7 @@ class Looked(NamedTuple):
     """A trial whose segments are in memory, to be looked at, and how its states follow (c, w)."""
 
     objective: FreeRunObjective
-    flown: Flown
+    point: TrialPoint
     slope: Any
 
 
@@ -65,30 +65,35 @@ class Layout(NamedTuple):
 
     @classmethod
     def of(
-        cls, record: Record, dynamics: Dynamics, criterion: Criterion, like: Course | None = None, shares: int = 1
+        cls,
+        record: Record,
+        dynamics: Dynamics,
+        criterion: Criterion,
+        like: SegmentedProblem | None = None,
+        shares: int = 1,
     ) -> Layout:
         """As a criterion of several steps declares; padded to the shapes of another course where that is larger.
 
         Raises:
             InputError: nothing would be scored.
         """
-        flown = criterion.flown
-        assert flown is not None, "one step ahead is `OneStepTask`'s"
+        free_run = criterion.free_run
+        assert free_run is not None, "one step ahead is `OneStepTask`'s"
         longest = max(len(e) for e in record.experiments) - dynamics.first_row
         check_scored(criterion, longest)
         shapes = (None, None) if like is None else (like.segments, like.whole)
-        segments = lay_segments(record, dynamics, flown.steps, flown.washout, shapes[0], shares)
-        if not (criterion.simulates and flown.steps):
+        segments = build_segments(record, dynamics, free_run.steps, free_run.washout, shapes[0], shares)
+        if not (criterion.simulates and free_run.steps):
             return cls(segments, segments, None)
-        whole, colour = lay_segments(record, dynamics, 0, flown.washout, shapes[1]), None
+        whole, colour = build_segments(record, dynamics, 0, free_run.washout, shapes[1]), None
         if segments.steps < COLOURED_STEPS <= longest:
             first = tuple(e.rows(0, COLOUR_ROWS) for e in record.experiments)
-            colour = lay_segments(replace(record, experiments=first), dynamics, 0, flown.washout)
+            colour = build_segments(replace(record, experiments=first), dynamics, 0, free_run.washout)
         return cls(segments, whole, colour)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Course:
+class SegmentedProblem:
     """A record laid out in segments for a criterion.
 
     `rms` is the unit of the errors. `deviation` (ny,) is that of the outputs, `output_weights` how they are weighed
@@ -103,7 +108,7 @@ class Course:
     colour: Segments | None
     """Segments that show the colour of the errors, where the others are too short for that."""
     criterion: Criterion
-    flown: Simulation
+    free_run: Simulation
     rms: float
     deviation: Vector
     output_weights: str | tuple[float, ...]
@@ -137,7 +142,7 @@ class Course:
         tell: RunTell = quiet,
         states: Any = None,
         **options: Any,
-    ) -> Flight:
+    ) -> FreeRunFit:
         """From p to the end; several outputs are weighted by their errors' covariance in a second leg.
 
         Args:
@@ -157,21 +162,21 @@ class Course:
             size = np.trace(objective.weight @ noise @ objective.weight.T) / ny  # so that the ridge keeps its place
             objective = replace(objective, weight=np.sqrt(size) * white)
             done = end.iterations
-            begun, options = Start(end.flown.states), options | {"ridge": end.ridge, "ceiling": np.inf}
+            begun, options = Start(end.point.states), options | {"ridge": end.ridge, "ceiling": np.inf}
             again = solver.after(done).descend(
                 objective,
-                end.flown.p,
+                end.point.p,
                 begun,
                 progress=lambda i, loss: tell(done + i, loss),
-                kept=self._kept(objective, end.flown.p, begun, options),
+                kept=self._kept(objective, end.point.p, begun, options),
                 **options,
             )
             path = (*end.path, *again.path)
             spent = {"iterations": done + again.iterations, "seconds": end.seconds + again.seconds}
             tail = again.tail and again.tail._replace(done=spent["iterations"], limit=solver.iterations)
             end = again._replace(path=path, tail=tail, **spent)
-        mean_square = self.mean_square(end.flown.c, end.flown.w)
-        return Flight(objective, end, mean_square, end.iterations, end.seconds)
+        mean_square = self.mean_square(end.point.c, end.point.w)
+        return FreeRunFit(objective, end, mean_square, end.iterations, end.seconds)
 
     def _kept(self, objective: FreeRunObjective, p: Vector, start: Start, options: dict[str, Any]) -> Kept | None:
         """Where the pauses of a descent from there are kept."""
@@ -184,11 +189,11 @@ class Course:
     def looked_at(self, objective: FreeRunObjective, end: Descent) -> Looked:
         """Where a run ended, on segments in memory; its end has a derivative."""
         assert end.linear is not None
-        return Looked(objective, end.flown, objective.slope(end.linear.start))
+        return Looked(objective, end.point, objective.slope(end.linear.start))
 
     def noise(self, objective: FreeRunObjective, end: Descent) -> Matrix | None:
         """Covariance (ny, ny) of the errors, in the outputs' units."""
-        squares, ny = objective.squares(end.flown), len(objective.weight)
+        squares, ny = objective.squares(end.point), len(objective.weight)
         used = (objective.physics + end.effective) / ny
         return None if squares is None else noise_covariance(squares, np.full(ny, self.segments.count - used))
 

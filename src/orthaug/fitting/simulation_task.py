@@ -17,12 +17,12 @@ from orthaug._base.errors import Warning
 from orthaug._base.progress import RunTell, quiet
 from orthaug.fitting.block_scores import FreeRunScores
 from orthaug.fitting.checkpoints import Checkpoints
-from orthaug.fitting.course import Flight
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.initial_states import Start
 from orthaug.fitting.learned import ErrorStatistics, Learned
 from orthaug.fitting.objective import FreeRunObjective
 from orthaug.fitting.rules import ridge_of
+from orthaug.fitting.segmented_problem import FreeRunFit
 from orthaug.fitting.solvers.descent import LEARNED, Descent
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.structures import Structure
@@ -41,27 +41,29 @@ class Place(NamedTuple):
     silent: bool
 
 
-def _learned(flight: Flight, first_loss: float) -> bool:
+def _learned(free_fit: FreeRunFit, first_loss: float) -> bool:
     """Whether the weights lowered the loss: evidence may also have found too early that none are needed."""
-    return bool(flight.end.flown.loss < LEARNED * first_loss)
+    return bool(free_fit.end.point.loss < LEARNED * first_loss)
 
 
-Task = TypeVar("Task", bound="FlightTask")  # Self is nothing that run-time checks of annotations can read
+Task = TypeVar("Task", bound="SimulationTask")  # Self is nothing that run-time checks of annotations can read
 
 
 @dataclass(frozen=True, eq=False)
-class FlightTask(ABC):
+class SimulationTask(ABC):
     """A course, and what physics alone does on it: None before `prepared`, and where physics alone cannot fly."""
 
     plan: Any
-    """The `Course`."""
-    physics: Flight | None = None
+    """The `SegmentedProblem`."""
+    physics: FreeRunFit | None = None
 
     @abstractmethod
-    def flown_alone(self, solver: LevenbergMarquardt, structure: Structure, tell: RunTell) -> tuple[Any, Flight | None]:
+    def train_physics_only(
+        self, solver: LevenbergMarquardt, structure: Structure, tell: RunTell
+    ) -> tuple[Any, FreeRunFit | None]:
         """The plan and physics alone trained on it; None where it cannot fly."""
 
-    def scaled(self, plan: Any, physics: Flight) -> Any:
+    def scaled(self, plan: Any, physics: FreeRunFit) -> Any:
         """The plan with its learner scaled by what physics alone does."""
         return plan
 
@@ -87,14 +89,14 @@ class FlightTask(ABC):
         def tell(iteration: int, loss: float) -> None:
             progress(iteration, loss * own.rms**2 / own.residuals)
 
-        plan, physics = self.flown_alone(solver, structure, tell)
+        plan, physics = self.train_physics_only(solver, structure, tell)
         if physics is None:
             return self
-        rms = plan.rms * float(np.sqrt(physics.end.flown.misfit / plan.residuals))
+        rms = plan.rms * float(np.sqrt(physics.end.point.misfit / plan.residuals))
         plan = replace(plan, rms=max(rms, 1e-10 * plan.rms))
         if not np.isfinite(physics.mean_square):
-            plan, flown = replace(plan, whole=plan.segments), physics.end.flown
-            physics = physics._replace(mean_square=plan.alone.mean_square(flown.c, flown.w))
+            plan, point = replace(plan, whole=plan.segments), physics.end.point
+            physics = physics._replace(mean_square=plan.alone.mean_square(point.c, point.w))
         return replace(self, plan=self.scaled(plan, physics), physics=physics)
 
     def keeping(self: Task, checkpoints: Checkpoints | None) -> Task:
@@ -129,7 +131,7 @@ class FlightTask(ABC):
         """One where runs cannot be compared over whole experiments."""
         if self.physics is None or self.plan.whole is not self.plan.segments:
             return ()
-        if not self.criterion.simulates or not self.plan.flown.steps:
+        if not self.criterion.simulates or not self.plan.free_run.steps:
             return ()
         text = (
             "the free run of physics alone diverges over whole experiments of the training data, so `loss` counts its "
@@ -144,7 +146,7 @@ class FlightTask(ABC):
         structure: Structure,
         regularization: str | float = "none",
         progress: RunTell = quiet,
-    ) -> Flight:
+    ) -> FreeRunFit:
         """One run from the weights `w`, silenced, and physics alone; the arguments as in `estimate`.
 
         An earlier model is gone on from where it is better than physics alone. A learner that cannot be silenced
@@ -165,39 +167,42 @@ class FlightTask(ABC):
             progress(iteration, loss * plan.rms**2 / plan.residuals)
 
         options: dict[str, Any] = {"ridge": ridge, "evidence": evidence, "evidence_settled": True}
-        flight = plan.descend(objective, best.p, solver, tell, best.states, ceiling=ceiling, **options)
-        if evidence and not _learned(flight, best.loss):
+        free_fit = plan.descend(objective, best.p, solver, tell, best.states, ceiling=ceiling, **options)
+        if evidence and not _learned(free_fit, best.loss):
             free = plan.descend(objective, best.p, solver.within_limit, tell, best.states, ceiling=ceiling)
             if _learned(free, best.loss):
-                flown, options = free.end.flown, options | {"evidence_settled": False}
-                again = plan.descend(objective, flown.p, solver, tell, flown.states, ceiling=ceiling, **options)
-                flight = again if _learned(again, best.loss) else flight
-                spent = {"iterations": free.iterations + flight.iterations, "seconds": free.seconds + flight.seconds}
-                flight = flight._replace(**spent)
-        return self._below_physics(flight)
+                point, options = free.end.point, options | {"evidence_settled": False}
+                again = plan.descend(objective, point.p, solver, tell, point.states, ceiling=ceiling, **options)
+                free_fit = again if _learned(again, best.loss) else free_fit
+                spent = {
+                    "iterations": free.iterations + free_fit.iterations,
+                    "seconds": free.seconds + free_fit.seconds,
+                }
+                free_fit = free_fit._replace(**spent)
+        return self._below_physics(free_fit)
 
-    def _below_physics(self, flight: Flight) -> Flight:
+    def _below_physics(self, free_fit: FreeRunFit) -> FreeRunFit:
         """The run, or the best iterate of it where over whole experiments its end is above physics alone."""
         physics = self.physics
-        if physics is None or flight.mean_square <= physics.mean_square or not flight.end.path:
-            return flight
-        objective, end, plan = flight.objective, flight.end, self.plan
+        if physics is None or free_fit.mean_square <= physics.mean_square or not free_fit.end.path:
+            return free_fit
+        objective, end, plan = free_fit.objective, free_fit.end, self.plan
         looked = np.unique(np.linspace(0, len(end.path) - 1, _LOOKED_AT).astype(int))
         losses = [plan.mean_square(*objective.place(end.path[i])[1:]) for i in looked]
         if not np.isfinite(losses).any():
-            return flight
+            return free_fit
         best = int(np.nanargmin(losses))
-        flown = objective.fly(end.path[looked[best]], Start(objective.initial.measured))
-        return flight._replace(
-            end=end._replace(flown=flown, linear=objective.linearise(flown)),
+        point = objective.evaluate(end.path[looked[best]], Start(objective.initial.measured))
+        return free_fit._replace(
+            end=end._replace(point=point, linear=objective.linearise(point)),
             mean_square=min(losses[best], physics.mean_square),  # its own start differs by rounding
         )
 
-    def loss(self, run: Flight) -> float:
+    def loss(self, run: FreeRunFit) -> float:
         """The run's `mean_square`."""
         return run.mean_square
 
-    def learned(self, run: Flight) -> Learned:
+    def learned(self, run: FreeRunFit) -> Learned:
         """The learner as a run left it, with the statistics of its errors."""
         end, objective = run.end, run.objective
         linear, rms = end.linear, objective.rms
@@ -212,7 +217,7 @@ class FlightTask(ABC):
 
         return Learned(
             bound=self.bound,
-            weights=end.flown.w,
+            weights=end.point.w,
             scaling=self.plan.scaling,
             unit=self.plan.unit,
             ending=end.ending,
@@ -222,16 +227,16 @@ class FlightTask(ABC):
             gram=gram,
             ridge=end.ridge * rms**2,
             middle=middle,
-            coefficients=end.flown.c,
+            coefficients=end.point.c,
             errors=self._errors(run),
             scores=self._scores(run),
             tail=end.tail,
         )
 
-    def _errors(self, run: Flight) -> ErrorStatistics:
+    def _errors(self, run: FreeRunFit) -> ErrorStatistics:
         """Noise covariance of the free run and Cov θ̂ from its sensitivities."""
         end, objective = run.end, run.objective
-        theta, nt = end.flown.theta, objective.physics
+        theta, nt = end.point.theta, objective.physics
         freedom = self.plan.segments.count - (nt + end.effective) / len(objective.weight)
         noise = self.plan.noise(objective, end)
         held = () if objective.bounds is None else zip(theta, *objective.bounds, strict=True)
@@ -241,18 +246,18 @@ class FlightTask(ABC):
             covariance = self._covariance(objective, end, noise, tuple(at_bound))
         return ErrorStatistics(noise, covariance, freedom, run.mean_square, at_bound)
 
-    def _scores(self, run: Flight) -> FreeRunScores | None:
+    def _scores(self, run: FreeRunFit) -> FreeRunScores | None:
         """What robust standard errors are made of; None for a run that ended nowhere."""
         if run.end.linear is None or not run.end.ending.usable:
             return None
-        objective, flown, slope = self.plan.looked_at(run.objective, run.end)
+        objective, point, slope = self.plan.looked_at(run.objective, run.end)
         rows = objective.start_rows
-        missed = np.moveaxis(objective.initial.measured - flown.states, -1, 1)
+        missed = np.moveaxis(objective.initial.measured - point.states, -1, 1)
         return FreeRunScores(
             dynamics=objective.dynamics,
-            numbers=self.plan.numbers(flown.c, flown.w),
+            numbers=self.plan.numbers(point.c, point.w),
             segments=objective.segments,
-            states=flown.states,
+            states=point.states,
             weight=objective.weight,
             unit=objective.rms**2,
             slope=slope,
@@ -264,6 +269,6 @@ class FlightTask(ABC):
         self, objective: FreeRunObjective, end: Descent, noise: Matrix, at_bound: tuple[int, ...]
     ) -> Matrix | None:
         assert end.linear is not None
-        information = objective.theta_information(end.linear, end.flown.w)
+        information = objective.theta_information(end.linear, end.point.w)
         white = objective.weight @ noise @ objective.weight.T
         return theta_block(information, end.ridge, objective.physics, at_bound) * float(np.trace(white)) / len(white)

@@ -47,7 +47,7 @@ class Tangent(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Ground:
+class LearnedLinearization:
     """The learner over M points in nl outputs or equations (`places`: name and unit).
 
     `target` is the learner in their units, `physics_moves` what the parameters, and starts of runs, do to what is
@@ -93,7 +93,7 @@ class Ground:
         return np.einsum("oi,mi->mo", self.weight, self.target).ravel()
 
 
-def ground_of(model: Model | MotionModel, record: Record) -> Ground:
+def linearization_of(model: Model | MotionModel, record: Record) -> LearnedLinearization:
     """The learner of a model over a record.
 
     Raises:
@@ -101,15 +101,15 @@ def ground_of(model: Model | MotionModel, record: Record) -> Ground:
     """
     if model.form.bound is None:
         raise InputError("the model is physics alone: it has no learner that could be explained.")
-    ground = _of_motion(model, record) if isinstance(model, MotionModel) else _of_lagged(model, record)
-    if len(ground.target) < FEWEST:
+    linearization = _of_motion(model, record) if isinstance(model, MotionModel) else _of_lagged(model, record)
+    if len(linearization.target) < FEWEST:
         raise InputError(
-            f"the learner has a value at {len(ground.target)} rows of the data; at least {FEWEST} are needed."
+            f"the learner has a value at {len(linearization.target)} rows of the data; at least {FEWEST} are needed."
         )
-    return ground
+    return linearization
 
 
-def _of_lagged(model: Model, record: Record) -> Ground:
+def _of_lagged(model: Model, record: Record) -> LearnedLinearization:
     form = model.form
     if form.states and not record.outputs:
         names = ", ".join(channel.name for channel in model.outputs)
@@ -133,7 +133,7 @@ def _of_lagged(model: Model, record: Record) -> Ground:
     columns = {lag: x[:, j] for j, lag in enumerate(form.layout)}
     own = tuple(dict.fromkeys(str(entry) for entry in form.features.entries))
     c = model.theta - model.theta_aux
-    return Ground(
+    return LearnedLinearization(
         target=target,
         physics_moves=_stacked(np.einsum("oi,mit->mot", model.weight, phi)),
         weight=np.asarray(model.weight),
@@ -153,7 +153,7 @@ def _of_lagged(model: Model, record: Record) -> Ground:
     )
 
 
-def _of_motion(model: MotionModel, record: Record) -> Ground:
+def _of_motion(model: MotionModel, record: Record) -> LearnedLinearization:
     form, numbers, motion = model.form, model.numbers, model.form.motion
     record = model.fitting(record, need_outputs=False)
     run = _Run.of(model, record)
@@ -169,7 +169,7 @@ def _of_motion(model: MotionModel, record: Record) -> Ground:
     z = np.asarray(form.seen(x.T, u.T, np)).T
     units = {channel.name: channel.unit for channel in (*model.outputs, *model.inputs)}
     units |= {parameter.name: parameter.unit for parameter in motion.parameters}
-    return Ground(
+    return LearnedLinearization(
         target=target,
         physics_moves=np.concatenate([linear.forward(slopes), linear.starts()], axis=1),
         weight=np.eye(len(learned)),
