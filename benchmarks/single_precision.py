@@ -19,7 +19,7 @@ from machine import alternate, describe
 import orthaug as oa
 from orthaug._base.jax import jax, jnp
 from orthaug._base.parallel import one_blas_thread
-from orthaug.fitting.normal_equations import Blocks, Hold, Summed, collect
+from orthaug.fitting.normal_equations import Blocks, Hold, SummedOneStep, collect
 from orthaug.fitting.one_step import OneStepTask
 from orthaug.models.learners import Bound
 from orthaug.models.rows import Chunk, InMemory, Overlap
@@ -68,7 +68,7 @@ def passes(task: OneStepTask, rough: bool) -> Callable[[Any, Overlap], Any]:
     nt = len(task.problem.baseline.names)
     hold = Hold(jnp.zeros((nt, nt)), jnp.zeros(nt))
     if not rough:
-        return Summed(task.engine, task.bound, task.rows, hold)
+        return SummedOneStep(task.engine, task.bound, task.rows, hold)
     made = jax.jit(collect)
     return lambda w, before: made(InMemory().sum(SingleBlocks(task.bound), task.rows, w, before), hold, before)
 

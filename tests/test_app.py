@@ -26,7 +26,7 @@ from test_cli import run, signals, write_csv
 from orthaug._base.errors import InputError
 from orthaug.commands.app import spec_text
 from orthaug.commands.app.gate import Gate
-from orthaug.commands.app.processes import Command, Desk, Run
+from orthaug.commands.app.processes import Command, Run, WorkerPool
 from orthaug.commands.app.session import Session, Sessions
 from orthaug.commands.app.worker import thinned
 from orthaug.commands.bars import training_bar
@@ -196,7 +196,7 @@ def test_the_address_in_the_browsers_arguments_opens_the_page_once():
 
 
 def test_each_dropped_file_keeps_its_content(tmp_path):
-    session = Session("key", tmp_path, Desk())
+    session = Session("key", tmp_path, WorkerPool())
 
     def drop(name: str, content: str) -> tuple[str, str]:
         partial = session.begin_file(name)
@@ -242,7 +242,7 @@ def test_a_file_beyond_the_limit_is_refused_before_it_comes(tmp_path, monkeypatc
 
 
 def test_a_session_keeps_to_its_folder(tmp_path):
-    session = Session("key", tmp_path, Desk())
+    session = Session("key", tmp_path, WorkerPool())
     assert session.place_for("../../etc/run one.csv") == tmp_path / "run one.csv"
     assert session.place_for("C:\\data\\<b>.CSV").parent == tmp_path
     for name in ("run.exe", ".csv", "", "spec.toml"):
@@ -318,7 +318,7 @@ def test_curves_of_the_loss_are_named_by_start_or_by_structure():
 def test_a_part_of_the_page_that_fails_keeps_no_other_from_what_is_new(tmp_path, monkeypatch):
     from orthaug.commands.app.routes import Page
 
-    session = Session("key", tmp_path, Desk())
+    session = Session("key", tmp_path, WorkerPool())
     page, told, seen = Page(session), [], []
     monkeypatch.setattr(page, "_complain", told.append)
     monkeypatch.setattr(page, "_name", lambda: None)
@@ -337,7 +337,7 @@ def test_a_process_that_cannot_start_is_told(tmp_path, monkeypatch):
         raise OSError(errno.EAGAIN, "Resource temporarily unavailable")
 
     async def looked() -> str:
-        session = Session("key", tmp_path, Desk())
+        session = Session("key", tmp_path, WorkerPool())
         session.desk.prepare()
         session.open_file(tmp_path / "run.csv")
         await session._look
@@ -352,7 +352,7 @@ def test_a_process_that_cannot_start_is_told(tmp_path, monkeypatch):
 
 async def failed(tmp_path) -> str:
     """What is told of a task that fails with what nobody expected."""
-    session = Session("key", tmp_path, Desk())
+    session = Session("key", tmp_path, WorkerPool())
     session.open_file(tmp_path / "run.csv")
     with pytest.raises(ZeroDivisionError):
         await session._look
@@ -369,7 +369,7 @@ def test_a_question_that_is_taken_back_leaves_its_process_to_the_next(tmp_path, 
         raise OSError(errno.EAGAIN, "later")
 
     async def twice() -> None:
-        desk = Desk()
+        desk = WorkerPool()
         desk.prepare()
         first = asyncio.ensure_future(desk.ask("look"))
         await asyncio.sleep(0.01)

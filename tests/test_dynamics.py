@@ -12,7 +12,7 @@ from orthaug._base.jax import jax, jnp
 from orthaug.data.record import Record
 from orthaug.data.regressors import Lags
 from orthaug.fitting.segments import build_segments, respond, sensitivity
-from orthaug.models.dynamics import Differentiated, Dynamics, Numbers, Parts
+from orthaug.models.dynamics import AutodiffDynamics, Dynamics, Numbers, Parts
 from orthaug.models.lagged import Lagged
 from orthaug.models.learners import MLP, Bound
 from orthaug.physics.baseline import Baseline, Term
@@ -22,7 +22,7 @@ from orthaug.physics.problem import pose
 
 
 @dataclass(frozen=True)
-class Generic(Differentiated, Lagged):
+class Generic(AutodiffDynamics, Lagged):
     """The lagged form by automatic differentiation of its step."""
 
 
@@ -110,7 +110,7 @@ def test_sensitivities_are_those_of_the_generic_form(name):
 
 
 @dataclass(frozen=True)
-class StateSpace(Differentiated):
+class StateSpace(AutodiffDynamics):
     """x⁺ = A x + B u, ŷ = C x, with all entries of A, B and C in θ; the state is not known from measured outputs."""
 
     outputs: tuple[str, ...]

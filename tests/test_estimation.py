@@ -12,7 +12,7 @@ from helpers import unfolded
 import orthaug as oa
 from orthaug._base.errors import InputError, RankError
 from orthaug._base.jax import jax, jnp
-from orthaug._base.progress import Enough
+from orthaug._base.progress import StopTraining
 from orthaug.data.record import Channel, Record
 from orthaug.data.regressors import Lags
 from orthaug.fitting.conclusion import orthogonalize
@@ -377,7 +377,7 @@ def test_a_learner_that_was_regularised_to_nothing_says_so():
 @pytest.mark.parametrize("solver", [LevenbergMarquardt(iterations=60), AdamLBFGS(40, 40)], ids=["lm", "paper"])
 def test_who_is_told_can_say_that_it_is_enough(record, solver):
     def enough(run, iteration, loss):
-        raise Enough
+        raise StopTraining
 
     found = estimate(record, PHYSICS, learner=NETWORK, solver=solver, restarts=2, progress=enough)
     assert found.status.code == "stopped" and found.status.ok and found.status.iterations == 1

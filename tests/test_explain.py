@@ -14,7 +14,7 @@ from orthaug._base.errors import InputError
 from orthaug.commands.spec import load_spec
 from orthaug.data.expressions import parse_named
 from orthaug.physics.motion import Output, State
-from orthaug.selection.added_physics import Added, added_to_motion
+from orthaug.selection.added_physics import NewTerm, added_to_motion
 from orthaug.selection.explaining import _written, candidates_of
 from orthaug.selection.learned_linearization import MotionResponse, _moved, linearization_of
 
@@ -259,7 +259,7 @@ def test_a_coefficient_within_an_equation_has_the_unit_of_the_sum_over_that_of_i
         inputs=["heat"],
     )
     units = {"heat": "W", "T": "degC", "h": "W/degC", "C": "J/degC"}
-    term = Added("lost", text, "T", -1e-8, "degC/s", scale=parse_named(text, motion.known, "the term"))
+    term = NewTerm("lost", text, "T", -1e-8, "degC/s", scale=parse_named(text, motion.known, "the term"))
     changed = added_to_motion(motion, np.array([0.5, 400.0]), [term], units)
     (lost,) = changed.parameters
     assert (lost.unit, lost.initial) == (unit, pytest.approx(4e-6))

@@ -35,7 +35,7 @@ from orthaug.models.lagged import Lagged
 from orthaug.models.learners import ACTIVATIONS, Bound
 from orthaug.models.model import Model
 from orthaug.models.motion_model import MotionModel
-from orthaug.models.moving import Moving
+from orthaug.models.moving import MotionDynamics
 from orthaug.models.terms import Terms
 from orthaug.physics.baseline import Baseline
 
@@ -103,7 +103,7 @@ def moving(motion: oa.Motion, features=(), learner=None, substeps=2) -> MotionMo
     numbers = Numbers(q, 0.02 * np.ones_like(q), weights, 0.1 * np.ones(nz), 1.5 * np.ones(nz), 0.3 * np.ones(values))
     ny = len(motion.outputs)
     return MotionModel(
-        form=Moving(motion, entries, bound, 0.1, substeps),
+        form=MotionDynamics(motion, entries, bound, 0.1, substeps),
         numbers=numbers,
         outputs=tuple(oa.Channel(output.name, "m") for output in motion.outputs),
         inputs=tuple(oa.Channel(name, "N") for name in motion.inputs),

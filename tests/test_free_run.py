@@ -11,7 +11,7 @@ import scipy.signal
 
 from orthaug._base.errors import InputError
 from orthaug._base.jax import jax, jnp
-from orthaug._base.progress import Enough
+from orthaug._base.progress import StopTraining
 from orthaug.data.record import Record
 from orthaug.fitting.criteria import Prediction, Simulation
 from orthaug.fitting.estimation import estimate as choosing
@@ -620,7 +620,7 @@ def test_evidence_keeps_a_learner_that_the_data_need():
 def test_a_run_that_is_stopped_is_kept_and_tried_on_no_block():
     def enough_after_physics(run, iteration, loss):
         if iteration > 12:
-            raise Enough
+            raise StopTraining
 
     found = choosing(record(), PHYSICS, learner=NETWORK, solver=LM, criterion=FREE, progress=enough_after_physics)
     assert found.status.code == "stopped" and found.held_out is None

@@ -24,7 +24,7 @@ from orthaug.data.regressors import Lags, stack_rows
 from orthaug.fitting.conclusion import orthogonalize
 from orthaug.fitting.estimation import estimate
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
-from orthaug.models.dynamics import Differentiated, Dynamics, Parts
+from orthaug.models.dynamics import AutodiffDynamics, Dynamics, Parts
 from orthaug.models.learners import MLP, Function
 from orthaug.models.model import Model
 from orthaug.models.storage import load, save
@@ -546,7 +546,7 @@ def test_channels_by_name(network):
 
 
 @dataclass(frozen=True)
-class Oscillator(Differentiated):
+class Oscillator(AutodiffDynamics):
     """x⁺ = A x + (0, u), y = x₁ + x₂³ of a state that nobody measures: no past outputs anywhere."""
 
     a: tuple[tuple[float, ...], ...]

@@ -11,7 +11,7 @@ import pytest
 from test_free_run import PHYSICS, nonlinear
 
 import orthaug as oa
-from orthaug._base.progress import Enough
+from orthaug._base.progress import StopTraining
 from orthaug.fitting import one_step
 from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.structures import Orthogonal
@@ -71,7 +71,7 @@ def test_progress_counts_passes_over_all_rows_and_asks_for_an_end_in_both(many):
 
     def enough(run, iteration, loss):
         few.append(iteration)
-        raise Enough
+        raise StopTraining
 
     found = fitted(progress=enough)
     assert few[0] == 0 < few[-1] and len(few) <= 4  # a run that is stopped above physics alone starts anew, silent

@@ -15,10 +15,10 @@ import orthaug.fitting.segments as laid
 from orthaug._base.jax import jax
 from orthaug.data.expressions import parse_named
 from orthaug.fitting.segments import build_segments, respond, sensitivity
-from orthaug.models.dynamics import Differentiated, Numbers
+from orthaug.models.dynamics import AutodiffDynamics, Numbers
 from orthaug.models.integrators import held
 from orthaug.models.learners import Bound
-from orthaug.models.moving import Moving
+from orthaug.models.moving import MotionDynamics
 from orthaug.models.settling import Windows, settle
 from orthaug.physics.motion_problem import guess
 
@@ -45,11 +45,11 @@ def numbers(motion: oa.Motion, weights=()) -> Numbers:
     return Numbers(q, np.zeros_like(q), np.asarray(weights), np.zeros(2), np.ones(2), np.array([0.5, 0.1]))
 
 
-def with_learner(motion: oa.Motion, substeps: int) -> tuple[Moving, Numbers]:
+def with_learner(motion: oa.Motion, substeps: int) -> tuple[MotionDynamics, Numbers]:
     features = tuple(parse_named(text, motion.known, "feature") for text in ("v", "x*u"))
     bound = Bound(oa.MLP((3,)), 2, 2)
     weights = 0.3 * np.random.default_rng(0).normal(size=bound.size)
-    return Moving(motion, features, bound, TS, substeps), numbers(motion, weights)
+    return MotionDynamics(motion, features, bound, TS, substeps), numbers(motion, weights)
 
 
 def record(rows: int = 60) -> oa.Record:
@@ -57,7 +57,7 @@ def record(rows: int = 60) -> oa.Record:
     return oa.Record.from_arrays(u=rng.normal(size=rows), y=0.1 * rng.normal(size=rows), sampling_time=TS)
 
 
-def run(form: Moving, made: Numbers, data: oa.Record, start) -> np.ndarray:
+def run(form: MotionDynamics, made: Numbers, data: oa.Record, start) -> np.ndarray:
     inputs = form.inputs(data.experiments[0], data)
 
     @jax.jit
@@ -75,7 +75,7 @@ def test_an_exact_step_is_that_of_the_matrix_exponential(hold: str) -> None:
     a, b = np.array([[0, 1], [-k / m, -c / m]]), np.array([[0], [1 / m]])
     data = record()
     u = data.experiments[0].inputs[:, 0]
-    ours = run(Moving(motion, (), None, TS, 1), numbers(motion), data, [0.3, -0.2])
+    ours = run(MotionDynamics(motion, (), None, TS, 1), numbers(motion), data, [0.3, -0.2])
     if method == "zoh":
         ad, bd, *_ = scipy.signal.cont2discrete((a, b, np.eye(2), np.zeros((2, 1))), TS, "zoh")
         x = np.array([0.3, -0.2])
@@ -99,7 +99,7 @@ def test_a_nonlinear_motion_under_a_spline_is_that_of_an_adaptive_integrator(int
     )
     time = TS * np.arange(80)
     data = oa.Record.from_arrays(u=np.sin(3 * time), y=np.zeros(80), sampling_time=TS)
-    ours = run(Moving(motion, (), None, TS, substeps), numbers(motion), data, [0.5, 0.0])
+    ours = run(MotionDynamics(motion, (), None, TS, substeps), numbers(motion), data, [0.5, 0.0])
 
     def rates(t, x):
         return [x[1], np.sin(3 * t) - 0.4 * x[1] - 4 * x[0] - 3 * x[0] ** 3]
@@ -124,7 +124,7 @@ def test_the_adjoint_of_the_stages_gives_the_derivatives(integrator: str, subste
     points = {"zero-order": 1, "spline": 2 * substeps + 1}[hold]
     state, inputs = rng.normal(size=(2, 5)), rng.normal(size=(points, 5))
     given = (made, state, inputs)
-    ours, plain = jax.jit(form.local)(*given), jax.jit(partial(Differentiated.local, form))(*given)
+    ours, plain = jax.jit(form.local)(*given), jax.jit(partial(AutodiffDynamics.local, form))(*given)
     for one, other in zip(ours, plain, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-13)
 
@@ -168,7 +168,7 @@ def test_sensitivities_of_steps_at_once_are_those_step_by_step(monkeypatch: pyte
 
 def test_a_start_is_guessed_and_then_settled() -> None:
     motion = spring()
-    form, made = Moving(motion, (), None, TS, 1), numbers(motion)
+    form, made = MotionDynamics(motion, (), None, TS, 1), numbers(motion)
     data = record(64)
     truth = run(form, made, data, [0.4, -1.0])
     guessed = guess(motion, truth[:, :1], [0, 30], TS)
@@ -187,7 +187,7 @@ def test_a_start_that_no_row_shows_stays_where_it_was_guessed() -> None:
         inputs=["u"],
         parameters=[oa.PhysicalParameter("a", 1.0)],
     )
-    form, data = Moving(motion, (), None, TS, 1), record(20)
+    form, data = MotionDynamics(motion, (), None, TS, 1), record(20)
     made = numbers(motion)
     inputs, outputs = form.inputs(data.experiments[0], data), data.experiments[0].outputs
     windows = Windows(inputs[..., None], outputs[..., None], np.ones((20, 1), dtype=bool))

@@ -11,7 +11,7 @@ import orthaug as oa
 from orthaug.data.expressions import parse_named
 from orthaug.inference.motion_split import shared_of_motion
 from orthaug.models.learners import Bound
-from orthaug.models.moving import Moving
+from orthaug.models.moving import MotionDynamics
 from orthaug.selection.learned_linearization import linearization_of
 
 TS = 0.05
@@ -175,7 +175,7 @@ def test_standard_errors_of_a_split_are_those_of_its_slope(fitted: oa.MotionEsti
 def test_shared_directions_of_the_spring(seen: tuple[str, ...], shared: int) -> None:
     motion = spring(learned=True)
     features = tuple(parse_named(text, motion.known, "feature") for text in seen)
-    form = Moving(motion, features, Bound(oa.MLP((2,)), len(seen), 1), TS, 1)
+    form = MotionDynamics(motion, features, Bound(oa.MLP((2,)), len(seen), 1), TS, 1)
     rng = np.random.default_rng(0)
     found = shared_of_motion(form, motion.coordinates.initial, rng.normal(size=(200, 2)), rng.normal(size=(200, 1)))
     assert found.basis.shape[1] == shared
@@ -185,7 +185,7 @@ def test_shared_directions_of_the_spring(seen: tuple[str, ...], shared: int) -> 
 def test_shared_directions_of_a_duffing_equation(seen: tuple[str, ...], shared: int) -> None:
     motion = spring(learned=True, extra=" - k3*x**3", more=[oa.PhysicalParameter("k3", 2.0)])
     features = tuple(parse_named(text, motion.known, "feature") for text in seen)
-    form = Moving(motion, features, Bound(oa.MLP((2,)), len(seen), 1), TS, 1)
+    form = MotionDynamics(motion, features, Bound(oa.MLP((2,)), len(seen), 1), TS, 1)
     rng = np.random.default_rng(0)
     found = shared_of_motion(form, motion.coordinates.initial, rng.normal(size=(200, 2)), rng.normal(size=(200, 1)))
     assert found.basis.shape[1] == shared

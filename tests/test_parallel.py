@@ -14,7 +14,7 @@ import scipy.linalg  # noqa: F401  (brings a BLAS of its own)
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from orthaug._base import parallel
-from orthaug._base.parallel import Stopped, one_blas_thread, spread
+from orthaug._base.parallel import RunCancelled, one_blas_thread, spread
 from orthaug.data.record import Record
 from orthaug.fitting.estimation import estimate
 from orthaug.fitting.solvers.adam_lbfgs import AdamLBFGS
@@ -72,7 +72,7 @@ def until_stopped(ended: Counter, check) -> None:
     for _ in range(200):
         try:
             check()
-        except Stopped:
+        except RunCancelled:
             ended["stopped"] += 1
             raise
         time.sleep(0.01)

@@ -15,7 +15,7 @@ from test_cli import SPEC, finite_json, make_project, one_line, run
 
 from orthaug._base.errors import InputError, KeyedError
 from orthaug._base.jax import jnp
-from orthaug._base.registry import LIBRARY_ONLY, InSpec, OneOf, Registry, check_fields, keys_of
+from orthaug._base.registry import LIBRARY_ONLY, OneOf, Registry, SpecLimit, check_fields, keys_of
 from orthaug.commands.spec import load_spec
 from orthaug.data.readers import read_record
 from orthaug.fitting.criteria import Prediction, Simulation
@@ -248,7 +248,7 @@ def test_entries_that_are_refused(registry, kind, declaration, message):
 @dataclass(frozen=True)
 class Whole:
     path: str
-    count: Annotated[int, Ge(0), InSpec(Ge(1))] = 3
+    count: Annotated[int, Ge(0), SpecLimit(Ge(1))] = 3
     size: Annotated[float, Gt(0)] = 1.0
     shape: Annotated[str, OneOf(("round", "square"))] = "round"
     hidden: int = field(default=0, metadata=LIBRARY_ONLY)

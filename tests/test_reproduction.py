@@ -31,7 +31,7 @@ from orthaug.studies.references import Spread
 from orthaug.studies.reproduction import (
     HYPHEN,
     WIDTH,
-    Reproduced,
+    StudyOutcome,
     as_rows,
     catalogue,
     chosen,
@@ -75,7 +75,7 @@ EXACT: dict[str, str] = {  # rows of which θ is solved, whatever the learner do
 }
 
 
-def reduced(store: Path) -> list[Reproduced]:
+def reduced(store: Path) -> list[StudyOutcome]:
     """Every study at its reduced size; where training takes longest it ends before it has converged.
 
     The uniform measure's rule has 2¹² of its 2²⁰ nodes, which integrate these smooth functions to rounding as well.
@@ -86,7 +86,7 @@ def reduced(store: Path) -> list[Reproduced]:
         return reproduce(chosen(None), small=True, store=store)
 
 
-def stored_columns(one: Reproduced) -> dict[str, list]:
+def stored_columns(one: StudyOutcome) -> dict[str, list]:
     """What is kept of a study: its axes, and the columns that are compared."""
     name = one.entry.name
     axes = list(one.entry.study("ours", True).grid)
@@ -100,7 +100,7 @@ def store(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def found(store) -> list[Reproduced]:
+def found(store) -> list[StudyOutcome]:
     return reduced(store)
 
 
@@ -202,7 +202,7 @@ def test_what_the_scripts_gave_is_drawn_from_their_smallest_to_their_largest_run
     assert [float(line.get_ydata()[0]) for line in (drawn[0], *drawn[1])] == [2.0, 0.5, 9.0]
 
 
-def by_quantity(found: list[Reproduced], name: str, start: str) -> Finding:
+def by_quantity(found: list[StudyOutcome], name: str, start: str) -> Finding:
     one = next(o for o in found if o.entry.name == name)
     (finding,) = (f for f in one.findings if f.quantity.startswith(start))
     return finding

@@ -15,7 +15,7 @@ import pytest
 from test_cli import SPEC, make_project, one_line, run
 
 from orthaug._base.errors import InputError
-from orthaug._base.jax import Checked
+from orthaug._base.jax import ChecksummedCache
 from orthaug.commands import streams
 from orthaug.commands.folder import check_figure, check_folder
 
@@ -161,7 +161,7 @@ class Store(dict):
 
 def test_programs_that_were_exchanged_or_cut_are_not_used(tmp_path):
     store = Store()
-    cache = Checked(store, str(tmp_path))
+    cache = ChecksummedCache(store, str(tmp_path))
     cache.put("one", b"first")
     cache.put("two", b"second")
     assert cache.get("one") == b"first" and cache.get("three") is None

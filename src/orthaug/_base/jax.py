@@ -55,7 +55,7 @@ def _real_jnp() -> Any:
     return _real_jax().numpy
 
 
-class _Late:
+class _LazyModule:
     """A module that is imported when one of its names is first asked for."""
 
     def __init__(self, real: Callable[[], Any], **own: Any) -> None:
@@ -99,7 +99,7 @@ def is_traced(value: Any) -> bool:
     return isinstance(value, Tracer)
 
 
-class _Compiling(threading.local):
+class _CompileTimes(threading.local):
     """When this thread traced and compiled, as disjoint spans of time [s] in order."""
 
     def __init__(self) -> None:
@@ -118,13 +118,13 @@ class _Compiling(threading.local):
         self.total += duration
 
 
-_compiling: list[_Compiling] = []
+_compiling: list[_CompileTimes] = []
 
 
 def training_clock() -> float:
     """A clock of this thread [s] that stands still while JAX compiles: its differences are what computing took."""
     if not _compiling:
-        _compiling.append(_Compiling())
+        _compiling.append(_CompileTimes())
         _real_jax().monitoring.register_event_duration_secs_listener(_compiling[0].note)
     return time.perf_counter() - _compiling[0].total
 
@@ -138,7 +138,7 @@ def padded_length(rows: int) -> int:
 
 
 if not TYPE_CHECKING:
-    jax, jnp = _Late(_real_jax, jit=_late_jit), _Late(_real_jnp)
+    jax, jnp = _LazyModule(_real_jax, jit=_late_jit), _LazyModule(_real_jnp)
     if "jax" in sys.modules:  # then it costs nothing, and what the user computes is in double precision too
         _real_jax()
 
@@ -154,7 +154,7 @@ def use_compilation_cache() -> None:
     _check_cached_programs()
 
 
-class Checked:
+class ChecksummedCache:
     """A cache of JAX whose entries end with a checksum of their key and content; a cache without writing is silent."""
 
     def __init__(self, cache: Any, folder: str) -> None:
@@ -201,6 +201,6 @@ def _check_cached_programs() -> None:
             made = make(path)
         except Exception:  # a place that cannot be written
             return None
-        return made and (Checked(made[0], path), made[1])
+        return made and (ChecksummedCache(made[0], path), made[1])
 
     compilation_cache.get_file_cache = checked

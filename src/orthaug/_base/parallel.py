@@ -59,7 +59,7 @@ def _blas() -> ThreadpoolController:
     return ThreadpoolController().select(user_api="blas")
 
 
-class Stopped(Exception):
+class RunCancelled(Exception):
     """Another run failed, or the user pressed Ctrl-C: this run's result is no longer wanted."""
 
 
@@ -78,14 +78,14 @@ def each(
     The first that fails ends the others, and so does a caller that takes no more.
 
     Args:
-        function: calls `check()` now and then, which raises `Stopped` once the results are not wanted.
+        function: calls `check()` now and then, which raises `RunCancelled` once the results are not wanted.
         workers: how many at a time; by default the machine's cores.
     """
     stop = threading.Event()
 
     def check() -> None:
         if stop.is_set():
-            raise Stopped
+            raise RunCancelled
 
     workers = min(len(items), workers or cores())
     if workers <= 1:
@@ -126,7 +126,7 @@ class Threads:
 
         Args:
             function: of a module, so that it can be sent elsewhere. It calls `tell(…)` now and then, which raises
-                `Stopped` once the results are not wanted.
+                `RunCancelled` once the results are not wanted.
             given: what all runs share.
             heard: called with the number of an item and what its run tells.
         """

@@ -13,10 +13,10 @@ from typing import Any
 LOG = logging.getLogger("orthaug")
 LOG.addHandler(logging.NullHandler())
 
-Tell = Callable[[int, int, float], None]
+ProgressCallback = Callable[[int, int, float], None]
 """Called now and then with the number of the run, its iteration and the loss; it may raise to stop the training.
 
-What it raises ends it without a result, but for `Enough`.
+What it raises ends it without a result, but for `StopTraining`.
 """
 
 
@@ -24,11 +24,11 @@ Plan = Sequence[Mapping[str, Any]]
 """What is known of each run of a fit: `structure`, `start` from 1 on, `regularization`."""
 
 
-RunTell = Callable[[int, float], None]
+RunProgress = Callable[[int, float], None]
 """The same of one run: called with its iteration and the loss."""
 
 
-class Enough(Exception):
+class StopTraining(Exception):
     """Raised by whoever is told: end this run with what it has reached, as its result."""
 
 
@@ -56,7 +56,7 @@ class Progress:
         2 20 0.5
     """
 
-    tell: Tell = _nothing
+    tell: ProgressCallback = _nothing
     runs: int = 0
     iterations: int = 0
     plan: Callable[[int, Plan], None] = _unplanned
@@ -73,7 +73,7 @@ class Progress:
         """Say what the runs that follow are."""
         self.plan(self.runs, plan)
 
-    def of(self, run: int) -> RunTell:
+    def of(self, run: int) -> RunProgress:
         """What one run tells: its iteration and the loss."""
         return lambda iteration, loss: self(run, iteration, loss)
 

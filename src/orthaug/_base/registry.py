@@ -33,7 +33,7 @@ class OneOf:
 
 
 @dataclass(frozen=True)
-class InSpec:
+class SpecLimit:
     """In `Annotated`: a limit that holds in a spec only."""
 
     limit: Any

@@ -16,14 +16,14 @@ Result = TypeVar("Result")
 MAKERS: dict[str, Callable[..., Any]] = {}  # html, plot, report, progress
 
 
-class Shown:
+class NotebookView:
     """Is shown in a notebook as a table."""
 
     def _repr_html_(self) -> str:
         return MAKERS["html"](self)
 
 
-class ShownFit(Shown):
+class FitView(NotebookView):
     """A fit with figures and a page."""
 
     @property

@@ -33,7 +33,7 @@ _SEED = 20_241_122
 
 
 @dataclass(frozen=True, eq=False)
-class Absorbed:
+class TermAfterFit:
     """A term of coefficient 1 after the fit.
 
     `moved` (nθ,) is what it adds to c. `held` (M, ny) is what the learner holds of it on a measure's points. `seen`
@@ -139,7 +139,7 @@ def absorbed(
     terms: Iterable[Callable[[Matrix], Matrix]],
     seen: Iterable[bool],
     x: Matrix,
-) -> list[Absorbed]:
+) -> list[TermAfterFit]:
     """What a fit makes of each term, to first order.
 
     Args:
@@ -151,13 +151,13 @@ def absorbed(
     found = []
     for term, visible in zip(terms, seen, strict=True):
         if visible:
-            found.append(Absorbed(np.zeros(nt), term(x), True))
+            found.append(TermAfterFit(np.zeros(nt), term(x), True))
         else:
             found.append(_unseen(smoother, term, x))
     return found
 
 
-def _unseen(smoother: Smoother, term: Callable[[Matrix], Matrix], x: Matrix) -> Absorbed:
+def _unseen(smoother: Smoother, term: Callable[[Matrix], Matrix], x: Matrix) -> TermAfterFit:
     problem = smoother.problem
     rows = problem.rows.x[smoother.every]
     phi = np.asarray(problem.baseline.phi(rows, problem.layout, problem.outputs, np))
@@ -170,7 +170,7 @@ def _unseen(smoother: Smoother, term: Callable[[Matrix], Matrix], x: Matrix) -> 
         size = np.sqrt(np.sum(times(gain, phi)[..., others] ** 2, axis=(0, 1)))
         size = np.where(size > 0, size, 1.0)
         moved[others] = np.linalg.lstsq(columns / size, target.reshape(-1), rcond=1e-8)[0] / size
-    return Absorbed(moved, smoother.mean(delta - phi @ moved, x), False)
+    return TermAfterFit(moved, smoother.mean(delta - phi @ moved, x), False)
 
 
 def completing(basis: Matrix) -> list[int]:

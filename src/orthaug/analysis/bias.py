@@ -20,7 +20,7 @@ from jaxtyping import Float
 from orthaug._base.checks import Matrix, Vector, check_unique
 from orthaug._base.errors import InputError
 from orthaug._base.lines import percent
-from orthaug.analysis.absorbed import Absorbed
+from orthaug.analysis.absorbed import TermAfterFit
 from orthaug.analysis.suspects import Suspect
 from orthaug.physics.excitation import excitation, require_rank
 from orthaug.physics.output_weights import times
@@ -175,7 +175,7 @@ def bias_table(
     learned: Matrix | None = None,
     certify: bool = True,
     directions: Matrix | None = None,
-    absorbed: Sequence[Absorbed] | None = None,
+    absorbed: Sequence[TermAfterFit] | None = None,
 ) -> tuple[SuspectedBias, ...]:
     """One `SuspectedBias` for each suspect, under the measure that `projection` was made with.
 

@@ -46,7 +46,7 @@ class Candidate:
 
 
 @dataclass(frozen=True, eq=False)
-class Named(Candidate):
+class NamedCause(Candidate):
     """The cause that is named, with the standard deviation of what it leaves."""
 
     rest: Vector | float = 0.0

@@ -23,7 +23,7 @@ from orthaug.analysis.bias import SuspectedBias, orthogonal_part
 from orthaug.analysis.bias_hull import (
     MOST_PHYSICS,
     Candidate,
-    Named,
+    NamedCause,
     compatible,
     hull,
     is_determined,
@@ -182,7 +182,7 @@ def _candidates(
 ) -> list[Candidate]:
     """Return the named causes, and what may stand instead of one of them."""
     several = " and ".join(cause.suspect.name for _, cause in found)
-    kept: list[Candidate] = [Named(several, min(explains(cause) for _, cause in found), bias, rest=rest)]
+    kept: list[Candidate] = [NamedCause(several, min(explains(cause) for _, cause in found), bias, rest=rest)]
     for own, cause in found:
         others = (*_declared(own, suspects), *_usual(own), *_families(own))
         others += own.table(saturations([entry.suspect for entry in others]), certify=False, every=False)

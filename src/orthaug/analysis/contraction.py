@@ -12,7 +12,7 @@ from scipy import linalg
 from orthaug._base.checks import Matrix, Vector, check_count
 from orthaug._base.parallel import one_blas_thread
 from orthaug.analysis.feedback import MOST_WORK, Feedback, feedback, linearised
-from orthaug.analysis.visited import Place, evenly
+from orthaug.analysis.visited import RunPoint, evenly
 from orthaug.data.record import Record
 from orthaug.models.model import Model
 from orthaug.models.response import Response
@@ -37,7 +37,7 @@ class Contraction:
     samples: int
     overshoot: float
     metric: Matrix
-    worst: Place
+    worst: RunPoint
 
 
 @one_blas_thread()

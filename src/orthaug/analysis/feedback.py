@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Vector, check_choice
 from orthaug._base.jax import Array, jax, jnp
-from orthaug.analysis.visited import MOST_STEPS, Place, Visited, measured_by, positive, visited_by
+from orthaug.analysis.visited import MOST_STEPS, RunPoint, RunPoints, measured_by, positive, visited_by
 from orthaug.data.record import Record
 from orthaug.models.dynamics import Dynamics, Numbers
 from orthaug.models.model import Model
@@ -29,7 +29,7 @@ MOST_WORK = 4e7  # rows times n0³
 _LONGEST_STATE = 200  # n0 with eigenvalues at all
 
 
-def linearised(model: Model, visited: Visited) -> tuple[Visited, Float[np.ndarray, "m n0 n0"], Vector]:
+def linearised(model: Model, visited: RunPoints) -> tuple[RunPoints, Float[np.ndarray, "m n0 n0"], Vector]:
     """The points with finite derivatives, A_k there, and its spectral radii (m,)."""
     transition = transitions(model, visited.states, visited.inputs)
     finite = (np.abs(transition) < _NO_DERIVATIVE).all(axis=(1, 2))
@@ -86,14 +86,14 @@ class Feedback:
     says in which output and where a free run left all bounds; `unit` (n0,) is the deviation of each entry of the state.
     """
 
-    points: Visited
+    points: RunPoints
     transition: Float[np.ndarray, "m n0 n0"]
     radius: Vector
     unit: Vector
     largest: float | None
     median: float | None
     share_above_one: float | None
-    worst: Place | None
+    worst: RunPoint | None
     steps: int
     skipped: int
     diverged: tuple[str, ...]

@@ -14,7 +14,7 @@ from orthaug.analysis.measure_bias import physical_slopes
 from orthaug.data.expressions import parse, parse_named
 from orthaug.data.regressors import Features
 from orthaug.inference.motion_split import shared_of_motion
-from orthaug.models.moving import Moving
+from orthaug.models.moving import MotionDynamics
 from orthaug.physics.motion import Motion
 from orthaug.physics.parameters import PhysicsMap
 from orthaug.physics.problem import Problem
@@ -205,7 +205,7 @@ def _listed(words: tuple[str, ...] | list[str]) -> str:
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}" if words else "nothing"
 
 
-def imitation_before(form: Moving, q: Vector, x: Matrix, u: Matrix) -> MotionImitation:
+def imitation_before(form: MotionDynamics, q: Vector, x: Matrix, u: Matrix) -> MotionImitation:
     """What a learner on the form's features would share with the physics, and what others would.
 
     Args:

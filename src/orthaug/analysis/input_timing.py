@@ -27,7 +27,7 @@ _REFITTED = 30  # iterations from where the declared hold ended
 
 
 @dataclass(frozen=True)
-class Held:
+class HoldTrial:
     """The residual of physics alone under a hold, RMS in deviations of the outputs; None where it has no run."""
 
     hold: str
@@ -43,7 +43,7 @@ class Trial:
 
     rows: int
     substeps: int | None
-    holds: tuple[Held, ...]
+    holds: tuple[HoldTrial, ...]
     task: MotionTask = field(repr=False, compare=False)
     """With physics alone trained."""
 
@@ -88,13 +88,13 @@ def on_longest(
     return MotionTask.of(problem.on(record), learner, criterion).prepared(solver, structure)
 
 
-def _under(hold: str, task: MotionTask, solver: Any) -> Held:
+def _under(hold: str, task: MotionTask, solver: Any) -> HoldTrial:
     assert task.physics is not None
     try:
         motion = replace(task.problem.motion, hold=hold)
         return _held(*refitted(task, task.physics, motion, task.problem.record, solver), declared=False)
     except InputError:
-        return Held(hold, None, False)
+        return HoldTrial(hold, None, False)
 
 
 def refitted(
@@ -122,12 +122,12 @@ def residual_of(segmented: SegmentedMotion, free_fit: FreeRunFit | None) -> floa
     return value if np.isfinite(value) else float("inf")
 
 
-def _held(segmented: SegmentedMotion, free_fit: FreeRunFit | None, *, declared: bool) -> Held:
+def _held(segmented: SegmentedMotion, free_fit: FreeRunFit | None, *, declared: bool) -> HoldTrial:
     motion, value = segmented.problem.motion, residual_of(segmented, free_fit)
     if free_fit is None or value == float("inf"):
-        return Held(motion.hold, None, declared)
+        return HoldTrial(motion.hold, None, declared)
     p = motion.coordinates.physical(free_fit.end.point.theta)
-    return Held(motion.hold, value, declared, dict(zip(motion.names, map(float, p), strict=True)))
+    return HoldTrial(motion.hold, value, declared, dict(zip(motion.names, map(float, p), strict=True)))
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from orthaug.inference.covariance import reach
 from orthaug.inference.motion_split import rest_of
 from orthaug.models.dynamics import Numbers
 from orthaug.models.motion_field import labels_of, parts_at
-from orthaug.models.moving import Moving
+from orthaug.models.moving import MotionDynamics
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def learned_reach(fit: MotionEstimate, x: Matrix, u: Matrix) -> Matrix | None:
 
 @partial(jax.jit, static_argnames="form")
 def _slopes(
-    form: Moving, numbers: Numbers, x: Float[Array, "m nx"], u: Float[Array, "m nu"]
+    form: MotionDynamics, numbers: Numbers, x: Float[Array, "m nx"], u: Float[Array, "m nu"]
 ) -> tuple[Float[Array, "m nl np"], Float[Array, "m nl n"]]:
     """How the learner's part follows p̂, and (c, w)."""
     c = numbers.theta - numbers.theta_aux

@@ -22,7 +22,7 @@ from orthaug.models.dynamics import Numbers
 from orthaug.models.lagged import Lagged
 from orthaug.models.model import Model
 from orthaug.models.motion_model import MotionModel
-from orthaug.models.moving import Moving
+from orthaug.models.moving import MotionDynamics
 from orthaug.models.stepping import Memory, step_inputs, step_lagged
 
 _WIDTH = 1e-3  # of differences, in sizes: bears a learner in single precision
@@ -80,7 +80,7 @@ class LaggedStep:
 class MotionStep:
     """As `LaggedStep`, of a motion; it rests where no state changes."""
 
-    form: Moving
+    form: MotionDynamics
 
     @property
     def continuous(self) -> bool:

@@ -14,7 +14,7 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
 from orthaug._base.jax import Array, jax, jnp
 from orthaug.analysis.feedback import by_differences, difference_width
-from orthaug.analysis.visited import MOST_STEPS, Place, Where, evenly, positive, usable
+from orthaug.analysis.visited import MOST_STEPS, RowIndex, RunPoint, evenly, positive, usable
 from orthaug.data.record import Record
 from orthaug.models.dynamics import Numbers
 from orthaug.models.lagged import Lagged
@@ -37,13 +37,13 @@ class Lipschitz:
 
     gradient: float | None
     gradient_scaled: float | None
-    worst: Place | None
+    worst: RunPoint | None
     phi: float | None
     phi_scaled: float | None
-    phi_worst: Place | None
+    phi_worst: RunPoint | None
     weights: float | None
     weights_scaled: float | None
-    weights_worst: Place | None
+    weights_worst: RunPoint | None
     rows: int
     weights_rows: int
 
@@ -97,7 +97,7 @@ def lipschitz(model: Model, record: Record, *, x: Matrix | None = None) -> Lipsc
     return Lipschitz(*largest, rows=len(x), weights_rows=len(fewer))
 
 
-def _measured(model: Model, record: Record, x: Matrix | None) -> tuple[Matrix, Where, Vector]:
+def _measured(model: Model, record: Record, x: Matrix | None) -> tuple[Matrix, RowIndex, Vector]:
     """Regressors of measured outputs, where each stands, and deviations of these outputs (ny,)."""
     form, record = model.form, usable(model, record)
     lengths = [len(e) - form.first_row for e in record.experiments]
@@ -106,7 +106,7 @@ def _measured(model: Model, record: Record, x: Matrix | None) -> tuple[Matrix, W
     elif np.shape(x) != (wanted := (sum(lengths), len(form.layout))):
         raise InputError(f"`x` has shape {np.shape(x)}; the usable regressors of the record have {wanted}.")
     outputs = np.concatenate([e.outputs for e in record.experiments])
-    return x, Where.of(lengths, form.first_row), positive(outputs.std(axis=0))
+    return x, RowIndex.of(lengths, form.first_row), positive(outputs.std(axis=0))
 
 
 def _gradients(form: Lagged, numbers: Numbers, x: Matrix) -> Iterator[list[Any]]:

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug.analysis.absorbed import Absorbed, absorbed
+from orthaug.analysis.absorbed import TermAfterFit, absorbed
 from orthaug.analysis.bias import SuspectedBias, bias_table
 from orthaug.analysis.suspects import Suspect, suspect_columns, usual_suspects
 from orthaug.inference.covariance import reach
-from orthaug.inference.measures import Weighed
+from orthaug.inference.measures import WeighedPhysics
 from orthaug.inference.physical import PhysicalEstimate, solve
 from orthaug.physics.output_weights import times
 from orthaug.physics.parameters import PhysicsMap
@@ -37,7 +37,7 @@ class MeasureLinearization:
         directions: (nθ, s) along which θ is split; None for all.
     """
 
-    weighed: Weighed
+    weighed: WeighedPhysics
     problem: Problem
     theta: Vector
     physics: PhysicsMap | None = None
@@ -84,7 +84,7 @@ class MeasureLinearization:
         )
         return replace(self, learned=np.asarray(self.learned) - (entry.coefficient_found or 0.0) * held)
 
-    def _absorbed(self, suspects: Sequence[Suspect]) -> list[Absorbed]:
+    def _absorbed(self, suspects: Sequence[Suspect]) -> list[TermAfterFit]:
         problem = self.problem
         layout, outputs = problem.layout, problem.outputs
 

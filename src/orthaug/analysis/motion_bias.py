@@ -19,7 +19,7 @@ import numpy as np
 from orthaug._base.checks import Matrix, Vector, check_type
 from orthaug.analysis.absorbed import completing
 from orthaug.analysis.bias import IN_SPAN, Certificate, SuspectedBias, find_certificate
-from orthaug.analysis.motion_response import Place, TermsResponse, respond_to
+from orthaug.analysis.motion_response import FreeRunPoint, TermsResponse, respond_to
 from orthaug.analysis.motion_suspects import (
     MotionSuspect,
     check_motion_suspects,
@@ -43,7 +43,7 @@ CERTIFIED_POINTS = 20_000  # of a measure at most, over which certificates and t
 
 
 @dataclass(frozen=True)
-class Told:
+class ResidualStep:
     """What the free run's residual tells of a term beside all that was fitted: one Gauss-Newton step.
 
     `share` is by how much of the residual's squares it falls, `left` what stays of them beyond white noise.
@@ -78,7 +78,7 @@ class TermBias:
     explained: float | None
     coefficient_found: float | None
     certificate: Certificate | None
-    residual: Told | None
+    residual: ResidualStep | None
 
     @property
     def removed_by(self) -> str | None:
@@ -119,7 +119,7 @@ class MotionLinearization:
         unknown: parameters that no output tells: a term does anything to them.
     """
 
-    place: Place
+    place: FreeRunPoint
     q: Vector
     shared: Shared
     field: Field
@@ -171,14 +171,14 @@ class MotionLinearization:
         if not np.isfinite(response.information).all() or not np.isfinite(response.gradient).all():
             return []
         seen = [self.sees(suspect) if self.learns else None for suspect in suspects]
-        residuals: list[Told | None] = [None] * len(added)
+        residuals: list[ResidualStep | None] = [None] * len(added)
         if used is not None and not all(seen):  # what the learner sees it has taken from the residual
             residuals = told_by_residual(response, used, steps)
         rows = enumerate(zip(suspects, seen, residuals, strict=True))
         return [self._entry(response, k, *row) for k, row in rows]
 
     def _entry(
-        self, response: TermsResponse, k: int, suspect: MotionSuspect, seen: bool | None, residual: Told | None
+        self, response: TermsResponse, k: int, suspect: MotionSuspect, seen: bool | None, residual: ResidualStep | None
     ) -> TermBias:
         motion, names = self.motion, self.motion.names
         place = suspect.place(motion)
@@ -294,7 +294,7 @@ class MotionLinearization:
         return moves(lambda rows: np.asarray(form.seen(rows[:, :nx].T, rows[:, nx:].T, np)).T, points)
 
 
-def told_by_residual(response: TermsResponse, used: float, steps: int | None) -> list[Told | None]:
+def told_by_residual(response: TermsResponse, used: float, steps: int | None) -> list[ResidualStep | None]:
     """What the residual tells of every term, with standard errors that hold for coloured errors where `steps` is given.
 
     Args:
@@ -303,7 +303,7 @@ def told_by_residual(response: TermsResponse, used: float, steps: int | None) ->
     whole, noise = response.squares()
     free = max(response.place.segmented.residuals - response.parameters - used, 1.0)
     middle = None if steps is None else response.scores().middle(steps, response.parameters + used)[0]
-    found: list[Told | None] = []
+    found: list[ResidualStep | None] = []
     for k in range(response.terms):
         step = response.step(k)
         if step is None or not whole > 0:
@@ -313,7 +313,7 @@ def told_by_residual(response: TermsResponse, used: float, steps: int | None) ->
         variance = whole / free * float(row @ response.information @ row) if middle is None else row @ middle @ row
         std = float(np.sqrt(variance)) if variance > 0 else None
         shares = min(fall / whole, 1.0), float(np.clip((whole - noise - fall) / whole, 0.0, 1.0))
-        found.append(Told(coefficient, std, None if std is None else coefficient / std, *shares))
+        found.append(ResidualStep(coefficient, std, None if std is None else coefficient / std, *shares))
     return found
 
 
@@ -368,7 +368,7 @@ def linearize_fit(fit: MotionEstimate) -> MotionLinearization | None:
     numbers, field, learned = fit.model.numbers, fit.split_by.field, None
     ridge = fit.model.statistics.ridge / fit.scores.unit
     c, w = np.asarray(numbers.theta - numbers.theta_aux), np.asarray(numbers.weights)
-    place = Place(fit.segmented, c, w, fit.states, fit.scores.weight, ridge)
+    place = FreeRunPoint(fit.segmented, c, w, fit.states, fit.scores.weight, ridge)
     if fit.model.form.bound is not None:
         learned = parts_at(fit.model.form, fit.model.numbers, field.x, field.u)[1]
         learned = np.where(np.isfinite(learned), learned, 0.0)
@@ -383,7 +383,7 @@ def linearize_physics(task: MotionTask, structure: Structure) -> MotionLineariza
     segmented, point = task.plan, task.physics.end.point
     form, names = segmented.dynamics, segmented.problem.motion.names
     weights = np.zeros(0)
-    place = Place(segmented, point.theta, weights, point.states, task.physics.objective.weight)
+    place = FreeRunPoint(segmented, point.theta, weights, point.states, task.physics.objective.weight)
     none = MotionSplit.none("training", form, point.theta)
     if segmented.bound is None:
         return MotionLinearization(place, point.theta, none.shared, none.field)

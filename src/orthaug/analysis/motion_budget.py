@@ -17,7 +17,7 @@ from orthaug._base.lines import percent
 from orthaug.analysis.bias_hull import (
     MOST_PHYSICS,
     Candidate,
-    Named,
+    NamedCause,
     compatible,
     hull,
     undetermined_warning,
@@ -143,7 +143,7 @@ def motion_budget(
         return None
     own = {entry.suspect for entry in table} if declared is None else set(declared)
     name = " and ".join(cause.suspect.name for cause in causes)
-    candidates = [Named(name, found.share, bias, rest=np.linalg.norm(found.unsure, axis=0))]
+    candidates = [NamedCause(name, found.share, bias, rest=np.linalg.norm(found.unsure, axis=0))]
     candidates += _instead(fit, (*table, *smooth, *families), own) if learns and len(causes) == 1 else []
     ends = hull(value, std, fit.freedom, candidates)
     parameters = fit.problem.motion.parameters
@@ -171,7 +171,7 @@ def _instead(fit: MotionEstimate, table: Sequence[TermBias], declared: set[Motio
 
 
 @dataclass(frozen=True, eq=False)
-class _Found:
+class _Causes:
     """Causes, what they move the parameters by (np,), standard deviations (k, np) of what they leave, and rivals."""
 
     causes: tuple[TermBias, ...]
@@ -206,7 +206,7 @@ def _moved(entry: TermBias) -> Vector:
 
 def _of_learner(
     fit: MotionEstimate, table: Sequence[TermBias], smooth: Sequence[TermBias], families: Sequence[TermBias] = ()
-) -> _Found | None:
+) -> _Causes | None:
     """The term that explains most of the learner, or one of each equation that together leave much less of it."""
     best, other = max(table, key=explains, default=None), max((*smooth, *families), key=explains, default=None)
     if other is not None and (best is None or _is_clearly_less(explains(best), explains(other))):
@@ -268,7 +268,7 @@ def _weighed(
     each: Sequence[Sequence[TermBias]],
     share: float,
     table: Sequence[TermBias],
-) -> _Found:
+) -> _Causes:
     """Causes with how unsure their sizes are, what the next one makes of the rest, and what they cannot be told from.
 
     Args:
@@ -285,10 +285,10 @@ def _weighed(
         rivals += [rival for rival, by in zip(near, apart, strict=True) if np.any(by > _ELSEWHERE * np.abs(bias))]
     after = [] if linearization is None else linearization.after(causes, table)
     unsure += [_moved(max(after, key=explains))] if after else []
-    return _Found(causes, share, bias, np.array(unsure), tuple(rivals))
+    return _Causes(causes, share, bias, np.array(unsure), tuple(rivals))
 
 
-def _of_residual(table: Sequence[TermBias]) -> _Found | None:
+def _of_residual(table: Sequence[TermBias]) -> _Causes | None:
     """The term that lowers the residual most, where that is no chance and most of what is no white noise.
 
     What stays beyond white noise counts as biased by as much for its size, of unknown sign.
@@ -301,10 +301,10 @@ def _of_residual(table: Sequence[TermBias]) -> _Found | None:
     if told.share < LEAST_SHARE * (told.share + told.left):
         return None
     unsure = np.hypot(std, told.coefficient * np.sqrt(told.left / told.share))
-    return _Found((best,), told.share, told.coefficient * best.per_unit, np.array([unsure * best.per_unit]))
+    return _Causes((best,), told.share, told.coefficient * best.per_unit, np.array([unsure * best.per_unit]))
 
 
-def _motion_warning(found: _Found, rows: Sequence[ParameterBias], *, learns: bool) -> Warning | None:
+def _motion_warning(found: _Causes, rows: Sequence[ParameterBias], *, learns: bool) -> Warning | None:
     """One sentence on what is biased by more than its standard error: causes and their sizes."""
     large = [entry for entry in rows if (entry.errors or 0.0) > 1]
     if not large:

@@ -21,7 +21,7 @@ from orthaug.analysis.motion_suspects import MotionSuspect
 from orthaug.analysis.plant import RUNS_AWAY
 from orthaug.models.dynamics import Numbers
 from orthaug.models.integrators import held
-from orthaug.models.moving import Moving
+from orthaug.models.moving import MotionDynamics
 from orthaug.physics.motion import Motion
 from orthaug.physics.suspected_motion import SuspectedMotion
 
@@ -58,7 +58,7 @@ class MotionPlant:
         starts = [state.start for state in motion.states]
         self.before = np.array([start if isinstance(start, float | int) else 0.0 for start in starts], dtype=float)
         suspected = SuspectedMotion.of(motion, [suspect.term(motion) for suspect in suspects])
-        self._form = Moving(suspected, (), None, sampling_time, substeps)
+        self._form = MotionDynamics(suspected, (), None, sampling_time, substeps)
         self._coefficients = np.array([suspect.coefficient for suspect in suspects], dtype=float)
         coordinates = motion.coordinates
         q = coordinates.of(self.theta)
@@ -110,7 +110,7 @@ def _without(start: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 @partial(jax.jit, static_argnames="form")
 def _run(
-    form: Moving, numbers: Numbers, start: Float[Array, "nx m"], inputs: Float[Array, "T nu m"]
+    form: MotionDynamics, numbers: Numbers, start: Float[Array, "nx m"], inputs: Float[Array, "T nu m"]
 ) -> tuple[Float[Array, "T ny m"], Float[Array, "T ny n m"]]:
     """Outputs of every run, and their sensitivities to start and coordinates."""
     numbers = form.prepared(numbers)

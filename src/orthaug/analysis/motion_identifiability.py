@@ -28,7 +28,7 @@ _SEED = 20_250_117
 
 
 @dataclass(frozen=True, eq=False)
-class Identified:
+class RankReport:
     """What the record's own inputs tell apart, and what rich ones do; with points of a run at the initial parameters.
 
     `by_any` is None where no run with rich inputs is finite. `states` (M, nx) and `inputs` (M, nu) are where physics
@@ -41,7 +41,7 @@ class Identified:
     inputs: Matrix
 
 
-def identified(segmented: SegmentedMotion) -> Identified | None:
+def identified(segmented: SegmentedMotion) -> RankReport | None:
     """Of the physics alone of a course, over shorter segments where it runs away; None where no run is finite."""
     segmented = segmented.alone
     steps = segmented.segments.steps
@@ -58,7 +58,7 @@ def identified(segmented: SegmentedMotion) -> Identified | None:
     initial = segmented.problem.motion.coordinates.initial
     x, u = shorter_runs.trajectory(initial, (), np.asarray(shorter_runs.segments.start))
     finite = np.isfinite(x).all(axis=1)
-    return Identified(on_data, by_any, x[finite], u[finite])
+    return RankReport(on_data, by_any, x[finite], u[finite])
 
 
 def _rank(segmented: SegmentedMotion) -> Excitation | None:

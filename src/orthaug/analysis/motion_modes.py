@@ -22,7 +22,7 @@ from orthaug.analysis.boundedness import divergence_scaling, margin
 from orthaug.data.record import Record
 from orthaug.models.dynamics import Numbers
 from orthaug.models.motion_model import MotionModel
-from orthaug.models.moving import Moving
+from orthaug.models.moving import MotionDynamics
 
 _LARGEST = 1024.0  # factor on the inputs that is tried
 _POINTS = 2000  # at most
@@ -159,7 +159,7 @@ def modes(model: MotionModel, x: Matrix, u: Matrix) -> Modes | None:
 
 @partial(jax.jit, static_argnames="form")
 def _slopes(
-    form: Moving, numbers: Numbers, x: Float[Array, "m nx"], u: Float[Array, "m nu"]
+    form: MotionDynamics, numbers: Numbers, x: Float[Array, "m nx"], u: Float[Array, "m nu"]
 ) -> Float[Array, "m nx nx"]:
     def rate(x: Any, u: Any) -> Any:
         return sum(form.rates(numbers, x, u))

@@ -32,9 +32,9 @@ from orthaug.fitting.segmented_motion import SegmentedMotion
 from orthaug.fitting.segments import respond, sensitivity
 from orthaug.models.dynamics import Numbers
 from orthaug.models.learners import Bound
-from orthaug.models.moving import Moving
+from orthaug.models.moving import MotionDynamics
 from orthaug.physics.motion import MOST_SUBSTEPS
-from orthaug.physics.suspected_motion import AddedTerm, SuspectedMotion
+from orthaug.physics.suspected_motion import SuspectedMotion, SuspectedTerm
 
 LOOSER = 1e-4  # times the weight of the guesses of the starts, as where standard errors are made
 _UNSEEN = 1e-9  # of the largest eigenvalue of normal equations with unit columns: directions that nothing tells
@@ -44,7 +44,7 @@ _LARGE_SHARE = 1e-3  # of a parameter that has no standard error
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
+class FreeRunPoint:
     """Where a free run is linearised: a course with its coordinates, its learner's weights and its segments' starts."""
 
     segmented: SegmentedMotion
@@ -64,8 +64,8 @@ class TermsResponse:
     `form` and `numbers` are of the motion with the terms, with waves for a learner that is not trained yet.
     """
 
-    place: Place
-    form: Moving
+    place: FreeRunPoint
+    form: MotionDynamics
     numbers: Numbers
     information: Matrix
     gradient: Vector
@@ -157,7 +157,7 @@ class TermsResponse:
         return row, float(self.information[i, i] + across @ row[self.fitted])
 
 
-def respond_to(place: Place, added: tuple[AddedTerm, ...]) -> TermsResponse:
+def respond_to(place: FreeRunPoint, added: tuple[SuspectedTerm, ...]) -> TermsResponse:
     """Linearise a free run with further terms, and with all that its learner could hold."""
     segmented, motion = place.segmented, place.segmented.problem.motion
     suspected = SuspectedMotion.of(motion, added)
@@ -190,7 +190,7 @@ def solved(matrix: Matrix, right: Vector) -> Vector:
 
 @partial(jax.jit, static_argnames="form")
 def _along(
-    form: Moving, numbers: Numbers, dw: Float[Array, "nw"], x: Float[Array, "m nx"], u: Float[Array, "m nu"]
+    form: MotionDynamics, numbers: Numbers, dw: Float[Array, "nw"], x: Float[Array, "m nx"], u: Float[Array, "m nu"]
 ) -> Float[Array, "m nl"]:
     def learned(w: Any) -> Any:
         return jax.vmap(lambda x, u: form.learned(numbers._replace(weights=w), x, u))(x, u)

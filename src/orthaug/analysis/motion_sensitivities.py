@@ -18,7 +18,7 @@ from orthaug._base.checks import Matrix
 from orthaug._base.jax import Array, jax, padded_length
 from orthaug.fitting.motion_estimates import MotionEstimate, fitted_numbers
 from orthaug.models.dynamics import Numbers
-from orthaug.models.moving import Moving
+from orthaug.models.moving import MotionDynamics
 
 _ROWS = 20_000  # that are looked at, in segments spread over the record
 _NUMBERS = 8_000_000  # that stand in memory at most
@@ -45,7 +45,7 @@ class Sensitivities:
 
 
 @partial(jax.jit, static_argnames="form")
-def _slopes(form: Moving, numbers: Numbers, states: Float[Array, "n0 m"], inputs: Float[Array, "nu m"]) -> Any:
+def _slopes(form: MotionDynamics, numbers: Numbers, states: Float[Array, "n0 m"], inputs: Float[Array, "nu m"]) -> Any:
     """∂x⁺/∂(x, c, w), the outputs, and ∂y/∂(x, c, w) at every point."""
     numbers = form.prepared(numbers)
     return form.tangents(numbers, states, form.first_slopes(states.shape[1]), inputs)[1:]
@@ -87,7 +87,7 @@ def sensitivities(
     return Sensitivities(columns, target - value, scored, points, n0, n0 + n)
 
 
-def _at_rows(form: Moving, numbers: Numbers, x: Any, u: Any) -> tuple[Any, Any, Any]:
+def _at_rows(form: MotionDynamics, numbers: Numbers, x: Any, u: Any) -> tuple[Any, Any, Any]:
     """Slopes at every row: (m, T, n0, n0 + n), outputs (m, T, ny), and their slopes (m, T, ny, n0 + n)."""
     m, steps = x.shape[:2]
     flat = [part.reshape(m * steps, -1).T for part in (x, u)]
@@ -97,7 +97,7 @@ def _at_rows(form: Moving, numbers: Numbers, x: Any, u: Any) -> tuple[Any, Any, 
     return tuple(part.reshape(m, steps, *part.shape[1:]) for part in found)  # type: ignore[return-value]
 
 
-def _followed(to_next: Any, to_output: Any, added: Any, equations: Sequence[int], form: Moving) -> Any:
+def _followed(to_next: Any, to_output: Any, added: Any, equations: Sequence[int], form: MotionDynamics) -> Any:
     """The columns (m, T, ny, n0 + n + q) of the outputs, from one row to the next."""
     m, steps, n0, own = to_next.shape
     q, h = len(added), form.sampling_time

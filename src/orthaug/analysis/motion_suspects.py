@@ -17,7 +17,7 @@ from orthaug.analysis.suspects import ODD_JUMPS, WIDTHS, changes_sign, check_coe
 from orthaug.data.expressions import Expression, parse_named
 from orthaug.physics.motion import Motion
 from orthaug.physics.motion_problem import MotionProblem
-from orthaug.physics.suspected_motion import AddedTerm
+from orthaug.physics.suspected_motion import SuspectedTerm
 
 _OF_STATES = ("coulomb", "quadratic_drag", "cubic")
 _WIDTHS = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0)  # of friction that turns round smoothly, in median sizes of what it acts on
@@ -107,9 +107,9 @@ class MotionSuspect:
             raise InputError(f"suspect '{self.name}': `equation` is missing; one of {', '.join(known)}.")
         return likely[0]
 
-    def term(self, motion: Motion) -> AddedTerm:
+    def term(self, motion: Motion) -> SuspectedTerm:
         """It as a term of the motion."""
-        return AddedTerm(self.name, self.place(motion), self.parsed(motion))
+        return SuspectedTerm(self.name, self.place(motion), self.parsed(motion))
 
     def values(self, motion: Motion, p: Vector, x: Matrix, u: Matrix) -> Vector:
         """The expression (M,) at states (M, nx) and inputs (M, nu), also where it is not finite."""

@@ -36,7 +36,7 @@ class Consistency:
 
 
 @dataclass(frozen=True, eq=False)
-class Observed:
+class ObserverRun:
     """An observer along one experiment of N rows; NaN on rows before `start`.
 
     `predicted` (N, ny) are the outputs as the rows before tell them, `spread` (N, ny, ny) the covariance of measured
@@ -76,7 +76,7 @@ class Observed:
 class Observations:
     """An observer along every experiment of a record."""
 
-    experiments: tuple[Observed, ...]
+    experiments: tuple[ObserverRun, ...]
     outputs: tuple[Channel, ...]
     state_names: tuple[str, ...]
     """Of a motion; a lagged model's states are its outputs."""

@@ -9,13 +9,13 @@ import numpy as np
 
 from orthaug._base.checks import Matrix, Vector, check_count, check_type
 from orthaug._base.errors import InputError, shown
-from orthaug.analysis.observed import Observations, Observed
+from orthaug.analysis.observed import Observations, ObserverRun
 from orthaug.analysis.observer_noise import by_verdict, most_likely, of_fit
 from orthaug.data.record import Experiment, Record
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.models.dynamics import Parts
-from orthaug.models.kalman import Belief, Noise, Told, ahead, filtered, one_row, spread_of
+from orthaug.models.kalman import FilterRow, Noise, StateEstimate, ahead, filtered, one_row, spread_of
 from orthaug.models.model import Model
 from orthaug.models.motion_model import MotionModel
 from orthaug.models.on_records import trajectory
@@ -65,7 +65,7 @@ class Observer:
         """
         return replace(self, noise=most_likely(self.model, self.noise, record))
 
-    def start(self, record: Record, row: int | None = None) -> Tracking:
+    def start(self, record: Record, row: int | None = None) -> ObserverState:
         """Where to begin, before a row of a record of one experiment, by default the first that is estimated.
 
         A motion's state is guessed from the outputs about the row, and unknown by the size of the states.
@@ -78,7 +78,7 @@ class Observer:
         experiment = one_experiment(record)
         last = len(experiment) - form.hidden
         row = checked_row(row, form.first_row, last)
-        return Tracking(self, form.start(experiment, record, row, self.noise, size))
+        return ObserverState(self, form.start(experiment, record, row, self.noise, size))
 
     def run(self, record: Record) -> Observations:
         """Outputs and states along a record, each row told by what was measured up to it.
@@ -114,7 +114,7 @@ class Observer:
     def _record(self, record: Record) -> Record:
         return self.model.fitting(record, need_outputs=True, gaps=True)
 
-    def _along(self, experiment: Experiment, record: Record) -> tuple[Observed, Belief, Matrix]:
+    def _along(self, experiment: Experiment, record: Record) -> tuple[ObserverRun, StateEstimate, Matrix]:
         """What an experiment tells, what is believed before its rows, and what their steps read."""
         form, numbers, size = self.model.filtering
         first = form.first_row
@@ -150,7 +150,7 @@ class Observer:
 
 
 @dataclass(frozen=True, eq=False)
-class Tracking:
+class ObserverState:
     """An observer at a sample; `update` gives that at the next one.
 
     Examples:
@@ -167,9 +167,9 @@ class Tracking:
     """
 
     observer: Observer
-    belief: Belief
+    belief: StateEstimate
     """The state before the next sample and its covariance."""
-    told: Told | None = None
+    told: FilterRow | None = None
     """What the last sample told; None before the first."""
 
     @property
@@ -213,12 +213,12 @@ class Tracking:
         return float(self._told.square)
 
     @property
-    def _told(self) -> Told:
+    def _told(self) -> FilterRow:
         if self.told is None:
             raise InputError("no sample has been measured yet; `update` first.")
         return self.told
 
-    def update(self, inputs: Any, outputs: Any) -> Tracking:
+    def update(self, inputs: Any, outputs: Any) -> ObserverState:
         """One sample later.
 
         Args:
@@ -255,13 +255,13 @@ def _row(values: Any, name: str, count: int, *, gaps: bool = False) -> Vector:
     return row
 
 
-def _observed(told: Told, experiment: Experiment, first: int) -> Observed:
+def _observed(told: FilterRow, experiment: Experiment, first: int) -> ObserverRun:
     """With NaN before the first row that is estimated."""
 
     def whole(values: Any) -> Any:
         return np.concatenate([np.full((first, *values.shape[1:]), np.nan), values])
 
-    return Observed(
+    return ObserverRun(
         measured=experiment.outputs,
         predicted=whole(told.predicted),
         spread=whole(told.spread),

@@ -17,7 +17,7 @@ from orthaug._base.parallel import Threads
 from orthaug.data.record import Record
 from orthaug.data.regressors import Layout
 from orthaug.fitting.estimates import Estimate
-from orthaug.fitting.held_out import HeldOut, Pieces, Ratio, blocked, mean_square, squared_errors
+from orthaug.fitting.held_out import HeldOutErrors, Pieces, Ratio, blocked, mean_square, squared_errors
 from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.models.model import Model
 from orthaug.models.motion_model import MotionModel
@@ -127,7 +127,7 @@ def trial_on(
     return Trial(where, error, own, pieces=(pieces[0], pieces[1]))
 
 
-def trials_of(held_out: HeldOut) -> list[Trial]:
+def trials_of(held_out: HeldOutErrors) -> list[Trial]:
     """The errors by which a run was chosen, as trials."""
     chosen, trials = held_out.runs[held_out.chosen], []
     for label in dict.fromkeys(held_out.labels):

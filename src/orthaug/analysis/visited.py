@@ -22,7 +22,7 @@ MOST_STEPS = 20_000  # rows that a check looks at, spread evenly
 
 
 @dataclass(frozen=True)
-class Place:
+class RunPoint:
     """A point by its entries, and where it stands: experiment, row in it, and both in words.
 
     `experiment` and `row` are None for a point that no run has visited.
@@ -38,14 +38,14 @@ class Place:
 
 
 @dataclass(frozen=True, eq=False)
-class Where:
+class RowIndex:
     """The experiment and the row (m,) of each of m points; -1 for those that no run has visited."""
 
     experiment: Int[np.ndarray, "m"]
     row: Int[np.ndarray, "m"]
 
     @classmethod
-    def of(cls, lengths: Sequence[int], first: int) -> Where:
+    def of(cls, lengths: Sequence[int], first: int) -> RowIndex:
         """So many rows of each experiment, from the row `first` on."""
         experiment = [np.full(length, i) for i, length in enumerate(lengths)]
         return cls(np.concatenate(experiment), np.concatenate([np.arange(length) + first for length in lengths]))
@@ -53,17 +53,17 @@ class Where:
     def __len__(self) -> int:
         return len(self.row)
 
-    def take(self, which: Any) -> Where:
+    def take(self, which: Any) -> RowIndex:
         """Those at the indices `which`, or where a mask is true."""
-        return Where(self.experiment[which], self.row[which])
+        return RowIndex(self.experiment[which], self.row[which])
 
-    def and_nowhere(self, count: int) -> Where:
+    def and_nowhere(self, count: int) -> RowIndex:
         """With `count` points more that no run has visited."""
-        return Where(*(np.concatenate([known, np.full(count, -1)]) for known in (self.experiment, self.row)))
+        return RowIndex(*(np.concatenate([known, np.full(count, -1)]) for known in (self.experiment, self.row)))
 
     def worst(
         self, record: Record, values: Vector, entries: Callable[[int], dict[str, float]]
-    ) -> tuple[float | None, Place | None]:
+    ) -> tuple[float | None, RunPoint | None]:
         """The largest of the values (m,) and its place, with the entries of that point; None where none is finite."""
         values = np.where(np.isfinite(values), values, -1.0)
         if values.max(initial=-1.0) < 0:
@@ -71,27 +71,27 @@ class Where:
         i = int(np.argmax(values))
         experiment, row, size = int(self.experiment[i]), int(self.row[i]), float(values[i])
         if experiment < 0:
-            return size, Place(None, None, "a point off the trajectory", entries(i))
+            return size, RunPoint(None, None, "a point off the trajectory", entries(i))
         where = f"experiment {experiment}, {record.experiments[experiment].where(row)}"
-        return size, Place(experiment, row, where, entries(i))
+        return size, RunPoint(experiment, row, where, entries(i))
 
 
 @dataclass(frozen=True, eq=False)
-class Visited:
+class RunPoints:
     """Points of a run: states (m, n0) and the inputs (m, nu) of a step from there, and where they stand."""
 
     states: Matrix
     inputs: Matrix
-    where: Where
+    where: RowIndex
 
     def __len__(self) -> int:
         return len(self.states)
 
-    def take(self, which: Any) -> Visited:
+    def take(self, which: Any) -> RunPoints:
         """Those at the indices `which`, or where a mask is true."""
         return replace(self, states=self.states[which], inputs=self.inputs[which], where=self.where.take(which))
 
-    def with_box(self, of: Visited, count: int) -> Visited:
+    def with_box(self, of: RunPoints, count: int) -> RunPoints:
         """With `count` points more, uniform in the box that others span; the same ones on every call."""
         if not count:
             return self
@@ -106,20 +106,20 @@ class Visited:
             where=where,
         )
 
-    def worst(self, record: Record, values: Vector, describe: Describe) -> tuple[float | None, Place | None]:
+    def worst(self, record: Record, values: Vector, describe: Describe) -> tuple[float | None, RunPoint | None]:
         """The largest of the values (m,) and its place in words of the dynamics; None where no value is finite."""
         return self.where.worst(record, values, lambda i: describe(self.states[i], self.inputs[i]))
 
 
 @dataclass(frozen=True, eq=False)
-class Visits:
+class RunSample:
     """At most so many `points` of a run of `steps` steps, and where it `diverged`.
 
     `unit` (n0,) is what counts as one in each entry of the state: the deviation of the measured output it stands for,
     or else its own over the points.
     """
 
-    points: Visited
+    points: RunPoints
     steps: int
     unit: Vector
     diverged: tuple[str, ...] = ()
@@ -137,7 +137,7 @@ def usable(model: Model | MotionModel, record: Record) -> Record:
     return record
 
 
-def visited_by(model: Model, record: Record, free_run: Response, most: int) -> Visits:
+def visited_by(model: Model, record: Record, free_run: Response, most: int) -> RunSample:
     """States of a free run from measured outputs, up to where it diverged."""
     form: Dynamics = model.form
     record, start, runs = usable(model, record), form.first_row, free_run.trajectories
@@ -156,7 +156,7 @@ def visited_by(model: Model, record: Record, free_run: Response, most: int) -> V
     return replace(found, diverged=tuple(diverged))
 
 
-def measured_by(model: Model, record: Record, most: int) -> Visits:
+def measured_by(model: Model, record: Record, most: int) -> RunSample:
     """States as the measured outputs give them."""
     form: Dynamics = model.form
     record = usable(model, record)
@@ -170,9 +170,9 @@ def _visits(
     ends: Sequence[int],
     most: int,
     states: Callable[[int, Experiment, Any, Any], Matrix],
-) -> Visits:
+) -> RunSample:
     """Points spread evenly over all experiments, up to the end of each."""
-    every = Where.of([end - form.first_row for end in ends], form.first_row)
+    every = RowIndex.of([end - form.first_row for end in ends], form.first_row)
     some = every.take(evenly(len(every), most))
     pieces = []
     for i, experiment in enumerate(record.experiments):
@@ -180,11 +180,11 @@ def _visits(
         inputs = form.inputs(experiment, record)
         pieces.append((states(i, experiment, inputs, rows), inputs[rows - form.first_row]))
     visited, inputs = (np.concatenate(piece) for piece in zip(*pieces, strict=True))
-    points = Visited(visited, inputs, some)
-    return Visits(points, len(every), _units(form, points, np.concatenate([e.outputs for e in record.experiments])))
+    points = RunPoints(visited, inputs, some)
+    return RunSample(points, len(every), _units(form, points, np.concatenate([e.outputs for e in record.experiments])))
 
 
-def _units(form: Dynamics, points: Visited, outputs: Matrix) -> Vector:
+def _units(form: Dynamics, points: RunPoints, outputs: Matrix) -> Vector:
     """One over what an entry costs in deviations of the outputs; its own deviation where it is free."""
     if not len(points):
         return np.ones(form.states)  # of what may be too long for a matrix

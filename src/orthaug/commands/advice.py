@@ -32,7 +32,7 @@ _LISTED = 3  # changes without gain that the text names
 
 
 @dataclass(frozen=True, eq=False)
-class HeldOutRows:
+class ValidationRows:
     """The rows that models are fitted to, and those that they run over."""
 
     training: Record
@@ -42,7 +42,7 @@ class HeldOutRows:
     which: str
 
     @classmethod
-    def of(cls, job: Job) -> HeldOutRows:
+    def of(cls, job: Job) -> ValidationRows:
         """Return the validation part of a job, or the last third of its training rows.
 
         Raises:
@@ -55,7 +55,7 @@ class HeldOutRows:
 
 
 @dataclass(frozen=True, eq=False)
-class Tried:
+class ProposalErrors:
     """A proposal with the errors of its free run; `pieces` is None where it could not be fitted."""
 
     proposal: Proposal
@@ -73,7 +73,7 @@ class Trials:
     """Fits of changed specs."""
 
     job: Job
-    rows: HeldOutRows
+    rows: ValidationRows
     variant: Variant
     unit: Any
     substeps: int | None = None
@@ -99,17 +99,17 @@ class Trials:
             LOG.info("a change was not tried: %s", error)
             return None
 
-    def of(self, proposal: Proposal, *, physics_only: bool) -> Tried:
+    def of(self, proposal: Proposal, *, physics_only: bool) -> ProposalErrors:
         """The trial of a proposal."""
         try:
             job = self.changed(proposal.change)
         except (InputError, ValueError) as error:
             LOG.info("%s was not tried: %s", proposal.words, error)
-            return Tried(proposal, None)
+            return ProposalErrors(proposal, None)
         criterion = job.spec.declared_criterion() if proposal.refocuses else self.variant.criterion
         kind = ALONE if physics_only else None if proposal.learns else self.variant.kind
         pieces = self.run(job, Variant(kind, criterion=criterion), proposal.accepts)
-        return Tried(proposal, pieces, physics_only)
+        return ProposalErrors(proposal, pieces, physics_only)
 
 
 def changed(declaration: dict[str, Any], change: dict[str, Any]) -> dict[str, Any]:
@@ -135,7 +135,7 @@ def advise(job: Job, fit: Any, result: FitResult) -> tuple[list[AdviceResult], A
     if not found or job.train.source is not None or job.spec.engine.kind not in ("auto", "memory"):
         return None
     try:
-        rows = HeldOutRows.of(job)
+        rows = ValidationRows.of(job)
     except InputError:
         return None
     learns = fit.model.form.bound is not None
@@ -152,11 +152,11 @@ def advise(job: Job, fit: Any, result: FitResult) -> tuple[list[AdviceResult], A
 
 
 def _concluded(
-    base: Pieces, tried: Sequence[Tried], rows: HeldOutRows, left: int, learns: bool
+    base: Pieces, tried: Sequence[ProposalErrors], rows: ValidationRows, left: int, learns: bool
 ) -> tuple[list[AdviceResult], AdviceTrialsResult]:
     before = math.sqrt(mean_square(base))
     helps = [one for one in tried if one.pieces is not None and _ratio(one.pieces, base).code == "helps"]
-    better: list[Tried] = []
+    better: list[ProposalErrors] = []
     for one in sorted(helps, key=lambda one: one.error):
         if not any(math.isclose(one.error, other.error, rel_tol=_SAME) for other in better):
             better.append(one)
@@ -191,7 +191,7 @@ def _ratio(pieces: Pieces, base: Pieces) -> Ratio:
     return Ratio.of([a for a, _ in cut], [b for _, b in cut])
 
 
-def _advice_text(one: Tried, before: float, rows: HeldOutRows) -> str:
+def _advice_text(one: ProposalErrors, before: float, rows: ValidationRows) -> str:
     alone = " of physics alone" if one.physics_only else ""
     text = f"With {one.proposal.words} the free run{alone} on {rows.where}"
     if math.isinf(before):
@@ -199,7 +199,7 @@ def _advice_text(one: Tried, before: float, rows: HeldOutRows) -> str:
     return f"{text} improves from {_error(before)} to {_error(one.error)} of the output's deviation."
 
 
-def _after(one: Tried) -> str:
+def _after(one: ProposalErrors) -> str:
     return "no fit" if one.pieces is None else "diverges" if math.isinf(one.error) else _error(one.error)
 
 

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from html import escape
 from typing import TYPE_CHECKING, Any
 
-from orthaug._base.progress import SILENT, Enough, Plan, Progress, Tell
+from orthaug._base.progress import SILENT, Plan, Progress, ProgressCallback, StopTraining
 from orthaug.commands import streams
 from orthaug.commands.signals import WATCH
 from orthaug.commands.streams import say
@@ -83,7 +83,7 @@ def training_bar(runs: int, iterations: int, wanted: bool = True, rows: int = 0)
             if interrupted.is_set():
                 raise KeyboardInterrupt(reached)
             if ENOUGH.is_set():
-                raise Enough
+                raise StopTraining
 
         try:
             yield Progress(tell, plan=line.planned)
@@ -207,7 +207,7 @@ def _deferred_interrupt() -> Iterator[threading.Event]:
 
 
 @contextmanager
-def shown_progress() -> Iterator[Tell]:
+def shown_progress() -> Iterator[ProgressCallback]:
     """Progress of a fit from Python: a bar on a terminal, a line in a notebook, nothing elsewhere."""
     display = _display()
     if display is not None:
@@ -226,7 +226,7 @@ def _display() -> Any:
     return shown.display if type(ipython.get_ipython()).__name__ == "ZMQInteractiveShell" else None
 
 
-def _in_notebook(display: Any) -> Iterator[Tell]:
+def _in_notebook(display: Any) -> Iterator[ProgressCallback]:
     lock, began = threading.Lock(), time.monotonic()
     runs: dict[int, tuple[int, float]] = {}
     handle: Any = display({"text/html": _line("compiling", ended=False), "text/plain": ""}, raw=True, display_id=True)
@@ -246,7 +246,7 @@ def _in_notebook(display: Any) -> Iterator[Tell]:
         show(f"{len(runs) or 1} runs, {steps} iterations, {time.monotonic() - began:.1f} s", ended=True)
 
 
-def _on_terminal() -> Iterator[Tell]:
+def _on_terminal() -> Iterator[ProgressCallback]:
     from rich.progress import TimeElapsedColumn
 
     with drawn_bar(TimeElapsedColumn()) as shown:

@@ -19,9 +19,9 @@ from orthaug.commands.bars import on_terminal, study_bars, training_bar
 from orthaug.commands.program import (
     AsJson,
     Force,
+    ListOptionCommand,
     OutFolder,
     SpecPath,
-    TakesLists,
     app,
     arguments,
     main,
@@ -193,7 +193,7 @@ def select(spec: SpecPath, out: OutFolder = None, as_json: AsJson = False, force
     tell(selected.result, selection_text(selected.result), as_json, place)
 
 
-@app.command(cls=TakesLists)
+@app.command(cls=ListOptionCommand)
 def init(
     data: Annotated[Path, typer.Argument(metavar="DATA", help="Data file.")],
     out: Annotated[Path, typer.Option("--out", metavar="FILE", help="The spec to write.")] = Path("spec.toml"),

@@ -14,7 +14,7 @@ from orthaug._base.folders import whole_folder
 from orthaug._base.progress import SILENT, Progress
 from orthaug.analysis.validation import Verdict, dominance
 from orthaug.commands.doubts import doubted
-from orthaug.commands.fit import Fitted, cross_validated, fit_variant, judge_fit, score_part, wanted_blocks
+from orthaug.commands.fit import FitReport, cross_validated, fit_variant, judge_fit, score_part, wanted_blocks
 from orthaug.commands.job import ALONE, Job, Variant, origin_of
 from orthaug.data.record import same_step
 from orthaug.fitting.criteria import Criterion, Prediction
@@ -30,7 +30,7 @@ class Comparison:
     """One entry per way of modelling: the fitted ones, and models that were saved earlier."""
 
     job: Job
-    fitted: dict[str, Fitted]
+    fitted: dict[str, FitReport]
     verdicts: dict[str, Verdict]
     result: CompareResult
 
@@ -78,7 +78,7 @@ def compare(job: Job, saved: Sequence[Path] = (), progress: Progress = SILENT) -
     return Comparison(job, fitted, verdicts, CompareResult.model_validate(content))
 
 
-def _criterion(job: Job, progress: Progress) -> tuple[Criterion, Fitted | None]:
+def _criterion(job: Job, progress: Progress) -> tuple[Criterion, FitReport | None]:
     """The criterion that every structure is trained by, and the fit that decided it where the data were to decide."""
     declared = job.spec.declared_criterion()
     if not declared.automatic:
@@ -88,7 +88,7 @@ def _criterion(job: Job, progress: Progress) -> tuple[Criterion, Fitted | None]:
     return (fitted.fit.criterion if fitted.fit.status.ok else Prediction()), fitted
 
 
-def _verdicts(job: Job, fitted: dict[str, Fitted]) -> dict[str, Verdict]:
+def _verdicts(job: Job, fitted: dict[str, FitReport]) -> dict[str, Verdict]:
     """Whether the learner earns its place in each structure, by blocked cross-validation and the held-out parts."""
     alone = fitted[ALONE].fit
     kinds = [kind for kind, tried in fitted.items() if kind != ALONE and tried.fit.status.ok]
@@ -153,7 +153,7 @@ def _matching(path: Path, job: Job) -> Model | MotionModel:
     return model
 
 
-def _row(kind: str, fitted: Fitted, verdict: Verdict | None) -> RowResult:
+def _row(kind: str, fitted: FitReport, verdict: Verdict | None) -> RowResult:
     result, fit = fitted.result, fitted.fit
     own = {key: getattr(result, key) for key in ("parameters", "orthogonality_defect", "residuals")}
     own |= {"status": result.status.code, "seconds": result.status.seconds, "validation": verdict}

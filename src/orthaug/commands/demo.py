@@ -9,7 +9,7 @@ import numpy as np
 from orthaug._base.folders import whole_folder
 from orthaug._base.lines import fold
 from orthaug._base.progress import SILENT, Progress
-from orthaug.commands.fit import Fitted, fill_result, fit_job
+from orthaug.commands.fit import FitReport, fill_result, fit_job
 from orthaug.commands.kinds import open_job
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.estimation import estimate
@@ -85,7 +85,7 @@ def _additive(example: Example, seed: int, progress: Progress) -> Estimate:
     )
 
 
-def _comparison(example: Example, orthogonal: Fitted, additive: list[Estimate]) -> str:
+def _comparison(example: Example, orthogonal: FitReport, additive: list[Estimate]) -> str:
     fit = orthogonal.fit
     std = fit.std if fit.std is not None else np.zeros_like(fit.theta)
     thetas = np.array([a.theta for a in additive])

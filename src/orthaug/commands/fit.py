@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class Fitted:
+class FitReport:
     """A fit with the content of result.json: parameters, scores on every part, findings."""
 
     job: Job
@@ -70,12 +70,12 @@ class Fitted:
 
 
 @one_blas_thread()
-def fit_job(job: Job, progress: Progress = SILENT) -> Fitted:
+def fit_job(job: Job, progress: Progress = SILENT) -> FitReport:
     """Train as the spec says, score every part, ask whether the learner earns its place, and try what may better it."""
     return advised(doubted(judged(fit_variant(job, AS_DECLARED, progress))))
 
 
-def advised(fitted: Fitted) -> Fitted:
+def advised(fitted: FitReport) -> FitReport:
     """Return a fit with the changes of its spec that were tried."""
     from orthaug.commands.advice import advise
 
@@ -88,7 +88,7 @@ def advised(fitted: Fitted) -> Fitted:
     return replace(fitted, result=FitResult.model_validate({**dict(fitted.result), **told}))
 
 
-def judged(fitted: Fitted) -> Fitted:
+def judged(fitted: FitReport) -> FitReport:
     """With whether the learner earns its place."""
     job, fit, warnings = fitted.job, fitted.fit, list(fitted.result.warnings)
     if not fit.status.ok or (fit.model.form.bound is None and fit.held_out is None):
@@ -111,13 +111,13 @@ def judged(fitted: Fitted) -> Fitted:
     return replace(fitted, result=result)
 
 
-def _physics_alone(fitted: Fitted) -> Any:
+def _physics_alone(fitted: FitReport) -> Any:
     """The fit of physics alone that the learner had to beat: the one that was made, or one by the same criterion."""
     made = fitted.fit.physics_alone
     return made if made is not None else fitted.job.run(Variant(ALONE, criterion=fitted.fit.criterion))
 
 
-def _unexplained(fitted: Fitted, physics: Callable[[], Any] | None) -> list[Warning]:
+def _unexplained(fitted: FitReport, physics: Callable[[], Any] | None) -> list[Warning]:
     """That a learner may have taken from parameters that it could imitate, where no cause tells by how much.
 
     Args:
@@ -165,13 +165,13 @@ def keeping(job: Job, folder: Path, *, resume: bool = False) -> Job:
     return replace(job, checkpoints=kept.opened(resume=resume))
 
 
-def fit_variant(job: Job, variant: Variant, progress: Progress = SILENT) -> Fitted:
+def fit_variant(job: Job, variant: Variant, progress: Progress = SILENT) -> FitReport:
     """Train a variant of a job and score every part; `judge_fit` asks whether the learner helps."""
     progress.planned(job.planned(variant))
     return told_of(job, job.run(variant, progress))
 
 
-def told_of(job: Job, fit: Any) -> Fitted:
+def told_of(job: Job, fit: Any) -> FitReport:
     """Scores of a fit on every part of its job, and all that results tell of it but the verdict on the learner."""
     warnings: list[Any] = [*job.warnings, *fit.warnings]
     if job.checkpoints is not None and job.checkpoints.lost:
@@ -214,7 +214,7 @@ def told_of(job: Job, fit: Any) -> Fitted:
     if terms:
         written = {writing: equation(fit.model, writing) for writing in ("text", "latex")}
         content |= {"terms": terms, "equation": written}
-    return Fitted(
+    return FitReport(
         job, fit, FitResult.model_validate(content), responses, {name: both for name, (_, both) in ran.items()}
     )
 
@@ -263,7 +263,7 @@ def _for_observers(fit: Any, verdict: str, warnings: list[Any]) -> Any:
 
 
 def judge_fit(
-    fitted: Fitted,
+    fitted: FitReport,
     physics: Callable[[], Any],
     blocks: Sequence[Trial] | None = None,
     alone: Mapping[str, tuple[Response, Response]] | None = None,
@@ -371,7 +371,7 @@ def _scored_along(model: Any, part: Part, warnings: list[Any]) -> PartScores:
     return PartScores.model_validate({"prediction": found.prediction, "simulation": simulation, "residual": tests})
 
 
-def write_result(fitted: Fitted, folder: Path, *, force: bool = False) -> None:
+def write_result(fitted: FitReport, folder: Path, *, force: bool = False) -> None:
     """result.json, model/ and figures/, whole or not at all; without a model where training failed."""
     with whole_folder(folder, force=force) as partial:
         fill_result(fitted, partial)
@@ -379,7 +379,7 @@ def write_result(fitted: Fitted, folder: Path, *, force: bool = False) -> None:
         fitted.job.checkpoints.discard()
 
 
-def fill_result(fitted: Fitted, folder: Path) -> None:
+def fill_result(fitted: FitReport, folder: Path) -> None:
     """Write the files of a result into an existing folder."""
     from orthaug.models import storage
 
@@ -399,7 +399,7 @@ def fill_result(fitted: Fitted, folder: Path) -> None:
     (folder / "report.html").write_text(fit_report(fitted), encoding="utf-8")
 
 
-def _draw(fitted: Fitted, folder: Path) -> None:
+def _draw(fitted: FitReport, folder: Path) -> None:
     from orthaug.reports import plots
 
     drawn = kind_of(fitted.job).figures(fitted.job, fitted.fit, fitted.result, fitted.responses)
@@ -407,7 +407,7 @@ def _draw(fitted: Fitted, folder: Path) -> None:
         plots.save(figure, folder / f"{name}.png")
 
 
-def fit_report(fitted: Fitted, origin: Origin | None = None) -> str:
+def fit_report(fitted: FitReport, origin: Origin | None = None) -> str:
     """The page of a fit that has a model; `origin` is where it comes from, None for its spec."""
     from orthaug.reports.learned_part import learned_of
     from orthaug.reports.page import fit_page

@@ -25,7 +25,7 @@ from orthaug.fitting.independent_terms import independent_terms
 from orthaug.fitting.kinds import STRUCTURES
 from orthaug.fitting.rules import check_cost, check_scored
 from orthaug.inference.kinds import MeasurePlace
-from orthaug.inference.measures import Measure, Weighed, weigh_problem
+from orthaug.inference.measures import Measure, WeighedPhysics, weigh_problem
 from orthaug.physics.parameters import PhysicsMap, with_initial
 from orthaug.physics.problem import Problem, check_defined, pose, regressor_of
 from orthaug.physics.streamed import pose_streamed
@@ -41,7 +41,7 @@ class LaggedJob(Job):
     """A job with a baseline."""
 
     problem: Problem
-    weighed: Weighed
+    weighed: WeighedPhysics
     physics: PhysicsMap | None
     engine: Engine
     """Who sums over the rows."""
@@ -218,7 +218,7 @@ def measure_of(spec: Spec, problem: Problem, folder: Path) -> Measure:
     return spec.declared_measure(MeasurePlace(folder, lags, problem.record, problem.rows.start))
 
 
-def _check_measure(weighed: Weighed, problem: Problem) -> None:
+def _check_measure(weighed: WeighedPhysics, problem: Problem) -> None:
     """Raise InputError for a measure under which the physics is rank-deficient, where on the data it is not."""
     if problem.excitation.full_rank and not weighed.excitation.full_rank:
         groups = "; ".join(", ".join(group) for group in weighed.excitation.collinear)

@@ -16,7 +16,7 @@ from orthaug._base.checks import check_type
 from orthaug._base.errors import InputError, TrainingError
 from orthaug._base.folders import check_new_file, whole_file
 from orthaug.commands.doubts import doubted
-from orthaug.commands.fit import Fitted, fit_job, fit_report, judged, told_of, write_result
+from orthaug.commands.fit import FitReport, fit_job, fit_report, judged, told_of, write_result
 from orthaug.commands.folder import check_folder, check_inputs_kept
 from orthaug.commands.job import Job, origin_of
 from orthaug.commands.kinds import open_job
@@ -56,7 +56,7 @@ def load_spec(path: str | os.PathLike) -> Job:
     return open_job(Path(path))
 
 
-def fit_spec(spec: Spec, out: str | os.PathLike | None = None) -> Fitted:
+def fit_spec(spec: Spec, out: str | os.PathLike | None = None) -> FitReport:
     """What `orthaug fit` does: train, score every part, and ask whether the learner earns its place.
 
     Args:
@@ -86,7 +86,7 @@ def compare(spec: Spec, models: Sequence[str | os.PathLike] = (), out: str | os.
         out: folder to write result, models and figure into; None to write nothing.
 
     Returns:
-        `fitted`, one `Fitted` by the name of the structure; `verdicts`, whether the learner helps in each; `result`,
+        `fitted`, one `FitReport` by the name of the structure; `verdicts`, whether the learner helps in each; `result`,
         the content of result.json; `summary()`, what the command prints.
 
     Raises:
@@ -132,7 +132,7 @@ class Page:
 
 
 @dataclass(frozen=True)
-class Known:
+class FitFacts:
     """What a fit tells in the place of a spec."""
 
     fit: Any
@@ -186,7 +186,7 @@ def page_of(
     return _written(fit_report(doubted(judged(told_of(job, fit))), made), place)
 
 
-def page_of_spec(fitted: Fitted, path: str | os.PathLike | None, tests: None = None) -> Page:
+def page_of_spec(fitted: FitReport, path: str | os.PathLike | None, tests: None = None) -> Page:
     """The page of what `fit_spec` returned, as the command line writes it; errors as `page_of`."""
     place = _checked(fitted.fit, path)
     return _written(fit_report(fitted), place)
@@ -224,7 +224,7 @@ def job_of(fit: Any, tests: Mapping[str, Record]) -> Job:
     if not isinstance(tests, Mapping) or not all(isinstance(record, Record) for record in tests.values()):
         raise InputError("`tests` must be records by their names, such as {'steps': record}.")
     problem = fit.problem
-    named: dict[str, Any] = {"path": Path(NAME), "spec": Known(fit), "validation": None, "problem": problem}
+    named: dict[str, Any] = {"path": Path(NAME), "spec": FitFacts(fit), "validation": None, "problem": problem}
     named["train"] = Part("train", problem.record, 0, ())
     named["tests"] = tuple(
         Part(f"tests.{name}", fit.model.fitting(record, need_outputs=True), 0, ()) for name, record in tests.items()

@@ -9,7 +9,7 @@ from orthaug._base.errors import InputError
 from orthaug._base.folders import check_replaceable, whole_file, whole_folder
 from orthaug.commands.folder import check_figure, check_file, save_figure
 from orthaug.commands.parts import load_parts
-from orthaug.commands.run import Reading, open_run
+from orthaug.commands.run import ReadOptions, open_run
 from orthaug.commands.spec import load_spec
 from orthaug.data.record import Record
 
@@ -53,7 +53,7 @@ def open_linear(model: Path, data: Path | None) -> tuple[Model | MotionModel, Re
 
         return load(model), None
     if data.suffix.lower() != ".toml":
-        opened = open_run(model, data, need_outputs=True, reading=Reading(prepare=True))
+        opened = open_run(model, data, need_outputs=True, reading=ReadOptions(prepare=True))
         return opened.model, opened.record
     from orthaug.models.storage import load
 

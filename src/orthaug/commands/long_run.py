@@ -13,7 +13,7 @@ import numpy as np
 
 from orthaug._base.errors import Warning
 from orthaug._base.folders import whole_file
-from orthaug.commands.run import Reading, check_instants, held_outputs
+from orthaug.commands.run import ReadOptions, check_instants, held_outputs
 from orthaug.data.parquet_source import open_parquet
 from orthaug.data.sources import Source
 from orthaug.data.tables import parquet_file
@@ -35,13 +35,13 @@ class LongRun:
     free: bool
 
 
-def long_run(model: Path, data: Path, reading: Reading, *, free: bool) -> LongRun | None:
+def long_run(model: Path, data: Path, reading: ReadOptions, *, free: bool) -> LongRun | None:
     """The model on a long Parquet file with all its channels; None for what is read at once.
 
     Raises:
         InputError: no model, a file that cannot be read, a model of data that had other instants.
     """
-    if data.suffix.lower() != ".parquet" or reading != Reading(columns=reading.columns) or not data.is_file():
+    if data.suffix.lower() != ".parquet" or reading != ReadOptions(columns=reading.columns) or not data.is_file():
         return None
     with parquet_file(data) as file:
         if file.metadata.num_rows <= LONG:

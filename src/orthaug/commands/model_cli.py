@@ -30,7 +30,7 @@ from orthaug.commands.program import (
 )
 
 if TYPE_CHECKING:
-    from orthaug.commands.run import ModelOnData, Reading
+    from orthaug.commands.run import ModelOnData, ReadOptions
     from orthaug.models.response import Response
 
 
@@ -53,7 +53,7 @@ def simulate(
     from orthaug.commands.folder import check_file, chosen_model
 
     model = chosen_model(model, which)
-    reading = run.Reading.of(missing, rows, every, column or (), prepare)
+    reading = run.ReadOptions.of(missing, rows, every, column or (), prepare)
     if initial is None and _written_long(model, data, reading, out, force, free=True):
         return
     opened = run.open_run(model, data, reading=reading)
@@ -87,7 +87,7 @@ def predict(
     from orthaug.commands.folder import check_file, chosen_model
 
     model = chosen_model(model, which)
-    reading = run.Reading.of(missing, rows, every, column or (), prepare)
+    reading = run.ReadOptions.of(missing, rows, every, column or (), prepare)
     plain = horizon == 1 and initial is None and not observer
     if plain and _written_long(model, data, reading, out, force, free=False):
         return
@@ -274,7 +274,7 @@ def track(
     tell(tracked.result, text, as_json, folder)
 
 
-def _written_long(model: Path, data: Path, reading: Reading, out: Path | None, force: bool, *, free: bool) -> bool:
+def _written_long(model: Path, data: Path, reading: ReadOptions, out: Path | None, force: bool, *, free: bool) -> bool:
     """Whether the file is one that is not read at once; then its table is written piece by piece."""
     from orthaug.commands import long_run
     from orthaug.commands.folder import check_file

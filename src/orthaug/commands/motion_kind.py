@@ -43,7 +43,7 @@ def checked(job: MotionJob) -> CheckResult:
     from orthaug.fitting.segmented_motion import SegmentedMotion
     from orthaug.inference.motion_split import shared_of_motion
     from orthaug.inference.nearly_shared import shared_warnings
-    from orthaug.models.moving import Moving
+    from orthaug.models.moving import MotionDynamics
 
     problem, spec = job.problem, job.spec
     motion, criterion = problem.motion, spec.declared_criterion()
@@ -57,7 +57,7 @@ def checked(job: MotionJob) -> CheckResult:
         raise InputError(f"{job.path}: physics alone has no finite free run from its initial values; {remedy}")
     shared, on_rows = None, []
     if spec.declared_learner() is not None and job.structure.shared != "all":
-        form = Moving(motion, problem.features, None, problem.record.sampling_time, problem.substeps)
+        form = MotionDynamics(motion, problem.features, None, problem.record.sampling_time, problem.substeps)
         shared = imitation_before(form, motion.coordinates.initial, told.states, told.inputs)
         seen = shared_of_motion(form, motion.coordinates.initial, told.states, told.inputs)
         on_rows = shared_warnings(seen, [str(entry) for entry in form.features])

@@ -27,7 +27,7 @@ class Interrupted(Exception):
     """Ctrl-C, with what it stopped; typer would turn a KeyboardInterrupt into a bare exit code."""
 
 
-class Unread(Exception):
+class OutputClosed(Exception):
     """Nobody reads the output any more, as after `| head`; typer would turn a BrokenPipeError into exit code 1."""
 
 
@@ -39,11 +39,11 @@ class _Group(typer.core.TyperGroup):
             raise Interrupted(*interrupt.args) from None
         except OSError as error:
             if error.errno in _NO_READER and error.filename is None:
-                raise Unread from None
+                raise OutputClosed from None
             raise
 
 
-class TakesLists(typer.core.TyperCommand):
+class ListOptionCommand(typer.core.TyperCommand):
     """A command each of whose repeatable options takes several values too: `--inputs a b`."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
@@ -132,7 +132,7 @@ def main() -> None:
         _fail(f"training failed: {error}", 1)
     except (Interrupted, KeyboardInterrupt) as interrupt:
         _fail(f"interrupted{''.join(f' during {text}' for text in interrupt.args)}; nothing is written", 130)
-    except (Unread, BrokenPipeError):
+    except (OutputClosed, BrokenPipeError):
         streams.silence(sys.stdout)
         sys.exit(0)
     except OSError as error:

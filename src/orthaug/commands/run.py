@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Reading:
+class ReadOptions:
     """Which rows and columns of a data file are read, as a part of a spec says it."""
 
     missing: str = "error"
@@ -43,7 +43,9 @@ class Reading:
     """Whether the rows go through the steps of the model's training data; None where nobody has said."""
 
     @classmethod
-    def of(cls, missing: str, rows: str | None, every: int, columns: Sequence[str], prepare: bool | None) -> Reading:
+    def of(
+        cls, missing: str, rows: str | None, every: int, columns: Sequence[str], prepare: bool | None
+    ) -> ReadOptions:
         """Of the options of a command.
 
         Raises:
@@ -83,7 +85,7 @@ def read_rows(text: str | None) -> tuple[int, int] | None:
     return int(start), int(stop)
 
 
-def trained_reading(model: Path, data: Path) -> Reading | None:
+def trained_reading(model: Path, data: Path) -> ReadOptions | None:
     """How a file was read to train a model, by the result beside that; None where it is none of its files."""
     digest = file_digest(data)
     for content in results_beside(model):
@@ -91,7 +93,7 @@ def trained_reading(model: Path, data: Path) -> Reading | None:
             if digest in [file["sha256"] for file in content["data"]["train"]]:
                 part = content["spec"]["data"]["train"]
                 rows = np.reshape(part.get("rows") or [], (-1, 2)).astype(int).tolist() or None
-                return Reading("skip", rows, int(part.get("every") or 1), dict(part.get("columns") or {}), True)
+                return ReadOptions("skip", rows, int(part.get("every") or 1), dict(part.get("columns") or {}), True)
     return None
 
 
@@ -105,7 +107,7 @@ def open_explained(model: Path, data: Sequence[Path], rows: tuple[int, int] | No
     for path in data:
         check_readable(path)
         trained = trained_reading(model, path)
-        reading = trained or Reading("skip", prepare=True)
+        reading = trained or ReadOptions("skip", prepare=True)
         opened.append(open_run(model, path, reading=replace(reading, rows=rows or reading.rows)))
         taken = rows_taken(trained) if trained and not rows else ""
         notes += opened[-1].notes
@@ -114,13 +116,13 @@ def open_explained(model: Path, data: Sequence[Path], rows: tuple[int, int] | No
     return replace(opened[0], record=whole, notes=tuple(dict.fromkeys(notes)))
 
 
-def rows_taken(reading: Reading) -> str:
+def rows_taken(reading: ReadOptions) -> str:
     """Which rows of a file were trained on, where that is not all."""
     return "rows " + " and ".join(f"{start}:{stop}" for start, stop in reading.rows) if reading.rows else ""
 
 
 def open_run(
-    model: Path, data: Path, *, need_outputs: bool = False, reading: Reading | None = None, ahead: int = 0
+    model: Path, data: Path, *, need_outputs: bool = False, reading: ReadOptions | None = None, ahead: int = 0
 ) -> ModelOnData:
     """Load a model and read its channels from a file; outputs only where the file has them, unless needed.
 
@@ -133,7 +135,7 @@ def open_run(
     check_readable(data)
     from orthaug.models.storage import load
 
-    loaded, reading = load(model), reading or Reading()
+    loaded, reading = load(model), reading or ReadOptions()
     names = [c.name for c in (*loaded.inputs, *loaded.outputs)]
     for name in reading.columns:
         if name not in names:
@@ -161,7 +163,7 @@ def open_run(
     return ModelOnData(loaded, record, data, rows, told)
 
 
-def record_for(model: Model | MotionModel, data: Path, outputs: Sequence[Channel], reading: Reading) -> Record:
+def record_for(model: Model | MotionModel, data: Path, outputs: Sequence[Channel], reading: ReadOptions) -> Record:
     """A model's inputs, and some outputs, from a file.
 
     Raises:
@@ -194,7 +196,7 @@ def check_instants(model: Model | MotionModel, data: Path) -> None:
         )
 
 
-def held_outputs(model: Model | MotionModel, data: Path, reading: Reading) -> list[Channel]:
+def held_outputs(model: Model | MotionModel, data: Path, reading: ReadOptions) -> list[Channel]:
     """The outputs that a file has columns of."""
     return [c for c in model.outputs if has_column(data, reading.columns.get(c.name, c.file_column))]
 
@@ -274,7 +276,7 @@ def with_initial(opened: ModelOnData, initial: str | Any) -> Record:
 
 
 def open_ahead(
-    model: Path, data: Path, reading: Reading, horizon: int, initial: str | None, *, observer: bool = False
+    model: Path, data: Path, reading: ReadOptions, horizon: int, initial: str | None, *, observer: bool = False
 ) -> ModelOnData:
     """As `open_run` for predictions `horizon` steps ahead; an observer's record keeps missing outputs.
 

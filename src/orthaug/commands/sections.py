@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
 from orthaug._base.checks import nearest
 from orthaug._base.errors import KeyedError, cut
-from orthaug._base.registry import InSpec, Key, OneOf, Option, Registry
+from orthaug._base.registry import Key, OneOf, Option, Registry, SpecLimit
 from orthaug.physics.parameters import PhysicalParameter
 
 Count = Annotated[int, Field(ge=0, strict=True)]
@@ -98,7 +98,7 @@ def _in_file(annotation: Any) -> Any:
         for limit in annotation.__metadata__:
             if isinstance(limit, OneOf):
                 return Literal[tuple(limit.choices)]
-            limits += [limit.limit] if isinstance(limit, InSpec) else [] if isinstance(limit, Option) else [limit]
+            limits += [limit.limit] if isinstance(limit, SpecLimit) else [] if isinstance(limit, Option) else [limit]
         plain = _in_file(inner[0])
         return Annotated[(plain, *limits)] if limits else plain  # type: ignore[return-value]
     if origin is tuple and inner[-1] is not Ellipsis:

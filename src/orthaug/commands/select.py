@@ -32,7 +32,7 @@ _DEGREE = 3  # of the terms that a spec without [learner] is searched with
 
 
 @dataclass(frozen=True, eq=False)
-class Selected:
+class SelectionReport:
     """A job, what was selected for it, and the result that is written."""
 
     job: LaggedJob
@@ -61,7 +61,7 @@ def open_select(path: Path) -> tuple[LaggedJob, Spec]:
     return open_lagged(path, alone), spec
 
 
-def select_for(job: LaggedJob, spec: Spec, folder: Path, told: Told) -> Selected:
+def select_for(job: LaggedJob, spec: Spec, folder: Path, told: Told) -> SelectionReport:
     """Select, and write the choice into the spec.
 
     Args:
@@ -92,7 +92,7 @@ def select_for(job: LaggedJob, spec: Spec, folder: Path, told: Told) -> Selected
     except InputError as error:
         raise InputError(f"{job.path}: {error}") from None
     result = _result(job, selection, time.monotonic() - began)
-    return Selected(job, selection, result, _new_spec(job, folder, selection, halved=section.halves))
+    return SelectionReport(job, selection, result, _new_spec(job, folder, selection, halved=section.halves))
 
 
 def steps_at_most(terms: int | None) -> int:
@@ -103,7 +103,7 @@ def steps_at_most(terms: int | None) -> int:
     return steps(MOST if terms is None else terms)
 
 
-def write_selected(selected: Selected, folder: Path, *, force: bool = False) -> None:
+def write_selected(selected: SelectionReport, folder: Path, *, force: bool = False) -> None:
     """result.json, spec.toml, table.csv and the figure, whole or not at all."""
     from orthaug.reports.drawing import save
     from orthaug.reports.plots import selection_figure

@@ -29,7 +29,7 @@ def _nothing() -> str:
     return ""
 
 
-class Watch:
+class SignalWatch:
     """Ends the program on a signal, once it is started; before that, signals do what they always do."""
 
     def __init__(self) -> None:
@@ -120,4 +120,4 @@ def _leave_to_the_thread(number: int, frame: object) -> None:
     """Python must have a handler, or the signal ends the process before the thread hears of it."""
 
 
-WATCH = Watch()  # of the process, as its signals are
+WATCH = SignalWatch()  # of the process, as its signals are

@@ -15,7 +15,7 @@ from orthaug._base.errors import InputError, KeyedError, Warning
 from orthaug._base.folders import file_digest
 from orthaug._base.registry import Key, keys_of, resolve
 from orthaug.commands.folder import results_beside
-from orthaug.commands.run import ModelOnData, Reading, prepared_notes, record_for, rows_taken, trained_reading
+from orthaug.commands.run import ModelOnData, ReadOptions, prepared_notes, record_for, rows_taken, trained_reading
 from orthaug.data.record import Record
 from orthaug.data.tables import check_readable
 from orthaug.inference.kinds import MEASURES, MeasurePlace
@@ -37,7 +37,7 @@ def open_training(model: Path, data: Sequence[Path], rows: tuple[int, int] | Non
     trained = [trained_reading(model, path) for path in data]
     read, notes = [], []
     for path, own in zip(data, trained, strict=True):
-        reading = own or Reading("skip", prepare=True)  # of rows with missing cells none were trained on
+        reading = own or ReadOptions("skip", prepare=True)  # of rows with missing cells none were trained on
         taken = rows_taken(reading)
         if rows is None:
             notes += [f"note: {path.name}: {taken}, those of the training."] if taken else []

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from orthaug._base.errors import InputError, Warning
 from orthaug._base.folders import file_digest, whole_folder
 from orthaug.commands.folder import results_beside
-from orthaug.commands.run import Reading, record_for
+from orthaug.commands.run import ReadOptions, record_for
 from orthaug.commands.split import open_training
 from orthaug.data.record import Record
 from orthaug.data.tables import check_readable
@@ -29,7 +29,7 @@ STATE = "state"
 
 
 @dataclass(frozen=True, eq=False)
-class Opened:
+class TrackingInput:
     """A model with new data, what it was trained on, and the physical parameters that its result declares."""
 
     model: Model
@@ -40,7 +40,7 @@ class Opened:
 
 
 @dataclass(frozen=True, eq=False)
-class Tracked:
+class TrackingReport:
     """What was found."""
 
     online: Recursive
@@ -50,7 +50,7 @@ class Tracked:
 
 def open_track(
     model: Path, data: Sequence[Path], training: Sequence[Path], rows: tuple[int, int] | None, state: Path | None
-) -> Opened:
+) -> TrackingInput:
     """Load a model, new data, and the files that it was trained on.
 
     Raises:
@@ -74,10 +74,10 @@ def open_track(
         raise InputError(f"{model}: {MOTION}")
     records, files = [], []
     for path in data:
-        records.append(record_for(loaded, path, loaded.outputs, Reading("skip", prepare=True)))
+        records.append(record_for(loaded, path, loaded.outputs, ReadOptions("skip", prepare=True)))
         files.append(FileResult(file=str(path), sha256=file_digest(path), rows=len(records[-1])))
     given = open_training(model, training, rows).record if training else None
-    return Opened(loaded, Record.join(records), given, tuple(files), _physics_of(model, loaded.sampling_time))
+    return TrackingInput(loaded, Record.join(records), given, tuple(files), _physics_of(model, loaded.sampling_time))
 
 
 def _physics_of(model: Path, sampling_time: float) -> PhysicsMap | None:
@@ -91,13 +91,13 @@ def _physics_of(model: Path, sampling_time: float) -> PhysicsMap | None:
 
 
 def track(
-    opened: Opened,
+    opened: TrackingInput,
     *,
     forgetting: float | None,
     memory: float | None,
     state: Path | None,
     follows: bool,
-) -> Tracked:
+) -> TrackingReport:
     """Follow the new rows.
 
     Raises:
@@ -116,10 +116,10 @@ def track(
         if digest(online.fitted) != digest(opened.model):
             raise InputError(f"{state}: is the state of another model; give the one that it was begun with.")
     online.update(opened.record, gap=not follows)
-    return Tracked(online, _result(opened, online), opened.physics)
+    return TrackingReport(online, _result(opened, online), opened.physics)
 
 
-def _result(opened: Opened, online: Recursive) -> TrackResult:
+def _result(opened: TrackingInput, online: Recursive) -> TrackResult:
     from orthaug.fitting.recursive import outside_text
     from orthaug.models.storage import digest
 
@@ -157,7 +157,7 @@ def _result(opened: Opened, online: Recursive) -> TrackResult:
     )
 
 
-def write_tracked(tracked: Tracked, folder: Path, text: str, *, force: bool = False) -> None:
+def write_tracked(tracked: TrackingReport, folder: Path, text: str, *, force: bool = False) -> None:
     """result.json, report.txt, table.csv, figures/ and the state, whole or not at all."""
     from orthaug.reports.drawing import save
     from orthaug.reports.plots import tracking_figure

@@ -30,7 +30,7 @@ _COUNTING = (0.0, 1.0)  # where counters of rows begin
 
 
 @dataclass(frozen=True, eq=False)
-class Refused:
+class RefusedColumn:
     """A column that could be the time and is not, with the reason; `signal` says whether it may be a channel."""
 
     column: Column
@@ -48,7 +48,7 @@ class Clock:
     seconds: Vector | None = None
     """The instants in s, where the column holds them: it can be the spec's `time`."""
     even: bool = True
-    refused: tuple[Refused, ...] = ()
+    refused: tuple[RefusedColumn, ...] = ()
     """Columns that could be taken for the time."""
 
     @property
@@ -111,7 +111,7 @@ def find_clock(columns: Sequence[Column], near: str = "") -> Clock:
         elif fault is None and clock.column is None:
             clock = _ticking(column, column.values if dates else in_seconds(column.values, column.header))
         elif fault is None and not dates:
-            refused.append(Refused(column, "rises as a time does, and another column is the time", False))
+            refused.append(RefusedColumn(column, "rises as a time does, and another column is the time", False))
     for column in columns:
         if column.unusable or column is clock.column or is_time(column.header):
             continue
@@ -119,7 +119,7 @@ def find_clock(columns: Sequence[Column], near: str = "") -> Clock:
         if verdict is None and clock.column is None and column.filled == rows:
             clock = _ticking(column, in_seconds(column.values, column.header))
         elif verdict is None:
-            refused.append(Refused(column, f"rises by {_mean_step(column):g} in each row, as a time does", False))
+            refused.append(RefusedColumn(column, f"rises by {_mean_step(column):g} in each row, as a time does", False))
         elif verdict:
             refused.append(verdict)
     kept = tuple(one for one in refused if not clock.instants or not one.signal or is_time(one.column.header))
@@ -136,25 +136,25 @@ def _mean_step(column: Column) -> float:
     return float((column.finite[-1] - column.finite[0]) / (rows[-1] - rows[0]))
 
 
-def _fault(column: Column, rows: int) -> Refused | None:
+def _fault(column: Column, rows: int) -> RefusedColumn | None:
     """Return why a column that is named as the time cannot be it; None where it can."""
     values = column.finite
     steps = np.diff(values)
     if len(steps) and (steps > 0).all() and column.filled == rows:
         return None
     if column.filled != rows:
-        return Refused(column, f"ends after {column.filled} of {rows} rows, so it is not the time", False)
+        return RefusedColumn(column, f"ends after {column.filled} of {rows} rows, so it is not the time", False)
     if len(steps) and not ((steps > 0).mean() >= _RISES or (steps >= 0).all()):
-        return Refused(column, "falls in many rows, so it is taken for a signal", True)
+        return RefusedColumn(column, "falls in many rows, so it is taken for a signal", True)
     at = int(np.flatnonzero(steps <= 0)[0]) + 1 if len(steps) else 0
     row = int(np.flatnonzero(np.isfinite(column.values))[at])
     went = f"stands still at {values[at]:g}"
     if len(steps) and steps[at - 1] < 0:
         went = f"falls from {values[at - 1]:g} to {values[at]:g}"
-    return Refused(column, f"{went} in row {row}, so it is not the time", False)
+    return RefusedColumn(column, f"{went} in row {row}, so it is not the time", False)
 
 
-def _resemblance(column: Column) -> Refused | bool | None:
+def _resemblance(column: Column) -> RefusedColumn | bool | None:
     """Return whether a column of any name is the time by its values: None where it is, False where nothing says so.
 
     A column that rises and is not the time for another reason comes with the reason.
@@ -170,13 +170,13 @@ def _resemblance(column: Column) -> Refused | bool | None:
     alike = (np.abs(steps - usual) <= JITTER * usual).mean() >= _MOSTLY and max(thirds) - min(thirds) <= DRIFT * usual
     if not (on_line or alike):
         reason = f"rises, but in steps of {steps.min():.3g} to {steps.max():.3g}, so it is taken for a signal"
-        return Refused(column, reason, True)
+        return RefusedColumn(column, reason, True)
     unit = unit_of_time(header)[1]
     if unit is None:
         reason = f"rises evenly, but its unit {split_header(header)[1]} is none of time, so it is taken for a signal"
-        return Refused(column, reason, True)
+        return RefusedColumn(column, reason, True)
     if (steps == 1).all() and values[0] in _COUNTING and not split_header(header)[1]:
-        return Refused(column, "counts the rows", False)
+        return RefusedColumn(column, "counts the rows", False)
     return None
 
 

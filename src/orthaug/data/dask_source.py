@@ -29,9 +29,9 @@ class FramePartition:
     missing: str
     held: tuple[Any, ...]
 
-    def on(self, frame: Any, before: Any) -> HeldFrame:
+    def on(self, frame: Any, before: Any) -> FramePartitionData:
         """The same where the rows are."""
-        return HeldFrame(replace(self, held=()), frame, before)
+        return FramePartitionData(replace(self, held=()), frame, before)
 
     def head(self, rows: int) -> FramePartition:
         """Its first rows, taken where they are."""
@@ -45,7 +45,7 @@ class FramePartition:
 
 
 @dataclass(frozen=True, eq=False)
-class HeldFrame:
+class FramePartitionData:
     """A partition with its rows."""
 
     of: FramePartition
@@ -121,7 +121,7 @@ class FrameSource:
             if a < b:
                 frame = self.client.submit(_rows, partition.held[0], a, b, pure=False).result()
                 shown = replace(partition, first_row=partition.first_row + a, rows=b - a, held=())
-                found += HeldFrame(shown, frame, None).pieces(0)
+                found += FramePartitionData(shown, frame, None).pieces(0)
         return joined(found)
 
 

@@ -50,7 +50,7 @@ class Runs(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Reading:
+class ChannelColumns:
     """How the channels stand in the files."""
 
     inputs: tuple[Channel, ...]
@@ -72,7 +72,7 @@ class RowGroups:
     start: int
     stop: int
     runs: Runs
-    reading: Reading
+    reading: ChannelColumns
     stamp: Stamp
 
     @property
@@ -196,7 +196,7 @@ def open_parquet(
     given, groups = dict(columns or {}), (as_channels(inputs, "inputs"), as_channels(outputs, "outputs"))
     check_channels(*groups)
     own = tuple(given.get(c.name, c.file_column) for c in (*groups[1], *groups[0]))
-    reading = Reading(*groups, own, missing)
+    reading = ChannelColumns(*groups, own, missing)
     partitions, steps, types = [], [], {}
     for path in map(Path, paths):
         check_readable(path)
@@ -262,14 +262,14 @@ def _look(file: Any, path: Path, total: int, time: str | None, experiment: str |
     if time is None and experiment is None:
         return Runs(((0, total),), (0.0,)), None
     wanted = [name for name in (time, experiment) if name]
-    found = _Look(path, time, experiment)
+    found = _BatchScan(path, time, experiment)
     for batch in file.iter_batches(batch_size=BATCH_ROWS, columns=wanted):
         instants = None if time is None else found.seconds(batch.column(time).to_numpy(zero_copy_only=False))
         found.add(instants, None if experiment is None else _numbers(batch, experiment))
     return found.ended()
 
 
-class _Look:
+class _BatchScan:
     """Where experiments begin and how time steps, batch by batch; each batch is joined to the last row before it."""
 
     def __init__(self, path: Path, time: str | None, experiment: str | None) -> None:
@@ -357,7 +357,7 @@ def _grouped(groups: Sequence[int], least: int) -> Iterator[tuple[int, int]]:
         yield start, stop
 
 
-def _batches(path: Path, start: int, stop: int, reading: Reading) -> Iterator[tuple[int, np.ndarray]]:
+def _batches(path: Path, start: int, stop: int, reading: ChannelColumns) -> Iterator[tuple[int, np.ndarray]]:
     """Rows `[start, stop)` of a file as (first row, matrix of its columns)."""
     with parquet_file(path) as file:
         ends = np.cumsum([file.metadata.row_group(i).num_rows for i in range(file.metadata.num_row_groups)])

@@ -91,7 +91,9 @@ def read_record(
     ranges = _ranges(rows, total, path)
     ranges = ranges if experiment is None else _labelled(table, experiment, ranges)
     if prepare:
-        return _Uncut(table, channels, column_of, time, sampling_time or 1.0, every, missing).prepared(prepare, ranges)
+        return _RawRanges(table, channels, column_of, time, sampling_time or 1.0, every, missing).prepared(
+            prepare, ranges
+        )
     for begin, end in ranges:
         recorded += len(range(begin, end, every))
         for start, stop in _stretches(table, wanted, needed, begin, end, every, missing):
@@ -120,7 +122,7 @@ def read_record(
 
 
 @dataclass(frozen=True, eq=False)
-class _Uncut:
+class _RawRanges:
     """Ranges of a table as they are, missing samples too, for steps that may mend them."""
 
     table: Table

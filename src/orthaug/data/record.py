@@ -10,7 +10,7 @@ import numpy as np
 
 from orthaug._base.checks import Matrix, as_signal, check_choice, check_label, check_type, check_unique, is_number
 from orthaug._base.errors import LONGEST, InputError, shown, visible
-from orthaug._base.views import Shown
+from orthaug._base.views import NotebookView
 from orthaug.data.expressions import RESERVED, is_name
 from orthaug.data.prepared import Prepared, added_up
 
@@ -153,7 +153,7 @@ class Experiment:
 
 
 @dataclass(frozen=True, eq=False)
-class Record(Shown):
+class Record(NotebookView):
     """Experiments that share channels and sampling time; lags never reach across experiments.
 
     `sampling_time` is in seconds. `outputs` is empty for a record that only carries inputs (something

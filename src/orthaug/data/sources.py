@@ -90,7 +90,7 @@ def witness(source: Source, limit: int = WITNESS_ROWS) -> Record:
 
 
 @dataclass(frozen=True, eq=False)
-class HeldRows:
+class RowPartition:
     """A partition that carries its rows."""
 
     experiment: Experiment
@@ -182,16 +182,16 @@ class RecordSource:
         return self.record.time_column
 
     @property
-    def partitions(self) -> tuple[HeldRows, ...]:
+    def partitions(self) -> tuple[RowPartition, ...]:
         return self._held
 
     @cached_property
-    def _held(self) -> tuple[HeldRows, ...]:
+    def _held(self) -> tuple[RowPartition, ...]:
         held = []
         for experiment in self.record.experiments:
             for begin in range(0, len(experiment), self.size):
                 first = max(begin - self.lead, 0)
-                held.append(HeldRows(_later(experiment, first, begin + self.size), begin - first))
+                held.append(RowPartition(_later(experiment, first, begin + self.size), begin - first))
         return tuple(held)
 
     def window(self, start: int, stop: int) -> list[Experiment]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from orthaug._base.checks import Vector, nearest
 from orthaug._base.errors import InputError, shown
-from orthaug.data.clock import DATES, Clock, Refused, by_single_number, find_clock
+from orthaug.data.clock import DATES, Clock, RefusedColumn, by_single_number, find_clock
 from orthaug.data.columns import Column, channel_name
 from orthaug.data.headers import split_header
 from orthaug.data.layouts import numbers_only
@@ -36,7 +36,7 @@ class Survey:
         found = [c for c in self.columns if not c.unusable and not c.constant]
         return tuple(c for c in found if not any(c is one for one in apart))
 
-    def looks_like_time(self, column: Column) -> Refused | None:
+    def looks_like_time(self, column: Column) -> RefusedColumn | None:
         """Return why a column is no channel although it has numbers that vary: it rises as a time does."""
         return next((one for one in self.clock.refused if one.column is column and not one.signal), None)
 

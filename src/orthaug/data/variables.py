@@ -32,7 +32,7 @@ _ELEMENT = re.compile(r"[({]\s*(?::\s*,\s*)?([1-9]\d{0,8})\s*(,\s*:\s*)?[)}]")  
 
 
 @dataclass(frozen=True)
-class Held:
+class FileVariable:
     """A variable of a file: what it is, in words, and how to read it (None where it holds no numbers).
 
     `text` reads a text. `named` is the name that the file itself gives to the signal, beside its path.
@@ -96,19 +96,19 @@ def foreign(path: Path) -> Iterator[None]:
 
 def _from_npz(path: Path, names: Wanted) -> dict[str, Vector]:
     with zipfile.ZipFile(path) as archive:
-        held: dict[str, Held] = {}
+        held: dict[str, FileVariable] = {}
         for info in archive.infolist():
             try:
                 held[info.filename.removesuffix(".npy")] = _member(path, archive, info)
             except Exception as error:  # one that cannot be read matters only where it is asked for
-                held[info.filename.removesuffix(".npy")] = Held(f"unreadable: {short(error)}", None)
+                held[info.filename.removesuffix(".npy")] = FileVariable(f"unreadable: {short(error)}", None)
         return _taken(path, names, held)
 
 
 _LARGE, _DENSEST = 2**28, 300  # bytes of an array that may shrink as it likes, and by how much a larger one may
 
 
-def _member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Held:
+def _member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> FileVariable:
     """An array of an archive by its header; Python objects are never opened."""
     with archive.open(info) as member:
         version = np.lib.format.read_magic(member)
@@ -116,16 +116,18 @@ def _member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Held
         shape, _, kind = read(member)
         begin = member.tell()
     if kind.hasobject:
-        return Held("Python objects", None)
+        return FileVariable("Python objects", None)
     if kind.kind not in "fiubc":
-        return Held("text" if kind.kind in "US" else f"{kind} values", None)
+        return FileVariable("text" if kind.kind in "US" else f"{kind} values", None)
     size = math.prod(shape) * kind.itemsize
     if size != info.file_size - begin:
-        return Held(f"cut: {in_words(info.file_size - begin)} of {in_words(size)}", None)
+        return FileVariable(f"cut: {in_words(info.file_size - begin)} of {in_words(size)}", None)
 
     if size > _LARGE and size > _DENSEST * info.compress_size:
         packed = in_words(info.compress_size)
-        return Held(f"{in_words(size)} in {packed} of the file, denser than measurements; store it uncompressed", None)
+        return FileVariable(
+            f"{in_words(size)} in {packed} of the file, denser than measurements; store it uncompressed", None
+        )
 
     def load() -> np.ndarray:
         with archive.open(info) as member:
@@ -141,18 +143,18 @@ def _from_mat(path: Path, names: Wanted) -> dict[str, Vector]:
     variables = read_mat5(content, path)
     asked = () if names is None or callable(names) else names
     roots = {_ROOT.split(name.lstrip("/"))[0] for name in asked}
-    held: dict[str, Held] = {}
+    held: dict[str, FileVariable] = {}
     for name, variable in variables.items():
         held |= _held(path, variable, deep=not roots or name in roots or not roots <= variables.keys())
     return _taken(path, names, _with_names(held))
 
 
-def _held(path: Path, variable: Variable, *, deep: bool) -> dict[str, Held]:
+def _held(path: Path, variable: Variable, *, deep: bool) -> dict[str, FileVariable]:
     """A variable, with what is in it if wanted, by their paths."""
     if not variable.what:
         return {variable.name: _lazy(path, variable.shape, 8, variable.numbers)}
     text = variable.text if variable.what == "text" else None
-    held = {variable.name: Held(variable.what, None, variable.shape, text)}
+    held = {variable.name: FileVariable(variable.what, None, variable.shape, text)}
     for part in variable.parts() if deep else ():
         held |= _held(path, part, deep=True)
     return held
@@ -180,7 +182,7 @@ class _Datasets:
     path: Path
     file: Any
     matlab: bool
-    held: dict[str, Held]
+    held: dict[str, FileVariable]
 
     def add(self, name: str, item: Any) -> None:
         """Note what stands at a path of groups; `#refs#` is reached by its references only."""
@@ -194,22 +196,24 @@ class _Datasets:
         kind = _word(item.attrs.get("MATLAB_class", b""))
         if isinstance(item, h5py.Group):
             sparse = "MATLAB_sparse" in item.attrs
-            self.held[key] = Held("a sparse matrix" if sparse else "a struct" if self.matlab else "a group", None)
+            self.held[key] = FileVariable(
+                "a sparse matrix" if sparse else "a struct" if self.matlab else "a group", None
+            )
             for child in item if depth else ():  # of what a reference points at; others are visited
                 self._note(f"{name}/{child}", item[child], depth + 1)
         elif "MATLAB_sparse" in item.parent.attrs:
             pass
         elif item.shape is None or "MATLAB_empty" in item.attrs:
-            self.held[key] = Held("empty", None)
+            self.held[key] = FileVariable("empty", None)
         elif self.matlab and (kind == "cell" or h5py.check_ref_dtype(item.dtype) is h5py.Reference):
             self._note_elements(name, item, kind == "cell", depth)
         elif kind == "char":
             text = lambda: "".join(map(chr, item[()].ravel().tolist()))  # noqa: E731
-            self.held[key] = Held("text", None, item.shape[::-1], text)
+            self.held[key] = FileVariable("text", None, item.shape[::-1], text)
         elif item.dtype.kind not in "fiubc" and item.dtype.names is None:
-            self.held[key] = Held(f"{item.dtype} values", None)
+            self.held[key] = FileVariable(f"{item.dtype} values", None)
         elif item.dtype.kind in "fiu" and item.id.get_type() != h5py.h5t.py_create(item.dtype):
-            self.held[key] = Held("numbers in a format of their own", None)
+            self.held[key] = FileVariable("numbers in a format of their own", None)
         else:
             shape = item.shape[::-1] if self.matlab else item.shape
             load = lambda: item[()].T if self.matlab else item[()]  # noqa: E731
@@ -220,7 +224,7 @@ class _Datasets:
         count = math.prod(item.shape)
         parent, _, field = name.rpartition("/")
         if cell:
-            self.held[name.replace("/", ".")] = Held("a cell", None)
+            self.held[name.replace("/", ".")] = FileVariable("a cell", None)
         if not 0 < count <= MOST_ELEMENTS or depth >= _DEEPEST:
             return
         for i, reference in enumerate(item[()].flat):
@@ -233,7 +237,7 @@ def _word(text: Any) -> str:
     return text.decode("latin-1") if isinstance(text, bytes) else str(text)
 
 
-def _with_names(held: Mapping[str, Held]) -> dict[str, Held]:
+def _with_names(held: Mapping[str, FileVariable]) -> dict[str, FileVariable]:
     """Add the signals that a file names in a field beside their values, each under its name where no other has it."""
     named: dict[str, str] = {}
     for path, variable in held.items():
@@ -268,17 +272,17 @@ def short(error: Exception) -> str:
     return " ".join(str(error).split())[:120] or type(error).__name__
 
 
-def _lazy(path: Path, shape: Sequence[int], itemsize: int, read: Callable[[], Any]) -> Held:
+def _lazy(path: Path, shape: Sequence[int], itemsize: int, read: Callable[[], Any]) -> FileVariable:
     what = "×".join(map(str, shape)) or "a scalar"
 
     def fitting() -> Any:
         check_memory(2 * math.prod(shape) * max(itemsize, 8), f"{path}: an array of {what} numbers")
         return read()
 
-    return Held(what, fitting, tuple(shape))
+    return FileVariable(what, fitting, tuple(shape))
 
 
-def _taken(path: Path, names: Wanted, held: Mapping[str, Held]) -> dict[str, Vector]:
+def _taken(path: Path, names: Wanted, held: Mapping[str, FileVariable]) -> dict[str, Vector]:
     """The named channels; without names an empty one for each that could be named; or the single numbers wanted."""
     if callable(names):
         single = {name: one for name, one in held.items() if one.read and math.prod(one.shape) == 1 and names(name)}
@@ -297,7 +301,7 @@ def _taken(path: Path, names: Wanted, held: Mapping[str, Held]) -> dict[str, Vec
     return lines
 
 
-def _pick(path: Path, name: str, held: Mapping[str, Held]) -> Vector:
+def _pick(path: Path, name: str, held: Mapping[str, FileVariable]) -> Vector:
     name = _known_as(name, held)
     variable, axis, index = (name, 0, 0) if name in held else _line(path, name)
     listing = ", ".join(f"{key} ({value.what})" for key, value in list(held.items())[:_NAMED]) or "nothing"
@@ -330,7 +334,7 @@ def _pick(path: Path, name: str, held: Mapping[str, Held]) -> Vector:
     return np.asarray(array, dtype=float)
 
 
-def _known_as(name: str, held: Mapping[str, Held]) -> str:
+def _known_as(name: str, held: Mapping[str, FileVariable]) -> str:
     """The name as the file has it: paths may be written with points or slashes."""
     bare = name.lstrip("/")
     for one in (name, bare, bare.replace("/", "."), bare.replace(".", "/")):

@@ -15,7 +15,7 @@ from orthaug.models.motion_field import MotionField
 
 
 @dataclass(frozen=True, eq=False)
-class Held:
+class FadeNodes:
     """Named intermediate results: features on the range of training, the point x̄ there, and what fading leaves."""
 
     locals: tuple[tuple[str, Node], ...]
@@ -27,7 +27,9 @@ class Held:
     """None where the correction is held."""
 
     @classmethod
-    def of(cls, form: Lagged | MotionField, numbers: Numbers, features: Sequence[Node], points: Sequence[Node]) -> Held:
+    def of(
+        cls, form: Lagged | MotionField, numbers: Numbers, features: Sequence[Node], points: Sequence[Node]
+    ) -> FadeNodes:
         """Return the intermediate results for features z (nz,) of the entries of a point x (nx,)."""
         low, high = np.asarray(numbers.limits).tolist()
         found: dict[str, Node] = {}

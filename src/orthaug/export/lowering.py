@@ -13,7 +13,7 @@ from orthaug._base.errors import InputError
 from orthaug.data.expressions import Expression, Lag
 from orthaug.data.preparation import MENDING
 from orthaug.data.record import Channel
-from orthaug.export.holding import Held
+from orthaug.export.holding import FadeNodes
 from orthaug.export.nodes import Apply, Entry, Name, Node, Number, apply, identifier, node_of, total
 from orthaug.export.program import Block, Constant, Layer, Network, Program, Scheme, Signal
 from orthaug.models.dynamics import Numbers
@@ -85,7 +85,7 @@ def _lagged(model: Model, name: str, digest: str) -> Program:
 
     limited = numbers.limits is not None
     features = [written(entry) for entry in form.features.entries]
-    held = Held.of(form, numbers, features, [lags[lag] for lag in form.layout]) if limited else None
+    held = FadeNodes.of(form, numbers, features, [lags[lag] for lag in form.layout]) if limited else None
     constants.symbols |= {} if held is None else held.symbols
     sums, corrections = _weighted_terms(model, constants, written, held)
     network = None
@@ -116,7 +116,7 @@ def _lagged(model: Model, name: str, digest: str) -> Program:
 
 
 def _weighted_terms(
-    model: Model, constants: _Constants, written: Callable[..., Node], held: Held | None
+    model: Model, constants: _Constants, written: Callable[..., Node], held: FadeNodes | None
 ) -> tuple[list[list[Node]], list[list[Node]]]:
     """Of each output the terms of the physics, and those that the learner's correction takes back where it is held."""
     form = model.form
@@ -157,7 +157,7 @@ def _motion_names(model: MotionModel, constants: _Constants) -> dict[str, Node]:
     return names
 
 
-def _with_correction(correction: Node, physics: Node, held: Held | None, rows: Sequence[Node]) -> Node:
+def _with_correction(correction: Node, physics: Node, held: FadeNodes | None, rows: Sequence[Node]) -> Node:
     """A learned equation with what is added to it; `rows` are its physics at p̂, and where it is held at c and at p̂."""
     if rows:
         physics, own, split = rows
@@ -205,7 +205,7 @@ def _motion(model: MotionModel, name: str, digest: str) -> Program:
     held, changed = None, list[dict[str, Node]]()
     if numbers.limits is not None:
         points: list[Node] = [*(Entry("x", i) for i in range(form.states)), *(names[key] for key in motion.inputs)]
-        held = Held.of(form, numbers, features, points)
+        held = FadeNodes.of(form, numbers, features, points)
         defined |= dict(held.locals)
         constants.symbols |= held.symbols
         if np.any(numbers.theta_aux):  # the physics itself extrapolates with the parameters that were split off

@@ -68,12 +68,12 @@ class Checkpoints:
             self.discard()
         return self
 
-    def of_run(self, *parts: Any, form: Any = _LEAVES) -> Kept:
+    def of_run(self, *parts: Any, form: Any = _LEAVES) -> RunCheckpoint:
         """What is kept of a run that begins with these weights and choices, in the form of the solver's states."""
         digest = hashlib.sha256(self.fingerprint.encode())
         for part in parts:
             digest.update(np.ascontiguousarray(part).tobytes() if isinstance(part, np.ndarray) else repr(part).encode())
-        return Kept(self, self.folder / f"{digest.hexdigest()[:24]}.safetensors", form)
+        return RunCheckpoint(self, self.folder / f"{digest.hexdigest()[:24]}.safetensors", form)
 
     def discard(self) -> None:
         """Remove the states: the fit is done."""
@@ -87,7 +87,7 @@ class Checkpoints:
 
 
 @dataclass(eq=False)
-class Kept:
+class RunCheckpoint:
     """The state of one run in a file."""
 
     checkpoints: Checkpoints

@@ -17,7 +17,7 @@ from orthaug.data.record import Record
 from orthaug.data.regressors import Lags
 from orthaug.fitting.elimination import Fixed, ThetaSplit, directions, eliminate, split_theta
 from orthaug.fitting.estimates import NOT_UNIQUE, Estimate
-from orthaug.fitting.learned import ErrorStatistics, Learned
+from orthaug.fitting.learned import ErrorStatistics, TrainedLearner
 from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.silence import learner_silent
 from orthaug.fitting.status import ALONE, Ending, Status
@@ -49,7 +49,7 @@ _UNDETERMINED = (
 )
 
 
-def conclude(task: OneStepTask, structure: Structure, learned: Learned) -> Estimate:
+def conclude(task: OneStepTask, structure: Structure, learned: TrainedLearner) -> Estimate:
     """Solve θ, split it from the learner, and attach statistics.
 
     Args:
@@ -109,7 +109,7 @@ def conclude(task: OneStepTask, structure: Structure, learned: Learned) -> Estim
 def _model(
     problem: Problem,
     structure: Structure,
-    learned: Learned,
+    learned: TrainedLearner,
     parameters: ThetaSplit,
     errors: ErrorStatistics,
     noise: Matrix | None,
@@ -154,7 +154,7 @@ def _limits(problem: Problem, form: Lagged) -> tuple[Matrix | None, Matrix | Non
 
 
 def _one_step_errors(
-    task: OneStepTask, structure: Structure, learned: Learned, c: Vector, fixed: Fixed
+    task: OneStepTask, structure: Structure, learned: TrainedLearner, c: Vector, fixed: Fixed
 ) -> ErrorStatistics:
     """The statistics of the one-step residual."""
     problem, ny = task.problem, len(task.problem.outputs)
@@ -175,7 +175,7 @@ def _one_step_errors(
 
 
 def _beside_the_learner(
-    problem: Problem, structure: Structure, learned: Learned, whitened: Matrix, fixed: Fixed
+    problem: Problem, structure: Structure, learned: TrainedLearner, whitened: Matrix, fixed: Fixed
 ) -> Matrix | None:
     """Cov θ̂ where only some directions are split off: `K Cov(c, w) Kᵀ` with `K = [I, ∂θ_aux/∂w]` (F8).
 
@@ -202,7 +202,7 @@ def _beside(fixed: Fixed, gram: Matrix) -> Matrix:
     return gram * np.outer(unknown, unknown)
 
 
-def _middle(problem: Problem, learned: Learned, noise: Matrix | None) -> Matrix | None:
+def _middle(problem: Problem, learned: TrainedLearner, noise: Matrix | None) -> Matrix | None:
     """ΣψᵀΣ_eψ in whitened outputs, for the intervals of later splits and of predictions."""
     if noise is None or learned.gram is None:
         return None
@@ -213,7 +213,7 @@ def _middle(problem: Problem, learned: Learned, noise: Matrix | None) -> Matrix 
 
 
 def _defect(
-    task: OneStepTask, structure: Structure, share: Share, parameters: ThetaSplit, learned: Learned
+    task: OneStepTask, structure: Structure, share: Share, parameters: ThetaSplit, learned: TrainedLearner
 ) -> float | None:
     """‖QᵀF̃‖ / ‖F‖ with F̃ = F − Φ θ_aux (eq:orth_property), along the shared directions; None for F = 0."""
     size = np.sqrt(share.square)
@@ -235,7 +235,12 @@ def without_loss(mean_square: float) -> list[Warning]:
 
 
 def _warnings(
-    problem: Problem, structure: Structure, learned: Learned, identified: bool, noise: Matrix | None, fixed: Fixed
+    problem: Problem,
+    structure: Structure,
+    learned: TrainedLearner,
+    identified: bool,
+    noise: Matrix | None,
+    fixed: Fixed,
 ) -> list[Warning]:
     told = []
     condition = problem.excitation.condition
@@ -305,7 +310,7 @@ def orthogonalize(
     gain = np.broadcast_to(problem.weight.matrix / task.rms, (*values.shape, ny))
     rows = task.engine.build_rows(values, problem.projection.q, problem.unexplained / task.rms, gain)
     task = replace(task, rows=rows, unit=unit, bound=Bound(_GIVEN, ny, ny))
-    concluded = conclude(task, Orthogonal(), Learned(task.bound, np.zeros(0), scaling, unit, elsewhere=True))
+    concluded = conclude(task, Orthogonal(), TrainedLearner(task.bound, np.zeros(0), scaling, unit, elsewhere=True))
     form = replace(concluded.model.form, bound=Bound(external, nz, ny))
     return replace(concluded, model=replace(concluded.model, form=form))
 

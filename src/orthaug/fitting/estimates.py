@@ -12,12 +12,12 @@ import numpy as np
 from orthaug._base.checks import Matrix, Vector, check_choice, check_count, check_type
 from orthaug._base.errors import InputError, Warning
 from orthaug._base.lines import fold
-from orthaug._base.views import ShownFit
+from orthaug._base.views import FitView
 from orthaug.data.record import Record
 from orthaug.data.regressors import Layout, lag_rows
 from orthaug.fitting.block_scores import FreeRunScores
 from orthaug.fitting.criteria import Criterion, Prediction
-from orthaug.fitting.held_out import Focus, HeldOut
+from orthaug.fitting.held_out import Focus, HeldOutErrors
 from orthaug.fitting.status import Status
 from orthaug.inference.covariance import interval, joint_covariance, robust_covariance, robust_split_covariance
 from orthaug.inference.influence import hc3, one_step_slopes
@@ -67,7 +67,7 @@ class Restart:
     """Generalised cross-validation, where that chose among the runs."""
 
 
-class AnyFit(ShownFit):
+class AnyFit(FitView):
     """What fits of lagged models and of motions have in common."""
 
     model: Any
@@ -123,7 +123,7 @@ class Estimate(AnyFit):
     """What θ was split under, if not the training measure."""
     at_bound: Mapping[str, float] = field(default_factory=dict)
     """Parameters that stand at a bound, with its value."""
-    held_out: HeldOut | None = None
+    held_out: HeldOutErrors | None = None
     """By what the run was chosen; None where the lowest training loss chose."""
     focus: Focus | None = None
     """What `Auto` chose, and why; None where the criterion was declared."""

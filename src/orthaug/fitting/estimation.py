@@ -11,7 +11,7 @@ import numpy as np
 
 from orthaug._base.checks import Vector, check_choice, check_count, check_type, is_number
 from orthaug._base.errors import InputError, shown
-from orthaug._base.progress import SILENT, Tell
+from orthaug._base.progress import SILENT, ProgressCallback
 from orthaug._base.views import with_progress
 from orthaug.data.record import Record
 from orthaug.data.regressors import Lags
@@ -63,7 +63,7 @@ class Options(TypedDict, total=False):
     initial: Estimate | Model | None
     validation: Record | None
     output_weights: str | Sequence[float]
-    progress: Tell | bool
+    progress: ProgressCallback | bool
     engine: Engine | None
 
 
@@ -90,7 +90,7 @@ def estimate(
     initial: Estimate | Model | None = None,
     validation: Record | None = None,
     output_weights: str | Sequence[float] = "auto",
-    progress: Tell = SILENT,
+    progress: ProgressCallback = SILENT,
     engine: Engine | None = None,
 ) -> Estimate | MotionEstimate:
     """Fit `y_k = φ(x_k)θ + learner(x_k) + e_k` by prediction error (eq:cost_fun) or by the error of a free run.
@@ -186,7 +186,7 @@ def fit(
     fallback: bool = True,
     initial: Model | None = None,
     validation: Record | None = None,
-    progress: Tell = SILENT,
+    progress: ProgressCallback = SILENT,
     engine: Engine = InMemory(),  # noqa: B008  (frozen)
     checkpoints: Checkpoints | None = None,
 ) -> Estimate:

@@ -59,7 +59,7 @@ def choose_focus(problem: Any, fit: Fit, options: Mapping[str, Any], criterion: 
     LOG.info("auto: %s; the free run is trained, too", reason)
     free_run = _free_run(criterion, problem)
     try:
-        return _best(_Choosing(problem, first, fit, options, free_run), reason)
+        return _best(_FocusChoice(problem, first, fit, options, free_run), reason)
     except InputError as error:  # too few rows for a free run
         text = f"trained one step ahead; {reason}, but the free run cannot be trained: {error}"
         return replace(first, focus=Focus(ONE_STEP, text))
@@ -142,7 +142,7 @@ def _free_run(criterion: Any, problem: Any) -> Any:
 
 
 @dataclass(frozen=True, eq=False)
-class _Choosing:
+class _FocusChoice:
     """A problem with its fit one step ahead, and how others are made of it."""
 
     problem: Any
@@ -216,7 +216,7 @@ def _without(estimate: Any, learner: bool) -> Any:
     return estimate.physics_alone
 
 
-def _best(choosing: _Choosing, reason: str) -> Any:
+def _best(choosing: _FocusChoice, reason: str) -> Any:
     """Return the estimate of the candidate with the least error, of those whose free run over all rows is sound."""
     errors = choosing.errors
     ranked = _ranked(errors, with_learner=choosing.learns and not choosing.options["fallback"])
@@ -260,7 +260,7 @@ def _ranked(errors: Mapping[Key, float], *, with_learner: bool) -> list[Key]:
     return alike + sorted((key for key in errors if key not in alike), key=lambda key: (key not in among, errors[key]))
 
 
-def _sound(choosing: _Choosing, key: Key) -> bool:
+def _sound(choosing: _FocusChoice, key: Key) -> bool:
     """Return whether a candidate runs over all training data, with a learner no worse than physics if that may be."""
     if not math.isfinite(choosing.errors[key]):
         return False

@@ -16,17 +16,17 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.checks import Vector
-from orthaug._base.progress import RunTell, quiet
+from orthaug._base.progress import RunProgress, quiet
 from orthaug.data.record import Record
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.elimination import Fixed, settle
 from orthaug.fitting.initial_states import Start
-from orthaug.fitting.learned import Learned
+from orthaug.fitting.learned import TrainedLearner
 from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.segmented_lagged import SegmentedLagged, StructuredObjective
 from orthaug.fitting.segmented_problem import FreeRunFit
 from orthaug.fitting.segmented_streamed import SegmentedStreamed
-from orthaug.fitting.simulation_task import Place, SimulationTask
+from orthaug.fitting.simulation_task import SimulationTask, StartPoint
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.structures import Structure
 from orthaug.physics.streamed import StreamedProblem
@@ -37,7 +37,7 @@ _SHRUNK = (0.99, 0.9, 0.5, 0.0)  # of the one-step θ: less feedback flies longe
 
 
 def train_physics_only(
-    plan: SegmentedLagged, solver: LevenbergMarquardt, structure: Structure, tell: RunTell = quiet
+    plan: SegmentedLagged, solver: LevenbergMarquardt, structure: Structure, tell: RunProgress = quiet
 ) -> FreeRunFit | None:
     """θ of physics alone under the plan's criterion and the structure's rows and bounds; None where none can fly.
 
@@ -148,7 +148,7 @@ class FreeRunTask(SimulationTask):
     def rows_task(self) -> OneStepTask:
         return self.plan.task
 
-    def physics_alone(self) -> tuple[OneStepTask, Learned]:
+    def physics_alone(self) -> tuple[OneStepTask, TrainedLearner]:
         """The rows without a learner, and what physics alone leaves on them; least squares where it cannot fly."""
         if self.physics is None:
             return self.rows_task.physics_alone()
@@ -161,7 +161,7 @@ class FreeRunTask(SimulationTask):
         return FreeRunTask(SegmentedLagged.of(self.rows_task.on(record), self.criterion, like))
 
     def train_physics_only(
-        self, solver: LevenbergMarquardt, structure: Structure, tell: RunTell
+        self, solver: LevenbergMarquardt, structure: Structure, tell: RunProgress
     ) -> tuple[SegmentedLagged, FreeRunFit | None]:
         return self.plan, train_physics_only(self.plan, solver, structure, tell)
 
@@ -171,7 +171,7 @@ class FreeRunTask(SimulationTask):
         w: Any,
         structure: Structure,
         regularization: str | float = "none",
-        progress: RunTell = quiet,
+        progress: RunProgress = quiet,
     ) -> FreeRunFit:
         """As any run on the free run, with an orthogonal θ at a bound a known term beside the learner.
 
@@ -204,14 +204,14 @@ class FreeRunTask(SimulationTask):
         w: Vector,
         structure: Structure,
         regularization: str | float,
-    ) -> list[Place]:
+    ) -> list[StartPoint]:
         """Where a run may start: physics alone, an earlier model, the solution one step ahead where it flies well."""
         plan, measured = self.plan, objective.initial.measured
-        places: list[Place] = []
+        places: list[StartPoint] = []
 
         def add(p: Vector, states: Any = measured, silent: bool = False) -> None:
             loss = objective.evaluate(p, Start(states)).loss
-            places.append(Place(p, states, loss if np.isfinite(loss) else np.inf, silent))
+            places.append(StartPoint(p, states, loss if np.isfinite(loss) else np.inf, silent))
 
         silenced = None if self.bound is None or self.warm is not None else self.bound.silent(w)
         if self.physics is not None and silenced is not None:
@@ -234,7 +234,7 @@ class FreeRunTask(SimulationTask):
         square = self.plan.mean_square(*objective.place(p)[1:])
         return bool(np.isfinite(square)) and (self.physics is None or square <= self.physics.mean_square)
 
-    def median(self, members: list[Learned], best: int) -> Learned:
+    def median(self, members: list[TrainedLearner], best: int) -> TrainedLearner:
         """The median of several, with the error of its own free run."""
         learned = self.rows_task.median(members, best)
         assert learned.errors is not None and learned.coefficients is not None

@@ -128,7 +128,7 @@ class Focus:
 
 
 @dataclass(frozen=True, eq=False)
-class HeldOut:
+class HeldOutErrors:
     """Squared errors where nothing was fitted: of physics alone and of every run, in `Estimate.restarts`' order.
 
     In deviations of the training output, of the criterion's own response; by pieces, None for one that diverged.

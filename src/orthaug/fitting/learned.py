@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import Warning
-from orthaug._base.progress import RunTell, quiet
+from orthaug._base.progress import RunProgress, quiet
 from orthaug.data.record import Record
 from orthaug.fitting.block_scores import FreeRunScores
 from orthaug.fitting.criteria import Criterion
@@ -34,7 +34,7 @@ class ErrorStatistics(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Learned:
+class TrainedLearner:
     """A trained learner: its weights, and what the run knows of them."""
 
     bound: Bound | None
@@ -103,11 +103,11 @@ class Task(Protocol):
         """The same problem on another record."""
         ...
 
-    def physics_alone(self) -> tuple[Any, Learned]:
+    def physics_alone(self) -> tuple[Any, TrainedLearner]:
         """The rows without a learner, and what physics alone leaves on them."""
         ...
 
-    def prepared(self, solver: Any, structure: Structure, progress: RunTell = quiet) -> Task:
+    def prepared(self, solver: Any, structure: Structure, progress: RunProgress = quiet) -> Task:
         """The same with physics alone trained: what all runs start from."""
         ...
 
@@ -117,7 +117,7 @@ class Task(Protocol):
         w: Any,
         structure: Structure,
         regularization: str | float = "none",
-        progress: RunTell = quiet,
+        progress: RunProgress = quiet,
     ) -> Any:
         """One run from the weights `w`, with `ending`, `iterations` and `seconds`; arguments as in `estimate`."""
         ...
@@ -126,10 +126,10 @@ class Task(Protocol):
         """What runs are compared by: a mean of squared errors, each output in its standard deviation."""
         ...
 
-    def learned(self, run: Any) -> Learned:
+    def learned(self, run: Any) -> TrainedLearner:
         """What a run left."""
         ...
 
-    def median(self, members: list[Learned], best: int) -> Learned:
+    def median(self, members: list[TrainedLearner], best: int) -> TrainedLearner:
         """Several members as one, the median of their predictions (`ensemble`)."""
         ...

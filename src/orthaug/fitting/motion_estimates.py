@@ -16,7 +16,7 @@ from orthaug.data.regressors import Layout
 from orthaug.fitting.block_scores import FreeRunScores
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.estimates import STD_KINDS, AnyFit, Restart, parameter_frame, parameter_lines
-from orthaug.fitting.held_out import Focus, HeldOut
+from orthaug.fitting.held_out import Focus, HeldOutErrors
 from orthaug.fitting.motion_measures import field_under, wobble
 from orthaug.fitting.status import Status
 from orthaug.inference.covariance import interval
@@ -73,7 +73,7 @@ class MotionEstimate(AnyFit):
     at_bound: tuple[str, ...] = ()
     unidentified: tuple[str, ...] = ()
     """Parameters that no output tells beside the learner, or only the prior of its weights."""
-    held_out: HeldOut | None = None
+    held_out: HeldOutErrors | None = None
     focus: Focus | None = None
     physics_alone: Any = field(default=None, repr=False)
     """The estimate of physics alone that the learner had to beat; None without a learner."""

@@ -10,13 +10,13 @@ import numpy as np
 from orthaug._base.checks import Matrix, check_type
 from orthaug._base.errors import InputError
 from orthaug._base.jax import jax, jnp
-from orthaug._base.progress import SILENT, Tell
+from orthaug._base.progress import SILENT, ProgressCallback
 from orthaug.data.record import Record
 from orthaug.fitting.checkpoints import Checkpoints
 from orthaug.fitting.conclusion import without_loss
 from orthaug.fitting.criteria import Criterion, Simulation
 from orthaug.fitting.kinds import Solver
-from orthaug.fitting.learned import Learned
+from orthaug.fitting.learned import TrainedLearner
 from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.fitting.motion_task import MotionTask
 from orthaug.fitting.rules import check_motion_choices, check_solver, checked_starts, tried
@@ -30,7 +30,7 @@ from orthaug.fitting.unfinished import ending_in_words, not_converged, unfinishe
 from orthaug.inference.motion_split import MotionSplit
 from orthaug.models.beyond import limits_of, pull_of
 from orthaug.models.learners import Learner, Scaling
-from orthaug.models.motion_model import MotionModel, Trained
+from orthaug.models.motion_model import MotionModel, TrainedSegments
 from orthaug.models.rows import Engine, InMemory
 from orthaug.models.statistics import Statistics
 from orthaug.models.tasks import Tasks, runs_on
@@ -67,7 +67,7 @@ def fit_motion(
     blocks: int = 4,
     fallback: bool = True,
     validation: Record | None = None,
-    progress: Tell = SILENT,
+    progress: ProgressCallback = SILENT,
     engine: Engine = InMemory(),  # noqa: B008  (frozen)
     checkpoints: Checkpoints | None = None,
 ) -> MotionEstimate:
@@ -105,7 +105,7 @@ _WINDOWS = (4, 16)  # times (states + 1): rows of a window to predict from
 _TRIED_ROWS = 1000  # on which windows are compared
 
 
-def conclude_motion(task: MotionTask, structure: Structure, learned: Learned) -> MotionEstimate:
+def conclude_motion(task: MotionTask, structure: Structure, learned: TrainedLearner) -> MotionEstimate:
     """Split the fitted motion and attach statistics."""
     plan = task.plan
     assert learned.coefficients is not None and learned.errors is not None
@@ -117,7 +117,7 @@ def conclude_motion(task: MotionTask, structure: Structure, learned: Learned) ->
     assert errors is not None and learned.coefficients is not None
     alone = np.asarray(learned.coefficients if task.physics is None else task.physics.end.point.theta)
     layout = (plan.free_run.steps, plan.free_run.washout, plan.segments.count)
-    trained = Trained(*layout, np.asarray(states), slope, alone)
+    trained = TrainedSegments(*layout, np.asarray(states), slope, alone)
     model = replace(_model(plan, structure, learned), trained=trained)
     reason = ALONE.get(learned.ending, "") if learned.bound is None or task.physics is None else ""
     if reason and not learned.ending.usable and (where := task.problem.without_value(np.any)):
@@ -145,7 +145,7 @@ def conclude_motion(task: MotionTask, structure: Structure, learned: Learned) ->
     return fit.split(structure.measure, getattr(structure, "shared", "auto")) if learned.ending.usable else fit
 
 
-def _learner_values(plan: SegmentedMotion, learned: Learned) -> Matrix | None:
+def _learner_values(plan: SegmentedMotion, learned: TrainedLearner) -> Matrix | None:
     """Return the values (N, nl) of a learner with few effective weights along the training runs; None of others."""
     bound = plan.bound
     if bound is None or learned.scores is None or not silenced(learned.effective, bound.ny):
@@ -158,7 +158,7 @@ def _learner_values(plan: SegmentedMotion, learned: Learned) -> Matrix | None:
     return values if np.isfinite(values).all() else None
 
 
-def _model(plan: SegmentedMotion, structure: Structure, learned: Learned) -> MotionModel:
+def _model(plan: SegmentedMotion, structure: Structure, learned: TrainedLearner) -> MotionModel:
     record = plan.record
     assert learned.coefficients is not None and learned.errors is not None
     noise = learned.errors.noise

@@ -16,7 +16,7 @@ from orthaug.inference.measures import Measure, Support
 from orthaug.inference.motion_split import Field, rest_of
 from orthaug.inference.splitting import SUPPORTED
 from orthaug.models.dynamics import Numbers
-from orthaug.models.moving import Moving
+from orthaug.models.moving import MotionDynamics
 
 if TYPE_CHECKING:
     from orthaug.fitting.segmented_motion import SegmentedMotion
@@ -69,7 +69,7 @@ def sizes_learned(segmented: SegmentedMotion, c: Any, x: Any, u: Any) -> Any:
 
 
 def wobble(
-    form: Moving,
+    form: MotionDynamics,
     numbers: Numbers,
     segments: Segments,
     states: Float[np.ndarray, "k n0 m"],
@@ -99,7 +99,7 @@ def wobble(
 
 @partial(jax.jit, static_argnames="form")
 def _summed(
-    form: Moving,
+    form: MotionDynamics,
     numbers: Numbers,
     state: Float[Array, "n0 m"],
     inputs: Float[Array, "T nu m"],

@@ -13,17 +13,17 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.checks import Vector
-from orthaug._base.progress import RunTell, quiet
+from orthaug._base.progress import RunProgress, quiet
 from orthaug.data.record import Record
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.initial_states import Start
-from orthaug.fitting.learned import ErrorStatistics, Learned
+from orthaug.fitting.learned import ErrorStatistics, TrainedLearner
 from orthaug.fitting.motion_measures import sizes_learned
 from orthaug.fitting.segment_sums import SegmentSums
 from orthaug.fitting.segmented_motion import SegmentedMotion
 from orthaug.fitting.segmented_problem import FreeRunFit
 from orthaug.fitting.segments import respond
-from orthaug.fitting.simulation_task import Place, SimulationTask
+from orthaug.fitting.simulation_task import SimulationTask, StartPoint
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.status import Ending
 from orthaug.fitting.structures import Structure
@@ -44,7 +44,7 @@ _LOOSER = 1e-4  # times the weight of the guesses, where it is asked what the ou
 
 
 def train_motion_physics(
-    segmented: SegmentedMotion, solver: LevenbergMarquardt, tell: RunTell = quiet
+    segmented: SegmentedMotion, solver: LevenbergMarquardt, tell: RunProgress = quiet
 ) -> tuple[SegmentedMotion, FreeRunFit | None]:
     """Parameters of the physics alone, and the course with segments that start where its runs do; None: none flies."""
     own, initial = segmented.alone, segmented.problem.motion.coordinates.initial
@@ -87,7 +87,7 @@ def _descended(
     solver: LevenbergMarquardt,
     starts: list[Vector],
     rows: list[np.ndarray] | None,
-    tell: RunTell = quiet,
+    tell: RunProgress = quiet,
 ) -> FreeRunFit | None:
     """From the best of the starts, whose segments begin at states that follow the outputs; None where none flies."""
     if rows is not None:
@@ -181,7 +181,7 @@ class MotionTask(SimulationTask):
         segmented = SegmentedMotion.of(self.problem.on(record), self.bound, self.criterion, self.plan, sums)
         return MotionTask(segmented)
 
-    def physics_alone(self) -> tuple[MotionTask, Learned]:
+    def physics_alone(self) -> tuple[MotionTask, TrainedLearner]:
         """The task without a learner, and what physics alone leaves; without an end where it cannot fly."""
         alone = replace(self, plan=self.plan.alone)
         if self.physics is not None:
@@ -189,13 +189,15 @@ class MotionTask(SimulationTask):
         unknown = ErrorStatistics(None, None, 0.0, np.nan, {})
         initial = self.problem.motion.coordinates.initial
         nothing: dict[str, Any] = {"bound": None, "weights": np.zeros(0), "errors": unknown, "coefficients": initial}
-        return alone, Learned(scaling=alone.plan.scaling, unit=alone.plan.unit, ending=Ending.NON_FINITE, **nothing)
+        return alone, TrainedLearner(
+            scaling=alone.plan.scaling, unit=alone.plan.unit, ending=Ending.NON_FINITE, **nothing
+        )
 
-    def median(self, members: list[Learned], best: int) -> Learned:
+    def median(self, members: list[TrainedLearner], best: int) -> TrainedLearner:
         """The best member: a motion has no ensemble, for medians of outputs follow no equations."""
         return members[best]
 
-    def learned(self, run: FreeRunFit) -> Learned:
+    def learned(self, run: FreeRunFit) -> TrainedLearner:
         """The learner as a run left it. The information counts what the outputs tell, hardly what the guesses do."""
         end, objective = run.end, run.objective
         if end.linear is None:
@@ -204,7 +206,7 @@ class MotionTask(SimulationTask):
         return super().learned(run._replace(end=end._replace(linear=end.linear._replace(information=information))))
 
     def train_physics_only(
-        self, solver: LevenbergMarquardt, structure: Structure, tell: RunTell
+        self, solver: LevenbergMarquardt, structure: Structure, tell: RunProgress
     ) -> tuple[SegmentedMotion, FreeRunFit | None]:
         return train_motion_physics(self.plan, solver, tell)
 
@@ -227,11 +229,11 @@ class MotionTask(SimulationTask):
         w: Vector,
         structure: Structure,
         regularization: str | float,
-    ) -> list[Place]:
+    ) -> list[StartPoint]:
         """Physics alone with a silent learner; a learner that cannot be silenced starts as it is."""
         silenced = w if self.bound is None else self.bound.silent(w)  # no learner: physics alone did not fly
         q = self.problem.motion.coordinates.initial if self.physics is None else self.physics.end.point.theta
         p = np.concatenate([q, w if silenced is None else silenced])
         states = objective.initial.measured
         loss = objective.evaluate(p, Start(states)).loss
-        return [Place(p, states, loss if np.isfinite(loss) else np.inf, silenced is not None)]
+        return [StartPoint(p, states, loss if np.isfinite(loss) else np.inf, silenced is not None)]

@@ -103,7 +103,7 @@ def linearise(
 
 
 @dataclass(frozen=True, eq=False)
-class Summed:
+class SummedOneStep:
     """The criterion `OneStep` over rows that an engine sums over, wherever they are."""
 
     engine: Engine

@@ -11,15 +11,15 @@ import numpy as np
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError, Warning
 from orthaug._base.jax import jnp
-from orthaug._base.progress import RunTell, quiet
+from orthaug._base.progress import RunProgress, quiet
 from orthaug.data.record import Record
 from orthaug.data.regressors import Features
 from orthaug.data.sources import RecordSource, witness
 from orthaug.fitting.checkpoints import Checkpoints
 from orthaug.fitting.criteria import Criterion, Prediction
 from orthaug.fitting.elimination import Elimination, Fixed, eliminate, split_theta
-from orthaug.fitting.learned import Learned
-from orthaug.fitting.normal_equations import Hold, OneStep, Summed, linearise
+from orthaug.fitting.learned import TrainedLearner
+from orthaug.fitting.normal_equations import Hold, OneStep, SummedOneStep, linearise
 from orthaug.fitting.paper_criterion import JointOneStep, PaperCriterion, Physics
 from orthaug.fitting.rules import check_joint, ridge_of
 from orthaug.fitting.solvers import compiled
@@ -104,7 +104,7 @@ class OneStepTask(TrainingRows):
         problem, scaling = replace(self.problem, features=Features(())), Scaling(np.zeros(0), np.ones(0))
         return replace(self, problem=problem, bound=None, scaling=scaling, unit=np.zeros_like(self.unit))
 
-    def physics_alone(self) -> tuple[OneStepTask, Learned]:
+    def physics_alone(self) -> tuple[OneStepTask, TrainedLearner]:
         """The rows without a learner, and least squares on them."""
         return self.alone, self.alone.physics_learned()
 
@@ -112,7 +112,7 @@ class OneStepTask(TrainingRows):
         """The same problem on another record."""
         return OneStepTask.of(self.problem.on(record), self.bound and self.bound.learner, engine=self.engine)
 
-    def prepared(self, solver: Any, structure: Structure, progress: RunTell = quiet) -> OneStepTask:
+    def prepared(self, solver: Any, structure: Structure, progress: RunProgress = quiet) -> OneStepTask:
         """The same with the loss of physics alone under the structure's rows and bounds; it is solved (F1)."""
         problem, elimination = self.problem, eliminate(structure, self.problem)
         nothing = np.zeros_like(problem.target_coordinates)
@@ -138,7 +138,7 @@ class OneStepTask(TrainingRows):
         w: Any,
         structure: Structure | None = None,
         regularization: str | float = "none",
-        progress: RunTell = quiet,
+        progress: RunProgress = quiet,
     ) -> compiled.TrainingRun:
         """One run from the weights `w`; the arguments as in `estimate`, `structure` None for no penalty.
 
@@ -173,7 +173,7 @@ class OneStepTask(TrainingRows):
         structure: Structure,
         elimination: Elimination,
         regularization: str | float,
-        progress: RunTell,
+        progress: RunProgress,
     ) -> compiled.TrainingRun:
         """One run with θ inside its bounds, which an active set meets (they reach into training, F1).
 
@@ -209,7 +209,7 @@ class OneStepTask(TrainingRows):
         elimination: Elimination,
         fixed: Fixed,
         regularization: str | float,
-        progress: RunTell,
+        progress: RunProgress,
     ) -> compiled.TrainingRun:
         assert self.bound is not None, "physics alone is not trained one step ahead"
         matrix, target = elimination.hold(fixed)
@@ -238,7 +238,7 @@ class OneStepTask(TrainingRows):
             end.w, normal, ridge, effective, end.iterations, end.ending, end.seconds, coefficients
         )
 
-    def _joint_least_squares(self, solver: Any, w: Any, physics: Physics, progress: RunTell) -> GradientRun:
+    def _joint_least_squares(self, solver: Any, w: Any, physics: Physics, progress: RunProgress) -> GradientRun:
         """Levenberg-Marquardt over θ, from θ⁰, and the weights together."""
         assert self.bound is not None
         nt = len(physics.outputs)
@@ -256,16 +256,16 @@ class OneStepTask(TrainingRows):
         if self.engine.resident:
             criterion, arguments = OneStep(self.bound), (self.rows, hold)
             return solver.minimise(criterion, w, arguments, self._nothing, samples=samples, **options)
-        summed = Summed(self.engine, self.bound, self.rows, hold)
+        summed = SummedOneStep(self.engine, self.bound, self.rows, hold)
         return solver.drive(summed, jnp.asarray(w), self._nothing, samples=samples, **options)
 
     def loss(self, run: compiled.TrainingRun) -> float:
         """Mean of squared errors of a run, with each output in its standard deviation."""
         return self.mean_square(run.normal.loss)
 
-    def learned(self, run: compiled.TrainingRun) -> Learned:
+    def learned(self, run: compiled.TrainingRun) -> TrainedLearner:
         """What a run left."""
-        return Learned(
+        return TrainedLearner(
             bound=self.bound,
             weights=np.asarray(run.w),
             scaling=self.scaling,
@@ -282,11 +282,11 @@ class OneStepTask(TrainingRows):
             tail=run.tail,
         )
 
-    def physics_learned(self) -> Learned:
+    def physics_learned(self) -> TrainedLearner:
         """Physics alone, which is solved and not trained."""
         change = self.problem.projection.to_coordinates
         none = np.zeros(0)
-        return Learned(
+        return TrainedLearner(
             bound=None,
             weights=none,
             scaling=self.scaling,
@@ -295,7 +295,7 @@ class OneStepTask(TrainingRows):
             middle=lambda noise: self.middle(none, noise),
         )
 
-    def median(self, members: list[Learned], best: int) -> Learned:
+    def median(self, members: list[TrainedLearner], best: int) -> TrainedLearner:
         """The median of several: `g = φ c̄ + median_i(f_i + φ (c_i − c̄))`, each with its own c_i (F2).
 
         The median is one function of the regressor again, and split like any other. It lacks some statistics: those
@@ -325,7 +325,7 @@ class OneStepTask(TrainingRows):
             nt = len(normal.overlap.values)
             free = Hold(np.zeros((nt, nt)), np.zeros(nt))
             assert self.bound is not None
-            normal = Summed(self.engine, self.bound, self.rows, free)(np.asarray(run.w), normal.overlap)
+            normal = SummedOneStep(self.engine, self.bound, self.rows, free)(np.asarray(run.w), normal.overlap)
         overlap = np.asarray(normal.overlap.jacobian) * self.rms
         to_phi = self.problem.projection.to_coordinates
         inner = np.asarray(normal.hessian) * self.rms**2 + overlap.T @ overlap

@@ -23,8 +23,8 @@ from orthaug.data.record import Record
 from orthaug.fitting import recursive_storage
 from orthaug.fitting.estimates import Estimate, order_of, parameter_frame, parameter_lines
 from orthaug.fitting.recursion import EstimateHistory, covariances
-from orthaug.fitting.recursive_rows import Lagging, Whitened, begin, joined_rows, trained, whitened_rows
-from orthaug.fitting.residual_band import Watch
+from orthaug.fitting.recursive_rows import RegressorStream, WhitenedRows, begin, joined_rows, trained, whitened_rows
+from orthaug.fitting.residual_band import ResidualMonitor
 from orthaug.inference.covariance import interval
 from orthaug.inference.physical import PhysicalEstimate, solve
 from orthaug.models.learners import Learner
@@ -94,13 +94,13 @@ class Recursive:
         began = trained(fit, training)
         factor = forgetting_factor(forgetting, memory, began.model.sampling_time)
         recursion, reference, inflation = begin(began, factor, quiet, empty=start == "empty")
-        self._set(began.model, recursion, Watch(reference), inflation, began.used)
+        self._set(began.model, recursion, ResidualMonitor(reference), inflation, began.used)
 
-    def _set(self, model: Model, recursion: Any, watch: Watch, inflation: Matrix | None, used: float) -> None:
+    def _set(self, model: Model, recursion: Any, watch: ResidualMonitor, inflation: Matrix | None, used: float) -> None:
         self._fitted, self._recursion, self._watch = model, recursion, watch
         self._inflation, self._used = inflation, used
         self._numbers = jax.device_put(model.numbers)
-        self._lagging = Lagging(model)
+        self._lagging = RegressorStream(model)
         self._tail = self._lagging.nothing
         self._rows_kept = EstimateHistory(len(model.outputs), len(model.theta))
         self.rows = self.outside = 0
@@ -136,10 +136,10 @@ class Recursive:
         """Write the files of `save` into an existing folder."""
         recursive_storage.write(self._kept(), folder)
 
-    def _kept(self) -> recursive_storage.Kept:
+    def _kept(self) -> recursive_storage.RecursiveState:
         alarms = np.array([alarm.row for alarm in self.alarms], dtype=float)
         state = (self._fitted, self._recursion, self._watch, self._inflation, self._used, self._tail, self._rows_kept)
-        return recursive_storage.Kept(*state, self.rows, self.outside, alarms)
+        return recursive_storage.RecursiveState(*state, self.rows, self.outside, alarms)
 
     def update(
         self, record: Record | None = None, *, u: Any = None, y: Any = None, gap: bool = False
@@ -186,7 +186,7 @@ class Recursive:
         record = model.fitting(record, need_outputs=True)
         return [np.concatenate([e.outputs, e.inputs], axis=1) for e in record.experiments]
 
-    def _whitened(self, x: Matrix, complete: Any, rows: Matrix) -> tuple[Any, Whitened | None, int]:
+    def _whitened(self, x: Matrix, complete: Any, rows: Matrix) -> tuple[Any, WhitenedRows | None, int]:
         """Which rows are used, and what θ is least squares of in them."""
         used = np.flatnonzero(complete)
         if not len(used):
@@ -194,7 +194,7 @@ class Recursive:
         y = rows[used, : len(self._fitted.outputs)]
         return used, whitened_rows(self._fitted, x[used], y, self._numbers), len(rows)
 
-    def _follow(self, used: Any, whitened: Whitened | None) -> list[Alarm]:
+    def _follow(self, used: Any, whitened: WhitenedRows | None) -> list[Alarm]:
         recursion, watch, kept_rows = self._recursion, self._watch, self._rows_kept
         told: list[Alarm] = []
         if whitened is None:

@@ -47,7 +47,7 @@ def _evaluated(form: Lagged, numbers: Numbers, x: Float[Array, "m nx"]) -> Float
     return jax.vmap(one)(x)
 
 
-class Whitened(NamedTuple):
+class WhitenedRows(NamedTuple):
     """φ (n, ny, nθ) and `y − known − (f − φθ_aux)` (n, ny) in whitened outputs: what θ is least squares of.
 
     `inside` (n,) is where the learner's features lie within those of training.
@@ -58,7 +58,7 @@ class Whitened(NamedTuple):
     inside: Bool[np.ndarray, "n"]
 
 
-def whitened_rows(model: Model, x: Matrix, y: Matrix, numbers: Numbers | None = None) -> Whitened:
+def whitened_rows(model: Model, x: Matrix, y: Matrix, numbers: Numbers | None = None) -> WhitenedRows:
     """Rows of measured regressors x (n, nx) and outputs y (n, ny).
 
     Args:
@@ -80,11 +80,11 @@ def whitened_rows(model: Model, x: Matrix, y: Matrix, numbers: Numbers | None = 
         at = ", ".join(f"{lag} = {value:.6g}" for lag, value in zip(model.form.layout, row, strict=True))
         raise InputError(f"physics or learner has no finite value at {at}; give NaN for such a row, or mend the data.")
     inside = np.asarray(values[:, 0, -1] <= 1 + _RIM)
-    return Whitened(times(model.weight, values[..., :-2]), times(model.weight, y - values[..., -2]), inside)
+    return WhitenedRows(times(model.weight, values[..., :-2]), times(model.weight, y - values[..., -2]), inside)
 
 
 @dataclass(frozen=True, eq=False)
-class Lagging:
+class RegressorStream:
     """Regressors of rows that are handed in a few at a time, from the rows before them."""
 
     model: Model
@@ -159,7 +159,7 @@ MOTION = (
 )
 
 
-class Trained(NamedTuple):
+class TrainingRowsModel(NamedTuple):
     """A model with its training rows in whitened outputs, φ (N, ny, nθ) and target (N, ny)."""
 
     model: Model
@@ -174,7 +174,7 @@ class Trained(NamedTuple):
     """Whether the covariance counts the colour of the errors."""
 
 
-def trained(fit: Any, training: Record | None) -> Trained:
+def trained(fit: Any, training: Record | None) -> TrainingRowsModel:
     """The rows of a fit.
 
     Raises:
@@ -209,12 +209,12 @@ def trained(fit: Any, training: Record | None) -> Trained:
     freedom = fit.freedom if isinstance(fit, Estimate) else model.statistics.freedom
     used = target.size - len(model.theta) - freedom * target.shape[1] if np.isfinite(freedom) else 0.0
     robust = isinstance(fit, Estimate) and fit.plain_covariance is not None
-    began = Trained(model, phi, target, lengths, covariance, max(used, 0.0), robust)
+    began = TrainingRowsModel(model, phi, target, lengths, covariance, max(used, 0.0), robust)
     _check_solved(began)
     return began if isinstance(fit, Estimate) else began._replace(covariance=_saved_covariance(began))
 
 
-def _check_solved(began: Trained) -> None:
+def _check_solved(began: TrainingRowsModel) -> None:
     """Raise InputError where θ is not the least squares of the rows: then new rows would not go on from it."""
     count, ny, nt = began.phi.shape
     stacked = began.phi.reshape(-1, nt)
@@ -229,7 +229,7 @@ def _check_solved(began: Trained) -> None:
         )
 
 
-def _saved_covariance(began: Trained) -> Matrix | None:
+def _saved_covariance(began: TrainingRowsModel) -> Matrix | None:
     """Cov θ of a saved model under its training measure: `K Cov(c, w) Kᵀ`, K = [I, ∂θ_aux/∂w] from the Gram matrix."""
     model, nt = began.model, len(began.model.theta)
     joint = model.statistics.joint(nt)
@@ -245,7 +245,7 @@ def _saved_covariance(began: Trained) -> Matrix | None:
 
 
 def begin(
-    began: Trained, forgetting: float, quiet: float, *, empty: bool
+    began: TrainingRowsModel, forgetting: float, quiet: float, *, empty: bool
 ) -> tuple[Recursion, Reference, Matrix | None]:
     """The state before new rows, what residuals were like, and by what intervals are wider than `s²(ΦᵀΦ)⁻¹`."""
     phi, target, model = began.phi, began.target, began.model

@@ -12,7 +12,7 @@ from orthaug._base.checks import Matrix, Vector, check_type
 from orthaug._base.errors import InputError
 from orthaug._base.folders import whole_folder
 from orthaug.fitting.recursion import EstimateHistory, Recursion
-from orthaug.fitting.residual_band import Reference, Watch
+from orthaug.fitting.residual_band import Reference, ResidualMonitor
 from orthaug.models import storage
 from orthaug.models.learners import Learner
 from orthaug.models.model import Model
@@ -25,12 +25,12 @@ _SUMS = ("forgetting", "errors", "freedom", "rows", "rows_squared", "oldest", "u
 _REFERENCE = ("white", "colour", "deviation", "variance", "limit")
 
 
-class Kept(NamedTuple):
+class RecursiveState(NamedTuple):
     """All that a recursive estimate goes on from."""
 
     model: Model
     recursion: Recursion
-    watch: Watch
+    watch: ResidualMonitor
     inflation: Matrix | None
     used: float
     tail: Matrix
@@ -40,14 +40,14 @@ class Kept(NamedTuple):
     alarms: Vector
 
 
-def save(kept: Kept, folder: str | Path, *, force: bool = False) -> None:
+def save(kept: RecursiveState, folder: str | Path, *, force: bool = False) -> None:
     """Write a folder of its own, whole or not at all."""
     check_type(folder, str | os.PathLike, "folder", "a folder's name")
     with whole_folder(Path(folder), force=force) as partial:
         write(kept, partial)
 
 
-def write(kept: Kept, folder: Path) -> None:
+def write(kept: RecursiveState, folder: Path) -> None:
     """Write the files into an existing folder."""
     (folder / _MODEL).mkdir()
     storage.write(kept.model, folder / _MODEL)
@@ -55,7 +55,7 @@ def write(kept: Kept, folder: Path) -> None:
     write_packed(pack(FORMAT, declared, _arrays(kept)), folder / _DECLARATION, folder / _ARRAYS)
 
 
-def _arrays(kept: Kept) -> dict[str, Any]:
+def _arrays(kept: RecursiveState) -> dict[str, Any]:
     recursion, watch, kept_rows = kept.recursion, kept.watch, kept.kept_rows
     optional = {"inflation": kept.inflation, "floor": recursion.floor}
     return {
@@ -75,7 +75,7 @@ def _arrays(kept: Kept) -> dict[str, Any]:
     }
 
 
-def load(folder: Any, baseline: Baseline | None, learner: Learner | None) -> Kept:
+def load(folder: Any, baseline: Baseline | None, learner: Learner | None) -> RecursiveState:
     """What `save` wrote.
 
     Raises:
@@ -102,19 +102,19 @@ def load(folder: Any, baseline: Baseline | None, learner: Learner | None) -> Kep
         raise InputError(f"{path}: not a recursive estimate of this version ({error}).") from None
 
 
-def _rebuilt(model: Model, arrays: dict[str, np.ndarray]) -> Kept:
+def _rebuilt(model: Model, arrays: dict[str, np.ndarray]) -> RecursiveState:
     sums = dict(zip(_SUMS, arrays["sums"].tolist(), strict=True))
     sums |= {"until": int(sums["until"]), "determined": bool(sums["determined"])}
     given = {name: arrays[name] for name in ("factor", "squared", "shape", "start")}
     recursion = Recursion(**given, **sums, floor=arrays.get("floor"))
     scales = tuple(int(scale) for scale in arrays["scales"])
-    watch = Watch(Reference(**{name: arrays[name] for name in _REFERENCE}, scales=scales))
+    watch = ResidualMonitor(Reference(**{name: arrays[name] for name in _REFERENCE}, scales=scales))
     watch.past, watch.sums = arrays["past"].copy(), arrays["blocks"].copy()
     watch.counts, watch.totals = [int(n) for n in arrays["counts"]], arrays["totals"].tolist()
     used, rows, outside, stride, watch.level, armed = arrays["counted"].tolist()
     watch.armed = bool(armed)
     kept_rows = EstimateHistory(len(model.outputs), len(model.theta), int(stride), list(arrays["course"]))
     tail, alarms = arrays["tail"].copy(), arrays["alarms"]
-    return Kept(
+    return RecursiveState(
         model, recursion, watch, arrays.get("inflation"), used, tail, kept_rows, int(rows), int(outside), alarms
     )

@@ -77,7 +77,7 @@ class Reference:
 
 
 @dataclass(eq=False)
-class Watch:
+class ResidualMonitor:
     """The sums so far; `step` changes them."""
 
     reference: Reference

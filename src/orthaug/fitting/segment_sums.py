@@ -49,7 +49,7 @@ def _errors(dynamics: Dynamics, numbers: Numbers, segments: Segments, states: An
 
 
 @dataclass(frozen=True)
-class Trying:
+class TrialSquares:
     """`Squares` of one chunk, from its states or from where they moved to with (c, w)."""
 
     dynamics: Dynamics
@@ -65,7 +65,7 @@ class Trying:
 
 
 @dataclass(frozen=True)
-class Linearising:
+class SegmentEquations:
     """Of one chunk: how its best states follow (c, w), which it keeps, and its share of the normal equations."""
 
     dynamics: Dynamics
@@ -84,7 +84,7 @@ class Linearising:
 
 
 @dataclass(frozen=True)
-class Moving:
+class MovedStates:
     """The states of a chunk after a step of (c, w), and nothing to add up."""
 
     def __call__(self, best: Best, step: Any) -> tuple[Any, Any]:
@@ -142,9 +142,9 @@ class SegmentSums:
         """
         if step is None:
             rows, step = self.with_states(segments, start.values), np.zeros(0)
-            trying = Trying(dynamics, moves=False)
+            trying = TrialSquares(dynamics, moves=False)
         else:
-            rows, trying = self.engine.beside(self.rows(segments), start.there), Trying(dynamics, moves=True)
+            rows, trying = self.engine.beside(self.rows(segments), start.there), TrialSquares(dynamics, moves=True)
         found = self.engine.sum(trying, rows, numbers, *made, step)
         return float(found.misfit), np.asarray(found.errors)
 
@@ -156,14 +156,14 @@ class SegmentSums:
 
     def moved(self, start: Start, step: Vector) -> Float[np.ndarray, "k n0 m"]:
         """The states after a step of (c, w)."""
-        return np.asarray(self.engine.fetch(self.engine.keep(Moving(), start.there, step)[0]))
+        return np.asarray(self.engine.fetch(self.engine.keep(MovedStates(), start.there, step)[0]))
 
     def linearised(
         self, dynamics: Dynamics, numbers: Numbers, segments: Any, initial: InitialStates, states: Any, *made: Matrix
     ) -> tuple[Matrix, Vector, Any]:
         """Normal matrix and right-hand side of (c, w) with the states at their best, and `Best` where it stays."""
         rows = self.with_states(segments, states)
-        kept, (hessian, gradient) = self.engine.keep(Linearising(dynamics, initial.free), rows, numbers, *made)
+        kept, (hessian, gradient) = self.engine.keep(SegmentEquations(dynamics, initial.free), rows, numbers, *made)
         return np.asarray(hessian), np.asarray(gradient), kept if initial.free else None
 
     def slope(self, there: Any) -> Float[np.ndarray, "k m n0 n"]:

@@ -21,7 +21,7 @@ from orthaug.fitting.structures import Structure
 from orthaug.models.dynamics import Numbers
 from orthaug.models.learners import Bound, Scaling
 from orthaug.models.motion_model import FIRST_ROWS
-from orthaug.models.moving import Moving
+from orthaug.models.moving import MotionDynamics
 from orthaug.models.settling import LOOSE, Windows, settle
 from orthaug.physics.motion_problem import MotionProblem
 
@@ -41,7 +41,7 @@ class MotionObjective(FreeRunObjective):
 class SegmentedMotion(SegmentedProblem):
     """A motion's record laid out in segments. `loose` (nx,) is how far a start may be from its guess."""
 
-    dynamics: Moving
+    dynamics: MotionDynamics
     problem: MotionProblem
     loose: Vector
 
@@ -65,7 +65,7 @@ class SegmentedMotion(SegmentedProblem):
         assert free_run is not None, "a motion has no criterion one step ahead"
         features = () if bound is None else problem.features
         substeps = problem.substeps if like is None else like.dynamics.substeps
-        dynamics = Moving(problem.motion, features, bound, record.sampling_time, substeps)
+        dynamics = MotionDynamics(problem.motion, features, bound, record.sampling_time, substeps)
         nz, nl = len(features), 0 if bound is None else bound.ny
         shares = 1 if sums is None else sums.engine.shares
         return cls(
@@ -209,7 +209,7 @@ def sizes(problem: MotionProblem) -> Vector:
 
 
 @partial(jax.jit, static_argnames="form")
-def _states(form: Moving, numbers: Numbers, segments: Segments, states: Float[Array, "k n0 m"]) -> Any:
+def _states(form: MotionDynamics, numbers: Numbers, segments: Segments, states: Float[Array, "k n0 m"]) -> Any:
     """The states (k, T, n0, m) of every segment's run."""
     numbers = form.prepared(numbers)
     side_by_side = jax.vmap(lambda state, row: form.step(numbers, state, row)[0], -1, -1)

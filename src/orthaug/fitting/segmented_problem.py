@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug._base.progress import RunTell, quiet
+from orthaug._base.progress import RunProgress, quiet
 from orthaug.data.record import Record
-from orthaug.fitting.checkpoints import OF_DESCENT, Checkpoints, Kept
+from orthaug.fitting.checkpoints import OF_DESCENT, Checkpoints, RunCheckpoint
 from orthaug.fitting.criteria import Criterion, Simulation
 from orthaug.fitting.initial_states import Start
 from orthaug.fitting.objective import RUNAWAY, FreeRunObjective, TrialPoint, errors_of
@@ -48,7 +48,7 @@ class FreeRunFit(NamedTuple):
         return self.end.effective
 
 
-class Looked(NamedTuple):
+class TrialInMemory(NamedTuple):
     """A trial whose segments are in memory, to be looked at, and how its states follow (c, w)."""
 
     objective: FreeRunObjective
@@ -139,7 +139,7 @@ class SegmentedProblem:
         objective: FreeRunObjective,
         p: Vector,
         solver: LevenbergMarquardt,
-        tell: RunTell = quiet,
+        tell: RunProgress = quiet,
         states: Any = None,
         **options: Any,
     ) -> FreeRunFit:
@@ -178,7 +178,9 @@ class SegmentedProblem:
         mean_square = self.mean_square(end.point.c, end.point.w)
         return FreeRunFit(objective, end, mean_square, end.iterations, end.seconds)
 
-    def _kept(self, objective: FreeRunObjective, p: Vector, start: Start, options: dict[str, Any]) -> Kept | None:
+    def _kept(
+        self, objective: FreeRunObjective, p: Vector, start: Start, options: dict[str, Any]
+    ) -> RunCheckpoint | None:
         """Where the pauses of a descent from there are kept."""
         if self.checkpoints is None:
             return None
@@ -186,10 +188,10 @@ class SegmentedProblem:
         size = (self.segments.steps, self.segments.count, objective.weight, objective.dynamics.unknowns)
         return self.checkpoints.of_run("flight", p, np.asarray(start.values), *size, *chosen, form=OF_DESCENT)
 
-    def looked_at(self, objective: FreeRunObjective, end: Descent) -> Looked:
+    def looked_at(self, objective: FreeRunObjective, end: Descent) -> TrialInMemory:
         """Where a run ended, on segments in memory; its end has a derivative."""
         assert end.linear is not None
-        return Looked(objective, end.point, objective.slope(end.linear.start))
+        return TrialInMemory(objective, end.point, objective.slope(end.linear.start))
 
     def noise(self, objective: FreeRunObjective, end: Descent) -> Matrix | None:
         """Covariance (ny, ny) of the errors, in the outputs' units."""

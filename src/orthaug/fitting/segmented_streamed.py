@@ -27,7 +27,7 @@ from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.rules import check_scored
 from orthaug.fitting.segment_sums import SegmentSums
 from orthaug.fitting.segmented_lagged import SegmentedLagged, declared, lagged
-from orthaug.fitting.segmented_problem import COLOUR_ROWS, COLOURED_STEPS, Looked
+from orthaug.fitting.segmented_problem import COLOUR_ROWS, COLOURED_STEPS, TrialInMemory
 from orthaug.fitting.segments import CHUNK, Segments, begins_of, build_segments, segment_of
 from orthaug.fitting.solvers.descent import Descent
 from orthaug.models.dynamics import Dynamics, Numbers
@@ -42,7 +42,7 @@ class SegmentedStreamed(SegmentedLagged):
     """A source's rows cut into segments where an engine reads or keeps them. `record` is a witness of them."""
 
     source: Source
-    found: Found
+    found: ExperimentStarts
     empty: Record
 
     @classmethod
@@ -61,7 +61,7 @@ class SegmentedStreamed(SegmentedLagged):
             )
         dynamics = lagged(task)
         empty, source, washout = problem.basis.form.empty, problem.source, free_run.washout
-        found = Found.of(task.engine.passes(look, source.partitions))
+        found = ExperimentStarts.of(task.engine.passes(look, source.partitions))
         longest = max(found.rows) - dynamics.first_row
         check_scored(criterion, longest)
         made = (task.engine, source, found, dynamics, empty)
@@ -93,7 +93,7 @@ class SegmentedStreamed(SegmentedLagged):
             mean = float(np.sum(squares / self.deviation**2)) / (self.whole.count * len(self.deviation))
         return mean if mean < RUNAWAY else np.nan
 
-    def looked_at(self, objective: FreeRunObjective, end: Descent) -> Looked:
+    def looked_at(self, objective: FreeRunObjective, end: Descent) -> TrialInMemory:
         """The segments of the witness; where that is all rows, with the states that were trained."""
         free_run = self.free_run
         segments = build_segments(self.record, self.dynamics, free_run.steps, free_run.washout)
@@ -112,10 +112,10 @@ class SegmentedStreamed(SegmentedLagged):
                 start = seen.linearise(seen.evaluate(p, start)).start
         there = seen.evaluate(p, start)
         linear = seen.linearise(there)
-        return Looked(seen, there, linear.start.slope)
+        return TrialInMemory(seen, there, linear.start.slope)
 
 
-class Carried(NamedTuple):
+class RunState(NamedTuple):
     """A run that ended somewhere: its state, the squares of its errors (ny,), and where it has to go on."""
 
     state: Any = None
@@ -126,7 +126,7 @@ class Carried(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Running:
+class PartitionRuns:
     """A partition's part of the runs, which start from what was measured; picklable if the physics is."""
 
     dynamics: Dynamics
@@ -135,13 +135,13 @@ class Running:
     washout: int
     """Leading steps of an experiment that are not scored."""
 
-    def __call__(self, partition: Any, run: Carried) -> Carried:
+    def __call__(self, partition: Any, run: RunState) -> RunState:
         first = self.dynamics.first_row
         for piece in partition.pieces(first):
             if len(piece) <= first:
                 continue
             if run.ended != (piece.source, piece.offset + first):
-                run = Carried(self.dynamics.start(piece.outputs, [first])[0], run.squares)
+                run = RunState(self.dynamics.start(piece.outputs, [first])[0], run.squares)
             inputs, target = self.dynamics.inputs(piece, self.empty), piece.outputs[first:]
             rows = len(target)
             length = padded_length(rows)
@@ -149,7 +149,7 @@ class Running:
             padded = (np.concatenate([part, np.zeros((length - rows, part.shape[1]))]) for part in (inputs, target))
             given = (self.dynamics, self.numbers, run.state, *padded, scored, np.int64(rows))
             state, squares = map(np.asarray, _along(*given))
-            run = Carried(state, run.squares + squares, (piece.source, piece.offset + len(piece)), run.done + rows)
+            run = RunState(state, run.squares + squares, (piece.source, piece.offset + len(piece)), run.done + rows)
         return run
 
 
@@ -183,12 +183,12 @@ class WholeRuns:
 
     def squares(self, dynamics: Dynamics, numbers: Numbers) -> Vector:
         """Σ e² (ny,) of the errors, in the outputs' units."""
-        running = Running(dynamics, numbers, self.empty, self.washout)
-        return np.asarray(self.engine.along(running, self.partitions, Carried()).squares)
+        running = PartitionRuns(dynamics, numbers, self.empty, self.washout)
+        return np.asarray(self.engine.along(running, self.partitions, RunState()).squares)
 
 
 @dataclass(frozen=True)
-class Seen:
+class PieceShape:
     """A piece of a partition without its rows: what `Experiment` has beside them."""
 
     source: str
@@ -200,13 +200,13 @@ class Seen:
         return self.rows
 
 
-def look(partition: Any) -> list[Seen]:
+def look(partition: Any) -> list[PieceShape]:
     """The pieces of a partition."""
-    return [Seen(piece.source, piece.first_row, piece.offset, len(piece)) for piece in partition.pieces(0)]
+    return [PieceShape(piece.source, piece.first_row, piece.offset, len(piece)) for piece in partition.pieces(0)]
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class ExperimentStarts:
     """Where the experiments of a source begin, counted over the rows of all partitions, and how many rows they have."""
 
     begins: tuple[int, ...]
@@ -215,10 +215,10 @@ class Found:
     """Where the partitions end."""
 
     @classmethod
-    def of(cls, seen: Sequence[Sequence[Seen]]) -> Found:
+    def of(cls, seen: Sequence[Sequence[PieceShape]]) -> ExperimentStarts:
         """From the pieces of all partitions."""
         begins, rows, total = [], [], 0
-        last: Seen | None = None
+        last: PieceShape | None = None
         for piece in (piece for pieces in seen for piece in pieces):
             if last is not None and follows(last, piece):
                 rows[-1] += piece.rows
@@ -247,7 +247,7 @@ class Part:
 
 
 @dataclass(frozen=True, eq=False)
-class Cutting:
+class SegmentCutter:
     """How rows become segments, in chunks of `width`; picklable if the physics is."""
 
     dynamics: Dynamics
@@ -291,7 +291,7 @@ def _slices(part: Part) -> Iterator[Experiment]:
 
 
 @dataclass(frozen=True)
-class Starting:
+class SegmentStarts:
     """The measured states of a chunk and which of its segments are any, and how many steps are scored."""
 
     def __call__(self, segments: Segments) -> tuple[Any, Any]:
@@ -316,7 +316,7 @@ class SourceSegments:
         cls,
         engine: Engine,
         source: Any,
-        found: Found,
+        found: ExperimentStarts,
         dynamics: Dynamics,
         empty: Record,
         segment: int,
@@ -344,8 +344,8 @@ class SourceSegments:
             parts.append(Part.of(Span.of(source.partitions[i : last + 1], into), own - before))
             counts.append(len(own))
         width = max(-(-n // -(-n // CHUNK)) for n in counts)
-        cutting = Cutting(dynamics, empty, steps, washout, width)
+        cutting = SegmentCutter(dynamics, empty, steps, washout, width)
         read = engine.read(cutting, parts, [-(-n // width) for n in counts])
-        kept, count = engine.keep(Starting(), read)
+        kept, count = engine.keep(SegmentStarts(), read)
         start, there = engine.fetch(kept)
         return cls(read, steps, int(count), np.asarray(start), np.asarray(there))

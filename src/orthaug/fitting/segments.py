@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 
 from orthaug._base.jax import Array, jax, jnp
 from orthaug.data.record import Experiment, Record
-from orthaug.models.dynamics import Differentiated, Dynamics, Numbers
+from orthaug.models.dynamics import AutodiffDynamics, Dynamics, Numbers
 from orthaug.models.rows import gram
 
 CHUNK = 256  # segments that run side by side
@@ -146,7 +146,7 @@ def chunk_sensitivity(dynamics: Dynamics, numbers: Numbers, chunk: tuple[Any, ..
     n0, width = state.shape
     n = dynamics.unknowns
     at_once = _BLOCK // (width * (n0 + len(dynamics.outputs)) * (n0 + n)) if n0 else 0
-    blocks = isinstance(dynamics, Differentiated) and at_once >= _FEWEST
+    blocks = isinstance(dynamics, AutodiffDynamics) and at_once >= _FEWEST
     advance = partial(_steps_at_once, at_once) if blocks else _step_by_step
     nothing = (jnp.zeros((n + 1, n + 1)), jnp.zeros((n0, n0 + n + 1, width)))
     return Sensitivity(*advance(dynamics, numbers, (state, dynamics.first_slopes(width), *nothing), rows, weight))

@@ -15,8 +15,8 @@ import numpy as np
 
 from orthaug._base.checks import Matrix
 from orthaug._base.errors import Warning
-from orthaug.fitting.held_out import HeldOut, mean_square
-from orthaug.fitting.learned import Learned
+from orthaug.fitting.held_out import HeldOutErrors, mean_square
+from orthaug.fitting.learned import TrainedLearner
 from orthaug.fitting.solvers.descent import evidence_ridge
 from orthaug.fitting.status import Ending
 
@@ -58,7 +58,7 @@ def add_retries(
 
 
 def tell_retries(
-    planned: int, starts: Sequence[Any], runs: Sequence[Any], held_out: HeldOut | None, best: int
+    planned: int, starts: Sequence[Any], runs: Sequence[Any], held_out: HeldOutErrors | None, best: int
 ) -> list[Warning]:
     """Return the warning that evidence silenced the learner and what was tried then; none where nothing was.
 
@@ -91,7 +91,7 @@ def tell_retries(
     return [Warning("evidence_retried", text)]
 
 
-def learner_silent(learned: Learned, values: Matrix | None = None) -> list[Warning]:
+def learner_silent(learned: TrainedLearner, values: Matrix | None = None) -> list[Warning]:
     """Return the warning that a learner does nothing, or no more than a constant; none otherwise.
 
     Args:

@@ -14,12 +14,12 @@ import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import Warning
-from orthaug._base.progress import RunTell, quiet
+from orthaug._base.progress import RunProgress, quiet
 from orthaug.fitting.block_scores import FreeRunScores
 from orthaug.fitting.checkpoints import Checkpoints
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.initial_states import Start
-from orthaug.fitting.learned import ErrorStatistics, Learned
+from orthaug.fitting.learned import ErrorStatistics, TrainedLearner
 from orthaug.fitting.objective import FreeRunObjective
 from orthaug.fitting.rules import ridge_of
 from orthaug.fitting.segmented_problem import FreeRunFit
@@ -32,7 +32,7 @@ from orthaug.models.learners import Bound
 _LOOKED_AT = 8  # iterates of a run that ended above physics alone
 
 
-class Place(NamedTuple):
+class StartPoint(NamedTuple):
     """Where a run may start: p and the segments' states, the loss there, and whether the learner is silent."""
 
     p: Vector
@@ -59,7 +59,7 @@ class SimulationTask(ABC):
 
     @abstractmethod
     def train_physics_only(
-        self, solver: LevenbergMarquardt, structure: Structure, tell: RunTell
+        self, solver: LevenbergMarquardt, structure: Structure, tell: RunProgress
     ) -> tuple[Any, FreeRunFit | None]:
         """The plan and physics alone trained on it; None where it cannot fly."""
 
@@ -75,10 +75,10 @@ class SimulationTask(ABC):
         w: Vector,
         structure: Structure,
         regularization: str | float,
-    ) -> list[Place]:
+    ) -> list[StartPoint]:
         """Where a run from the weights w may start; arguments as in `estimate`."""
 
-    def prepared(self: Task, solver: LevenbergMarquardt, structure: Structure, progress: RunTell = quiet) -> Task:
+    def prepared(self: Task, solver: LevenbergMarquardt, structure: Structure, progress: RunProgress = quiet) -> Task:
         """The same with physics alone trained.
 
         Its errors are then the unit of the criterion, in which a ridge counts. Where it runs away over whole
@@ -145,7 +145,7 @@ class SimulationTask(ABC):
         w: Any,
         structure: Structure,
         regularization: str | float = "none",
-        progress: RunTell = quiet,
+        progress: RunProgress = quiet,
     ) -> FreeRunFit:
         """One run from the weights `w`, silenced, and physics alone; the arguments as in `estimate`.
 
@@ -202,7 +202,7 @@ class SimulationTask(ABC):
         """The run's `mean_square`."""
         return run.mean_square
 
-    def learned(self, run: FreeRunFit) -> Learned:
+    def learned(self, run: FreeRunFit) -> TrainedLearner:
         """The learner as a run left it, with the statistics of its errors."""
         end, objective = run.end, run.objective
         linear, rms = end.linear, objective.rms
@@ -215,7 +215,7 @@ class SimulationTask(ABC):
             white = change @ noise @ change.T * rms**2
             return gram * float(np.trace(white)) / len(white)
 
-        return Learned(
+        return TrainedLearner(
             bound=self.bound,
             weights=end.point.w,
             scaling=self.plan.scaling,

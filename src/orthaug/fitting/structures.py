@@ -67,7 +67,7 @@ class Structure(Protocol):
         ...
 
 
-class _Solved:
+class _SolvedTheta:
     """θ solved for any weights, without rows in the criterion; called what is left beside the learner."""
 
     projects = False
@@ -82,7 +82,7 @@ class _Solved:
 
 
 @dataclass(frozen=True)
-class Orthogonal(_Solved):
+class Orthogonal(_SolvedTheta):
     """ŷ = φ(θ − θ_aux) + f with θ_aux = Φ_μ⁺F_μ (eq:orth_param).
 
     Under the training measure θ̂ = Φ⁺Y for every learner that sees all lags (F1). Under another `measure` training is
@@ -105,7 +105,7 @@ class Orthogonal(_Solved):
 
 
 @dataclass(frozen=True)
-class Additive(_Solved):
+class Additive(_SolvedTheta):
     """ŷ = φθ + f (eqs:additive_struct): θ takes what this learner happens to leave, so it is not unique.
 
     With `from_initial` θ starts at θ⁰ and is trained with the weights, one step ahead; without, it is solved for any
@@ -120,7 +120,7 @@ class Additive(_Solved):
 
 
 @dataclass(frozen=True)
-class OrthogonalPenalty(_Solved):
+class OrthogonalPenalty(_SolvedTheta):
     """Additive with `λ‖QᵀF‖²` in the criterion (Kon 2022, Györök 2025): drives the learner out of the physics.
 
     `weight` is λ, against the sum of squares in the output's units.
@@ -138,7 +138,7 @@ class OrthogonalPenalty(_Solved):
 
 
 @dataclass(frozen=True)
-class BaselinePenalty(_Solved):
+class BaselinePenalty(_SolvedTheta):
     """Additive with `λ‖(θ − θ⁰)/θ⁰‖²` in the criterion (Bolderman 2022): keeps θ near its initial value.
 
     `weight` is λ, against the sum of squares in the output's units.

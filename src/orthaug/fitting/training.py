@@ -15,13 +15,13 @@ from orthaug._base.errors import InputError, Warning
 from orthaug._base.jax import jax
 from orthaug._base.lines import counted
 from orthaug._base.parallel import Threads, one_blas_thread
-from orthaug._base.progress import LOG, Tell
+from orthaug._base.progress import LOG, ProgressCallback
 from orthaug.data.record import Record
 from orthaug.fitting.conclusion import conclude
 from orthaug.fitting.estimates import Restart
-from orthaug.fitting.held_out import HeldOut, Pieces, blocked, mean_square, squared_errors
+from orthaug.fitting.held_out import HeldOutErrors, Pieces, blocked, mean_square, squared_errors
 from orthaug.fitting.kinds import Solver
-from orthaug.fitting.learned import Learned, Task
+from orthaug.fitting.learned import Task, TrainedLearner
 from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.silence import add_retries, tell_retries
 from orthaug.fitting.status import Ending
@@ -32,7 +32,7 @@ _INFLATION = 1.4  # of the effective weights in cross-validation, against what f
 FOLD_ITERATIONS = 60  # enough to tell whether a learner helps, on every block of cross-validation
 
 
-Concluding = Callable[[Any, Structure, Learned], Any]
+Concluding = Callable[[Any, Structure, TrainedLearner], Any]
 """Makes the estimate of a task, a structure and what a run learned."""
 
 
@@ -93,7 +93,7 @@ def train(
     structure: Structure,
     solver: Solver,
     choice: Choice,
-    progress: Tell,
+    progress: ProgressCallback,
     conclude: Concluding = conclude,
     runner: Any = Threads(),  # noqa: B008  (it holds nothing)
 ) -> Any:
@@ -200,7 +200,7 @@ def _run_all(
     structure: Structure,
     solver: Solver,
     choice: Choice,
-    progress: Tell,
+    progress: ProgressCallback,
     runner: Any,
 ) -> tuple[list[PlannedRun], list[Any]]:
     """Make every planned run, and more where evidence silenced the learner and held-out rows can choose."""
@@ -215,7 +215,12 @@ def _run_all(
 
 
 def _run(
-    task: Task, starts: Sequence[PlannedRun], structure: Structure, solver: Solver, progress: Tell, runner: Any
+    task: Task,
+    starts: Sequence[PlannedRun],
+    structure: Structure,
+    solver: Solver,
+    progress: ProgressCallback,
+    runner: Any,
 ) -> tuple[list[PlannedRun], list[Any]]:
     """Every planned run; one that fails is made again from the seeds that follow."""
     made, given = list(starts), (task, solver, structure)
@@ -267,7 +272,7 @@ def _held_out(
     choice: Choice,
     conclude: Concluding,
     runner: Any,
-) -> HeldOut | None:
+) -> HeldOutErrors | None:
     """Errors where nothing was fitted: of the runs on the validation record, or of runs on folds on their blocks.
 
     `concluded` gives the estimate of a run by its number.
@@ -277,7 +282,7 @@ def _held_out(
         fits = [concluded(i) for i in range(len(starts))]
         alone = _errors(_alone(conclude, task, structure), record, unit)
         labels = ("the validation part",) * len(record.experiments)
-        return HeldOut("the validation part", labels, alone, tuple(_errors(fit, record, unit) for fit in fits))
+        return HeldOutErrors("the validation part", labels, alone, tuple(_errors(fit, record, unit) for fit in fits))
     if not choice.blocks or not choice.compares(task, starts):
         return None
     try:
@@ -290,7 +295,7 @@ def _held_out(
     found = runner.map(_on_fold, given, folds)
     pieces = [[p for block in column for p in block] for column in zip(*found, strict=True)]
     labels = tuple(f"block {i + 1} of {choice.blocks}" for i, (_, held) in enumerate(folds) for _ in held.experiments)
-    return HeldOut(f"blocked cross-validation ({choice.blocks} blocks)", labels, pieces[0], tuple(pieces[1:]))
+    return HeldOutErrors(f"blocked cross-validation ({choice.blocks} blocks)", labels, pieces[0], tuple(pieces[1:]))
 
 
 def _on_fold(given: Any, fold: tuple[Record, Record], tell: Callable[..., None]) -> list[Pieces]:
@@ -317,7 +322,7 @@ def _errors(fit: Any, record: Record, unit: Any) -> Pieces:
     return squared_errors(fit.criterion.response(fit.model, record), unit)
 
 
-def _fell_back(held_out: HeldOut) -> Warning:
+def _fell_back(held_out: HeldOutErrors) -> Warning:
     model, alone = (math.sqrt(mean_square(p)) for p in (held_out.runs[held_out.chosen], held_out.alone))
     errors = f"its error is {model:.4g} deviations of the output, that of physics alone {alone:.4g}"
     if math.isinf(model):
@@ -340,11 +345,11 @@ def _kept_physics(conclude: Concluding, task: Task, structure: Structure) -> Any
     return _alone(conclude, task, Orthogonal() if plain else structure)
 
 
-def _concluded(conclude: Concluding, task: Task, structure: Structure, learned: Learned) -> Any:
+def _concluded(conclude: Concluding, task: Task, structure: Structure, learned: TrainedLearner) -> Any:
     return replace(conclude(task.rows_task, structure, learned), criterion=task.criterion)
 
 
-def _median(task: Task, runs: Sequence[Any], members: Sequence[int], best: int) -> Learned:
+def _median(task: Task, runs: Sequence[Any], members: Sequence[int], best: int) -> TrainedLearner:
     """The median of the members that have a value everywhere; the best one alone if it has none."""
     rows: OneStepTask = task.rows_task
     learned = {i: task.learned(runs[i]) for i in members}

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug.fitting.learned import Learned
+from orthaug.fitting.learned import TrainedLearner
 from orthaug.fitting.normal_equations import Blocks
 from orthaug.inference.covariance import mixing
 from orthaug.models.learners import Bound, Scaling
@@ -51,7 +51,7 @@ class TrainingRows:
         """The criterion's `‖r‖²` as the mean of squared errors with each output in its standard deviation."""
         return float(loss) * self.rms**2 / self.problem.samples
 
-    def share(self, learned: Learned) -> Share:
+    def share(self, learned: TrainedLearner) -> Share:
         """QᵀF, refined once, and ‖F‖²; not finite where the learner is not."""
         f = np.zeros(len(self.problem.baseline.names))
         if learned.bound is None:
@@ -61,18 +61,18 @@ class TrainingRows:
             f = f + rest
         return Share(f, square)
 
-    def left_share(self, learned: Learned, theta: Vector) -> Vector:
+    def left_share(self, learned: TrainedLearner, theta: Vector) -> Vector:
         """Qᵀ(F − Φθ) (nθ,), in whitened outputs."""
         return self._sums(learned, self.problem.projection.to_coordinates @ theta)[0]
 
-    def residual_gram(self, learned: Learned, c: Vector) -> Matrix:
+    def residual_gram(self, learned: TrainedLearner, c: Vector) -> Matrix:
         """Σ r rᵀ (ny, ny) of the residual r = Y − F − Φc, in whitened outputs."""
         problem = self.problem
         physics = problem.target_coordinates - problem.projection.to_coordinates @ c
         total = self.engine.sum(ResidualGram(learned.bound), self.rows, *self._weights(learned), physics / self.rms)
         return np.asarray(total) * self.rms**2
 
-    def _sums(self, learned: Learned, shift: Vector) -> tuple[Vector, float]:
+    def _sums(self, learned: TrainedLearner, shift: Vector) -> tuple[Vector, float]:
         summed = LearnerSums(learned.bound)
         rest, square = self.engine.sum(summed, self.rows, *self._weights(learned), shift / self.rms)
         return np.asarray(rest) * self.rms, float(square) * self.rms**2
@@ -98,7 +98,7 @@ class TrainingRows:
         total = self.engine.sum(Blocks(self.bound), self.rows, w, self._nothing)
         return np.asarray(total[:nt, nt + 1 :]) * self.rms
 
-    def _weights(self, learned: Learned) -> tuple[Any, Any]:
+    def _weights(self, learned: TrainedLearner) -> tuple[Any, Any]:
         """Weights and tilt of a learned function, the tilt in the coordinates of the rows."""
         if learned.tilt is None:
             return learned.weights, None

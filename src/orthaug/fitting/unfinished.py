@@ -12,7 +12,7 @@ from dataclasses import replace
 from orthaug._base.errors import Warning
 from orthaug._base.lines import counted, percent
 from orthaug.fitting.elimination import directions
-from orthaug.fitting.learned import Learned
+from orthaug.fitting.learned import TrainedLearner
 from orthaug.fitting.solvers.limit import Tail, noticeable_in
 from orthaug.fitting.status import Ending
 from orthaug.fitting.structures import Structure
@@ -34,7 +34,7 @@ def noticeable_fall(structure: Structure, decoupled: bool, samples: int) -> floa
     return _SETTLED_THETA if decoupled and structure.measure == Training() else noticeable_in(samples)
 
 
-def follows_training(structure: Structure, problem: Problem, learned: Learned) -> bool:
+def follows_training(structure: Structure, problem: Problem, learned: TrainedLearner) -> bool:
     """Return whether θ of a lagged model moves with the weights."""
     if learned.errors is not None or learned.coefficients is not None:
         return True
@@ -42,18 +42,18 @@ def follows_training(structure: Structure, problem: Problem, learned: Learned) -
     return not whole or structure.measure != Training()
 
 
-def unfinished(learned: Learned) -> bool:
+def unfinished(learned: TrainedLearner) -> bool:
     """Return whether training ended while the loss still fell noticeably."""
     return learned.ending.usable and learned.tail is not None and learned.tail.noticeable
 
 
-def withheld(learned: Learned) -> Learned:
+def withheld(learned: TrainedLearner) -> TrainedLearner:
     """Return what a run left without what intervals are made of."""
     errors = None if learned.errors is None else learned.errors._replace(covariance=None)
     return replace(learned, gram=None, middle=None, errors=errors)
 
 
-def not_converged(learned: Learned) -> Warning:
+def not_converged(learned: TrainedLearner) -> Warning:
     """Return the warning that there are no intervals, with cause and remedy."""
     assert learned.tail is not None
     text = (

@@ -300,7 +300,7 @@ def _rule(coordinates: int) -> Points:
 
 
 @dataclass(frozen=True, eq=False)
-class Weighed:
+class WeighedPhysics:
     """A measure's `points`, and the physics there with every row multiplied by `unit` (M, ny, ny).
 
     The unit is the square root of a point's weight times the matrix of the output weights.
@@ -313,7 +313,9 @@ class Weighed:
     excitation: Excitation
 
 
-def weigh(measure: Measure, support: Support, baseline: Baseline, outputs: tuple[str, ...], weight: Matrix) -> Weighed:
+def weigh(
+    measure: Measure, support: Support, baseline: Baseline, outputs: tuple[str, ...], weight: Matrix
+) -> WeighedPhysics:
     """The physics over a measure's points.
 
     Args:
@@ -334,10 +336,10 @@ def weigh(measure: Measure, support: Support, baseline: Baseline, outputs: tuple
         )
     unit = np.sqrt(points.weight)[:, None, None] * weight
     projection = Projection.factor(times(unit, phi))
-    return Weighed(measure, points, unit, projection, excitation(projection.r, baseline.names))
+    return WeighedPhysics(measure, points, unit, projection, excitation(projection.r, baseline.names))
 
 
-def weigh_problem(measure: Measure, problem: Problem) -> Weighed:
+def weigh_problem(measure: Measure, problem: Problem) -> WeighedPhysics:
     """The same for a posed problem. Under the training measure it takes the factor that the problem has."""
     if measure != Training():
         return weigh(measure, Support.of(problem), problem.baseline, problem.outputs, problem.weight.matrix)
@@ -346,4 +348,4 @@ def weigh_problem(measure: Measure, problem: Problem) -> Weighed:
     size = np.sqrt(even[0])
     projection = replace(own, r=own.r * size, phi=own.phi * size)
     unit = np.sqrt(even)[:, None, None] * problem.weight.matrix
-    return Weighed(measure, Points(problem.rows.x, even), unit, projection, problem.excitation)
+    return WeighedPhysics(measure, Points(problem.rows.x, even), unit, projection, problem.excitation)

@@ -21,8 +21,8 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug._base.jax import Array, jax, jnp
 from orthaug.models.dynamics import Numbers
 from orthaug.models.motion_field import MotionField
-from orthaug.models.moving import Moving
-from orthaug.physics.left_over import LeftOver, left_over
+from orthaug.models.moving import MotionDynamics
+from orthaug.physics.left_over import UnexplainedPhysics, left_over
 from orthaug.physics.motion import Motion
 from orthaug.physics.shared import Shared, agreeing, moves, spanned
 
@@ -70,7 +70,7 @@ class MotionSplit:
         return cls(name, c, shared, None, None, None, 1.0, nothing)
 
 
-def shared_of_motion(form: Moving, q: Vector, x: Matrix, u: Matrix) -> Shared:
+def shared_of_motion(form: MotionDynamics, q: Vector, x: Matrix, u: Matrix) -> Shared:
     """The directions of q that a learner on the form's features could imitate, at q.
 
     A direction is shared if it moves no equation and no output without a learner, and moves those with one by a
@@ -99,7 +99,7 @@ def shared_of_motion(form: Moving, q: Vector, x: Matrix, u: Matrix) -> Shared:
     return Shared(names, agreeing(before, after)).beside(_left_over(form, q, points, nx))
 
 
-def _left_over(form: Moving, q: Vector, points: Matrix, nx: int) -> LeftOver | None:
+def _left_over(form: MotionDynamics, q: Vector, points: Matrix, nx: int) -> UnexplainedPhysics | None:
     """What functions of the features leave of the slopes at the points."""
     some = points[:: max(1, -(-len(points) // _ROWS))]
     slopes = np.asarray(slopes_at(form, q, some[:, :nx], some[:, nx:]))
@@ -107,7 +107,7 @@ def _left_over(form: Moving, q: Vector, points: Matrix, nx: int) -> LeftOver | N
     return left_over(slopes, features, _has_learner(form.motion))
 
 
-def _spanned(form: Moving, q: Vector, x: Matrix, u: Matrix) -> Shared:
+def _spanned(form: MotionDynamics, q: Vector, x: Matrix, u: Matrix) -> Shared:
     """The directions that move what has a learner by linear combinations of its features, and nothing else."""
     some = slice(None, None, max(1, len(x) // _POINTS))
     slopes = np.moveaxis(np.asarray(slopes_at(form, q, x[some], u[some])), 1, 0)
@@ -126,7 +126,7 @@ def _has_learner(motion: Motion) -> Bool[np.ndarray, "r"]:
 
 
 def nearest(
-    form: Moving,
+    form: MotionDynamics,
     numbers: Numbers,
     start: Vector,
     field: Field,
@@ -184,7 +184,7 @@ def _unit(basis: Matrix, gauss: Matrix) -> Matrix:
 
 def split_motion(
     name: str,
-    form: Moving,
+    form: MotionDynamics,
     numbers: Numbers,
     start: Vector,
     field: Field,
@@ -230,19 +230,19 @@ def split_motion(
     return MotionSplit(name, q, shared, slope, defect, share, curvature, field)
 
 
-def _learned_rows(form: Moving, q: Any, x: Any, u: Any) -> Any:
+def _learned_rows(form: MotionDynamics, q: Any, x: Any, u: Any) -> Any:
     """The physics of the learned equations and outputs (nl,) at one point."""
     return form.learned_rows(form.motion.coordinates.physical(q, jnp), x, u)
 
 
-def rest_of(form: Moving, numbers: Numbers, q: Any, c: Any, w: Any, x: Any, u: Any, size: Any) -> Any:
+def rest_of(form: MotionDynamics, numbers: Numbers, q: Any, c: Any, w: Any, x: Any, u: Any, size: Any) -> Any:
     """(G − f(q)) / size (nl,) at one point."""
     own = numbers._replace(weights=w)
     return (_learned_rows(form, c, x, u) + form.learned(own, x, u) - _learned_rows(form, q, x, u)) / size
 
 
 @partial(jax.jit, static_argnames="form")
-def slopes_at(form: Moving, q: Any, x: Float[Array, "m nx"], u: Float[Array, "m nu"]) -> Float[Array, "m r np"]:
+def slopes_at(form: MotionDynamics, q: Any, x: Float[Array, "m nx"], u: Float[Array, "m nu"]) -> Float[Array, "m r np"]:
     """∂(f, h)/∂q at points."""
 
     def both(q: Any, x: Any, u: Any) -> Any:
@@ -252,12 +252,12 @@ def slopes_at(form: Moving, q: Any, x: Float[Array, "m nx"], u: Float[Array, "m 
     return jax.vmap(lambda x, u: jax.jacfwd(both)(q, x, u))(x, u)
 
 
-def _distance(form: Moving, numbers: Numbers, q: Vector, field: Field) -> float:
+def _distance(form: MotionDynamics, numbers: Numbers, q: Vector, field: Field) -> float:
     value = float(np.asarray(_summed(_square, form, numbers, q, field)))
     return value if np.isfinite(value) else np.inf
 
 
-def _summed(function: Any, form: Moving, numbers: Numbers, q: Vector, field: Field) -> Any:
+def _summed(function: Any, form: MotionDynamics, numbers: Numbers, q: Vector, field: Field) -> Any:
     """The sum over the points, batch by batch."""
     total = None
     for begin in range(0, len(field.x), _BATCH):
@@ -272,14 +272,14 @@ def _summed(function: Any, form: Moving, numbers: Numbers, q: Vector, field: Fie
 
 
 @partial(jax.jit, static_argnames="form")
-def _square(form: Moving, numbers: Numbers, q: Any, x: Any, u: Any, weight: Any, size: Any) -> Any:
+def _square(form: MotionDynamics, numbers: Numbers, q: Any, x: Any, u: Any, weight: Any, size: Any) -> Any:
     c, w = numbers.theta - numbers.theta_aux, numbers.weights
     rest = jax.vmap(lambda x, u: rest_of(form, numbers, q, c, w, x, u, size))(x, u)
     return jnp.sum(jnp.where(weight[:, None] > 0, weight[:, None] * rest**2, 0.0)) / 2
 
 
 @partial(jax.jit, static_argnames="form")
-def _gauss_newton(form: Moving, numbers: Numbers, q: Any, x: Any, u: Any, weight: Any, size: Any) -> Any:
+def _gauss_newton(form: MotionDynamics, numbers: Numbers, q: Any, x: Any, u: Any, weight: Any, size: Any) -> Any:
     c, w = numbers.theta - numbers.theta_aux, numbers.weights
 
     def one(x: Any, u: Any) -> Any:
@@ -295,7 +295,7 @@ def _gauss_newton(form: Moving, numbers: Numbers, q: Any, x: Any, u: Any, weight
 
 
 @partial(jax.jit, static_argnames="form")
-def _second(form: Moving, numbers: Numbers, q: Any, x: Any, u: Any, weight: Any, size: Any) -> Any:
+def _second(form: MotionDynamics, numbers: Numbers, q: Any, x: Any, u: Any, weight: Any, size: Any) -> Any:
     """Second derivatives of half the distance: in q, in q and c, in q and w; and what the rest is made of."""
     c, w = numbers.theta - numbers.theta_aux, numbers.weights
 

@@ -97,7 +97,7 @@ def split_under(measure: Measure, model: Model, support: Support, joint: JointCo
 
 
 @dataclass(frozen=True, eq=False)
-class _Overlapping:
+class _PartitionOverlap:
     """QᵀJ over the rows of a partition; picklable if the learner is."""
 
     row_builder: RowBuilder
@@ -118,7 +118,9 @@ def streamed_slope(model: Model, problem: StreamedProblem) -> Matrix:
         return np.zeros((nt, 0))
     gain = problem.weight.matrix * np.asarray(numbers.gain)
     row_builder = problem.row_builder(np.asarray(numbers.centre), np.asarray(numbers.halfwidth), 1.0, gain)
-    parts = problem.passes(_Overlapping(row_builder, bound, np.asarray(numbers.weights)), problem.source.partitions)
+    parts = problem.passes(
+        _PartitionOverlap(row_builder, bound, np.asarray(numbers.weights)), problem.source.partitions
+    )
     overlap = sum(part for part in parts if part is not None)
     return problem.projection.from_coordinates(problem.projection.along(model.shared) @ overlap)
 

@@ -39,7 +39,7 @@ _PATIENCE = "20 s"  # to reach a scheduler
 
 
 @dataclass(frozen=True, eq=False)
-class Held:
+class ClusterChunks:
     """Futures of groups of chunks, or tuples of those whose chunks stand beside each other; how many each group has."""
 
     futures: list[Any]
@@ -94,19 +94,21 @@ class Dask(Threads):
     def shares(self) -> int:
         return max(len(self.client.nthreads()), 1)
 
-    def place(self, chunks: Any, like: Sequence[Any] | None = None) -> Held:
+    def place(self, chunks: Any, like: Sequence[Any] | None = None) -> ClusterChunks:
         pieces = apart(chunks)
         each = -(-len(pieces) // min(self.shares, len(pieces)))
         whole, rest = divmod(len(pieces), each)
-        counts = like.counts if isinstance(like, Held) else (*[each] * whole, *([rest] if rest else []))
+        counts = like.counts if isinstance(like, ClusterChunks) else (*[each] * whole, *([rest] if rest else []))
         ends = np.cumsum(counts).tolist()
         with told():
             groups = [pieces[end - count : end] for end, count in zip(ends, counts, strict=True)]
-            return Held([self.client.submit(kept, group, pure=False) for group in groups], tuple(counts))
+            return ClusterChunks([self.client.submit(kept, group, pure=False) for group in groups], tuple(counts))
 
-    def read(self, function: Callable[[Any], Any], partitions: Sequence[Any], counts: Sequence[int]) -> Held:
+    def read(self, function: Callable[[Any], Any], partitions: Sequence[Any], counts: Sequence[int]) -> ClusterChunks:
         with told():
-            return Held([self._on(partial(_listed, function), partition) for partition in partitions], tuple(counts))
+            return ClusterChunks(
+                [self._on(partial(_listed, function), partition) for partition in partitions], tuple(counts)
+            )
 
     def along(self, function: Callable[[Any, Any], Any], partitions: Sequence[Any], carry: Any) -> Any:
         with told():
@@ -116,17 +118,17 @@ class Dask(Threads):
                 carry = self.client.submit(_carried, function, bare, carry, *held, pure=False)
             return self.client.gather(carry)
 
-    def beside(self, *rows: Held) -> Held:
-        return Held(list(zip(*rows, strict=True)), rows[0].counts)
+    def beside(self, *rows: ClusterChunks) -> ClusterChunks:
+        return ClusterChunks(list(zip(*rows, strict=True)), rows[0].counts)
 
-    def keep(self, function: Callable[..., Any], rows: Held, *arguments: Any) -> tuple[Held, Any]:
+    def keep(self, function: Callable[..., Any], rows: ClusterChunks, *arguments: Any) -> tuple[ClusterChunks, Any]:
         given = jax.tree.map(np.asarray, arguments)
         with told():
             both = [self.client.submit(_folded, function, part, given, pure=False) for part in rows]
             kept, parts = ([self.client.submit(itemgetter(i), one, pure=False) for one in both] for i in (0, 1))
-            return Held(kept, rows.counts), self._added(parts)
+            return ClusterChunks(kept, rows.counts), self._added(parts)
 
-    def fetch(self, rows: Held) -> Any:
+    def fetch(self, rows: ClusterChunks) -> Any:
         with told():
             return together([chunk for group in self.client.gather(list(rows)) for chunk in group])
 

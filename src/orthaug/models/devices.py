@@ -19,7 +19,17 @@ from orthaug._base.checks import Matrix
 from orthaug._base.jax import jax
 from orthaug._base.memory import available
 from orthaug._base.parallel import Heard, nobody
-from orthaug.models.rows import CHUNK_ROWS, Chunk, Here, Room, all_chunks, brought, build_chunk, chunk_shape, row_fold
+from orthaug.models.rows import (
+    CHUNK_ROWS,
+    Chunk,
+    LocalEngine,
+    Room,
+    all_chunks,
+    brought,
+    build_chunk,
+    chunk_shape,
+    row_fold,
+)
 
 _ROWS = "rows"
 _ONE_AT_A_TIME = threading.Lock()  # devices that wait for each other in two programs would wait for ever
@@ -27,7 +37,7 @@ _MATRICES = 3  # the sum so far, what a chunk adds, and what all devices have
 
 
 @dataclass(frozen=True)
-class Devices(Here):
+class Devices(LocalEngine):
     """All rows in the memory of the devices, in equal shares.
 
     Args:

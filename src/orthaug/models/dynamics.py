@@ -178,7 +178,7 @@ class Local(NamedTuple):
         return self.value[:n0], slope[:n0], self.value[n0:], slope[n0:]
 
 
-class Differentiated:
+class AutodiffDynamics:
     """What follows from `step`, for dynamics that know no faster way.
 
     `first_slopes` and `tangents` by automatic differentiation, `states_at` by running it.

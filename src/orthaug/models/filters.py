@@ -12,9 +12,9 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug._base.jax import jax, jnp
 from orthaug.data.record import Experiment, Record
 from orthaug.models.dynamics import Numbers, Parts
-from orthaug.models.kalman import Belief, Filter, Noise, Told, corrected, slope, without_gaps
+from orthaug.models.kalman import Filter, FilterRow, Noise, StateEstimate, corrected, slope, without_gaps
 from orthaug.models.lagged import Lagged
-from orthaug.models.moving import Moving
+from orthaug.models.moving import MotionDynamics
 from orthaug.models.stepping import Memory
 
 
@@ -46,7 +46,7 @@ class LaggedFilter:
     def inputs(self, experiment: Experiment, record: Record) -> Matrix:
         return experiment.inputs[self.first_row :]
 
-    def start(self, experiment: Experiment, record: Record, row: int, noise: Noise, size: Vector) -> Belief:
+    def start(self, experiment: Experiment, record: Record, row: int, noise: Noise, size: Vector) -> StateEstimate:
         """The lags before a row: outputs with the sensors' noise, or unknown by their `size` (ny,) where missing."""
         outputs, lags = list(self.form.outputs), self.memory.lags
         before = Experiment(experiment.inputs[:row], without_gaps(experiment.outputs[:row]))
@@ -63,20 +63,22 @@ class LaggedFilter:
                 if other.lag == lag.lag and other.channel in outputs:
                     there = np.isfinite(experiment.outputs[row - lag.lag, outputs.index(other.channel)])
                     variance[i, j] = noise.output[own, outputs.index(other.channel)] if there else 0.0
-        return Belief(mean, variance)
+        return StateEstimate(mean, variance)
 
     def step(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
         parts = self.form.at(numbers, jnp.concatenate([state, inputs])[self.memory.read])
         return jnp.concatenate([parts.total, inputs, state])[self.memory.following], parts
 
-    def row(self, numbers: Numbers, noise: Noise, belief: Belief, inputs: Any, measured: Any) -> tuple[Belief, Told]:
+    def row(
+        self, numbers: Numbers, noise: Noise, belief: StateEstimate, inputs: Any, measured: Any
+    ) -> tuple[StateEstimate, FilterRow]:
         n, ny = len(self.memory.lags), len(self.form.outputs)
         value, derivative = slope(_both(self, numbers, inputs), belief.state)
         enters = jnp.concatenate([jnp.asarray(self._newest), jnp.eye(ny)])
         covariance = derivative @ belief.covariance @ derivative.T + enters @ noise.state @ enters.T
         mean, after, spread, square, likelihood = corrected(value, covariance, noise.output, measured)
-        told = Told(value[n:], spread, mean[n:], after[n:, n:], mean[:n], after[:n, :n], square, likelihood)
-        return Belief(told.state, told.state_covariance), told
+        told = FilterRow(value[n:], spread, mean[n:], after[n:, n:], mean[:n], after[:n, :n], square, likelihood)
+        return StateEstimate(told.state, told.state_covariance), told
 
     @property
     def _newest(self) -> Matrix:
@@ -101,7 +103,7 @@ class LaggedFilter:
 class MotionFilter:
     """A motion without its numbers as a filter: `Filter`."""
 
-    form: Moving
+    form: MotionDynamics
 
     first_row = 0
     hidden = True
@@ -122,14 +124,16 @@ class MotionFilter:
     def inputs(self, experiment: Experiment, record: Record) -> Matrix:
         return self.form.inputs(experiment, record)
 
-    def start(self, experiment: Experiment, record: Record, row: int, noise: Noise, size: Vector) -> Belief:
+    def start(self, experiment: Experiment, record: Record, row: int, noise: Noise, size: Vector) -> StateEstimate:
         """The state as it is guessed from what is measured about a row, unknown by the `size` (nx,) of all."""
-        return Belief(self.form.start(without_gaps(experiment.outputs), [row])[0], np.diag(size**2))
+        return StateEstimate(self.form.start(without_gaps(experiment.outputs), [row])[0], np.diag(size**2))
 
     def step(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
         return self.form.step(numbers, state, inputs)
 
-    def row(self, numbers: Numbers, noise: Noise, belief: Belief, inputs: Any, measured: Any) -> tuple[Belief, Told]:
+    def row(
+        self, numbers: Numbers, noise: Noise, belief: StateEstimate, inputs: Any, measured: Any
+    ) -> tuple[StateEstimate, FilterRow]:
         n = self.form.states
         value, seen = slope(lambda x: self.step(numbers, x, inputs)[1].total, belief.state)
         both = jnp.concatenate([jnp.eye(n), seen])
@@ -138,8 +142,8 @@ class MotionFilter:
         mean, after, spread, square, likelihood = corrected(mean, covariance, noise.output, measured)
         following, moved = slope(lambda x: self.step(numbers, x, inputs)[0], mean[:n])
         own = after[:n, :n]
-        told = Told(value, spread, mean[n:], after[n:, n:], mean[:n], own, square, likelihood)
-        return Belief(following, moved @ own @ moved.T + noise.state), told
+        told = FilterRow(value, spread, mean[n:], after[n:, n:], mean[:n], own, square, likelihood)
+        return StateEstimate(following, moved @ own @ moved.T + noise.state), told
 
     def unit(self, noise: Matrix, size: Vector) -> Matrix:
         """A disturbance (nx, nx) as large as the states; none where a rate is another state: that is exact."""

@@ -30,14 +30,14 @@ class Noise(NamedTuple):
     output: Matrix
 
 
-class Belief(NamedTuple):
+class StateEstimate(NamedTuple):
     """The state (n,) before a row, and its covariance (n, n)."""
 
     state: Any
     covariance: Any
 
 
-class Told(NamedTuple):
+class FilterRow(NamedTuple):
     """What a row tells: the outputs as they were expected, and outputs and state (n,) once they are measured."""
 
     predicted: Any
@@ -85,7 +85,9 @@ class Filter(Protocol):
         """One step without noise."""
         ...
 
-    def row(self, numbers: Numbers, noise: Noise, belief: Belief, inputs: Any, measured: Any) -> tuple[Belief, Told]:
+    def row(
+        self, numbers: Numbers, noise: Noise, belief: StateEstimate, inputs: Any, measured: Any
+    ) -> tuple[StateEstimate, FilterRow]:
         """A row: what its outputs (ny,) tell, and the belief before the next one."""
         ...
 
@@ -118,19 +120,19 @@ def corrected(mean: Any, covariance: Any, noise: Any, measured: Any) -> tuple[An
 
 @partial(jax.jit, static_argnames="form")
 def one_row(
-    form: Filter, numbers: Numbers, noise: Noise, belief: Belief, inputs: Any, measured: Any
-) -> tuple[Belief, Told]:
+    form: Filter, numbers: Numbers, noise: Noise, belief: StateEstimate, inputs: Any, measured: Any
+) -> tuple[StateEstimate, FilterRow]:
     """One row of a filter."""
     return form.row(numbers, noise, belief, inputs, measured)
 
 
 @partial(jax.jit, static_argnames="form")
 def _all_rows(
-    form: Filter, numbers: Numbers, noise: Noise, belief: Belief, inputs: Any, measured: Any
-) -> tuple[Belief, Told]:
+    form: Filter, numbers: Numbers, noise: Noise, belief: StateEstimate, inputs: Any, measured: Any
+) -> tuple[StateEstimate, FilterRow]:
     """What is believed before the rows, and what they tell."""
 
-    def row(belief: Belief, given: tuple[Any, Any]) -> tuple[Belief, tuple[Belief, Told]]:
+    def row(belief: StateEstimate, given: tuple[Any, Any]) -> tuple[StateEstimate, tuple[StateEstimate, FilterRow]]:
         following, told = form.row(numbers, noise, belief, *given)
         return following, (belief, told)
 
@@ -138,8 +140,8 @@ def _all_rows(
 
 
 @partial(jax.jit, static_argnames="form")
-def _likelihood(form: Filter, numbers: Numbers, noise: Noise, belief: Belief, inputs: Any, measured: Any) -> Any:
-    def row(carry: tuple[Belief, Any], given: tuple[Any, Any]) -> tuple[tuple[Belief, Any], None]:
+def _likelihood(form: Filter, numbers: Numbers, noise: Noise, belief: StateEstimate, inputs: Any, measured: Any) -> Any:
+    def row(carry: tuple[StateEstimate, Any], given: tuple[Any, Any]) -> tuple[tuple[StateEstimate, Any], None]:
         following, told = form.row(numbers, noise, carry[0], *given)
         return (following, carry[1] + told.log_likelihood), None
 
@@ -147,17 +149,17 @@ def _likelihood(form: Filter, numbers: Numbers, noise: Noise, belief: Belief, in
 
 
 def filtered(
-    form: Filter, numbers: Numbers, noise: Noise, belief: Belief, inputs: Matrix, measured: Matrix
-) -> tuple[Belief, Told]:
+    form: Filter, numbers: Numbers, noise: Noise, belief: StateEstimate, inputs: Matrix, measured: Matrix
+) -> tuple[StateEstimate, FilterRow]:
     """A filter over all rows (T): what is believed before them, and what they tell."""
     rows = len(inputs)
     found = _all_rows(form, numbers, noise, belief, *_padded(inputs, measured))
     before, told = ([np.asarray(part)[:rows] for part in one] for one in found)
-    return Belief(*before), Told(*told)
+    return StateEstimate(*before), FilterRow(*told)
 
 
 def log_likelihood(
-    form: Filter, numbers: Numbers, noise: Noise, belief: Belief, inputs: Matrix, measured: Matrix
+    form: Filter, numbers: Numbers, noise: Noise, belief: StateEstimate, inputs: Matrix, measured: Matrix
 ) -> float:
     """Of the innovations (Schweppe 1965)."""
     return float(_likelihood(form, numbers, noise, belief, *_padded(inputs, measured)))
@@ -172,13 +174,13 @@ def _padded(inputs: Matrix, measured: Matrix) -> tuple[Matrix, Matrix]:
 
 @partial(jax.jit, static_argnames="form")
 def _ahead(
-    form: Filter, numbers: Numbers, noise: Noise, beliefs: Belief, inputs: Any, horizon: Any
+    form: Filter, numbers: Numbers, noise: Noise, beliefs: StateEstimate, inputs: Any, horizon: Any
 ) -> tuple[Parts, Any]:
     """The outputs of the last of `horizon` steps from each of m beliefs, under inputs (m, h, nu), and their S."""
     unknown = jnp.full(len(noise.output), jnp.nan)
 
-    def one(belief: Belief, rows: Any) -> tuple[Parts, Any]:
-        def step(i: Any, belief: Belief) -> Belief:
+    def one(belief: StateEstimate, rows: Any) -> tuple[Parts, Any]:
+        def step(i: Any, belief: StateEstimate) -> StateEstimate:
             return form.row(numbers, noise, belief, rows[i], unknown)[0]
 
         belief = jax.lax.fori_loop(0, horizon - 1, step, belief)
@@ -189,7 +191,7 @@ def _ahead(
 
 
 def ahead(
-    form: Filter, numbers: Numbers, noise: Noise, beliefs: Belief, inputs: Matrix, horizon: int
+    form: Filter, numbers: Numbers, noise: Noise, beliefs: StateEstimate, inputs: Matrix, horizon: int
 ) -> tuple[Parts, Matrix]:
     """The outputs `horizon` steps on from what is believed before the rows (T), and their deviations; (T − h + 1, ny).
 
@@ -202,7 +204,7 @@ def ahead(
         count = len(windows[rows])
         more = _SIDE_BY_SIDE - count
         chosen = [np.concatenate([a[rows], np.repeat(a[rows][-1:], more, axis=0)]) for a in (*beliefs, windows)]
-        parts, spread = _ahead(form, numbers, noise, Belief(*chosen[:2]), chosen[2], horizon)
+        parts, spread = _ahead(form, numbers, noise, StateEstimate(*chosen[:2]), chosen[2], horizon)
         pieces.append([np.asarray(part)[:count] for part in parts])
         deviations.append(spread_of(np.asarray(spread)[:count]))
     return Parts(*(np.concatenate(piece) for piece in zip(*pieces, strict=True))), np.concatenate(deviations)

@@ -13,13 +13,13 @@ from jaxtyping import Float
 from orthaug._base.checks import Matrix, Vector, as_signal, check_count
 from orthaug._base.errors import InputError
 from orthaug._base.jax import Array, jax, jnp
-from orthaug._base.views import Shown
+from orthaug._base.views import NotebookView
 from orthaug.data.record import Channel, Experiment, Prepared, Record
 from orthaug.models.beyond import outside
 from orthaug.models.dynamics import Dynamics, Numbers, Parts
 from orthaug.models.filters import LaggedFilter
 from orthaug.models.lagged import Lagged
-from orthaug.models.on_records import WITHIN, OnRecords, trajectory
+from orthaug.models.on_records import WITHIN, RecordModel, trajectory
 from orthaug.models.response import Response, Trajectory
 from orthaug.models.statistics import Statistics
 from orthaug.models.stepping import Memory, checked_row, one_experiment, step_lagged
@@ -57,7 +57,7 @@ def _ahead(
 
 
 @dataclass(frozen=True, eq=False)
-class Model(OnRecords, Shown):
+class Model(RecordModel, NotebookView):
     """A fitted model; `estimate` makes it, `orthaug.save` and `orthaug.load` keep it.
 
     `weight` (ny, ny) is the inner product of criterion and measure: rows multiplied by it are whitened. `deviation`

@@ -17,14 +17,14 @@ from jaxtyping import Float
 from orthaug._base.checks import Matrix, Vector, as_signal, check_count
 from orthaug._base.errors import InputError
 from orthaug._base.jax import Array, jax, padded_length
-from orthaug._base.views import Shown
+from orthaug._base.views import NotebookView
 from orthaug.data.record import Channel, Experiment, Prepared, Record
 from orthaug.models.dynamics import Numbers, Parts
 from orthaug.models.filters import MotionFilter
 from orthaug.models.learners import Scaling
 from orthaug.models.motion_field import parts_at
-from orthaug.models.moving import Moving
-from orthaug.models.on_records import RUNAWAY, OnRecords, trajectory
+from orthaug.models.moving import MotionDynamics
+from orthaug.models.on_records import RUNAWAY, RecordModel, trajectory
 from orthaug.models.response import Response, Trajectory
 from orthaug.models.settling import LOOSE, Windows, padded_steps, settle
 from orthaug.models.statistics import Statistics
@@ -41,7 +41,7 @@ _GUESS_ITERATIONS, _WINDOW_ITERATIONS = 30, 6
 
 @partial(jax.jit, static_argnames="form")
 def _run(
-    form: Moving, numbers: Numbers, state: Float[Array, "n0"], inputs: Float[Array, "T nu"]
+    form: MotionDynamics, numbers: Numbers, state: Float[Array, "n0"], inputs: Float[Array, "T nu"]
 ) -> tuple[Float[Array, "T n0"], Float[Array, "T ny"]]:
     """States and outputs of a free run."""
     numbers = form.prepared(numbers)
@@ -55,7 +55,7 @@ def _run(
 
 @partial(jax.jit, static_argnames="form")
 def _last(
-    form: Moving, numbers: Numbers, states: Float[Array, "n0 m"], inputs: Float[Array, "T nu m"], steps: Any
+    form: MotionDynamics, numbers: Numbers, states: Float[Array, "n0 m"], inputs: Float[Array, "T nu m"], steps: Any
 ) -> Float[Array, "ny m"]:
     """The last output of `steps` of runs side by side."""
     numbers = form.prepared(numbers)
@@ -64,7 +64,7 @@ def _last(
     return side_by_side(states, inputs[steps - 1])[1].total
 
 
-class Trained(NamedTuple):
+class TrainedSegments(NamedTuple):
     """What a later split under a measure needs beside the training data: how segments lay, and where they started.
 
     `rows` counts the rows that were scored, `alone` (np,) are the coordinates of physics alone; `slope` (k, m, nx, n)
@@ -80,14 +80,14 @@ class Trained(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class MotionModel(OnRecords, Shown):
+class MotionModel(RecordModel, NotebookView):
     """A fitted motion; `estimate` makes it, `orthaug.save` and `orthaug.load` keep it.
 
     `window` rows tell a state from which to predict. `weight` (ny, ny) is the inner product of the outputs; `loose`
     (nx,) how far a state may be from its guess. `deviation` (ny,) is that of the training outputs.
     """
 
-    form: Moving
+    form: MotionDynamics
     numbers: Numbers
     """θ are the coordinates of the physical parameters, θ − θ_aux those beside the learner."""
     outputs: tuple[Channel, ...]
@@ -101,7 +101,7 @@ class MotionModel(OnRecords, Shown):
     window: int
     measure: str = field(default="training", kw_only=True)
     time_column: str | None = None
-    trained: Trained | None = field(default=None, repr=False)
+    trained: TrainedSegments | None = field(default=None, repr=False)
     seen: Matrix | None = field(default=None, kw_only=True, repr=False)
     """Least and largest (2, nz) of the learner's features over the fitted run of the training data."""
     statistics: Statistics = Statistics()  # noqa: RUF009  (frozen)
@@ -282,7 +282,7 @@ class MotionModel(OnRecords, Shown):
         learner = run.model - known
         return replace(run, baseline=known, learner=learner, learner_before=learner, whole=run.model)
 
-    def _follow(self, form: Moving, numbers: Numbers, start: Vector, inputs: Matrix) -> tuple[Matrix, Matrix]:
+    def _follow(self, form: MotionDynamics, numbers: Numbers, start: Vector, inputs: Matrix) -> tuple[Matrix, Matrix]:
         rows = len(inputs)
         padded = np.concatenate([inputs, np.repeat(inputs[-1:], padded_length(rows) - rows, axis=0)])
         states, outputs = _run(form, numbers, start, padded)

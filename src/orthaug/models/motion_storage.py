@@ -13,8 +13,8 @@ from orthaug._base.errors import InputError
 from orthaug.data.expressions import parse_named
 from orthaug.models.learners import Learner
 from orthaug.models.model_arrays import arrays_of, bound_of, declaration_of, fields_from, said_of
-from orthaug.models.motion_model import MotionModel, Trained
-from orthaug.models.moving import Moving
+from orthaug.models.motion_model import MotionModel, TrainedSegments
+from orthaug.models.moving import MotionDynamics
 from orthaug.physics.motion import Motion, Output, State
 from orthaug.physics.parameters import PhysicalParameter
 
@@ -52,7 +52,7 @@ def rebuild(
         InputError: a callable is asked for.
     """
     motion = _rebuilt_motion(declared["motion"], baseline, path)
-    form = Moving(
+    form = MotionDynamics(
         motion=motion,
         features=tuple(parse_named(text, motion.known, "learner input") for text in declared["features"]),
         bound=bound_of(declared["learner"], arrays.get("numbers.weights", np.zeros(0)), learner, path),
@@ -64,7 +64,7 @@ def rebuild(
     if kept is not None:
         layout = {key: int(kept[key]) for key in _SEGMENTATION}
         own = {key: arrays.get(f"trained.{key}") for key in ("states", "slope", "alone")}
-        trained = Trained(**layout, **own)  # type: ignore[arg-type]
+        trained = TrainedSegments(**layout, **own)  # type: ignore[arg-type]
     return MotionModel(
         form=form,
         **fields_from(declared, arrays),

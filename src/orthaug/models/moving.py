@@ -14,7 +14,7 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug._base.jax import jax, jnp
 from orthaug.data.expressions import Lag
 from orthaug.data.record import Experiment, Record
-from orthaug.models.dynamics import Differentiated, Local, Numbers, Parts
+from orthaug.models.dynamics import AutodiffDynamics, Local, Numbers, Parts
 from orthaug.models.integrators import UNROLLED, Exponentials, advance, held
 from orthaug.models.motion_field import MotionField
 from orthaug.models.motion_tangents import output_slopes, sample_slopes
@@ -22,7 +22,7 @@ from orthaug.physics.motion_problem import guess, layout_of
 
 
 @dataclass(frozen=True)
-class Moving(MotionField, Differentiated):
+class MotionDynamics(MotionField, AutodiffDynamics):
     """A motion with a learner as dynamics, without its numbers: `Dynamics`."""
 
     linear = False
@@ -43,7 +43,7 @@ class Moving(MotionField, Differentiated):
         return layout_of(self.motion)
 
     @property
-    def alone(self) -> Moving:
+    def alone(self) -> MotionDynamics:
         """The same motion without a learner."""
         return replace(self, features=(), bound=None)
 
@@ -139,11 +139,11 @@ class Moving(MotionField, Differentiated):
 
 
 @partial(jax.jit, static_argnames="form")
-def _step(form: Moving, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
+def _step(form: MotionDynamics, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
     """A step. It is traced once, whatever programs it stands in; so is the field in it."""
     return form._stepped(numbers, state, inputs)
 
 
 @partial(jax.jit, static_argnames="form")
-def _field(form: Moving, numbers: Numbers, x: Any, u: Any) -> Any:
+def _field(form: MotionDynamics, numbers: Numbers, x: Any, u: Any) -> Any:
     return sum(form.rates(numbers, x, u))

@@ -21,7 +21,7 @@ RUNAWAY = 1e6  # times the largest training output: a free run beyond this has d
 WITHIN = 1e-9  # of a feature's half width: the largest of training is no extrapolation
 
 
-class OnRecords:
+class RecordModel:
     """A model of some channels at a sampling time."""
 
     form: Dynamics

@@ -122,7 +122,7 @@ class Engine(Protocol):
         ...
 
 
-class Here(Threads):
+class LocalEngine(Threads):
     """What engines share that read partitions in this process, and keep the chunks of rows in one array."""
 
     def passes(self, function: Callable[[Any], Any], partitions: Sequence[Any]) -> list[Any]:
@@ -139,7 +139,7 @@ class Here(Threads):
 
 
 @dataclass(frozen=True)
-class InMemory(Here):
+class InMemory(LocalEngine):
     """All rows on the device, summed by one compiled loop over chunks."""
 
     limit: int = CHUNK_ROWS

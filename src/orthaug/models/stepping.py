@@ -22,7 +22,7 @@ from orthaug.data.record import Experiment, Record
 from orthaug.data.regressors import Layout
 from orthaug.models.dynamics import Numbers
 from orthaug.models.lagged import Lagged
-from orthaug.models.moving import Moving
+from orthaug.models.moving import MotionDynamics
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ def step_lagged(form: Lagged, numbers: Numbers, memory: Memory, state: Any, inpu
     return jnp.concatenate([y, inputs, state])[memory.following], y
 
 
-def step_inputs(form: Moving) -> tuple[str, ...]:
+def step_inputs(form: MotionDynamics) -> tuple[str, ...]:
     """What a step of a motion takes: its inputs, and under a first-order hold those of the next sample behind them.
 
     Raises:
@@ -117,7 +117,7 @@ def step_inputs(form: Moving) -> tuple[str, ...]:
     return (*motion.inputs, *after)
 
 
-def with_scheme(form: Moving, numbers: Numbers) -> Numbers:
+def with_scheme(form: MotionDynamics, numbers: Numbers) -> Numbers:
     """The numbers with the exponentials of an exact integrator, whose derivatives a step does not need."""
     with jax.ensure_compile_time_eval():
         scheme = form.exponentials(numbers)

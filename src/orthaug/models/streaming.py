@@ -18,7 +18,7 @@ from jaxtyping import Float
 from orthaug._base.checks import Matrix
 from orthaug._base.jax import jax
 from orthaug.data.sources import Source, rows_of
-from orthaug.models.rows import CHUNK_ROWS, Chunk, Here, build_chunk, chunk_shape, together
+from orthaug.models.rows import CHUNK_ROWS, Chunk, LocalEngine, build_chunk, chunk_shape, together
 
 _AHEAD = 3  # chunks that wait to be summed
 
@@ -27,7 +27,7 @@ RowArrays = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
-class Drawn:
+class SourceRows:
     """Rows of a source: where they are, how they are laid out, and in chunks of how many."""
 
     source: Source
@@ -41,7 +41,7 @@ class Drawn:
 
 
 @dataclass(frozen=True)
-class Stream(Here):
+class Stream(LocalEngine):
     """Rows stay in their files; memory holds a few chunks of them, of `limit` rows."""
 
     limit: int = CHUNK_ROWS
@@ -51,8 +51,8 @@ class Stream(Here):
         """Rows that are in memory, in chunks."""
         return apart(build_chunk(z, q, e, gain, chunk_shape(len(z), self.limit)))
 
-    def draw(self, source: Source, row_builder: Callable[[Any], Iterator[RowArrays]]) -> Drawn:
-        return Drawn(source, row_builder, chunk_shape(rows_of(source), self.limit)[1])
+    def draw(self, source: Source, row_builder: Callable[[Any], Iterator[RowArrays]]) -> SourceRows:
+        return SourceRows(source, row_builder, chunk_shape(rows_of(source), self.limit)[1])
 
     def sum(self, function: Callable[..., Any], rows: Iterable[Chunk], *arguments: Any) -> Any:
         return summed(function, rows, arguments)
@@ -64,11 +64,11 @@ class Stream(Here):
     def place(self, chunks: Any, like: Any = None) -> list[Any]:
         return apart(chunks)
 
-    def read(self, function: Callable[[Any], Any], partitions: Sequence[Any], counts: Sequence[int]) -> Read:
-        return Read(function, partitions)
+    def read(self, function: Callable[[Any], Any], partitions: Sequence[Any], counts: Sequence[int]) -> PartitionChunks:
+        return PartitionChunks(function, partitions)
 
-    def beside(self, *rows: Iterable[Any]) -> Beside:
-        return Beside(rows)
+    def beside(self, *rows: Iterable[Any]) -> PairedChunks:
+        return PairedChunks(rows)
 
     def keep(self, function: Callable[..., Any], rows: Iterable[Any], *arguments: Any) -> tuple[list[Any], Any]:
         return folded(function, rows, arguments)
@@ -81,7 +81,7 @@ class Stream(Here):
 
 
 @dataclass(frozen=True, eq=False)
-class Read:
+class PartitionChunks:
     """Chunks of partitions, read at every pass."""
 
     function: Callable[[Any], Any]
@@ -92,7 +92,7 @@ class Read:
 
 
 @dataclass(frozen=True, eq=False)
-class Beside:
+class PairedChunks:
     """Chunks of several rows, as tuples."""
 
     rows: tuple[Iterable[Any], ...]

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from orthaug._base.jax import jax
-from orthaug._base.parallel import Heard, Stopped, each, nobody, one_blas_thread, one_core
+from orthaug._base.parallel import Heard, RunCancelled, each, nobody, one_blas_thread, one_core
 from orthaug.models.cluster import Dask, kept, smallest_worker, told
 from orthaug.models.rows import InMemory, Room
 
@@ -56,7 +56,7 @@ class Tasks(InMemory):
                     while said[i]:
                         heard(i, *said[i].popleft())
 
-                return ask(self.client, look, _made, shared, Sealed((function, item)), topic, i)
+                return ask(self.client, look, _made, shared, DoublePrecision((function, item)), topic, i)
 
             yield from each(one, list(enumerate(items)), places(self.client))
 
@@ -71,7 +71,7 @@ class Tasks(InMemory):
         if id(given) not in self._sent:
             self._sent.clear()
             with told(), config.set(_ANY_SIZE):
-                self._sent[id(given)] = given, self.client.submit(kept, Sealed(given), pure=False)
+                self._sent[id(given)] = given, self.client.submit(kept, DoublePrecision(given), pure=False)
         return self._sent[id(given)][1]
 
 
@@ -120,7 +120,7 @@ def _heard_on(client: Any) -> Iterator[tuple[str, dict[int, deque[Any]]]]:
 
 
 @dataclass(frozen=True, eq=False)
-class Sealed:
+class DoublePrecision:
     """A value that reaches a worker in double precision: JAX would cut its arrays where that is not turned on yet."""
 
     value: Any
@@ -140,11 +140,11 @@ def _in_double() -> None:
     _ = jax.config  # what turns it on
 
 
-def _sealed(_: None, value: Any) -> Sealed:
-    return Sealed(value)
+def _sealed(_: None, value: Any) -> DoublePrecision:
+    return DoublePrecision(value)
 
 
-def _made(shared: Sealed, asked: Sealed, topic: str, number: int) -> Any:
+def _made(shared: DoublePrecision, asked: DoublePrecision, topic: str, number: int) -> Any:
     """A run on a worker. What it tells goes to the client, from time to time."""
     from dask.context import thread_state
     from distributed import get_worker
@@ -158,7 +158,7 @@ def _made(shared: Sealed, asked: Sealed, topic: str, number: int) -> Any:
         last = time.monotonic()
         task = worker.state.tasks.get(key)
         if task is None or task.state == "cancelled":
-            raise Stopped
+            raise RunCancelled
         worker.log_event(topic, (number, tuple(float(value) for value in what)))
 
     with one_blas_thread(), one_core():

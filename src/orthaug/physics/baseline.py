@@ -13,7 +13,7 @@ import numpy as np
 
 from orthaug._base.checks import check_label, check_type, check_unique, is_number
 from orthaug._base.errors import LONGEST, InputError, shown
-from orthaug._base.views import Shown
+from orthaug._base.views import NotebookView
 from orthaug.data.expressions import RESERVED, SAMPLING_TIME, Expression, Lag, is_identifier, is_name, parse
 from orthaug.data.record import Channel, same_step
 from orthaug.data.regressors import Layout, in_order
@@ -90,7 +90,7 @@ class Term:
 
 
 @dataclass(frozen=True)
-class Baseline(Shown):
+class Baseline(NotebookView):
     """φ and the parameters it multiplies; make one with `from_terms` or `from_function`.
 
     Examples:

@@ -38,7 +38,7 @@ _SEED = 20_261_124
 
 
 @dataclass(frozen=True, eq=False)
-class LeftOver:
+class UnexplainedPhysics:
     """What functions of the learner's features leave of the physics on the rows.
 
     `share` (nθ,) is that of each parameter's own slope, between 0 and 1, and `limit` the share below which a direction
@@ -114,7 +114,7 @@ def left_over(
     slopes: Float[np.ndarray, "N m nt"],
     features: Float[np.ndarray, "N nz"],
     learned: Bool[np.ndarray, "m"] | None = None,
-) -> LeftOver | None:
+) -> UnexplainedPhysics | None:
     """Measure what functions of the features leave of each direction; None where there are too few rows.
 
     Args:
@@ -147,7 +147,7 @@ def left_over(
     share = np.where(own > 1e-12 * np.diag(whole), np.diag(left) / np.maximum(own, 1e-300), 1.0)
     known = np.mean(rest[:, flat.shape[1] :] ** 2, axis=0) / np.maximum(np.mean(probes**2, axis=0), 1e-300)
     limit = float(np.clip(_MARGIN * np.quantile(known, 0.9), _LEAST, _MOST))
-    return LeftOver(np.clip(share, 0.0, 1.0), limit, left, among, whole)
+    return UnexplainedPhysics(np.clip(share, 0.0, 1.0), limit, left, among, whole)
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ import numpy as np
 
 from orthaug._base.checks import Vector, check_choice, check_label, check_unique, is_number, nearest
 from orthaug._base.errors import InputError, shown
-from orthaug._base.views import Shown
+from orthaug._base.views import NotebookView
 from orthaug.data.expressions import FUNCTIONS, SAMPLING_TIME, Expression, is_name, parse_named
 from orthaug.physics.baseline import check_sampling_constant
 from orthaug.physics.parameters import Coordinates, PhysicalParameter, check_not_sampling_time, check_parameters
@@ -65,7 +65,7 @@ class Output:
 
 
 @dataclass(frozen=True)
-class Motion(Shown):
+class Motion(NotebookView):
     """Equations of motion; `from_equations` or `from_functions` make one and tell of its fields. Hashable.
 
     Examples:

@@ -217,13 +217,13 @@ def _polynomials(width: int) -> Float[np.ndarray, "width degree+1 width"]:
     return np.linalg.pinv(offset[..., None] ** np.arange(min(_DEGREE, width - 1) + 1))
 
 
-class Named(Lag):
+class SignalName(Lag):
     """A state or an input as a measure names it: at the present instant, without an index."""
 
     def __str__(self) -> str:
         return self.channel
 
 
-def layout_of(motion: Motion) -> tuple[Named, ...]:
+def layout_of(motion: Motion) -> tuple[SignalName, ...]:
     """States, then inputs."""
-    return tuple(Named(name, 0) for name in (*motion.names_of_states, *motion.inputs))
+    return tuple(SignalName(name, 0) for name in (*motion.names_of_states, *motion.inputs))

@@ -22,7 +22,7 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug.data.expressions import Lag
 from orthaug.data.regressors import Features, Layout
 from orthaug.physics.baseline import Baseline
-from orthaug.physics.left_over import LeftOver, left_over
+from orthaug.physics.left_over import UnexplainedPhysics, left_over
 
 _MOVES = 400
 _FEWEST = 4  # moves that succeed, for each parameter
@@ -45,7 +45,7 @@ class Shared:
     basis: Matrix
     on_data: tuple[str, ...] = ()
     """Parameters that only the rows show to be shared: their regressors read what the learner does not see."""
-    rest: LeftOver | None = None
+    rest: UnexplainedPhysics | None = None
     """What functions of the features leave of the physics on the rows; None where that was not asked."""
 
     @property
@@ -56,7 +56,7 @@ class Shared:
         shares = zip(self.names, self.basis, self.rest.share, strict=True)
         return {name: float(share) for name, row, share in shares if not row.any() and share < NEARLY}
 
-    def beside(self, rest: LeftOver | None) -> Shared:
+    def beside(self, rest: UnexplainedPhysics | None) -> Shared:
         """Return these directions and those that the rows do not tell from functions of the features."""
         if rest is None:
             return self

@@ -98,7 +98,7 @@ class Survey(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Surveying:
+class PartitionSurvey:
     """The survey of a partition; everything in it is checked to be finite."""
 
     form: Form
@@ -136,7 +136,7 @@ class Factoring:
         return r
 
 
-class Refined(NamedTuple):
+class SecondQR(NamedTuple):
     """What the second QR tells: R of `[Q₁ e₁]`, the moments of e₁ and `Σ ‖q_ki‖²` of each output."""
 
     r: Matrix
@@ -167,25 +167,25 @@ class Basis:
 
 
 @dataclass(frozen=True, eq=False)
-class Refining:
+class PartitionQR:
     """The second QR, and what the physics leaves."""
 
     basis: Basis
     coordinates: Vector
 
-    def __call__(self, partition: Partition) -> Refined | None:
+    def __call__(self, partition: Partition) -> SecondQR | None:
         basis, found, nt = self.basis, None, len(self.coordinates)
         for _, rows, phi, known in basis.form.posed(partition):
             q = basis.rows(phi)
             e = basis.left(rows.y - known, q, self.coordinates)
             r = _triangle([np.concatenate([q.reshape(-1, nt), e.reshape(-1, 1)], axis=1)])
-            seen = Refined(r, Moments.of(e), np.sum(q**2, axis=(0, 2)))
+            seen = SecondQR(r, Moments.of(e), np.sum(q**2, axis=(0, 2)))
             found = seen if found is None else _both(found, seen)
         return found
 
 
-def _both(one: Refined, other: Refined) -> Refined:
-    return Refined(_triangle([one.r, other.r]), one.errors | other.errors, one.freedom + other.freedom)
+def _both(one: SecondQR, other: SecondQR) -> SecondQR:
+    return SecondQR(_triangle([one.r, other.r]), one.errors | other.errors, one.freedom + other.freedom)
 
 
 def _triangle(blocks: Sequence[Matrix]) -> Matrix:
@@ -294,7 +294,7 @@ class StreamedProblem(Problem):
 
 
 def _survey(form: Form, source: Source, passes: Passes) -> Survey:
-    found = _merged(passes(Surveying(form), source.partitions), Survey.__or__)
+    found = _merged(passes(PartitionSurvey(form), source.partitions), Survey.__or__)
     if found is None:
         raise InputError(
             f"no experiment has enough rows for a single prediction: the largest lag is {form.lead}, so at least "
@@ -346,7 +346,7 @@ def _factored(seen: Problem, source: Source, passes: Passes, survey: Survey, for
         r, coordinates = np.eye(nt), np.zeros(nt)
     inverse = scale[:, None] * scipy.linalg.solve_triangular(r, np.eye(nt)) if nt else r
     basis = Basis(form, weight, inverse, np.eye(nt))
-    second = _merged(passes(Refining(basis, coordinates), source.partitions), _both)
+    second = _merged(passes(PartitionQR(basis, coordinates), source.partitions), _both)
     turn, rest = (second.r[:nt, :nt], second.r[:nt, nt]) if ready else (np.eye(nt), np.zeros(nt))
     back = np.linalg.inv(turn)
     basis = replace(basis, turn=back)

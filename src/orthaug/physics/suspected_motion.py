@@ -11,7 +11,7 @@ from orthaug.physics.motion import Motion
 from orthaug.physics.parameters import PhysicalParameter
 
 
-class AddedTerm(NamedTuple):
+class SuspectedTerm(NamedTuple):
     """A term of an equation, counted from 0 with the outputs after the states; `name` is that of its coefficient."""
 
     name: str
@@ -24,10 +24,10 @@ class SuspectedMotion(Motion):
     """`physics` with `added` terms: their coefficients follow its parameters, and are 0 at first."""
 
     physics: Motion | None = None
-    added: tuple[AddedTerm, ...] = ()
+    added: tuple[SuspectedTerm, ...] = ()
 
     @classmethod
-    def of(cls, physics: Motion, added: Sequence[AddedTerm]) -> SuspectedMotion:
+    def of(cls, physics: Motion, added: Sequence[SuspectedTerm]) -> SuspectedMotion:
         """The terms read what the equations do."""
         own = {field.name: getattr(physics, field.name) for field in fields(Motion)}
         own["parameters"] = (*physics.parameters, *(PhysicalParameter(term.name, 0.0) for term in added))

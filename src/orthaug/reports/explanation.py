@@ -5,7 +5,7 @@ from __future__ import annotations
 from orthaug._base.lines import fold, percent, table
 from orthaug.reports.fields import Content, Flag, Number, WarningResult, Whole
 from orthaug.reports.findings import MemoryResult
-from orthaug.reports.result import Headed
+from orthaug.reports.result import ResultHeader
 
 _MEMORY = 5  # terms with memory that the text lists
 
@@ -45,7 +45,7 @@ class MovedParameterResult(Content):
     value_with: Number
 
 
-class ExplainResult(Headed):
+class ExplainResult(ResultHeader):
     """What `orthaug explain` tells."""
 
     found: Flag

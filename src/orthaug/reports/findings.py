@@ -88,7 +88,7 @@ class PhysicalBias(Content):
     relative: Number
 
 
-class ToldResult(Content):
+class ResidualStepResult(Content):
     """What the residual of a motion's free run tells of a term."""
 
     coefficient: Number
@@ -122,7 +122,7 @@ class SuspectResult(Content):
     expected_physical_bias: dict[str, PhysicalBias] | None
     equation: str | None = None
     unit: str | None = None
-    residual: ToldResult | None = None
+    residual: ResidualStepResult | None = None
 
     @property
     def percent(self) -> dict[str, float | None]:

@@ -9,7 +9,7 @@ import numpy as np
 from orthaug.analysis.linear_view import Linearization, LinearView, Pole, phase_of
 from orthaug.analysis.measured_response import MeasuredResponse
 from orthaug.reports.fields import ByName, Content, Flag, Number, Numbers, WarningResult, Whole
-from orthaug.reports.result import Headed
+from orthaug.reports.result import ResultHeader
 
 Rows = list[Numbers]
 Intervals = list[list[Numbers]]
@@ -135,7 +135,7 @@ class MeasuredResponseResult(Content):
     response: list[MeasuredPairResult]
 
 
-class LinearizeResult(Headed):
+class LinearizeResult(ResultHeader):
     """What `orthaug linearize` tells."""
 
     sampling_time: Number

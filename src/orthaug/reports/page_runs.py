@@ -153,7 +153,7 @@ class _Panels:
         self.traces: list[dict[str, Any]] = []
         self.layout: dict[str, Any] = {"shapes": [], "annotations": []}
         self.series: dict[str, Any] = {}
-        self._left: list[Left] = []
+        self._left: list[PanelExit] = []
 
     def keep(self, name: str, i: int, values: Matrix) -> str:
         """The name by which traces find the curve of output i."""
@@ -195,7 +195,7 @@ class _Panels:
 
 
 @dataclass(frozen=True)
-class Left:
+class PanelExit:
     """A curve that leaves its panel: the output, the instant [s], the edge it leaves by, and the value farthest out."""
 
     name: str
@@ -233,16 +233,16 @@ def frame_of(measured: Vector, curves: Iterable[Vector]) -> list[float] | None:
 
 def curves_left(
     curves: Mapping[str, Vector], limits: Sequence[float], output: int, start: float, step: float
-) -> list[Left]:
+) -> list[PanelExit]:
     """The curves that are cut off at the edge of a panel, in the order of the drawing."""
-    found: list[Left] = []
+    found: list[PanelExit] = []
     for name, curve in curves.items():
         with np.errstate(invalid="ignore"):
             outside = np.flatnonzero((curve < limits[0]) | (curve > limits[1]))
         if len(outside):
             row, above = int(outside[0]), bool(curve[outside[0]] > limits[1])
             farthest = curve[outside][np.argmax(np.abs(curve[outside] - np.mean(limits)))]
-            found.append(Left(name, output, start + step * row, limits[above], above, float(farthest)))
+            found.append(PanelExit(name, output, start + step * row, limits[above], above, float(farthest)))
     return found
 
 

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 SCHEMA = 2
 
 
-class Headed(Content):
+class ResultHeader(Content):
     """What every result begins with."""
 
     schema_number: Literal[2] = Field(SCHEMA, validation_alias="schema", serialization_alias="schema")
@@ -266,7 +266,7 @@ class PhysicsAloneResult(Content):
     scores: dict[str, PartScores]
 
 
-class FitResult(Headed):
+class FitResult(ResultHeader):
     """What `orthaug fit` leaves."""
 
     absent: ClassVar = frozenset({"motion", "terms", "equation", "unexplained", "standard_errors_by"})
@@ -316,7 +316,7 @@ class FitResult(Headed):
         return self.motion is None or self.shared is not None
 
 
-class CheckResult(Headed):
+class CheckResult(ResultHeader):
     """What `orthaug check` tells."""
 
     absent: ClassVar = frozenset({"motion"})
@@ -349,7 +349,7 @@ class RowResult(Content):
     validation: ValidationResult | None
 
 
-class CompareResult(Headed):
+class CompareResult(ResultHeader):
     """What `orthaug compare` leaves."""
 
     spec: dict[str, Any]
@@ -360,7 +360,7 @@ class CompareResult(Headed):
     warnings: list[WarningResult]
 
 
-class SplitResult(Headed):
+class SplitResult(ResultHeader):
     """What `orthaug split` tells."""
 
     parameters: list[ParameterResult]

@@ -6,7 +6,7 @@ from typing import Any
 
 from orthaug._base.lines import fold
 from orthaug.reports.fields import Content, Flag, Number, WarningResult, Whole
-from orthaug.reports.result import DataResult, Headed
+from orthaug.reports.result import DataResult, ResultHeader
 
 _SHOWN = 12  # models of a stage in the text
 
@@ -58,7 +58,7 @@ class ShiftResult(Content):
     moved: Flag
 
 
-class JudgedResult(Content):
+class SelectionRowResult(Content):
     """A model that was judged: a row of the table."""
 
     stage: str
@@ -71,7 +71,7 @@ class JudgedResult(Content):
     seconds: Number
 
 
-class SelectResult(Headed):
+class SelectResult(ResultHeader):
     """What `orthaug select` leaves."""
 
     data: DataResult
@@ -83,7 +83,7 @@ class SelectResult(Headed):
     terms: list[TermShareResult] | None
     physics: list[ShiftResult] | None = None
     condition: Number = None
-    models: list[JudgedResult]
+    models: list[SelectionRowResult]
     seconds: Number
     stopped: Flag
     warnings: list[WarningResult]
@@ -146,7 +146,7 @@ def _learner(result: SelectResult) -> str:
     return f"{learner['hidden'][0]} neurons of {seen}"
 
 
-def _table(stage: str, rows: list[JudgedResult]) -> list[str]:
+def _table(stage: str, rows: list[SelectionRowResult]) -> list[str]:
     chosen = next((i for i, row in enumerate(rows) if row.chosen), 0)
     first = max(0, min(chosen - _SHOWN // 2, len(rows) - _SHOWN))
     shown = rows[first : first + _SHOWN]

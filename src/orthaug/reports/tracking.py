@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from orthaug._base.lines import fold
 from orthaug.reports.fields import Content, Flag, Number, WarningResult, Whole
-from orthaug.reports.result import FileResult, Headed, ParameterResult
+from orthaug.reports.result import FileResult, ParameterResult, ResultHeader
 from orthaug.reports.text import parameter_table, warning_lines
 
 
@@ -15,7 +15,7 @@ class AlarmResult(Content):
     time: Number
 
 
-class TrackResult(Headed):
+class TrackResult(ResultHeader):
     """What `orthaug track` tells."""
 
     files: list[FileResult]

@@ -21,7 +21,7 @@ _DIVIDED = re.compile(r"\((?P<inner>.+)\)\s*/\s*(?P<by>[A-Za-z_]\w*)")
 
 
 @dataclass(frozen=True)
-class Added:
+class NewTerm:
     """A term to be added: its parameter's `name`, the `text` with its `width` as a number, and where it goes.
 
     `scale` is the expression whose unit the term has; None for one by which no unit is told. `template` has `{width}`
@@ -52,7 +52,7 @@ def names_for(kinds: Sequence[str], taken: Sequence[str]) -> list[str]:
     return names
 
 
-def added_to_baseline(baseline: Baseline, values: Vector, added: Sequence[Added], several: bool) -> Baseline | None:
+def added_to_baseline(baseline: Baseline, values: Vector, added: Sequence[NewTerm], several: bool) -> Baseline | None:
     """A baseline with terms, starting from these parameter values; None if it is a function."""
     if baseline.function is not None:
         return None
@@ -66,7 +66,7 @@ def added_to_baseline(baseline: Baseline, values: Vector, added: Sequence[Added]
     return Baseline.from_terms([*old, *new], dict(baseline.constants))
 
 
-def baseline_lines(added: Sequence[Added], several: bool) -> str:
+def baseline_lines(added: Sequence[NewTerm], several: bool) -> str:
     """The terms as tables of a spec."""
     blocks = []
     for one in added:
@@ -96,7 +96,7 @@ class ChangedMotion:
         return "\n\n".join([*blocks, "\n".join(["[motion.parameters]", *rows])])
 
 
-def added_to_motion(motion: Motion, values: Vector, added: Sequence[Added], units: dict[str, str]) -> Any:
+def added_to_motion(motion: Motion, values: Vector, added: Sequence[NewTerm], units: dict[str, str]) -> Any:
     """A `ChangedMotion` that starts from these parameter values; None if the equations are functions.
 
     A term of an equation `(…)/m` goes inside, so that its coefficient is a force. A width becomes a parameter.
@@ -148,7 +148,7 @@ def added_to_motion(motion: Motion, values: Vector, added: Sequence[Added], unit
     return ChangedMotion(changed, tuple(new), equations)
 
 
-def _unit_inside(inner: str, added: Added, units: dict[str, str]) -> str:
+def _unit_inside(inner: str, added: NewTerm, units: dict[str, str]) -> str:
     """The unit of a term's coefficient within a sum; none where the sum's or the term's is not told."""
     unit = _unit_of_first(inner, units)
     if not unit or added.scale is None:

@@ -25,7 +25,7 @@ _ROUNDING = 1e-8  # of the largest variance
 
 
 @dataclass(frozen=True, eq=False)
-class Shown:
+class LearnerTarget:
     """How a learner shows what is missing: `target` (r,) is what it shows, `covariance` (r, r) that of its errors.
 
     `view` (P, r) takes whitened values over all points to that; None where the learner tells no tangent space: then
@@ -40,7 +40,7 @@ class Shown:
     size: float
 
     @classmethod
-    def of(cls, linearization: LearnedLinearization) -> Shown:
+    def of(cls, linearization: LearnedLinearization) -> LearnerTarget:
         """By the learner's tangent space over the points, where it has one."""
         q = basis_of(linearization.physics_moves.T)
         raw = linearization.fitted(linearization.learner)

@@ -43,7 +43,7 @@ def candidates(problem: Problem, library: TermLibrary) -> Candidates:
         InputError: no term is left.
     """
     runs = TermRuns.of(problem, library, Prediction())
-    known = _Known.of(runs)
+    known = _ModelColumns.of(runs)
     norms, left, _ = known.weigh(runs)
     finite = np.isfinite(norms)
     own = finite & (left > DEPENDENT * norms) & (norms > 0)
@@ -59,20 +59,20 @@ def candidates(problem: Problem, library: TermLibrary) -> Candidates:
 
 
 @dataclass(frozen=True, eq=False)
-class _Known:
+class _ModelColumns:
     """What is in the model: an orthonormal basis Q of its columns over the rows, and the error that it leaves."""
 
     q: Float[np.ndarray, "N k"]
     left: Vector
 
     @classmethod
-    def of(cls, runs: TermRuns) -> _Known:
+    def of(cls, runs: TermRuns) -> _ModelColumns:
         """Of the physics alone."""
         every = (runs.physics(*runs.rows(experiment)) for experiment in runs.problem.record.experiments)
         phi, target = zip(*every, strict=True)
         return cls(np.zeros((sum(map(len, target)), 0)), np.concatenate(target)).beside(np.concatenate(phi))
 
-    def beside(self, columns: Float[np.ndarray, "N m"]) -> _Known:
+    def beside(self, columns: Float[np.ndarray, "N m"]) -> _ModelColumns:
         """With further columns."""
         size = np.linalg.norm(columns, axis=0)
         columns = columns / np.where(size > 0, size, 1.0)
@@ -80,7 +80,7 @@ class _Known:
             columns = columns - self.q @ (self.q.T @ columns)
         u, sigma, _ = np.linalg.svd(columns, full_matrices=False)
         u = u[:, sigma > 1e-10]
-        return _Known(np.column_stack([self.q, u]), self.left - u @ (u.T @ self.left))
+        return _ModelColumns(np.column_stack([self.q, u]), self.left - u @ (u.T @ self.left))
 
     def weigh(self, runs: TermRuns, chosen: Sequence[int] | np.ndarray | None = None) -> tuple[Vector, Vector, Vector]:
         """Of each term its squared norm, what of that the model leaves, and its product with the error."""
@@ -108,7 +108,7 @@ def _chunks(runs: TermRuns, chosen: Sequence[int] | np.ndarray) -> Iterator[tupl
         begin += factors.shape[1]
 
 
-def _promising(runs: TermRuns, known: _Known, among: np.ndarray) -> np.ndarray:
+def _promising(runs: TermRuns, known: _ModelColumns, among: np.ndarray) -> np.ndarray:
     """The terms that promise most, in rounds: a look through all, and picks among the best of it."""
     found: dict[int, None] = {}
     for _ in range(_ROUNDS):

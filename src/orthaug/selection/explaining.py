@@ -19,7 +19,7 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
 from orthaug.analysis.suspects import ODD_JUMPS, WIDTHS, changes_sign, is_level, written
 from orthaug.data.terms import CONSTANT, TermLibrary, outside_brackets
-from orthaug.selection.as_shown import Shown, basis_of, least_squares, without
+from orthaug.selection.as_shown import LearnerTarget, basis_of, least_squares, without
 from orthaug.selection.learned_linearization import LearnedLinearization
 
 MOST_CANDIDATES = 3000
@@ -85,7 +85,7 @@ class Space:
     """
 
     linearization: LearnedLinearization
-    shown: Shown
+    shown: LearnerTarget
     target: Vector
     norm: float
     candidates: tuple[Candidate, ...]
@@ -95,7 +95,7 @@ class Space:
     @classmethod
     def of(cls, linearization: LearnedLinearization, candidates: Sequence[Candidate]) -> Space:
         """Candidates without a value on some point, and those that physics expresses or no learner shows, are out."""
-        shown = Shown.of(linearization)
+        shown = LearnerTarget.of(linearization)
         norm = float(np.linalg.norm(shown.target))
         kept, columns = [], []
         for candidate in candidates:

@@ -21,7 +21,7 @@ from orthaug.models.motion_model import MotionModel
 from orthaug.physics.baseline import Baseline
 from orthaug.physics.motion import Motion
 from orthaug.selection.added_physics import (
-    Added,
+    NewTerm,
     added_to_baseline,
     added_to_motion,
     baseline_lines,
@@ -300,7 +300,7 @@ def _physics(
     return (None, None) if baseline is None else (baseline, baseline_lines(added, several))
 
 
-def _added(linearization: LearnedLinearization, term: ExplainingTerm) -> Added:
+def _added(linearization: LearnedLinearization, term: ExplainingTerm) -> NewTerm:
     template = unit = None
     if term.width is not None:
         template = term.expression.replace(repr(term.width), "{width}")
@@ -308,4 +308,4 @@ def _added(linearization: LearnedLinearization, term: ExplainingTerm) -> Added:
         unit = None if unit is None else linearization.units.get(str(term.on), "")
     where = (term.added_to, term.coefficient, term.unit)
     scale = linearization.parse(_scale(term.kind, term.on, term.expression))
-    return Added(term.parameter, term.expression, *where, term.width, unit, template, scale)
+    return NewTerm(term.parameter, term.expression, *where, term.width, unit, template, scale)

@@ -69,7 +69,7 @@ class Equations(NamedTuple):
         return float(self.square - 2 * p @ self.right + p @ self.hessian @ p)
 
 
-class Pick(NamedTuple):
+class ForwardStep(NamedTuple):
     """A column that was picked, and the share of the squared error left that it takes away."""
 
     column: int
@@ -84,7 +84,7 @@ def forward(
     least: float = 0.0,
     within: float = 0.0,
     constant: int | None = None,
-) -> list[Pick]:
+) -> list[ForwardStep]:
     """Pick up to `most` columns, one after another, beside those that are `known`.
 
     Args:
@@ -112,7 +112,7 @@ def forward(
 
     for column in known:
         project_out(column)
-    picks: list[Pick] = []
+    picks: list[ForwardStep] = []
     while len(picks) < most:
         left = np.diag(gram)
         able = (left > np.maximum(DEPENDENT * size, deviation)) & (left > 0) & ~out
@@ -120,7 +120,7 @@ def forward(
         best, before = int(np.argmax(gains)), max(square, 1e-300)
         if not able.any() or gains[best] <= least * before or gains[best] <= 0:
             break
-        picks.append(Pick(best, float(min(project_out(best) / before, 1.0))))
+        picks.append(ForwardStep(best, float(min(project_out(best) / before, 1.0))))
     return picks
 
 

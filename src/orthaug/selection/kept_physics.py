@@ -55,7 +55,7 @@ class Shift:
 
 
 @dataclass(frozen=True, eq=False)
-class KeptPhysics:
+class PhysicsComparison:
     """How the physics fares beside the chosen terms."""
 
     shifts: tuple[Shift, ...]
@@ -98,7 +98,7 @@ class KeptPhysics:
         return notes
 
 
-def kept_physics(runs: TermRuns, alone: Point, chosen: Point, able: Able = None) -> KeptPhysics:
+def kept_physics(runs: TermRuns, alone: Point, chosen: Point, able: Able = None) -> PhysicsComparison:
     """Compare θ of physics alone with θ beside the chosen terms, both trained on the criterion.
 
     Args:
@@ -115,7 +115,7 @@ def kept_physics(runs: TermRuns, alone: Point, chosen: Point, able: Able = None)
     )
     within = spanned(every, columns, runs.collinear, runs.constant) if columns else []
     terms = dict(zip((texts[i] for i in chosen.chosen), map(float, left[nt:]), strict=True))
-    return KeptPhysics(shifts, terms, condition, len(within), len(texts), runs.collinear)
+    return PhysicsComparison(shifts, terms, condition, len(within), len(texts), runs.collinear)
 
 
 def _statistics(runs: TermRuns, point: Point, own: Equations) -> tuple[list[float | None], Vector, float]:

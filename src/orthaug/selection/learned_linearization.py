@@ -25,7 +25,7 @@ from orthaug.models.dynamics import Numbers
 from orthaug.models.model import Model
 from orthaug.models.motion_field import labels_of, parts_at
 from orthaug.models.motion_model import MotionModel
-from orthaug.models.moving import Moving
+from orthaug.models.moving import MotionDynamics
 from orthaug.models.statistics import JointCovariance
 from orthaug.physics.baseline import Baseline, Parameter
 from orthaug.physics.motion import Motion
@@ -207,7 +207,7 @@ class MotionResponse:
 
     @classmethod
     def of(
-        cls, form: Moving, numbers: Numbers, x: Matrix, u: Matrix, rows: Matrix, begins: Any, weight: Matrix
+        cls, form: MotionDynamics, numbers: Numbers, x: Matrix, u: Matrix, rows: Matrix, begins: Any, weight: Matrix
     ) -> MotionResponse:
         """Along states x (M, nx) and inputs u (M, nu), with the rows that steps read."""
         steps, outputs = (np.asarray(part) for part in _derivatives(form, numbers, x, u, rows))
@@ -261,7 +261,7 @@ class MotionResponse:
 
 
 @partial(jax.jit, static_argnames="form")
-def _derivatives(form: Moving, numbers: Numbers, x: Any, u: Any, rows: Any) -> tuple[Any, Any]:
+def _derivatives(form: MotionDynamics, numbers: Numbers, x: Any, u: Any, rows: Any) -> tuple[Any, Any]:
     """∂(next state)/∂x and ∂y/∂x at points."""
     numbers = form.prepared(numbers)
     steps = jax.vmap(lambda x, row: jax.jacfwd(lambda s: form.step(numbers, s, row)[0])(x))(x, rows)

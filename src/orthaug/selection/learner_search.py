@@ -20,7 +20,7 @@ from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.models.learners import MLP
 from orthaug.physics.problem import Problem
 from orthaug.selection.nonlinearity import Nonlinearity
-from orthaug.selection.term_path import Rung, Search, Told
+from orthaug.selection.term_path import PathModel, Search, Told
 from orthaug.selection.term_runs import Point
 
 _ITERATIONS = 40  # of a network on a fold
@@ -69,7 +69,7 @@ def search_learners(
         nz = 0 if one is None else len(one.inputs if one.inputs is not None else lags.layout(*names))
         size = 0 if one is None else one.weights(nz, 1)
         words = () if one is None else (f"{one.hidden[0]} neurons of {', '.join(one.inputs or ('all lags',))}",)
-        rungs.append(Rung(Point((), np.zeros(0), np.zeros(0)), words, np.array(held), sum(seconds), size))
+        rungs.append(PathModel(Point((), np.zeros(0), np.zeros(0)), words, np.array(held), sum(seconds), size))
         try:
             told(rungs[-1])
         except KeyboardInterrupt:

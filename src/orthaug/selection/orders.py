@@ -17,7 +17,7 @@ from orthaug.data.record import Record
 from orthaug.data.terms import TermLibrary
 from orthaug.fitting.criteria import Criterion
 from orthaug.physics.problem import Problem
-from orthaug.selection.term_path import Blocks, Rung, Search, Told, judge_all
+from orthaug.selection.term_path import Blocks, PathModel, Search, Told, judge_all
 from orthaug.selection.term_runs import TermRuns
 
 _SURE = 1.96  # standard errors of a cross-correlation of white signals
@@ -125,7 +125,7 @@ def search_orders(
     runs = TermRuns.of(problem, TermLibrary(tuple(lags), (*((i,) for i in range(len(lags))), ())), criterion)
     level = [len(lags)] if runs.constant == len(problem.baseline.names) + len(lags) else []
     known = {str(lag) for term in problem.baseline.terms for lag in [term.regressor]}
-    found: dict[Orders, Rung] = {}
+    found: dict[Orders, PathModel] = {}
     with one_blas_thread():
         folds = Blocks(runs, blocks, runner)
 
@@ -138,7 +138,7 @@ def search_orders(
         def judge(several: Iterable[Orders]) -> None:
             new = [orders for orders in dict.fromkeys(several) if orders not in found]
             for orders, (point, held, seconds) in zip(new, folds.fitted(list(map(chosen, new))), strict=True):
-                found[orders] = Rung(point, (str(orders),), held, seconds, orders.size)
+                found[orders] = PathModel(point, (str(orders),), held, seconds, orders.size)
                 told(found[orders])
 
         try:
@@ -156,12 +156,12 @@ def search_orders(
         if not level:
             return search
         point, held, seconds = next(folds.fitted([chosen(search.chosen, [])]))
-        without = Rung(point, (), held, seconds, search.chosen.size)
+        without = PathModel(point, (), held, seconds, search.chosen.size)
         needed = not judge_all((without, replace(search.rungs[search.place], size=without.size + 1)))[0].within
         return replace(search, constant=needed)
 
 
-def _shrink(found: dict[Orders, Rung], judge: Callable[[Iterable[Orders]], None], least: Orders) -> None:
+def _shrink(found: dict[Orders, PathModel], judge: Callable[[Iterable[Orders]], None], least: Orders) -> None:
     """From the best on, as long as one lag less is as good as the best."""
     current = min(found, key=lambda orders: found[orders].score)
     while True:

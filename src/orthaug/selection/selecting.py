@@ -23,11 +23,11 @@ from orthaug.physics.baseline import Baseline
 from orthaug.physics.problem import Problem, pose, regressor_of
 from orthaug.selection.candidates import candidates
 from orthaug.selection.forward import COLLINEAR
-from orthaug.selection.kept_physics import KeptPhysics, kept_physics
+from orthaug.selection.kept_physics import PhysicsComparison, kept_physics
 from orthaug.selection.learner_search import LearnerSearch, search_learners
 from orthaug.selection.nonlinearity import Nonlinearity, nonlinearity
 from orthaug.selection.orders import Delay, Orders, OrderSearch, search_orders
-from orthaug.selection.term_path import Judged, TermPath, climb
+from orthaug.selection.term_path import RankedModel, TermPath, climb
 from orthaug.selection.term_runs import TermRuns
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ class Selection:
     notes: tuple[Warning, ...]
     stopped: bool = False
     """Whether the search was stopped before its end; what it had found by then was chosen from."""
-    physics: KeptPhysics | None = None
+    physics: PhysicsComparison | None = None
     """θ of physics alone beside θ with the chosen terms; None where no terms were searched, or there is no physics."""
     reach: Orders | None = None
     """The orders that were chosen, with lags of inputs that act by a nonlinear function alone; None for no such."""
@@ -134,8 +134,8 @@ class Selection:
                 )
         return pd.DataFrame(rows)
 
-    def _stages(self) -> list[tuple[str, Sequence[Judged]]]:
-        stages: list[tuple[str, Sequence[Judged]]] = [("orders", self.orders.judged())]
+    def _stages(self) -> list[tuple[str, Sequence[RankedModel]]]:
+        stages: list[tuple[str, Sequence[RankedModel]]] = [("orders", self.orders.judged())]
         if self.terms is not None:
             stages.append(("terms", self.terms.judged()))
         if self.learners is not None:

@@ -37,12 +37,12 @@ _HALVES = 50  # random halves of the data over which terms are chosen again
 _PARTS = 10  # of the training data, that halves are made of
 _SEED = 20_261_122
 
-Told = Callable[["Rung"], None]
+Told = Callable[["PathModel"], None]
 """Called with every model that was judged."""
 
 
 @dataclass(frozen=True, eq=False)
-class Rung:
+class PathModel:
     """A model on the path: its terms, and the mean squared error of its free runs on each held-out block.
 
     Errors are in units of the output squared; infinite where a free run diverged.
@@ -65,16 +65,16 @@ class Rung:
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
+class RankedModel:
     """A rung beside the best one: the standard error of its score, and whether it is as good within one."""
 
-    rung: Rung
+    rung: PathModel
     error: float
     within: bool
     chosen: bool
 
 
-def judge_all(rungs: Sequence[Rung], terms: bool = True) -> tuple[Judged, ...]:
+def judge_all(rungs: Sequence[PathModel], terms: bool = True) -> tuple[RankedModel, ...]:
     """Every model beside the best, block by block in pairs; the choice is the smallest that is as good.
 
     Args:
@@ -88,7 +88,7 @@ def judge_all(rungs: Sequence[Rung], terms: bool = True) -> tuple[Judged, ...]:
         tolerated = worse.std(ddof=1) / np.sqrt(count) if finite else 0.0
         within = finite and (float(worse.mean()) <= tolerated or rung.score <= (1 + WORTH) * best.score)
         spread_of = rung.held.std(ddof=1) / np.sqrt(count) / (2 * rung.score) if finite and rung.score else np.inf
-        found.append(Judged(rung, float(spread_of), within, False))
+        found.append(RankedModel(rung, float(spread_of), within, False))
     able = [i for i, one in enumerate(found) if one.within]
     chosen = min(able, key=lambda i: (rungs[i].size, rungs[i].lags, rungs[i].score), default=0)
     found[chosen] = replace(found[chosen], chosen=True)
@@ -99,9 +99,9 @@ def judge_all(rungs: Sequence[Rung], terms: bool = True) -> tuple[Judged, ...]:
 class Search:
     """All models that were judged, with the choice: the smallest within one standard error of the best."""
 
-    rungs: tuple[Rung, ...]
+    rungs: tuple[PathModel, ...]
 
-    def judged(self) -> tuple[Judged, ...]:
+    def judged(self) -> tuple[RankedModel, ...]:
         """Every model beside the best."""
         return judge_all(self.rungs)
 
@@ -196,11 +196,11 @@ class TermPath(Search):
         chosen = set(self.chosen.point.chosen)
         return next((able for able in self.ways if chosen <= set(able)), None)
 
-    def judged(self) -> tuple[Judged, ...]:
+    def judged(self) -> tuple[RankedModel, ...]:
         return judge_all(self.rungs, self.confirmed)
 
     @property
-    def chosen(self) -> Rung:
+    def chosen(self) -> PathModel:
         """The choice."""
         return self.rungs[self.place]
 
@@ -245,13 +245,13 @@ def climb(
         folds, rungs, ways = Blocks(runs, blocks, runner), [], _ways(runs, near)
         confirmed = True
 
-        def judged(point: Point, change: Sequence[str], began: float) -> Rung:
+        def judged(point: Point, change: Sequence[str], began: float) -> PathModel:
             known = (rung.held for rung in rungs if rung.point.chosen == point.chosen)  # ways that begin alike
             held = next(known, None)
             if held is None:
                 held, _ = next(folds.judge([point]))
             lags = frozenset[Lag]().union(*(runs.lags[i] for i in point.chosen))
-            rung = Rung(point, tuple(change), held, time.monotonic() - began, len(point.chosen), len(lags))
+            rung = PathModel(point, tuple(change), held, time.monotonic() - began, len(point.chosen), len(lags))
             rungs.append(rung)
             told(rung)
             return rung
@@ -305,7 +305,7 @@ def _added_to(size: int) -> int:
     return 1 if size < _ONE_BY_ONE else max(1, size // 8)
 
 
-def _forward(runs: TermRuns, begin: Rung, most: int, able: Able, judged: Any, *, again: bool) -> None:
+def _forward(runs: TermRuns, begin: PathModel, most: int, able: Able, judged: Any, *, again: bool) -> None:
     texts, point, best, waited = runs.library.texts, begin.point, begin.score, 0
     while len(point.chosen) < most and waited < _PATIENCE and np.isfinite(point.loss):
         began = time.monotonic()
@@ -361,12 +361,12 @@ def _refitted(runs: TermRuns, point: Point, equations: Equations, chosen: tuple[
 def _confirmed(folds: Blocks, size: int, able: Able) -> bool:
     """Whether up to `size` terms beat physics alone on blocks without which they were picked."""
     points: Sequence[Point | None] = [None] * len(folds.folds)
-    rungs: list[Rung] = []
+    rungs: list[PathModel] = []
     while size and (not rungs or rungs[-1].size < size):
         before = rungs[-1].size if rungs else 0
         count = min(_added_to(before), size - before) if rungs else 0
         points, held = folds.along(points, count, able)
-        rungs.append(Rung(Point((), held, held), (), held, 0.0, before + count))
+        rungs.append(PathModel(Point((), held, held), (), held, 0.0, before + count))
         if _beyond_doubt(rungs[0].held, held):
             return True
     return bool(size) and not judge_all(rungs)[0].within

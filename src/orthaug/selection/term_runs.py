@@ -216,7 +216,7 @@ class TermRuns:
             own = self.step_equations.of([*range(nt), *(nt + i for i in chosen)])
             p = own.solve()
             return Point(chosen, p[:nt], p[nt:], None, max(own.miss(p), 0.0) / own.rows)
-        objective = _Chosen.of(self, chosen)
+        objective = _TermSubset.of(self, chosen)
         p = np.concatenate([point.c, w, np.zeros(objective.dynamics.unknowns - len(point.c) - len(w))])
         states = point.states if point.states is not None else np.asarray(self.layout.start)
         trial = _descended(objective, p, Start(states), iterations)
@@ -227,7 +227,7 @@ class TermRuns:
         """Return the share of a model's errors that is independent; one step ahead all of them count."""
         if self.layout is None:
             return 1.0
-        objective = _Chosen.of(self, point.chosen)
+        objective = _TermSubset.of(self, point.chosen)
         p = np.zeros(objective.physics + objective.dynamics.width)  # type: ignore[attr-defined]
         p[: len(point.c)], p[len(point.c) : len(point.c) + len(point.w)] = point.c, point.w
         return objective.samples(objective.evaluate(p, Start(point.states)))[1]
@@ -245,7 +245,7 @@ class TermRuns:
         if self.layout is None:
             own = self.step_equations if scored is None else Equations.sum_of(self.step_blocks[scored])
             return own if able is None else own.of(columns).among(columns, nt + terms)
-        objective = _Chosen.of(self, tuple(taken), exactly=True)
+        objective = _TermSubset.of(self, tuple(taken), exactly=True)
         if scored is not None:
             objective = replace(objective, segments=self.layout._replace(scored=scored))
         w = np.zeros(terms)
@@ -291,7 +291,7 @@ class TermRuns:
 
     def errors(self, point: Point, held: Segments) -> float:
         """Mean of squared errors of free runs over held-out segments from measured starts; infinite if one diverges."""
-        objective = _Chosen.of(self, point.chosen)
+        objective = _TermSubset.of(self, point.chosen)
         w = np.zeros(objective.dynamics.unknowns - objective.physics)
         w[: len(point.w)] = point.w
         numbers = objective.numbers(point.c, w)
@@ -329,13 +329,13 @@ def _descended(objective: FreeRunObjective, p: Vector, start: Start, iterations:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class _Chosen(FreeRunObjective):
+class _TermSubset(FreeRunObjective):
     """The free run of some terms, in a program with more places: those that are not taken stay zero."""
 
     taken: int
 
     @classmethod
-    def of(cls, runs: TermRuns, chosen: tuple[int, ...], *, exactly: bool = False) -> _Chosen:
+    def of(cls, runs: TermRuns, chosen: tuple[int, ...], *, exactly: bool = False) -> _TermSubset:
         places = len(chosen) if exactly else runs.places(len(chosen))
         menu, layout = replace(runs.menu, width=places), runs.layout
         products = np.full((places, runs.menu.order), len(runs.library.factors))

@@ -45,12 +45,12 @@ PIPELINES = {  # name, and how the page says who trained
 HYPHEN = "\N{NON-BREAKING HYPHEN}"  # a line of the page never ends within 1e-6
 WIDTH = 100  # characters of a line in a terminal
 MARK = "reproduction.json"
-StudiesTell = Callable[[str, int, int], None]
+StudiesProgress = Callable[[str, int, int], None]
 """Called with the study's title, the runs done and all of them."""
 
 
 @dataclass(frozen=True, eq=False)
-class Reproduced:
+class StudyOutcome:
     """One study with its table, figures and findings."""
 
     entry: Reproduction
@@ -96,9 +96,9 @@ def reproduce(
     pipeline: str = "ours",
     small: bool = False,
     store: Path | None = None,
-    progress: StudiesTell | None = None,
+    progress: StudiesProgress | None = None,
     client: Any = None,
-) -> list[Reproduced]:
+) -> list[StudyOutcome]:
     """Run the studies; what a store holds already is not run again.
 
     Args:
@@ -115,7 +115,7 @@ def reproduce(
         tell = None if progress is None else lambda done, total, e=entry: progress(e.title, done, total)
         done = runs(entry.study(pipeline, small), store=store, progress=tell, client=client)
         table = as_table(done)
-        reproduced.append(Reproduced(entry, done, table, dict(entry.figures(table)), entry.findings(table), small))
+        reproduced.append(StudyOutcome(entry, done, table, dict(entry.figures(table)), entry.findings(table), small))
     return reproduced
 
 
@@ -124,7 +124,7 @@ def check_output(folder: Path, *, force: bool = False) -> None:
     check_replaceable(folder, force=force)
 
 
-def write(reproduced: Sequence[Reproduced], folder: Path, pipeline: str, *, force: bool = False) -> None:
+def write(reproduced: Sequence[StudyOutcome], folder: Path, pipeline: str, *, force: bool = False) -> None:
     """index.html, and for each study its figures as PNG and its runs as CSV; whole or not at all."""
     with whole_folder(folder, force=force) as partial:
         for study in reproduced:
@@ -144,12 +144,12 @@ def write(reproduced: Sequence[Reproduced], folder: Path, pipeline: str, *, forc
         (partial / "index.html").write_text(_page(reproduced, pipeline), encoding="utf-8")
 
 
-def as_rows(reproduced: Sequence[Reproduced]) -> list[dict[str, Any]]:
+def as_rows(reproduced: Sequence[StudyOutcome]) -> list[dict[str, Any]]:
     """The findings as plain rows, each with its study."""
     return [{"study": study.entry.name, **finding._asdict()} for study in reproduced for finding in study.findings]
 
 
-def _counts(reproduced: Sequence[Reproduced]) -> Counts:
+def _counts(reproduced: Sequence[StudyOutcome]) -> Counts:
     return Counts.of(finding for study in reproduced for finding in study.findings)
 
 
@@ -166,7 +166,7 @@ def when(done: Sequence[Run]) -> str:
     return f"{len(done)} run{'s' * (len(done) != 1)}: {'; '.join(parts)}, summed over runs"
 
 
-def text(reproduced: Sequence[Reproduced]) -> str:
+def text(reproduced: Sequence[StudyOutcome]) -> str:
     """A table per study, in lines for a terminal, and what is met."""
     from rich import box
     from rich.console import Console
@@ -199,7 +199,7 @@ def _marked(reference: str, met: bool | None) -> str:
     return f"{reference} ({'met' if met else 'differs'})"
 
 
-def _page(reproduced: Sequence[Reproduced], pipeline: str) -> str:
+def _page(reproduced: Sequence[StudyOutcome], pipeline: str) -> str:
     source = files("orthaug.studies").joinpath("templates/reproduction.html").read_text(encoding="utf-8")
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
     environment.filters["whole"] = lambda words: words.replace("e-", f"e{HYPHEN}")

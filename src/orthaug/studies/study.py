@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 Case = dict[str, Any]
-CasesTell = Callable[[int, int], None]
+CasesProgress = Callable[[int, int], None]
 """Called after each run with the runs done and all of them."""
 
 
@@ -105,7 +105,7 @@ def run(
     *,
     store: Path | None = None,
     workers: int | None = None,
-    progress: CasesTell | None = None,
+    progress: CasesProgress | None = None,
     client: Any = None,
 ) -> pd.DataFrame:
     """Run what the store does not hold yet, several cases at a time; a row per case, axes first.
@@ -133,7 +133,7 @@ def runs(
     *,
     store: Path | None = None,
     workers: int | None = None,
-    progress: CasesTell | None = None,
+    progress: CasesProgress | None = None,
     client: Any = None,
 ) -> list[Run]:
     """`run`, with the time of every result instead of a table."""

@@ -138,7 +138,7 @@ def _progress(line: str) -> dict[str, Any] | None:
     return None
 
 
-class Desk:
+class WorkerPool:
     """Answers questions in processes of their own, so that the page neither waits nor holds the data.
 
     One process waits with its modules imported for the next question.

@@ -19,7 +19,7 @@ from typing import Any
 from orthaug._base.errors import InputError
 from orthaug._base.folders import file_digest
 from orthaug._base.progress import LOG
-from orthaug.commands.app.processes import Command, Desk
+from orthaug.commands.app.processes import Command, WorkerPool
 from orthaug.commands.app.spec_text import absolute, files, in_file, keep, kept_title, plain, section, with_value
 from orthaug.data.tables import KNOWN
 
@@ -31,7 +31,7 @@ KINDS = ("fit", "compare")
 class Session:
     """State and actions. `versions` counts the changes of `data`, `spec`, `check` and `work`, for pages to follow."""
 
-    def __init__(self, key: str, folder: Path, desk: Desk) -> None:
+    def __init__(self, key: str, folder: Path, desk: WorkerPool) -> None:
         self.key, self.folder, self.desk = key, folder, desk
         self.versions: Counter[str] = Counter()
         self.title = ""
@@ -377,7 +377,7 @@ class Sessions:
     """All work that goes on, by keys that cannot be guessed."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder, self.desk = folder, Desk()
+        self.folder, self.desk = folder, WorkerPool()
         self._open: dict[str, Session] = {}
         self._made = 0
 

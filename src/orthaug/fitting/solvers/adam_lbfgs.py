@@ -14,7 +14,7 @@ from annotated_types import Ge, Gt
 from jaxtyping import Float
 
 from orthaug._base.jax import Array, jax, jnp, training_clock
-from orthaug._base.progress import Enough, RunTell, quiet
+from orthaug._base.progress import RunProgress, StopTraining, quiet
 from orthaug._base.registry import check_fields
 from orthaug.fitting.paper_criterion import PaperCriterion, Physics
 from orthaug.fitting.solvers.compiled import burst_length
@@ -78,7 +78,7 @@ class AdamLBFGS:
         chunks: Chunk,
         physics: Physics,
         *,
-        progress: RunTell = quiet,
+        progress: RunProgress = quiet,
     ) -> GradientRun:
         """Minimise the joint criterion from θ⁰ and `w`; the loss told to `progress` is a mean square."""
         import optax
@@ -104,7 +104,7 @@ class AdamLBFGS:
                 burst = burst_length(burst, training_clock() - tick)
                 try:
                     progress(done + int(state.iteration), float(state.loss) * float(physics.samples))
-                except Enough:
+                except StopTraining:
                     enough = True
             done += int(state.iteration)
         finite = bool(jnp.isfinite(state.loss))

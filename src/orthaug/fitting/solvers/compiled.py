@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 
 from orthaug._base.checks import Vector
 from orthaug._base.jax import Array, jax, jnp, training_clock
-from orthaug._base.progress import Enough, RunTell, quiet
+from orthaug._base.progress import RunProgress, StopTraining, quiet
 from orthaug.fitting.normal_equations import Normal, linearise, one_pass
 from orthaug.fitting.solvers.descent import IDENTITY
 from orthaug.fitting.solvers.limit import Limit, Tail
@@ -46,7 +46,7 @@ class State(NamedTuple):
 
 
 @runtime_checkable
-class Keeper(Protocol):
+class CheckpointWriter(Protocol):
     """Where the states of a run are kept."""
 
     def state(self) -> State | None:
@@ -110,8 +110,8 @@ class Settings:
     ridge: float = 0.0
     evidence: bool = False
     groups: Int[np.ndarray, "nw"] | None = None
-    progress: RunTell = quiet
-    kept: Keeper | None = None
+    progress: RunProgress = quiet
+    kept: CheckpointWriter | None = None
 
     def prepared(self, w: Any) -> tuple[Options, Any, State | None]:
         """The numbers of the compiled program, the ridge it starts with, and the state to go on from."""
@@ -138,7 +138,7 @@ class Settings:
         """Whoever listens, and whoever keeps states; whether a listener says that it is enough."""
         try:
             self.progress(int(state.iteration), float(state.normal.loss))
-        except Enough:
+        except StopTraining:
             return True
         if self.kept is not None:
             self.kept.keep(state, ended=int(state.code) != Ending.RUNNING)

@@ -19,7 +19,7 @@ from jaxtyping import Bool
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.jax import training_clock
-from orthaug._base.progress import Enough, RunTell, quiet
+from orthaug._base.progress import RunProgress, StopTraining, quiet
 from orthaug.fitting.solvers.limit import Limit, Tail
 from orthaug.fitting.status import Ending
 
@@ -42,7 +42,7 @@ MARQUARDT = Damping(1e-3, 1e16, diagonal=True)
 
 
 @runtime_checkable
-class Tried(Protocol):
+class Trial(Protocol):
     """A trial: an objective at p."""
 
     @property
@@ -55,7 +55,7 @@ class Tried(Protocol):
 
 
 @runtime_checkable
-class Linearised(Protocol):
+class LinearModel(Protocol):
     """An objective and its derivative about an accepted trial."""
 
     @property
@@ -84,11 +84,11 @@ class SquaredResiduals(Protocol):
         ...
 
     def evaluate(self, p: Vector, start: Any) -> Any:
-        """A trial (`Tried`) at p, from the `start` that the last accepted one left."""
+        """A trial (`Trial`) at p, from the `start` that the last accepted one left."""
         ...
 
     def linearise(self, point: Any) -> Any:
-        """The derivative (`Linearised`) about a trial."""
+        """The derivative (`LinearModel`) about a trial."""
         ...
 
     def samples(self, point: Any) -> tuple[float, float]:
@@ -172,7 +172,7 @@ def descend(
     evidence_settled: bool = False,
     ceiling: float = np.inf,
     bounds: tuple[Vector, Vector] | None = None,
-    progress: RunTell = quiet,
+    progress: RunProgress = quiet,
     kept: Any = None,
 ) -> Descent:
     """Minimise `‖r‖² + α‖w‖²` from p.
@@ -217,7 +217,7 @@ def descend(
         mark = iterate.point.loss if limit.begins_window(done) else mark
         try:
             progress(done, iterate.point.loss)
-        except Enough:
+        except StopTraining:
             ending = Ending.STOPPED if ending is Ending.RUNNING else ending
             break
         if kept is not None:

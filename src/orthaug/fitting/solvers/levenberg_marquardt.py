@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Vector, check_count, check_number
 from orthaug._base.jax import Array
-from orthaug._base.registry import LIBRARY_ONLY, InSpec, check_fields
+from orthaug._base.registry import LIBRARY_ONLY, SpecLimit, check_fields
 from orthaug.fitting.normal_equations import Normal
 from orthaug.fitting.solvers import compiled
 from orthaug.fitting.solvers.compiled import Settings, TrainingRun
@@ -35,7 +35,7 @@ class LevenbergMarquardt:
 
     gauss_newton = True
 
-    iterations: Annotated[int, Ge(0), InSpec(Ge(1))] = _ITERATIONS
+    iterations: Annotated[int, Ge(0), SpecLimit(Ge(1))] = _ITERATIONS
     tolerance: Annotated[float, Ge(0)] = field(default=1e-6, metadata=LIBRARY_ONLY)
     longest: int | None = field(default=None, metadata=LIBRARY_ONLY)
 
