@@ -14,8 +14,8 @@ from orthaug._base.errors import InputError
 from orthaug.commands.spec import load_spec
 from orthaug.data.expressions import parse_named
 from orthaug.physics.motion import Output, State
-from orthaug.selection.added_physics import NewTerm, added_to_motion
 from orthaug.selection.explaining import _written, candidates_of
+from orthaug.selection.explanation import NewTerm, added_to_motion
 from orthaug.selection.learned_linearization import MotionResponse, _moved, linearization_of
 
 ROWS = 600

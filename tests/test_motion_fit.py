@@ -405,8 +405,7 @@ def test_traces_that_tests_see_beside_the_noise_are_told() -> None:
 
 def test_a_term_that_is_there_already_moves_the_run_as_its_parameter_does() -> None:
     """Linear in x, added to the equation of v: the spring's own column, −k/m of it by the logarithm of k."""
-    from orthaug.analysis.missing_terms import doubted
-    from orthaug.analysis.motion_sensitivities import sensitivities
+    from orthaug.analysis.missing_terms import doubted, sensitivities
 
     fit = oa.estimate(data(), spring(), learner=None, criterion=WHOLE)
     assert doubted(fit) == (1,)  # ẋ = v only says what v is

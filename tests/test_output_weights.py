@@ -11,8 +11,7 @@ from test_cli import finite_json, run
 from orthaug._base.errors import InputError
 from orthaug.data.record import Record
 from orthaug.fitting.criteria import Simulation
-from orthaug.fitting.estimation import estimate
-from orthaug.fitting.reweighting import reweighted
+from orthaug.fitting.estimation import estimate, reweighted
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.structures import Additive, OrthogonalPenalty
 from orthaug.inference.covariance import joint_covariance

@@ -11,19 +11,124 @@ other it is that beside all terms, so that what the missing one leaves does not 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.special
+from jaxtyping import Bool, Float
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug.analysis.motion_sensitivities import Sensitivities, Terms, sensitivities
+from orthaug._base.jax import Array, jax, padded_length
 from orthaug.analysis.suspects import changes_sign
 from orthaug.analysis.whiteness import whitening
-from orthaug.fitting.motion_estimates import MotionEstimate
+from orthaug.fitting.motion_estimates import MotionEstimate, fitted_numbers
+from orthaug.models.dynamics import Numbers
+from orthaug.models.moving import MotionDynamics
 from orthaug.physics.motion import Motion
+
+_ROWS = 20_000  # that are looked at, in segments spread over the record
+_NUMBERS = 8_000_000  # that stand in memory at most
+
+Terms = Callable[[Float[np.ndarray, "n r"]], Float[np.ndarray, "t r"]]
+"""Makes terms of states and inputs."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sensitivities:
+    """Of some segments (m): errors, and how the outputs follow starts, unknowns and added terms, in this order.
+
+    `columns` (m, T, ny, n0 + n + q), `errors` (m, T, ny), `scored` (m, T); q counts equations times terms, those of the
+    first equation in front. `points` (n, M) are the states and inputs that were scored.
+    """
+
+    columns: Float[np.ndarray, "m T ny K"]
+    errors: Float[np.ndarray, "m T ny"]
+    scored: Bool[np.ndarray, "m T"]
+    points: Matrix
+    starts: int
+    nuisance: int
+    """n0, and n0 + n."""
+
+
+@partial(jax.jit, static_argnames="form")
+def _slopes(form: MotionDynamics, numbers: Numbers, states: Float[Array, "n0 m"], inputs: Float[Array, "nu m"]) -> Any:
+    """∂x⁺/∂(x, c, w), the outputs, and ∂y/∂(x, c, w) at every point."""
+    numbers = form.prepared(numbers)
+    return form.tangents(numbers, states, form.first_slopes(states.shape[1]), inputs)[1:]
+
+
+def sensitivities(
+    fit: MotionEstimate, equations: Sequence[int], terms: Callable[[Matrix], Terms], count: int
+) -> Sensitivities | None:
+    """Along the segments that were trained on; None where something is not finite.
+
+    Args:
+        equations: states whose equations the terms are added to.
+        terms: makes the terms, given the points (n, M) of the runs.
+        count: of terms.
+    """
+    segmented, numbers = fit.segmented, fitted_numbers(fit.model.numbers)
+    form = segmented.dynamics
+    runs = np.moveaxis(segmented.runs(numbers.theta, numbers.weights, fit.states), -1, 1)  # (k, m, T, n0)
+    segments = [np.moveaxis(np.asarray(part), -1, 1) for part in segmented.segments[1:]]
+    k, m = runs.shape[:2]
+    x, u, target, scored = (part.reshape(k * m, *part.shape[2:]) for part in (runs, *segments))
+    n0, n, q = form.states, form.unknowns, count * len(equations)
+    steps = min(x.shape[1], max(_NUMBERS // (target.shape[2] * (n0 + n + q)), 1))
+    there = np.flatnonzero(scored[:, :steps].any(axis=1))
+    most = max(min(_ROWS, _NUMBERS // (target.shape[2] * (n0 + n + q))) // steps, 1)
+    taken = there[np.unique(np.linspace(0, len(there) - 1, min(most, len(there))).astype(int))]
+    x, u, target, scored = (part[taken, :steps] for part in (x, u, target, scored))
+    rows = np.concatenate([x, form.now(u)], axis=2)
+    points = rows[scored].T
+    if not np.isfinite(points).all():
+        return None
+    to_next, value, to_output = _at_rows(form, numbers, x, u)
+    with np.errstate(all="ignore"):
+        added = terms(points)(rows.reshape(-1, rows.shape[2]).T).reshape(count, *scored.shape)
+        columns = _followed(to_next, to_output, added, equations, form)
+    kept = np.isfinite(columns).all(axis=(2, 3)) & np.isfinite(value).all(axis=2)
+    if not kept[scored].all():
+        return None
+    return Sensitivities(columns, target - value, scored, points, n0, n0 + n)
+
+
+def _at_rows(form: MotionDynamics, numbers: Numbers, x: Any, u: Any) -> tuple[Any, Any, Any]:
+    """Slopes at every row: (m, T, n0, n0 + n), outputs (m, T, ny), and their slopes (m, T, ny, n0 + n)."""
+    m, steps = x.shape[:2]
+    flat = [part.reshape(m * steps, -1).T for part in (x, u)]
+    length = padded_length(m * steps)
+    padded = [np.concatenate([part, np.repeat(part[:, -1:], length - m * steps, axis=1)], axis=1) for part in flat]
+    found = [np.moveaxis(np.asarray(part)[..., : m * steps], -1, 0) for part in _slopes(form, numbers, *padded)]
+    return tuple(part.reshape(m, steps, *part.shape[1:]) for part in found)  # type: ignore[return-value]
+
+
+def _followed(to_next: Any, to_output: Any, added: Any, equations: Sequence[int], form: MotionDynamics) -> Any:
+    """The columns (m, T, ny, n0 + n + q) of the outputs, from one row to the next."""
+    m, steps, n0, own = to_next.shape
+    q, h = len(added), form.sampling_time
+    columns = np.zeros((m, steps, to_output.shape[2], own + q * len(equations)))
+    slope = np.zeros((m, n0, columns.shape[3]))
+    slope[:, :, :n0] = np.eye(n0)
+    for k in range(steps):
+        a, c = to_next[:, k, :, :n0], to_output[:, k, :, :n0]
+        columns[:, k] = c @ slope
+        columns[:, k, :, n0:own] += to_output[:, k, :, n0:]
+        slope = a @ slope
+        slope[:, :, n0:own] += to_next[:, k, :, n0:]
+        now, then = added[:, :, k].T, added[:, :, min(k + 1, steps - 1)].T  # (m, q)
+        for place, i in enumerate(equations):
+            to = slice(own + place * q, own + (place + 1) * q)
+            if form.motion.integrator == "discrete":
+                slope[:, i, to] += now
+                continue
+            slope[:, :, to] += h / 2 * a[:, :, i, None] * now[:, None]
+            slope[:, i, to] += h / 2 * then
+    return columns
+
 
 SHAPES = ("linear", "jump", "absolute", "square", "cube")
 _EDGE = 0.05  # of the largest value: over which a jump at zero is smoothed

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any, TypedDict, Unpack, overload
@@ -10,7 +10,7 @@ from typing import Any, TypedDict, Unpack, overload
 import numpy as np
 
 from orthaug._base.checks import Vector, check_choice, check_count, check_type, is_number
-from orthaug._base.errors import InputError, shown
+from orthaug._base.errors import InputError, Warning, shown
 from orthaug._base.progress import SILENT, ProgressCallback
 from orthaug._base.views import with_progress
 from orthaug.data.record import Record
@@ -27,11 +27,11 @@ from orthaug.fitting.kinds import Solver
 from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.fitting.motion_estimation import DEFAULT, fit_motion, pose_for
 from orthaug.fitting.one_step import OneStepTask
-from orthaug.fitting.reweighting import reweighted
 from orthaug.fitting.rules import check_cost, check_solver, checked_starts, tried
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.structures import Orthogonal, Structure
 from orthaug.fitting.training import Choice, PlannedRun, planned, train
+from orthaug.inference.covariance import whitening
 from orthaug.inference.measures import Training
 from orthaug.models.learners import MLP, Learner, Scaling
 from orthaug.models.model import Model
@@ -40,8 +40,44 @@ from orthaug.models.tasks import Tasks, runs_on
 from orthaug.models.terms import over_lags, over_states
 from orthaug.physics.baseline import Baseline
 from orthaug.physics.motion import Motion
+from orthaug.physics.output_weights import by_covariance
 from orthaug.physics.problem import Problem, pose
 from orthaug.physics.streamed import StreamedProblem, pose_streamed
+
+_TURNS = 30
+_SETTLED = 1e-6  # relative change of W
+
+
+def reweighted(first: Estimate, again: Callable[[Problem, Estimate], Estimate]) -> Estimate:
+    """The fit whose outputs are weighted by the covariance of its own errors.
+
+    Args:
+        first: a fit with any output weights.
+        again: the fit of a problem with other weights, begun from an earlier estimate.
+
+    Returns:
+        The last fit, with the restarts of the first one. It stays at the weights it has where the errors' covariance is
+        singular; a warning tells that the turns did not settle.
+    """
+    estimate, problem = first, first.problem
+    covariance = problem.target_covariance
+    for _ in range(_TURNS):
+        noise = estimate.model.statistics.noise if estimate.status.ok else None
+        white = None if noise is None else whitening(noise)
+        if white is None:
+            return replace(estimate, restarts=first.restarts)
+        weight = by_covariance(white, covariance)
+        change = np.linalg.norm(weight.matrix - problem.weight.matrix) / np.linalg.norm(weight.matrix)
+        if change <= _SETTLED:
+            return replace(estimate, restarts=first.restarts)
+        problem = problem.weighed(weight)
+        estimate = again(problem, estimate)
+    text = (
+        f"the weights of the outputs still change by {change:.1g} after {_TURNS} fits; θ depends on where they stopped."
+    )
+    told = (*estimate.warnings, Warning("output_weights_unsettled", text))
+    return replace(estimate, restarts=first.restarts, warnings=told)
+
 
 Regularization = str | float
 
