@@ -18,7 +18,7 @@ Matrix = Float[np.ndarray, "_ _"]
 
 
 def as_signal(values: Any, name: str, *, gaps: bool = False) -> Matrix:
-    """Samples as a float matrix (N, channels); a vector is one channel. NaN may stand for missing ones if `gaps`.
+    """Return samples as a float matrix (N, channels); a vector is one channel. NaN may stand for missing ones if `gaps`.
 
     Raises:
         InputError: not numeric, more than two axes, or a cell that is not finite (named by its row).
@@ -86,7 +86,7 @@ def check_count(value: Any, name: str, least: int = 1, *, of: str = "") -> int:
 
 
 def is_number(value: Any) -> bool:
-    """Whether `value` is a finite real number; a truth value is none."""
+    """Return whether `value` is a finite real number; a truth value is none."""
     if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
         return False
     try:

@@ -19,12 +19,12 @@ _WORD = re.compile(r"""[^\s/\\'"`]+""")
 
 
 def visible(text: str) -> str:
-    """The text with line breaks, terminal controls and invisible characters escaped."""
+    """Return the text with line breaks, terminal controls and invisible characters escaped."""
     return text if text.isprintable() else "".join(c if c.isprintable() else _escaped(c) for c in text)
 
 
 def shown(value: Any) -> str:
-    """A value as Python writes it, on one line, cut where it is long."""
+    """Return a value as Python writes it, on one line, cut where it is long."""
     try:
         if math.prod(getattr(value, "shape", ())) > _FEW:
             return f"an array of shape {tuple(value.shape)}"
@@ -39,7 +39,7 @@ def cut(text: str) -> str:
 
 
 def message(text: str) -> str:
-    """A message as users see it: one line, its names, values and paths visible and cut where they are long."""
+    """Return a message as users see it: one line, its names, values and paths visible and cut where they are long."""
     text = visible(_ends(text, _SEARCHED))
     text = _QUOTED.sub(lambda found: f"{found[1]}{cut(found[2])}{found[1]}", text)
     text = _LISTED.sub(lambda found: f"[{cut(found[0][1:-1])}]", text)
@@ -48,7 +48,7 @@ def message(text: str) -> str:
 
 
 def _ends(text: str, most: int) -> str:
-    """The text without its middle where it is longer."""
+    """Return the text without its middle where it is longer."""
     head = most * _HEAD // _MOST
     return text if len(text) <= most else f"{text[:head]} … {text[head - most :]}"
 

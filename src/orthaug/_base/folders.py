@@ -43,21 +43,21 @@ class Partials:
         self._swept: set[Path] = set()
 
     def folder(self, parent: Path, made: Sequence[Path] = ()) -> Path:
-        """A new folder in `parent`; `made` are the parents that vanish with it."""
+        """Return a new folder in `parent`; `made` are the parents that vanish with it."""
         with self.lock:
             partial = self._named(parent, made)
             partial.mkdir()
             return partial
 
     def file(self, parent: Path) -> Path:
-        """A new empty file in `parent`."""
+        """Return a new empty file in `parent`."""
         with self.lock:
             partial = self._named(parent, ())
             partial.touch(exist_ok=False)
             return partial
 
     def shelter(self, parent: Path) -> Path:
-        """A new folder for what stood there before, until the new one stands."""
+        """Return a new folder for what stood there before, until the new one stands."""
         shelter = parent / _name(_OLD)
         shelter.mkdir()
         return shelter
@@ -124,7 +124,7 @@ def _name(kind: str) -> str:
 
 
 def _lives(name: str) -> bool:
-    """Whether the process in a name may be alive; one of another machine may be."""
+    """Return whether the process in a name may be alive; one of another machine may be."""
     parts = name.split("-")
     if len(parts) != 5 or parts[2] != _HOST or not parts[3].isdecimal():
         return True
@@ -326,7 +326,7 @@ def write_manifest(folder: Path) -> None:
 
 
 def not_ours(folder: Path) -> str | None:
-    """A file of a folder that orthaug did not write or that was changed, in words; None where all may be replaced.
+    """Return a file of a folder that orthaug did not write or that was changed, in words; None where all may be replaced.
 
     Without a manifest nothing says who wrote a file, whatever its name: each counts as the user's own.
     """
@@ -355,7 +355,7 @@ def _names(folder: Path) -> Iterator[str]:
 
 
 def file_digest(path: Path) -> str:
-    """The sha256 of a file; empty where there is none."""
+    """Return the sha256 of a file; empty where there is none."""
     if not path.is_file():
         return ""
     with path.open("rb") as file:
@@ -363,7 +363,7 @@ def file_digest(path: Path) -> str:
 
 
 def _listed(path: Path) -> dict[str, str] | None:
-    """The checksums of a manifest; None where there is none of orthaug's."""
+    """Return the checksums of a manifest; None where there is none of orthaug's."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):

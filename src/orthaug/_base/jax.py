@@ -85,7 +85,7 @@ def _late_jit(function: Callable[..., Any], **options: Any) -> Callable[..., Any
 
 
 def starts() -> bool:
-    """Whether JAX finds a device to compute on; what it raises where it does not depends on the platform asked for."""
+    """Return whether JAX finds a device to compute on; what it raises where it does not depends on the platform asked for."""
     try:
         return bool(_real_jax().devices())
     except Exception:
@@ -93,7 +93,7 @@ def starts() -> bool:
 
 
 def is_traced(value: Any) -> bool:
-    """Whether a value stands for numbers that are not there yet, because a program is being made of it."""
+    """Return whether a value stands for numbers that are not there yet, because a program is being made of it."""
     from jax.core import Tracer
 
     return isinstance(value, Tracer)
@@ -122,7 +122,7 @@ _compiling: list[_CompileTimes] = []
 
 
 def training_clock() -> float:
-    """A clock of this thread [s] that stands still while JAX compiles: its differences are what computing took."""
+    """Return a clock of this thread [s] that stands still while JAX compiles: its differences are what computing took."""
     if not _compiling:
         _compiling.append(_CompileTimes())
         _real_jax().monitoring.register_event_duration_secs_listener(_compiling[0].note)
@@ -130,7 +130,7 @@ def training_clock() -> float:
 
 
 def padded_length(rows: int) -> int:
-    """What to pad a number of rows to: lengths grow by powers of two, so that few programs are compiled.
+    """Return what to pad a number of rows to: lengths grow by powers of two, so that few programs are compiled.
 
     To compile one takes longer than a thousand rows.
     """
@@ -162,7 +162,7 @@ class ChecksummedCache:
         self._path = getattr(cache, "_path", folder)
 
     def get(self, key: str) -> bytes | None:
-        """The content of an entry; None where there is none, or not that one."""
+        """Return the content of an entry; None where there is none, or not that one."""
         try:
             entry = self._cache.get(key)
         except Exception:  # JAX words each failure in a warning of many lines

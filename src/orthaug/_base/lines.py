@@ -25,7 +25,7 @@ def counted(number: int, thing: str) -> str:
 
 
 def percent(share: float, digits: int = 2, *, sign: str = "") -> str:
-    """A share in per cent with so many digits, and without an exponent unless it is tiny or huge.
+    """Return a share in per cent with so many digits, and without an exponent unless it is tiny or huge.
 
     Examples:
         >>> [percent(share) for share in (0.0123, 0.999, 26.04)]
@@ -37,7 +37,7 @@ def percent(share: float, digits: int = 2, *, sign: str = "") -> str:
 
 
 def plain_number(value: float, digits: int = 2, *, sign: str = "") -> str:
-    """A number with so many digits, and without an exponent unless it is tiny or huge.
+    """Return a number with so many digits, and without an exponent unless it is tiny or huge.
 
     Examples:
         >>> [plain_number(value) for value in (0.0123, 1634.2)]

@@ -73,7 +73,7 @@ def _unused() -> float:
 
 
 def _allowed() -> float:
-    """What limits on the process (`ulimit -v`) leave."""
+    """Return what limits on the process (`ulimit -v`) leave."""
     most = limit()
     if math.isinf(most):
         return most

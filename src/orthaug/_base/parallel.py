@@ -21,7 +21,7 @@ _own_cores: ContextVar[int | None] = ContextVar("own_cores", default=None)
 
 
 def cores() -> int:
-    """How many runs this process makes at a time: the machine's cores, or those that it was left."""
+    """Return how many runs this process makes at a time: the machine's cores, or those that it was left."""
     return _own_cores.get() or os.cpu_count() or 1
 
 
@@ -49,7 +49,7 @@ def one_blas_thread() -> Iterator[None]:
 
 @cache
 def _blas() -> ThreadpoolController:
-    """The BLAS libraries of NumPy and SciPy, found once.
+    """Return the BLAS libraries of NumPy and SciPy, found once.
 
     To find them is to read the process's memory map, which gets longer with every compiled program: after some hundred
     of them it took longer than a small fit.

@@ -66,7 +66,7 @@ class Progress:
         self.tell(self.runs + run, self.iterations + iteration, loss)
 
     def after(self, *, runs: int = 0, iterations: int = 0) -> Progress:
-        """The progress of what follows so many runs or iterations."""
+        """Return the progress of what follows so many runs or iterations."""
         return replace(self, runs=self.runs + runs, iterations=self.iterations + iterations)
 
     def planned(self, plan: Plan) -> None:
@@ -74,7 +74,7 @@ class Progress:
         self.plan(self.runs, plan)
 
     def of(self, run: int) -> RunProgress:
-        """What one run tells: its iteration and the loss."""
+        """Return what one run tells: its iteration and the loss."""
         return lambda iteration, loss: self(run, iteration, loss)
 
 

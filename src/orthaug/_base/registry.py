@@ -66,7 +66,7 @@ class Key:
 
     @property
     def metadata(self) -> tuple[Any, ...]:
-        """What stands beside the type in `Annotated`."""
+        """Return what stands beside the type in `Annotated`."""
         return getattr(self.annotation, "__metadata__", ())
 
     @property
@@ -149,18 +149,18 @@ class Registry(Mapping[str, Any]):
             self.remove(kind)
 
     def section_keys(self) -> dict[str, Key]:
-        """The keys of all kinds."""
+        """Return the keys of all kinds."""
         keys: dict[str, Key] = {}
         for declaration in self._entries.values():
             keys = keys_of(declaration) | keys
         return keys
 
     def kind_of(self, declared: object) -> str | None:
-        """The name under which a declaration's class is registered; None for a foreign one."""
+        """Return the name under which a declaration's class is registered; None for a foreign one."""
         return next((kind for kind, declaration in self._entries.items() if type(declared) is declaration), None)
 
     def kind_with(self, option: str) -> tuple[str, Key] | None:
-        """The kind that a command-line option belongs to, with the key that it gives."""
+        """Return the kind that a command-line option belongs to, with the key that it gives."""
         for kind, declaration in self._entries.items():
             for key in keys_of(declaration).values():
                 if key.option == option:
@@ -168,7 +168,7 @@ class Registry(Mapping[str, Any]):
         return None
 
     def declare(self, kind: str, values: Mapping[str, Any]) -> Any:
-        """The declaration of a kind; `values` of keys that it does not have are left out.
+        """Return the declaration of a kind; `values` of keys that it does not have are left out.
 
         Raises:
             InputError: an unknown kind, a missing key, or what the declaration refuses.
@@ -184,7 +184,7 @@ class Registry(Mapping[str, Any]):
 
 @functools.cache
 def keys_of(declaration: type) -> dict[str, Key]:
-    """The keys that a declaration's fields are."""
+    """Return the keys that a declaration's fields are."""
     hints = typing.get_type_hints(declaration, include_extras=True)
     return {
         field.name: Key(field.name, hints[field.name], _default(field))
@@ -194,7 +194,7 @@ def keys_of(declaration: type) -> dict[str, Key]:
 
 
 def resolve(declared: Any, context: Any = None) -> Any:
-    """What a declaration stands for: itself, or what its `resolve(context)` makes."""
+    """Return what a declaration stands for: itself, or what its `resolve(context)` makes."""
     return declared.resolve(context) if hasattr(declared, "resolve") else declared
 
 

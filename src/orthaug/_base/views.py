@@ -32,7 +32,7 @@ class FitView(NotebookView):
         return MAKERS["plot"](self)
 
     def report(self, path: Any = None, *, tests: Any = None) -> Any:
-        """The page that `orthaug fit` writes, with all figures in one file.
+        """Return the page that `orthaug fit` writes, with all figures in one file.
 
         Args:
             path: HTML file to write, which is replaced; None to get the page as text that a notebook shows.
@@ -48,7 +48,7 @@ class FitView(NotebookView):
 
 
 def with_progress(verb: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """A verb whose `progress` may also be True, to show a bar on a terminal or in a notebook, or False."""
+    """Return a verb whose `progress` may also be True, to show a bar on a terminal or in a notebook, or False."""
 
     @wraps(verb)
     def shown(*arguments: Arguments.args, **options: Arguments.kwargs) -> Result:

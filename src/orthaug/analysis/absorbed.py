@@ -140,7 +140,7 @@ def absorbed(
     seen: Iterable[bool],
     x: Matrix,
 ) -> list[TermAfterFit]:
-    """What a fit makes of each term, to first order.
+    """Return what a fit makes of each term, to first order.
 
     Args:
         terms: the value (M, ny) of each on rows of the regressor.

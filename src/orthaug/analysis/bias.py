@@ -83,7 +83,7 @@ class SuspectedBias:
 
     @property
     def removed_by(self) -> RemovedBy | None:
-        """What leaves θ unbiased by it; None where that is not known.
+        """Return what leaves θ unbiased by it; None where that is not known.
 
         A learner that sees the term removes its bias from all that the learner could not imitate. Along the shared
         directions a measure may remove the rest.
@@ -177,7 +177,7 @@ def bias_table(
     directions: Matrix | None = None,
     absorbed: Sequence[TermAfterFit] | None = None,
 ) -> tuple[SuspectedBias, ...]:
-    """One `SuspectedBias` for each suspect, under the measure that `projection` was made with.
+    """Return one `SuspectedBias` for each suspect, under the measure that `projection` was made with.
 
     Args:
         projection: of the rows of φ, their outputs multiplied by `gain`.
@@ -315,7 +315,7 @@ def find_certificate(
 
 
 def _certificate_along(projection: Projection, delta: Matrix, directions: Matrix) -> Certificate:
-    """The certificate among some directions, told in all parameters."""
+    """Return the certificate among some directions, told in all parameters."""
     directions = projection.told_of(directions)
     if not directions.shape[1]:
         return Certificate("orthogonal")

@@ -91,7 +91,7 @@ def is_determined(value: float, std: float, freedom: float, low: float, high: fl
 
 
 def undetermined_warning(names: Sequence[str], candidates: Sequence[Candidate], remedies: Sequence[str]) -> Warning:
-    """The warning on parameters that the hull leaves open: why, and what would determine them."""
+    """Return the warning on parameters that the hull leaves open: why, and what would determine them."""
     shown = ", ".join(names[:_TOLD]) + (f" and {len(names) - _TOLD} more" if len(names) > _TOLD else "")
     apart = sorted(candidates, key=lambda c: float(np.sum(np.sign(c.moved) * c.moved**2)))
     pair = [apart[0], apart[-1]] if len(apart) > 1 else apart

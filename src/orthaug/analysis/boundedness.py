@@ -79,7 +79,7 @@ def _doubled(largest: float) -> list[float]:
 
 
 def _below_one(diverges: Diverging) -> float:
-    """The factor where a run with the record's own inputs diverges: below 10⁻⁴ the last one tried, or 0."""
+    """Return the factor where a run with the record's own inputs diverges: below 10⁻⁴ the last one tried, or 0."""
     falling = [1.0]
     while falling[-1] >= 1 / _LARGEST_FACTOR:
         falling.append(falling[-1] / 2)
@@ -91,7 +91,7 @@ def _below_one(diverges: Diverging) -> float:
 
 
 def _bisected(low: float, high: float, diverges: Diverging) -> float:
-    """The lowest factor that is known to diverge once `low` and `high` are close; every middle is tried at once."""
+    """Return the lowest factor that is known to diverge once `low` and `high` are close; every middle is tried at once."""
     middles = _middles(low, high)
     if not middles:
         return high
@@ -103,7 +103,7 @@ def _bisected(low: float, high: float, diverges: Diverging) -> float:
 
 
 def _middles(low: float, high: float) -> list[float]:
-    """All factors that a bisection between two, at most one double the other, can come to: 15 or fewer."""
+    """Return all factors that a bisection between two, at most one double the other, can come to: 15 or fewer."""
     if not high > _CLOSE * low:
         return []
     middle = _middle(low, high)
@@ -115,7 +115,7 @@ def _middle(low: float, high: float) -> float:
 
 
 def _diverging(model: Model | MotionModel, record: Record, factors: Sequence[float]) -> Bool[np.ndarray, "f"]:
-    """Whether the free run diverges with the inputs' deviations from their means times each of up to 16 factors.
+    """Return whether the free run diverges with the inputs' deviations from their means times each of up to 16 factors.
 
     The runs start from the measured outputs of each experiment and go side by side.
 
@@ -152,7 +152,7 @@ def _side_by_side(
     factors: Float[Array, "f"],
     bound: Float[Array, "ny"],
 ) -> Bool[Array, "f"]:
-    """Whether an output leaves `bound` within `steps` of free runs with `resting + factor (inputs − resting)`."""
+    """Return whether an output leaves `bound` within `steps` of free runs with `resting + factor (inputs − resting)`."""
     one = jax.vmap(lambda state, row: form.step(numbers, state, row))
 
     def going_on(carry: tuple[Any, Any, Any]) -> Any:

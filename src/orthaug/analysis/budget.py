@@ -54,7 +54,7 @@ def remedies(linearization: MeasureLinearization, cause: SuspectedBias, biased: 
 
 
 def _by_inputs(linearization: MeasureLinearization, cause: SuspectedBias, biased: Sequence[str]) -> Iterator[str]:
-    """The choice of learner inputs that frees most of the parameters."""
+    """Yield the choice of learner inputs that frees most of the parameters."""
     problem, suspect = linearization.problem, cause.suspect
     layout, x = problem.layout, problem.rows.x
     now = {str(entry) for entry in problem.features.entries}
@@ -81,7 +81,7 @@ def _by_inputs(linearization: MeasureLinearization, cause: SuspectedBias, biased
 
 
 def _by_measure(linearization: MeasureLinearization, cause: SuspectedBias, biased: Sequence[str]) -> Iterator[str]:
-    """A measure that brings the bias of all of them near zero."""
+    """Yield a measure that brings the bias of all of them near zero."""
     if cause.seen is False or len(linearization.problem.rows) > _MEASURED_ROWS:
         return
     for measure in (Symmetrized(), Uniform()):
@@ -98,7 +98,7 @@ def _by_measure(linearization: MeasureLinearization, cause: SuspectedBias, biase
 
 
 def _bias(linearization: MeasureLinearization, suspect: Suspect) -> Vector:
-    """The bias per unit of a suspect that the learner sees."""
+    """Return the bias per unit of a suspect that the learner sees."""
     values = suspect.values(linearization.weighed.points.x, linearization.problem.layout, linearization.problem.outputs)
     return linearization.weighed.projection.solve_along(
         times(linearization.weighed.unit, values), linearization.directions
@@ -153,21 +153,21 @@ class Budget:
 
     @property
     def cause(self) -> SuspectedBias:
-        """What explains most."""
+        """Return what explains most."""
         return self.causes[0]
 
     @property
     def share(self) -> float:
-        """How much of the learner that explains; where each output has a cause, of what is learned of its own."""
+        """Return how much of the learner that explains; where each output has a cause, of what is learned of its own."""
         return explains(self.cause)
 
     def of(self, name: str) -> ParameterBias | None:
-        """The bias of a parameter or physical parameter."""
+        """Return the bias of a parameter or physical parameter."""
         return next((entry for entry in (*self.parameters, *self.physical) if entry.name == name), None)
 
 
 def linearization_of(fit: Estimate, measure: Measure, physics: PhysicsMap | None = None) -> MeasureLinearization:
-    """What biases of a fit are computed on; `measure` is the one that θ was split under."""
+    """Return what biases of a fit are computed on; `measure` is the one that θ was split under."""
     weighed = weigh_problem(measure, fit.problem)
     learns = fit.model.form.bound is not None
     learned = fit.model.learner_at(weighed.points.x) if learns else None
@@ -277,7 +277,7 @@ def _physical_rows(
     causes: Sequence[SuspectedBias],
     other: Vector | float,
 ) -> tuple[tuple[ParameterBias, ...], list[Warning]]:
-    """The biases of the physical parameters: the hull over the causes that move any of them farthest."""
+    """Return the biases of the physical parameters: the hull over the causes that move any of them farthest."""
     assert linearization.physics is not None
     physical, slopes, bias = fit.physical(linearization.physics), linearization.slopes, moved.sum(axis=0)
     own = np.array([np.nan if s is None else s for s in physical.std])
@@ -303,7 +303,7 @@ def _physical_rows(
 def _causes(
     linearization: MeasureLinearization, suspects: Sequence[Suspect], something: Bool[np.ndarray, "ny"]
 ) -> tuple[list[tuple[MeasureLinearization, SuspectedBias]], list[SuspectedBias]]:
-    """What explains the learner, with the ground that it does so on: all of it, or what is learned of one output.
+    """Return what explains the learner, with the ground that it does so on: all of it, or what is learned of one output.
 
     Args:
         something: whether anything is learned of an output.
@@ -335,7 +335,7 @@ def _owners(causes: Sequence[SuspectedBias], moved: Float[np.ndarray, "k n"]) ->
 def named_cause(
     linearization: MeasureLinearization, suspects: Sequence[Suspect], least: float = LEAST_SHARE
 ) -> SuspectedBias | None:
-    """The cause that explains most of the learner, the declared ones first; None where that is less than `least`.
+    """Return the cause that explains most of the learner, the declared ones first; None where that is less than `least`.
 
     Of what no one declared only what the learner sees counts: the rest is no likely cause of what it found.
     """
@@ -352,7 +352,7 @@ def named_cause(
 
 
 def _likeliest(linearization: MeasureLinearization, suspects: Sequence[Suspect]) -> SuspectedBias | None:
-    """What explains most of the learner, however little, declared or not."""
+    """Return what explains most of the learner, however little, declared or not."""
     found = (*_declared(linearization, suspects), *_usual(linearization))
     return max((entry for entry in found if entry.explained), key=explains, default=None)
 
@@ -372,7 +372,7 @@ def _usual(linearization: MeasureLinearization) -> tuple[SuspectedBias, ...]:
 
 
 def _families(linearization: MeasureLinearization) -> tuple[SuspectedBias, ...]:
-    """What every member of the catalogue does that the learner sees."""
+    """Return what every member of the catalogue does that the learner sees."""
     table = linearization.table(catalogue(linearization.problem), certify=False, every=False)
     return tuple(entry for entry in table if entry.seen is not False and (entry.cosine or 0.0) <= MOST_PHYSICS)
 
@@ -380,7 +380,7 @@ def _families(linearization: MeasureLinearization) -> tuple[SuspectedBias, ...]:
 def rival_of(
     linearization: MeasureLinearization, cause: SuspectedBias, suspects: Sequence[Suspect]
 ) -> SuspectedBias | None:
-    """A term that explains as much as a cause that no one declared, and moves θ elsewhere; None where there is none.
+    """Return a term that explains as much as a cause that no one declared, and moves θ elsewhere; None where there is none.
 
     As a dead zone and a saturation of what the physics has a term in: their sum is that term.
     """
@@ -402,7 +402,7 @@ def rival_of(
 def near_causes(
     linearization: MeasureLinearization, cause: SuspectedBias, suspects: Sequence[Suspect]
 ) -> list[SuspectedBias]:
-    """The next best causes, one of each variable, beside one that no one declared and that is not sure."""
+    """Return the next best causes, one of each variable, beside one that no one declared and that is not sure."""
     assert cause.explained
     if cause.suspect in suspects or cause.explained >= SURE_SHARE:
         return []
@@ -417,7 +417,7 @@ def near_causes(
 def left_over(
     linearization: MeasureLinearization, cause: SuspectedBias, suspects: Sequence[Suspect]
 ) -> Float[np.ndarray, "k nt"]:
-    """Standard deviations of the bias of θ that the cause does not tell: k directions, each of one unknown size.
+    """Return standard deviations of the bias of θ that the cause does not tell: k directions, each of one unknown size.
 
     What it leaves of the learner counts as biased by as much for its size as the cause, of unknown sign; beside that by
     what the next best cause makes of it. What may stand instead of the cause is in the hull.
@@ -429,7 +429,7 @@ def left_over(
 
 
 def _moved(cause: SuspectedBias) -> Vector:
-    """What a cause of the size found makes of θ."""
+    """Return what a cause of the size found makes of θ."""
     return (cause.coefficient_found or 0.0) * np.array(cause.bias)
 
 
@@ -442,7 +442,7 @@ def parameter_biases(
     causes: Sequence[tuple[str, float]],
     freedom: float,
 ) -> tuple[ParameterBias, ...]:
-    """A row for each parameter whose bias is known; `ends` are those of its interval, `causes` names and shares."""
+    """Return a row for each parameter whose bias is known; `ends` are those of its interval, `causes` names and shares."""
     found = []
     for name, v, s, b, ci, (cause, share) in zip(names, value, std, bias, ends, causes, strict=True):
         if np.isfinite(b):
@@ -469,7 +469,7 @@ def _warning(
     suspects: Sequence[Suspect],
     of_one: bool,
 ) -> Warning | None:
-    """What a cause biases by more than the standard error: its size, remedies; and how sure the cause is."""
+    """Return what a cause biases by more than the standard error: its size, remedies; and how sure the cause is."""
     own, name = [row for row in rows if row.cause == cause.suspect.name], cause.suspect.name
     large = [row for row in own if (row.errors or 0.0) > 1 and abs(row.relative or 1.0) > _ROUNDING]
     if not large:
@@ -497,7 +497,7 @@ def _warning(
 
 
 def told_biases(large: Sequence[ParameterBias]) -> str:
-    """The largest biases in words."""
+    """Return the largest biases in words."""
     shown = sorted(large, key=lambda entry: -(entry.errors or 0.0))[:_TOLD]
     more = f" and {len(large) - len(shown)} more" if len(large) > len(shown) else ""
     return f"{', '.join(map(_told_bias, shown))}{more}"

@@ -64,12 +64,12 @@ class Change:
 
     @property
     def gains(self) -> bool:
-        """Whether the error is predicted to fall by enough to name it."""
+        """Return whether the error is predicted to fall by enough to name it."""
         return self.fall >= fall_of(WORTH)
 
     @property
     def prediction(self) -> str:
-        """What it is predicted to gain, as a clause."""
+        """Return what it is predicted to gain, as a clause."""
         if self.kind == "criterion" and not self.gains:
             return "the parameters would not be biased so; the error of its free run is not predicted to fall"
         error = "its error one step ahead" if self.of == "prediction" else "the error of its free run"
@@ -93,7 +93,7 @@ def model_changes(
     one_step: Response | None = None,
     functions: float = 0.0,
 ) -> tuple[Change, ...]:
-    """The best change of each kind that is worth making, the best one first.
+    """Return the best change of each kind that is worth making, the best one first.
 
     Args:
         response: of the training data, whose errors are to be explained: the prediction, or with `simulates` the free run.
@@ -110,7 +110,7 @@ def model_changes(
 
 
 def own_share(fit: Estimate, one_step: Response) -> Share:
-    """What the physics' own columns explain of the one-step residual: nothing where they were fitted to it."""
+    """Return what the physics' own columns explain of the one-step residual: nothing where they were fitted to it."""
     with one_blas_thread():
         candidates = Candidates(fit, one_step, False, 0, own=True)
         return candidates.sums.share(range(candidates.base)) if candidates.usable else Share(0.0, 0.0)
@@ -130,7 +130,7 @@ class Candidates:
 
     @property
     def base(self) -> int:
-        """How many columns the physics has, its offsets with it."""
+        """Return how many columns the physics has, its offsets with it."""
         return len(self.fit.theta) + len(self.fit.problem.outputs)
 
     @cached_property
@@ -169,7 +169,7 @@ class Candidates:
 
     @cached_property
     def usable(self) -> bool:
-        """Whether there are enough rows for all columns."""
+        """Return whether there are enough rows for all columns."""
         rows = sum(len(e) - self.first - skipped for e, _, _, skipped in self.stretches)
         return rows * len(self.fit.problem.outputs) >= _ROWS_PER_COLUMN * max(self._width, 8)
 
@@ -229,7 +229,7 @@ class Candidates:
         return np.array([means[lag.channel] for lag in self.lags])
 
     def _carried(self, columns: np.ndarray, piece: Experiment, record: Record) -> np.ndarray:
-        """What the columns become in the free run, from a start that does not depend on them."""
+        """Return what the columns become in the free run, from a start that does not depend on them."""
         form, first, ny = self.fit.model.form, self.first, columns.shape[1]
         states = form.start(piece.outputs, np.arange(first, len(piece)))
         inputs = form.inputs(piece, record)[first - form.first_row :]
@@ -241,7 +241,7 @@ class Candidates:
         return carried
 
     def changes(self, functions: float = 0.0) -> tuple[Change, ...]:
-        """The best of each kind that is worth making, the best one first; as `model_changes`."""
+        """Return the best of each kind that is worth making, the best one first; as `model_changes`."""
         if not self.usable or not np.isfinite(self.sums.grams).all():
             return ()
         problem, of = self.fit.problem, "simulation" if self.simulates else "prediction"
@@ -272,7 +272,7 @@ class Candidates:
         return tuple(best.values())
 
     def _learner(self) -> str:
-        """What a learner could be given."""
+        """Return what a learner could be given."""
         model, problem = self.fit.model, self.fit.problem
         if model.form.bound is None:
             return "a learner"

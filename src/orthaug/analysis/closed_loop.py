@@ -44,7 +44,7 @@ class Feedback:
 
 
 def feedback_in(record: Record) -> tuple[Feedback, ...]:
-    """The inputs that surely follow past outputs; of an input that its own past tells, nothing can be said."""
+    """Return the inputs that surely follow past outputs; of an input that its own past tells, nothing can be said."""
     found = []
     with one_blas_thread():
         for j, channel in enumerate(record.inputs):
@@ -55,7 +55,7 @@ def feedback_in(record: Record) -> tuple[Feedback, ...]:
 
 
 def closed_loop(record: Record) -> tuple[Warning, ...]:
-    """A warning where inputs follow outputs: what that does to estimates, and what to do."""
+    """Return a warning where inputs follow outputs: what that does to estimates, and what to do."""
     found = feedback_in(record)
     if not found:
         return ()
@@ -109,7 +109,7 @@ def told_beside(own: Matrix, others: Matrix, target: Vector) -> tuple[float, flo
 
 
 def _usual(own: Matrix, target: Vector) -> np.ndarray:
-    """The rows on which an input does not jump: those of a reference would hide all that lies between them."""
+    """Return the rows on which an input does not jump: those of a reference would hide all that lies between them."""
     base, kept = np.column_stack([np.ones(len(target)), _scaled(own)]), np.ones(len(target), dtype=bool)
     for _ in range(_ROUNDS):
         if kept.sum() < _ROWS_PER_COLUMN * base.shape[1]:
@@ -165,7 +165,7 @@ def _past(y: Matrix, rows: np.ndarray, lags: int) -> Matrix:
 
 
 def _period(x: Vector, beyond: int) -> int | None:
-    """The lag, larger than `beyond`, at which a signal repeats itself; None where it does not within its half."""
+    """Return the lag, larger than `beyond`, at which a signal repeats itself; None where it does not within its half."""
     n = len(x)
     centred = x - x.mean()
     power = np.abs(np.fft.rfft(centred, 2 * n)) ** 2

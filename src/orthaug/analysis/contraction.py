@@ -49,7 +49,7 @@ def contraction(
     along: Feedback | None = None,
     response: Response | None = None,
 ) -> Contraction | None:
-    """The quadratic norm in which the free run contracts on as many of at most 2000 sampled points as was reached.
+    """Return the quadratic norm in which the free run contracts on as many of at most 2000 sampled points as was reached.
 
     It minimises `max_k ‖T A_k T⁻¹‖₂`, P = TᵀT. Along `T(t) = exp(tX) T`, X symmetric, the logarithm of each norm is
     convex in t with the slope `uᵀXu − vᵀXv`, u and v its singular vectors: there are no false minima. The search starts

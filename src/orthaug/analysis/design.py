@@ -174,7 +174,7 @@ def design_input(
     initial_outputs: Any = 0.0,
     iterations: int = 30,
 ) -> Design:
-    """The input of least predicted error of θ within minimum ≤ u ≤ maximum and |u_k − u_{k−1}| ≤ rate · Ts.
+    """Return the input of least predicted error of θ within minimum ≤ u ≤ maximum and |u_k − u_{k−1}| ≤ rate · Ts.
 
     Args:
         baseline: made of terms; of channels with the names `outputs` and `inputs`.
@@ -219,7 +219,7 @@ def set_known(plant: DesignPlant, known_inputs: Mapping[str, Any] | None, sample
 
 
 def check_samples(samples: Any, plant: DesignPlant) -> int:
-    """How many samples are designed; raises InputError for too few, too many, or more than fit into memory."""
+    """Return how many samples are designed; raises InputError for too few, too many, or more than fit into memory."""
     nt, ny = len(plant.theta), len(plant.outputs)
     samples = check_count(samples, "samples", plant.start + 4 * nt + 16)
     if samples > MOST_SAMPLES:
@@ -238,7 +238,7 @@ def searched(
     weights: Vector | Matrix | None,
     effort: tuple[int, int],
 ) -> Design:
-    """The best input of a plant; the arguments as in `design_input`.
+    """Return the best input of a plant; the arguments as in `design_input`.
 
     Args:
         limits: of the input, its rate, and the cap on the condition number.
@@ -362,7 +362,7 @@ class _Search:
         return Design(*own, math.sqrt(cost), condition, cost, table)
 
     def measured(self, waves: Matrix, period: Vector | None = None) -> tuple[Matrix, Factors]:
-        """The limited signals (N, M) of waves of amplitude 1, and their factors per row; of whole periods if given."""
+        """Return the limited signals (N, M) of waves of amplitude 1, and their factors per row; of whole periods if given."""
         signals, factors, size = [], [], max(1, BATCH // len(waves))
         for first in range(0, waves.shape[1], size):
             u = self.limited(waves[:, first : first + size])
@@ -410,7 +410,7 @@ class _Search:
         return _Scores(cost, parts[0], parts[1], condition, bias, np.linalg.norm(half, axis=1), ranked)
 
     def patterns(self, period: int, seed: int, iterations: int) -> list[Pattern]:
-        """The best patterns, best first; the first few of different lengths were improved."""
+        """Return the best patterns, best first; the first few of different lengths were improved."""
         length = min(self.samples, max(SEARCH_ROWS, SEARCH_PERIODS * period) + self.plant.start)
 
         def tried(patterns: list[Pattern]) -> Vector:

@@ -124,7 +124,7 @@ def _of_lagged(fit: Estimate, one_step: Response | None, free_run: Response | No
 
 
 def _concluded(seen: Finding) -> Diagnosis:
-    """The verdict and its words."""
+    """Return the verdict and its words."""
     misfit = any(t.follows() or t.curved_over(SHARE) for t in seen.tests) or seen.lacks
     if not seen.fit.criterion.simulates:  # errors along a free run are slow, and look like functions of what is slow
         misfit = misfit or any(one.functions > _SMALL for one in seen.predictable)
@@ -156,7 +156,7 @@ def _inconsistent(fit: Estimate, one_step: Response, free_run: Response | None) 
 
 
 def _steps(problem: Problem, tests: tuple[ResidualTest, ...]) -> dict[str, float]:
-    """The steps of the outputs that are measured in such as the one-step error has the size of."""
+    """Return the steps of the outputs that are measured in such as the one-step error has the size of."""
     found = {}
     for i, test in enumerate(tests):
         step = quantum_of(np.concatenate([e.outputs[:, i] for e in problem.record.experiments]))
@@ -166,7 +166,7 @@ def _steps(problem: Problem, tests: tuple[ResidualTest, ...]) -> dict[str, float
 
 
 def _is_small(seen: Finding) -> bool:
-    """Whether what could be predicted is a small effect: no change is worth making."""
+    """Return whether what could be predicted is a small effect: no change is worth making."""
     if seen.lacks or not seen.predictable or seen.drifts or seen.follows(_SMALL):
         return False
     shares = [one.largest(own_past=not seen.simulated) for one in seen.predictable]
@@ -178,7 +178,7 @@ def _is_small(seen: Finding) -> bool:
 
 
 def _effects(fit: Estimate, one_step: Response, free_run: Response | None, simulates: bool) -> dict:
-    """What could be predicted of the error that was minimised, and which changes would do it."""
+    """Return what could be predicted of the error that was minimised, and which changes would do it."""
     response, skip = (free_run, fit.criterion.washout) if simulates else (one_step, 0)
     several = fit.criterion.free_run is not None and not fit.criterion.simulates
     if response is None or several:  # it ran away, or is the error of some steps ahead
@@ -194,7 +194,7 @@ def _effects(fit: Estimate, one_step: Response, free_run: Response | None, simul
 def _with_criterion(
     seen: Finding, free_run: Response | None, trained: list[tuple[Response, int]]
 ) -> tuple[Change, ...]:
-    """The changes of a one-step fit with that of the criterion: in front where it is sensor noise, else if alone."""
+    """Return the changes of a one-step fit with that of the criterion: in front where it is sensor noise, else if alone."""
     if not trained:
         return seen.changes
     (run, skip), unit = trained[0], seen.fit.problem.deviation
@@ -208,7 +208,7 @@ def _with_criterion(
 
 
 def _toward_prediction(seen: Finding) -> tuple[Change, ...]:
-    """One step ahead instead of the free run, where its θ would predict better."""
+    """Return one step ahead instead of the free run, where its θ would predict better."""
     share = own_share(seen.fit, seen.one_step)
     if share.value < _SMALL or not share.sure:
         return ()
@@ -216,13 +216,13 @@ def _toward_prediction(seen: Finding) -> tuple[Change, ...]:
 
 
 def _accounts(problem: Problem, free_run: Response, skip: int) -> bool:
-    """Whether the errors of a free run look like noise on a sensor: white enough, and not following the inputs."""
+    """Return whether the errors of a free run look like noise on a sensor: white enough, and not following the inputs."""
     tests = _tests(problem, free_run, skip)
     return all(test.practically_white(_LITTLE_COLOUR) and not test.follows(_LITTLE_FOLLOWED) for test in tests)
 
 
 def _physics_runs(fit: Estimate) -> list[tuple[Response, int]]:
-    """The free run of the physics alone, trained on the free run; with the rows to skip."""
+    """Return the free run of the physics alone, trained on the free run; with the rows to skip."""
     problem, criterion = fit.problem, Simulation()
     longest = max(len(e) for e in problem.record.experiments) - fit.model.form.first_row
     if longest <= 2 * criterion.washout:
@@ -235,7 +235,7 @@ def _physics_runs(fit: Estimate) -> list[tuple[Response, int]]:
 
 
 def _lags_of(fit: Estimate) -> Lags | None:
-    """The lags that a baseline function needs; terms know their own."""
+    """Return the lags that a baseline function needs; terms know their own."""
     if fit.problem.baseline.function is None:
         return None
     layout, outputs = fit.problem.layout, fit.problem.outputs
@@ -249,7 +249,7 @@ def _lags_of(fit: Estimate) -> Lags | None:
 
 
 def _tests(problem: Problem, response: Response, skip: int = 0) -> tuple[ResidualTest, ...]:
-    """The tests of measured minus model on every usable row of the problem after the first `skip`."""
+    """Return the tests of measured minus model on every usable row of the problem after the first `skip`."""
     record, start = problem.record, problem.rows.start
     residuals, inputs = [], []
     for experiment, trajectory in zip(record.experiments, response.trajectories, strict=True):
@@ -288,7 +288,7 @@ def _noise_in_lags(problem: Problem, ratio: float | None, one_step: Response) ->
 
 
 def wild_rows(response: Response, experiments: Sequence[Experiment]) -> tuple[Warning, ...]:
-    """A warning for each output whose error is mostly that of a few rows, far from all others."""
+    """Return a warning for each output whose error is mostly that of a few rows, far from all others."""
     found = []
     errors = errors_of(response)
     starts = [t.start for t in response.trajectories]

@@ -30,7 +30,7 @@ _LONGEST_STATE = 200  # n0 with eigenvalues at all
 
 
 def linearised(model: Model, visited: RunPoints) -> tuple[RunPoints, Float[np.ndarray, "m n0 n0"], Vector]:
-    """The points with finite derivatives, A_k there, and its spectral radii (m,)."""
+    """Return the points with finite derivatives, A_k there, and its spectral radii (m,)."""
     transition = transitions(model, visited.states, visited.inputs)
     finite = (np.abs(transition) < _NO_DERIVATIVE).all(axis=(1, 2))
     radius = np.abs(np.linalg.eigvals(transition[finite])).max(axis=1, initial=0.0)
@@ -52,7 +52,7 @@ def transitions(
 
 
 def difference_width(points: Float[np.ndarray, "m n"]) -> Vector:
-    """How far differences reach to each side of a point, in each entry."""
+    """Return how far differences reach to each side of a point, in each entry."""
     return _WIDTH * positive(points.std(axis=0))
 
 

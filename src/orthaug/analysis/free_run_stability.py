@@ -52,7 +52,7 @@ def stability(
     box: int = 0,
     largest: float = 1024.0,
 ) -> Stability:
-    """All checks of a model on a record, with a text that says what they mean.
+    """Return all checks of a model on a record, with a text that says what they mean.
 
     Args:
         response: the model's free run of the record, if it is there already.
@@ -83,7 +83,7 @@ def stability(
 
 
 def _sentences(checks: Stability, driven: bool) -> Iterator[tuple[str, str]]:
-    """What the checks say, sentence by sentence; with the code of a warning, or nothing."""
+    """Yield what the checks say, sentence by sentence; with the code of a warning, or nothing."""
     run, contracts = checks.feedback, checks.contraction
     if checks.lipschitz:
         steepest = checks.lipschitz.gradient

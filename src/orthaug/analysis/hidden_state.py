@@ -58,7 +58,7 @@ class FamilyTest:
 
     @property
     def name(self) -> str:
-        """What it is, in words."""
+        """Return what it is, in words."""
         return f"a function of {self.on}" if self.term is None else f"a {self.term.name}"
 
     def is_short(self, least: float) -> bool:
@@ -67,7 +67,7 @@ class FamilyTest:
 
     @property
     def sure(self) -> bool:
-        """Whether it is surely there."""
+        """Return whether it is surely there."""
         return self.p < _LEVEL and self.share > 2 * self.error
 
 
@@ -89,7 +89,7 @@ class StructureTest:
 
     @property
     def found(self) -> bool:
-        """Whether there is any structure."""
+        """Return whether there is any structure."""
         return self.static is not None or self.memory is not None
 
     def is_a_lag(self, one: FamilyTest) -> bool:
@@ -98,7 +98,7 @@ class StructureTest:
 
     @property
     def has_memory(self) -> bool:
-        """Whether a hidden state is the likely cause: memory is sure beside static terms, and predicts clearly more.
+        """Return whether a hidden state is the likely cause: memory is sure beside static terms, and predicts clearly more.
 
         Play and hysteresis of a position follow the sign of its speed, so they stand in for friction that is not quite
         right; a lag of a sample or two is a lag that the physics has too few of.

@@ -121,7 +121,7 @@ class MotionImitation(Imitation):
 def imitation(
     problem: Problem, physics: PhysicsMap | None = None, *, others: bool = True, held: Collection[str] = ()
 ) -> Imitation:
-    """What the problem's learner could imitate, and what `others`, other inputs, would make of it.
+    """Return what the problem's learner could imitate, and what `others`, other inputs, would make of it.
 
     Args:
         held: parameters at a bound.
@@ -192,7 +192,7 @@ def other_inputs(problem: Problem) -> Iterator[tuple[str, ...]]:
 
 
 def _combination(direction: dict[str, float]) -> str:
-    """A direction as a sum: `theta1 - theta2`."""
+    """Return a direction as a sum: `theta1 - theta2`."""
     text = ""
     for name, factor in direction.items():
         size = "" if abs(abs(factor) - 1) < 1e-9 else f"{abs(factor):.4g}*"
@@ -206,7 +206,7 @@ def _listed(words: tuple[str, ...] | list[str]) -> str:
 
 
 def imitation_before(form: MotionDynamics, q: Vector, x: Matrix, u: Matrix) -> MotionImitation:
-    """What a learner on the form's features would share with the physics, and what others would.
+    """Return what a learner on the form's features would share with the physics, and what others would.
 
     Args:
         x: states (M, nx) of a run at the coordinates q; `u` its inputs (M, nu).
@@ -221,7 +221,7 @@ def imitation_before(form: MotionDynamics, q: Vector, x: Matrix, u: Matrix) -> M
 
 
 def _choices(motion: Motion) -> Iterator[tuple[str, ...]]:
-    """Each state alone, all states, all states and inputs."""
+    """Yield each state alone, all states, all states and inputs."""
     states = motion.names_of_states
     yield from ((name,) for name in states)
     yield from (several for several in (states, (*states, *motion.inputs)) if len(several) > 1)

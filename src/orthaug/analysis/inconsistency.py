@@ -58,7 +58,7 @@ class Inconsistency:
 
     @property
     def found(self) -> bool:
-        """Whether the errors are surely coloured, and θ is off by enough to spoil its intervals."""
+        """Return whether the errors are surely coloured, and θ is off by enough to spoil its intervals."""
         return bool(self.p < LEVEL and np.abs(self.apart).max(initial=0.0) > _WORTH)
 
     @property
@@ -69,7 +69,7 @@ class Inconsistency:
 
     @property
     def warning(self) -> Warning:
-        """What to be warned of, with the values that the remedies give."""
+        """Return what to be warned of, with the values that the remedies give."""
         each = [
             f"{self.names[i]} is then {self.modelled[i]:.6g} (std {self.modelled_std[i]:.2g}) instead of "
             f"{self.theta[i]:.6g}, {abs(self.apart[i]):.1f} standard errors away"
@@ -115,7 +115,7 @@ class _Rows(NamedTuple):
         return float(np.sum(self.errors**2) / max(self.errors.size - used, 1.0))
 
     def past(self, errors: Matrix, order: int) -> Matrix:
-        """The errors 1 … `order` rows before (N ny, ny order), zero before the start of an experiment.
+        """Return the errors 1 … `order` rows before (N ny, ny order), zero before the start of an experiment.
 
         Every output has coefficients of its own.
         """
@@ -205,7 +205,7 @@ def _rows(fit: Estimate, one_step: Response) -> _Rows | None:
 
 
 def _plain_std(rows: _Rows) -> Vector:
-    """Standard errors of θ for white and even noise."""
+    """Return standard errors of θ for white and even noise."""
     along, root = rows.influence.along, rows.flat
     return np.sqrt(rows.noise * np.sum((along @ (root.T @ root + rows.stiff)) * along, axis=1))
 
@@ -229,7 +229,7 @@ def _durbin(rows: _Rows, order: int) -> tuple[float, Vector]:
 
 
 def _with_colour(rows: _Rows, order: int) -> tuple[Vector | None, Vector]:
-    """How θ moves with an autoregression of the errors beside it, and its standard errors; None where it diverges."""
+    """Return how θ moves with an autoregression of the errors beside it, and its standard errors; None where it diverges."""
     a, ny, r = rows.flat, rows.errors.shape[1], rows.flat.shape[1]
     moved, rho = np.zeros(r), np.zeros((ny, order))
     nothing = np.zeros(len(rows.influence.along))
@@ -266,7 +266,7 @@ def _with_colour(rows: _Rows, order: int) -> tuple[Vector | None, Vector]:
 
 
 def _by_instruments(rows: _Rows, free_run: Response) -> tuple[Vector, Vector] | None:
-    """How θ moves with the free run's outputs in place of the measured ones, and its standard errors; or None."""
+    """Return how θ moves with the free run's outputs in place of the measured ones, and its standard errors; or None."""
     fit = rows.fit
     form, record = fit.model.form, fit.problem.record
     pieces: Sequence[Matrix] = [

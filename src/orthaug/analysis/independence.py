@@ -157,7 +157,7 @@ def _bin_blocks(e: list[Vector], placed: list[Any], a: Vector, bins: int) -> Ite
 
 
 def _bins(x: Vector, bins: int) -> Int[np.ndarray, "_"] | None:
-    """The bin of each sample, numbered from 0: each distinct value goes where the middle of its ranks falls."""
+    """Return the bin of each sample, numbered from 0: each distinct value goes where the middle of its ranks falls."""
     bins = min(bins, len(x) // _ROWS_PER_BIN)
     if bins < 2 or not np.abs(x).max() < LARGEST:  # true for NaN, too
         return None

@@ -141,7 +141,7 @@ class DeadTime:
 
     @property
     def gain(self) -> str:
-        """What a delay explains, in words."""
+        """Return what a delay explains, in words."""
         late = f"{self.samples} sample{'s' * (self.samples > 1)}"
         return (
             f"with a delay of {late} physics alone leaves {self.residual:.3g} deviations of the output instead of "
@@ -160,7 +160,7 @@ class DeadTime:
 
 
 def dead_times(task: MotionTask, solver: Any) -> tuple[DeadTime, ...]:
-    """The inputs that act clearly later than they do in the equations, and by how many samples.
+    """Return the inputs that act clearly later than they do in the equations, and by how many samples.
 
     Each input is delayed in turn, by 1, 2, 4, … samples while that explains the data better, then by what lies
     between; physics alone is refitted each time from where the last one ended.
@@ -190,7 +190,7 @@ class _Delays:
     """What each delay leaves, and where it ended; none is there from the start."""
 
     def leaves(self, samples: int) -> float:
-        """What physics alone leaves with the input so many samples later."""
+        """Return what physics alone leaves with the input so many samples later."""
         if samples not in self.tried:
             near = self.tried[min(self.tried, key=lambda known: (abs(known - samples), self.tried[known][0]))][1]
             problem = self.task.problem
@@ -213,7 +213,7 @@ def _least(leaves: Callable[[int], float], most: int) -> int:
 
 
 def _delayed(record: Record, number: int, samples: int) -> Record:
-    """An input later by so many samples; what it was before the record is its first value."""
+    """Return an input later by so many samples; what it was before the record is its first value."""
 
     def moved(inputs: np.ndarray) -> np.ndarray:
         column = inputs[:, number]

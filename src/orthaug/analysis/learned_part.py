@@ -68,7 +68,7 @@ def learned_reach(fit: MotionEstimate, x: Matrix, u: Matrix) -> Matrix | None:
 def _slopes(
     form: MotionDynamics, numbers: Numbers, x: Float[Array, "m nx"], u: Float[Array, "m nu"]
 ) -> tuple[Float[Array, "m nl np"], Float[Array, "m nl n"]]:
-    """How the learner's part follows p̂, and (c, w)."""
+    """Return how the learner's part follows p̂, and (c, w)."""
     c = numbers.theta - numbers.theta_aux
 
     def at(x: Any, u: Any) -> Any:

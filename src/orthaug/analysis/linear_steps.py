@@ -54,21 +54,21 @@ class LaggedStep:
         return self.memory.inputs
 
     def state_at(self, rest: Any, inputs: Any) -> Any:
-        """The state that keeps outputs `rest` and inputs for long."""
+        """Return the state that keeps outputs `rest` and inputs for long."""
         now = dict(zip((*self.rest, *self.inputs), (*rest, *inputs), strict=True))
         return jnp.stack([now[lag.channel] for lag in self.memory.lags] or [jnp.zeros(())])[: len(self.memory.lags)]
 
     def advance(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Any]:
-        """The next state and the outputs."""
+        """Return the next state and the outputs."""
         return step_lagged(self.form, numbers, self.memory, state, inputs)
 
     def unrest(self, numbers: Numbers, rest: Any, inputs: Any) -> tuple[Any, Any]:
-        """What is zero at rest, and the outputs."""
+        """Return what is zero at rest, and the outputs."""
         y = self.advance(numbers, self.state_at(rest, inputs), inputs)[1]
         return y - rest, y
 
     def seen(self, rest: Vector, inputs: Vector) -> Vector | None:
-        """The learner's features at rest; None where there is no telling what training reached of them."""
+        """Return the learner's features at rest; None where there is no telling what training reached of them."""
         if self.form.bound is None or not self.form.differentiable:
             return None
         now = dict(zip((*self.rest, *self.inputs), (*rest, *inputs), strict=True))
@@ -103,7 +103,7 @@ class MotionStep:
         return self.form.motion.inputs
 
     def state_at(self, rest: Any, inputs: Any) -> Any:
-        """The state itself."""
+        """Return the state itself."""
         return jnp.asarray(rest)
 
     def advance(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Any]:
@@ -111,7 +111,7 @@ class MotionStep:
         return following, parts.total
 
     def field(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Any]:
-        """The derivatives in time, or the next state of a discrete motion, and the outputs."""
+        """Return the derivatives in time, or the next state of a discrete motion, and the outputs."""
         return sum(self.form.rates(numbers, state, inputs)), self.form.observed(numbers, state, inputs)
 
     def unrest(self, numbers: Numbers, rest: Any, inputs: Any) -> tuple[Any, Any]:
@@ -128,7 +128,7 @@ Step = LaggedStep | MotionStep
 
 
 def step_of(model: Model | MotionModel) -> Step:
-    """The step to linearise; a spline through the record is replaced by straight lines between samples."""
+    """Return the step to linearise; a spline through the record is replaced by straight lines between samples."""
     if isinstance(model, Model):
         return LaggedStep(model.form, model.memory)
     form = model.form
@@ -139,7 +139,7 @@ def step_of(model: Model | MotionModel) -> Step:
 
 
 def sizes_of(model: Model | MotionModel) -> Vector:
-    """How large what is looked for at rest is over the training data."""
+    """Return how large what is looked for at rest is over the training data."""
     if isinstance(model, Model):
         size = np.asarray(model.largest_output, dtype=float)
     else:
@@ -149,7 +149,7 @@ def sizes_of(model: Model | MotionModel) -> Vector:
 
 @partial(jax.jit, static_argnames="step")
 def at_rest(step: Step, numbers: Numbers, rest: Any, inputs: Any, width: Any) -> tuple[Any, Any, Any]:
-    """What is zero at rest (ne,), the outputs (ny,), and how both follow rest and inputs (ne + ny, ne + nu)."""
+    """Return what is zero at rest (ne,), the outputs (ny,), and how both follow rest and inputs (ne + ny, ne + nu)."""
     both, point = partial(_unrest, step, numbers), jnp.concatenate([rest, inputs])
     value = both(point)
     slope = jax.jacfwd(both)(point) if step.form.differentiable else by_differences(both, point, width)
@@ -163,7 +163,7 @@ def _unrest(step: Step, numbers: Numbers, point: Any) -> Any:
 
 
 def _moved(numbers: Numbers, unknowns: Any) -> Numbers:
-    """The numbers with others for (θ, weights), or for θ alone."""
+    """Return the numbers with others for (θ, weights), or for θ alone."""
     nt = len(numbers.theta)
     weights = unknowns[nt:] if len(unknowns) > nt else numbers.weights
     return numbers._replace(theta=unknowns[:nt], weights=weights)
@@ -171,7 +171,7 @@ def _moved(numbers: Numbers, unknowns: Any) -> Numbers:
 
 @partial(jax.jit, static_argnames="step")
 def unrest_along(step: Step, numbers: Numbers, rest: Any, inputs: Any, unknowns: Any, root: Any) -> Float[Array, "m r"]:
-    """How what is zero at rest, and the outputs, move along the columns of `root` (n, r)."""
+    """Return how what is zero at rest, and the outputs, move along the columns of `root` (n, r)."""
 
     def of(p: Any) -> Any:
         return _unrest(step, _moved(numbers, p), jnp.concatenate([rest, inputs]))
@@ -180,7 +180,7 @@ def unrest_along(step: Step, numbers: Numbers, rest: Any, inputs: Any, unknowns:
 
 
 def _of_point(step: Step, field: bool, numbers: Numbers) -> Callable[[Any], Any]:
-    """A step, or the field, as a function of state and inputs in one vector."""
+    """Return a step, or the field, as a function of state and inputs in one vector."""
     n = len(step.states)
     function = step.field if field and isinstance(step, MotionStep) else step.advance
     return lambda point: jnp.concatenate(function(numbers, point[:n], point[n:]))
@@ -219,7 +219,7 @@ def slope_at(step: Step, field: bool, numbers: Numbers, rest: Any, inputs: Any, 
 def slope_along(
     step: Step, field: bool, numbers: Numbers, rest: Any, inputs: Any, unknowns: Any, along: tuple[Any, Any, Any]
 ) -> Float[Array, "r m n"]:
-    """How `[[A, B], [C, D]]` moves where (rest, inputs, unknowns) move along the columns of `along`."""
+    """Return how `[[A, B], [C, D]]` moves where (rest, inputs, unknowns) move along the columns of `along`."""
 
     def of(rest: Any, inputs: Any, p: Any) -> Any:
         return _slope(step, field, _moved(numbers, p), rest, inputs, None)
@@ -229,5 +229,5 @@ def slope_along(
 
 
 def difference_widths(size: Vector, inputs: Vector) -> Vector:
-    """How far differences reach, for rest and inputs."""
+    """Return how far differences reach, for rest and inputs."""
     return _WIDTH * np.concatenate([size, np.maximum(np.abs(inputs), 1.0)])

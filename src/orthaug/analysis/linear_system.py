@@ -87,7 +87,7 @@ class System:
 
     @property
     def integrates(self) -> bool:
-        """Whether a pole stands where the static gain is asked for."""
+        """Return whether a pole stands where the static gain is asked for."""
         rest = 1.0 if self.step is not None else 0.0
         size = 1.0 if self.step is not None else max(np.abs(self.modes.values).max(initial=0.0), 1e-300)
         return bool(np.any(np.abs(self.modes.values - rest) < _UNIT * size)) or (
@@ -95,12 +95,12 @@ class System:
         )
 
     def at(self, frequency: Vector) -> Response:
-        """The response to sines at frequencies [Hz]."""
+        """Return the response to sines at frequencies [Hz]."""
         turn = 2j * np.pi * frequency
         return self.response(turn if self.step is None else np.exp(turn * self.step))
 
     def gain(self) -> Response | None:
-        """The static gain (1, ny, nu); None for a system that integrates."""
+        """Return the static gain (1, ny, nu); None for a system that integrates."""
         if self.integrates:
             return None
         found = self.response(np.array([1.0 + 0j if self.step is not None else 0j]))
@@ -153,7 +153,7 @@ def modes_of(a: Matrix, moved: Float[np.ndarray, "r n n"] | None) -> Modes:
 
 
 def _core(a: Matrix) -> tuple[Matrix, Matrix]:
-    """A on what it never forgets: `Qᵀ A Q` with all eigenvalues but 0, and Q.
+    """Return a on what it never forgets: `Qᵀ A Q` with all eigenvalues but 0, and Q.
 
     Kernels are divided out one after the other, each by an orthogonal basis.
     """
@@ -169,7 +169,7 @@ def _core(a: Matrix) -> tuple[Matrix, Matrix]:
 
 
 def _right(a: Matrix, value: complex, start: Any) -> Any:
-    """The right eigenvector of a pole, by inverse iteration."""
+    """Return the right eigenvector of a pole, by inverse iteration."""
     shifted = a - value * (1 + 1e-12) * np.eye(len(a))
     for _ in range(2):
         start = np.linalg.solve(shifted, start / np.linalg.norm(start))
@@ -202,7 +202,7 @@ class Continuous:
 
 
 def converted(system: System, method: str, memory: Memory | None, names: tuple[str, ...]) -> Continuous | str:
-    """The system in continuous time, or why there is none."""
+    """Return the system in continuous time, or why there is none."""
     step = system.step
     assert step is not None
     dead = np.zeros(system.d.shape[1], dtype=int)
@@ -232,7 +232,7 @@ def converted(system: System, method: str, memory: Memory | None, names: tuple[s
 
 
 def observer_form(system: System, memory: Memory) -> tuple[System, Any]:
-    """A lagged system with `Σ n_i` states, n_i the largest lag in the equation of output i; and dead samples (nu,).
+    """Return a lagged system with `Σ n_i` states, n_i the largest lag in the equation of output i; and dead samples (nu,).
 
     `s_i,l⁺ = s_i,l+1 + Σ_j a_ij,l y_j + Σ_j b_ij,l u_j`, `y_i = s_i,1 + Σ_j d_ij u_j`.
     """

@@ -160,7 +160,7 @@ class LinearView:
 
     @property
     def stable(self) -> bool:
-        """Whether all poles lie inside the unit circle."""
+        """Return whether all poles lie inside the unit circle."""
         return all(pole.magnitude < 1 for pole in self.poles)
 
     @cached_property
@@ -170,7 +170,7 @@ class LinearView:
         return None if std is None else interval(self.system.matrix, std, self.freedom)
 
     def to_control(self, time: str = "discrete") -> control.StateSpace:
-        """The system for python-control, with the names of states, inputs and outputs.
+        """Return the system for python-control, with the names of states, inputs and outputs.
 
         Args:
             time: "discrete" at the sampling time, or "continuous". Dead time is no part of a continuous system.
@@ -208,7 +208,7 @@ def about(value: Any, relative: Any, freedom: float) -> Any:
 
 
 def bode_of(system: System, frequency: Vector, freedom: float) -> Bode:
-    """The response on a grid, with bands of `ln G`: `δ ln|G| = Re(δG/G)`, `δ arg G = Im(δG/G)`."""
+    """Return the response on a grid, with bands of `ln G`: `δ ln|G| = Re(δG/G)`, `δ arg G = Im(δG/G)`."""
     found = system.at(frequency)
     if found.moved is None:
         return Bode(frequency, found.value, None, None)
@@ -220,7 +220,7 @@ def bode_of(system: System, frequency: Vector, freedom: float) -> Bode:
 
 
 def gain_of(system: System, freedom: float) -> tuple[Matrix | None, Any]:
-    """The static gain (ny, nu) and its intervals."""
+    """Return the static gain (ny, nu) and its intervals."""
     found = system.gain()
     if found is None:
         return None, None
@@ -244,7 +244,7 @@ def poles_of(system: System, own: System | None, freedom: float) -> tuple[Pole, 
 
 
 def _matched(z: Any, own: System, step: float) -> list[tuple[complex, Any]]:
-    """The equations' poles in the order of the sampled ones, each with how it moves."""
+    """Return the equations' poles in the order of the sampled ones, each with how it moves."""
     from scipy.optimize import linear_sum_assignment
 
     modes = own.modes
@@ -312,7 +312,7 @@ class Linearization:
         return iter(self.views)
 
     def agreement(self, view: LinearView) -> Agreement | None:
-        """How near a view comes to what data alone say, where coherence is at least a half; None without any."""
+        """Return how near a view comes to what data alone say, where coherence is at least a half; None without any."""
         if self.measured is None:
             return None
         known = self.measured.coherence[:, :, None] >= COHERENT

@@ -54,7 +54,7 @@ def linearize(
     frequencies: Any = None,
     continuous: str = "zoh",
 ) -> Linearization:
-    """The model about its points of rest as linear systems, with 95 % intervals from its joint covariance.
+    """Return the model about its points of rest as linear systems, with 95 % intervals from its joint covariance.
 
     Args:
         model: a fitted model; of a fit the record is that of training.
@@ -130,7 +130,7 @@ def _frequencies(given: Any, step: float) -> Vector | None:
 
 
 def _spread(model: Model | MotionModel, fit: Any) -> tuple[_Spread | None, list[Warning]]:
-    """The covariance to take intervals from, and what is to be said of it."""
+    """Return the covariance to take intervals from, and what is to be said of it."""
     joint, nt = model.statistics.joint(len(model.theta)), len(model.theta)
     if not model.form.differentiable:
         text = "the learner has no derivatives (a function from another toolbox): differences stand in, no intervals."
@@ -193,7 +193,7 @@ def _view(
 
 
 def _system(search: Search, point: OperatingPoint, spread: _Spread | None, time: float | None) -> System:
-    """The matrices of a step of `time`, or of the equations, and how they move along the covariance."""
+    """Return the matrices of a step of `time`, or of the equations, and how they move along the covariance."""
     step, numbers, field = search.step, search.numbers, time is None
     width = difference_widths(search.size, point.inputs)
     matrix = np.asarray(slope_at(step, field, numbers, point.rest, point.inputs, width))
@@ -215,14 +215,14 @@ def _system(search: Search, point: OperatingPoint, spread: _Spread | None, time:
 
 
 def _smooth(model: Model | MotionModel) -> bool:
-    """Whether inputs run on a spline between samples."""
+    """Return whether inputs run on a spline between samples."""
     if not isinstance(model, MotionModel) or not model.inputs:
         return False
     return model.form.motion.hold == "spline" and model.form.motion.integrator != "discrete"
 
 
 def _without_next(system: System) -> System:
-    """A step that reads the inputs of the next sample as one that does not: `z = x − B₁ u` (first-order hold)."""
+    """Return a step that reads the inputs of the next sample as one that does not: `z = x − B₁ u` (first-order hold)."""
 
     def rewritten(matrix: Any, moved: Any = None) -> Any:
         """Of the matrices, or of their change `moved`."""
@@ -251,7 +251,7 @@ def _shape(system: System) -> tuple[int, int]:
 
 
 def _kinks(search: Search, point: OperatingPoint, system: System) -> list[Warning]:
-    """Whether differences tell of another slope than the derivative: then the view holds in no neighbourhood."""
+    """Return whether differences tell of another slope than the derivative: then the view holds in no neighbourhood."""
     if not search.step.form.differentiable:
         return []
     width, n = difference_widths(search.size, point.inputs), system.states

@@ -50,7 +50,7 @@ class MeasureLinearization:
         return physical_slopes(self.physics, self.problem, self.theta)
 
     def table(self, suspects: Sequence[Suspect], *, certify: bool, every: bool = True) -> tuple[SuspectedBias, ...]:
-        """What every suspect does to θ.
+        """Return what every suspect does to θ.
 
         Args:
             every: also what is zero on all points.
@@ -101,7 +101,7 @@ class MeasureLinearization:
 def bias_under(
     linearization: MeasureLinearization, suspects: Sequence[Suspect] = (), *, certify_usual: bool = True
 ) -> list[dict[str, Any]]:
-    """The bias of every suspect under a measure, for θ and, to first order, for the physical parameters; for JSON.
+    """Return the bias of every suspect under a measure, for θ and, to first order, for the physical parameters; for JSON.
 
     Args:
         suspects: those that were named; without any, the usual ones that have an effect.
@@ -128,7 +128,7 @@ def bias_under(
 def _expected(
     entry: SuspectedBias, physics: PhysicsMap | None, problem: Problem, theta: Vector
 ) -> dict[str, dict[str, float | None]] | None:
-    """What the guessed coefficient does to each physical parameter: p of θ̂ less p without the bias."""
+    """Return what the guessed coefficient does to each physical parameter: p of θ̂ less p without the bias."""
     if physics is None or entry.expected is None:
         return None
     biased, true = (physical_of(physics, problem, t) for t in (theta, theta - np.array(entry.expected)))
@@ -139,7 +139,7 @@ def _expected(
 
 
 def _relative(entry: SuspectedBias, slopes: tuple[dict[str, Vector], Vector] | None) -> dict[str, float | None] | None:
-    """The bias of each physical parameter over its value."""
+    """Return the bias of each physical parameter over its value."""
     if slopes is None or entry.physical is None:
         return None
     return {name: bias / p if p else None for (name, bias), p in zip(entry.physical, slopes[1], strict=True)}
@@ -208,7 +208,7 @@ def physical_with_bias(
 
 
 def _met(found: PhysicalEstimate) -> bool:
-    """Whether there is p that gives θ."""
+    """Return whether there is p that gives θ."""
     return all(warning.code != "physics_not_met" for warning in found.warnings)
 
 

@@ -86,7 +86,7 @@ def _welch(record: Record) -> MeasuredResponse:
 
 
 def _period(record: Record) -> int | None:
-    """The rows after which the only input of the only experiment repeats itself exactly, twice at least."""
+    """Return the rows after which the only input of the only experiment repeats itself exactly, twice at least."""
     if len(record.inputs) != 1 or len(record.experiments) != 1:
         return None
     u = record.experiments[0].inputs[:, 0] - record.experiments[0].inputs[:, 0].mean()

@@ -76,7 +76,7 @@ class MissingLags:
 
 
 def missing_lags(fit: Estimate, one_step: Response | None = None) -> MissingLags | None:
-    """The tests of a one-step fit; None where the learner sees all lags, without a learner, or with too few rows.
+    """Return the tests of a one-step fit; None where the learner sees all lags, without a learner, or with too few rows.
 
     Args:
         one_step: the prediction of the training data, if it is there already.
@@ -93,7 +93,7 @@ def missing_lags(fit: Estimate, one_step: Response | None = None) -> MissingLags
 
 
 def lag_tests(problem: Problem, residual: Matrix, hidden: Sequence[int]) -> tuple[LagTest, ...]:
-    """The test of each lag, by its place in the layout.
+    """Return the test of each lag, by its place in the layout.
 
     Args:
         residual: of every row, (N, ny), in the outputs' units.
@@ -146,7 +146,7 @@ def _score_test(h: Float[np.ndarray, "N ny q"], e: Matrix, cuts: list[int]) -> t
 
 
 def _orthonormal(columns: Matrix, size: float) -> Matrix:
-    """An orthonormal basis of the columns, without what is rounding beside `size`."""
+    """Return an orthonormal basis of the columns, without what is rounding beside `size`."""
     if not columns.shape[1] or not size:
         return columns[:, :0]
     u, sigma, _ = np.linalg.svd(columns, full_matrices=False)

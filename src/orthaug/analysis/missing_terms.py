@@ -107,7 +107,7 @@ def _at_rows(form: MotionDynamics, numbers: Numbers, x: Any, u: Any) -> tuple[An
 
 
 def _followed(to_next: Any, to_output: Any, added: Any, equations: Sequence[int], form: MotionDynamics) -> Any:
-    """The columns (m, T, ny, n0 + n + q) of the outputs, from one row to the next."""
+    """Return the columns (m, T, ny, n0 + n + q) of the outputs, from one row to the next."""
     m, steps, n0, own = to_next.shape
     q, h = len(added), form.sampling_time
     columns = np.zeros((m, steps, to_output.shape[2], own + q * len(equations)))
@@ -196,7 +196,7 @@ class MissingTest:
     terms: tuple[MissingTerm, ...]
 
     def found(self, level: float, share: float) -> bool:
-        """Whether a term is surely missing and explains more than a share."""
+        """Return whether a term is surely missing and explains more than a share."""
         return bool(self.p < level and self.terms and self.terms[0].share > share)
 
 
@@ -257,7 +257,7 @@ def doubted(fit: MotionEstimate) -> tuple[int, ...]:
 
 
 def _values(z: Matrix, one_sided: list[bool]) -> Any:
-    """A constant, then the shapes of each variable: (1 + 5 n, r) of z (n, r).
+    """Return a constant, then the shapes of each variable: (1 + 5 n, r) of z (n, r).
 
     Where a variable keeps its sign a jump at zero is a constant, and its size itself: zeros stand for them.
     """
@@ -350,7 +350,7 @@ def _regression(found: Sensitivities, filters: tuple[list[Vector], Vector] | Non
 
 
 def _range(columns: Matrix, rank: float = 1e-10) -> Matrix:
-    """An orthonormal basis of what columns span, each taken as of size 1."""
+    """Return an orthonormal basis of what columns span, each taken as of size 1."""
     size = np.linalg.norm(columns, axis=0)
     columns = columns[:, size > 0] / size[size > 0]
     if not columns.size:
@@ -381,7 +381,7 @@ def _filtered(found: Sensitivities, segment: int, filters: tuple[list[Vector], V
 
 
 def _filters(found: Sensitivities, left: Vector) -> tuple[list[Vector], Vector]:
-    """The autoregression of what is left of each output's errors, and the size of its innovations."""
+    """Return the autoregression of what is left of each output's errors, and the size of its innovations."""
     ny = found.errors.shape[2]
     pieces: list[list[Vector]] = [[] for _ in range(ny)]
     for one in _cut(found, left):
@@ -399,7 +399,7 @@ def _filters(found: Sensitivities, left: Vector) -> tuple[list[Vector], Vector]:
 
 
 def _cut(found: Sensitivities, whole: Vector) -> Iterator[Vector]:
-    """A vector over all rows in the pieces of its segments."""
+    """Yield a vector over all rows in the pieces of its segments."""
     ny, place = found.errors.shape[2], 0
     for there in found.scored:
         count = int(there.sum()) * ny

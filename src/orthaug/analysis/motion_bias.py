@@ -82,7 +82,7 @@ class TermBias:
 
     @property
     def removed_by(self) -> str | None:
-        """What leaves the parameters unbiased by it; None where that is not known, or nothing is to remove."""
+        """Return what leaves the parameters unbiased by it; None where that is not known, or nothing is to remove."""
         if self.seen is None:
             return "nothing" if self.moved.any() else None
         return self._told.removed_by
@@ -134,7 +134,7 @@ class MotionLinearization:
 
     @property
     def learns(self) -> bool:
-        """Whether there is a learner."""
+        """Return whether there is a learner."""
         return self.place.segmented.bound is not None
 
     @cached_property
@@ -149,7 +149,7 @@ class MotionLinearization:
         return rows * np.sqrt(self.field.weight)[:, None] / self.field.size
 
     def usual(self) -> tuple[MotionSuspect, ...]:
-        """What is often missing, with widths by where its run goes."""
+        """Return what is often missing, with widths by where its run goes."""
         place = self.place
         segmented = place.segmented if len(place.w) else place.segmented.alone
         x, u = segmented.trajectory(place.c, place.w, place.states)
@@ -160,7 +160,7 @@ class MotionLinearization:
     def table(
         self, suspects: Sequence[MotionSuspect], used: float | None = None, steps: int | None = None
     ) -> list[TermBias]:
-        """What every suspect does; nothing where the free run has no sensitivities.
+        """Return what every suspect does; nothing where the free run has no sensitivities.
 
         Args:
             used: weights that a fit used, where it is asked what its residual tells; `steps` of a block, where its
@@ -210,7 +210,7 @@ class MotionLinearization:
         return TermBias(*own, *told, None if seen else residual)
 
     def after(self, causes: Sequence[TermBias], table: Sequence[TermBias]) -> list[TermBias]:
-        """What terms that the learner sees explain of it without causes that it sees; nothing of other causes."""
+        """Return what terms that the learner sees explain of it without causes that it sees; nothing of other causes."""
         if self.learned is None or not all(cause.seen for cause in causes):
             return []
         learned, gone = np.array(self.learned), {cause.suspect for cause in causes}
@@ -224,7 +224,7 @@ class MotionLinearization:
         return found
 
     def held(self, suspect: MotionSuspect) -> Matrix:
-        """A term that the learner sees (M, nl), weighed."""
+        """Return a term that the learner sees (M, nl), weighed."""
         return self.weighed(self._rows(suspect, suspect.place(self.motion)))
 
     def physics_cosine(self, suspect: MotionSuspect) -> float:
@@ -246,16 +246,16 @@ class MotionLinearization:
         return TermBias(*own, None, size, True, explained, found, None, None)
 
     def told(self) -> Matrix:
-        """The learner (M, nl), weighed, beside the shared directions."""
+        """Return the learner (M, nl), weighed, beside the shared directions."""
         return self.beside(self.weighed(np.asarray(self.learned)))
 
     def beside(self, values: Matrix) -> Matrix:
-        """What the shared directions leave of values (M, nl) that are weighed."""
+        """Return what the shared directions leave of values (M, nl) that are weighed."""
         basis = self.shared.basis
         return values - self.phi.phi @ self.phi.solve_along(values, basis) if basis.shape[1] else values
 
     def _rows(self, suspect: MotionSuspect, place: int) -> Matrix:
-        """The term (M, nl) in the learned equations, 0 where it acts elsewhere."""
+        """Return the term (M, nl) in the learned equations, 0 where it acts elsewhere."""
         learned = learned_places(self.motion)
         rows = np.zeros((len(self.field.x), len(learned)))
         if place in learned:
@@ -264,7 +264,7 @@ class MotionLinearization:
         return np.where(np.isfinite(rows), rows, 0.0)
 
     def _explained(self, held: Matrix) -> tuple[float | None, float | None]:
-        """How much of the learner a term explains, and with which coefficient, beside the shared directions."""
+        """Return how much of the learner a term explains, and with which coefficient, beside the shared directions."""
         if self.learned is None:
             return None, None
         rest, tilde, size = self.beside(held), self.told(), np.linalg.norm(held)
@@ -275,7 +275,7 @@ class MotionLinearization:
         return float(min((product / np.linalg.norm(tilde)) ** 2, 1.0)), float(product / norm)
 
     def sees(self, suspect: MotionSuspect) -> bool:
-        """Whether the learner is added where the term acts, and the term is a function of what the learner sees."""
+        """Return whether the learner is added where the term acts, and the term is a function of what the learner sees."""
         if suspect.place(self.motion) not in learned_places(self.motion):
             return False
         start, end = self._moves
@@ -295,7 +295,7 @@ class MotionLinearization:
 
 
 def told_by_residual(response: TermsResponse, used: float, steps: int | None) -> list[ResidualStep | None]:
-    """What the residual tells of every term, with standard errors that hold for coloured errors where `steps` is given.
+    """Return what the residual tells of every term, with standard errors that hold for coloured errors where `steps` is given.
 
     Args:
         used: weights that the fit used.
@@ -318,7 +318,7 @@ def told_by_residual(response: TermsResponse, used: float, steps: int | None) ->
 
 
 def suspected_bias(fit: MotionEstimate, suspects: Sequence[MotionSuspect]) -> list[TermBias]:
-    """What terms that the equations of a fitted motion may lack do to its parameters, and what tells of them.
+    """Return what terms that the equations of a fitted motion may lack do to its parameters, and what tells of them.
 
     Raises:
         InputError: suspects that the motion cannot have, or a fit of difference equations.
@@ -335,7 +335,7 @@ def suspected_bias(fit: MotionEstimate, suspects: Sequence[MotionSuspect]) -> li
 
 
 def softened_bias(fit: MotionEstimate, suspects: Sequence[MotionSuspect]) -> list[TermBias]:
-    """What friction among the suspects does that turns round smoothly, of widths by the size of what it acts on.
+    """Return what friction among the suspects does that turns round smoothly, of widths by the size of what it acts on.
 
     Nothing without a learner: it alone shows the shape of what is missing.
     """
@@ -347,7 +347,7 @@ def softened_bias(fit: MotionEstimate, suspects: Sequence[MotionSuspect]) -> lis
 
 
 def usual_biases(fit: MotionEstimate) -> tuple[list[TermBias], list[TermBias]]:
-    """What usual terms do that nobody declared, and their smooth forms.
+    """Return what usual terms do that nobody declared, and their smooth forms.
 
     Of these only what the learner sees counts: the rest is no likely cause of what it found. Nothing where it could
     imitate no change of a parameter.

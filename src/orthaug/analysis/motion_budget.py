@@ -75,7 +75,7 @@ class MotionBudget:
         return _size(self.cause)
 
     def of(self, name: str) -> ParameterBias | None:
-        """The bias of a parameter."""
+        """Return the bias of a parameter."""
         return next((entry for entry in self.parameters if entry.name == name), None)
 
 
@@ -98,7 +98,7 @@ def told_budget(
 
 
 def families_of(linearization: MotionLinearization) -> list[TermBias]:
-    """What every member of the catalogue does that the learner sees; nothing where it could imitate no parameter."""
+    """Return what every member of the catalogue does that the learner sees; nothing where it could imitate no parameter."""
     if linearization.learned is None or not linearization.shared.basis.shape[1]:
         return []
     motion, field = linearization.motion, linearization.field
@@ -187,7 +187,7 @@ def _is_clearly_less(share: float, other: float) -> bool:
 
 
 def _size(cause: TermBias) -> float:
-    """The coefficient by the learner, else by what the free run leaves."""
+    """Return the coefficient by the learner, else by what the free run leaves."""
     if cause.explained is None and cause.residual is not None:
         return cause.residual.coefficient
     return cause.coefficient_found or 0.0
@@ -200,14 +200,14 @@ def rivals_of(cause: TermBias, table: Sequence[TermBias]) -> list[TermBias]:
 
 
 def _moved(entry: TermBias) -> Vector:
-    """What a term of the size found makes of the parameters."""
+    """Return what a term of the size found makes of the parameters."""
     return (entry.coefficient_found or 0.0) * entry.per_unit
 
 
 def _of_learner(
     fit: MotionEstimate, table: Sequence[TermBias], smooth: Sequence[TermBias], families: Sequence[TermBias] = ()
 ) -> _Causes | None:
-    """The term that explains most of the learner, or one of each equation that together leave much less of it."""
+    """Return the term that explains most of the learner, or one of each equation that together leave much less of it."""
     best, other = max(table, key=explains, default=None), max((*smooth, *families), key=explains, default=None)
     if other is not None and (best is None or _is_clearly_less(explains(best), explains(other))):
         best = other
@@ -241,7 +241,7 @@ def one_of_each(linearization: MotionLinearization, table: Sequence[TermBias]) -
     cosines = (rows @ rows.T) / np.outer(sizes, sizes)
 
     def beside(others: list[int]) -> tuple[Vector, Vector]:
-        """The share of the learner that others explain with each term, and its coefficient."""
+        """Return the share of the learner that others explain with each term, and its coefficient."""
         rest = cosines - cosines[:, others] @ np.linalg.pinv(cosines[np.ix_(others, others)]) @ cosines[others]
         own, product = rest.diagonal()[:-1], rest[:-1, -1]
         fitted = np.where(own > _SAME, product / np.where(own > _SAME, own, 1.0), 0.0)
@@ -289,7 +289,7 @@ def _weighed(
 
 
 def _of_residual(table: Sequence[TermBias]) -> _Causes | None:
-    """The term that lowers the residual most, where that is no chance and most of what is no white noise.
+    """Return the term that lowers the residual most, where that is no chance and most of what is no white noise.
 
     What stays beyond white noise counts as biased by as much for its size, of unknown sign.
     """
@@ -305,7 +305,7 @@ def _of_residual(table: Sequence[TermBias]) -> _Causes | None:
 
 
 def _motion_warning(found: _Causes, rows: Sequence[ParameterBias], *, learns: bool) -> Warning | None:
-    """One sentence on what is biased by more than its standard error: causes and their sizes."""
+    """Return one sentence on what is biased by more than its standard error: causes and their sizes."""
     large = [entry for entry in rows if (entry.errors or 0.0) > 1]
     if not large:
         return None

@@ -112,7 +112,7 @@ def _without(start: np.ndarray, rows: np.ndarray) -> np.ndarray:
 def _run(
     form: MotionDynamics, numbers: Numbers, start: Float[Array, "nx m"], inputs: Float[Array, "T nu m"]
 ) -> tuple[Float[Array, "T ny m"], Float[Array, "T ny n m"]]:
-    """Outputs of every run, and their sensitivities to start and coordinates."""
+    """Return outputs of every run, and their sensitivities to start and coordinates."""
     numbers = form.prepared(numbers)
 
     def step(carry: Any, row: Any) -> Any:
@@ -143,7 +143,7 @@ def design_motion_input(
     seed: int = 0,
     iterations: int = 30,
 ) -> Design:
-    """The input of least predicted error of p within minimum ≤ u ≤ maximum and |u_k − u_{k−1}| ≤ rate · Ts.
+    """Return the input of least predicted error of p within minimum ≤ u ≤ maximum and |u_k − u_{k−1}| ≤ rate · Ts.
 
     Args:
         sampling_time: Ts, s.

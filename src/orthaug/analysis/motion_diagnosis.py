@@ -72,7 +72,7 @@ def diagnose_motion(fit: MotionEstimate, free_run: Response) -> Diagnosis | None
 
 
 def _late(fit: MotionEstimate) -> tuple[DeadTime, ...]:
-    """Inputs that act later, by physics alone, as it was trained in front of the learner: by the same programs."""
+    """Return inputs that act later, by physics alone, as it was trained in front of the learner: by the same programs."""
     solver, bound = LevenbergMarquardt().within_limit, fit.model.form.bound
     posed, learner = (fit.problem, bound.learner) if bound else (without_learner(fit.problem), None)
     return dead_times(on_longest(posed, fit.criterion, solver, Orthogonal(), learner), solver)
@@ -138,7 +138,7 @@ def _words(
 
 
 def _traces(tests: tuple[ResidualTest, ...], shares: tuple[Predictable, ...]) -> str:
-    """What tests surely see beside the noise, too little to conclude otherwise."""
+    """Return what tests surely see beside the noise, too little to conclude otherwise."""
     told = [f"{test.name} follows {', '.join(test.correlated_inputs)}" for test in tests if test.correlated_inputs]
     told += [f"{test.name} is not flat over {', '.join(over)}" for test in tests if (over := test.curved_over(0.0))]
     if not told:
@@ -159,7 +159,7 @@ def _colour(tests: tuple[ResidualTest, ...], shares: tuple[Predictable, ...]) ->
 
 
 def _named(lacks: MissingTest) -> str:
-    """The terms that are most likely missing."""
+    """Return the terms that are most likely missing."""
     best, *others = lacks.terms
     text = f"Most likely {best} would explain {percent(best.share)} of its square"
     if others:

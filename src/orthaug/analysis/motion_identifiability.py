@@ -62,7 +62,7 @@ def identified(segmented: SegmentedMotion) -> RankReport | None:
 
 
 def _rank(segmented: SegmentedMotion) -> Excitation | None:
-    """The highest rank of some points near the initial parameters; None where no run is finite.
+    """Return the highest rank of some points near the initial parameters; None where no run is finite.
 
     Of several of that rank the one that ties most: of `a*b` with a = 0 it looks as if b alone were idle.
     """

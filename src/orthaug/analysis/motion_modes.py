@@ -104,7 +104,7 @@ def _of_modes(model: MotionModel, x: Matrix, u: Matrix) -> MotionStability:
 
 
 def _sizes(found: Modes) -> str:
-    """How many integrators there are, and how fast the other modes."""
+    """Return how many integrators there are, and how fast the other modes."""
     count = found.integrators
     whole = f"{count} integrators" if count > 1 else "an integrator" if count else ""
     if not found.fastest:
@@ -126,7 +126,7 @@ def _without_growth(found: Modes) -> str:
 
 
 def modes(model: MotionModel, x: Matrix, u: Matrix) -> Modes | None:
-    """The eigenvalues over at most 2000 points, spread evenly; None where no derivative is finite."""
+    """Return the eigenvalues over at most 2000 points, spread evenly; None where no derivative is finite."""
     finite = np.isfinite(x).all(axis=1)
     x, u = x[finite], u[finite]
     rows = np.linspace(0, len(x) - 1, min(len(x), _POINTS)).astype(int) if len(x) else np.zeros(0, dtype=int)

@@ -78,7 +78,7 @@ class TermsResponse:
         return len(self.place.c)
 
     def moved(self, k: int, apart: Bool[np.ndarray, "np"]) -> tuple[Vector, Float[np.ndarray, "nw"]]:
-        """What a unit of term k adds to c (np,), and to the weights; parameters in `apart` stay.
+        """Return what a unit of term k adds to c (np,), and to the weights; parameters in `apart` stay.
 
         Args:
             apart: those whose change the learner could undo, so that it holds it instead.
@@ -97,11 +97,11 @@ class TermsResponse:
         return self.information + np.diag(ridge)
 
     def held(self, dw: Vector, x: Matrix, u: Matrix) -> Matrix:
-        """What a change of the weights adds to the learner (M, nl) at states (M, nx) and inputs (M, nu)."""
+        """Return what a change of the weights adds to the learner (M, nl) at states (M, nx) and inputs (M, nu)."""
         return np.asarray(_along(self.form, self.numbers, dw, x, u))
 
     def cosine(self, k: int) -> float | None:
-        """How much of the term's effect on the outputs the fit takes up, in [0, 1]; None where it has none."""
+        """Return how much of the term's effect on the outputs the fit takes up, in [0, 1]; None where it has none."""
         own = self.information[self.parameters + k, self.parameters + k]
         return float(np.sqrt(np.clip(1 - self._beside(k)[1] / own, 0.0, 1.0))) if own > 0 else None
 
@@ -112,7 +112,7 @@ class TermsResponse:
         return float(np.sqrt(max(self.information[self.parameters + k, self.parameters + k], 0.0) / whole))
 
     def step(self, k: int) -> tuple[float, float, Vector] | None:
-        """The coefficient that lowers what is left most, by how much that falls, and the row (n,) of scores it is.
+        """Return the coefficient that lowers what is left most, by how much that falls, and the row (n,) of scores it is.
 
         None where the fit could hold the term as well.
         """
@@ -125,7 +125,7 @@ class TermsResponse:
         return coefficient, coefficient**2 * left, row / left
 
     def squares(self) -> tuple[float, float]:
-        """The sum of squares that the free run leaves, and as much of it as neighbouring steps do not share.
+        """Return the sum of squares that the free run leaves, and as much of it as neighbouring steps do not share.
 
         The second is half the sum of squared differences (von Neumann 1941): all of white noise, little of what physics
         leaves out.
@@ -140,7 +140,7 @@ class TermsResponse:
         return whole, min(apart * float(scored.sum() / max(pairs.sum(), 1)), whole)
 
     def scores(self) -> FreeRunScores:
-        """The scores of all unknowns, for standard errors that hold for coloured errors."""
+        """Return the scores of all unknowns, for standard errors that hold for coloured errors."""
         place, objective = self.place, self.place.segmented.objective()
         missed = np.moveaxis(np.asarray(place.segmented.segments.start) - place.states, -1, 1)
         prior = LOOSER**2 * objective.start_rows.T @ objective.start_rows
@@ -148,7 +148,7 @@ class TermsResponse:
         return FreeRunScores(*made, 1.0, self.slope, missed @ prior)
 
     def _beside(self, k: int) -> tuple[Vector, float]:
-        """The row (n,) that takes what was fitted off the term, and what information on it is left."""
+        """Return the row (n,) that takes what was fitted off the term, and what information on it is left."""
         i = self.parameters + k
         row = np.zeros(len(self.fitted))
         row[i] = 1.0
@@ -215,7 +215,7 @@ class SubstepBias:
 
 
 def substep_bias(fit: MotionEstimate) -> SubstepBias | None:
-    """The part of p̂ that is the integrator's; None of a motion that is not integrated, or without normal equations.
+    """Return the part of p̂ that is the integrator's; None of a motion that is not integrated, or without normal equations.
 
     Args:
         fit: of a motion, from `estimate`.
@@ -250,7 +250,7 @@ def substep_bias(fit: MotionEstimate) -> SubstepBias | None:
 
 
 def _warnings(found: SubstepBias, fit: MotionEstimate) -> tuple[Warning, ...]:
-    """One sentence on the parameters that finer steps would move."""
+    """Return one sentence on the parameters that finer steps would move."""
     told = []
     for name, moved, errors, value in zip(found.names, found.value, found.errors, fit.values, strict=True):
         share = f", {percent(moved / value, sign='+')}" if value else ""

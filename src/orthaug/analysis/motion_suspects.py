@@ -65,7 +65,7 @@ class MotionSuspect:
         unit: str = "",
         name: str | None = None,
     ) -> MotionSuspect:
-        """A suspect of a known kind (those of `Suspect.of`), times a factor.
+        """Return a suspect of a known kind (those of `Suspect.of`), times a factor.
 
         Args:
             on: an expression of states, inputs, parameters and definitions, such as `"v"`.
@@ -83,7 +83,7 @@ class MotionSuspect:
         return cls(label if name is None else name, text, equation, coefficient, unit, jump)
 
     def parsed(self, motion: Motion) -> Expression:
-        """The expression on the motion's names.
+        """Return the expression on the motion's names.
 
         Raises:
             InputError: names that the motion does not have, what is no arithmetic.
@@ -91,7 +91,7 @@ class MotionSuspect:
         return parse_named(self.expression, motion.known, f"suspect '{self.name}'")
 
     def place(self, motion: Motion) -> int:
-        """The number of its equation, outputs after states.
+        """Return the number of its equation, outputs after states.
 
         Raises:
             InputError: an unknown equation, or none where there are several.
@@ -112,7 +112,7 @@ class MotionSuspect:
         return SuspectedTerm(self.name, self.place(motion), self.parsed(motion))
 
     def values(self, motion: Motion, p: Vector, x: Matrix, u: Matrix) -> Vector:
-        """The expression (M,) at states (M, nx) and inputs (M, nu), also where it is not finite."""
+        """Return the expression (M,) at states (M, nx) and inputs (M, nu), also where it is not finite."""
         with np.errstate(all="ignore"):
             found = self.parsed(motion).value(motion.values(x.T, u.T, p, np), np)
         return np.broadcast_to(np.asarray(found, dtype=float), (len(x),))
@@ -124,7 +124,7 @@ def equations_of(motion: Motion) -> tuple[str, ...]:
 
 
 def usual_places(motion: Motion) -> tuple[int, ...]:
-    """The equations of states that a term is likely to lack in: the learned ones, else those that have parameters."""
+    """Return the equations of states that a term is likely to lack in: the learned ones, else those that have parameters."""
     if motion.learned[0]:
         return motion.learned[0]
     if motion.functions is not None:
@@ -147,7 +147,7 @@ def check_motion_suspects(suspects: Sequence[MotionSuspect], problem: MotionProb
 
 
 def motion_width(on: str, motion: Motion, x: Matrix, u: Matrix) -> float:
-    """A width from states x (M, nx) and inputs u (M, nu): the median of |on| where it is not zero, to six digits.
+    """Return a width from states x (M, nx) and inputs u (M, nu): the median of |on| where it is not zero, to six digits.
 
     Raises:
         InputError: an expression that cannot be read, that is not finite, or zero everywhere.
@@ -195,7 +195,7 @@ def softened(
 
 
 def usual_motion_suspects(motion: Motion, x: Matrix, u: Matrix, on: Sequence[str] = ()) -> tuple[MotionSuspect, ...]:
-    """What is often missing: friction, drag and hardening of every state, what bends an input, an offset.
+    """Return what is often missing: friction, drag and hardening of every state, what bends an input, an offset.
 
     Args:
         x: states (M, nx) that it is about; with inputs u (M, nu) they tell the widths.

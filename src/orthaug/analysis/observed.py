@@ -89,7 +89,7 @@ class Observations:
         return f"Observations({', '.join(c.name for c in self.outputs)}, {rows} samples)"
 
     def consistency(self, skip: int | None = None) -> Consistency:
-        """Whether the innovations are white and of the expected size, without the first `skip` rows (`settled`)."""
+        """Return whether the innovations are white and of the expected size, without the first `skip` rows (`settled`)."""
         skip = self.settled if skip is None else skip
         pieces = [(one, slice(max(one.start, skip), None)) for one in self.experiments]
         total = float(sum(np.sum(one.square[rows]) for one, rows in pieces))

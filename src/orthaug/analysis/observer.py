@@ -56,7 +56,7 @@ class Observer:
         return f"Observer({self.model!r})"
 
     def tuned(self, record: Record) -> Observer:
-        """The observer whose noises, each times a factor, are the most likely ones for a record.
+        """Return the observer whose noises, each times a factor, are the most likely ones for a record.
 
         A noise that is zero stays so.
 
@@ -81,7 +81,7 @@ class Observer:
         return ObserverState(self, form.start(experiment, record, row, self.noise, size))
 
     def run(self, record: Record) -> Observations:
-        """Outputs and states along a record, each row told by what was measured up to it.
+        """Return outputs and states along a record, each row told by what was measured up to it.
 
         Raises:
             InputError: other channels, too few rows, or an estimate that leaves all bounds.
@@ -93,7 +93,7 @@ class Observer:
         return Observations(told, self.model.outputs, names, record.sampling_time, self._settled)
 
     def predict(self, record: Record, horizon: int = 1) -> Response:
-        """Each row from the state that was estimated `horizon` samples before it, with its standard deviation.
+        """Return each row from the state that was estimated `horizon` samples before it, with its standard deviation.
 
         A motion's first rows, which tell its state, have no value, as in its `predict`.
 
@@ -115,7 +115,7 @@ class Observer:
         return self.model.fitting(record, need_outputs=True, gaps=True)
 
     def _along(self, experiment: Experiment, record: Record) -> tuple[ObserverRun, StateEstimate, Matrix]:
-        """What an experiment tells, what is believed before its rows, and what their steps read."""
+        """Return what an experiment tells, what is believed before its rows, and what their steps read."""
         form, numbers, size = self.model.filtering
         first = form.first_row
         self.model.check_rows(experiment, first)
@@ -219,7 +219,7 @@ class ObserverState:
         return self.told
 
     def update(self, inputs: Any, outputs: Any) -> ObserverState:
-        """One sample later.
+        """Return one sample later.
 
         Args:
             inputs: those of the sample, as `model.step_inputs` lists them.
@@ -276,7 +276,7 @@ def _observed(told: FilterRow, experiment: Experiment, first: int) -> ObserverRu
 
 
 def _checked(noise: Any, disturbances: int, outputs: int) -> Noise:
-    """Two covariances; raises InputError for anything else."""
+    """Return two covariances; raises InputError for anything else."""
     sizes = {"state": disturbances, "output": outputs}
     if not isinstance(noise, Noise):
         raise InputError(f"`noise` must be an oa.Noise(state, output) of two covariances; got {shown(noise)}.")

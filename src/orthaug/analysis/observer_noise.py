@@ -34,7 +34,7 @@ _LARGE = 1e12
 
 
 def by_verdict(model: Model | MotionModel, verdict: str | None = None) -> Noise:
-    """The noises of a fitted model as the verdict on its residual says, by default what it carries.
+    """Return the noises of a fitted model as the verdict on its residual says, by default what it carries.
 
     That are noises which the likelihood of its training data told, else those of its verdict.
 
@@ -76,7 +76,7 @@ def with_share(model: Model | MotionModel, noise: Matrix, share: float) -> Noise
 
 
 def of_fit(fit: Estimate | MotionEstimate) -> Noise:
-    """The noises of a fit by the verdict on its residual; where both are there, by the likelihood of its data.
+    """Return the noises of a fit by the verdict on its residual; where both are there, by the likelihood of its data.
 
     Raises:
         InputError: a fit that failed, or without an estimate of its noise.
@@ -92,7 +92,7 @@ def of_fit(fit: Estimate | MotionEstimate) -> Noise:
 
 
 def to_keep(fit: Estimate | MotionEstimate, verdict: str) -> Noise | None:
-    """What a fit keeps with its model, by the likelihood of some of its rows, where its residual has both noises.
+    """Return what a fit keeps with its model, by the likelihood of some of its rows, where its residual has both noises.
 
     None where the verdict's rule is as good, without an estimate of the noise, and where a filter takes long.
     """
@@ -105,7 +105,7 @@ def to_keep(fit: Estimate | MotionEstimate, verdict: str) -> Noise | None:
 
 
 def most_likely(model: Model | MotionModel, begun: Noise, record: Record, rows: int = _TUNED_ROWS) -> Noise:
-    """The noises of most likelihood for a record among `(q Q, r R)`, over its first rows.
+    """Return the noises of most likelihood for a record among `(q Q, r R)`, over its first rows.
 
     Where an R or Q that is zero begins, it stays zero.
     """

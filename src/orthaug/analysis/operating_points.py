@@ -39,7 +39,7 @@ class Slopes:
     """Numbers of the outputs whose values are equations too."""
 
     def following(self, change: Float[np.ndarray, "m r"]) -> Float[np.ndarray, "k r"]:
-        """How (rest, inputs) follow where the equations change (implicit function theorem)."""
+        """Return how (rest, inputs) follow where the equations change (implicit function theorem)."""
         moved = np.zeros((len(self.free), change.shape[1]))
         if self.free.any():
             moved[self.free] = -np.linalg.pinv(self.matrix[:, self.free], rcond=_SINGULAR) @ change
@@ -146,16 +146,16 @@ class Search:
 
     @property
     def free(self) -> Bool[np.ndarray, "k"]:
-        """What is looked for, of rest and inputs."""
+        """Return what is looked for, of rest and inputs."""
         return np.isnan(self.given)
 
     @property
     def scale(self) -> Vector:
-        """What counts as one, of rest and inputs."""
+        """Return what counts as one, of rest and inputs."""
         return np.concatenate([self.size, np.maximum(np.abs(self.middle[len(self.size) :]), 1.0)])
 
     def equations(self, point: Vector) -> tuple[Vector, Matrix, Vector]:
-        """What must be zero (m,), how it follows rest and inputs (m, k), and the outputs."""
+        """Return what must be zero (m,), how it follows rest and inputs (m, k), and the outputs."""
         ne = len(self.step.rest)
         width = difference_widths(self.size, point[ne:])
         value, outputs, slope = map(np.asarray, at_rest(self.step, self.numbers, point[:ne], point[ne:], width))
@@ -165,7 +165,7 @@ class Search:
         return value, np.where(np.isfinite(slope), slope, 0.0), outputs
 
     def starts(self) -> Float[np.ndarray, "s k"]:
-        """The middle, then points of the box that training reached."""
+        """Return the middle, then points of the box that training reached."""
         from scipy.stats import qmc  # slow to import
 
         free = self.free
@@ -178,7 +178,7 @@ class Search:
 
 
 def operating_points(search: Search) -> tuple[list[OperatingPoint], list[Warning]]:
-    """All that were found, the nearest to the middle first.
+    """Return all that were found, the nearest to the middle first.
 
     Raises:
         InputError: none.
@@ -205,7 +205,7 @@ def operating_points(search: Search) -> tuple[list[OperatingPoint], list[Warning
 
 
 def _within_reach(search: Search, found: list[OperatingPoint]) -> tuple[list[OperatingPoint], list[Warning]]:
-    """Those that training came near to, if there are any, and what is to be said."""
+    """Return those that training came near to, if there are any, and what is to be said."""
     warnings = []
     ne = len(search.size)
     near = [one for one in found if np.all(np.abs(one.rest) <= _FAR * search.size[:ne])] or found[:1]
@@ -230,7 +230,7 @@ def _whole(point: OperatingPoint) -> Vector:
 
 
 def _solved(search: Search, start: Vector, unit: Vector) -> Vector | None:
-    """The point of rest that a start leads to; None where it leads nowhere."""
+    """Return the point of rest that a start leads to; None where it leads nowhere."""
     from scipy.optimize import least_squares  # slow to import
 
     free, point = search.free, start.copy()

@@ -53,7 +53,7 @@ class Tape:
         return self._node((function, *slots))
 
     def trace(self, expression: Expression, coefficient: float | None = None) -> Node:
-        """The value of an expression, times a coefficient if given."""
+        """Return the value of an expression, times a coefficient if given."""
         nodes = {lag: self._node(lag) for lag in expression.lags}
         self.lags |= {lag: node.slot for lag, node in nodes.items()}
         value = self.asarray(expression.evaluate(nodes, self))

@@ -104,7 +104,7 @@ class BlockSums:
         return cls(np.stack([both[a:b].T @ both[a:b] for a, b in zip(edges[:-1], edges[1:], strict=True)]))
 
     def share(self, columns: Sequence[int], beside: Sequence[int] = ()) -> Share:
-        """What `columns` explain of the target beyond those `beside` which they stand."""
+        """Return what `columns` explain of the target beyond those `beside` which they stand."""
         return Share.of(self._missed(list(beside)), self._missed([*beside, *columns]))
 
     def _missed(self, columns: list[int]) -> Vector:
@@ -121,12 +121,12 @@ class BlockSums:
 
 
 def from_own_past(signal: Pieces, lags: int) -> Share:
-    """What a short autoregression explains of a signal less its mean."""
+    """Return what a short autoregression explains of a signal less its mean."""
     return from_lags(signal, [signal], range(1, lags + 1))
 
 
 def from_lags(signal: Pieces, others: Sequence[Pieces], lags: Sequence[int]) -> Share:
-    """What lags of other signals explain of a signal, beside a constant."""
+    """Return what lags of other signals explain of a signal, beside a constant."""
     if not others or not len(lags):
         return Share(0.0, 0.0)
     target, columns = [], []
@@ -146,7 +146,7 @@ def from_lags(signal: Pieces, others: Sequence[Pieces], lags: Sequence[int]) -> 
 
 
 def from_neighbours(x: Matrix, signal: Vector) -> Share:
-    """What a smooth function of the rows x explains of a signal (N,), whatever its form.
+    """Return what a smooth function of the rows x explains of a signal (N,), whatever its form.
 
     Where two rows lie close to each other, their values differ by the rest alone: half the mean square of that is the
     variance of the rest (Rice 1984). Where they lie far apart, as in many dimensions, it explains less than there is.
@@ -180,14 +180,14 @@ class Predictable:
     functions: float
 
     def largest(self, own_past: bool = True) -> float:
-        """The largest share; without the own past where that is of no use, as in a free run."""
+        """Return the largest share; without the own past where that is of no use, as in a free run."""
         return max(self.inputs, self.functions, self.own_past if own_past else 0.0)
 
 
 def predictable(
     problem: Problem, response: Response, skip: int = 0, *, simulates: bool = False
 ) -> tuple[Predictable, ...]:
-    """What could be predicted of a response's errors on the training data, after the first `skip` rows.
+    """Return what could be predicted of a response's errors on the training data, after the first `skip` rows.
 
     Args:
         simulates: a free run, whose errors are no function of the regressor.

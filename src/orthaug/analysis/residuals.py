@@ -70,7 +70,7 @@ class ResidualTest:
         return self.white is not False or self.largest_acf is None or self.largest_acf < small
 
     def follows(self, small: float = PRACTICALLY_WHITE) -> list[str]:
-        """Inputs that the residual follows: surely, by enough to matter, and beyond the band of the figure."""
+        """Return inputs that the residual follows: surely, by enough to matter, and beyond the band of the figure."""
         band = max([small, *(test.band for test in self.cross.values() if test is not None)])
         named = [(name, self.cross[name]) for name in self.correlated_inputs]
         return [name for name, test in named if test is not None and test.largest > band]
@@ -93,7 +93,7 @@ def analyse(
     level: float = 0.01,
     fitted: int = 0,
 ) -> tuple[ResidualTest, ...]:
-    """All tests of the residual of every output, in their order.
+    """Return all tests of the residual of every output, in their order.
 
     The regressor tests ask for bin means that differ from the overall mean: an offset, reported as `mean`, is no curve.
 
@@ -161,7 +161,7 @@ def _rejected(tests: Mapping[str, Any], level: float) -> tuple[str, ...]:
 
 
 def _channels(experiments: Sequence[Matrix], names: Sequence[str], what: str, lengths: Sequence[int]) -> Channels:
-    """Every channel in one piece per experiment, by its name."""
+    """Return every channel in one piece per experiment, by its name."""
     check_unique(names, f"`{what}`:")
     if len(experiments) != len(lengths) or not lengths:
         raise InputError(f"`{what}` has {len(experiments)} experiments but `residuals` has {len(lengths)}; at least 1.")

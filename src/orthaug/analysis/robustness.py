@@ -29,7 +29,7 @@ _LEVEL = 0.01  # of the test whether a residual is white
 
 
 def robust_where_asked(fit: Estimate, response: Response) -> Estimate:
-    """The fit with the standard errors that its errors ask for: plain, or robust against colour or uneven size.
+    """Return the fit with the standard errors that its errors ask for: plain, or robust against colour or uneven size.
 
     One step ahead that is HC3 where White's test finds that the size of the errors goes with what moves θ, and Newey
     and West where they are coloured and the rows suffice. `response` is the prediction of the training rows.
@@ -50,7 +50,7 @@ def robust_where_asked(fit: Estimate, response: Response) -> Estimate:
 
 
 def robust_free_run(fit: Any) -> Any:
-    """The fit of a free run, of lagged physics or of a motion, with batch means where its errors ask for them.
+    """Return the fit of a free run, of lagged physics or of a motion, with batch means where its errors ask for them.
 
     Where they are coloured and the record holds too few stretches that do not remember each other for blocks, a model
     of their colour takes the place of these; where it says that the record is too short, there are no standard errors,
@@ -70,7 +70,7 @@ def robust_free_run(fit: Any) -> Any:
 
 
 def _by_colour(fit: Any) -> Any:
-    """The fit with the standard errors of an autoregressive model of its errors; without any where these are few."""
+    """Return the fit with the standard errors of an autoregressive model of its errors; without any where these are few."""
     if _has_rows(fit, fit.scores.segments.count):
         found = _robust(fit, None, "autoregressive")
         if found.std_kind == "autoregressive" and found.freedom >= _FEWEST_INDEPENDENT:
@@ -79,7 +79,7 @@ def _by_colour(fit: Any) -> Any:
 
 
 def _robust(fit: Any, lags: int | None, kind: str | None = None) -> Any:
-    """The fit with robust standard errors; as it is where there can be none."""
+    """Return the fit with robust standard errors; as it is where there can be none."""
     try:
         return fit.robust(lags) if kind is None else fit.robust(lags, kind)
     except InputError:  # an ensemble, or a fit without statistics
@@ -87,7 +87,7 @@ def _robust(fit: Any, lags: int | None, kind: str | None = None) -> Any:
 
 
 def _has_rows(fit: Any, rows: int) -> bool:
-    """Whether the derivatives of every row exist, and fit into memory."""
+    """Return whether the derivatives of every row exist, and fit into memory."""
     gram = fit.model.statistics.gram
     if gram is None or fit.model.numbers.tilt is not None or isinstance(fit.problem, StreamedProblem):
         return False
@@ -95,7 +95,7 @@ def _has_rows(fit: Any, rows: int) -> bool:
 
 
 def _is_uneven(fit: Any, slopes: Any, errors: Matrix) -> bool:
-    """Whether White's test rejects errors whose size has nothing to do with what moves the parameters."""
+    """Return whether White's test rejects errors whose size has nothing to do with what moves the parameters."""
     made = fit.moves_by()
     if made is None or not np.isfinite(slopes).all() or not np.isfinite(errors).all():
         return False
@@ -109,7 +109,7 @@ def _is_uneven(fit: Any, slopes: Any, errors: Matrix) -> bool:
 
 
 def _withheld(fit: Any) -> Any:
-    """The fit without standard errors, which says why."""
+    """Return the fit without standard errors, which says why."""
     segments = fit.scores.segments
     lengths = [correlation_length(errors) for errors in fit.scores.errors()]
     known = [length for length in lengths if length is not None]
@@ -159,7 +159,7 @@ def _memory(fit: Estimate, response: Response) -> int | None:
 
 
 def block_of(fit: Any) -> int | None:
-    """Steps of a block for the errors of the free run; None where these are white, or leave too few blocks."""
+    """Return steps of a block for the errors of the free run; None where these are white, or leave too few blocks."""
     if fit.scores is None or not _is_tested(fit) or not _coloured_run(fit):
         return None
     steps = fit.scores.block()
@@ -169,18 +169,18 @@ def block_of(fit: Any) -> int | None:
 
 
 def _is_tested(fit: Any) -> bool:
-    """Whether the errors of the free run are finite and more than rounding."""
+    """Return whether the errors of the free run are finite and more than rounding."""
     errors = fit.scores.errors()  # (ny, segments, steps), 0 where a step is not scored
     size = np.sqrt(np.sum(errors**2, axis=(1, 2)) / max(fit.scores.segments.count, 1))
     return bool(np.isfinite(size).all() and not np.all(size / fit.problem.deviation < ROUNDING))
 
 
 def _coloured_run(fit: Any) -> bool:
-    """Whether the errors of the free run are coloured in some output."""
+    """Return whether the errors of the free run are coloured in some output."""
     return any(_is_coloured([one[one != 0] for one in output]) for output in fit.scores.errors())
 
 
 def _is_coloured(pieces: list[Vector]) -> bool:
-    """Whether Ljung-Box rejects a white residual and a correlation is large enough to matter."""
+    """Return whether Ljung-Box rejects a white residual and a correlation is large enough to matter."""
     box, acf = ljung_box(pieces, LAGS), autocorrelation(pieces, sum(map(len, pieces)) // ROWS_PER_LAG)
     return box is not None and acf is not None and box.p < _LEVEL and np.abs(acf[1:]).max() >= PRACTICALLY_WHITE

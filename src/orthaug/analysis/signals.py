@@ -123,7 +123,7 @@ def swept_sine(
     sampling_time: float = 1.0,
     logarithmic: bool = False,
 ) -> Vector:
-    """A sine whose frequency runs through `band` (Hz, from first to second) once in N samples, from zero on.
+    """Return a sine whose frequency runs through `band` (Hz, from first to second) once in N samples, from zero on.
 
     Raises:
         InputError: numbers out of range, a frequency above half the sampling frequency.
@@ -148,7 +148,7 @@ def swept_square(
     sampling_time: float = 1.0,
     logarithmic: bool = False,
 ) -> Vector:
-    """The sign of `swept_sine`, ±amplitude (the positive level where the sine is zero)."""
+    """Return the sign of `swept_sine`, ±amplitude (the positive level where the sine is zero)."""
     wave = swept_sine(samples, amplitude=1.0, band=band, sampling_time=sampling_time, logarithmic=logarithmic)
     return _amplitude(amplitude) * np.where(wave >= 0, 1.0, -1.0)
 
@@ -166,7 +166,7 @@ def square(samples: int, *, amplitude: float, period: int) -> Vector:
 
 
 def binary_pattern(samples: int, pattern: Sequence[int] | np.ndarray, *, amplitude: float, hold: int = 1) -> Vector:
-    """A pattern of 0 and 1 as ∓amplitude, each held for `hold` samples, repeated until there are N.
+    """Return a pattern of 0 and 1 as ∓amplitude, each held for `hold` samples, repeated until there are N.
 
     Raises:
         InputError: numbers out of range, a pattern that is empty or holds anything but 0 and 1.
@@ -226,7 +226,7 @@ def sign_symmetric(u: Vector) -> Vector:
 
 
 def limit_rate(u: Vector, largest_step: float, start: float | None = None) -> Vector:
-    """The signal that follows u with steps of at most `largest_step` a sample, (N,): what a slow actuator does.
+    """Return the signal that follows u with steps of at most `largest_step` a sample, (N,): what a slow actuator does.
 
     `v_k = v_{k−1} + clip(u_k − v_{k−1}, ±largest_step)`; it stays within the range of u and `start`.
 
@@ -251,7 +251,7 @@ def limit_rate(u: Vector, largest_step: float, start: float | None = None) -> Ve
 
 
 def space_filling(samples: int, order: int, *, amplitude: float, seed: int, spread: float = 1.0) -> Vector:
-    """A sequence whose vectors of `order` successive samples fill the box [−amplitude, amplitude]^order evenly.
+    """Return a sequence whose vectors of `order` successive samples fill the box [−amplitude, amplitude]^order evenly.
 
     A de Bruijn sequence (a random Eulerian circuit of the graph whose nodes are order − 1 symbols) over
     `m = ⌊(N − order + 1)^(1/order)⌋` levels meets each of the m^order cells of the box exactly once; within its
@@ -290,7 +290,7 @@ def space_filling(samples: int, order: int, *, amplitude: float, seed: int, spre
 
 
 def fill_distance(u: Vector, order: int, *, amplitude: float) -> float:
-    """How far a point of the box [−amplitude, amplitude]^order can be from all lag vectors of u, in units of amplitude.
+    """Return how far a point of the box [−amplitude, amplitude]^order can be from all lag vectors of u, in units of amplitude.
 
     Euclidean, over 4096 points of a Sobol sequence: a lower bound of the true one, the same on every call.
 
@@ -318,7 +318,7 @@ def lag_vectors(u: Vector, order: int) -> Matrix:
 
 
 def _de_bruijn(levels: int, order: int, rng: np.random.Generator) -> np.ndarray:
-    """A cyclic sequence of `levels**order` symbols in which every word of `order` symbols stands once.
+    """Return a cyclic sequence of `levels**order` symbols in which every word of `order` symbols stands once.
 
     Hierholzer's algorithm on the graph of words of order − 1 symbols. The branches are shuffled, so that a part of
     the sequence is even too: the usual lexicographic sequence spends its first part on the lowest levels.
@@ -339,7 +339,7 @@ def _de_bruijn(levels: int, order: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def _van_der_corput(count: int) -> Vector:
-    """The first `count` radical inverses in base 2, spread to the multiples of 1/count in [0, 1)."""
+    """Return the first `count` radical inverses in base 2, spread to the multiples of 1/count in [0, 1)."""
     from scipy.stats import qmc
 
     return np.argsort(np.argsort(qmc.Halton(1, scramble=False).random(count)[:, 0])) / count
@@ -366,7 +366,7 @@ def _signal(u: Any) -> Vector:
 
 
 def _band(band: Any, sampling_time: float, *, falling: bool = False) -> tuple[float, float]:
-    """Two frequencies, Hz, of 0 to Nyquist's; the second larger, or at least another one where `falling` is allowed."""
+    """Return two frequencies, Hz, of 0 to Nyquist's; the second larger, or at least another one where `falling` is allowed."""
     highest = 0.5 / sampling_time
     numbers = isinstance(band, Sequence | np.ndarray) and not isinstance(band, str) and len(band) == 2
     if not numbers or not all(isinstance(f, int | float | np.number) and math.isfinite(f) for f in band):

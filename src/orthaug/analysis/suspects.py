@@ -103,7 +103,7 @@ class Suspect:
         name: str | None = None,
         constants: Mapping[str, float] | None = None,
     ) -> Suspect:
-        """A suspect of a known kind, applied to the channel expression x = `on`.
+        """Return a suspect of a known kind, applied to the channel expression x = `on`.
 
         | kind | δ | width |
         |---|---|---|
@@ -145,7 +145,7 @@ class Suspect:
             raise InputError(f"suspect '{self.name}': {error}") from None
 
     def sampled(self, sampling_time: float) -> Suspect:
-        """The suspect with this value [s] of `Ts`, where its expression reads that without declaring it."""
+        """Return the suspect with this value [s] of `Ts`, where its expression reads that without declaring it."""
         if not self.parsed.unsampled:
             return self
         return replace(self, constants=(*dict(self.constants).items(), (SAMPLING_TIME, float(sampling_time))))
@@ -175,7 +175,7 @@ class Suspect:
         return values
 
     def form(self, x: Matrix, layout: Layout) -> Vector:
-        """The expression on rows of the regressor (N,), also where it is not finite."""
+        """Return the expression on rows of the regressor (N,), also where it is not finite."""
         with np.errstate(all="ignore"):
             return _evaluate(self.parsed, x, layout, f"suspect '{self.name}'")
 
@@ -248,7 +248,7 @@ def suspect_columns(
 
 
 def data_width(on: str, x: Matrix, layout: Layout, constants: Mapping[str, float] | None = None) -> float:
-    """A width from the data's own scale: the median of |x| where x is not zero, to six digits, in the unit of `on`.
+    """Return a width from the data's own scale: the median of |x| where x is not zero, to six digits, in the unit of `on`.
 
     Half of the moving samples then lie inside a dead zone, a saturation or a Stribeck peak, so that the
     data show both sides of it.
@@ -266,7 +266,7 @@ def data_width(on: str, x: Matrix, layout: Layout, constants: Mapping[str, float
 
 
 def usual_suspects(problem: Problem) -> tuple[Suspect, ...]:
-    """What is often missing: friction, drag, hardening, dead zone, saturation, an offset, the root of a level."""
+    """Return what is often missing: friction, drag, hardening, dead zone, saturation, an offset, the root of a level."""
     layout, outputs = problem.layout, problem.outputs
     pairs: list[tuple[str, str]] = []
     for channel in dict.fromkeys(lag.channel for lag in layout):
@@ -293,7 +293,7 @@ def usual_suspects(problem: Problem) -> tuple[Suspect, ...]:
 
 
 def saturations(suspects: Sequence[Suspect]) -> list[Suspect]:
-    """What is left of the channel beside each dead zone: data of a physics with that channel cannot tell the two."""
+    """Return what is left of the channel beside each dead zone: data of a physics with that channel cannot tell the two."""
     zones = [suspect for suspect in suspects if suspect.name.startswith("dead_zone")]
     return [
         replace(s, name=s.name.replace("dead_zone", "saturation"), expression=f"{s.on} - ({s.expression})")
@@ -302,13 +302,13 @@ def saturations(suspects: Sequence[Suspect]) -> list[Suspect]:
 
 
 def changes_sign(values: Vector) -> bool:
-    """Whether values (N,) lie clearly on both sides of zero; otherwise what jumps there is as good as a constant."""
+    """Return whether values (N,) lie clearly on both sides of zero; otherwise what jumps there is as good as a constant."""
     edge = _CLEARLY * np.abs(values).max(initial=0.0)
     return bool(np.min(values, initial=0.0) < -edge and np.max(values, initial=0.0) > edge)
 
 
 def is_level(values: Vector) -> bool:
-    """Whether values (N,) are positive but for noise, so that a root of them may be missing."""
+    """Return whether values (N,) are positive but for noise, so that a root of them may be missing."""
     return bool(np.min(values) >= -_BELOW * np.max(values))
 
 

@@ -118,7 +118,7 @@ def trial_on(
     alone_response: Response | None = None,
     response: Response | None = None,
 ) -> Trial:
-    """Both models' free runs on a record that was not fitted; their responses, if they are there already."""
+    """Return both models' free runs on a record that was not fitted; their responses, if they are there already."""
     alone_response = alone.simulate(record) if alone_response is None else alone_response
     response = model.simulate(record) if response is None else response
     error = free_run_error(alone, record, skip, response=alone_response)
@@ -128,7 +128,7 @@ def trial_on(
 
 
 def trials_of(held_out: HeldOutErrors) -> list[Trial]:
-    """The errors by which a run was chosen, as trials."""
+    """Return the errors by which a run was chosen, as trials."""
     chosen, trials = held_out.runs[held_out.chosen], []
     for label in dict.fromkeys(held_out.labels):
         own = [i for i, other in enumerate(held_out.labels) if other == label]
@@ -188,7 +188,7 @@ def block_trials(errors: Sequence[Sequence[Pieces]], fit: int) -> list[Trial]:
 
 
 def judge(trials: Sequence[Trial], extrapolation: Sequence[Extrapolation] = ()) -> Verdict | None:
-    """The verdict on trials of physics alone against the model; None without a trial.
+    """Return the verdict on trials of physics alone against the model; None without a trial.
 
     All blocks together, and every part of its own, are judged by one rule (`Ratio.code`). The learner helps where each
     of them says so; it hurts where one of them does, or where the model runs away and physics alone does not.
@@ -237,7 +237,7 @@ def _ratio(group: Sequence[Trial], alone: float, model: float) -> Ratio:
 
 
 def _told(alone: float, model: float) -> str:
-    """Both errors in words."""
+    """Return both errors in words."""
     errors = {"with the learner": model, "with physics alone": alone}
     if not any(map(math.isinf, errors.values())):
         return f"free-run NRMSE {model:.4g} with the learner, {alone:.4g} with physics alone"
@@ -284,7 +284,7 @@ def verdict(
     *,
     skip: int = 0,
 ) -> Verdict:
-    """Whether the learner helps: free runs of a fit and of physics alone on records that neither was fitted to.
+    """Return whether the learner helps: free runs of a fit and of physics alone on records that neither was fitted to.
 
     Args:
         fit: with a learner.

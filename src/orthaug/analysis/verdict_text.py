@@ -88,7 +88,7 @@ class Finding:
 
     @property
     def lacks(self) -> bool:
-        """Whether a change of the model itself is worth making."""
+        """Return whether a change of the model itself is worth making."""
         return any(change.kind != "criterion" for change in self.changes)
 
     @property
@@ -98,12 +98,12 @@ class Finding:
 
     @property
     def drifts(self) -> bool:
-        """Whether a free run's error is slow, and white noise in the equation does not explain that."""
+        """Return whether a free run's error is slow, and white noise in the equation does not explain that."""
         slow = any(one.own_past > _SLOW for one in self.predictable)
         return self.simulated and slow and not self.white and not self.sensor
 
     def follows(self, share: float = SHARE) -> tuple[str, ...]:
-        """What the error that was minimised still follows: surely, and by more than a share of its variance."""
+        """Return what the error that was minimised still follows: surely, and by more than a share of its variance."""
         inputs = (name for test in self.own for name in test.follows(float(np.sqrt(share))))
         return tuple(dict.fromkeys([*inputs, *(name for test in self.own for name in test.curved_over(share))]))
 
@@ -114,7 +114,7 @@ class Finding:
 
 
 def words(verdict: str, seen: Finding) -> tuple[str, tuple[Warning, ...]]:
-    """The text of a verdict, and its warnings."""
+    """Return the text of a verdict, and its warnings."""
     text, warnings = {
         "white": _white,
         "equation_noise": _equation_noise,
@@ -132,7 +132,7 @@ def words(verdict: str, seen: Finding) -> tuple[str, tuple[Warning, ...]]:
 
 
 def _inconsistent(seen: Finding) -> bool:
-    """Whether a coloured disturbance enters one-step θ through lagged outputs."""
+    """Return whether a coloured disturbance enters one-step θ through lagged outputs."""
     if seen.simulated or seen.white or seen.steps or not seen.fit.model.form.states or seen.fit.std is None:
         return False
     return any(one.own_past > _COLOUR for one in seen.predictable)
@@ -212,7 +212,7 @@ def _quantised(seen: Finding) -> str:
 
 
 def _cause(seen: Finding) -> str:
-    """What may stand behind a residual that none of the changes that were tried lowers, and what to do."""
+    """Return what may stand behind a residual that none of the changes that were tried lowers, and what to do."""
     followed = [name for test in seen.own for name in (*test.follows(), *test.curved_over(SHARE))]
     if followed:
         return (
@@ -235,7 +235,7 @@ def _joined(names: Sequence[str]) -> str:
 
 
 def _small(seen: Finding) -> str:
-    """What is said where the tests reject, but hardly anything could be predicted."""
+    """Return what is said where the tests reject, but hardly anything could be predicted."""
     colour = " Its colour is that of the noise." if seen.simulated and not seen.white else ""
     followed = seen.follows()
     shown = (
@@ -251,7 +251,7 @@ def _size(seen: Finding) -> str:
 
 
 def _shares(seen: Finding) -> str:
-    """How much could be predicted, of the output of which most could; of equal ones that which follows something."""
+    """Return how much could be predicted, of the output of which most could; of equal ones that which follows something."""
     if not seen.predictable:
         return ""
     told = {test.name for test in seen.own if test.follows() or test.curved_over(SHARE)}
@@ -267,7 +267,7 @@ def _shares(seen: Finding) -> str:
 
 
 def _advice(seen: Finding, otherwise: str) -> str:
-    """The change that is predicted to help most; or that none of them is, and what follows."""
+    """Return the change that is predicted to help most; or that none of them is, and what follows."""
     if seen.changes:
         return _sentence(seen.changes[0])
     if not seen.predictable:

@@ -54,7 +54,7 @@ class RowIndex:
         return len(self.row)
 
     def take(self, which: Any) -> RowIndex:
-        """Those at the indices `which`, or where a mask is true."""
+        """Return those at the indices `which`, or where a mask is true."""
         return RowIndex(self.experiment[which], self.row[which])
 
     def and_nowhere(self, count: int) -> RowIndex:
@@ -64,7 +64,7 @@ class RowIndex:
     def worst(
         self, record: Record, values: Vector, entries: Callable[[int], dict[str, float]]
     ) -> tuple[float | None, RunPoint | None]:
-        """The largest of the values (m,) and its place, with the entries of that point; None where none is finite."""
+        """Return the largest of the values (m,) and its place, with the entries of that point; None where none is finite."""
         values = np.where(np.isfinite(values), values, -1.0)
         if values.max(initial=-1.0) < 0:
             return None, None
@@ -88,7 +88,7 @@ class RunPoints:
         return len(self.states)
 
     def take(self, which: Any) -> RunPoints:
-        """Those at the indices `which`, or where a mask is true."""
+        """Return those at the indices `which`, or where a mask is true."""
         return replace(self, states=self.states[which], inputs=self.inputs[which], where=self.where.take(which))
 
     def with_box(self, of: RunPoints, count: int) -> RunPoints:
@@ -107,7 +107,7 @@ class RunPoints:
         )
 
     def worst(self, record: Record, values: Vector, describe: Describe) -> tuple[float | None, RunPoint | None]:
-        """The largest of the values (m,) and its place in words of the dynamics; None where no value is finite."""
+        """Return the largest of the values (m,) and its place in words of the dynamics; None where no value is finite."""
         return self.where.worst(record, values, lambda i: describe(self.states[i], self.inputs[i]))
 
 
@@ -126,7 +126,7 @@ class RunSample:
 
 
 def usable(model: Model | MotionModel, record: Record) -> Record:
-    """The record's channels in the model's order.
+    """Return the record's channels in the model's order.
 
     Raises:
         InputError: other channels, or too few rows in an experiment.
@@ -185,7 +185,7 @@ def _visits(
 
 
 def _units(form: Dynamics, points: RunPoints, outputs: Matrix) -> Vector:
-    """One over what an entry costs in deviations of the outputs; its own deviation where it is free."""
+    """Return one over what an entry costs in deviations of the outputs; its own deviation where it is free."""
     if not len(points):
         return np.ones(form.states)  # of what may be too long for a matrix
     per_output = positive(outputs.std(axis=0))
@@ -199,5 +199,5 @@ def evenly(count: int, most: int) -> Int[np.ndarray, "m"]:
 
 
 def positive(scale: Vector) -> Vector:
-    """The scale, 1 where it is 0 or not finite."""
+    """Return the scale, 1 where it is 0 or not finite."""
     return np.where(np.isfinite(scale) & (scale > 0), scale, 1.0)

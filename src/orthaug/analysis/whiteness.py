@@ -57,7 +57,7 @@ def _products(x: Vector, y: Vector, reach: int) -> Vector:
 
 
 def pieces_of(signal: Pieces) -> list[Vector]:
-    """One array per experiment."""
+    """Return one array per experiment."""
     parts = [signal] if isinstance(signal, np.ndarray) and signal.ndim == 1 else signal
     return [np.asarray(one, dtype=float) for one in parts]
 
@@ -75,7 +75,7 @@ def standardised(signal: Pieces) -> list[Vector] | None:
 
 
 def cut(whole: Any, like: Sequence[Vector]) -> list[Any]:
-    """A signal in experiments as long as those of another."""
+    """Return a signal in experiments as long as those of another."""
     return np.split(whole, np.cumsum([len(one) for one in like])[:-1])
 
 
@@ -135,7 +135,7 @@ def normality(signal: Pieces) -> Normality | None:
 
 
 def whitening(signal: Pieces, largest: int = 25) -> Vector | None:
-    """The coefficients (1, a_1, …, a_p) of `A(q) e_k = ε_k`, ε white, of a signal less its mean, by Burg.
+    """Return the coefficients (1, a_1, …, a_p) of `A(q) e_k = ε_k`, ε white, of a signal less its mean, by Burg.
 
     None for a signal that is constant or not finite.
     """

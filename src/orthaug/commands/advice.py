@@ -52,7 +52,7 @@ class Proposal:
     """A parameter that has to be positive, as the size of a dead zone."""
 
     def accepts(self, fit: Any) -> bool:
-        """Whether a fit of the changed spec is what the words say."""
+        """Return whether a fit of the changed spec is what the words say."""
         if self.positive is None:
             return True
         return bool(fit.parameters.loc[self.positive, "value"] > 0)
@@ -92,7 +92,7 @@ def _missing_terms(job: Job, result: FitResult) -> Iterator[Proposal]:
 
 
 def _suspected_terms(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal]:
-    """The suspects that explain most of what the learner found, or of what the physics leaves."""
+    """Yield the suspects that explain most of what the learner found, or of what the physics leaves."""
     plain = job.spec.motion is None and fit.model.form.bound is None and len(fit.theta) > 0
     left = _residual_columns(fit) if plain else None
     found = []
@@ -111,7 +111,7 @@ def _suspected_terms(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal
 
 
 def _residual_columns(fit: Any) -> tuple[np.ndarray, np.ndarray]:
-    """An orthonormal basis of the physics (N ny, nθ) and the one-step residual beside it (N ny,), in deviations."""
+    """Return an orthonormal basis of the physics (N ny, nθ) and the one-step residual beside it (N ny,), in deviations."""
     problem = fit.problem
     x, unit = problem.rows.x[:: _every(fit)], problem.deviation
     phi = np.asarray(problem.baseline.phi(x, problem.layout, problem.outputs, np)) / unit[:, None]
@@ -127,7 +127,7 @@ def _every(fit: Any) -> int:
 
 
 def _residual_share(fit: Any, entry: SuspectResult, basis: np.ndarray, error: np.ndarray) -> tuple[float, float]:
-    """The share of the one-step residual that a suspect explains beside the physics, and its coefficient."""
+    """Return the share of the one-step residual that a suspect explains beside the physics, and its coefficient."""
     problem = fit.problem
     constants = {SAMPLING_TIME: problem.record.sampling_time} | dict(problem.baseline.constants)
     suspect = Suspect(entry.name, entry.expression, entry.output, constants=constants)
@@ -142,7 +142,7 @@ def _residual_share(fit: Any, entry: SuspectResult, basis: np.ndarray, error: np
 def _term(
     job: Job, expression: str, equation: str | None, size: float | None, words: str, *, positive: bool = False
 ) -> Iterator[Proposal]:
-    """The proposal of a term with its size as a parameter; nothing where the spec has the term."""
+    """Yield the proposal of a term with its size as a parameter; nothing where the spec has the term."""
     spec, declared = job.spec, job.declaration
     name, initial = _new_name(job), float(size or 0.0)
     if spec.motion is not None:
@@ -175,7 +175,7 @@ def _term(
 
 
 def _equation(job: Job, equation: str | None) -> str | None:
-    """The state whose equation a term goes to; None for a term of an output."""
+    """Return the state whose equation a term goes to; None for a term of an output."""
     from orthaug.analysis.motion_suspects import equations_of, usual_places
 
     motion = job.problem.motion
@@ -186,7 +186,7 @@ def _equation(job: Job, equation: str | None) -> str | None:
 
 
 def _new_name(job: Job) -> str:
-    """A parameter that the spec does not have."""
+    """Return a parameter that the spec does not have."""
     spec, number = job.spec, 1
     taken = set(spec.data.inputs) | set(spec.data.outputs)
     if spec.motion is not None:
@@ -208,7 +208,7 @@ def _same(one: str, other: str, output: str | None, equation: str | None) -> boo
 
 
 def _predicted_changes(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal]:
-    """The changes that the residual of lagged physics predicts a gain of."""
+    """Yield the changes that the residual of lagged physics predicts a gain of."""
     for change in result.residuals.changes if result.residuals is not None else ():
         if change.kind in ("input_lag", "output_lag", "offset"):
             yield from _term(job, change.what, change.output, None, _lag_words(change))
@@ -219,7 +219,7 @@ def _predicted_changes(job: Job, result: FitResult, fit: Any) -> Iterator[Propos
 
 
 def _compared(result: FitResult) -> bool:
-    """Whether both criteria were tried by the fit itself."""
+    """Return whether both criteria were tried by the fit itself."""
     return result.focus is not None and bool(result.focus.candidates)
 
 
@@ -228,7 +228,7 @@ def _lag_words(change: ChangeResult) -> str:
 
 
 def _learner(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal]:
-    """A learner where none was tried, one that sees more, one of more neurons."""
+    """Yield a learner where none was tried, one that sees more, one of more neurons."""
     from orthaug.physics.shared import seen
 
     spec, problem, bound = job.spec, job.problem, fit.model.form.bound
@@ -254,7 +254,7 @@ def _learner(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal]:
 
 
 def _learner_for_equation(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal]:
-    """A learner in the equation of a motion that lacks something, or one that sees what it lacks a function of."""
+    """Yield a learner in the equation of a motion that lacks something, or one that sees what it lacks a function of."""
     test = result.residuals.missing if result.residuals is not None else None
     if job.spec.motion is None or test is None or not test.terms or result.residuals is None:
         return
@@ -279,7 +279,7 @@ def _reads(inputs: tuple[str, ...], variable: str) -> bool:
 
 
 def _holds(job: Job, result: FitResult) -> Iterator[Proposal]:
-    """The holds of its inputs that a motion does not have."""
+    """Yield the holds of its inputs that a motion does not have."""
     motion = job.spec.motion
     if motion is None or not job.spec.data.inputs or motion.integrator == "discrete":
         return
@@ -365,7 +365,7 @@ class Trials:
             return None
 
     def of(self, proposal: Proposal, *, physics_only: bool) -> ProposalErrors:
-        """The trial of a proposal."""
+        """Return the trial of a proposal."""
         try:
             job = self.changed(proposal.change)
         except (InputError, ValueError) as error:

@@ -16,7 +16,7 @@ DEFECTS: tuple[type[BaseException], ...] = (AttributeError, IndexError, KeyError
 
 
 def attempt(what: str, analysis: Callable[[], T], warnings: list[Any], otherwise: T) -> T:
-    """What an analysis finds, or `otherwise` with one more warning where it fails.
+    """Return what an analysis finds, or `otherwise` with one more warning where it fails.
 
     A training may have taken hours: a defect of an analysis does not take it away, and is logged.
 

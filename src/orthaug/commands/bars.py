@@ -36,12 +36,12 @@ _SEEN = 3  # models after which the time of the rest is told: the first ones com
 
 
 def on_terminal() -> bool:
-    """Whether a person sees standard error. FORCE_COLOR, which build servers set, does not make it one."""
+    """Return whether a person sees standard error. FORCE_COLOR, which build servers set, does not make it one."""
     return sys.stderr is not None and sys.stderr.isatty()
 
 
 def drawn_bar(*columns: ProgressColumn, transient: bool = True) -> Bar:
-    """A bar with its description and these columns, drawn on a terminal only. NO_COLOR is heeded."""
+    """Return a bar with its description and these columns, drawn on a terminal only. NO_COLOR is heeded."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn
 
@@ -259,6 +259,6 @@ def _words(run: int, iteration: int, loss: float) -> str:
 
 
 def _line(words: str, *, ended: bool) -> str:
-    """A bar that moves as long as it is not known how long it takes."""
+    """Return a bar that moves as long as it is not known how long it takes."""
     moving = "" if ended else '<progress aria-label="training" style="vertical-align:middle"></progress> '
     return f"<div>{moving}{escape(words)}</div>"

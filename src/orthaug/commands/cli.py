@@ -247,7 +247,7 @@ def _unsaid(line: str) -> None:
 
 
 def _asked(text: str, check: Callable[[str], Any], default: str | None = "") -> str:
-    """An answer that `check` accepts; what is wrong with another one is said, and it is asked again."""
+    """Return an answer that `check` accepts; what is wrong with another one is said, and it is asked again."""
     from orthaug._base.errors import InputError
 
     while True:

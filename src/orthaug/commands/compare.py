@@ -39,7 +39,7 @@ class Comparison:
         return f"Comparison({', '.join(f'{kind}: {code}' for kind, code in codes.items())})"
 
     def summary(self) -> str:
-        """What `orthaug compare` prints."""
+        """Return what `orthaug compare` prints."""
         from orthaug.reports.text import compare_text
 
         return compare_text(self.result, self.verdicts)
@@ -79,7 +79,7 @@ def compare(job: Job, saved: Sequence[Path] = (), progress: Progress = SILENT) -
 
 
 def _criterion(job: Job, progress: Progress) -> tuple[Criterion, FitReport | None]:
-    """The criterion that every structure is trained by, and the fit that decided it where the data were to decide."""
+    """Return the criterion that every structure is trained by, and the fit that decided it where the data were to decide."""
     declared = job.spec.declared_criterion()
     if not declared.automatic:
         return declared, None
@@ -89,7 +89,7 @@ def _criterion(job: Job, progress: Progress) -> tuple[Criterion, FitReport | Non
 
 
 def _verdicts(job: Job, fitted: dict[str, FitReport]) -> dict[str, Verdict]:
-    """Whether the learner earns its place in each structure, by blocked cross-validation and the held-out parts."""
+    """Return whether the learner earns its place in each structure, by blocked cross-validation and the held-out parts."""
     alone = fitted[ALONE].fit
     kinds = [kind for kind, tried in fitted.items() if kind != ALONE and tried.fit.status.ok]
     if not kinds or not alone.status.ok:
@@ -121,7 +121,7 @@ def write(comparison: Comparison, folder: Path, *, force: bool = False) -> None:
 
 
 def compare_report(comparison: Comparison) -> str:
-    """The page of a comparison."""
+    """Return the page of a comparison."""
     from orthaug.reports.page import compare_page
     from orthaug.reports.page_compare import ComparePage
 
@@ -134,7 +134,7 @@ def compare_report(comparison: Comparison) -> str:
 
 
 def _matching(path: Path, job: Job) -> Model | MotionModel:
-    """A saved model that the job's data fit."""
+    """Return a saved model that the job's data fit."""
     model = storage.load(path)
     record = job.problem.record
     lacking = [c.name for c in model.inputs if c.name not in [own.name for own in record.inputs]]
@@ -168,7 +168,7 @@ def _saved_row(name: str, model: Model | MotionModel, job: Job) -> RowResult:
 
 
 def _row_of(name: str, model: Model | MotionModel, scores: Any, warnings: Sequence[Any], **told: Any) -> RowResult:
-    """A row; null for what is not `told`."""
+    """Return a row; null for what is not `told`."""
     own = {"name": name, "weights": model.form.bound.size if model.form.bound else 0}
     return RowResult.model_validate(
         dict.fromkeys(RowResult.model_fields) | own | {"scores": scores, "warnings": warnings} | told
@@ -176,7 +176,7 @@ def _row_of(name: str, model: Model | MotionModel, scores: Any, warnings: Sequen
 
 
 def _chosen(rows: Sequence[RowResult], simulates: bool) -> str | None:
-    """The row of the lowest error on the validation part, of the free run or one step ahead as training looks at it.
+    """Return the row of the lowest error on the validation part, of the free run or one step ahead as training looks at it.
 
     Physics alone wins where the verdict is that the learner of that row does not help.
     """

@@ -94,7 +94,7 @@ class Data(Section):
         return self
 
     def _no_channel(self, name: str) -> str:
-        """What is wrong with a section of `channels` for no channel: it, or the name that it should have met."""
+        """Return what is wrong with a section of `channels` for no channel: it, or the name that it should have met."""
         known = (*self.inputs, *self.outputs)
         open_names = [other for other in known if other not in self.channels]
         close = difflib.get_close_matches(name, open_names, n=1)
@@ -118,7 +118,7 @@ class EngineSection(Section):
     checkpoint: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 10.0
 
     def chosen(self, files: Sequence[Path]) -> str:
-        """The kind; "auto" streams Parquet files that are too large for memory."""
+        """Return the kind; "auto" streams Parquet files that are too large for memory."""
         if self.kind != "auto":
             return self.kind
         parquet = all(file.suffix.lower() == _PARQUET for file in files)
@@ -130,7 +130,7 @@ class EngineSection(Section):
 
 
 def engine_of(section: EngineSection, kind: str) -> Engine:
-    """The engine of a kind.
+    """Return the engine of a kind.
 
     Raises:
         InputError: one that is not installed, or cannot be reached.
@@ -184,7 +184,7 @@ class MotionSection(Section):
 
     @model_validator(mode="after")
     def _check_equations(self) -> MotionSection:
-        """Each state has the equation that its integrator reads."""
+        """Return each state has the equation that its integrator reads."""
         discrete = self.integrator == "discrete"
         own, other = ("next", "derivative") if discrete else ("derivative", "next")
         kind = "a discrete motion" if discrete else f'`integrator = "{self.integrator}"`'
@@ -197,12 +197,12 @@ class MotionSection(Section):
 
     @property
     def learns(self) -> bool:
-        """Whether a learner is added to any equation or output."""
+        """Return whether a learner is added to any equation or output."""
         outputs = (output.learned for output in self.outputs.values() if not isinstance(output, str))
         return any(state.learned for state in self.states.values()) or any(outputs)
 
     def declared(self, inputs: Sequence[str], outputs: Sequence[str]) -> Motion:
-        """The motion, its channels in the order of the data.
+        """Return the motion, its channels in the order of the data.
 
         Raises:
             InputError: names and expressions that cannot be, and what else `Motion.from_equations` refuses.

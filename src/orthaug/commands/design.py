@@ -17,7 +17,7 @@ from orthaug.commands.suspects import declared
 
 
 def design_for(job: Job) -> Design:
-    """The input that the spec's `[design]` asks for.
+    """Return the input that the spec's `[design]` asks for.
 
     θ is the spec's initial value, or least squares on the training data where none is given; the noise, where the spec
     states none, is what physics alone leaves of these data. The parameters of a motion are those of physics alone.
@@ -86,7 +86,7 @@ def _input(name: str | None, known: list[str]) -> str:
 
 
 def _others(job: Job, chosen: str, samples: int) -> dict[str, np.ndarray]:
-    """The other inputs as the longest experiment of the training data has them, repeated where it ends."""
+    """Return the other inputs as the longest experiment of the training data has them, repeated where it ends."""
     record = job.problem.record
     longest = max(record.experiments, key=len).inputs
     named = zip((channel.name for channel in record.inputs), longest.T, strict=True)
@@ -94,7 +94,7 @@ def _others(job: Job, chosen: str, samples: int) -> dict[str, np.ndarray]:
 
 
 def notes(job: Job) -> list[str]:
-    """What stands in the inputs that are not designed."""
+    """Return what stands in the inputs that are not designed."""
     assert job.spec.design is not None
     others = [c.name for c in job.problem.record.inputs if c.name != job.spec.design.input]
     return [f"note: {', '.join(others)}: as recorded in the training data."] if others and job.spec.design.input else []

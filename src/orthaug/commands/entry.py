@@ -46,7 +46,7 @@ def _open_streams() -> None:
 
 
 def _complaint() -> str | None:
-    """What keeps every command from running, in words."""
+    """Return what keeps every command from running, in words."""
     from orthaug._base.memory import in_words, limit
 
     try:

@@ -49,13 +49,13 @@ class FitReport:
         return f"Fitted({self.job.path.name}: {self.fit!r})"
 
     def summary(self) -> str:
-        """What `orthaug fit` prints."""
+        """Return what `orthaug fit` prints."""
         from orthaug.reports.text import fit_text
 
         return fit_text(self.fit, self.result) or self.fit.status.message
 
     def report(self, path: Any = None) -> Any:
-        """The page that `orthaug fit` writes; see `Estimate.report`."""
+        """Return the page that `orthaug fit` writes; see `Estimate.report`."""
         return MAKERS["report"](self, path, None)
 
     @property
@@ -112,7 +112,7 @@ def judged(fitted: FitReport) -> FitReport:
 
 
 def _physics_alone(fitted: FitReport) -> Any:
-    """The fit of physics alone that the learner had to beat: the one that was made, or one by the same criterion."""
+    """Return the fit of physics alone that the learner had to beat: the one that was made, or one by the same criterion."""
     made = fitted.fit.physics_alone
     return made if made is not None else fitted.job.run(Variant(ALONE, criterion=fitted.fit.criterion))
 
@@ -147,7 +147,7 @@ def _unexplained(fitted: FitReport, physics: Callable[[], Any] | None) -> list[W
 
 
 def keeping(job: Job, folder: Path, *, resume: bool = False) -> Job:
-    """The job with the states of its training kept beside the result folder; with `resume` it goes on from them.
+    """Return the job with the states of its training kept beside the result folder; with `resume` it goes on from them.
 
     Raises:
         InputError: states of another fit; hosts that do not run the same one.
@@ -220,7 +220,7 @@ def told_of(job: Job, fit: Any) -> FitReport:
 
 
 def _status(fit: Any, warnings: Sequence[Any]) -> Any:
-    """How training ended; of a model that does not run freely its message begins with that."""
+    """Return how training ended; of a model that does not run freely its message begins with that."""
     first = next((warning.text for warning in warnings if warning.code == "one_step_only"), "")
     last = "" if fit.status.ok else describe_scales(fit.problem.record)
     if not (first or last):
@@ -252,7 +252,7 @@ def _one_step_only(
 
 
 def _for_observers(fit: Any, verdict: str, warnings: list[Any]) -> Any:
-    """The fit whose model keeps what an observer of it asks for: the verdict on the residual, and two noises."""
+    """Return the fit whose model keeps what an observer of it asks for: the verdict on the residual, and two noises."""
     from orthaug.analysis.observer_noise import to_keep
 
     kept = replace(fit.model.statistics, verdict=verdict)
@@ -268,7 +268,7 @@ def judge_fit(
     blocks: Sequence[Trial] | None = None,
     alone: Mapping[str, tuple[Response, Response]] | None = None,
 ) -> Verdict | None:
-    """Whether the learner earns its place: free runs against physics alone on what was not fitted.
+    """Return whether the learner earns its place: free runs against physics alone on what was not fitted.
 
     Where the fit fell back to physics alone, that is judged by which it did.
 
@@ -307,7 +307,7 @@ def judge_fit(
 
 
 def _stopped(fit: Any) -> bool:
-    """Whether training was asked to end with what it had: then nobody waits for cross-validation either."""
+    """Return whether training was asked to end with what it had: then nobody waits for cross-validation either."""
     return any(warning.code == "stopped" for warning in fit.warnings)
 
 
@@ -408,7 +408,7 @@ def _draw(fitted: FitReport, folder: Path) -> None:
 
 
 def fit_report(fitted: FitReport, origin: Origin | None = None) -> str:
-    """The page of a fit that has a model; `origin` is where it comes from, None for its spec."""
+    """Return the page of a fit that has a model; `origin` is where it comes from, None for its spec."""
     from orthaug.reports.learned_part import learned_of
     from orthaug.reports.page import fit_page
     from orthaug.reports.page_fit import FitPage

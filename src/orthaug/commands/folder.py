@@ -39,7 +39,7 @@ def chosen_model(model: Path, which: str) -> Path:
 
 
 def results_beside(model: Path) -> Iterator[Any]:
-    """What is read from result.json in the folder of a model, or the one above; for the caller to check."""
+    """Yield what is read from result.json in the folder of a model, or the one above; for the caller to check."""
     for folder in (model, model.parent):
         with suppress(OSError, ValueError, RecursionError):
             yield json.loads((folder / "result.json").read_text(encoding="utf-8"))
@@ -101,7 +101,7 @@ def save_figure(figure: Figure, out: Path, *, force: bool = False) -> None:
 
 
 def relative(file: Path, folder: Path) -> str:
-    """A file as a spec in the folder names it."""
+    """Return a file as a spec in the folder names it."""
     try:
         return Path(os.path.relpath(file.resolve(), folder.resolve())).as_posix()
     except ValueError:  # on another drive

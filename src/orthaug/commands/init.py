@@ -38,12 +38,12 @@ class Roles:
 
 
 def channel_names(columns: Sequence[Column]) -> list[str]:
-    """What the channels of these columns are called."""
+    """Return what the channels of these columns are called."""
     return [column.name for column in columns]
 
 
 def time_of(found: Survey, roles: Roles) -> str | None:
-    """The column of instants, where there is one that is to be used: uneven steps, or such as every part has."""
+    """Return the column of instants, where there is one that is to be used: uneven steps, or such as every part has."""
     clock = found.clock
     used = clock.column is not None and clock.instants and not roles.sampling_time
     return clock.column.header if used and clock.column and (clock.steady or not clock.even) else None
@@ -80,7 +80,7 @@ def spec_text(
     named: tuple[list[str], list[str]],
     model: FirstModel,
 ) -> str:
-    """The spec with comments; `gaps` says which rows will be left out, "" for none."""
+    """Return the spec with comments; `gaps` says which rows will be left out, "" for none."""
     document = tomlkit.document()
     document.add(tomlkit.comment(f"Written by orthaug init from {found.path.name}. Run: orthaug fit {out.name}"))
     document.add(tomlkit.comment("Every key: orthaug schema keys. What is written here is a start, not a verdict."))
@@ -197,7 +197,7 @@ class Draft:
 
 
 def look(path: Path) -> Survey:
-    """The columns of a file.
+    """Return the columns of a file.
 
     Raises:
         InputError: a file that cannot be read or holds no numbers.
@@ -265,7 +265,7 @@ def _check_no_time(found: Survey, column: Column, kind: str, sampling_time: floa
 
 
 def question(found: Survey, inputs: Names | None = None, outputs: Names | None = None) -> str:
-    """What to give where the columns do not say what they are; `inputs` and `outputs` are what was given.
+    """Return what to give where the columns do not say what they are; `inputs` and `outputs` are what was given.
 
     Raises:
         InputError: no column could be a channel, or none is left for an output.
@@ -312,7 +312,7 @@ def _nothing_left(found: Survey, inputs: str | None) -> str:
 
 
 def left_out(found: Survey, used: Sequence[Column]) -> str:
-    """The columns that are not used, and why, in a list; the time is none of them."""
+    """Return the columns that are not used, and why, in a list; the time is none of them."""
     apart = {id(c) for c in (*used, found.clock.column)}
     return _listed([f"{c.header} ({found.why_not(c)})" for c in found.columns if id(c) not in apart])
 
@@ -323,7 +323,7 @@ def _listed(columns: Sequence[str]) -> str:
 
 
 def draft(found: Survey, roles: Roles, out: Path) -> Draft:
-    """A spec for a file that runs, for the place `out`, and the account.
+    """Return a spec for a file that runs, for the place `out`, and the account.
 
     Raises:
         InputError: too few rows, or channels without a row where all have a value.
@@ -385,7 +385,7 @@ def _extent(roles: Roles) -> tuple[int, int]:
 
 
 def _record(found: Survey, roles: Roles, cut: int, missing: int) -> tuple[Record, int]:
-    """The training rows, and how many are left out because a sample is missing."""
+    """Return the training rows, and how many are left out because a sample is missing."""
     inputs, outputs = ([Channel(c.name, c.unit, c.header) for c in group] for group in (roles.inputs, roles.outputs))
     options: dict[str, Any] = {"rows": (0, cut), "missing": "skip" if missing or not found.clock.even else "error"}
     options["prepare"] = [STEPS.declare(kind, keys) for kind, keys in steps_of(found, roles)]
@@ -408,7 +408,7 @@ def _account(
     wild: str,
     notes: Sequence[str] = (),
 ) -> str:
-    """What was seen, a line each."""
+    """Return what was seen, a line each."""
     step = f"{roles.sampling_time:g} s, as given" if roles.sampling_time else str(found.clock)
     if roles.sampling_time is None and found.clock.step is None:
         step += "; 1 s is written: change it"
@@ -456,7 +456,7 @@ def _order(order: int) -> str:
 
 
 def as_seen(column: Column, *, spikes: bool) -> str:
-    """A channel in words: range, and what is odd about it."""
+    """Return a channel in words: range, and what is odd about it."""
     low, high = float(column.finite.min()), float(column.finite.max())
     text = f"{column.name}" + (f" = column '{column.header}'" if column.header != column.name else "")
     text += f": {low:.4g} to {high:.4g} {column.unit}".rstrip()

@@ -50,7 +50,7 @@ class Variant:
 
     @property
     def alone(self) -> bool:
-        """Whether there is no learner."""
+        """Return whether there is no learner."""
         return self.kind == ALONE
 
     @property
@@ -98,7 +98,7 @@ class Job(ABC):
     @property
     @abstractmethod
     def compared(self) -> tuple[str, ...]:
-        """What `orthaug compare` fits: kinds of variants, physics alone first."""
+        """Return what `orthaug compare` fits: kinds of variants, physics alone first."""
 
     @abstractmethod
     def refusal(self, variant: Variant) -> str | None:
@@ -109,7 +109,7 @@ class Job(ABC):
         """Train as the spec says, or a variant of that."""
 
     def fold_fit(self, variant: Variant) -> Callable[[Record], Any]:
-        """What trains a variant on a fold."""
+        """Return what trains a variant on a fold."""
         return lambda fold: self.run(variant.on(fold))
 
     @abstractmethod
@@ -131,7 +131,7 @@ class Job(ABC):
 
     @property
     def warnings(self) -> tuple[Warning, ...]:
-        """What was done to the data, and which samples of the training data are no measurements."""
+        """Return what was done to the data, and which samples of the training data are no measurements."""
         return (*(warning for part in self.parts for warning in part.warnings), *self._of_samples)
 
     @cached_property
@@ -146,16 +146,16 @@ class Job(ABC):
 
     @property
     def run_count(self) -> int:
-        """How many runs a fit makes: restarts times regularizations."""
+        """Return how many runs a fit makes: restarts times regularizations."""
         return self.spec.runs(linear=self.linear)
 
     @property
     def linear(self) -> bool:
-        """Whether the physics is linear in θ."""
+        """Return whether the physics is linear in θ."""
         return False
 
     def planned(self, variant: Variant) -> Plan:
-        """What is known of each run of a variant; nothing where fits to new weights of the outputs follow."""
+        """Return what is known of each run of a variant; nothing where fits to new weights of the outputs follow."""
         spec = self.spec
         if spec.training.output_weights == "covariance":
             return ()
@@ -204,7 +204,7 @@ class Job(ABC):
         )
 
     def training_options(self, variant: Variant) -> dict[str, Any]:
-        """What a variant is trained with, whatever the physics is."""
+        """Return what a variant is trained with, whatever the physics is."""
         from orthaug.fitting.training import FOLD_ITERATIONS
 
         fold, spec, training = variant.fold, self.spec, self.spec.training
@@ -266,7 +266,7 @@ def origin_of(job: Job, command: str) -> Origin:
 
 
 def _toml(job: Job) -> str:
-    """The spec as it was written; where its file is another one by now, what was read of it."""
+    """Return the spec as it was written; where its file is another one by now, what was read of it."""
     import tomlkit
 
     try:

@@ -24,7 +24,7 @@ class Kind(Protocol):
     """What a module of a kind has."""
 
     def checked(self, job: Any) -> CheckResult:
-        """What can be said before training: excitation, identifiability, what may bias; nothing is kept."""
+        """Return what can be said before training: excitation, identifiability, what may bias; nothing is kept."""
         ...
 
     def refused(self, job: Any, result: CheckResult) -> InputError | None:
@@ -34,19 +34,19 @@ class Kind(Protocol):
     def content(
         self, job: Any, fit: Any, responses: Mapping[str, tuple[Response, Response]], warnings: list[Any]
     ) -> tuple[Any, dict[str, Any]]:
-        """The fit as it is handed over, and what results tell of it beside what all kinds do; warnings are added."""
+        """Return the fit as it is handed over, and what results tell of it beside what all kinds do; warnings are added."""
         ...
 
     def figures(
         self, job: Any, fit: Any, result: FitResult, responses: Mapping[str, tuple[Response, Response]]
     ) -> dict[str, Figure]:
-        """The figures of a result by their names."""
+        """Return the figures of a result by their names."""
         ...
 
     def physics_alone(
         self, job: Any, fit: Any, responses: Mapping[str, tuple[Response, Response]]
     ) -> Mapping[str, Response]:
-        """The free run of every part by the physics without the learner that there is."""
+        """Return the free run of every part by the physics without the learner that there is."""
         ...
 
 
@@ -54,7 +54,7 @@ _KINDS: dict[type[Job], Kind] = {LaggedJob: lagged_kind, MotionJob: motion_kind}
 
 
 def kind_of(job: Job) -> Kind:
-    """What tells of a job."""
+    """Return what tells of a job."""
     return _KINDS[type(job)]
 
 

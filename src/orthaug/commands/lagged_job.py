@@ -213,7 +213,7 @@ def _check_cost(spec: Spec, problem: Problem, engine: Engine) -> None:
 
 
 def measure_of(spec: Spec, problem: Problem, folder: Path) -> Measure:
-    """The measure that a spec declares for its problem."""
+    """Return the measure that a spec declares for its problem."""
     lags = [str(lag) for lag in problem.used]
     return spec.declared_measure(MeasurePlace(folder, lags, problem.record, problem.rows.start))
 

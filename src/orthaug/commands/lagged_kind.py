@@ -65,7 +65,7 @@ def refused(job: LaggedJob, result: CheckResult) -> InputError | None:
 def content(
     job: LaggedJob, fit: Estimate, responses: Mapping[str, tuple[Response, Response]], warnings: list[Any]
 ) -> tuple[Estimate, dict[str, Any]]:
-    """The fit with the standard errors that its residual asks for, and what results tell of it; warnings are added."""
+    """Return the fit with the standard errors that its residual asks for, and what results tell of it; warnings are added."""
     from orthaug.analysis.robustness import robust_where_asked
 
     told: dict[str, Any] = dict.fromkeys((*_UNKNOWN, "residuals", "missing_lags", "stability"))
@@ -111,7 +111,7 @@ def content(
 def figures(
     job: LaggedJob, fit: Estimate, result: FitResult, responses: Mapping[str, tuple[Response, Response]]
 ) -> dict[str, Figure]:
-    """The figures of a result by their names."""
+    """Return the figures of a result by their names."""
     from orthaug.reports import finding_plots, plots
 
     last, structure = job.parts[-1].name, fit.model.structure
@@ -139,13 +139,13 @@ def figures(
 def physics_alone(
     job: LaggedJob, fit: Estimate, responses: Mapping[str, tuple[Response, Response]]
 ) -> Mapping[str, Response]:
-    """The free run of every part by the physics without the learner."""
+    """Return the free run of every part by the physics without the learner."""
     alone = fit.model.alone
     return {part.name: alone.simulate(part.record) for part in job.parts}
 
 
 def _physical_content(job: LaggedJob, fit: Estimate, warnings: list[Any]) -> dict[str, Any]:
-    """The physical parameters of θ̂ and what belongs to them, where the spec has a map; warnings are added."""
+    """Return the physical parameters of θ̂ and what belongs to them, where the spec has a map; warnings are added."""
     if job.physics is None:
         return {}
     physical, profiles, slopes = fit.physical(job.physics), None, None
@@ -165,7 +165,7 @@ def _physical_content(job: LaggedJob, fit: Estimate, warnings: list[Any]) -> dic
 
 
 def _analysed(fit: Estimate, one_step: Response, free_run: Response, warnings: list[Any]) -> dict[str, Any]:
-    """What the residuals and the free run's sensitivity say; warnings are added."""
+    """Return what the residuals and the free run's sensitivity say; warnings are added."""
     from orthaug.analysis.diagnosis import diagnose
     from orthaug.analysis.free_run_stability import stability
     from orthaug.analysis.missing_lags import missing_lags
@@ -189,7 +189,7 @@ def _analysed(fit: Estimate, one_step: Response, free_run: Response, warnings: l
 
 
 def _bias_of(job: LaggedJob, fit: Estimate | None = None) -> list[dict[str, Any]]:
-    """The table of suspects under the spec's measure; after a fit with its θ and what its learner explains.
+    """Return the table of suspects under the spec's measure; after a fit with its θ and what its learner explains.
 
     Whether a measure can remove a bias is asked before a fit: then it is answered for the usual suspects, too.
     """
@@ -200,7 +200,7 @@ def _bias_of(job: LaggedJob, fit: Estimate | None = None) -> list[dict[str, Any]
 
 
 def _budget_of(job: LaggedJob, fit: Estimate) -> Budget | None:
-    """The bias that what the learner found implies, under the spec's measure."""
+    """Return the bias that what the learner found implies, under the spec's measure."""
     from orthaug.analysis.budget import budget_on
 
     if fit.model.structure != "orthogonal" or fit.model.form.bound is None:
@@ -234,7 +234,7 @@ def _linearization(job: LaggedJob, fit: Estimate | None) -> MeasureLinearization
 
 
 def _said_of_shared(job: LaggedJob, fit: Estimate | None = None) -> list[Warning]:
-    """What the rows say of directions that the names call determined beside the learner."""
+    """Return what the rows say of directions that the names call determined beside the learner."""
     structure, problem = job.spec.declared_structure(), fit.problem if fit else job.problem
     if job.spec.declared_learner() is None or not structure.projects or structure.shared == "all":
         return []

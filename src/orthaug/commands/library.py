@@ -57,7 +57,7 @@ def load_spec(path: str | os.PathLike) -> Job:
 
 
 def fit_spec(spec: Spec, out: str | os.PathLike | None = None) -> FitReport:
-    """What `orthaug fit` does: train, score every part, and ask whether the learner earns its place.
+    """Return what `orthaug fit` does: train, score every part, and ask whether the learner earns its place.
 
     Args:
         spec: a spec file, or what `load_spec` returned.
@@ -78,7 +78,7 @@ def fit_spec(spec: Spec, out: str | os.PathLike | None = None) -> FitReport:
 
 
 def compare(spec: Spec, models: Sequence[str | os.PathLike] = (), out: str | os.PathLike | None = None) -> Comparison:
-    """What `orthaug compare` does: physics alone and every structure on the same data and seeds.
+    """Return what `orthaug compare` does: physics alone and every structure on the same data and seeds.
 
     Args:
         spec: a spec file, or what `load_spec` returned.
@@ -106,7 +106,7 @@ def compare(spec: Spec, models: Sequence[str | os.PathLike] = (), out: str | os.
 
 
 def _opened(spec: Spec, out: str | os.PathLike | None) -> tuple[Job, Path | None]:
-    """The job, and the folder to write, checked."""
+    """Return the job, and the folder to write, checked."""
     check_type(spec, Spec, "spec", "the name of a spec file, or what load_spec returns")
     check_type(out, str | os.PathLike | None, "out", "the name of a folder, or None")
     folder = None if out is None else Path(out)
@@ -143,26 +143,26 @@ class FitFacts:
     validation: ValidationSection = field(default_factory=lambda: ValidationSection(blocks=0))
 
     def declared_learner(self) -> Any:
-        """The learner; None without one."""
+        """Return the learner; None without one."""
         bound = self.fit.model.form.bound
         return None if bound is None else bound.learner
 
     def declared_structure(self, kind: str | None = None, measure: Any = None) -> Any:
-        """The kind of structure that was fitted."""
+        """Return the kind of structure that was fitted."""
         return STRUCTURES[kind or self.fit.model.structure]()
 
     def declared_criterion(self) -> Any:
-        """What was fitted."""
+        """Return what was fitted."""
         return self.fit.criterion
 
     def declared_solver(self) -> Any:
-        """The default: physics alone needs no other."""
+        """Return the default: physics alone needs no other."""
         from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 
         return LevenbergMarquardt()
 
     def model_dump(self, **_: Any) -> dict[str, Any]:
-        """What a title is made of."""
+        """Return what a title is made of."""
         record = self.fit.problem.record
         return {
             "data": {
@@ -175,7 +175,7 @@ class FitFacts:
 def page_of(
     fit: Estimate | MotionEstimate, path: str | os.PathLike | None = None, tests: Mapping[str, Record] | None = None
 ) -> Page:
-    """What `fit.report` returns: parameters, free runs, what was learned, residuals, stability.
+    """Return what `fit.report` returns: parameters, free runs, what was learned, residuals, stability.
 
     Raises:
         TrainingError: a fit without a usable model. InputError: a path that cannot be written, records that do not fit.
@@ -187,7 +187,7 @@ def page_of(
 
 
 def page_of_spec(fitted: FitReport, path: str | os.PathLike | None, tests: None = None) -> Page:
-    """The page of what `fit_spec` returned, as the command line writes it; errors as `page_of`."""
+    """Return the page of what `fit_spec` returned, as the command line writes it; errors as `page_of`."""
     place = _checked(fitted.fit, path)
     return _written(fit_report(fitted), place)
 
@@ -211,7 +211,7 @@ def _written(text: str, path: Path | None) -> Page:
 
 
 def _account(fit: Estimate | MotionEstimate) -> str:
-    """What stands in the place of the spec."""
+    """Return what stands in the place of the spec."""
     physics = fit.problem.motion if isinstance(fit, MotionEstimate) else fit.problem.baseline
     bound = fit.model.form.bound
     told = (fit.problem.record, physics, f"learner: {'none' if bound is None else bound.learner}")
@@ -220,7 +220,7 @@ def _account(fit: Estimate | MotionEstimate) -> str:
 
 
 def job_of(fit: Any, tests: Mapping[str, Record]) -> Job:
-    """The job whose result the fit is, as far as the fit knows it."""
+    """Return the job whose result the fit is, as far as the fit knows it."""
     if not isinstance(tests, Mapping) or not all(isinstance(record, Record) for record in tests.values()):
         raise InputError("`tests` must be records by their names, such as {'steps': record}.")
     problem = fit.problem

@@ -43,7 +43,7 @@ def check_place(out: Path | None, *read: Path, force: bool = False) -> None:
 
 
 def open_linear(model: Path, data: Path | None) -> tuple[Model | MotionModel, Record | None]:
-    """The model, and the record of a data file, or of the training data of a spec.
+    """Return the model, and the record of a data file, or of the training data of a spec.
 
     Raises:
         InputError: no model, no file, missing columns.
@@ -96,7 +96,7 @@ def write(found: Linearization, out: Path, *, force: bool = False) -> None:
 
 
 def told(found: Linearization, *, as_json: bool) -> str:
-    """What the command prints."""
+    """Return what the command prints."""
     from orthaug.reports.linear import LinearizeResult
     from orthaug.reports.linear_text import linear_text
 

@@ -36,7 +36,7 @@ class LongRun:
 
 
 def long_run(model: Path, data: Path, reading: ReadOptions, *, free: bool) -> LongRun | None:
-    """The model on a long Parquet file with all its channels; None for what is read at once.
+    """Return the model on a long Parquet file with all its channels; None for what is read at once.
 
     Raises:
         InputError: no model, a file that cannot be read, a model of data that had other instants.
@@ -65,7 +65,7 @@ def long_run(model: Path, data: Path, reading: ReadOptions, *, free: bool) -> Lo
 
 
 def write(run: LongRun, out: Path | None, *, force: bool = False) -> tuple[Scores | None, list[Warning]]:
-    """The table of `run.write_csv`, to a file (whole or not at all) or standard output; scores of all rows, warnings.
+    """Return the table of `run.write_csv`, to a file (whole or not at all) or standard output; scores of all rows, warnings.
 
     No scores where a free run left all bounds.
     """

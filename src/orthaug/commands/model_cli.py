@@ -275,7 +275,7 @@ def track(
 
 
 def _written_long(model: Path, data: Path, reading: ReadOptions, out: Path | None, force: bool, *, free: bool) -> bool:
-    """Whether the file is one that is not read at once; then its table is written piece by piece."""
+    """Return whether the file is one that is not read at once; then its table is written piece by piece."""
     from orthaug.commands import long_run
     from orthaug.commands.folder import check_file
     from orthaug.commands.run import prepared_notes

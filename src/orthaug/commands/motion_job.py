@@ -140,7 +140,7 @@ def _check_choices(spec: Spec, motion: Motion) -> None:
 
 
 def _place(error: KeyedError) -> str:
-    """The key of the spec that an error is about."""
+    """Return the key of the spec that an error is about."""
     return _SECTIONS.get(error.key, f"training.{error.key}")
 
 
@@ -162,7 +162,7 @@ def _check_sizes(spec: Spec, problem: MotionProblem) -> None:
 
 
 def _measure_of(spec: Spec, problem: MotionProblem, folder: Path) -> Measure:
-    """The measure that a spec declares, tried on the guessed states: names and limits are wrong before any training."""
+    """Return the measure that a spec declares, tried on the guessed states: names and limits are wrong before any training."""
     names = [str(lag) for lag in layout_of(problem.motion)]
     measure = spec.declared_measure(MeasurePlace(folder, names, problem.record, problem.first_row))
     rows = len(problem.record)  # a measure may weigh each of them

@@ -34,7 +34,7 @@ _NOT_RICH = Warning(
 
 
 def checked(job: MotionJob) -> CheckResult:
-    """What the outputs tell apart, what the learner could imitate, substeps and holds."""
+    """Return what the outputs tell apart, what the learner could imitate, substeps and holds."""
     from orthaug.analysis.absorbed import Waves
     from orthaug.analysis.imitation import imitation_before
     from orthaug.analysis.input_timing import dead_times, try_holds
@@ -93,7 +93,7 @@ def checked(job: MotionJob) -> CheckResult:
 
 
 def _biases(job: MotionJob, trial: Trial) -> list[dict[str, Any]] | None:
-    """What every suspect would do, about physics alone; of the usual ones those that do anything, where none is named.
+    """Return what every suspect would do, about physics alone; of the usual ones those that do anything, where none is named.
 
     None where physics alone has no run.
     """
@@ -131,7 +131,7 @@ def content(
     responses: Mapping[str, tuple[Response, Response]],
     warnings: list[Any],
 ) -> tuple[MotionEstimate, dict[str, Any]]:
-    """The fit, and what results tell of it; warnings are added."""
+    """Return the fit, and what results tell of it; warnings are added."""
     from orthaug.analysis.imitation import MotionImitation
     from orthaug.analysis.robustness import robust_free_run
     from orthaug.inference.nearly_shared import shared_warnings
@@ -171,7 +171,7 @@ def content(
 
 
 def _analysed(job: MotionJob, fit: MotionEstimate, free_run: Response, warnings: list[Any]) -> dict[str, Any]:
-    """What is asked of a fit behind its training; None for an analysis that fails. Warnings are added."""
+    """Return what is asked of a fit behind its training; None for an analysis that fails. Warnings are added."""
     from orthaug.analysis.learned_part import equation_parts
     from orthaug.analysis.motion_bias import suspected_bias
     from orthaug.analysis.motion_budget import told_budget
@@ -208,7 +208,7 @@ def _analysed(job: MotionJob, fit: MotionEstimate, free_run: Response, warnings:
 def figures(
     job: MotionJob, fit: MotionEstimate, result: FitResult, responses: Mapping[str, tuple[Response, Response]]
 ) -> dict[str, Figure]:
-    """The figures of a result by their names."""
+    """Return the figures of a result by their names."""
     from orthaug.reports import finding_plots, plots
     from orthaug.reports.learned_part import learned_of
 
@@ -235,12 +235,12 @@ def figures(
 def physics_alone(
     job: MotionJob, fit: MotionEstimate, responses: Mapping[str, tuple[Response, Response]]
 ) -> Mapping[str, Response]:
-    """The free run of every part by the physics without the learner."""
+    """Return the free run of every part by the physics without the learner."""
     return {part: free.physics_alone for part, (_, free) in responses.items()}
 
 
 def _parameters(fit: MotionEstimate, budget: MotionBudget | None) -> list[ParameterResult]:
-    """The parameters with their intervals, whether the learner could imitate them, and what biases them."""
+    """Return the parameters with their intervals, whether the learner could imitate them, and what biases them."""
     motion = fit.problem.motion
     values = fit.values if fit.status.ok else np.full(len(motion.names), np.nan)
     rows = parameter_rows(motion.parameters, values, fit.std, fit.interval, plain_std=fit.plain_std)
@@ -251,7 +251,7 @@ def _parameters(fit: MotionEstimate, budget: MotionBudget | None) -> list[Parame
 
 
 def _about_steps(job: MotionJob, trial: Trial) -> tuple[str, list[Warning]]:
-    """What integrator and hold do to the outputs, in words; with what to be warned of."""
+    """Return what integrator and hold do to the outputs, in words; with what to be warned of."""
     motion, problem, warnings = job.problem.motion, job.problem, []
     step = problem.record.sampling_time
     if motion.integrator == "discrete":

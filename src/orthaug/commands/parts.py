@@ -51,11 +51,11 @@ class Part:
 
     @property
     def skips(self) -> tuple[int, ...]:
-        """How many leading samples of each experiment are not scored."""
+        """Return how many leading samples of each experiment are not scored."""
         return tuple(max(0, self.skip - experiment.offset) for experiment in self.record.experiments)
 
     def scored(self, start: int) -> Record:
-        """The record of the scored rows and their lags, where the first usable row is `start`."""
+        """Return the record of the scored rows and their lags, where the first usable row is `start`."""
         kept = tuple(
             e.rows(max(0, skip - start), None) for e, skip in zip(self.record.experiments, self.skips, strict=True)
         )
@@ -85,7 +85,7 @@ class Part:
 def long_stretches(
     record: Record, skips: Sequence[int], first: int, least: int = 0, what: str = "", skip: int = 0
 ) -> tuple[Record, str]:
-    """A record without stretches that are too short for a row after the first ones, and what was left out, in words.
+    """Return a record without stretches that are too short for a row after the first ones, and what was left out, in words.
 
     Args:
         skips: leading samples of each stretch that are not scored.
@@ -191,7 +191,7 @@ def _load(path: Path, spec: Spec, part: PartSection, name: str, *, stays: bool =
 
 
 def _left(path: Path, spec: Spec, part: PartSection, name: str, files: Sequence[str]) -> Part:
-    """A part whose rows stay in its Parquet files."""
+    """Return a part whose rows stay in its Parquet files."""
     if spec.data.prepare:
         raise InputError(
             f"{path}: 'data.prepare' needs the rows in memory, and these stay in their files; prepare the files, or "
@@ -225,7 +225,7 @@ def _left(path: Path, spec: Spec, part: PartSection, name: str, files: Sequence[
 
 
 def _options(spec: Spec, part: PartSection) -> dict[str, Any]:
-    """How the files of a part are read, wherever their rows are."""
+    """Return how the files of a part are read, wherever their rows are."""
     data = spec.data
     named = {key: getattr(data, key) for key in ("sampling_time", "time", "experiment", "missing")}
     channels = {"inputs": spec.channels(data.inputs), "outputs": spec.channels(data.outputs)}
@@ -233,7 +233,7 @@ def _options(spec: Spec, part: PartSection) -> dict[str, Any]:
 
 
 def _used_columns(spec: Spec, columns: Mapping[str, str]) -> set[str]:
-    """The columns of a part's files that are channels, or tell experiments apart."""
+    """Return the columns of a part's files that are channels, or tell experiments apart."""
     channels = [*spec.channels(spec.data.inputs), *spec.channels(spec.data.outputs)]
     return {columns.get(c.name, c.file_column) for c in channels} | {spec.data.experiment or ""}
 
@@ -241,7 +241,7 @@ def _used_columns(spec: Spec, columns: Mapping[str, str]) -> set[str]:
 def _other_step(
     path: Path, spec: Spec, files: Sequence[str], name: str, columns: Mapping[str, str]
 ) -> tuple[Warning, ...]:
-    """A warning where a file tells another sampling time than the spec does."""
+    """Return a warning where a file tells another sampling time than the spec does."""
     used = _used_columns(spec, columns)
     step, given = spec.data.sampling_time or 1.0, spec.data.sampling_time is not None
     for file in files:

@@ -148,7 +148,7 @@ def main() -> None:
 
 
 def _complaint(error: Exception) -> str | None:
-    """What to tell of an error that is not ours; None of one that should not be."""
+    """Return what to tell of an error that is not ours; None of one that should not be."""
     from orthaug._base.jax import starts
 
     complaint = getattr(error, "format_message", None)  # typer's own, about arguments
@@ -204,7 +204,7 @@ def tell(result: Content, text: str, as_json: bool, place: object = None) -> Non
 
 
 def other_writes() -> bool:
-    """Whether this is one of several processes and another one writes, which is said."""
+    """Return whether this is one of several processes and another one writes, which is said."""
     from orthaug.models.hosts import waits
 
     text = waits()
@@ -214,7 +214,7 @@ def other_writes() -> bool:
 
 
 def arguments(command: str, spec: Path, **options: Any) -> tuple[str, ...]:
-    """What a command was asked for, to be asked again: the options that were given, under their names.
+    """Return what a command was asked for, to be asked again: the options that were given, under their names.
 
     Examples:
         >>> arguments("fit", Path("a.toml"), out=Path("b"), resume=False, model=None, force=True)

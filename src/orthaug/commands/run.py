@@ -86,7 +86,7 @@ def read_rows(text: str | None) -> tuple[int, int] | None:
 
 
 def trained_reading(model: Path, data: Path) -> ReadOptions | None:
-    """How a file was read to train a model, by the result beside that; None where it is none of its files."""
+    """Return how a file was read to train a model, by the result beside that; None where it is none of its files."""
     digest = file_digest(data)
     for content in results_beside(model):
         with suppress(AttributeError, KeyError, TypeError, ValueError):
@@ -98,7 +98,7 @@ def trained_reading(model: Path, data: Path) -> ReadOptions | None:
 
 
 def open_explained(model: Path, data: Sequence[Path], rows: tuple[int, int] | None) -> ModelOnData:
-    """A model with files to explain it over: of those that it was trained on, where no `rows` are given, those rows.
+    """Return a model with files to explain it over: of those that it was trained on, where no `rows` are given, those rows.
 
     Raises:
         InputError: as `open_run`.
@@ -164,7 +164,7 @@ def open_run(
 
 
 def record_for(model: Model | MotionModel, data: Path, outputs: Sequence[Channel], reading: ReadOptions) -> Record:
-    """A model's inputs, and some outputs, from a file.
+    """Return a model's inputs, and some outputs, from a file.
 
     Raises:
         InputError: as `read_record`.
@@ -197,7 +197,7 @@ def check_instants(model: Model | MotionModel, data: Path) -> None:
 
 
 def held_outputs(model: Model | MotionModel, data: Path, reading: ReadOptions) -> list[Channel]:
-    """The outputs that a file has columns of."""
+    """Return the outputs that a file has columns of."""
     return [c for c in model.outputs if has_column(data, reading.columns.get(c.name, c.file_column))]
 
 
@@ -206,7 +206,7 @@ _DETRENDED = " Detrended signals are deviations from their trend in each file."
 
 
 def prepared_notes(model: Model | MotionModel, record: Record | None = None, what: str = _RAW) -> tuple[str, ...]:
-    """What to know of a model whose training data were prepared.
+    """Return what to know of a model whose training data were prepared.
 
     Args:
         record: other data that went through the same; what the steps found there is told.
@@ -224,7 +224,7 @@ def prepared_notes(model: Model | MotionModel, record: Record | None = None, wha
 
 
 def read_initial(initial: str | None, opened: ModelOnData) -> str | Any:
-    """The `initial` of `Model.simulate`: measured where the data have outputs, zero otherwise, or a CSV's rows."""
+    """Return the `initial` of `Model.simulate`: measured where the data have outputs, zero otherwise, or a CSV's rows."""
     gaps, measured = len(opened.record.experiments) > 1, bool(opened.record.outputs)
     if gaps and not (measured and initial in (None, "measured")):
         remedy = "leave --initial out" if measured else "a free run without measured outputs cannot go on behind them"
@@ -248,7 +248,7 @@ def read_initial(initial: str | None, opened: ModelOnData) -> str | Any:
 
 
 def notes(opened: ModelOnData, initial: str | None) -> list[str]:
-    """What a user may not expect of a free run: where it starts when nothing says so."""
+    """Return what a user may not expect of a free run: where it starts when nothing says so."""
     if initial is not None or opened.record.outputs or not opened.model.form.states:
         return [*opened.notes]
     names = ", ".join(channel.name for channel in opened.model.outputs)
@@ -259,7 +259,7 @@ def notes(opened: ModelOnData, initial: str | None) -> list[str]:
 
 
 def with_initial(opened: ModelOnData, initial: str | Any) -> Record:
-    """The record with the outputs of its first rows replaced, for predictions that start from others."""
+    """Return the record with the outputs of its first rows replaced, for predictions that start from others."""
     if isinstance(initial, str) and initial == "measured":
         return opened.record
     start = opened.model.form.first_row
@@ -291,7 +291,7 @@ def open_ahead(
 
 
 def observed(opened: ModelOnData, horizon: int) -> tuple[Response, list[str]]:
-    """The prediction `horizon` steps ahead from an observer's state, and whether its band is what it says."""
+    """Return the prediction `horizon` steps ahead from an observer's state, and whether its band is what it says."""
     from orthaug.analysis.observer import Observer
 
     observer = Observer(opened.model)
@@ -339,7 +339,7 @@ def write_csv(response: Response, opened: ModelOnData, out: Path | None, *, forc
 
 
 def _table(response: Response, opened: ModelOnData) -> Any:
-    """The tables of all stretches in the rows of the file; of rows that were left out the time alone."""
+    """Return the tables of all stretches in the rows of the file; of rows that were left out the time alone."""
     stretches = opened.record.experiments
     frames = [response.to_frame(i) for i in range(len(stretches))]
     if len(stretches[0]) == opened.rows:
@@ -354,7 +354,7 @@ def _table(response: Response, opened: ModelOnData) -> Any:
 
 
 def explain_notes(model: Path) -> list[str]:
-    """What to write beside proposed terms, where the result of the model has a map to physical parameters."""
+    """Return what to write beside proposed terms, where the result of the model has a map to physical parameters."""
     for content in results_beside(model):
         with suppress(AttributeError, KeyError, TypeError):
             if content["spec"].get("physics"):
@@ -366,7 +366,7 @@ def explain_notes(model: Path) -> list[str]:
 
 
 def explain_model(opened: ModelOnData, *, degree: int, functions: Sequence[str], most: int) -> ExplainResult:
-    """The content of the explanation of a model over its data.
+    """Return the content of the explanation of a model over its data.
 
     Raises:
         InputError: physics alone, data without what the learner is evaluated at, too many candidates.

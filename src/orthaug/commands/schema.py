@@ -29,7 +29,7 @@ RESULTS: dict[str, type[Content]] = {
 
 
 def schema_of(command: str) -> dict[str, Any]:
-    """The JSON schema of what a command writes."""
+    """Return the JSON schema of what a command writes."""
     return RESULTS[command].model_json_schema(mode="serialization")
 
 

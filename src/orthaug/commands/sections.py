@@ -40,7 +40,7 @@ class PhysicalSection(Section):
     max: Finite | None = None
 
     def declared(self, name: str) -> PhysicalParameter:
-        """The parameter of this name."""
+        """Return the parameter of this name."""
         low, high = -math.inf if self.min is None else self.min, math.inf if self.max is None else self.max
         return PhysicalParameter(name, self.initial, self.unit, low, high)
 
@@ -56,7 +56,7 @@ class KindSection(Section):
         def __getattr__(self, name: str) -> Any: ...
 
     def declared(self, registry: Registry, kind: str) -> Any:
-        """The declaration of a kind with the keys that the file gives."""
+        """Return the declaration of a kind with the keys that the file gives."""
         return registry.declare(kind, {name: getattr(self, name) for name in self.model_fields_set})
 
     @model_validator(mode="after")
@@ -70,7 +70,7 @@ Kinds = TypeVar("Kinds", bound=KindSection)
 
 
 def with_kinds(section: type[Kinds], **other: Any) -> type[Kinds]:
-    """A section with the keys of all kinds of its registries.
+    """Return a section with the keys of all kinds of its registries.
 
     Args:
         section: has each key that chooses a kind, with the default kind.
@@ -84,14 +84,14 @@ def with_kinds(section: type[Kinds], **other: Any) -> type[Kinds]:
 
 
 def _field(key: Key) -> tuple[Any, Any]:
-    """A key as pydantic's type and default; one that its kind needs is None where another kind is chosen."""
+    """Return a key as pydantic's type and default; one that its kind needs is None where another kind is chosen."""
     if key.default is MISSING:
         return Union[_in_file(key.annotation), None], None  # noqa: UP007  (the parts are known at run time only)
     return _in_file(key.annotation), _thawed(key.default)
 
 
 def _in_file(annotation: Any) -> Any:
-    """The type of what a file holds for a declaration's type: lists for tuples, finite numbers."""
+    """Return the type of what a file holds for a declaration's type: lists for tuples, finite numbers."""
     origin, inner = typing.get_origin(annotation), typing.get_args(annotation)
     if origin is Annotated:
         limits = []
@@ -120,7 +120,7 @@ def _thawed(value: Any) -> Any:
 
 
 def first_message(error: ValidationError, content: dict[str, Any], model: type[BaseModel]) -> str:
-    """The first error as `key: found …; expected …`."""
+    """Return the first error as `key: found …; expected …`."""
     errors = error.errors()
     # every branch of a union complains: the branch was meant whose type fits, and there the deepest complaint counts
     fitting = [e for e in errors if not e["type"].endswith("_type")]
@@ -145,7 +145,7 @@ def first_message(error: ValidationError, content: dict[str, Any], model: type[B
 
 
 def _shown(value: Any) -> str:
-    """A value as the file writes it, cut where it is long."""
+    """Return a value as the file writes it, cut where it is long."""
     try:
         text = json.dumps(value, default=str, ensure_ascii=False).replace("Infinity", "inf").replace("NaN", "nan")
     except RecursionError:
@@ -164,7 +164,7 @@ def _plain(message: str) -> str:
 
 
 def _key(location: tuple[Any, ...], content: Any) -> str:
-    """The key's path in the file; pydantic's names of union branches are not part of it."""
+    """Return the key's path in the file; pydantic's names of union branches are not part of it."""
     text = ""
     for i, part in enumerate(location):
         if isinstance(part, int):
@@ -177,7 +177,7 @@ def _key(location: tuple[Any, ...], content: Any) -> str:
 
 
 def _known_keys(parents: list[Any], model: Any) -> list[str]:
-    """The keys of the section at a path such as ["data", "tests", "steps"]."""
+    """Return the keys of the section at a path such as ["data", "tests", "steps"]."""
     for part in parents:
         if isinstance(part, int) or not isinstance(model, type):
             continue
@@ -187,7 +187,7 @@ def _known_keys(parents: list[Any], model: Any) -> list[str]:
 
 
 def _section_of(annotation: Any) -> Any:
-    """The section inside an annotation such as `dict[str, PartSection] | None`."""
+    """Return the section inside an annotation such as `dict[str, PartSection] | None`."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
     for inner in getattr(annotation, "__args__", ()):

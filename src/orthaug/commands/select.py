@@ -43,7 +43,7 @@ class SelectionReport:
 
 
 def open_select(path: Path) -> tuple[LaggedJob, Spec]:
-    """The job of a spec's physics alone, and the spec as it was given.
+    """Return the job of a spec's physics alone, and the spec as it was given.
 
     Raises:
         InputError: a motion, and anything wrong with spec, files or physics.
@@ -96,7 +96,7 @@ def select_for(job: LaggedJob, spec: Spec, folder: Path, told: Told) -> Selectio
 
 
 def steps_at_most(terms: int | None) -> int:
-    """How many models the path of terms has at most, forward."""
+    """Return how many models the path of terms has at most, forward."""
     from orthaug.selection.selecting import MOST
     from orthaug.selection.term_path import steps
 
@@ -118,7 +118,7 @@ def write_selected(selected: SelectionReport, folder: Path, *, force: bool = Fal
 
 
 def _learner(spec: Spec) -> Learner | None:
-    """What is searched: the declared learner, or terms where none is declared."""
+    """Return what is searched: the declared learner, or terms where none is declared."""
     if "learner" not in spec.model_fields_set:
         return Terms(degree=_DEGREE)
     declared = spec.learner.declared(LEARNERS, spec.learner.kind)
@@ -126,7 +126,7 @@ def _learner(spec: Spec) -> Learner | None:
 
 
 def _largest(spec: Spec) -> Lags | None:
-    """The largest orders: of [selection], or of [lags]."""
+    """Return the largest orders: of [selection], or of [lags]."""
     section, lags = spec.selection, spec.lags
     if section.na is None and section.nb is None and section.nk is None:
         return spec.lag_orders()
@@ -140,7 +140,7 @@ def _largest(spec: Spec) -> Lags | None:
 
 
 def _criterion(spec: Spec) -> Criterion:
-    """The declared one; the free run where the spec does not say."""
+    """Return the declared one; the free run where the spec does not say."""
     focus = "simulation" if spec.training.focus == "auto" else spec.training.focus
     return spec.training.declared(CRITERIA, focus)
 
@@ -181,7 +181,7 @@ def _moved(shift: Shift) -> dict[str, Any]:
 
 
 def _declared(learner: Learner | None) -> dict[str, Any] | None:
-    """The section [learner] of a choice."""
+    """Return the section [learner] of a choice."""
     if learner is None:
         return None
     if isinstance(learner, Terms):
@@ -191,7 +191,7 @@ def _declared(learner: Learner | None) -> dict[str, Any] | None:
 
 
 def _new_spec(job: LaggedJob, folder: Path, selection: Selection, *, halved: bool) -> str:
-    """The spec with the choice in it; comments and order are kept, paths made relative to the new folder."""
+    """Return the spec with the choice in it; comments and order are kept, paths made relative to the new folder."""
     path = job.path
     document: Any = tomlkit.parse(path.read_text(encoding="utf-8-sig"))
     _rebase(document, path.parent, folder)

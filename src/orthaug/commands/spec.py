@@ -245,18 +245,18 @@ class Spec(Section):
         return self
 
     def channels(self, names: list[str]) -> tuple[Channel, ...]:
-        """The named channels with unit, column, scale and offset."""
+        """Return the named channels with unit, column, scale and offset."""
         given = self.data.channels
         return tuple(Channel(name, **(given[name].model_dump() if name in given else {})) for name in names)
 
     def lag_orders(self) -> Lags | None:
-        """The learner's orders; None for the raw lags that the baseline uses."""
+        """Return the learner's orders; None for the raw lags that the baseline uses."""
         if self.lags is None:
             return None
         return Lags(*(tuple(v) if isinstance(v, list) else v for v in (self.lags.na, self.lags.nb, self.lags.nk)))
 
     def declared_baseline(self) -> Baseline:
-        """The baseline as declared."""
+        """Return the baseline as declared."""
         assert self.baseline is not None, "a motion has no baseline"
         terms = [
             Term(t.parameter, str(t.regressor), t.initial, t.unit, t.output, t.fixed, t.min, t.max)
@@ -265,14 +265,14 @@ class Spec(Section):
         return Baseline.from_terms(terms, self.baseline.constants)
 
     def physics_map(self, sampling_time: float) -> PhysicsMap | None:
-        """The physical parameters and their map to θ, if the spec has one; `Ts` in it is the sampling time [s]."""
+        """Return the physical parameters and their map to θ, if the spec has one; `Ts` in it is the sampling time [s]."""
         if self.physics is None or self.baseline is None:
             return None
         parameters = [section.declared(name) for name, section in self.physics.parameters.items()]
         return PhysicsMap.of(parameters, self.physics.theta, {SAMPLING_TIME: sampling_time} | self.baseline.constants)
 
     def declared_learner(self) -> Learner | None:
-        """The learner; None for physics alone, as of a motion that nothing is added to."""
+        """Return the learner; None for physics alone, as of a motion that nothing is added to."""
         if self.motion is not None and not self.motion.learns and "learner" not in self.model_fields_set:
             return None
         learner = resolve(self.learner.declared(LEARNERS, self.learner.kind))
@@ -284,22 +284,22 @@ class Spec(Section):
         return over_lags(learner, self.declared_baseline(), self.lag_orders(), *channels)
 
     def learner_inputs(self) -> tuple[str, ...] | None:
-        """What the learner sees; None for all lags."""
+        """Return what the learner sees; None for all lags."""
         return getattr(self.declared_learner(), "inputs", None)
 
     def declared_structure(self, kind: str | None = None, measure: Measure | None = None) -> Structure:
-        """The structure, or another kind with the same keys; under a measure where it splits θ by one."""
+        """Return the structure, or another kind with the same keys; under a measure where it splits θ by one."""
         structure = resolve(self.structure.declared(STRUCTURES, kind or self.structure.kind))
         takes = any(field.name == "measure" for field in fields(structure))
         return replace(structure, measure=measure) if takes and measure is not None else structure
 
     def declared_measure(self, place: MeasurePlace) -> Measure:
-        """The measure, with what it reads from files."""
+        """Return the measure, with what it reads from files."""
         section = self.structure.measure
         return resolve(section.declared(MEASURES, section.kind), place)
 
     def declared_criterion(self) -> Criterion:
-        """The criterion. A motion is trained on its free run, from starts that are estimated: without a washout."""
+        """Return the criterion. A motion is trained on its free run, from starts that are estimated: without a washout."""
         training = self.training
         if self.motion is None:
             return resolve(training.declared(CRITERIA, training.chosen_focus()))
@@ -308,7 +308,7 @@ class Spec(Section):
         return resolve(training.model_copy(update=washout).declared(CRITERIA, focus))
 
     def declared_solver(self) -> Solver:
-        """The solver."""
+        """Return the solver."""
         return resolve(self.training.declared(SOLVERS, self.training.solver))
 
     def engine_kind(self, files: Sequence[Path]) -> str:
@@ -329,19 +329,19 @@ class Spec(Section):
 
     @property
     def brought(self) -> bool:
-        """Whether training reads all rows into memory: of a motion, and of free runs over whole experiments."""
+        """Return whether training reads all rows into memory: of a motion, and of free runs over whole experiments."""
         free_run = self.declared_criterion().free_run
         return self.motion is not None or (free_run is not None and not free_run.steps)
 
     def regularizations(self, *, linear: bool, validated: bool, kind: str | None = None) -> tuple[str | float, ...]:
-        """Those that every start is run with, in the structure that is declared or another kind."""
+        """Return those that every start is run with, in the structure that is declared or another kind."""
         given = self.training.regularization
         declared = (self.declared_solver(), self.declared_criterion(), self.declared_structure(kind))
         conditions: dict[str, Any] = {"linear": linear, "validated": validated}
         return tried(given, *declared, **conditions, motion=self.motion is not None, learner=self.declared_learner())
 
     def runs(self, *, linear: bool) -> int:
-        """How many runs a fit makes: restarts times regularizations."""
+        """Return how many runs a fit makes: restarts times regularizations."""
         validated = self.data.validation is not None
         return self.training.restarts * len(self.regularizations(linear=linear, validated=validated))
 

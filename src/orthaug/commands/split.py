@@ -28,7 +28,7 @@ _UNKNOWN = Warning("no_statistics", "no standard errors: training left no statis
 
 
 def open_training(model: Path, data: Sequence[Path], rows: tuple[int, int] | None) -> ModelOnData:
-    """A model with the files that it was trained on, `rows` of each; None for those that its result names."""
+    """Return a model with the files that it was trained on, `rows` of each; None for those that its result names."""
     from orthaug.models.storage import load
 
     for path in data:
@@ -50,7 +50,7 @@ def open_training(model: Path, data: Sequence[Path], rows: tuple[int, int] | Non
 
 
 def _other_files(model: Path, data: Sequence[Path]) -> list[Warning]:
-    """A warning where the result of a model has other files' checksums."""
+    """Return a warning where the result of a model has other files' checksums."""
     for content in results_beside(model):
         with suppress(KeyError, TypeError):
             kept = {file["sha256"]: file["file"] for file in content["data"]["train"]}
@@ -66,7 +66,7 @@ def _other_files(model: Path, data: Sequence[Path]) -> list[Warning]:
 
 
 def read_measure(kind: str, given: Mapping[str, Sequence[str]], opened: ModelOnData) -> Measure:
-    """The measure of a kind from the values `given` to each option; the registry says which kind takes which.
+    """Return the measure of a kind from the values `given` to each option; the registry says which kind takes which.
 
     Raises:
         InputError: an unknown kind, an option of another kind or without what it needs, files that do not fit.
@@ -91,7 +91,7 @@ def read_measure(kind: str, given: Mapping[str, Sequence[str]], opened: ModelOnD
 
 
 def _read(key: Key, option: str, texts: Sequence[str]) -> Any:
-    """The value of a key: limits by raw lag for a mapping, the texts themselves otherwise."""
+    """Return the value of a key: limits by raw lag for a mapping, the texts themselves otherwise."""
     if get_origin(key.type) is not Mapping:
         return tuple(texts)
     limits: dict[str, tuple[float, float]] = {}
@@ -110,7 +110,7 @@ def _read(key: Key, option: str, texts: Sequence[str]) -> Any:
 
 
 def split_model(opened: ModelOnData, measure: Measure) -> SplitResult:
-    """The parameters of a saved model under a measure.
+    """Return the parameters of a saved model under a measure.
 
     Raises:
         InputError: a θ at a bound, a measure that does not fit the model, other data than those of its training.

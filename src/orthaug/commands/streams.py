@@ -33,7 +33,7 @@ def prepare() -> None:
 
 
 def plain(error: UnicodeError) -> tuple[str, int]:
-    """What stands for letters that an encoding lacks: words and ASCII; in JSON the escape that means the same."""
+    """Return what stands for letters that an encoding lacks: words and ASCII; in JSON the escape that means the same."""
     if not isinstance(error, UnicodeEncodeError):
         raise error
     missing = error.object[error.start : error.end]

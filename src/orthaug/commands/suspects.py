@@ -13,7 +13,7 @@ from orthaug.physics.problem import Problem
 
 
 def declared(sections: Sequence[SuspectSection], problem: Problem) -> tuple[Suspect, ...]:
-    """The suspects of a spec. A width that is not given is the median size of what the term acts on.
+    """Return the suspects of a spec. A width that is not given is the median size of what the term acts on.
 
     Raises:
         InputError: an unknown kind, channel or lag, an expression that cannot be read.

@@ -81,7 +81,7 @@ def open_track(
 
 
 def _physics_of(model: Path, sampling_time: float) -> PhysicsMap | None:
-    """What θ is made of, from the result beside a model; None where there is none."""
+    """Return what θ is made of, from the result beside a model; None where there is none."""
     from orthaug.commands.spec import spec_model
 
     for content in results_beside(model):

@@ -53,19 +53,19 @@ class Clock:
 
     @property
     def instants(self) -> bool:
-        """Whether the column holds instants."""
+        """Return whether the column holds instants."""
         return self.seconds is not None
 
     @property
     def steady(self) -> bool:
-        """Whether parts of the file tell the same sampling time from their instants."""
+        """Return whether parts of the file tell the same sampling time from their instants."""
         seconds = np.zeros(0) if self.seconds is None else self.seconds[np.isfinite(self.seconds)]
         means = [part.mean() for part in np.array_split(np.diff(seconds), 4) if len(part)]
         return bool(means) and same_step(min(means), max(means))
 
     @property
     def by_name(self) -> bool:
-        """Whether the column's name or its dates say that it is the time, and not only its values."""
+        """Return whether the column's name or its dates say that it is the time, and not only its values."""
         return self.column is not None and (
             not self.instants or bool(self.column.unusable) or is_time(self.column.header)
         )
@@ -127,7 +127,7 @@ def find_clock(columns: Sequence[Column], near: str = "") -> Clock:
 
 
 def _parent(path: str) -> str:
-    """The struct or group that a variable is in."""
+    """Return the struct or group that a variable is in."""
     return path[: max(path.rfind("."), path.rfind("/"), 0)]
 
 
@@ -181,7 +181,7 @@ def _resemblance(column: Column) -> RefusedColumn | bool | None:
 
 
 def told_clock(path: Path, apart: Collection[str] = (), *, by_content: bool = False) -> Clock:
-    """What a file tells of its sampling time by the names of its columns and their first rows.
+    """Return what a file tells of its sampling time by the names of its columns and their first rows.
 
     Args:
         apart: columns that are channels, whatever they are called.
@@ -227,7 +227,7 @@ def thinned_twice(path: Path, sampling_time: float | None, every: int, apart: Co
 
 
 def by_single_number(path: Path) -> Clock:
-    """A clock of single numbers called `Ts` or `fs` beside the channels, where all that there are agree."""
+    """Return a clock of single numbers called `Ts` or `fs` beside the channels, where all that there are agree."""
     if path.suffix.lower() not in ENDINGS:
         return Clock()
     found = scalars(path, lambda name: step_of(name, 1.0) is not None)

@@ -63,7 +63,7 @@ class Column:
 
     @property
     def constant(self) -> bool:
-        """Whether all values are the same."""
+        """Return whether all values are the same."""
         return len(self.finite) > 0 and bool(np.ptp(self.finite) == 0)
 
     @property
@@ -126,7 +126,7 @@ class Column:
 
 
 def quantum_of(values: Vector) -> float | None:
-    """The step of which all differences between values are multiples, up to rounding; None where there is none."""
+    """Return the step of which all differences between values are multiples, up to rounding; None where there is none."""
     levels = np.unique(values)
     if len(levels) < 3 or not np.isfinite(levels[[0, -1]]).all():
         return None
@@ -137,7 +137,7 @@ def quantum_of(values: Vector) -> float | None:
 
 
 def channel_name(text: str, taken: Iterable[str] = ()) -> str:
-    """An identifier for a column: other letters become underscores; a name that is taken gets a number."""
+    """Return an identifier for a column: other letters become underscores; a name that is taken gets a number."""
     name = re.sub(r"\W+", "_", unicodedata.normalize("NFKC", text)).strip("_")[: LONGEST - 4] or "channel"
     name = f"x{name}" if name[0].isdigit() else name
     if not is_name(name) or keyword.iskeyword(name) or name in (SAMPLING_TIME, "time"):

@@ -136,7 +136,7 @@ def open_frame(
     missing: str = "error",
     client: Any = None,
 ) -> FrameSource:
-    """A Dask DataFrame whose rows are in order; its partitions are kept on the workers.
+    """Return a Dask DataFrame whose rows are in order; its partitions are kept on the workers.
 
     Args:
         frame: a `dask.dataframe.DataFrame`.

@@ -87,12 +87,12 @@ class Expression:
 
     @cached_property
     def unsampled(self) -> bool:
-        """Whether it reads `Ts`, and has no value for that yet."""
+        """Return whether it reads `Ts`, and has no value for that yet."""
         named = any(isinstance(node, ast.Name) and node.id == SAMPLING_TIME for node in _free_names(self.tree))
         return named and SAMPLING_TIME not in dict(self.constants)
 
     def sampled(self, sampling_time: float) -> Expression:
-        """The expression with this value [s] of `Ts`; the same one where it does not wait for it."""
+        """Return the expression with this value [s] of `Ts`; the same one where it does not wait for it."""
         if not self.unsampled:
             return self
         return replace(self, constants=tuple(sorted((*self.constants, (SAMPLING_TIME, float(sampling_time))))))
@@ -117,7 +117,7 @@ class Expression:
         return _evaluate(self.tree, {}, values, xp, self.text)
 
     def term_without_value(self, values: Mapping[str, Any]) -> tuple[str, tuple[str, ...]]:
-        """The smallest term that is not finite although all in it is, and its names."""
+        """Return the smallest term that is not finite although all in it is, and its names."""
 
         def finite(node: ast.expr) -> bool:
             with np.errstate(all="ignore"):
@@ -134,7 +134,7 @@ class Expression:
 
 
 def is_name(name: str, taken: Container[str] = RESERVED) -> bool:
-    """Whether expressions can use `name`: Python reads an identifier in its normal form only."""
+    """Return whether expressions can use `name`: Python reads an identifier in its normal form only."""
     return (
         is_identifier(name)
         and not keyword.iskeyword(name)
@@ -144,7 +144,7 @@ def is_name(name: str, taken: Container[str] = RESERVED) -> bool:
 
 
 def is_identifier(name: Any) -> bool:
-    """Whether `name` is made of letters, digits and underscores, does not start with a digit and is not too long."""
+    """Return whether `name` is made of letters, digits and underscores, does not start with a digit and is not too long."""
     return isinstance(name, str) and name.isidentifier() and len(name) <= LONGEST
 
 
@@ -296,7 +296,7 @@ def _check_call(node: ast.Call, text: str) -> None:
 
 
 def _free_names(node: ast.AST) -> Iterator[ast.Name]:
-    """The names that stand for numbers: neither channels nor functions."""
+    """Yield the names that stand for numbers: neither channels nor functions."""
     if isinstance(node, ast.Name):
         yield node
     elif isinstance(node, ast.Call):
@@ -308,7 +308,7 @@ def _free_names(node: ast.AST) -> Iterator[ast.Name]:
 
 
 def _lag(node: ast.Subscript, text: str) -> Lag:
-    """The raw lag that `name[k]` or `name[k-3]` stands for."""
+    """Return the raw lag that `name[k]` or `name[k-3]` stands for."""
     if not isinstance(node.value, ast.Name):
         raise InputError(f"'{text}': '{ast.unparse(node)}' is not a channel at a lag such as y[k-1].")
     name, index = node.value.id, node.slice

@@ -53,7 +53,7 @@ def split_header(header: str) -> tuple[str, str]:
 
 
 def last_part(name: str) -> str:
-    """The name of a variable without the struct or group that it is in: `u` of `data.u`."""
+    """Return the name of a variable without the struct or group that it is in: `u` of `data.u`."""
     return re.split(r"[./]", name)[-1]
 
 
@@ -69,13 +69,13 @@ def unit_of_time(header: str) -> tuple[str, float | None]:
 
 
 def is_time(header: str) -> bool:
-    """Whether the name says that the column holds instants."""
+    """Return whether the name says that the column holds instants."""
     base, unit = unit_of_time(header)
     return unit is not None and bool(_TIME.match(base) or _TIME.match(last_part(base)))
 
 
 def step_of(header: str, value: float) -> float | None:
-    """The sampling time in s where the name says that the value is one, or a rate in Hz; otherwise None."""
+    """Return the sampling time in s where the name says that the value is one, or a rate in Hz; otherwise None."""
     base, unit = unit_of_time(header)
     if unit is not None and value > 0 and _STEP.match(last_part(base)):
         return unit * value
@@ -118,7 +118,7 @@ def dated(cells: Sequence[Any] | np.ndarray, where: str) -> Vector | None:
 
 
 def _plain(cell: Any) -> Any:
-    """A time of the day as a duration; anything else as it is."""
+    """Return a time of the day as a duration; anything else as it is."""
     if not isinstance(cell, datetime.time):
         return cell
     return datetime.timedelta(hours=cell.hour, minutes=cell.minute, seconds=cell.second, microseconds=cell.microsecond)

@@ -55,7 +55,7 @@ class Layout(NamedTuple):
 
     @property
     def note(self) -> str:
-        """What to know of the encoding and of the names; mostly nothing."""
+        """Return what to know of the encoding and of the names; mostly nothing."""
         notes = ["no UTF-8, so read as Windows-1252"] if self.encoding == _FALLBACK else []
         if not self.headed:
             named = [name for name in self.names if name]
@@ -156,7 +156,7 @@ def _layout(path: Path, encoding: str, columns: Sequence[str]) -> Layout:
 
 
 def _has_numbers(line: str) -> bool:
-    """Whether a line is one of a table and no remark: a cell between separators is a number, or each between spaces."""
+    """Return whether a line is one of a table and no remark: a cell between separators is a number, or each between spaces."""
     if line.lstrip().startswith(_REMARK):
         return False
     return any(map(_NUMBER.fullmatch, re.split(r"[,;\t]", line))) or all(map(_NUMBER.fullmatch, line.split()))
@@ -177,13 +177,13 @@ def _first_unnamed(rows: list[tuple[list[str], int]], separator: str, line: str)
 
 
 def _is_row(cells: list[str], separator: str) -> bool:
-    """Whether cells hold numbers, dates or nothing, and at least one of the former."""
+    """Return whether cells hold numbers, dates or nothing, and at least one of the former."""
     found = [_is_number(cell, separator) or _DATE.fullmatch(cell.strip()) is not None for cell in cells]
     return any(found) and all(good or cell.strip().lower() in _MISSING for good, cell in zip(found, cells, strict=True))
 
 
 def _counts_columns(rows: list[tuple[list[str], int]], separator: str) -> bool:
-    """Whether the first line, 0, 1, 2, …, stands for columns without names, as pandas writes it.
+    """Return whether the first line, 0, 1, 2, …, stands for columns without names, as pandas writes it.
 
     It does not where the table has one column, or where the first column goes on evenly from it, as time does.
     """
@@ -203,7 +203,7 @@ def _unnamed(rows: list[list[str]]) -> list[str]:
 
 
 def _below_remarks(rows: list[tuple[list[str], int]], separator: str) -> tuple[list[str], int]:
-    """The first line with as many cells as the rows below, or simply the first."""
+    """Return the first line with as many cells as the rows below, or simply the first."""
     for at, (cells, _) in enumerate(rows[1:], start=1):
         if len(cells) > 1 and any(_is_number(cell, separator) for cell in cells):
             count = len(cells)
@@ -217,7 +217,7 @@ def _is_number(cell: str, separator: str) -> bool:
 
 
 def _count(cells: list[str]) -> int:
-    """How many there are, empty ones at the end too; 0 where one of the others is a number or empty: no header."""
+    """Return how many there are, empty ones at the end too; 0 where one of the others is a number or empty: no header."""
     named = [cell.strip() for cell in cells]
     while named and not named[-1]:
         named.pop()
@@ -254,7 +254,7 @@ def _cells(line: str, separator: str) -> list[str]:
 
 
 def _next_line(file: TextIO, number: int) -> tuple[str, int]:
-    """The next line that is not blank, empty at the end of the file, and its number, after line `number`."""
+    """Return the next line that is not blank, empty at the end of the file, and its number, after line `number`."""
     for line in iter(file.readline, ""):
         number += 1
         if line.strip():
@@ -263,7 +263,7 @@ def _next_line(file: TextIO, number: int) -> tuple[str, int]:
 
 
 def numbers_only(names: list[str]) -> bool:
-    """Whether a header is a row of numbers; 0, 1, 2, … stand for columns without names."""
+    """Return whether a header is a row of numbers; 0, 1, 2, … stand for columns without names."""
     found = [name for name in names if name]
     if not found or not all(map(_NUMBER.fullmatch, found)):
         return False
@@ -271,7 +271,7 @@ def numbers_only(names: list[str]) -> bool:
 
 
 def read_sheet(path: Path, place: Place) -> tuple[int, list[list[Any]]]:
-    """The row of the header, counted from 1, and the cells below it in the columns that `place` finds in the header.
+    """Return the row of the header, counted from 1, and the cells below it in the columns that `place` finds in the header.
 
     The first row that holds anything is the header. A cell that is not there is None.
 
@@ -370,7 +370,7 @@ def _pick(path: Path, sheet: Any, place: Place) -> tuple[int, list[list[Any]]]:
 
 
 def as_number(value: Any) -> float:
-    """A cell as a float, NaN where it holds none; dates are none."""
+    """Return a cell as a float, NaN where it holds none; dates are none."""
     if isinstance(value, str):
         return text_number(value)
     if not isinstance(value, int | float | np.number):
@@ -382,7 +382,7 @@ def as_number(value: Any) -> float:
 
 
 def text_number(text: str) -> float:
-    """The number that a text is in ASCII digits with a decimal point, to the last digit; NaN where it is none."""
+    """Return the number that a text is in ASCII digits with a decimal point, to the last digit; NaN where it is none."""
     try:
         return float(text) if text.isascii() and "_" not in text else np.nan
     except ValueError:

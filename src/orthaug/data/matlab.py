@@ -35,7 +35,7 @@ class Variable:
     _body: Callable[[], memoryview]
 
     def numbers(self) -> np.ndarray:
-        """The values, of the variable's shape."""
+        """Return the values, of the variable's shape."""
         kind, data, at = _element(body := self._body(), self._begin, self._order)
         values = self._values(kind, data)
         if self._flags & _COMPLEX_FLAG:
@@ -56,7 +56,7 @@ class Variable:
         return values.reshape(self.shape, order="F")
 
     def parts(self) -> Iterator[Variable]:
-        """What is in a struct, an object or a cell, by its path; nothing of anything else.
+        """Yield what is in a struct, an object or a cell, by its path; nothing of anything else.
 
         Elements of arrays are counted from 0: `runs[1].u`, `c[0]`. The only element of a cell has the cell's own name.
         """
@@ -85,7 +85,7 @@ class Variable:
 
 
 def read_mat5(content: bytes, path: object) -> dict[str, Variable]:
-    """The variables of a v5 file by name; their numbers are read when they are asked for.
+    """Return the variables of a v5 file by name; their numbers are read when they are asked for.
 
     Raises:
         ValueError, KeyError, struct.error, zlib.error: what is no such file, or ends too early.
@@ -138,7 +138,7 @@ def _inflated(data: memoryview, order: str, path: object) -> tuple[int, memoryvi
 
 
 def _variable(data: memoryview, order: str, body: Callable[[], memoryview], name: str | None = None) -> Variable:
-    """A variable by its header; `body` gives all of its bytes."""
+    """Return a variable by its header; `body` gives all of its bytes."""
     kind, flags, at = _element(data, 0, order)
     if kind != _UINT32 or len(flags) != 8:
         raise ValueError("a variable has no flags")

@@ -44,7 +44,7 @@ class Runs(NamedTuple):
     began: tuple[float, ...]
 
     def within(self, start: int, stop: int) -> Runs:
-        """Those with a row in `[start, stop)`."""
+        """Return those with a row in `[start, stop)`."""
         kept = [i for i, (a, b) in enumerate(self.ranges) if a < stop and b > start]
         return Runs(tuple(self.ranges[i] for i in kept), tuple(self.began[i] for i in kept))
 
@@ -258,7 +258,7 @@ def _check_types(
 
 
 def _look(file: Any, path: Path, total: int, time: str | None, experiment: str | None) -> tuple[Runs, float | None]:
-    """The file's experiments and its sampling time [s], by a pass over the two columns that tell them."""
+    """Return the file's experiments and its sampling time [s], by a pass over the two columns that tell them."""
     if time is None and experiment is None:
         return Runs(((0, total),), (0.0,)), None
     wanted = [name for name in (time, experiment) if name]
@@ -283,7 +283,7 @@ class _BatchScan:
         self.origin: Any = None
 
     def seconds(self, instants: np.ndarray) -> np.ndarray:
-        """A batch of the time column in s, dates since the first row of the file."""
+        """Return a batch of the time column in s, dates since the first row of the file."""
         if instants.dtype.kind != "M":
             return in_seconds(np.asarray(instants, dtype=float), self.time or "")
         self.origin = instants[0] if self.origin is None else self.origin

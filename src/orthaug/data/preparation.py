@@ -22,7 +22,7 @@ Phase = Annotated[str, OneOf(("zero", "causal"))]
 
 
 def _filtered(values: Matrix, sections: Matrix, phase: str, what: str) -> Matrix:
-    """Every stretch without a gap through a filter; those too short for it are missing."""
+    """Return every stretch without a gap through a filter; those too short for it are missing."""
     from scipy.signal import sosfilt, sosfilt_zi, sosfiltfilt
 
     result, pad = np.full_like(values, np.nan), 3 * (2 * len(sections) + 1)
@@ -164,7 +164,7 @@ SAMPLING = ("decimate", "resample")
 
 
 def prepare(record: Record, *steps: Any) -> Record:
-    """A record after steps such as `Detrend()` and `Lowpass(cutoff=10.0)`, in this order; `.prepared` tells of them.
+    """Return a record after steps such as `Detrend()` and `Lowpass(cutoff=10.0)`, in this order; `.prepared` tells of them.
 
     Every step acts within an experiment, never across. Samples that are missing afterwards split experiments. Gaps
     that were left out when the record was read are not seen: to fill them give the steps to `read_record(prepare=…)`.
@@ -253,7 +253,7 @@ class _Account:
 
 
 def _options_of(step: Any) -> dict[str, Any]:
-    """The fields of a step that have values."""
+    """Return the fields of a step that have values."""
     found = {name: getattr(step, name) for name in type(step).__dataclass_fields__}
     plain = {name: list(value) if isinstance(value, tuple) else value for name, value in found.items()}
     return {name: value for name, value in plain.items() if value is not None}
@@ -264,7 +264,7 @@ def _kind(step: Any) -> str:
 
 
 def _pieces(run: Run, place: Experiment, keep: bool) -> list[Experiment]:
-    """The stretches of rows that have all that is needed."""
+    """Return the stretches of rows that have all that is needed."""
     stride = place.stride * run.stride
     line = None if run.moved else place.first_line
     pieces = []
@@ -279,7 +279,7 @@ def _pieces(run: Run, place: Experiment, keep: bool) -> list[Experiment]:
 def steps_again(
     prepared: Sequence[Prepared], names: Sequence[str], sampling_time: float
 ) -> tuple[tuple[Step, ...], float]:
-    """The steps that prepare a new record as another one was, and its sampling time [s] before them.
+    """Return the steps that prepare a new record as another one was, and its sampling time [s] before them.
 
     Args:
         names: channels that the new record has; the steps leave out others.
@@ -300,7 +300,7 @@ def steps_again(
 
 
 def warnings_of(prepared: Sequence[Prepared], names: Sequence[str]) -> tuple[Warning, ...]:
-    """What must be known of a fit to data that were prepared so."""
+    """Return what must be known of a fit to data that were prepared so."""
     found = []
     for done in prepared:
         channels = done.options.get("channels")

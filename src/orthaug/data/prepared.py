@@ -36,7 +36,7 @@ class Prepared:
 
 
 def added_up(prepared: Sequence[tuple[Prepared, ...]]) -> tuple[Prepared, ...]:
-    """What was done to records that are joined, their samples added up; all went through the same steps.
+    """Return what was done to records that are joined, their samples added up; all went through the same steps.
 
     Raises:
         InputError: they did not.

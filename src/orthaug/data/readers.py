@@ -134,7 +134,7 @@ class _RawRanges:
     missing: str
 
     def prepared(self, steps: Sequence[Any], ranges: Sequence[tuple[int, int]]) -> Record:
-        """The record after the steps."""
+        """Return the record after the steps."""
         check_steps(steps)
         mends = self.missing != "error" or any(isinstance(step, Outliers | Fill) for step in steps)
         uneven = any(isinstance(step, Resample) for step in steps)
@@ -148,7 +148,7 @@ class _RawRanges:
         return Record(self.channels[0], self.channels[1], step, experiments, self.time, lost, done)
 
     def _run(self, begin: int, end: int, *, mends: bool, uneven: bool) -> tuple[Run, Experiment]:
-        """The rows of a range, and where they stand."""
+        """Return the rows of a range, and where they stand."""
         table, pick, both = self.table, slice(begin, end, self.every), [*self.channels[0], *self.channels[1]]
         names = [self.column_of[c.name] for c in both]
         _stretches(table, names, names, begin, end, self.every, "skip" if mends else "error")  # text is refused
@@ -195,7 +195,7 @@ def read_samples(
 
 
 def _trim(table: Table, *, uneven: bool = False) -> Table:
-    """The table without its last rows where every used column is empty (blank lines, longer unused columns)."""
+    """Return the table without its last rows where every used column is empty (blank lines, longer unused columns)."""
     longest = max(table.filled.values())
     if longest == 0:
         raise InputError(f"{table.path}: there are no data rows in {', '.join(table.columns)}.")
@@ -267,7 +267,7 @@ def _ranges(rows: RowRange | Sequence[RowRange] | None, total: int, path: Path) 
 
 
 def _labelled(table: Table, column: str, ranges: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
-    """The ranges cut where the label of the experiment changes."""
+    """Return the ranges cut where the label of the experiment changes."""
     found, seen, labels = [], set(), table.columns[column]
     for start, stop in ranges:
         _check_cells(table, [column], start, stop)

@@ -19,7 +19,7 @@ _DERIVED = ("model", "baseline", "learner", "model_low", "model_high")  # column
 
 
 def same_step(step: float, other: float) -> bool:
-    """Whether two sampling times are the same to 0.1 %, as logged time columns are."""
+    """Return whether two sampling times are the same to 0.1 %, as logged time columns are."""
     return bool(np.isclose(step, other, rtol=1e-3, atol=0.0))
 
 
@@ -147,7 +147,7 @@ class Experiment:
         return f"{visible(self.source)}: {place}" if self.source else place
 
     def rows(self, start: int | None, stop: int | None) -> Experiment:
-        """The half-open range of rows `[start, stop)` as an experiment of its own."""
+        """Return the half-open range of rows `[start, stop)` as an experiment of its own."""
         first = self.first_row + self.stride * range(len(self))[start:stop].start
         return replace(self, inputs=self.inputs[start:stop], outputs=self.outputs[start:stop], first_row=first)
 
@@ -207,7 +207,7 @@ class Record(NotebookView):
         source: str = "",
         missing: str = "error",
     ) -> Record:
-        """One experiment from arrays.
+        """Return one experiment from arrays.
 
         Args:
             u: inputs, (N,) or (N, nu); None for none.
@@ -246,7 +246,7 @@ class Record(NotebookView):
 
     @classmethod
     def join(cls, records: Iterable[Record]) -> Record:
-        """One record with the experiments of several, each kept as it is."""
+        """Return one record with the experiments of several, each kept as it is."""
         records = tuple(records)
         for record in records:
             check_type(record, Record, "records", "several Records")
@@ -273,7 +273,7 @@ class Record(NotebookView):
     __iter__ = None  # rows of several experiments would follow each other without a sign
 
     def __getitem__(self, rows: slice) -> Record:
-        """The half-open range of rows `record[start:stop]`; negative ones count from the end.
+        """Return the half-open range of rows `record[start:stop]`; negative ones count from the end.
 
         Rows count over all experiments, one behind the other, as `len(record)` does. Experiments stay apart: the range
         cuts the first and the last of them, and those outside are left out.
@@ -315,7 +315,7 @@ class Record(NotebookView):
                 )
 
     def rows(self, start: int | None = None, stop: int | None = None) -> Record:
-        """The half-open range of rows `[start, stop)` of a single experiment; negative ones count from its end."""
+        """Return the half-open range of rows `[start, stop)` of a single experiment; negative ones count from its end."""
         for name, value in (("start", start), ("stop", stop)):
             check_type(value, int | np.integer | None, name, "a whole number or None")
         if len(self.experiments) != 1:
@@ -323,7 +323,7 @@ class Record(NotebookView):
         return replace(self, experiments=(self._piece(self.experiments[0], start, stop),))
 
     def split(self, fraction: float, by: str = "rows") -> tuple[Record, Record]:
-        """Two records: the first `fraction` and the rest.
+        """Return two records: the first `fraction` and the rest.
 
         Args:
             fraction: between 0 and 1, rounded to whole rows or experiments.

@@ -35,7 +35,7 @@ class Lags:
     nk: int | Sequence[int] = 1
 
     def layout(self, outputs: Sequence[str], inputs: Sequence[str]) -> Layout:
-        """The raw lags in regressor order.
+        """Return the raw lags in regressor order.
 
         Raises:
             InputError: negative orders, or a list whose length is not the number of channels.
@@ -64,7 +64,7 @@ def _per_channel(value: int | Sequence[int], names: Sequence[str], key: str, kin
 
 
 def in_order(lags: Iterable[Lag], outputs: Sequence[str], inputs: Sequence[str]) -> Layout:
-    """The distinct lags in regressor order.
+    """Return the distinct lags in regressor order.
 
     Raises:
         InputError: an unknown channel, or an output at lag 0 (the model would look at what it predicts).
@@ -81,7 +81,7 @@ def in_order(lags: Iterable[Lag], outputs: Sequence[str], inputs: Sequence[str])
 
 
 def largest_lag(layout: Layout) -> int:
-    """The first row of an experiment at which every lag of the layout exists."""
+    """Return the first row of an experiment at which every lag of the layout exists."""
     return max((lag.lag for lag in layout), default=0)
 
 
@@ -99,7 +99,7 @@ def lag_matrix(experiment: Experiment, layout: Layout, record: Record, start: in
 
 
 def lag_rows(record: Record, layout: Layout) -> Matrix:
-    """The regressors of all rows from the largest lag on, experiment after experiment, (N, len(layout))."""
+    """Return the regressors of all rows from the largest lag on, experiment after experiment, (N, len(layout))."""
     start = largest_lag(layout)
     return np.concatenate([lag_matrix(experiment, layout, record, start) for experiment in record.experiments])
 
@@ -118,7 +118,7 @@ class UsableRows:
 
 
 def stack_rows(record: Record, layout: Layout) -> UsableRows:
-    """All rows from the largest lag on, experiment after experiment.
+    """Return all rows from the largest lag on, experiment after experiment.
 
     Raises:
         InputError: an experiment with too few rows for a single prediction.
@@ -148,7 +148,7 @@ class Features:
 
     @classmethod
     def of(cls, layout: Layout) -> Features:
-        """All raw lags of a layout."""
+        """Return all raw lags of a layout."""
         return cls(tuple(Expression(str(lag)) for lag in layout))
 
     @property
@@ -157,7 +157,7 @@ class Features:
         return tuple(dict.fromkeys(lag for entry in self.entries for lag in entry.lags))
 
     def sampled(self, sampling_time: float) -> Features:
-        """The features with this value [s] of `Ts`, where they read it."""
+        """Return the features with this value [s] of `Ts`, where they read it."""
         return Features(tuple(entry.sampled(sampling_time) for entry in self.entries), self.linear)
 
     def evaluate(self, x: Any, layout: Layout, xp: Any) -> Any:

@@ -26,12 +26,12 @@ class Partition(Protocol):
 
     @property
     def name(self) -> str:
-        """What messages call it."""
+        """Return what messages call it."""
         ...
 
     @property
     def rows(self) -> int:
-        """How many it has, at most: missing samples are left out when it is read."""
+        """Return how many it has, at most: missing samples are left out when it is read."""
         ...
 
     def pieces(self, lead: int) -> Iterator[Experiment]:
@@ -70,17 +70,17 @@ class Source(Protocol):
 
 
 def rows_of(source: Source) -> int:
-    """How many rows a source has."""
+    """Return how many rows a source has."""
     return sum(partition.rows for partition in source.partitions)
 
 
 def as_record(source: Source, experiments: Sequence[Experiment]) -> Record:
-    """Some of its rows as a record in memory."""
+    """Return some of its rows as a record in memory."""
     return Record(source.inputs, source.outputs, source.sampling_time, tuple(experiments), source.time_column)
 
 
 def witness(source: Source, limit: int = WITNESS_ROWS) -> Record:
-    """A record in memory that stands for the source: all of it, or windows that are spread over it evenly."""
+    """Return a record in memory that stands for the source: all of it, or windows that are spread over it evenly."""
     total = rows_of(source)
     if total <= limit:
         return as_record(source, source.window(0, total))
@@ -122,7 +122,7 @@ class Span:
 
     @classmethod
     def of(cls, partitions: Sequence[Any], rows: int) -> Span:
-        """The first with the others, of the last of which no more than the first `rows` are needed."""
+        """Return the first with the others, of the last of which no more than the first `rows` are needed."""
         if len(partitions) > 1 and hasattr(partitions[-1], "head"):
             partitions = (*partitions[:-1], partitions[-1].head(rows))
         held = [getattr(partition, "held", ()) for partition in partitions]
@@ -205,7 +205,7 @@ class RecordSource:
 
 
 def stretches(experiment: Experiment, lead: int) -> Iterator[Experiment]:
-    """A piece without its rows that have a missing sample, cut there: no lag reaches across."""
+    """Yield a piece without its rows that have a missing sample, cut there: no lag reaches across."""
     for begin, end in unbroken(np.hstack([experiment.inputs, experiment.outputs])):
         if end - begin == len(experiment):
             yield experiment
@@ -214,7 +214,7 @@ def stretches(experiment: Experiment, lead: int) -> Iterator[Experiment]:
 
 
 def follows(one: Any, other: Any) -> bool:
-    """Whether the other experiment is of the same recording, from where the one ends."""
+    """Return whether the other experiment is of the same recording, from where the one ends."""
     ends = (one.source, one.first_row + len(one), one.offset + len(one))
     return ends == (other.source, other.first_row, other.offset)
 

@@ -41,7 +41,7 @@ class Run:
     """Whether the samples are no rows of the file any more."""
 
     def columns(self, channels: Channels, usual: range | None = None) -> list[int]:
-        """Indices of channels; without names the usual ones, which are all unless given."""
+        """Return indices of channels; without names the usual ones, which are all unless given."""
         if channels is None:
             return list(range(len(self.names)) if usual is None else usual)
         check_type(channels, tuple | list, "channels", "a list of channel names")
@@ -68,7 +68,7 @@ class Step(Protocol):
     """A step of preparation: a frozen declaration."""
 
     def apply(self, run: Run) -> Run:
-        """The experiment after the step.
+        """Return the experiment after the step.
 
         Raises:
             InputError: what cannot be done with these samples.
@@ -143,14 +143,14 @@ class Resample:
 
 
 def _measured(t: Vector, grid: Vector, near: float) -> Vector:
-    """The grid, with the measured instant itself where one lies that near: a sample is not lost by rounding."""
+    """Return the grid, with the measured instant itself where one lies that near: a sample is not lost by rounding."""
     after = np.clip(np.searchsorted(t, grid), 1, len(t) - 1)
     closest = np.where(grid - t[after - 1] < t[after] - grid, t[after - 1], t[after])
     return np.where(np.abs(closest - grid) <= near, closest, grid)
 
 
 def _between(t: Vector, column: Vector, grid: Vector, method: str, most: float) -> Vector:
-    """A channel at other instants; NaN outside of it, and between neighbours more than `most` apart."""
+    """Return a channel at other instants; NaN outside of it, and between neighbours more than `most` apart."""
     there = np.isfinite(column)
     known, values = t[there], column[there]
     if len(known) < 2:
@@ -204,7 +204,7 @@ class Outliers:
         return distance > self.threshold * deviation
 
     def distances(self, x: Vector) -> tuple[Vector, Vector]:
-        """How far each sample is from the median of its window, and the deviation there; NaN where one is missing."""
+        """Return how far each sample is from the median of its window, and the deviation there; NaN where one is missing."""
         if len(x) < 2:
             return np.zeros(len(x)), np.zeros(len(x))
         width = min(self.window, len(x) - 1)

@@ -58,7 +58,7 @@ class Survey:
         return replace(self, clock=clock if clock.column else self.clock)
 
     def find(self, name: str) -> Column:
-        """A column by its header, or by the name of its channel.
+        """Return a column by its header, or by the name of its channel.
 
         Raises:
             InputError: no such column, one without numbers, or one that never changes.
@@ -78,7 +78,7 @@ class Survey:
         return column
 
     def roles(self) -> tuple[list[Column], list[Column]] | None:
-        """Inputs and outputs where every signal's name says what it is and there is an output, otherwise None."""
+        """Return inputs and outputs where every signal's name says what it is and there is an output, otherwise None."""
         kinds = [c.kind for c in self.signals]
         if any(one.column.kind for one in self.clock.refused if not one.signal):
             return None  # a name says one thing and the values another

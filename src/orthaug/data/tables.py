@@ -47,7 +47,7 @@ class Table:
 
 
 def read_table(path: Path, columns: Sequence[str], time: str | None = None, *, most: int | None = None) -> Table:
-    """The named columns of a file.
+    """Return the named columns of a file.
 
     Args:
         time: the one of them that holds instants, numbers in the unit of its header or dates: it comes in s.
@@ -69,7 +69,7 @@ def read_table(path: Path, columns: Sequence[str], time: str | None = None, *, m
 
 
 def has_column(path: Path, name: str) -> bool:
-    """Whether the file has a column (or variable) of that name.
+    """Return whether the file has a column (or variable) of that name.
 
     Raises:
         InputError: a file that cannot be read, or holds the column twice.
@@ -82,7 +82,7 @@ def has_column(path: Path, name: str) -> bool:
 
 
 def column_names(path: Path) -> list[str]:
-    """The columns (or variables) of a file that could be read, in order.
+    """Return the columns (or variables) of a file that could be read, in order.
 
     Raises:
         InputError: no such file, an unknown ending, content that does not fit it.
@@ -106,7 +106,7 @@ def column_names(path: Path) -> list[str]:
 
 
 def reading_note(path: Path) -> str:
-    """What to know of how a file is read: an encoding that was guessed; mostly nothing."""
+    """Return what to know of how a file is read: an encoding that was guessed; mostly nothing."""
     return layout(path).note if _READERS.get(path.suffix.lower()) is _read_text else ""
 
 
@@ -170,7 +170,7 @@ def _read_text(path: Path, columns: Sequence[str], time: str | None, most: int |
 def _cells(
     path: Path, found: Layout, used: list[str], commas: bool, apart: str | None, most: int | None
 ) -> tuple[Any, Any, Any]:
-    """The used columns as numbers, as text (None where all are numbers or empty), and what is not empty.
+    """Return the used columns as numbers, as text (None where all are numbers or empty), and what is not empty.
 
     The one `apart` may hold text, so that it is looked at by itself.
     """
@@ -220,7 +220,7 @@ def _cells(
 
 
 def _plain_numbers(path: Path, found: Layout) -> Matrix | None:
-    """The columns (count, rows) of a small file with a finite number in every cell of every line; None for all others.
+    """Return the columns (count, rows) of a small file with a finite number in every cell of every line; None for all others.
 
     NumPy reads it before pandas would be imported.
     """
@@ -247,7 +247,7 @@ def _plain_numbers(path: Path, found: Layout) -> Matrix | None:
 
 
 def _comma_number(text: str) -> float:
-    """A number where decimals are commas; a point would be one of thousands, and is refused."""
+    """Return a number where decimals are commas; a point would be one of thousands, and is refused."""
     return np.nan if "." in text else text_number(text.replace(",", "."))
 
 
@@ -294,7 +294,7 @@ def parquet_file(path: Path) -> Iterator[Any]:
 
 
 def _read_excel(path: Path, columns: Sequence[str], time: str | None) -> Table:
-    """The first worksheet."""
+    """Return the first worksheet."""
 
     def place(header: Sequence[str]) -> list[int]:
         return places(path, columns, header)
@@ -319,7 +319,7 @@ def _read_variables(path: Path, columns: Sequence[str], time: str | None) -> Tab
 
 
 def _full(path: Path, columns: Mapping[str, Vector]) -> Table:
-    """A table of a file type that has no empty cells."""
+    """Return a table of a file type that has no empty cells."""
     filled = {name: len(values) for name, values in columns.items()}
     return Table(path, columns, filled, cell=lambda column, row: str(columns[column][row]))
 

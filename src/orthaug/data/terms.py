@@ -55,7 +55,7 @@ class TermLibrary:
         terms: Sequence[str] = (),
         exclude: Iterable[str] = (),
     ) -> TermLibrary:
-        """All products of up to `degree` signals, of which one may be a function of a signal instead; and `terms`.
+        """Return all products of up to `degree` signals, of which one may be a function of a signal instead; and `terms`.
 
         Args:
             signals: as expressions can read them, `y[k-1]` or the name of a state.
@@ -114,7 +114,7 @@ class TermLibrary:
         return table
 
     def picked(self, chosen: Iterable[int]) -> TermLibrary:
-        """Some of the terms, of the same factors."""
+        """Return some of the terms, of the same factors."""
         return TermLibrary(self.factors, tuple(self.products[i] for i in chosen))
 
     def _text(self, product: tuple[int, ...]) -> str:
@@ -142,7 +142,7 @@ class TermLibrary:
 
 
 def products_of(factors: Any, numbers: Any, xp: Any) -> Any:
-    """The terms (K, …) of factors (nf, …) by their factors' numbers (K, order); number nf stands for 1."""
+    """Return the terms (K, …) of factors (nf, …) by their factors' numbers (K, order); number nf stands for 1."""
     with_one = xp.concatenate([factors, xp.ones((1, *factors.shape[1:]))])
     value = with_one[numbers[:, 0]]
     for column in range(1, numbers.shape[1]):
@@ -151,7 +151,7 @@ def products_of(factors: Any, numbers: Any, xp: Any) -> Any:
 
 
 def outside_brackets(text: str, marks: str) -> bool:
-    """Whether one of some marks stands in a text outside of all brackets."""
+    """Return whether one of some marks stands in a text outside of all brackets."""
     depth = 0
     for character in text:
         depth += (character in "([") - (character in ")]")
@@ -161,7 +161,7 @@ def outside_brackets(text: str, marks: str) -> bool:
 
 
 def _factors_of(text: str) -> tuple[str, ...]:
-    """The factors of a product as it is written, in order; `v**2` is v and v."""
+    """Return the factors of a product as it is written, in order; `v**2` is v and v."""
     text, pieces, depth, begin = text.replace(" ", ""), [], 0, 0
     for i, character in enumerate(text):
         depth += (character in "([") - (character in ")]")

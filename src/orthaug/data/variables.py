@@ -46,7 +46,7 @@ class FileVariable:
 
 
 def read_variables(path: Path, names: Sequence[str]) -> dict[str, Vector]:
-    """The named channels: a vector (1×N or N×1), or a line of a matrix, counted from 0.
+    """Return the named channels: a vector (1×N or N×1), or a line of a matrix, counted from 0.
 
     A column is written `"U[2]"`, a row `"U[2,:]"`; what is in MATLAB's structs or in groups of HDF5 `"data.u"`.
 
@@ -59,7 +59,7 @@ def read_variables(path: Path, names: Sequence[str]) -> dict[str, Vector]:
 
 
 def variable_names(path: Path) -> list[str]:
-    """The names under which a file's channels are read: vectors, and every line along a narrow matrix.
+    """Return the names under which a file's channels are read: vectors, and every line along a narrow matrix.
 
     Raises:
         InputError: a corrupt file.
@@ -109,7 +109,7 @@ _LARGE, _DENSEST = 2**28, 300  # bytes of an array that may shrink as it likes, 
 
 
 def _member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> FileVariable:
-    """An array of an archive by its header; Python objects are never opened."""
+    """Return an array of an archive by its header; Python objects are never opened."""
     with archive.open(info) as member:
         version = np.lib.format.read_magic(member)
         read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}[version]
@@ -150,7 +150,7 @@ def _from_mat(path: Path, names: Wanted) -> dict[str, Vector]:
 
 
 def _held(path: Path, variable: Variable, *, deep: bool) -> dict[str, FileVariable]:
-    """A variable, with what is in it if wanted, by their paths."""
+    """Return a variable, with what is in it if wanted, by their paths."""
     if not variable.what:
         return {variable.name: _lazy(path, variable.shape, 8, variable.numbers)}
     text = variable.text if variable.what == "text" else None
@@ -266,7 +266,7 @@ ENDINGS = tuple(_FORMATS)
 
 
 def short(error: Exception) -> str:
-    """What a library says, on one line."""
+    """Return what a library says, on one line."""
     if isinstance(error, LookupError) or any(isinstance(part, bytes) for part in error.args):
         return "unknown bytes"
     return " ".join(str(error).split())[:120] or type(error).__name__
@@ -283,7 +283,7 @@ def _lazy(path: Path, shape: Sequence[int], itemsize: int, read: Callable[[], An
 
 
 def _taken(path: Path, names: Wanted, held: Mapping[str, FileVariable]) -> dict[str, Vector]:
-    """The named channels; without names an empty one for each that could be named; or the single numbers wanted."""
+    """Return the named channels; without names an empty one for each that could be named; or the single numbers wanted."""
     if callable(names):
         single = {name: one for name, one in held.items() if one.read and math.prod(one.shape) == 1 and names(name)}
         read = {name: np.asarray(one.read()).ravel() for name, one in single.items() if one.read}
@@ -335,7 +335,7 @@ def _pick(path: Path, name: str, held: Mapping[str, FileVariable]) -> Vector:
 
 
 def _known_as(name: str, held: Mapping[str, FileVariable]) -> str:
-    """The name as the file has it: paths may be written with points or slashes."""
+    """Return the name as the file has it: paths may be written with points or slashes."""
     bare = name.lstrip("/")
     for one in (name, bare, bare.replace("/", "."), bare.replace(".", "/")):
         if one in held or (one.endswith("]") and one.rpartition("[")[0] in held):

@@ -175,7 +175,7 @@ def _twice(record: Record) -> list[Warning]:
 
 
 def _frozen(record: Record) -> list[Warning]:
-    """Outputs that stand still for many rows while an input moves, and hardly ever for two rows elsewhere."""
+    """Return outputs that stand still for many rows while an input moves, and hardly ever for two rows elsewhere."""
     found = []
     for j, output in enumerate(record.outputs):
         for experiment in record.experiments:

@@ -18,7 +18,7 @@ Unit = Counter[str]
 
 
 def coefficient_unit(unit: str, term: Expression, units: Mapping[str, str]) -> str | None:
-    """The unit of a term's coefficient, where the sum has `unit` and channels or states theirs; None if not told.
+    """Return the unit of a term's coefficient, where the sum has `unit` and channels or states theirs; None if not told.
 
     Examples:
         >>> from orthaug.data.expressions import parse
@@ -39,7 +39,7 @@ def coefficient_unit(unit: str, term: Expression, units: Mapping[str, str]) -> s
 
 
 def latex(expression: Expression) -> str:
-    r"""The expression as LaTeX, lags as indices.
+    r"""Return the expression as LaTeX, lags as indices.
 
     Examples:
         >>> from orthaug.data.expressions import parse
@@ -139,7 +139,7 @@ def tex_text(text: str) -> str:
 
 
 def symbol(name: str, index: str = "") -> str:
-    """A name: one letter as it stands, with digits behind it as an index, words upright."""
+    """Return a name: one letter as it stands, with digits behind it as an index, words upright."""
     letters = name.rstrip("0123456789")
     if len(letters) == 1:
         base, below = letters, ",".join(filter(None, (name[1:], index)))

@@ -105,7 +105,7 @@ def _table(name: str, values: np.ndarray) -> str:
 
 
 def _network(block: Block) -> str:
-    """The tables of a network and the function that evaluates it."""
+    """Return the tables of a network and the function that evaluates it."""
     assert block.network is not None
     layers, parts, declared, loops = block.network.layers, [], [], []
     for i, layer in enumerate(layers, start=1):
@@ -133,7 +133,7 @@ def _layer(prefix: str, number: int, layer: Layer, target: str, source: str) -> 
 
 
 def body(block: Block, result: str, entry: Callable[[str, int], str] = _plain) -> list[str]:
-    """The lines that evaluate a block, in braces of their own, into the vector `result`."""
+    """Return the lines that evaluate a block, in braces of their own, into the vector `result`."""
     write = _language(entry).write
     lines = [f"const real {name} = {write(node)};" for name, node in block.locals]
     if block.network is not None:
@@ -153,7 +153,7 @@ def _function(block: Block, program: Program) -> str:
 
 
 def advance(program: Program) -> list[str]:
-    """The lines of a step that make `x` the next state."""
+    """Return the lines of a step that make `x` the next state."""
     scheme = program.scheme
     assert scheme is not None
     n = len(program.states)

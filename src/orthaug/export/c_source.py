@@ -46,7 +46,7 @@ takes NaN for impossible."""
 
 
 def fields_of(program: Program) -> list[tuple[str, Signal, int]]:
-    """The fields of the state: its name in C, what it holds, and how many samples, 0 for a number by itself."""
+    """Return the fields of the state: its name in C, what it holds, and how many samples, 0 for a number by itself."""
     if program.scheme is None:
         wanted = [(signal.identifier, signal, depth) for signal, depth in program.lines if depth]
     else:
@@ -62,7 +62,7 @@ def fields_of(program: Program) -> list[tuple[str, Signal, int]]:
 
 
 def places_of(fields: list[tuple[str, Signal, int]]) -> list[str]:
-    """Every entry of the state as a member of its struct."""
+    """Return every entry of the state as a member of its struct."""
     return [f"{name}[{i}]" if depth else name for name, _, depth in fields for i in range(max(depth, 1))]
 
 
@@ -184,7 +184,7 @@ def _checks(program: Program, following: bool) -> list[str]:
 
 
 def _lagged_step(program: Program, fields: list[tuple[str, Signal, int]]) -> str:
-    """The block in place on the state's fields, then every line moved on by one sample."""
+    """Return the block in place on the state's fields, then every line moved on by one sample."""
     place = [f"state->{place}" for place in places_of(fields)]
     lines = [*_step_head(program), "    int i, ok = 1;"]
     lines += c_arithmetic.body(program.output, "y", lambda vector, i: place[i] if vector == "x" else f"{vector}[{i}]")

@@ -159,7 +159,7 @@ def _listed(head: str, signals: Sequence[Signal]) -> str:
 
 
 def _vectors_of(model: Any, program: Program) -> Vectors:
-    """A free run under random levels of the inputs, in the range that the model was trained on where that is known.
+    """Return a free run under random levels of the inputs, in the range that the model was trained on where that is known.
 
     Of the starts it takes the one from which the outputs stay finite for longest.
     """

@@ -111,7 +111,7 @@ def _compiled(sources: Mapping[str, str]) -> tuple[str, str, bytes]:
 
 
 def _variables(program: Program) -> str:
-    """What the wrapper has to know of the model."""
+    """Return what the wrapper has to know of the model."""
     cases = "\n".join(f"    case {i}: return &state->{place};" for i, place in enumerate(places_of(fields_of(program))))
     return f"""/* Written by orthaug. */
 #define GUID "{_guid(program)}"

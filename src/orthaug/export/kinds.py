@@ -31,7 +31,7 @@ class Target(Protocol):
         ...
 
     def usage(self, program: Program) -> str:
-        """How to run what was made, as Markdown."""
+        """Return how to run what was made, as Markdown."""
         ...
 
 

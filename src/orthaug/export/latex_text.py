@@ -102,7 +102,7 @@ def _constant(name: str, program: Program) -> str:
 
 
 def _letters(text: str) -> list[str]:
-    """What Greek letters and the micro sign are, so that pdflatex reads them."""
+    """Return what Greek letters and the micro sign are, so that pdflatex reads them."""
     lines = []
     for letter in sorted(set(text)):
         kind, _, name = unicodedata.name(letter, "").partition(" LETTER ")

@@ -89,7 +89,7 @@ _OWN_FUNCTION = (
 
 
 def program_of(model: Model | MotionModel, name: str = "model", digest: str = "") -> Program:
-    """The step of a model in the intermediate form.
+    """Return the step of a model in the intermediate form.
 
     Raises:
         InputError: physics or a learner that is a Python function, an ensemble, a hold that needs the whole record.
@@ -110,7 +110,7 @@ class _Constants:
         self.symbols: dict[str, str] = {}
 
     def node(self, kind: str, name: str, value: float, meaning: str) -> Name:
-        """The constant's node, `p_` for parameters and `c_` for others before its name.
+        """Return the constant's node, `p_` for parameters and `c_` for others before its name.
 
         Another value under the same name gets a name of its own.
         """
@@ -123,7 +123,7 @@ class _Constants:
         return Name(written)
 
     def of(self, expression: Expression) -> dict[str, Node]:
-        """The constants of an expression of lagged channels."""
+        """Return the constants of an expression of lagged channels."""
         return {name: self.node("c", name, value, f"constant {name}") for name, value in expression.constants}
 
 
@@ -203,7 +203,7 @@ def _weighted_terms(
 
 
 def _motion_names(model: MotionModel, constants: _Constants) -> dict[str, Node]:
-    """What the names of constants, parameters, states and inputs stand for."""
+    """Return what the names of constants, parameters, states and inputs stand for."""
     form, numbers, motion = model.form, model.numbers, model.form.motion
     values = np.asarray(motion.coordinates.physical(np.asarray(numbers.theta) - np.asarray(numbers.theta_aux)))
     names: dict[str, Node] = {
@@ -219,7 +219,7 @@ def _motion_names(model: MotionModel, constants: _Constants) -> dict[str, Node]:
 
 
 def _with_correction(correction: Node, physics: Node, held: FadeNodes | None, rows: Sequence[Node]) -> Node:
-    """A learned equation with what is added to it; `rows` are its physics at p̂, and where it is held at c and at p̂."""
+    """Return a learned equation with what is added to it; `rows` are its physics at p̂, and where it is held at c and at p̂."""
     if rows:
         physics, own, split = rows
         correction = apply("add", correction, apply("sub", own, split))
@@ -227,7 +227,7 @@ def _with_correction(correction: Node, physics: Node, held: FadeNodes | None, ro
 
 
 def _split_parameters(model: MotionModel, constants: _Constants) -> dict[str, Node]:
-    """The estimated parameters, with which the physics goes on beyond the data."""
+    """Return the estimated parameters, with which the physics goes on beyond the data."""
     motion = model.form.motion
     values = np.asarray(motion.coordinates.physical(np.asarray(model.numbers.theta))).tolist()
     return {
@@ -246,7 +246,7 @@ def _motion(model: MotionModel, name: str, digest: str) -> Program:
     defined: dict[str, Node] = {}
 
     def define(names: dict[str, Node], suffix: str = "") -> dict[str, Node]:
-        """The names with those of the definitions, in terms of the others."""
+        """Return the names with those of the definitions, in terms of the others."""
         for key, expression in motion.definitions:
             local = f"v_{identifier(key)}{suffix}"
             defined[local] = node_of(expression, names, {}, numeric)
@@ -322,7 +322,7 @@ def _step_input(name: str, units: Mapping[str, str]) -> Signal:
 
 
 def _needed(defined: Mapping[str, Node], roots: Sequence[Node]) -> tuple[tuple[str, Node], ...]:
-    """The definitions that some nodes reach, in order."""
+    """Return the definitions that some nodes reach, in order."""
     reached: set[str] = set()
 
     def visit(node: Node) -> None:
@@ -339,7 +339,7 @@ def _needed(defined: Mapping[str, Node], roots: Sequence[Node]) -> tuple[tuple[s
 
 
 def _network(bound: Bound, numbers: Numbers, features: Sequence[Node], rows: Vector) -> Network:
-    """The learner with its scaling; `rows` are those of its values that are wanted."""
+    """Return the learner with its scaling; `rows` are those of its values that are wanted."""
     declared = getattr(bound.learner, "layers", None)
     if declared is None:
         raise InputError(

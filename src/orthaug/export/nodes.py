@@ -67,7 +67,7 @@ Node = Union[Number, Name, Entry, Apply]  # noqa: UP007  (refers to itself)
 
 
 def apply(function: str, *arguments: Node) -> Node:
-    """A function of nodes; arithmetic on numbers is done here, by the rules of floating point."""
+    """Return a function of nodes; arithmetic on numbers is done here, by the rules of floating point."""
     numbers = [argument.value for argument in arguments if isinstance(argument, Number)]
     if function in ARITHMETIC and len(numbers) == len(arguments):
         with np.errstate(all="ignore"):
@@ -91,7 +91,7 @@ def node_of(
     lags: Mapping[Lag, Node],
     numbers: Mapping[str, float],
 ) -> Node:
-    """An expression as a node.
+    """Return an expression as a node.
 
     Args:
         expression: from the parser.
@@ -130,7 +130,7 @@ def _node(tree: ast.expr, names: Mapping[str, Node], lags: Mapping[Lag, Node], n
 
 
 def _constant(tree: ast.expr, numbers: Mapping[str, float]) -> float | None:
-    """The number that an exponent is, where it is one."""
+    """Return the number that an exponent is, where it is one."""
     if isinstance(tree, ast.Constant):
         return float(tree.value)  # type: ignore[arg-type]
     if isinstance(tree, ast.Name):
@@ -142,7 +142,7 @@ def _constant(tree: ast.expr, numbers: Mapping[str, float]) -> float | None:
 
 
 def functions_in(node: Node) -> set[str]:
-    """The functions that a node is made of; a whole power of 2 counts as `square`."""
+    """Return the functions that a node is made of; a whole power of 2 counts as `square`."""
     if not isinstance(node, Apply):
         return set()
     square = node.function == "whole_power" and node.arguments[1] == Number(2.0)
@@ -150,14 +150,14 @@ def functions_in(node: Node) -> set[str]:
 
 
 def names_in(node: Node) -> set[str]:
-    """The names that a node reads."""
+    """Return the names that a node reads."""
     if isinstance(node, Name):
         return {node.name}
     return set[str]().union(*map(names_in, node.arguments)) if isinstance(node, Apply) else set()
 
 
 def identifier(name: str) -> str:
-    """A name in ASCII: other letters by their code point, as `u03b8` for θ."""
+    """Return a name in ASCII: other letters by their code point, as `u03b8` for θ."""
     plain = unicodedata.normalize("NFKC", name)
     return "".join(c if c.isascii() and (c.isalnum() or c == "_") else f"u{ord(c):04x}" for c in plain)
 
@@ -212,11 +212,11 @@ class Language:
     name: Callable[[str], str] = lambda name: name
 
     def write(self, node: Node) -> str:
-        """An expression."""
+        """Return an expression."""
         return self._level(node)[1]
 
     def _level(self, node: Node) -> tuple[int, str]:
-        """How strongly the text binds, and the text."""
+        """Return how strongly the text binds, and the text."""
         if isinstance(node, Number):
             return (0 if node.value < 0 else _ATOM), self.number(node.value)
         if isinstance(node, Name):
@@ -244,7 +244,7 @@ class Language:
 
 
 def decimal(value: float) -> str:
-    """A number that reads back exactly, with a point or an exponent."""
+    """Return a number that reads back exactly, with a point or an exponent."""
     return repr(float(value))
 
 

@@ -42,7 +42,7 @@ outputs = model.run(state, np.zeros((100, {len(program.inputs)})))   # a free ru
 
 
 def module(program: Program) -> str:
-    """The text of the module."""
+    """Return the text of the module."""
     return "\n".join(
         [
             f'"""{program.name}: one step of a fitted model. Written by orthaug; needs NumPy alone."""',

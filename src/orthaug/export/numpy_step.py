@@ -52,7 +52,7 @@ class NumpyStep:
         self._held = program.held
 
     def __call__(self, state: Any, inputs: Any) -> tuple[Vector, Vector]:
-        """The next state (n,) and the outputs (ny,) of one sample.
+        """Return the next state (n,) and the outputs (ny,) of one sample.
 
         Raises:
             InputError: vectors of another length.
@@ -116,7 +116,7 @@ class NumpyStep:
 
 
 def numpy_step(model: Model | MotionModel) -> NumpyStep:
-    """The step of a fitted model in NumPy alone, for loops in Python and where JAX is too slow to call.
+    """Return the step of a fitted model in NumPy alone, for loops in Python and where JAX is too slow to call.
 
     Args:
         model: as `estimate` or `load` gives it.

@@ -78,13 +78,13 @@ class _Graph:
         return model.SerializeToString()
 
     def add(self, operator: str, *inputs: str, out: str | None = None, **attributes: Any) -> str:
-        """A node; its result."""
+        """Return a node; its result."""
         out = out or f"n{len(self.nodes)}"
         self.nodes.append(self.onnx.helper.make_node(operator, list(inputs), [out], **attributes))
         return out
 
     def table(self, value: Any) -> str:
-        """A constant tensor."""
+        """Return a constant tensor."""
         name = f"t{len(self.tables)}"
         self.tables[name] = np.ascontiguousarray(value)
         return name
@@ -99,7 +99,7 @@ class _Graph:
         return parts[0] if len(parts) == 1 else self.add("Concat", *parts, axis=0)
 
     def block(self, block: Block, x: str, u: str) -> str:
-        """The results of a block as a vector."""
+        """Return the results of a block as a vector."""
         known = {"x": x, "u": u}
         for name, node in block.locals:
             known[name] = self.node(node, known)
@@ -119,7 +119,7 @@ class _Graph:
         return self.add("MatMul", self.table(weight), z)
 
     def node(self, node: Node, known: Mapping[str, str]) -> str:
-        """A node of the program as a vector of one entry, or of a layer's entries."""
+        """Return a node of the program as a vector of one entry, or of a layer's entries."""
         if isinstance(node, Number):
             return self.real(node.value)
         if isinstance(node, Name):
@@ -158,7 +158,7 @@ class _Graph:
         return self.add("Where", self.add("Equal", x, zero), upright, beside)
 
     def following(self, now: str, u: str, y: str) -> str:
-        """The next state."""
+        """Return the next state."""
         program, scheme = self.program, self.program.scheme
         if scheme is None or program.rate is None:
             parts = [name for name, there in ((y, True), (u, program.inputs), ("state", program.states)) if there]

@@ -122,7 +122,7 @@ class Program:
 
     @property
     def blocks(self) -> tuple[Block, ...]:
-        """What a step evaluates."""
+        """Return what a step evaluates."""
         return (self.output,) if self.rate is None else (self.output, self.rate)
 
     @property
@@ -150,7 +150,7 @@ class Vectors:
     outputs: Float[np.ndarray, "r ny"]
 
     def csv(self, program: Program) -> str:
-        """A column for each input, state and output, with `state:` or `output:` before names that stand twice."""
+        """Return a column for each input, state and output, with `state:` or `output:` before names that stand twice."""
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
         kinds = {"input": program.inputs, "state": program.states, "output": program.outputs}

@@ -36,7 +36,7 @@ def python_language(functions: dict[str, str]) -> Language:
 
 
 def declarations(program: Program) -> str:
-    """The names and the sampling time of a model."""
+    """Return the names and the sampling time of a model."""
     names = {
         kind.upper(): tuple(signal.name for signal in getattr(program, kind))
         for kind in ("states", "inputs", "outputs")

@@ -58,12 +58,12 @@ class FreeRunScores:
         return int(np.asarray(self.segments.scored).sum(axis=1).max())
 
     def errors(self) -> Float[np.ndarray, "ny s T"]:
-        """The errors of each output by segments, 0 where a step is not scored."""
+        """Return the errors of each output by segments, 0 where a step is not scored."""
         errors = errors_of(self.dynamics, self.numbers, self.states, self.segments)
         return np.moveaxis(errors, 3, 1).reshape(-1, *errors.shape[1:3]).transpose(2, 0, 1)
 
     def block(self) -> int | None:
-        """Steps of a block: three times as many as the correlation of the errors lasts, at most those of a segment.
+        """Return steps of a block: three times as many as the correlation of the errors lasts, at most those of a segment.
 
         None where the correlation has no end, or lasts longer than a segment.
         """
@@ -74,7 +74,7 @@ class FreeRunScores:
         return min(_MEMORIES * max(known), self.longest)
 
     def blocks(self, steps: int) -> Float[np.ndarray, "b n"]:
-        """The score of every block of about `steps` scored steps, no fewer where the segment has as many."""
+        """Return the score of every block of about `steps` scored steps, no fewer where the segment has as many."""
         scored = np.asarray(self.segments.scored)
         first = int(np.argmax(scored.any(axis=(0, 2))))
         count = max(self.longest // steps, 1)
@@ -91,7 +91,7 @@ class FreeRunScores:
         return scores[counts > 0]
 
     def slopes(self) -> Float[np.ndarray, "N ny n"]:
-        """The sensitivities of p on every scored step, the starts eliminated, in the units of the model's Gram matrix.
+        """Return the sensitivities of p on every scored step, the starts eliminated, in the units of the model's Gram matrix.
 
         They are the scores of errors of 1 in one whitened output after the other.
         """
@@ -108,7 +108,7 @@ class FreeRunScores:
         return np.sqrt(self.unit) * np.stack(found, axis=1)
 
     def whitened(self) -> Float[np.ndarray, "N ny"]:
-        """The errors of the same steps in whitened outputs, in the same units."""
+        """Return the errors of the same steps in whitened outputs, in the same units."""
         errors = np.moveaxis(errors_of(self.dynamics, self.numbers, self.states, self.segments), 3, 1)  # (k, m, T, ny)
         there = errors[np.moveaxis(np.asarray(self.segments.scored), -1, 1)]
         return np.sqrt(self.unit) * there @ self.weight.T
@@ -150,7 +150,7 @@ class FreeRunScores:
     def robust(
         self, statistics: Statistics, freedom: float, used: float, steps: int | None, *, modelled: bool = False
     ) -> Statistics:
-        """The model's statistics for coloured errors, from blocks of so many steps; None for as many as `block` says.
+        """Return the model's statistics for coloured errors, from blocks of so many steps; None for as many as `block` says.
 
         Args:
             statistics, freedom: of errors that are white.

@@ -69,7 +69,7 @@ class Checkpoints:
         return self
 
     def of_run(self, *parts: Any, form: Any = _LEAVES) -> RunCheckpoint:
-        """What is kept of a run that begins with these weights and choices, in the form of the solver's states."""
+        """Return what is kept of a run that begins with these weights and choices, in the form of the solver's states."""
         digest = hashlib.sha256(self.fingerprint.encode())
         for part in parts:
             digest.update(np.ascontiguousarray(part).tobytes() if isinstance(part, np.ndarray) else repr(part).encode())
@@ -96,7 +96,7 @@ class RunCheckpoint:
     written: float = field(default_factory=time.monotonic)
 
     def state(self) -> Any:
-        """The last one that was written whole; None where there is none."""
+        """Return the last one that was written whole; None where there is none."""
         from safetensors import SafetensorError
         from safetensors.numpy import load
 

@@ -114,7 +114,7 @@ def spectrum_size(longest: int) -> int:
 
 
 def correlation_length(residuals: Matrix) -> int | None:
-    """The lag τ from which to twice it correlations are noise, so that a resonance is not cut where it is 0.
+    """Return the lag τ from which to twice it correlations are noise, so that a resonance is not cut where it is 0.
 
     Their root mean square there is that of correlations of coloured noise, `√((1 + 2 Σ_{j<τ} ρ_j²) / N)` (Bartlett
     1946), or hardly more; or it is too small to count. None where there is no such lag among the first N / 20, or in

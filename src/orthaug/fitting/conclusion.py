@@ -146,7 +146,7 @@ def _model(
 
 
 def _limits(problem: Problem, form: Lagged) -> tuple[Matrix | None, Matrix | None]:
-    """The range of the features, beyond which the correction is held or fades, and how x follows it there."""
+    """Return the range of the features, beyond which the correction is held or fades, and how x follows it there."""
     limits = None if form.beyond == "free" else limits_of(problem.feature_range)
     if limits is None:
         return None, None
@@ -156,7 +156,7 @@ def _limits(problem: Problem, form: Lagged) -> tuple[Matrix | None, Matrix | Non
 def _one_step_errors(
     task: OneStepTask, structure: Structure, learned: TrainedLearner, c: Vector, fixed: Fixed
 ) -> ErrorStatistics:
-    """The statistics of the one-step residual."""
+    """Return the statistics of the one-step residual."""
     problem, ny = task.problem, len(task.problem.outputs)
     whitened = task.residual_gram(learned, c)
     freedom = degrees_of_freedom(problem.count, problem.freedom_used, learned.effective) + len(fixed) / ny
@@ -196,7 +196,7 @@ def _beside_the_learner(
 
 
 def _beside(fixed: Fixed, gram: Matrix) -> Matrix:
-    """A Gram matrix of (c, w) in which what stands at a bound is no unknown."""
+    """Return a Gram matrix of (c, w) in which what stands at a bound is no unknown."""
     unknown = np.ones(len(gram))
     unknown[list(fixed)] = 0.0
     return gram * np.outer(unknown, unknown)
@@ -224,7 +224,7 @@ def _defect(
 
 
 def without_loss(mean_square: float) -> list[Warning]:
-    """What is told of a free run whose mean square over whole experiments does not exist."""
+    """Return what is told of a free run whose mean square over whole experiments does not exist."""
     if np.isfinite(mean_square):
         return []
     text = (

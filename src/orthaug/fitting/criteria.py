@@ -25,12 +25,12 @@ class Criterion(Protocol):
 
     @property
     def one_step(self) -> bool:
-        """Whether it is the error one step ahead, which is linear in θ."""
+        """Return whether it is the error one step ahead, which is linear in θ."""
         ...
 
     @property
     def simulates(self) -> bool:
-        """Whether runs are compared by free runs over whole experiments."""
+        """Return whether runs are compared by free runs over whole experiments."""
         ...
 
     @property
@@ -40,7 +40,7 @@ class Criterion(Protocol):
 
     @property
     def automatic(self) -> bool:
-        """Whether the data decide between one step ahead and the free run."""
+        """Return whether the data decide between one step ahead and the free run."""
         ...
 
     @property
@@ -49,7 +49,7 @@ class Criterion(Protocol):
         ...
 
     def on(self, record: Record, first_row: int = 0) -> Any:
-        """The criterion with what it leaves to the record."""
+        """Return the criterion with what it leaves to the record."""
         ...
 
     @property
@@ -58,7 +58,7 @@ class Criterion(Protocol):
         ...
 
     def response(self, model: Model, record: Record) -> Response:
-        """The response whose error judges a model on a validation part."""
+        """Return the response whose error judges a model on a validation part."""
         ...
 
 
@@ -88,7 +88,7 @@ class Prediction:
 
     @property
     def one_step(self) -> bool:
-        """Whether it is the error one step ahead, which is linear in θ."""
+        """Return whether it is the error one step ahead, which is linear in θ."""
         return self.horizon == 1
 
     @property
@@ -106,7 +106,7 @@ class Prediction:
         return self
 
     def response(self, model: Model, record: Record) -> Response:
-        """The prediction."""
+        """Return the prediction."""
         return model.predict(record, self.horizon)
 
 
@@ -168,12 +168,12 @@ class Simulation:
         return replace(self, segment=self.steps)
 
     def response(self, model: Model, record: Record) -> Response:
-        """The free run."""
+        """Return the free run."""
         return model.simulate(record)
 
     @property
     def estimates_pasts(self) -> bool:
-        """Whether the outputs before a segment are unknowns."""
+        """Return whether the outputs before a segment are unknowns."""
         if self.exact_start is not None:
             return not self.exact_start
         return self.washout > 0 or self.segment == 0
@@ -227,7 +227,7 @@ class Auto:
         return Prediction()
 
     def response(self, model: Model, record: Record) -> Response:
-        """The free run."""
+        """Return the free run."""
         return model.simulate(record)
 
 

@@ -18,7 +18,7 @@ Fixed = dict[int, float]
 
 
 def settle(fixed: Fixed, run: Callable[[Fixed], Fixed | None]) -> Fixed:
-    """What stands at a bound where a run with the same entries held ended.
+    """Return what stands at a bound where a run with the same entries held ended.
 
     What was held together once before is not released again, so that this ends.
 
@@ -57,17 +57,17 @@ class Elimination:
 
     @property
     def bounded(self) -> bool:
-        """Whether any entry of θ has a bound."""
+        """Return whether any entry of θ has a bound."""
         return bool(np.isfinite(self.lower).any() or np.isfinite(self.upper).any())
 
     @property
     def projects(self) -> bool:
-        """Whether anything is moved from the learner to θ."""
+        """Return whether anything is moved from the learner to θ."""
         return bool(self.taken.any())
 
     @property
     def decoupled(self) -> bool:
-        """Whether θ does not depend on the learner, nor the learner on bounds (F1)."""
+        """Return whether θ does not depend on the learner, nor the learner on bounds (F1)."""
         return not self._learner({}).any()
 
     def taken_beside(self, fixed: Fixed) -> Matrix:
@@ -105,7 +105,7 @@ class Elimination:
         return small[:, :nt], small[:, nt]
 
     def theta(self, f: Vector, fixed: Fixed) -> Vector:
-        """The minimising θ (nθ,) for the learner's coordinates f (nθ,)."""
+        """Return the minimising θ (nθ,) for the learner's coordinates f (nθ,)."""
         free, offset = self._split(fixed)
         scale = np.linalg.norm(free, axis=0)
         right = self._target - self._learner(fixed) @ f - offset
@@ -142,7 +142,7 @@ class Elimination:
         )
 
     def settled(self, run: Callable[[Fixed], Vector | None]) -> Fixed:
-        """What stands at a bound where training with the same entries held ended; those of physics alone at first.
+        """Return what stands at a bound where training with the same entries held ended; those of physics alone at first.
 
         Args:
             run: trains with some entries held, and gives the learner's coordinates f; None to leave it at that.
@@ -151,7 +151,7 @@ class Elimination:
         return settle(first, lambda fixed: None if (f := run(fixed)) is None else self.active(f))
 
     def past(self, f: Vector, fixed: Fixed) -> Fixed:
-        """The `fixed`, and at their bounds all entries that would else leave them, for the learner's coordinates f."""
+        """Return the `fixed`, and at their bounds all entries that would else leave them, for the learner's coordinates f."""
         while True:
             theta = self.theta(f, fixed)
             beyond = {i: float(v) for i, v in enumerate(np.clip(theta, self.lower, self.upper)) if v != theta[i]}
@@ -160,14 +160,14 @@ class Elimination:
             fixed = fixed | beyond
 
     def _split(self, fixed: Fixed) -> tuple[Matrix, Vector]:
-        """The columns of the free entries, and what the fixed ones contribute."""
+        """Return the columns of the free entries, and what the fixed ones contribute."""
         matrix = self._theta
         free = [i for i in range(matrix.shape[1]) if i not in fixed]
         return matrix[:, free], matrix[:, list(fixed)] @ np.array(list(fixed.values()), dtype=float)
 
 
 def eliminate(structure: Structure, problem: Problem) -> Elimination:
-    """The elimination of θ from a problem's criterion with a structure's rows and the baseline's bounds."""
+    """Return the elimination of θ from a problem's criterion with a structure's rows and the baseline's bounds."""
     baseline, projection = problem.baseline, problem.projection
     nt = len(baseline.names)
     shared = _shared(structure, problem)
@@ -189,7 +189,7 @@ def _shared(structure: Structure, problem: Problem) -> Shared:
 
 
 def directions(structure: Structure, problem: Problem, fixed: Iterable[int] = ()) -> Matrix | None:
-    """The directions of θ (nθ, s) along which a split makes the learner orthogonal; None for all.
+    """Return the directions of θ (nθ, s) along which a split makes the learner orthogonal; None for all.
 
     Args:
         fixed: entries of θ that stand at a bound, which no direction moves.

@@ -84,7 +84,7 @@ class AnyFit(FitView):
         return term_frame(learned_terms(self.model))
 
     def equation(self, writing: str = "text") -> str:
-        """The fitted equations with their numbers, where the learner is a sum of terms; as "text", "latex", "python".
+        """Return the fitted equations with their numbers, where the learner is a sum of terms; as "text", "latex", "python".
 
         Raises:
             InputError: another learner, physics that are Python functions, another writing.
@@ -92,11 +92,11 @@ class AnyFit(FitView):
         return equation(self.model, writing)
 
     def lines(self) -> list[str]:
-        """The lines of `summary` before its warnings."""
+        """Return the lines of `summary` before its warnings."""
         raise NotImplementedError
 
     def summary(self) -> str:
-        """A page of text: status, parameters, what is known of them, warnings."""
+        """Return a page of text: status, parameters, what is known of them, warnings."""
         warnings = ["", *(f"warning: {warning}" for warning in self.warnings)] if self.warnings else []
         return "\n".join(fold([*self.lines(), *warnings]))
 
@@ -144,11 +144,11 @@ class Estimate(AnyFit):
 
     @property
     def layout(self) -> Layout:
-        """What the entries of `reach` are called."""
+        """Return what the entries of `reach` are called."""
         return self.problem.layout
 
     def reach(self, record: Record) -> Matrix:
-        """The regressors (N, nx) of a record in the model's order of channels."""
+        """Return the regressors (N, nx) of a record in the model's order of channels."""
         return lag_rows(record, self.problem.layout)
 
     @property
@@ -307,7 +307,7 @@ class Estimate(AnyFit):
         return None if joint is None else joint.of(np.column_stack([np.eye(len(self.theta)), slope]))
 
     def moves_by(self) -> tuple[Matrix, Vector] | None:
-        """How θ follows (c, w), [I ∂θ_aux/∂w], and which entries of these move."""
+        """Return how θ follows (c, w), [I ∂θ_aux/∂w], and which entries of these move."""
         k = np.column_stack([np.eye(len(self.theta)), self._slope()])
         return k, np.ones(k.shape[1], dtype=bool)
 
@@ -325,7 +325,7 @@ class Estimate(AnyFit):
         return learner_slope(self.model, points, problem.projection, unit)
 
     def physical(self, physics: PhysicsMap) -> PhysicalEstimate:
-        """The physical parameters that θ̂ is made of, with intervals by the delta method."""
+        """Return the physical parameters that θ̂ is made of, with intervals by the delta method."""
         order, covariance = self._in_order_of(physics)
         return solve(physics, self.theta[order], covariance, freedom=max(self.freedom, 1.0))
 
@@ -389,7 +389,7 @@ def order_of(physics: PhysicsMap, names: Sequence[str], sampling_time: float) ->
 
 
 def parameter_frame(parameters: Sequence[Any], values: Vector, std: Vector | None, ci: Matrix | None) -> pd.DataFrame:
-    """A row per parameter: unit, initial, value, std, and the 95 % interval; NaN where there is none."""
+    """Return a row per parameter: unit, initial, value, std, and the 95 % interval; NaN where there is none."""
     import pandas as pd
 
     nothing = np.full(len(parameters), np.nan)

@@ -49,7 +49,7 @@ _SETTLED = 1e-6  # relative change of W
 
 
 def reweighted(first: Estimate, again: Callable[[Problem, Estimate], Estimate]) -> Estimate:
-    """The fit whose outputs are weighted by the covariance of its own errors.
+    """Return the fit whose outputs are weighted by the covariance of its own errors.
 
     Args:
         first: a fit with any output weights.
@@ -282,20 +282,20 @@ def fit(
 
 
 def _again(problem: Problem, last: Estimate, **options: Any) -> Estimate:
-    """The fit to other weights of the outputs, from where the last one ended."""
+    """Return the fit to other weights of the outputs, from where the last one ended."""
     chosen = next((r.regularization for r in last.restarts if r.chosen), "none")
     start = None if last.model.form.bound is None else last.model
     return fit(problem, initial=start, regularization=chosen, **options)
 
 
 def _undecided(problem: Problem, solver: Solver, structure: Structure, *, warm: bool, ensemble: bool) -> bool:
-    """Whether the data may decide for the free run: not where nothing but one step ahead can be trained."""
+    """Return whether the data may decide for the free run: not where nothing but one step ahead can be trained."""
     able = solver.gauss_newton and problem.baseline.linear and not isinstance(problem, StreamedProblem)
     return able and not (warm or ensemble or structure.from_initial)
 
 
 def _settled(criterion: Criterion, problem: Problem) -> Criterion:
-    """The criterion with what it left to the record; one step ahead where nothing else can be trained."""
+    """Return the criterion with what it left to the record; one step ahead where nothing else can be trained."""
     criterion = Prediction() if criterion.automatic else criterion
     if isinstance(problem, StreamedProblem):
         return criterion.streamed
@@ -320,7 +320,7 @@ def _check_cost(problem: Problem, learner: Learner | None, solver: Solver, runs:
 
 
 def _check_blocks(blocks: int) -> int:
-    """How many blocks are held out in turn.
+    """Return how many blocks are held out in turn.
 
     Raises:
         InputError: one, of which nothing would be left to train on.
@@ -332,7 +332,7 @@ def _check_blocks(blocks: int) -> int:
 
 
 def _check_ensemble(ensemble: bool, problem: Problem) -> bool:
-    """Whether there is one; raise InputError for a median of outputs that are mixed with each other."""
+    """Return whether there is one; raise InputError for a median of outputs that are mixed with each other."""
     if ensemble and problem.weight.choice == "covariance":
         raise InputError("an ensemble takes the median of each output; use `output_weights` std, none or numbers.")
     return ensemble
@@ -351,12 +351,12 @@ def _check_splittable(structure: Structure, baseline: Baseline, learner: Learner
 
 
 def _splits(structure: Structure) -> bool:
-    """Whether θ is split off under another measure than that of training."""
+    """Return whether θ is split off under another measure than that of training."""
     return structure.measure != Training()
 
 
 def _warm_start(problem: Problem, model: Model, engine: Engine) -> tuple[OneStepTask, Vector, Vector]:
-    """The task of going on from an earlier model's weights, in its scaling; and the model's c."""
+    """Return the task of going on from an earlier model's weights, in its scaling; and the model's c."""
     bound, numbers = model.form.bound, model.numbers
     if numbers.tilt is not None:
         raise InputError("`initial` is an ensemble, which has no single weights to start from; fit anew.")
@@ -390,7 +390,7 @@ def _check_types(**given: Any) -> None:
 
 
 def _check_regularizations(given: Any, choices: Sequence[Any], chosen: bool) -> bool:
-    """Whether "auto" was given; raise InputError for what is none, or for several that nothing chooses between."""
+    """Return whether "auto" was given; raise InputError for what is none, or for several that nothing chooses between."""
     auto = isinstance(given, str) and given == "auto"
     if len(choices) > 1 and not (auto or chosen):
         raise InputError("several regularizations need `validation` or `blocks` to choose between them.")
@@ -409,7 +409,7 @@ def _check_regularizations(given: Any, choices: Sequence[Any], chosen: bool) -> 
 def posed_on(
     record: Record | Source, engine: Engine | None, baseline: Baseline, *args: Any, **options: Any
 ) -> tuple[Problem, Engine]:
-    """The problem with the engine that sums over its rows; further arguments as of `pose`.
+    """Return the problem with the engine that sums over its rows; further arguments as of `pose`.
 
     Args:
         engine: None for what suits the record: memory, a stream of its files, the cluster that holds it.

@@ -153,7 +153,7 @@ class _FocusChoice:
 
     @property
     def learns(self) -> bool:
-        """Whether there is a learner to be with or without."""
+        """Return whether there is a learner to be with or without."""
         return self.options["learner"] is not None
 
     @cached_property
@@ -196,7 +196,7 @@ class _FocusChoice:
         return {key: math.sqrt(mean_square(found)) for key, found in pieces.items()}
 
     def _folds(self) -> list[tuple[Record, Record]]:
-        """What blocks are left out of, and these; of few rows the training data themselves."""
+        """Return what blocks are left out of, and these; of few rows the training data themselves."""
         try:
             return blocked(self.problem.record, self.options["blocks"] or BLOCKS, self.problem.first_row)
         except InputError:

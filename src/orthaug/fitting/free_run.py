@@ -65,7 +65,7 @@ def train_physics_only(
 def _lengthening(
     plan: SegmentedLagged, solver: LevenbergMarquardt, structure: Structure, starts: Sequence[Vector]
 ) -> list[FreeRunFit]:
-    """The end over the plan's own segments, reached over shorter ones, from the first start that flies over them."""
+    """Return the end over the plan's own segments, reached over shorter ones, from the first start that flies over them."""
     p, segment, shortest = None, _SHORTEST, plan.over(_SHORTEST)
     for start in starts:
         end = shortest.descend(shortest.objective(structure), start, solver.within_limit)
@@ -96,7 +96,7 @@ def _over_whole(
     starts: Sequence[Vector],
     ends: Sequence[FreeRunFit],
 ) -> list[FreeRunFit]:
-    """The end over whole experiments, where no end over segments is as good there as every start."""
+    """Return the end over whole experiments, where no end over segments is as good there as every start."""
     places = [(end.mean_square, end.end.point.p) for end in ends]
     objective = plan.objective(structure)
     begun = [(plan.mean_square(objective.place(p)[1], np.zeros(0)), p) for p in starts]
@@ -118,7 +118,7 @@ def _over_whole(
 
 
 def _best(ends: Sequence[FreeRunFit]) -> FreeRunFit | None:
-    """The lowest over whole experiments; where all run away, the lowest over segments."""
+    """Return the lowest over whole experiments; where all run away, the lowest over segments."""
     usable = [end for end in ends if end.ending.usable]
     flying = [end for end in usable if np.isfinite(end.mean_square)]
     if flying:
@@ -149,7 +149,7 @@ class FreeRunTask(SimulationTask):
         return self.plan.task
 
     def physics_alone(self) -> tuple[OneStepTask, TrainedLearner]:
-        """The rows without a learner, and what physics alone leaves on them; least squares where it cannot fly."""
+        """Return the rows without a learner, and what physics alone leaves on them; least squares where it cannot fly."""
         if self.physics is None:
             return self.rows_task.physics_alone()
         plan = self.plan.alone
@@ -230,12 +230,12 @@ class FreeRunTask(SimulationTask):
         return places
 
     def _simulates_better(self, objective: StructuredObjective, p: Vector) -> bool:
-        """Whether over whole experiments the loss at p is no higher than that of physics alone."""
+        """Return whether over whole experiments the loss at p is no higher than that of physics alone."""
         square = self.plan.mean_square(*objective.place(p)[1:])
         return bool(np.isfinite(square)) and (self.physics is None or square <= self.physics.mean_square)
 
     def median(self, members: list[TrainedLearner], best: int) -> TrainedLearner:
-        """The median of several, with the error of its own free run."""
+        """Return the median of several, with the error of its own free run."""
         learned = self.rows_task.median(members, best)
         assert learned.errors is not None and learned.coefficients is not None
         own = self.plan.mean_square(learned.coefficients, learned.weights, learned.tilt)

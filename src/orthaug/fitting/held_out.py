@@ -42,7 +42,7 @@ class Ratio:
 
     @classmethod
     def of(cls, model: Pieces, other: Pieces) -> Ratio:
-        """The model against the other. Runs that diverge count first; then those that both survive."""
+        """Return the model against the other. Runs that diverge count first; then those that both survive."""
         lost, other_lost = (sum(piece is None for piece in pieces) for pieces in (model, other))
         if lost != other_lost:
             certain = math.inf if lost > other_lost else 0.0
@@ -90,7 +90,7 @@ def _tail(count: int) -> float:
 
 
 def _stretches(model: Vector, other: Vector, rows: int) -> np.ndarray:
-    """Sums of both over stretches of one run, (stretches, 2); `rows` of all runs together make `_STRETCHES`."""
+    """Return sums of both over stretches of one run, (stretches, 2); `rows` of all runs together make `_STRETCHES`."""
     count = max(1, min(round(_STRETCHES * len(model) / rows), len(model)))
     edges = np.linspace(0, len(model), count + 1).astype(int)[:-1]
     return np.stack([np.add.reduceat(errors, edges) for errors in (model, other)], axis=-1)
@@ -205,7 +205,7 @@ def blocked(record: Record, blocks: int, start: int) -> list[tuple[Record, Recor
 
 
 def _cut(experiments: list[Experiment], usable: int, start: int) -> tuple[Experiment, ...]:
-    """The experiments without the last rows of the longest ones, so that `usable` rows remain."""
+    """Return the experiments without the last rows of the longest ones, so that `usable` rows remain."""
     cut = list(experiments)
     while (surplus := sum(len(e) - start for e in cut) - usable) > 0:
         longest = max(range(len(cut)), key=lambda i: len(cut[i]))

@@ -32,11 +32,11 @@ class Start(NamedTuple):
 
     @property
     def follows(self) -> bool:
-        """Whether it is known how the best states follow (c, w)."""
+        """Return whether it is known how the best states follow (c, w)."""
         return self.slope is not None or self.there is not None
 
     def at(self, unknowns: Vector) -> Float[np.ndarray, "k n0 m"] | None:
-        """The best states to first order where (c, w) is `unknowns`; None where that is not known."""
+        """Return the best states to first order where (c, w) is `unknowns`; None where that is not known."""
         if self.offset is None or self.slope is None or self.unknowns is None:
             return None
         moved = self.offset - self.slope @ (unknowns - self.unknowns)
@@ -58,7 +58,7 @@ class InitialStates:
     def eliminate(
         self, sensitivity: Sensitivity, values: Float[np.ndarray, "k n0 m"], rows: Matrix
     ) -> tuple[Matrix, Vector, Float[np.ndarray, "k m n0"] | None, Float[np.ndarray, "k m n0 n"] | None]:
-        """Normal matrix and right-hand side of (c, w) with the states at their best, and how these follow (c, w).
+        """Return normal matrix and right-hand side of (c, w) with the states at their best, and how these follow (c, w).
 
         The best states are `values + offset − slope · step` for a small step of (c, w).
         """
@@ -75,7 +75,7 @@ class InitialStates:
 
 
 def without_states(shared: Any, own: Any, missed: Any, prior: Any, xp: Any) -> tuple[Any, Any, Any, Any]:
-    """Normal matrix and right-hand side of (c, w), offset and slope of the states: a Schur complement per segment.
+    """Return normal matrix and right-hand side of (c, w), offset and slope of the states: a Schur complement per segment.
 
     Args:
         own: (…, n0, n0 + n + 1), of the segments in front.

@@ -21,7 +21,7 @@ class Solver(Protocol):
 
     @property
     def gauss_newton(self) -> bool:
-        """Whether it works on normal equations over the weights, with θ eliminated.
+        """Return whether it works on normal equations over the weights, with θ eliminated.
 
         Evidence and the free run need them. Other solvers get the criterion of θ and the weights together
         (`PaperCriterion`).

@@ -86,12 +86,12 @@ class Task(Protocol):
 
     @property
     def seconds(self) -> float:
-        """What was spent before the first run."""
+        """Return what was spent before the first run."""
         ...
 
     @property
     def warnings(self) -> tuple[Warning, ...]:
-        """What physics alone gave reason to tell."""
+        """Return what physics alone gave reason to tell."""
         ...
 
     @property
@@ -104,7 +104,7 @@ class Task(Protocol):
         ...
 
     def physics_alone(self) -> tuple[Any, TrainedLearner]:
-        """The rows without a learner, and what physics alone leaves on them."""
+        """Return the rows without a learner, and what physics alone leaves on them."""
         ...
 
     def prepared(self, solver: Any, structure: Structure, progress: RunProgress = quiet) -> Task:
@@ -119,15 +119,15 @@ class Task(Protocol):
         regularization: str | float = "none",
         progress: RunProgress = quiet,
     ) -> Any:
-        """One run from the weights `w`, with `ending`, `iterations` and `seconds`; arguments as in `estimate`."""
+        """Return one run from the weights `w`, with `ending`, `iterations` and `seconds`; arguments as in `estimate`."""
         ...
 
     def loss(self, run: Any) -> float:
-        """What runs are compared by: a mean of squared errors, each output in its standard deviation."""
+        """Return what runs are compared by: a mean of squared errors, each output in its standard deviation."""
         ...
 
     def learned(self, run: Any) -> TrainedLearner:
-        """What a run left."""
+        """Return what a run left."""
         ...
 
     def median(self, members: list[TrainedLearner], best: int) -> TrainedLearner:

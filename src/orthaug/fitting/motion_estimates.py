@@ -83,11 +83,11 @@ class MotionEstimate(AnyFit):
 
     @property
     def layout(self) -> Layout:
-        """What the entries of `reach` are called."""
+        """Return what the entries of `reach` are called."""
         return layout_of(self.problem.motion)
 
     def reach(self, record: Record) -> Matrix:
-        """The states and inputs (N, nx + nu) of the free run on a record, where they are finite."""
+        """Return the states and inputs (N, nx + nu) of the free run on a record, where they are finite."""
         return self.model.reach(record)
 
     @property
@@ -178,7 +178,7 @@ class MotionEstimate(AnyFit):
         return _with_split(robust, self.split_by, kept)
 
     def moves_by(self) -> tuple[Matrix, Vector] | None:
-        """How the coordinates follow (c, w), and which entries of these move; None without statistics."""
+        """Return how the coordinates follow (c, w), and which entries of these move; None without statistics."""
         made = free_covariance(self)
         return None if made is None or self.split_by.slope is None else (self.split_by.slope, made[1])
 
@@ -208,13 +208,13 @@ class MotionEstimate(AnyFit):
 
 
 def fitted_numbers(numbers: Numbers) -> Numbers:
-    """The numbers before any split: θ are those beside the learner."""
+    """Return the numbers before any split: θ are those beside the learner."""
     c = np.asarray(numbers.theta - numbers.theta_aux)
     return numbers._replace(theta=c, theta_aux=np.zeros_like(c))
 
 
 def _with_split(fit: MotionEstimate, split: MotionSplit, told: tuple[Warning, ...] = ()) -> MotionEstimate:
-    """The estimate with p̂, its intervals and its warnings as a split gives them."""
+    """Return the estimate with p̂, its intervals and its warnings as a split gives them."""
     motion, numbers = fit.problem.motion, fit.model.numbers
     c = np.asarray(numbers.theta - numbers.theta_aux)
     bounds = motion.coordinates.bounds
@@ -269,7 +269,7 @@ def free_covariance(fit: MotionEstimate) -> tuple[JointCovariance, Bool[np.ndarr
 
 
 def _wider_without_prior(joint: JointCovariance, slope: Matrix) -> Vector:
-    """How many times wider the intervals of K (c, w) were without the ridge on w (m,); inf where nothing tells them.
+    """Return how many times wider the intervals of K (c, w) were without the ridge on w (m,); inf where nothing tells them.
 
     Both for white noise: the question is where the information comes from.
     """
@@ -316,7 +316,7 @@ def _doubts(split: MotionSplit, at_bound: tuple[str, ...], unseen: tuple[str, ..
 
 
 def shared_in_words(shared: Shared) -> str:
-    """What the learner could imitate, in words."""
+    """Return what the learner could imitate, in words."""
     if not shared.basis.size:
         return "nothing: the fit tells all parameters from the learner"
     if shared.all:

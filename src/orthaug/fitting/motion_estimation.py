@@ -44,7 +44,7 @@ DEFAULT = Simulation(washout=0)
 def pose_for(
     record: Record, motion: Motion, learner: Learner | None, output_weights: str | Sequence[float]
 ) -> MotionProblem:
-    """The problem of a motion with what a learner sees.
+    """Return the problem of a motion with what a learner sees.
 
     Raises:
         InputError: as `pose_motion`.
@@ -188,7 +188,7 @@ def _model(plan: SegmentedMotion, structure: Structure, learned: TrainedLearner)
 
 
 def _limited(model: MotionModel, record: Record) -> MotionModel:
-    """The model with the range beyond which its correction is held or fades: of the features over the fitted run."""
+    """Return the model with the range beyond which its correction is held or fades: of the features over the fitted run."""
     limits = None if model.form.beyond == "free" or model.seen is None else limits_of(model.seen)
     if limits is None:
         return model
@@ -211,7 +211,7 @@ def _seen(model: MotionModel, record: Record) -> Matrix | None:
 
 
 def _best_window(model: MotionModel, record: Record) -> int:
-    """The rows to predict from that give the least error one step ahead, on some of the training data."""
+    """Return the rows to predict from that give the least error one step ahead, on some of the training data."""
     longest = max(record.experiments, key=len).rows(0, _TRIED_ROWS)
     tried = [n * (model.form.states + 1) for n in _WINDOWS]
     best, least = tried[0], np.inf
@@ -234,7 +234,7 @@ def _best_window(model: MotionModel, record: Record) -> int:
 
 
 def reopened(model: MotionModel, record: Record) -> MotionEstimate:
-    """The estimate of a saved model with its training data, to split again, less what was told of its training.
+    """Return the estimate of a saved model with its training data, to split again, less what was told of its training.
 
     Raises:
         InputError: other data than the model was trained on.

@@ -57,7 +57,7 @@ def field_under(
 
 
 def sizes_learned(segmented: SegmentedMotion, c: Any, x: Any, u: Any) -> Any:
-    """The size (nl,) of each learned equation and output over the runs."""
+    """Return the size (nl,) of each learned equation and output over the runs."""
     motion = segmented.problem.motion
     with np.errstate(all="ignore"):
         rates = np.asarray(motion.rates(x.T, u.T, motion.coordinates.physical(c), np), dtype=float)
@@ -77,7 +77,7 @@ def wobble(
     size: Vector,
     q: Vector,
 ) -> Matrix:
-    """How the points of a motion's own measure follow its unknowns: they are where the fitted run goes.
+    """Return how the points of a motion's own measure follow its unknowns: they are where the fitted run goes.
 
     A split under the training measure depends on the unknowns twice, through the fitted field and through these points.
     Intervals that leave the second out cover too little. `Σ φ_qx dx/d(c, w)` (np, n) is over the scored steps with

@@ -105,12 +105,12 @@ def _descended(
 
 
 def _follows(segmented: SegmentedMotion, free_fit: FreeRunFit) -> bool:
-    """Whether the runs follow most of what the outputs do."""
+    """Return whether the runs follow most of what the outputs do."""
     return bool(_left(segmented, free_fit) < _POOR**2 * segmented.residuals)
 
 
 def _left(segmented: SegmentedMotion, free_fit: FreeRunFit) -> float:
-    """The sum of squared errors, each output in its deviation; infinite where they are too large to square."""
+    """Return the sum of squared errors, each output in its deviation; infinite where they are too large to square."""
     squares = free_fit.objective.squares(free_fit.end.point)
     return np.inf if squares is None else float(np.sum(np.diag(squares) / segmented.deviation**2))
 
@@ -182,7 +182,7 @@ class MotionTask(SimulationTask):
         return MotionTask(segmented)
 
     def physics_alone(self) -> tuple[MotionTask, TrainedLearner]:
-        """The task without a learner, and what physics alone leaves; without an end where it cannot fly."""
+        """Return the task without a learner, and what physics alone leaves; without an end where it cannot fly."""
         alone = replace(self, plan=self.plan.alone)
         if self.physics is not None:
             return alone, alone.learned(self.physics)
@@ -194,11 +194,11 @@ class MotionTask(SimulationTask):
         )
 
     def median(self, members: list[TrainedLearner], best: int) -> TrainedLearner:
-        """The best member: a motion has no ensemble, for medians of outputs follow no equations."""
+        """Return the best member: a motion has no ensemble, for medians of outputs follow no equations."""
         return members[best]
 
     def learned(self, run: FreeRunFit) -> TrainedLearner:
-        """The learner as a run left it. The information counts what the outputs tell, hardly what the guesses do."""
+        """Return the learner as a run left it. The information counts what the outputs tell, hardly what the guesses do."""
         end, objective = run.end, run.objective
         if end.linear is None:
             return super().learned(run)
@@ -211,7 +211,7 @@ class MotionTask(SimulationTask):
         return train_motion_physics(self.plan, solver, tell)
 
     def scaled(self, plan: SegmentedMotion, physics: FreeRunFit) -> SegmentedMotion:
-        """The learner's features over the runs of physics alone, and the size of what it is added to."""
+        """Return the learner's features over the runs of physics alone, and the size of what it is added to."""
         if plan.bound is None:
             return plan
         point = physics.end.point

@@ -195,12 +195,12 @@ class AugmentedNARX(Augmented):
         return float(r2_score(measured[scored], found[scored]))
 
     def _layout(self, names: tuple[str, ...]) -> Layout:
-        """The regressor, for physics that are made of it."""
+        """Return the regressor, for physics that are made of it."""
         lags = _FIRST if self.lags is None else self.lags
         return lags.layout(self.output_names_, names) if isinstance(lags, Lags) else ()
 
     def _record(self, x: np.ndarray, y: np.ndarray | None, groups: list[Group]) -> Record:
-        """The experiments, with their outputs where they are given."""
+        """Return the experiments, with their outputs where they are given."""
         outputs = np.empty((len(x), 0)) if y is None else y
         experiments = [
             Experiment(x[group.rows], outputs[group.rows], "" if group.label is None else f"group {group.label}")
@@ -218,7 +218,7 @@ class AugmentedNARX(Augmented):
 
 
 def _groups(groups: Any, rows: int) -> Iterator[Group]:
-    """The experiments in order of first appearance; `groups` (rows,) labels them, None is one.
+    """Yield the experiments in order of first appearance; `groups` (rows,) labels them, None is one.
 
     Raises:
         InputError: not one label for every row.

@@ -57,7 +57,7 @@ class Blocks:
 
 
 def collect(total: Float[Array, "n n"], hold: Hold, before: Overlap) -> Normal:
-    """The normal equations from the sum of all `Blocks`: `JᵀP⊥J = JᵀJ − (QᵀJ)ᵀ(QᵀJ)`, plus the structure's `Hold`."""
+    """Return the normal equations from the sum of all `Blocks`: `JᵀP⊥J = JᵀJ − (QᵀJ)ᵀ(QᵀJ)`, plus the structure's `Hold`."""
     nt = before.values.shape[0]
     g_qr, g_qj = total[:nt, nt], total[:nt, nt + 1 :]
     g_rr, g_jr, g_jj = total[nt, nt], total[nt + 1 :, nt], total[nt + 1 :, nt + 1 :]
@@ -90,14 +90,14 @@ class OneStep:
 def one_pass(
     criterion: Callable[..., Normal], w: Float[Array, "nw"], arguments: tuple[Any, ...], overlap: Overlap
 ) -> Normal:
-    """The criterion at w. The programs around it trace it once, together."""
+    """Return the criterion at w. The programs around it trace it once, together."""
     return criterion(w, *arguments, overlap)
 
 
 def linearise(
     criterion: Callable[..., Normal], w: Float[Array, "nw"], arguments: tuple[Any, ...], overlap: Overlap
 ) -> Normal:
-    """The criterion at w, in two passes: the second subtracts the overlap of the first."""
+    """Return the criterion at w, in two passes: the second subtracts the overlap of the first."""
     first = one_pass(criterion, w, arguments, overlap)
     return one_pass(criterion, w, arguments, first.overlap)
 
@@ -112,7 +112,7 @@ class SummedOneStep:
     hold: Hold
 
     def __call__(self, w: Any, before: Overlap) -> Normal:
-        """The normal equations at w; `before` is the overlap from the previous pass."""
+        """Return the normal equations at w; `before` is the overlap from the previous pass."""
         return _collect(self.engine.sum(Blocks(self.bound), self.rows, w, before), self.hold, before)
 
 

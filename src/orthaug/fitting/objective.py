@@ -81,7 +81,7 @@ class FreeRunObjective:
         return p[: self.physics], p[: self.physics], p[self.physics :]
 
     def evaluate(self, p: Vector, start: Start) -> TrialPoint:
-        """A trial at p. The states follow p to first order. Where that does not lower the misfit, they stay."""
+        """Return a trial at p. The states follow p to first order. Where that does not lower the misfit, they stay."""
         theta, c, w = self.place(p)
         trials: list[TrialPoint] = []
         for follows in (True, False) if self.initial.free and start.follows else (False,):
@@ -114,18 +114,18 @@ class FreeRunObjective:
         return total, states, errors, None
 
     def linearise(self, point: TrialPoint) -> LinearisedFreeRun:
-        """Normal equations about a trial, with its states at their best."""
+        """Return normal equations about a trial, with its states at their best."""
         information, gradient, following = self.eliminated(point, self.start_rows)
         start = Start(point.states, point.misfit, np.concatenate([point.c, point.w]), **following)
         return LinearisedFreeRun(information, gradient, information, start)
 
     def kept(self, point: TrialPoint) -> tuple[Any, ...]:
-        """What `again` makes the trial of, bit by bit."""
+        """Return what `again` makes the trial of, bit by bit."""
         squares = np.zeros((0, 0)) if point.squares is None else point.squares
         return point.p, np.asarray(point.states), point.misfit, point.loss, squares
 
     def again(self, kept: tuple[Any, ...]) -> TrialPoint:
-        """The trial that was `kept`."""
+        """Return the trial that was `kept`."""
         p, states, misfit, loss, squares = kept
         theta, c, w = self.place(p)
         known = self.sums is not None
@@ -133,7 +133,7 @@ class FreeRunObjective:
         return TrialPoint(p, theta, c, w, states, errors, float(misfit), float(loss), squares if known else None)
 
     def eliminated(self, point: TrialPoint, rows: Matrix) -> tuple[Matrix, Vector, dict[str, Any]]:
-        """Normal matrix and right-hand side of (c, w), L = `rows`, and how the states follow, as `Start` has it."""
+        """Return normal matrix and right-hand side of (c, w), L = `rows`, and how the states follow, as `Start` has it."""
         numbers, states = self.numbers(point.c, point.w), point.states
         if self.sums is not None:
             made = (self.dynamics, numbers, self.segments, self.initial, states, self.weight, rows)
@@ -144,11 +144,11 @@ class FreeRunObjective:
         return information, gradient, {"offset": offset, "slope": slope}
 
     def slope(self, start: Start) -> Float[np.ndarray, "k m n0 n"] | None:
-        """How the best states follow (c, w)."""
+        """Return how the best states follow (c, w)."""
         return start.slope if self.sums is None or start.there is None else self.sums.slope(start.there)
 
     def theta_information(self, linear: LinearisedFreeRun, w: Vector) -> Matrix:
-        """The information of (θ, w), with θ as it is split from the learner."""
+        """Return the information of (θ, w), with θ as it is split from the learner."""
         return linear.information
 
     def errors(self, c: Vector, w: Vector, states: Any, segments: Segments) -> Float[np.ndarray, "k T ny m"]:
@@ -156,7 +156,7 @@ class FreeRunObjective:
         return errors_of(self.dynamics, self.numbers(c, w), states, segments)
 
     def samples(self, point: TrialPoint) -> tuple[float, float]:
-        """Number of residuals less the physics' own parameters, and the share of them that is independent."""
+        """Return number of residuals less the physics' own parameters, and the share of them that is independent."""
         ny, errors = len(self.weight), point.errors
         segments, states = self.segments, point.states
         if self.colour is not None:

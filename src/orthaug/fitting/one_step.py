@@ -86,7 +86,7 @@ class OneStepTask(TrainingRows):
 
     @property
     def seconds(self) -> float:
-        """What physics alone took."""
+        """Return what physics alone took."""
         return 0.0
 
     @property
@@ -105,7 +105,7 @@ class OneStepTask(TrainingRows):
         return replace(self, problem=problem, bound=None, scaling=scaling, unit=np.zeros_like(self.unit))
 
     def physics_alone(self) -> tuple[OneStepTask, TrainedLearner]:
-        """The rows without a learner, and least squares on them."""
+        """Return the rows without a learner, and least squares on them."""
         return self.alone, self.alone.physics_learned()
 
     def on(self, record: Record) -> OneStepTask:
@@ -140,7 +140,7 @@ class OneStepTask(TrainingRows):
         regularization: str | float = "none",
         progress: RunProgress = quiet,
     ) -> compiled.TrainingRun:
-        """One run from the weights `w`; the arguments as in `estimate`, `structure` None for no penalty.
+        """Return one run from the weights `w`; the arguments as in `estimate`, `structure` None for no penalty.
 
         Over very many rows its iterations are those over all of them, its seconds those over the few as well.
         """
@@ -163,7 +163,7 @@ class OneStepTask(TrainingRows):
         return run
 
     def _above(self, run: compiled.TrainingRun) -> bool:
-        """Whether a run ended above physics alone."""
+        """Return whether a run ended above physics alone."""
         return run.ending.usable and self.loss(run) > self.start_loss
 
     def _run_inside(
@@ -175,7 +175,7 @@ class OneStepTask(TrainingRows):
         regularization: str | float,
         progress: RunProgress,
     ) -> compiled.TrainingRun:
-        """One run with θ inside its bounds, which an active set meets (they reach into training, F1).
+        """Return one run with θ inside its bounds, which an active set meets (they reach into training, F1).
 
         Entries at a bound are known terms: they are held there from the first step on, as if they were `fixed`. Where
         others stand there at the end, the run is made again.
@@ -264,7 +264,7 @@ class OneStepTask(TrainingRows):
         return self.mean_square(run.normal.loss)
 
     def learned(self, run: compiled.TrainingRun) -> TrainedLearner:
-        """What a run left."""
+        """Return what a run left."""
         return TrainedLearner(
             bound=self.bound,
             weights=np.asarray(run.w),
@@ -296,7 +296,7 @@ class OneStepTask(TrainingRows):
         )
 
     def median(self, members: list[TrainedLearner], best: int) -> TrainedLearner:
-        """The median of several: `g = φ c̄ + median_i(f_i + φ (c_i − c̄))`, each with its own c_i (F2).
+        """Return the median of several: `g = φ c̄ + median_i(f_i + φ (c_i − c̄))`, each with its own c_i (F2).
 
         The median is one function of the regressor again, and split like any other. It lacks some statistics: those
         are taken from the `best` member.

@@ -161,7 +161,7 @@ def started(
     *,
     empty: bool,
 ) -> Recursion:
-    """The state after the training rows in whitened outputs, which count as one memory at most.
+    """Return the state after the training rows in whitened outputs, which count as one memory at most.
 
     Args:
         level, freedom: s² and its degrees of freedom over these rows.
@@ -214,7 +214,7 @@ class EstimateHistory:
         return np.reshape(self._lines, (-1, 5 + self.ny + self.nt + 2 * self.nt**2))
 
     def line(self, row: int, level: float, freedom: float, residual: Vector, recursion: Recursion) -> Vector:
-        """What is kept of a row."""
+        """Return what is kept of a row."""
         line = np.empty(5 + self.ny + self.nt + 2 * self.nt**2)
         first, second = 5 + self.ny, 5 + self.ny + self.nt
         line[:5] = row, level, recursion.level, freedom, recursion.determined

@@ -248,7 +248,7 @@ class Recursive:
 
     @property
     def alarmed(self) -> bool:
-        """Whether the residual is out of its band now."""
+        """Return whether the residual is out of its band now."""
         return self.alarm_level > 1
 
     @property
@@ -303,14 +303,14 @@ class Recursive:
         return pd.DataFrame(columns, index=pd.Index(rows[:, 0].astype(int), name="row"))
 
     def physical(self, physics: PhysicsMap) -> PhysicalEstimate:
-        """The physical parameters that θ is made of now, with intervals by the delta method."""
+        """Return the physical parameters that θ is made of now, with intervals by the delta method."""
         order = self._in_order_of(physics)
         covariance = self.covariance
         covariance = None if covariance is None else covariance[np.ix_(order, order)]
         return solve(physics, self.theta[order], covariance, freedom=self._freedom)
 
     def physical_history(self, physics: PhysicsMap, points: int = 100) -> pd.DataFrame:
-        """The physical parameters at some instants of `history`, the last one among them.
+        """Return the physical parameters at some instants of `history`, the last one among them.
 
         Args:
             points: how many, at most.
@@ -342,7 +342,7 @@ class Recursive:
         return f"Recursive({self.rows} rows, forgetting {self.forgetting:g}, {len(self.alarms)} alarms, {values})"
 
     def summary(self) -> str:
-        """A page of text: rows, memory, parameters, alarms."""
+        """Return a page of text: rows, memory, parameters, alarms."""
         step = self._fitted.sampling_time
         memory = "everything" if self.forgetting == 1 else f"{-step / math.log(self.forgetting):.4g} s"
         lines = [
@@ -359,7 +359,7 @@ class Recursive:
 
 
 def outside_text(outside: int, rows: int) -> str:
-    """How many rows the learner extrapolates on."""
+    """Return how many rows the learner extrapolates on."""
     share = f"{percent(outside / rows)} of the rows"
     return f"the learner's inputs leave those of training on {share}: it extrapolates there, which raises no alarm"
 

@@ -114,7 +114,7 @@ class RegressorStream:
 
 
 def as_rows(values: Any, channels: int, name: str) -> Matrix:
-    """One row or many (n, channels); NaN is a missing sample.
+    """Return one row or many (n, channels); NaN is a missing sample.
 
     Raises:
         InputError: no numbers, another number of channels, or an infinite one.
@@ -135,7 +135,7 @@ def as_rows(values: Any, channels: int, name: str) -> Matrix:
 
 
 def joined_rows(u: Any, y: Any, inputs: int, outputs: int) -> Matrix:
-    """Outputs and inputs side by side (n, ny + nu), as they are handed in.
+    """Return outputs and inputs side by side (n, ny + nu), as they are handed in.
 
     Raises:
         InputError: one of them missing, or of another length.
@@ -175,7 +175,7 @@ class TrainingRowsModel(NamedTuple):
 
 
 def trained(fit: Any, training: Record | None) -> TrainingRowsModel:
-    """The rows of a fit.
+    """Return the rows of a fit.
 
     Raises:
         InputError: what cannot be followed, or a model without its training data.
@@ -247,7 +247,7 @@ def _saved_covariance(began: TrainingRowsModel) -> Matrix | None:
 def begin(
     began: TrainingRowsModel, forgetting: float, quiet: float, *, empty: bool
 ) -> tuple[Recursion, Reference, Matrix | None]:
-    """The state before new rows, what residuals were like, and by what intervals are wider than `s²(ΦᵀΦ)⁻¹`."""
+    """Return the state before new rows, what residuals were like, and by what intervals are wider than `s²(ΦᵀΦ)⁻¹`."""
     phi, target, model = began.phi, began.target, began.model
     count, ny, nt = phi.shape
     residual = target - phi @ model.theta
@@ -289,7 +289,7 @@ def _root(matrix: Matrix) -> Matrix:
 
 
 def _memory(stretches: list[Matrix], white: Matrix) -> int:
-    """How many lags the colour of the errors takes: three times as many as their correlation lasts."""
+    """Return how many lags the colour of the errors takes: three times as many as their correlation lasts."""
     longest, rows = max(map(len, stretches)), sum(map(len, stretches))
     padded = [np.pad(stretch @ white.T, ((0, longest - len(stretch)), (0, 0))) for stretch in stretches]
     lasting = [correlation_length(np.stack([p[:, i] for p in padded])) for i in range(len(white))]

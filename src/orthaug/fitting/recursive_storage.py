@@ -76,7 +76,7 @@ def _arrays(kept: RecursiveState) -> dict[str, Any]:
 
 
 def load(folder: Any, baseline: Baseline | None, learner: Learner | None) -> RecursiveState:
-    """What `save` wrote.
+    """Return what `save` wrote.
 
     Raises:
         InputError: no saved state there; a file that is cut, altered, or from a newer version.

@@ -137,7 +137,7 @@ class ResidualMonitor:
 
 
 def _steps(blocks: Matrix) -> Vector:
-    """The increments of g, summed over outputs (n,)."""
+    """Return the increments of g, summed over outputs (n,)."""
     squares = np.minimum(blocks * blocks, _LARGEST**2)
     return (0.5 * ((1 - 1 / _RATIO) * squares - math.log(_RATIO))).sum(axis=1)
 
@@ -154,14 +154,14 @@ def _exponent(steps: Vector) -> float:
 
 
 def _blocks(stretch: Matrix, scale: int) -> Matrix:
-    """Sums over blocks of rows over √rows, of clipped residuals (n, ny)."""
+    """Return sums over blocks of rows over √rows, of clipped residuals (n, ny)."""
     count = len(stretch) // scale
     clipped = np.clip(stretch[: count * scale], -_LARGEST, _LARGEST)
     return clipped.reshape(count, scale, -1).sum(axis=1) / math.sqrt(scale)
 
 
 def _filtered(stretch: Matrix, colour: Matrix) -> Matrix:
-    """What an autoregression leaves of residuals."""
+    """Return what an autoregression leaves of residuals."""
     lags = len(colour)
     left = stretch[lags:].copy()
     for i, row in enumerate(colour, start=1):

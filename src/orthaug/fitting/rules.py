@@ -25,7 +25,7 @@ _FEWEST = 50  # iterations that are counted on where more are allowed: most runs
 
 
 def checked_starts(restarts: int, seed: int, *, warm: bool, ensemble: bool) -> tuple[int, int]:
-    """How many starts and from which seed, as whole numbers; a `warm` start is one."""
+    """Return how many starts and from which seed, as whole numbers; a `warm` start is one."""
     restarts, seed = check_count(restarts, "restarts"), check_count(seed, "seed", least=0)
     check_starts(1 if warm else restarts, seed, ensemble=ensemble)
     return restarts, seed
@@ -99,7 +99,7 @@ def tried(
     motion: bool = False,
     learner: Learner | None = None,
 ) -> tuple[Any, ...]:
-    """The regularizations of every start: those given, or what "auto" stands for (docs/design.md has the table).
+    """Return the regularizations of every start: those given, or what "auto" stands for (docs/design.md has the table).
 
     Args:
         linear: whether the physics is linear in θ, which is then solved.
@@ -121,7 +121,7 @@ def tried(
 
 
 def ridge_of(regularization: str | float) -> tuple[float, bool]:
-    """The ridge α that a run starts with, and whether evidence re-estimates it."""
+    """Return the ridge α that a run starts with, and whether evidence re-estimates it."""
     evidence = regularization in ("evidence", "ard")
     return (1.0 if evidence else 0.0 if regularization == "none" else float(regularization)), evidence
 

@@ -129,7 +129,7 @@ class Augmented(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return values[:, 0] if self._one_column else values
 
     def _fitted(self) -> Estimate:
-        """The estimate; NotFittedError where there is none."""
+        """Return the estimate; NotFittedError where there is none."""
         from sklearn.utils.validation import check_is_fitted
 
         check_is_fitted(self, "estimate_")
@@ -170,14 +170,14 @@ def check_there(values: np.ndarray) -> None:
 
 
 def input_names(estimator: Any) -> tuple[str, ...]:
-    """The columns of X as expressions name them: their own names, or x0, x1, … where they cannot be used."""
+    """Return the columns of X as expressions name them: their own names, or x0, x1, … where they cannot be used."""
     given = getattr(estimator, "feature_names_in_", [""] * estimator.n_features_in_)
     good = [str(name) if is_name(str(name)) else "" for name in given]
     return tuple(name or _free(f"x{j}", good) for j, name in enumerate(good))
 
 
 def output_names(y: Any, columns: int, inputs: Sequence[str]) -> tuple[str, ...]:
-    """The outputs as expressions name them: those of a Series or DataFrame, or y (y0, y1, … of several).
+    """Return the outputs as expressions name them: those of a Series or DataFrame, or y (y0, y1, … of several).
 
     Args:
         y: as the user gave it.
@@ -198,7 +198,7 @@ def _free(name: str, taken: Sequence[str]) -> str:
 
 
 def at_now(text: str, names: Sequence[str]) -> str:
-    """An expression of columns as one of channels: `speed**2` becomes `speed[k]**2`."""
+    """Return an expression of columns as one of channels: `speed**2` becomes `speed[k]**2`."""
     if not names or not isinstance(text, str):  # what is no text is refused where it is read
         return text
     columns = "|".join(map(re.escape, names))
@@ -206,7 +206,7 @@ def at_now(text: str, names: Sequence[str]) -> str:
 
 
 def learner_of(given: Any, names: Sequence[str] = ()) -> Any:
-    """The learner of a parameter, "auto" for `MLP()`; the columns `names` in its expressions become channels."""
+    """Return the learner of a parameter, "auto" for `MLP()`; the columns `names` in its expressions become channels."""
     if isinstance(given, str) and given == "auto":
         return MLP()
     if not is_dataclass(given) or isinstance(given, type):
@@ -220,7 +220,7 @@ def learner_of(given: Any, names: Sequence[str] = ()) -> Any:
 
 
 def baseline_of(physics: Any, layout: Layout, outputs: Sequence[str], names: Sequence[str] = ()) -> Baseline:
-    """The physics of a parameter.
+    """Return the physics of a parameter.
 
     Args:
         physics: "linear", expressions, `Term`s, a mapping of parameters to expressions, a Baseline, or a JAX function.

@@ -32,7 +32,7 @@ class Best(NamedTuple):
     slope: Float[Any, "m n0 n"]
 
     def moved(self, step: Any) -> Float[Array, "n0 m"]:
-        """The best states where (c, w) has moved by `step` (n,)."""
+        """Return the best states where (c, w) has moved by `step` (n,)."""
         return self.values + (self.offset - self.slope @ step).T
 
 
@@ -117,7 +117,7 @@ class SegmentSums:
         return None if engine.resident else cls(engine)
 
     def rows(self, segments: Any) -> Any:
-        """The segments where the engine keeps them."""
+        """Return the segments where the engine keeps them."""
         with self.one_at_a_time:
             known = self.placed.get(id(segments))
             if known is None:
@@ -128,7 +128,7 @@ class SegmentSums:
             return known[1]
 
     def with_states(self, segments: Any, states: Any) -> Any:
-        """The segments beside their states (k, n0, m)."""
+        """Return the segments beside their states (k, n0, m)."""
         rows = self.rows(segments)
         return self.engine.beside(rows, self.engine.place(np.asarray(states), rows))
 
@@ -155,19 +155,19 @@ class SegmentSums:
         return self.tried(dynamics, numbers, segments, start, None, np.eye(ny), np.eye(n0))[1]
 
     def moved(self, start: Start, step: Vector) -> Float[np.ndarray, "k n0 m"]:
-        """The states after a step of (c, w)."""
+        """Return the states after a step of (c, w)."""
         return np.asarray(self.engine.fetch(self.engine.keep(MovedStates(), start.there, step)[0]))
 
     def linearised(
         self, dynamics: Dynamics, numbers: Numbers, segments: Any, initial: InitialStates, states: Any, *made: Matrix
     ) -> tuple[Matrix, Vector, Any]:
-        """Normal matrix and right-hand side of (c, w) with the states at their best, and `Best` where it stays."""
+        """Return normal matrix and right-hand side of (c, w) with the states at their best, and `Best` where it stays."""
         rows = self.with_states(segments, states)
         kept, (hessian, gradient) = self.engine.keep(SegmentEquations(dynamics, initial.free), rows, numbers, *made)
         return np.asarray(hessian), np.asarray(gradient), kept if initial.free else None
 
     def slope(self, there: Any) -> Float[np.ndarray, "k m n0 n"]:
-        """How the best states follow (c, w), brought here."""
+        """Return how the best states follow (c, w), brought here."""
         return np.asarray(self.engine.fetch(there).slope)
 
     def spectra(

@@ -27,13 +27,13 @@ _SMALL = 4096  # steps: a run over more of them than are needed takes less time 
 
 
 def lagged(task: OneStepTask) -> Lagged:
-    """The dynamics of a problem and its learner."""
+    """Return the dynamics of a problem and its learner."""
     problem = task.problem
     return Lagged(problem.baseline, problem.features, problem.layout, problem.outputs, task.bound)
 
 
 def declared(task: OneStepTask, criterion: Criterion) -> dict[str, Any]:
-    """What a plan has of its task and its criterion, wherever the segments are."""
+    """Return what a plan has of its task and its criterion, wherever the segments are."""
     problem = task.problem
     return {
         "record": problem.record,
@@ -85,7 +85,7 @@ class SegmentedLagged(SegmentedProblem):
 
     @property
     def lengthens(self) -> bool:
-        """Whether whole experiments can be segments to train on."""
+        """Return whether whole experiments can be segments to train on."""
         return True
 
     def over(self, segment: int) -> SegmentedLagged:
@@ -99,7 +99,7 @@ class SegmentedLagged(SegmentedProblem):
         return build_segments(self.record, self.dynamics, segment, washout, like, self.shares)
 
     def objective(self, structure: Structure) -> StructuredObjective:
-        """The criterion as a function of θ and the weights."""
+        """Return the criterion as a function of θ and the weights."""
         start, elimination = np.asarray(self.segments.start), eliminate(structure, self.problem)
         free = elimination.projects and not elimination.bounded and self.bound is not None  # the unknown is c
         bounds = elimination.lower.copy(), elimination.upper.copy()
@@ -138,12 +138,12 @@ class StructuredObjective(FreeRunObjective):
 
     @property
     def follows(self) -> bool:
-        """Whether c follows θ, `c = θ − θ_aux(w)`."""
+        """Return whether c follows θ, `c = θ − θ_aux(w)`."""
         return self.elimination.projects and self.elimination.bounded and self.task.bound is not None
 
     @property
     def apart(self) -> bool:
-        """Whether what stands at a bound becomes a known term beside the learner."""
+        """Return whether what stands at a bound becomes a known term beside the learner."""
         return self.follows and self.elimination.shared is not None
 
     def begin(self, w: Vector) -> Vector:
@@ -159,7 +159,7 @@ class StructuredObjective(FreeRunObjective):
         return theta, c, w
 
     def evaluate(self, p: Vector, start: Start) -> TrialPoint:
-        """A trial at p, with the structure's rows."""
+        """Return a trial at p, with the structure's rows."""
         point = super().evaluate(p, start)
         rows = self.elimination.rows
         if not len(rows.target):
@@ -168,7 +168,7 @@ class StructuredObjective(FreeRunObjective):
         return point._replace(loss=point.loss + float(miss @ miss) / self.rms**2)
 
     def linearise(self, point: TrialPoint) -> LinearisedFreeRun:
-        """Normal equations about a trial, of the unknown θ and with the structure's rows."""
+        """Return normal equations about a trial, of the unknown θ and with the structure's rows."""
         linear = super().linearise(point)
         hessian, gradient = linear.hessian, linear.gradient
         rows, rms = self.elimination.rows, self.rms
@@ -182,7 +182,7 @@ class StructuredObjective(FreeRunObjective):
         return linear._replace(hessian=hessian, gradient=gradient)
 
     def theta_information(self, linear: LinearisedFreeRun, w: Vector) -> Matrix:
-        """The information of (θ, w): of an orthogonal θ that the learner's share was taken from."""
+        """Return the information of (θ, w): of an orthogonal θ that the learner's share was taken from."""
         if not (self.elimination.projects and self.task.bound is not None):
             return linear.information
         change = self.change(w)
@@ -203,7 +203,7 @@ class StructuredObjective(FreeRunObjective):
         return self.elimination.taken_beside(self.fixed)
 
     def held(self, end: Descent) -> Fixed:
-        """What stands at a bound at the end of a run: entries that got there, and the fixed ones that would stay.
+        """Return what stands at a bound at the end of a run: entries that got there, and the fixed ones that would stay.
 
         Those that the learner could imitate stay where the nearest θ in the bounds does, the others where descent
         would leave the bounds.

@@ -117,7 +117,7 @@ class SegmentedMotion(SegmentedProblem):
         return replace(self, segments=self.segments._replace(start=np.asarray(states)))
 
     def objective(self, structure: Structure | None = None) -> MotionObjective:
-        """The criterion as a function of the parameters' coordinates and the weights."""
+        """Return the criterion as a function of the parameters' coordinates and the weights."""
         return MotionObjective(
             dynamics=self.dynamics,
             numbers=self.numbers,
@@ -139,7 +139,7 @@ class SegmentedMotion(SegmentedProblem):
         return self.problem.weight.matrix / self.rms
 
     def settled(self, c: Vector, w: Any = (), segments: Segments | None = None, iterations: int = 12) -> np.ndarray:
-        """The starts (k, n0, m) by which the segments follow the outputs best."""
+        """Return the starts (k, n0, m) by which the segments follow the outputs best."""
         segments = self.segments if segments is None else segments
         numbers, states = self.numbers(c, np.asarray(w)), []
         for start, inputs, target, scored in zip(*map(np.asarray, segments), strict=True):
@@ -164,7 +164,7 @@ class SegmentedMotion(SegmentedProblem):
         return mean if mean < RUNAWAY else np.nan
 
     def runs(self, c: Vector, w: Any, states: Any) -> Float[np.ndarray, "k T n0 m"]:
-        """The states along every segment from these starts."""
+        """Return the states along every segment from these starts."""
         return np.asarray(_states(self.dynamics, self.numbers(c, w), self.segments, states))
 
     def trajectory(self, c: Vector, w: Any, states: Any) -> tuple[Matrix, Matrix]:
@@ -175,7 +175,7 @@ class SegmentedMotion(SegmentedProblem):
         return np.moveaxis(runs, -1, 1)[scored], self.dynamics.now(inputs)
 
     def states_by_row(self, c: Vector, w: Any, states: Any) -> list[Matrix]:
-        """The states (N, nx) of every experiment, put together from the segments' runs."""
+        """Return the states (N, nx) of every experiment, put together from the segments' runs."""
         runs = np.moveaxis(self.runs(c, w, states), -1, 1)
         rows, place, found = runs.reshape(-1, *runs.shape[2:]), 0, []
         steps, washout = self.segments.steps, min(self.free_run.washout, self.segments.steps - 1)
@@ -203,14 +203,14 @@ class SegmentedMotion(SegmentedProblem):
 
 
 def sizes(problem: MotionProblem) -> Vector:
-    """How large each state is (nx,): of its guesses; 1 where nothing is known."""
+    """Return how large each state is (nx,): of its guesses; 1 where nothing is known."""
     size = np.abs(problem.looked_at[0]).max(axis=1)
     return np.where(size > 0, size, 1.0)
 
 
 @partial(jax.jit, static_argnames="form")
 def _states(form: MotionDynamics, numbers: Numbers, segments: Segments, states: Float[Array, "k n0 m"]) -> Any:
-    """The states (k, T, n0, m) of every segment's run."""
+    """Return the states (k, T, n0, m) of every segment's run."""
     numbers = form.prepared(numbers)
     side_by_side = jax.vmap(lambda state, row: form.step(numbers, state, row)[0], -1, -1)
 

@@ -121,16 +121,16 @@ class SegmentedProblem:
 
     @property
     def shares(self) -> int:
-        """How many sum over segments at a time."""
+        """Return how many sum over segments at a time."""
         return 1 if self.sums is None else self.sums.engine.shares
 
     @property
     def residuals(self) -> int:
-        """How many errors are scored."""
+        """Return how many errors are scored."""
         return self.segments.count * len(self.dynamics.outputs)
 
     def numbers(self, c: Vector, w: Any, tilt: Any = None) -> Numbers:
-        """The model's numbers before the split."""
+        """Return the model's numbers before the split."""
         scaling = self.scaling
         return Numbers(c, np.zeros_like(c), np.asarray(w), scaling.centre, scaling.halfwidth, self.unit, tilt)
 

@@ -94,7 +94,7 @@ class SegmentedStreamed(SegmentedLagged):
         return mean if mean < RUNAWAY else np.nan
 
     def looked_at(self, objective: FreeRunObjective, end: Descent) -> TrialInMemory:
-        """The segments of the witness; where that is all rows, with the states that were trained."""
+        """Return the segments of the witness; where that is all rows, with the states that were trained."""
         free_run = self.free_run
         segments = build_segments(self.record, self.dynamics, free_run.steps, free_run.washout)
         initial = InitialStates(np.asarray(segments.start), objective.initial.free)
@@ -157,7 +157,7 @@ class PartitionRuns:
 def _along(
     dynamics: Dynamics, numbers: Numbers, state: Any, inputs: Any, target: Any, scored: Any, rows: Any
 ) -> tuple[Any, Any]:
-    """The state after so many rows, and the squares (ny,) of the errors on the scored ones."""
+    """Return the state after so many rows, and the squares (ny,) of the errors on the scored ones."""
     numbers = dynamics.prepared(numbers)
 
     def step(carry: Any, row: Any) -> tuple[Any, None]:
@@ -201,7 +201,7 @@ class PieceShape:
 
 
 def look(partition: Any) -> list[PieceShape]:
-    """The pieces of a partition."""
+    """Return the pieces of a partition."""
     return [PieceShape(piece.source, piece.first_row, piece.offset, len(piece)) for piece in partition.pieces(0)]
 
 
@@ -275,7 +275,7 @@ class SegmentCutter:
 
 
 def _slices(part: Part) -> Iterator[Experiment]:
-    """The rows of each segment; those before the next one are let go."""
+    """Yield the rows of each segment; those before the next one are let go."""
     pieces, begin = part.span.pieces(0), 0
     inputs, outputs = [], []
     for first, last in part.rows.tolist():

@@ -82,7 +82,7 @@ def begins_of(rows: int, steps: int, washout: int) -> list[int]:
 def segment_of(
     experiment: Experiment, inputs: Any, begin: int, steps: int, washout: int, dynamics: Dynamics
 ) -> Segments:
-    """One segment. Where the experiment is shorter, its end is repeated."""
+    """Return one segment. Where the experiment is shorter, its end is repeated."""
     rows = np.arange(begin, begin + steps)
     there = np.minimum(rows, len(inputs) - 1)
     first = dynamics.first_row + begin
@@ -95,13 +95,13 @@ def segment_of(
 def respond(
     dynamics: Dynamics, numbers: Numbers, segments: Segments, states: Float[Array, "k n0 m"]
 ) -> Float[Array, "k T ny m"]:
-    """Outputs of every segment from its state."""
+    """Return outputs of every segment from its state."""
     numbers = dynamics.prepared(numbers)
     return jax.lax.map(lambda chunk: chunk_response(dynamics, numbers, *chunk), (states, segments.inputs))
 
 
 def chunk_response(dynamics: Dynamics, numbers: Numbers, states: Any, inputs: Any) -> Float[Array, "T ny m"]:
-    """Outputs of the segments of one chunk, of prepared numbers."""
+    """Return outputs of the segments of one chunk, of prepared numbers."""
     side_by_side = jax.vmap(partial(dynamics.step, numbers), in_axes=-1, out_axes=-1)
 
     def step(state: Any, inputs: Any) -> tuple[Any, Any]:

@@ -42,7 +42,7 @@ class StartPoint(NamedTuple):
 
 
 def _learned(free_fit: FreeRunFit, first_loss: float) -> bool:
-    """Whether the weights lowered the loss: evidence may also have found too early that none are needed."""
+    """Return whether the weights lowered the loss: evidence may also have found too early that none are needed."""
     return bool(free_fit.end.point.loss < LEARNED * first_loss)
 
 
@@ -61,10 +61,10 @@ class SimulationTask(ABC):
     def train_physics_only(
         self, solver: LevenbergMarquardt, structure: Structure, tell: RunProgress
     ) -> tuple[Any, FreeRunFit | None]:
-        """The plan and physics alone trained on it; None where it cannot fly."""
+        """Return the plan and physics alone trained on it; None where it cannot fly."""
 
     def scaled(self, plan: Any, physics: FreeRunFit) -> Any:
-        """The plan with its learner scaled by what physics alone does."""
+        """Return the plan with its learner scaled by what physics alone does."""
         return plan
 
     @abstractmethod
@@ -105,7 +105,7 @@ class SimulationTask(ABC):
 
     @property
     def problem(self) -> Any:
-        """What is estimated, with its record."""
+        """Return what is estimated, with its record."""
         return self.plan.problem
 
     @property
@@ -123,7 +123,7 @@ class SimulationTask(ABC):
 
     @property
     def seconds(self) -> float:
-        """What physics alone took."""
+        """Return what physics alone took."""
         return 0.0 if self.physics is None else self.physics.seconds
 
     @property
@@ -147,7 +147,7 @@ class SimulationTask(ABC):
         regularization: str | float = "none",
         progress: RunProgress = quiet,
     ) -> FreeRunFit:
-        """One run from the weights `w`, silenced, and physics alone; the arguments as in `estimate`.
+        """Return one run from the weights `w`, silenced, and physics alone; the arguments as in `estimate`.
 
         An earlier model is gone on from where it is better than physics alone. A learner that cannot be silenced
         starts with its weights, from the best θ for them.
@@ -182,7 +182,7 @@ class SimulationTask(ABC):
         return self._below_physics(free_fit)
 
     def _below_physics(self, free_fit: FreeRunFit) -> FreeRunFit:
-        """The run, or the best iterate of it where over whole experiments its end is above physics alone."""
+        """Return the run, or the best iterate of it where over whole experiments its end is above physics alone."""
         physics = self.physics
         if physics is None or free_fit.mean_square <= physics.mean_square or not free_fit.end.path:
             return free_fit
@@ -199,11 +199,11 @@ class SimulationTask(ABC):
         )
 
     def loss(self, run: FreeRunFit) -> float:
-        """The run's `mean_square`."""
+        """Return the run's `mean_square`."""
         return run.mean_square
 
     def learned(self, run: FreeRunFit) -> TrainedLearner:
-        """The learner as a run left it, with the statistics of its errors."""
+        """Return the learner as a run left it, with the statistics of its errors."""
         end, objective = run.end, run.objective
         linear, rms = end.linear, objective.rms
         gram = None if linear is None else linear.information * rms**2
@@ -247,7 +247,7 @@ class SimulationTask(ABC):
         return ErrorStatistics(noise, covariance, freedom, run.mean_square, at_bound)
 
     def _scores(self, run: FreeRunFit) -> FreeRunScores | None:
-        """What robust standard errors are made of; None for a run that ended nowhere."""
+        """Return what robust standard errors are made of; None for a run that ended nowhere."""
         if run.end.linear is None or not run.end.ending.usable:
             return None
         objective, point, slope = self.plan.looked_at(run.objective, run.end)

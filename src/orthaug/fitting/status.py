@@ -59,7 +59,7 @@ class Ending(IntEnum):
 
     @property
     def usable(self) -> bool:
-        """Whether there is a model."""
+        """Return whether there is a model."""
         return self is not Ending.NON_FINITE
 
 
@@ -108,5 +108,5 @@ class Status:
 
     @property
     def ok(self) -> bool:
-        """Whether there is a usable model."""
+        """Return whether there is a usable model."""
         return self.ending.usable

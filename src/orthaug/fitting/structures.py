@@ -39,17 +39,17 @@ class Structure(Protocol):
 
     @property
     def projects(self) -> bool:
-        """Whether θ is split so that the learner is orthogonal to the physics."""
+        """Return whether θ is split so that the learner is orthogonal to the physics."""
         ...
 
     @property
     def identifies(self) -> bool:
-        """Whether the data alone determine θ where nothing is learned."""
+        """Return whether the data alone determine θ where nothing is learned."""
         ...
 
     @property
     def from_initial(self) -> bool:
-        """Whether one-step training takes θ from θ⁰ beside the weights; otherwise it solves θ for any weights."""
+        """Return whether one-step training takes θ from θ⁰ beside the weights; otherwise it solves θ for any weights."""
         ...
 
     @property
@@ -63,7 +63,7 @@ class Structure(Protocol):
         ...
 
     def penalty(self, names: Sequence[str], initial: Vector, unit: float) -> PenaltyRows:
-        """The rows that join the criterion, from θ⁰ (nθ,) and the output's unit in whitened outputs."""
+        """Return the rows that join the criterion, from θ⁰ (nθ,) and the output's unit in whitened outputs."""
         ...
 
 
@@ -153,7 +153,7 @@ class BaselinePenalty(_SolvedTheta):
         check_fields(self)
 
     def penalty(self, names: Sequence[str], initial: Vector, unit: float) -> PenaltyRows:
-        """The rows `√λ (θ⁰ − θ)/θ⁰`.
+        """Return the rows `√λ (θ⁰ − θ)/θ⁰`.
 
         Raises:
             InputError: an initial value of 0, relative to which nothing can be penalised.

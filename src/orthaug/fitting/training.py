@@ -45,7 +45,7 @@ class PlannedRun(NamedTuple):
 
 
 def planned(bound: Bound | None, seeds: range, choices: Sequence[str | float]) -> list[PlannedRun]:
-    """A run from every seed with every regularization; one without a learner."""
+    """Return a run from every seed with every regularization; one without a learner."""
     if bound is None:
         return [PlannedRun(seeds.start, np.zeros(0), "none")]
     keyed = {seed: bound.init(jax.random.key(seed)) for seed in seeds}
@@ -70,12 +70,12 @@ class Choice:
     """Whether runs that evidence silenced are made again with weaker regularizations, if held-out rows can choose."""
 
     def compares(self, task: Task, starts: Sequence[PlannedRun]) -> bool:
-        """Whether there is something to choose by held-out errors: runs that fly, or several regularizations."""
+        """Return whether there is something to choose by held-out errors: runs that fly, or several regularizations."""
         several = len({start.regularization for start in starts}) > 1
         return task.bound is not None and (task.criterion.free_run is not None or (several and not self.scored))
 
     def ranking(self, task: Task, runs: Sequence[Any], errors: Sequence[float]) -> np.ndarray:
-        """What is lowest for the best run: its held-out error, its score, or its loss.
+        """Return what is lowest for the best run: its held-out error, its score, or its loss.
 
         On blocks other runs of its kind were judged: one that ended higher on its own data than they did on what they
         had not seen failed to train, and its loss counts.
@@ -156,7 +156,7 @@ def train(
 
 
 def _beside(conclude: Concluding, task: Task, structure: Structure) -> Any:
-    """The estimate of physics alone that a learner stands beside; None without one, and where it costs a pass."""
+    """Return the estimate of physics alone that a learner stands beside; None without one, and where it costs a pass."""
     streamed = hasattr(task.problem, "source")
     return None if task.bound is None or streamed else _kept_physics(conclude, task, structure)
 
@@ -182,12 +182,12 @@ def _cross_validation(task: Task, run: Any) -> float:
 
 
 def _alike(starts: Sequence[PlannedRun], best: int) -> list[int]:
-    """The runs with the regularization of the best one."""
+    """Return the runs with the regularization of the best one."""
     return [i for i, start in enumerate(starts) if start.regularization == starts[best].regularization]
 
 
 def _members(starts: Sequence[PlannedRun], ranking: np.ndarray, best: int) -> list[int]:
-    """The best run from every seed."""
+    """Return the best run from every seed."""
     seeds = dict.fromkeys(start.seed for start in starts)
     ranking = np.where(np.isfinite(ranking), ranking, np.inf)
     own = {seed: [i for i, start in enumerate(starts) if start.seed == seed] for seed in seeds}
@@ -222,7 +222,7 @@ def _run(
     progress: ProgressCallback,
     runner: Any,
 ) -> tuple[list[PlannedRun], list[Any]]:
-    """Every planned run; one that fails is made again from the seeds that follow."""
+    """Return every planned run; one that fails is made again from the seeds that follow."""
     made, given = list(starts), (task, solver, structure)
     runs = list(runner.map(_one_run, given, made, progress))
     for i, (start, run) in enumerate(zip(made, runs, strict=True), 1):
@@ -350,7 +350,7 @@ def _concluded(conclude: Concluding, task: Task, structure: Structure, learned: 
 
 
 def _median(task: Task, runs: Sequence[Any], members: Sequence[int], best: int) -> TrainedLearner:
-    """The median of the members that have a value everywhere; the best one alone if it has none."""
+    """Return the median of the members that have a value everywhere; the best one alone if it has none."""
     rows: OneStepTask = task.rows_task
     learned = {i: task.learned(runs[i]) for i in members}
     sound = [i for i, member in learned.items() if np.isfinite(rows.share(member).square)]

@@ -48,7 +48,7 @@ class TrainingRows:
         return Overlap(np.zeros((nt, size)), np.zeros(nt))
 
     def mean_square(self, loss: Any) -> float:
-        """The criterion's `‖r‖²` as the mean of squared errors with each output in its standard deviation."""
+        """Return the criterion's `‖r‖²` as the mean of squared errors with each output in its standard deviation."""
         return float(loss) * self.rms**2 / self.problem.samples
 
     def share(self, learned: TrainedLearner) -> Share:

@@ -144,7 +144,7 @@ def joint_covariance(problem: Problem, model: Model, convention: str = "calibrat
 
 
 def prediction_std(model: Model, record: Record) -> list[Matrix]:
-    """Standard error of the one-step prediction on every row of every experiment, (N, ny); NaN on the first lags.
+    """Return standard error of the one-step prediction on every row of every experiment, (N, ny); NaN on the first lags.
 
     It is that of the fitted function, `√(ψ Cov(c, w) ψᵀ)`. A new measurement adds the noise, whose covariance (ny, ny)
     is `model.statistics.noise`: its standard deviation is `√(std² + diag(noise))`.
@@ -186,7 +186,7 @@ def _variances(
 def changes(
     form: Lagged, numbers: Numbers, x: Float[Array, "k nx m"], root: Float[Array, "n r"]
 ) -> Float[Array, "k ro m"]:
-    """How far each prediction moves along the columns of `root`."""
+    """Return how far each prediction moves along the columns of `root`."""
 
     def one_chunk(rows: Any) -> Any:
         moved = _along(form, numbers, rows, root)
@@ -269,6 +269,6 @@ def _correction(problem: Problem, residual: Matrix, used: float) -> float:
 
 
 def by_experiment(problem: Problem, values: Matrix) -> list[Matrix]:
-    """What each usable row has, (N, m), in a piece per experiment."""
+    """Return what each usable row has, (N, m), in a piece per experiment."""
     ends = np.cumsum([len(experiment) - problem.rows.start for experiment in problem.record.experiments])
     return np.split(values, ends[:-1])

@@ -69,7 +69,7 @@ def learned_terms(model: Any) -> tuple[LearnedTerm, ...]:
 
 
 def equation(model: Any, writing: str = "text") -> str:
-    """The whole model as an equation for each output, or for each equation of a motion, with its numbers.
+    """Return the whole model as an equation for each output, or for each equation of a motion, with its numbers.
 
     Args:
         writing: "text", "latex", or "python": expressions of arrays that Python evaluates, in full precision.
@@ -171,7 +171,7 @@ def _power_of_ten(number: str) -> str:
 
 
 def term_frame(terms: Sequence[LearnedTerm]) -> pd.DataFrame:
-    """A row per term; NaN where there is no interval."""
+    """Return a row per term; NaN where there is no interval."""
     import pandas as pd
 
     nothing = (np.nan, np.nan)
@@ -191,7 +191,7 @@ def term_frame(terms: Sequence[LearnedTerm]) -> pd.DataFrame:
 
 
 def term_lines(terms: Sequence[LearnedTerm]) -> list[str]:
-    """The terms as a table of text, a heading before them; a dash where there is no interval."""
+    """Return the terms as a table of text, a heading before them; a dash where there is no interval."""
     if not terms:
         return []
     width = max(4, *(len(term.term) for term in terms))

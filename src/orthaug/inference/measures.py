@@ -72,7 +72,7 @@ class Support:
         return stack_rows(self.record, self.layout).x if self.stacked is None else self.stacked
 
     def share(self, points: Points) -> float:
-        """The measure's weight within reach of the training data.
+        """Return the measure's weight within reach of the training data.
 
         A point is within reach if its nearest training point is closer than a limit: twice the distance from a training
         point to its nearest neighbour, at the 99 % quantile. Each used lag counts in units of the range of its data.
@@ -102,7 +102,7 @@ class Measure(Protocol):
     def name(self) -> str: ...
 
     def points(self, support: Support) -> Points:
-        """The points over which physics and learner are made orthogonal."""
+        """Return the points over which physics and learner are made orthogonal."""
         ...
 
 
@@ -262,7 +262,7 @@ def _normalised(weights: Any, count: int, what: str) -> Vector:
 
 
 def _lag_of(text: str, support: Support) -> Lag:
-    """The used lag that a text such as `force[k-1]` names."""
+    """Return the used lag that a text such as `force[k-1]` names."""
     known = {str(lag): lag for lag in support.used}
     plain = "".join(text.split())
     if plain.endswith("[k-0]"):
@@ -276,7 +276,7 @@ def _lag_of(text: str, support: Support) -> Lag:
 
 
 def _entries(support: Support) -> str:
-    """What the names of a measure stand for: a motion has no lags."""
+    """Return what the names of a measure stand for: a motion has no lags."""
     return "raw lag" if any("[" in str(lag) for lag in support.used) else "state or input"
 
 
@@ -316,7 +316,7 @@ class WeighedPhysics:
 def weigh(
     measure: Measure, support: Support, baseline: Baseline, outputs: tuple[str, ...], weight: Matrix
 ) -> WeighedPhysics:
-    """The physics over a measure's points.
+    """Return the physics over a measure's points.
 
     Args:
         weight: the matrix of the output weights, (ny, ny).

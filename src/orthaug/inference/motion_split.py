@@ -71,7 +71,7 @@ class MotionSplit:
 
 
 def shared_of_motion(form: MotionDynamics, q: Vector, x: Matrix, u: Matrix) -> Shared:
-    """The directions of q that a learner on the form's features could imitate, at q.
+    """Return the directions of q that a learner on the form's features could imitate, at q.
 
     A direction is shared if it moves no equation and no output without a learner, and moves those with one by a
     function of the features alone.
@@ -100,7 +100,7 @@ def shared_of_motion(form: MotionDynamics, q: Vector, x: Matrix, u: Matrix) -> S
 
 
 def _left_over(form: MotionDynamics, q: Vector, points: Matrix, nx: int) -> UnexplainedPhysics | None:
-    """What functions of the features leave of the slopes at the points."""
+    """Return what functions of the features leave of the slopes at the points."""
     some = points[:: max(1, -(-len(points) // _ROWS))]
     slopes = np.asarray(slopes_at(form, q, some[:, :nx], some[:, nx:]))
     features = np.asarray(form.seen(some[:, :nx].T, some[:, nx:].T, np)).T
@@ -108,7 +108,7 @@ def _left_over(form: MotionDynamics, q: Vector, points: Matrix, nx: int) -> Unex
 
 
 def _spanned(form: MotionDynamics, q: Vector, x: Matrix, u: Matrix) -> Shared:
-    """The directions that move what has a learner by linear combinations of its features, and nothing else."""
+    """Return the directions that move what has a learner by linear combinations of its features, and nothing else."""
     some = slice(None, None, max(1, len(x) // _POINTS))
     slopes = np.moveaxis(np.asarray(slopes_at(form, q, x[some], u[some])), 1, 0)
     features = np.asarray(form.seen(x[some].T, u[some].T, np)).T
@@ -116,7 +116,7 @@ def _spanned(form: MotionDynamics, q: Vector, x: Matrix, u: Matrix) -> Shared:
 
 
 def learned_places(motion: Motion) -> list[int]:
-    """The numbers of the equations that have a learner, outputs after states."""
+    """Return the numbers of the equations that have a learner, outputs after states."""
     states, outputs = motion.learned
     return [*states, *(len(motion.states) + i for i in outputs)]
 
@@ -177,7 +177,7 @@ def nearest(
 
 
 def _unit(basis: Matrix, gauss: Matrix) -> Matrix:
-    """The directions in such a length that each moves the learned equations by one."""
+    """Return the directions in such a length that each moves the learned equations by one."""
     size = np.sqrt(np.maximum(np.einsum("ij,ik,kj->j", basis, gauss, basis), 0.0))
     return basis / np.where(size > 0, size, 1.0)
 
@@ -231,7 +231,7 @@ def split_motion(
 
 
 def _learned_rows(form: MotionDynamics, q: Any, x: Any, u: Any) -> Any:
-    """The physics of the learned equations and outputs (nl,) at one point."""
+    """Return the physics of the learned equations and outputs (nl,) at one point."""
     return form.learned_rows(form.motion.coordinates.physical(q, jnp), x, u)
 
 
@@ -258,7 +258,7 @@ def _distance(form: MotionDynamics, numbers: Numbers, q: Vector, field: Field) -
 
 
 def _summed(function: Any, form: MotionDynamics, numbers: Numbers, q: Vector, field: Field) -> Any:
-    """The sum over the points, batch by batch."""
+    """Return the sum over the points, batch by batch."""
     total = None
     for begin in range(0, len(field.x), _BATCH):
         x, u, weight = (part[begin : begin + _BATCH] for part in field[:3])

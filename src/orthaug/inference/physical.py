@@ -128,7 +128,7 @@ class _Fit:
         return cost, p
 
     def solutions(self, starts: int) -> list[Vector]:
-        """The best p first, then others that explain θ̂ as well; from p⁰ and `starts` points about it."""
+        """Return the best p first, then others that explain θ̂ as well; from p⁰ and `starts` points about it."""
         points = (self.physics.initial, *self.physics.around(starts, 4.0))
         minima = [self.descend(p) for p in points]
         least = min(cost for cost, _ in minima)

@@ -71,7 +71,7 @@ class Dask(Threads):
             return [self.client.submit(kept, group, pure=False) for group in groups]
 
     def draw(self, source: Source, row_builder: Callable[[Any], Iterator[RowArrays]]) -> list[Any]:
-        """The partitions of a source, laid out where they will be summed."""
+        """Return the partitions of a source, laid out where they will be summed."""
         with told():
             task = partial(
                 _build_chunks, row_builder=row_builder, size=self.limit
@@ -84,7 +84,7 @@ class Dask(Threads):
             return self._added([self.client.submit(_partial_sum, function, part, given, pure=False) for part in rows])
 
     def _added(self, parts: list[Any]) -> Any:
-        """The sum of partial sums, in their order."""
+        """Return the sum of partial sums, in their order."""
         while len(parts) > 1:
             groups = [parts[i : i + _BRANCHES] for i in range(0, len(parts), _BRANCHES)]
             parts = [self.client.submit(_added, group, pure=False) for group in groups]
@@ -133,7 +133,7 @@ class Dask(Threads):
             return together([chunk for group in self.client.gather(list(rows)) for chunk in group])
 
     def passes(self, function: Callable[[Any], Any], partitions: Sequence[Any]) -> list[Any]:
-        """A function of every partition, where the workers are."""
+        """Return a function of every partition, where the workers are."""
         with told():
             return self.client.gather([self._on(function, partition) for partition in partitions])
 
@@ -142,7 +142,7 @@ class Dask(Threads):
         return smallest_worker(self.client, _BRANCHES + 1)
 
     def _on(self, function: Callable[[Any], Any], partition: Any) -> Any:
-        """A task; rows that the cluster holds already go to it by their futures."""
+        """Return a task; rows that the cluster holds already go to it by their futures."""
         held = getattr(partition, "held", ())
         if not held:
             return self.client.submit(function, partition, pure=False)
@@ -150,7 +150,7 @@ class Dask(Threads):
 
 
 def _build_chunks(partition: Any, row_builder: Callable[[Any], Iterator[RowArrays]], size: int) -> list[Chunk]:
-    """The chunks of a partition."""
+    """Return the chunks of a partition."""
     return list(chunks_of(row_builder(partition), chunk_shape(partition.rows, size)[1]))
 
 
@@ -167,22 +167,22 @@ def _carried(function: Callable[[Any, Any], Any], partition: Any, carry: Any, *h
 
 
 def kept(value: Any) -> Any:
-    """What a worker keeps; made again from what the scheduler knows where that worker is lost."""
+    """Return what a worker keeps; made again from what the scheduler knows where that worker is lost."""
     return value
 
 
 def _paired(groups: Any) -> list[Any]:
-    """The chunks of a group; of a tuple of groups, tuples of their chunks."""
+    """Return the chunks of a group; of a tuple of groups, tuples of their chunks."""
     return list(zip(*map(_paired, groups), strict=True)) if isinstance(groups, tuple) else groups
 
 
 def _folded(function: Callable[..., Any], chunks: Sequence[Any], arguments: tuple[Any, ...]) -> tuple[list[Any], Any]:
-    """What one partition keeps, and its share of a sum."""
+    """Return what one partition keeps, and its share of a sum."""
     return folded(function, _paired(chunks), arguments)
 
 
 def _partial_sum(function: Callable[..., Any], chunks: Sequence[Chunk], arguments: tuple[Any, ...]) -> Any:
-    """One partition's share of a sum, as NumPy arrays."""
+    """Return one partition's share of a sum, as NumPy arrays."""
     return jax.tree.map(np.asarray, summed(function, _paired(chunks), arguments))
 
 
@@ -194,7 +194,7 @@ def _added(parts: Sequence[Any]) -> Any:
 
 
 def smallest_worker(client: Any, matrices: int) -> Room:
-    """The worker with the least memory; without a limit it is infinite."""
+    """Return the worker with the least memory; without a limit it is infinite."""
     with told():
         workers = client.scheduler_info(n_workers=-1)["workers"]
     limits = {address: float(worker["memory_limit"] or math.inf) for address, worker in workers.items()}
@@ -221,7 +221,7 @@ def told() -> Iterator[None]:
 
 
 def connected(scheduler: str | None, workers: int | None) -> Any:
-    """A client of the scheduler at an address, or of a local cluster with a process for each core.
+    """Return a client of the scheduler at an address, or of a local cluster with a process for each core.
 
     Raises:
         InputError: without Dask, where no scheduler answers, and for workers with other versions.

@@ -86,7 +86,7 @@ class Devices(LocalEngine):
             return jax.block_until_ready(_compiled(function, self.count, len(arguments), keeps)(rows, *arguments))
 
     def map(self, function: Any, given: Any, items: Sequence[Any], heard: Heard = nobody) -> Iterator[Any]:
-        """One after another: programs that share devices wait for each other, on all hosts in the same order."""
+        """Yield one after another: programs that share devices wait for each other, on all hosts in the same order."""
         for i, item in enumerate(items):
             yield function(given, item, partial(heard, i))
 
@@ -107,7 +107,7 @@ def _mesh(count: int | None) -> tuple[Any, int]:
 
 @cache
 def _compiled(function: Callable[..., Any], count: int | None, arguments: int, keeps: bool) -> Any:
-    """Each device sums over its own chunks; then all of them have the sum. With `keeps` beside what each one keeps."""
+    """Return each device sums over its own chunks; then all of them have the sum. With `keeps` beside what each one keeps."""
     spec = jax.sharding.PartitionSpec
 
     def share(chunks: Any, *given: Any) -> Any:

@@ -75,12 +75,12 @@ class Dynamics(Protocol):
 
     @property
     def linear(self) -> bool:
-        """Whether the output is linear in θ where state and inputs are given: then training eliminates θ (F1)."""
+        """Return whether the output is linear in θ where state and inputs are given: then training eliminates θ (F1)."""
         ...
 
     @property
     def differentiable(self) -> bool:
-        """Whether JAX can differentiate `step`; differences stand in where it cannot."""
+        """Return whether JAX can differentiate `step`; differences stand in where it cannot."""
         ...
 
     @property
@@ -100,11 +100,11 @@ class Dynamics(Protocol):
 
     @property
     def memory(self) -> int:
-        """How many rows of measured outputs `start` reads."""
+        """Return how many rows of measured outputs `start` reads."""
         ...
 
     def start(self, outputs: Matrix, rows: Any) -> Float[np.ndarray, "r n0"]:
-        """The states at some rows, made of the outputs (N, ny) that were measured before each of them."""
+        """Return the states at some rows, made of the outputs (N, ny) that were measured before each of them."""
         ...
 
     def start_rows(self, weight: Matrix) -> Matrix:
@@ -115,11 +115,11 @@ class Dynamics(Protocol):
         ...
 
     def inputs(self, experiment: Experiment, record: Record) -> Matrix:
-        """What the steps of an experiment read, (T, nu), from its first row with an output on; affine in its inputs."""
+        """Return what the steps of an experiment read, (T, nu), from its first row with an output on; affine in its inputs."""
         ...
 
     def states_at(self, numbers: Numbers, outputs: Matrix, inputs: Matrix, rows: Any) -> Float[np.ndarray, "r n0"]:
-        """The states of a free run at some rows of an experiment.
+        """Return the states of a free run at some rows of an experiment.
 
         `outputs` (N, ny) are those of the run, before its first row the measured ones; `inputs` (T, nu) as its steps
         read them, up to the last of the rows at least.
@@ -127,7 +127,7 @@ class Dynamics(Protocol):
         ...
 
     def scaled_features(self, numbers: Numbers, start: Vector, outputs: Matrix, inputs: Matrix) -> Matrix | None:
-        """The learner's features (T, nz) along a free run, in [-1, 1] over the training data; None if not known.
+        """Return the learner's features (T, nz) along a free run, in [-1, 1] over the training data; None if not known.
 
         `start` (n0,) is its first state, `outputs` (T, ny) are those of the run, `inputs` (T, nu) as its steps read
         them.
@@ -135,15 +135,15 @@ class Dynamics(Protocol):
         ...
 
     def describe(self, state: Vector, inputs: Vector) -> dict[str, float]:
-        """A state and the inputs of a step as a user knows them, by names."""
+        """Return a state and the inputs of a step as a user knows them, by names."""
         ...
 
     def prepared(self, numbers: Numbers) -> Numbers:
-        """The numbers with what all steps of a run need of them, computed once."""
+        """Return the numbers with what all steps of a run need of them, computed once."""
         ...
 
     def step(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
-        """The next state (n0,) and the output, from a state and the inputs (nu,) of one row."""
+        """Return the next state (n0,) and the output, from a state and the inputs (nu,) of one row."""
         ...
 
     def first_slopes(self, width: int) -> Any:
@@ -151,7 +151,7 @@ class Dynamics(Protocol):
         ...
 
     def tangents(self, numbers: Numbers, state: Any, slopes: Any, inputs: Any) -> tuple[Any, Any, Any, Any]:
-        """A step of m runs side by side with its derivatives: (state, slopes, ŷ, ∂ŷ/∂(start, c, w)).
+        """Return a step of m runs side by side with its derivatives: (state, slopes, ŷ, ∂ŷ/∂(start, c, w)).
 
         Shapes: `state` (n0, m), `inputs` (nu, m), ŷ (ny, m), ∂ŷ (ny, n0 + n, m); `slopes` as in `first_slopes`.
         """
@@ -205,7 +205,7 @@ class AutodiffDynamics:
         return jnp.broadcast_to(jnp.eye(n0, n0 + self.unknowns)[..., None], (n0, n0 + self.unknowns, width))
 
     def local(self: Dynamics, numbers: Numbers, states: Any, inputs: Any) -> Local:
-        """Steps from r states (n0, r) and inputs (nu, r), each by itself."""
+        """Return steps from r states (n0, r) and inputs (nu, r), each by itself."""
         nt = len(numbers.theta)
 
         def both(state: Any, unknowns: Any, inputs: Any) -> Any:
@@ -228,5 +228,5 @@ class AutodiffDynamics:
 def _states(
     form: Dynamics, numbers: Numbers, state: Float[Array, "n0"], inputs: Float[Array, "T nu"]
 ) -> Float[Array, "T n0"]:
-    """The state at every row of a free run."""
+    """Return the state at every row of a free run."""
     return jax.lax.scan(lambda state, row: (form.step(numbers, state, row)[0], state), state, inputs)[1]

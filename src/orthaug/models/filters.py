@@ -47,7 +47,7 @@ class LaggedFilter:
         return experiment.inputs[self.first_row :]
 
     def start(self, experiment: Experiment, record: Record, row: int, noise: Noise, size: Vector) -> StateEstimate:
-        """The lags before a row: outputs with the sensors' noise, or unknown by their `size` (ny,) where missing."""
+        """Return the lags before a row: outputs with the sensors' noise, or unknown by their `size` (ny,) where missing."""
         outputs, lags = list(self.form.outputs), self.memory.lags
         before = Experiment(experiment.inputs[:row], without_gaps(experiment.outputs[:row]))
         mean = self.memory.at(before, record, row)
@@ -90,11 +90,11 @@ class LaggedFilter:
         return place
 
     def unit(self, noise: Matrix, size: Vector) -> Matrix:
-        """A disturbance (ny, ny) in proportion to the error of the outputs."""
+        """Return a disturbance (ny, ny) in proportion to the error of the outputs."""
         return noise
 
     def linearised(self, numbers: Numbers) -> tuple[Matrix, Matrix, Matrix, Matrix]:
-        """A (n, n), C (ny, n) at the origin, and how a disturbance enters state (n, ny) and outputs (ny, ny)."""
+        """Return a (n, n), C (ny, n) at the origin, and how a disturbance enters state (n, ny) and outputs (ny, ny)."""
         slopes = _at_origin(self, numbers, np.zeros(len(self.memory.inputs)), len(self.memory.lags))
         return *slopes, self._newest, np.eye(len(self.form.outputs))
 
@@ -125,7 +125,7 @@ class MotionFilter:
         return self.form.inputs(experiment, record)
 
     def start(self, experiment: Experiment, record: Record, row: int, noise: Noise, size: Vector) -> StateEstimate:
-        """The state as it is guessed from what is measured about a row, unknown by the `size` (nx,) of all."""
+        """Return the state as it is guessed from what is measured about a row, unknown by the `size` (nx,) of all."""
         return StateEstimate(self.form.start(without_gaps(experiment.outputs), [row])[0], np.diag(size**2))
 
     def step(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
@@ -146,12 +146,12 @@ class MotionFilter:
         return StateEstimate(following, moved @ own @ moved.T + noise.state), told
 
     def unit(self, noise: Matrix, size: Vector) -> Matrix:
-        """A disturbance (nx, nx) as large as the states; none where a rate is another state: that is exact."""
+        """Return a disturbance (nx, nx) as large as the states; none where a rate is another state: that is exact."""
         known = [state.derivative in self.names and not state.learned for state in self.form.motion.states]
         return np.diag(np.where(known, 0.0, size**2))
 
     def linearised(self, numbers: Numbers) -> tuple[Matrix, Matrix, Matrix, Matrix]:
-        """A (nx, nx), C (ny, nx) at the origin, and how a disturbance enters state (nx, nx) and outputs (ny, nx)."""
+        """Return a (nx, nx), C (ny, nx) at the origin, and how a disturbance enters state (nx, nx) and outputs (ny, nx)."""
         n = self.form.states
         nothing = Experiment(np.zeros((4, len(self.form.motion.inputs))), np.zeros((4, len(self.form.outputs))))
         inputs = np.zeros(self.form.inputs(nothing, None).shape[1])  # type: ignore[arg-type]
@@ -159,7 +159,7 @@ class MotionFilter:
 
 
 def _both(form: Filter, numbers: Numbers, inputs: Any) -> Callable[[Any], Any]:
-    """The next state and the outputs as one function of the state."""
+    """Return the next state and the outputs as one function of the state."""
 
     def both(state: Any) -> Any:
         following, parts = form.step(numbers, state, inputs)
@@ -169,7 +169,7 @@ def _both(form: Filter, numbers: Numbers, inputs: Any) -> Callable[[Any], Any]:
 
 
 def _at_origin(form: Filter, numbers: Numbers, inputs: Vector, n: int) -> tuple[Matrix, Matrix]:
-    """A (n, n) and C (ny, n)."""
+    """Return a (n, n) and C (ny, n)."""
     both = _both(form, numbers, inputs)
     derivative = np.asarray(jax.jit(lambda x: slope(both, x)[1])(np.zeros(n)))
     return derivative[:n], derivative[n:]

@@ -64,7 +64,7 @@ def _await(address: str) -> None:
 
 
 def several() -> bool:
-    """Whether this process is one of several."""
+    """Return whether this process is one of several."""
     return bool(jax.distributed.is_initialized()) and jax.process_count() > 1
 
 
@@ -79,7 +79,7 @@ def check_alike(fingerprint: str) -> None:
 
 
 def waits() -> str | None:
-    """What a process that writes nothing says; None for the one that writes."""
+    """Return what a process that writes nothing says; None for the one that writes."""
     if not several() or jax.process_index() == 0:
         return None
     return f"process {jax.process_index()} of {jax.process_count()}: done; process 0 writes the result."

@@ -23,7 +23,7 @@ Field = Callable[[Any, Any], Any]
 
 
 def held(inputs: Matrix, hold: str, substeps: int) -> Matrix:
-    """What the steps of a run read of its inputs (N, nu): the input at points of each sample, (N, points nu).
+    """Return what the steps of a run read of its inputs (N, nu): the input at points of each sample, (N, points nu).
 
     One point under a zero-order hold, both ends under a first-order hold, and under a spline hold the ends and middles
     of all substeps, on a cubic spline through the record.
@@ -92,7 +92,7 @@ def advance(field: Field, scheme: Any, x: Any, row: Any, nu: int, step: float, s
 
 
 def runge_kutta(field: Field, h: float) -> Callable[..., Any]:
-    """A step of length h under inputs at its begin, middle and end, of JAX or NumPy arrays alike."""
+    """Return a step of length h under inputs at its begin, middle and end, of JAX or NumPy arrays alike."""
 
     def one(x: Any, first: Any, middle: Any, last: Any) -> Any:
         k1 = field(x, first)

@@ -66,7 +66,7 @@ class Filter(Protocol):
 
     @property
     def hidden(self) -> bool:
-        """Whether states are more than past outputs, so that some rows must tell them."""
+        """Return whether states are more than past outputs, so that some rows must tell them."""
         ...
 
     @property
@@ -78,22 +78,22 @@ class Filter(Protocol):
         ...
 
     def inputs(self, experiment: Experiment, record: Record) -> Matrix:
-        """What the steps read (T, nu), from the first row on."""
+        """Return what the steps read (T, nu), from the first row on."""
         ...
 
     def step(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
-        """One step without noise."""
+        """Return one step without noise."""
         ...
 
     def row(
         self, numbers: Numbers, noise: Noise, belief: StateEstimate, inputs: Any, measured: Any
     ) -> tuple[StateEstimate, FilterRow]:
-        """A row: what its outputs (ny,) tell, and the belief before the next one."""
+        """Return a row: what its outputs (ny,) tell, and the belief before the next one."""
         ...
 
 
 def slope(function: Any, at: Any) -> tuple[Any, Any]:
-    """A function's value (m,) and derivative (m, n); a kink without one counts as flat."""
+    """Return a function's value (m,) and derivative (m, n); a kink without one counts as flat."""
     value, derivative = function(at), jax.jacfwd(function)(at)
     return value, jnp.where(jnp.isfinite(derivative), derivative, 0.0)
 
@@ -122,7 +122,7 @@ def corrected(mean: Any, covariance: Any, noise: Any, measured: Any) -> tuple[An
 def one_row(
     form: Filter, numbers: Numbers, noise: Noise, belief: StateEstimate, inputs: Any, measured: Any
 ) -> tuple[StateEstimate, FilterRow]:
-    """One row of a filter."""
+    """Return one row of a filter."""
     return form.row(numbers, noise, belief, inputs, measured)
 
 
@@ -130,7 +130,7 @@ def one_row(
 def _all_rows(
     form: Filter, numbers: Numbers, noise: Noise, belief: StateEstimate, inputs: Any, measured: Any
 ) -> tuple[StateEstimate, FilterRow]:
-    """What is believed before the rows, and what they tell."""
+    """Return what is believed before the rows, and what they tell."""
 
     def row(belief: StateEstimate, given: tuple[Any, Any]) -> tuple[StateEstimate, tuple[StateEstimate, FilterRow]]:
         following, told = form.row(numbers, noise, belief, *given)
@@ -151,7 +151,7 @@ def _likelihood(form: Filter, numbers: Numbers, noise: Noise, belief: StateEstim
 def filtered(
     form: Filter, numbers: Numbers, noise: Noise, belief: StateEstimate, inputs: Matrix, measured: Matrix
 ) -> tuple[StateEstimate, FilterRow]:
-    """A filter over all rows (T): what is believed before them, and what they tell."""
+    """Return a filter over all rows (T): what is believed before them, and what they tell."""
     rows = len(inputs)
     found = _all_rows(form, numbers, noise, belief, *_padded(inputs, measured))
     before, told = ([np.asarray(part)[:rows] for part in one] for one in found)
@@ -176,7 +176,7 @@ def _padded(inputs: Matrix, measured: Matrix) -> tuple[Matrix, Matrix]:
 def _ahead(
     form: Filter, numbers: Numbers, noise: Noise, beliefs: StateEstimate, inputs: Any, horizon: Any
 ) -> tuple[Parts, Any]:
-    """The outputs of the last of `horizon` steps from each of m beliefs, under inputs (m, h, nu), and their S."""
+    """Return the outputs of the last of `horizon` steps from each of m beliefs, under inputs (m, h, nu), and their S."""
     unknown = jnp.full(len(noise.output), jnp.nan)
 
     def one(belief: StateEstimate, rows: Any) -> tuple[Parts, Any]:
@@ -193,7 +193,7 @@ def _ahead(
 def ahead(
     form: Filter, numbers: Numbers, noise: Noise, beliefs: StateEstimate, inputs: Matrix, horizon: int
 ) -> tuple[Parts, Matrix]:
-    """The outputs `horizon` steps on from what is believed before the rows (T), and their deviations; (T − h + 1, ny).
+    """Return the outputs `horizon` steps on from what is believed before the rows (T), and their deviations; (T − h + 1, ny).
 
     The deviations are those of what would be measured.
     """
@@ -211,7 +211,7 @@ def ahead(
 
 
 def without_gaps(outputs: Matrix) -> Matrix:
-    """Outputs with missing samples by straight lines between those that are there; zero where there are none."""
+    """Return outputs with missing samples by straight lines between those that are there; zero where there are none."""
     filled = outputs.copy()
     for column in filled.T:
         there = np.isfinite(column)
@@ -220,5 +220,5 @@ def without_gaps(outputs: Matrix) -> Matrix:
 
 
 def spread_of(covariance: Any) -> Vector:
-    """Standard deviations, of one covariance or of many."""
+    """Return standard deviations, of one covariance or of many."""
     return np.sqrt(np.maximum(np.diagonal(covariance, axis1=-2, axis2=-1), 0.0))

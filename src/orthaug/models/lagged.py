@@ -45,7 +45,7 @@ class Lagged:
 
     @property
     def beyond(self) -> str:
-        """What the learner's correction does beyond the range of its training."""
+        """Return what the learner's correction does beyond the range of its training."""
         return "free" if self.bound is None else beyond_of(self.bound.learner, "hold")
 
     @property
@@ -90,7 +90,7 @@ class Lagged:
         return outputs[before].reshape(len(before), self.states)
 
     def start_rows(self, weight: Matrix) -> Matrix:
-        """A past output has the same errors as all others."""
+        """Return a past output has the same errors as all others."""
         return np.kron(np.eye(self.memory), weight)
 
     def inputs(self, experiment: Experiment, record: Record) -> Matrix:
@@ -99,13 +99,13 @@ class Lagged:
     def states_at(
         self, numbers: Numbers, outputs: Matrix, inputs: Matrix, rows: Sequence[int] | Int[np.ndarray, "r"]
     ) -> Float[np.ndarray, "r n0"]:
-        """The run's own past outputs: nothing needs to run again."""
+        """Return the run's own past outputs: nothing needs to run again."""
         return self.start(outputs, rows)
 
     def scaled_features(
         self, numbers: Numbers, start: Vector, outputs: Matrix, inputs: Matrix
     ) -> Float[np.ndarray, "T nz"] | None:
-        """The learner's features along a free run, in [-1, 1] over the training data.
+        """Return the learner's features along a free run, in [-1, 1] over the training data.
 
         None without a learner, and of a function from another toolbox, whose features are not scaled.
         """
@@ -117,7 +117,7 @@ class Lagged:
         return (np.asarray(self.features.evaluate(x, self.layout, np)) - numbers.centre) / numbers.halfwidth
 
     def describe(self, state: Vector, inputs: Vector) -> dict[str, float]:
-        """The entries of the regressor."""
+        """Return the entries of the regressor."""
         x = self.regressor(state, inputs, np)
         return {str(lag): float(value) for lag, value in zip(self.layout, x, strict=True)}
 
@@ -132,7 +132,7 @@ class Lagged:
         return xp.concatenate([past[lag - 1, output], inputs])
 
     def at(self, numbers: Numbers, x: Float[Array, "nx"]) -> Parts:
-        """The prediction at one regressor x (nx,), in parts."""
+        """Return the prediction at one regressor x (nx,), in parts."""
         phi = self.baseline.phi(x, self.layout, self.outputs, jnp)
         known = self.baseline.known(x, self.layout, self.outputs, jnp)
         physics = known + phi @ numbers.theta
@@ -157,11 +157,11 @@ class Lagged:
         return self._push(state, parts.total), parts
 
     def _push(self, state: Any, y: Any) -> Any:
-        """The state (n0, …) one step later, when y (ny, …) is the newest output."""
+        """Return the state (n0, …) one step later, when y (ny, …) is the newest output."""
         return jnp.concatenate([y, state[: -len(self.outputs)]]) if self.memory else state
 
     def first_slopes(self, width: int) -> Any:
-        """One block (ny, n0 + n, m) for each past output, newest first."""
+        """Return one block (ny, n0 + n, m) for each past output, newest first."""
         n0, n, ny = self.states, self.unknowns, len(self.outputs)
         blocks = jnp.eye(n0, n0 + n).reshape(self.memory, ny, n0 + n, 1)
         return tuple(jnp.broadcast_to(blocks, (self.memory, ny, n0 + n, width)))

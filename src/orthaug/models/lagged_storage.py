@@ -19,7 +19,7 @@ from orthaug.physics.baseline import Baseline, Parameter, Term
 
 
 def declare(model: Model) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """What a file says of a model, and its arrays."""
+    """Return what a file says of a model, and its arrays."""
     form = model.form
     baseline = form.baseline
     declared = {
@@ -45,7 +45,7 @@ def rebuild(
     learner: Learner | None,
     path: Path,
 ) -> Model:
-    """The model that a file declares.
+    """Return the model that a file declares.
 
     Raises:
         InputError: a callable is asked for.

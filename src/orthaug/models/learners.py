@@ -54,7 +54,7 @@ class Learner(Protocol):
     def inputs(self) -> tuple[str, ...] | None: ...
 
     def init(self, key: Array, nz: int, ny: int) -> Tree:
-        """Initial weights, any pytree of float arrays, for `nz` features and `ny` outputs."""
+        """Return initial weights, any pytree of float arrays, for `nz` features and `ny` outputs."""
         ...
 
     def apply(self, tree: Tree, z: Float[Array, "nz"]) -> Float[Array, "ny"]:
@@ -121,7 +121,7 @@ class MLP:
         return [*labels, (outward, np.full(np.shape(bias), first + 1))]
 
     def weights(self, nz: int, ny: int) -> int:
-        """How many weights it has for `nz` features and `ny` outputs."""
+        """Return how many weights it has for `nz` features and `ny` outputs."""
         sizes = (nz, *self.hidden, ny)
         return sum((fan_in + 1) * fan_out for fan_in, fan_out in zip(sizes, sizes[1:], strict=False))
 
@@ -253,7 +253,7 @@ class External:
         return jax.pure_callback(self.values, shape, z, vmap_method="expand_dims")
 
     def values(self, z: Any) -> np.ndarray:
-        """The function's values (…, ny) of features (…, nz).
+        """Return the function's values (…, ny) of features (…, nz).
 
         Raises:
             InputError: the function returns another shape.
@@ -319,7 +319,7 @@ class Bound:
 
     @property
     def differentiable(self) -> bool:
-        """Whether JAX differentiates the learner; otherwise differences have to do."""
+        """Return whether JAX differentiates the learner; otherwise differences have to do."""
         return getattr(self.learner, "differentiable", True)
 
     @property
@@ -328,7 +328,7 @@ class Bound:
         return sum(math.prod(shape) for shape in self._shape[1])
 
     def init(self, key: Array) -> Float[Array, "nw"]:
-        """Initial weights as one vector."""
+        """Return initial weights as one vector."""
         return self.ravel(jax.tree.leaves(self.learner.init(key, self.nz, self.ny)))
 
     def silent(self, w: Float[Array | np.ndarray, "nw"]) -> np.ndarray | None:
@@ -370,7 +370,7 @@ class Bound:
         return jax.device_put(np.concatenate([np.zeros(0), *flat]))
 
     def leaves(self, w: Float[Array | np.ndarray, "nw"]) -> list[Float[Array, "..."]]:
-        """The weight arrays that the vector holds, in the tree's order."""
+        """Return the weight arrays that the vector holds, in the tree's order."""
         pieces, offset = [], 0
         for shape in self._shape[1]:
             size = math.prod(shape)
@@ -387,7 +387,7 @@ class Bound:
         return self.learner.apply(self.tree(leaves), z)
 
     def tree(self, leaves: list[Any]) -> Tree:
-        """The learner's own weights, of the weight arrays."""
+        """Return the learner's own weights, of the weight arrays."""
         return jax.tree.unflatten(self._shape[0], leaves)
 
     def jacobian(

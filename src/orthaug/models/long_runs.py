@@ -27,13 +27,13 @@ class RunPiece(NamedTuple):
 
 
 def pieces_of(model: Model, source: Source) -> Iterator[Experiment]:
-    """The pieces of a source that have rows behind the history that the model needs."""
+    """Return the pieces of a source that have rows behind the history that the model needs."""
     first = model.form.first_row
     return (piece for partition in source.partitions for piece in partition.pieces(first) if len(piece) > first)
 
 
 def run_pieces(model: Model, source: Source) -> Iterator[RunPiece]:
-    """The free run along every experiment of a source, from the measured outputs of each."""
+    """Yield the free run along every experiment of a source, from the measured outputs of each."""
     record, first = as_record(source, (_nothing(source),)), model.form.first_row
     state: Any = None
     ended: tuple[str, int] = ("", -1)
@@ -47,7 +47,7 @@ def run_pieces(model: Model, source: Source) -> Iterator[RunPiece]:
 
 
 def responses(model: Model, source: Source, *, free: bool) -> Iterator[tuple[Experiment, Response]]:
-    """One-step predictions or free runs of a source, piece by piece; a run that left all bounds has no more values."""
+    """Yield one-step predictions or free runs of a source, piece by piece; a run that left all bounds has no more values."""
     record = as_record(source, (_nothing(source),))
     if not free:
         for piece in pieces_of(model, source):
@@ -64,7 +64,7 @@ def responses(model: Model, source: Source, *, free: bool) -> Iterator[tuple[Exp
 
 
 def _after(model: Model, state: Any, outputs: Matrix) -> Any:
-    """The state after outputs (m, ny) of a run that began in a state."""
+    """Return the state after outputs (m, ny) of a run that began in a state."""
     before = state.reshape(model.form.memory, len(model.outputs))[::-1]
     past = np.concatenate([before, outputs])
     return model.form.start(past, [len(past)])[0]

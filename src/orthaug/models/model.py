@@ -38,7 +38,7 @@ def _predict_rows(form: Lagged, numbers: Numbers, x: Float[Array, "m nx"]) -> Pa
 def _free_run(
     form: Dynamics, numbers: Numbers, state: Float[Array, "n0"], inputs: Float[Array, "T nu"]
 ) -> tuple[Float[Array, "n0"], Parts]:
-    """One scan over the rows, from the state at the first one; with the state after the last."""
+    """Return one scan over the rows, from the state at the first one; with the state after the last."""
     return jax.lax.scan(lambda state, row: form.step(numbers, state, row), state, inputs)
 
 
@@ -46,7 +46,7 @@ def _free_run(
 def _ahead(
     form: Dynamics, numbers: Numbers, states: Float[Array, "m n0"], inputs: Float[Array, "m T nu"], horizon: Any
 ) -> Parts:
-    """The last of `horizon` free-run steps from each of m starts."""
+    """Return the last of `horizon` free-run steps from each of m starts."""
     side_by_side = jax.vmap(lambda state, row: form.step(numbers, state, row))
 
     def step(i: Any, carry: tuple[Any, Parts]) -> tuple[Any, Parts]:
@@ -128,7 +128,7 @@ class Model(RecordModel, NotebookView):
         return np.asarray(self.numbers.theta_aux)
 
     def components(self, record: Record) -> Response:
-        """One-step prediction of every row in its parts, before and after projection."""
+        """Return one-step prediction of every row in its parts, before and after projection."""
         return self.predict(record, horizon=1)
 
     def predict(self, record: Record, horizon: int = 1) -> Response:
@@ -176,13 +176,13 @@ class Model(RecordModel, NotebookView):
         return Response(tuple(trajectories), None, self.outputs, record.sampling_time)
 
     def as_trajectory(self, start: Vector, parts: Parts, experiment: Experiment, record: Record) -> Trajectory:
-        """A free run from a state, cut where it left all bounds."""
+        """Return a free run from a state, cut where it left all bounds."""
         outside = self._outside(start, parts, experiment, record)
         return replace(self.bounded(parts, experiment, experiment.outputs if record.outputs else None), outside=outside)
 
     @cached_property
     def memory(self) -> Memory:
-        """What a step remembers."""
+        """Return what a step remembers."""
         return Memory.of(self.form.layout, self.form.outputs, [channel.name for channel in self.inputs])
 
     @property
@@ -192,11 +192,11 @@ class Model(RecordModel, NotebookView):
 
     @property
     def step_inputs(self) -> tuple[str, ...]:
-        """What a step takes: the inputs at its sample."""
+        """Return what a step takes: the inputs at its sample."""
         return self.memory.inputs
 
     def start(self, record: Record, row: int | None = None) -> Vector:
-        """The state before a row of a record of one experiment, by default the first that has a prediction.
+        """Return the state before a row of a record of one experiment, by default the first that has a prediction.
 
         Raises:
             InputError: other channels, several experiments, a row that is not there.
@@ -206,7 +206,7 @@ class Model(RecordModel, NotebookView):
         return self.memory.at(experiment, record, checked_row(row, self.form.first_row, len(experiment)))
 
     def step(self, state: Any, inputs: Any) -> tuple[Array, Array]:
-        """One sample of a free run: the next state (n,) and the outputs (ny,), from a state and the inputs (nu,).
+        """Return one sample of a free run: the next state (n,) and the outputs (ny,), from a state and the inputs (nu,).
 
         A pure function of JAX arrays, so that `jax.jit`, `jax.vmap` and `jax.grad` take it; to go on from a measured
         output, put that in the place of the model's own.
@@ -219,7 +219,7 @@ class Model(RecordModel, NotebookView):
         return LaggedFilter(self.form, self.memory), self.numbers, self.deviation
 
     def check_initial(self, initial: Any) -> Matrix:
-        """Outputs before the first usable row, (rows, ny).
+        """Return outputs before the first usable row, (rows, ny).
 
         Raises:
             InputError: too few rows, or not one column per output.
@@ -236,7 +236,7 @@ class Model(RecordModel, NotebookView):
         return rows
 
     def run_parts(self, state: Vector, inputs: Matrix) -> Parts:
-        """The free run from a state along lagged inputs (T, nu), in parts."""
+        """Return the free run from a state along lagged inputs (T, nu), in parts."""
         if not self.form.states:
             return self.parts_at(inputs)
         pieces = []
@@ -249,7 +249,7 @@ class Model(RecordModel, NotebookView):
         return Parts(*(np.concatenate(piece) for piece in zip(*pieces, strict=True)))
 
     def parts_at(self, x: Matrix) -> Parts:
-        """The prediction at measured regressors (T, nx), in parts."""
+        """Return the prediction at measured regressors (T, nx), in parts."""
         return _in_batches(lambda rows: _predict_rows(self.form, self.numbers, rows), (x,))
 
     def _predict_ahead(self, experiment: Experiment, record: Record, horizon: int) -> Parts:
@@ -265,7 +265,7 @@ class Model(RecordModel, NotebookView):
         return self._start("measured", experiment.outputs)
 
     def _start(self, initial: Any, measured: Matrix | None) -> Vector:
-        """The state at the first row with an output."""
+        """Return the state at the first row with an output."""
         if isinstance(initial, str) and initial == "zero":
             return np.zeros(self.form.states)
         if isinstance(initial, str) and initial == "measured":

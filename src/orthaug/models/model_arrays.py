@@ -23,7 +23,7 @@ _SAID = ("structure", "measure", "sampling_time", "time_column")
 
 
 def said_of(model: Any) -> dict[str, Any]:
-    """What a file says of every model, whatever its physics."""
+    """Return what a file says of every model, whatever its physics."""
     channels = {kind: [asdict(channel) for channel in getattr(model, kind)] for kind in ("outputs", "inputs")}
     kept = model.statistics
     said = (
@@ -33,7 +33,7 @@ def said_of(model: Any) -> dict[str, Any]:
 
 
 def fields_from(declared: dict[str, Any], arrays: dict[str, np.ndarray]) -> dict[str, Any]:
-    """The fields that every model has, from its file."""
+    """Return the fields that every model has, from its file."""
     channels = {kind: tuple(Channel(**c) for c in declared[kind]) for kind in ("outputs", "inputs")}
     numbers = {"numbers": numbers_from(arrays), "statistics": statistics_from(arrays, declared)}
     fields = {name: declared[name] for name in _SAID} | channels | numbers
@@ -61,12 +61,12 @@ def arrays_of(model: Any) -> dict[str, np.ndarray]:
 
 
 def numbers_from(arrays: dict[str, np.ndarray]) -> Numbers:
-    """The model's numbers."""
+    """Return the model's numbers."""
     return Numbers(**{name: arrays.get(f"numbers.{name}") for name in Numbers._fields})  # type: ignore[arg-type]
 
 
 def statistics_from(arrays: dict[str, np.ndarray], declared: dict[str, Any]) -> Statistics:
-    """What training left."""
+    """Return what training left."""
     return Statistics(
         gram=arrays.get("gram"),
         middle=arrays.get("middle"),
@@ -81,7 +81,7 @@ def statistics_from(arrays: dict[str, np.ndarray], declared: dict[str, Any]) -> 
 
 
 def declaration_of(bound: Bound | None) -> dict[str, Any] | None:
-    """What a file says of a learner; None without one."""
+    """Return what a file says of a learner; None without one."""
     if bound is None:
         return None
     return declare_learner(bound.learner) | {"nz": bound.nz, "ny": bound.ny}
@@ -96,7 +96,7 @@ def declare_learner(learner: Learner) -> dict[str, Any]:
 
 
 def rebuilt_learner(kept: dict[str, Any], given: Learner | None, path: Path) -> Learner:
-    """The learner that a file declares. For a callable it is the given one."""
+    """Return the learner that a file declares. For a callable it is the given one."""
     kind = kept["kind"]
     if kind in LEARNERS:
         learner = LEARNERS[kind]
@@ -116,7 +116,7 @@ def _field_names(learner: type) -> list[str]:
 
 
 def bound_of(kept: dict[str, Any] | None, weights: np.ndarray, given: Learner | None, path: Path) -> Bound | None:
-    """The learner that a file declares with its sizes; None for physics alone.
+    """Return the learner that a file declares with its sizes; None for physics alone.
 
     Raises:
         InputError: a learner that is not known here, or has another number of weights.

@@ -50,7 +50,7 @@ class MotionField:
         return inputs[..., : len(self.motion.inputs)]
 
     def seen(self, x: Any, u: Any, xp: Any = jnp) -> Any:
-        """The learner's features z (nz, …) of states (nx, …) and inputs (nu, …)."""
+        """Return the learner's features z (nz, …) of states (nx, …) and inputs (nu, …)."""
         values: Mapping[str, Any] = self.motion.values(x, u, self.motion.initial, xp)
         columns = [xp.asarray(entry.value(values, xp), dtype=float) for entry in self.features]
         return xp.stack([xp.broadcast_to(column, x.shape[1:]) for column in columns])
@@ -65,11 +65,11 @@ class MotionField:
 
     @property
     def beyond(self) -> str:
-        """What the learner's correction does beyond the range of its training."""
+        """Return what the learner's correction does beyond the range of its training."""
         return "free" if self.bound is None else beyond_of(self.bound.learner, "fade")
 
     def added(self, numbers: Numbers, x: Any, u: Any) -> Any:
-        """What is added to the physics at c, learned equations and outputs first, at one point.
+        """Return what is added to the physics at c, learned equations and outputs first, at one point.
 
         Within the range of training it is g. Beyond it the physics at p̂ goes on, and what it left there at x̄ is held
         or fades: `f(x; p̂) − f(x; c) + a (f(x̄; c) − f(x̄; p̂) + g(z̄))`.
@@ -89,13 +89,13 @@ class MotionField:
         return jnp.where(jnp.all(inside == z), self._values(numbers, inside), beyond)
 
     def learned_rows(self, p: Any, x: Any, u: Any) -> Any:
-        """The physics (nl,) of the learned equations, then of the learned outputs, with the parameters p."""
+        """Return the physics (nl,) of the learned equations, then of the learned outputs, with the parameters p."""
         states, outputs = (np.array(rows, dtype=int) for rows in self.motion.learned)
         rates, observed = self.motion.rates(x, u, p, jnp), self.motion.observed(x, u, p, jnp)
         return jnp.concatenate([rates[states], observed[outputs]])
 
     def rates(self, numbers: Numbers, x: Any, u: Any) -> tuple[Any, Any]:
-        """The equations' right-hand sides of physics and learner, each (nx,)."""
+        """Return the equations' right-hand sides of physics and learner, each (nx,)."""
         physics = self.motion.rates(x, u, self.parameters(numbers), jnp)
         learned = jnp.zeros(self.states)
         states, _ = self.motion.learned
@@ -112,7 +112,7 @@ class MotionField:
         return y
 
     def parameters(self, numbers: Numbers) -> Any:
-        """The physical parameters (np,) beside the learner, before any split."""
+        """Return the physical parameters (np,) beside the learner, before any split."""
         return self.motion.coordinates.physical(numbers.theta - numbers.theta_aux, jnp)
 
     def linear_part(self, numbers: Numbers) -> Any:

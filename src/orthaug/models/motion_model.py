@@ -57,7 +57,7 @@ def _run(
 def _last(
     form: MotionDynamics, numbers: Numbers, states: Float[Array, "n0 m"], inputs: Float[Array, "T nu m"], steps: Any
 ) -> Float[Array, "ny m"]:
-    """The last output of `steps` of runs side by side."""
+    """Return the last output of `steps` of runs side by side."""
     numbers = form.prepared(numbers)
     side_by_side = jax.vmap(lambda state, row: form.step(numbers, state, row), -1, -1)
     states = jax.lax.fori_loop(0, steps - 1, lambda i, states: side_by_side(states, inputs[i])[0], states)
@@ -165,11 +165,11 @@ class MotionModel(RecordModel, NotebookView):
         return Response(tuple(trajectories), horizon, self.outputs, record.sampling_time)
 
     def components(self, record: Record) -> Response:
-        """The free run in its parts."""
+        """Return the free run in its parts."""
         return self.simulate(record)
 
     def states(self, record: Record, initial: str | Any = "measured") -> pd.DataFrame:
-        """The states of a free run; of each learned equation its rate by the physics, and what is learned beside it.
+        """Return the states of a free run; of each learned equation its rate by the physics, and what is learned beside it.
 
         Of a learned output likewise.
         """
@@ -198,7 +198,7 @@ class MotionModel(RecordModel, NotebookView):
 
     @property
     def step_inputs(self) -> tuple[str, ...]:
-        """What a step takes: the inputs at its sample, under a first-order hold those at the next one behind them."""
+        """Return what a step takes: the inputs at its sample, under a first-order hold those at the next one behind them."""
         return step_inputs(self.form)
 
     @cached_property
@@ -206,7 +206,7 @@ class MotionModel(RecordModel, NotebookView):
         return with_scheme(self.form, self.numbers)
 
     def start(self, record: Record, row: int | None = None) -> Vector:
-        """The state at a row of the free run on a record of one experiment, by default at the first row.
+        """Return the state at a row of the free run on a record of one experiment, by default at the first row.
 
         Raises:
             InputError: other channels, several experiments, a row that is not there.
@@ -220,7 +220,7 @@ class MotionModel(RecordModel, NotebookView):
         return self._follow(self.form, self.numbers, state, self.form.inputs(experiment, record))[0][row]
 
     def step(self, state: Any, inputs: Any) -> tuple[Array, Array]:
-        """One sample: the next state (nx,) and the outputs (ny,) at this one, from a state and `step_inputs`.
+        """Return one sample: the next state (nx,) and the outputs (ny,) at this one, from a state and `step_inputs`.
 
         A pure function of JAX arrays, so that `jax.jit`, `jax.vmap` and `jax.grad` take it.
 
@@ -238,18 +238,18 @@ class MotionModel(RecordModel, NotebookView):
 
     @property
     def reached(self) -> Scaling:
-        """What training reached of the learner's features; of a model saved without it, what physics alone did."""
+        """Return what training reached of the learner's features; of a model saved without it, what physics alone did."""
         return super().reached if self.seen is None else Scaling.fit(self.seen)
 
     def reach(self, record: Record) -> Matrix:
-        """The states and inputs (N, nx + nu) of the free run on a record, where they are finite."""
+        """Return the states and inputs (N, nx + nu) of the free run on a record, where they are finite."""
         states = self.states(record)[list(self.form.motion.names_of_states)].to_numpy()
         inputs = [e.inputs for e in self.fitting(record, need_outputs=False).experiments]
         points = np.concatenate([states, np.concatenate(inputs)], axis=1)
         return points[np.isfinite(points).all(axis=1)]
 
     def check_initial(self, initial: Any) -> Matrix:
-        """Outputs of the first rows (rows, ny).
+        """Return outputs of the first rows (rows, ny).
 
         Raises:
             InputError: no rows, or not one column per output.
@@ -275,7 +275,7 @@ class MotionModel(RecordModel, NotebookView):
         return told if told.diverged else replace(told, outside=self._outside(states, self.form.now(inputs)))
 
     def _with_physics(self, run: Trajectory, physics: Matrix) -> Trajectory:
-        """A run of the whole model with the output of the physics alone; no value from where that left all bounds."""
+        """Return a run of the whole model with the output of the physics alone; no value from where that left all bounds."""
         with np.errstate(all="ignore"):
             wild = ~(np.abs(physics) <= RUNAWAY * self.largest_output).all(axis=1)
         known = np.where(np.logical_or.accumulate(wild)[:, None] | np.isnan(run.model), np.nan, physics)
@@ -300,7 +300,7 @@ class MotionModel(RecordModel, NotebookView):
         return self._start(experiment, "measured", record)
 
     def _start(self, experiment: Experiment, initial: str | Any, record: Record) -> Vector:
-        """The state at the first row."""
+        """Return the state at the first row."""
         if isinstance(initial, str) and initial == "zero":
             return np.zeros(self.form.states)
         if isinstance(initial, str) and initial == "measured":
@@ -335,7 +335,7 @@ class MotionModel(RecordModel, NotebookView):
     def _predicted(
         self, experiment: Experiment, record: Record, horizon: int, window: int
     ) -> tuple[Float[np.ndarray, "r ny"], Float[np.ndarray, "r ny"]]:
-        """The outputs from row `window + horizon - 1` on, each `horizon` steps after a window; and by physics alone."""
+        """Return the outputs from row `window + horizon - 1` on, each `horizon` steps after a window; and by physics alone."""
         steps = window + horizon
         inputs = self.form.inputs(experiment, record)
         run = self._follow(self.form, self.numbers, self._start(experiment, "measured", record), inputs)[0]

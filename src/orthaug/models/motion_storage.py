@@ -23,7 +23,7 @@ _SEGMENTATION = ("segment", "washout", "rows")  # of `Trained`
 
 
 def declare(model: MotionModel) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """What a file says of a model, and its arrays."""
+    """Return what a file says of a model, and its arrays."""
     form, trained = model.form, model.trained
     declared = {
         "kind": "motion",
@@ -46,7 +46,7 @@ def declare(model: MotionModel) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
 def rebuild(
     declared: dict[str, Any], arrays: dict[str, np.ndarray], baseline: Any, learner: Learner | None, path: Path
 ) -> MotionModel:
-    """The model that a file declares.
+    """Return the model that a file declares.
 
     Raises:
         InputError: a callable is asked for.
@@ -97,7 +97,7 @@ def _declared_motion(motion: Motion) -> dict[str, Any]:
 
 
 def _rebuilt_motion(kept: dict[str, Any], given: Any, path: Path) -> Motion:
-    """The motion that a file declares. Of functions it is the given one, with the saved parameters."""
+    """Return the motion that a file declares. Of functions it is the given one, with the saved parameters."""
     parameters = [
         PhysicalParameter(**(p | {k: limit for k, limit in _LIMITS.items() if p[k] is None}))
         for p in kept["parameters"]

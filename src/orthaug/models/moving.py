@@ -132,7 +132,7 @@ def _differentiated(function: Any, x: Any, c: Any) -> tuple[Any, Any, Any]:
 
 
 def _finite(slope: Any) -> Any:
-    """A kink without a derivative, such as sqrt(max(x, 0)) at 0, counts as flat."""
+    """Return a kink without a derivative, such as sqrt(max(x, 0)) at 0, counts as flat."""
     return jnp.where(jnp.isfinite(slope), slope, 0.0)
 
 
@@ -167,7 +167,7 @@ class MotionDynamics(MotionField, AutodiffDynamics):
         return guess(self.motion, outputs, rows, self.sampling_time)
 
     def start_rows(self, weight: Matrix) -> Matrix:
-        """A start costs nothing: the outputs from there on tell it."""
+        """Return a start costs nothing: the outputs from there on tell it."""
         return np.zeros((self.states, self.states))
 
     def inputs(self, experiment: Experiment, record: Record) -> Matrix:
@@ -237,7 +237,7 @@ class MotionDynamics(MotionField, AutodiffDynamics):
         return Local(value, to_x, jnp.concatenate(own, axis=1))
 
     def _by_scheme(self, numbers: Numbers, state: Any, inputs: Any) -> Any:
-        """How states and outputs (n0 + ny, n, r) follow p through the exponentials, which a step takes as given."""
+        """Return how states and outputs (n0 + ny, n, r) follow p through the exponentials, which a step takes as given."""
         scheme, by_theta = numbers.scheme
 
         def following(scheme: Any, state: Any, row: Any) -> Any:
@@ -255,7 +255,7 @@ class MotionDynamics(MotionField, AutodiffDynamics):
 
 @partial(jax.jit, static_argnames="form")
 def _step(form: MotionDynamics, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
-    """A step. It is traced once, whatever programs it stands in; so is the field in it."""
+    """Return a step. It is traced once, whatever programs it stands in; so is the field in it."""
     return form._stepped(numbers, state, inputs)
 
 

@@ -39,7 +39,7 @@ class RecordModel:
 
     @property
     def reached(self) -> Scaling:
-        """What training reached of the learner's features."""
+        """Return what training reached of the learner's features."""
         return Scaling(np.asarray(self.numbers.centre), np.asarray(self.numbers.halfwidth))
 
     def beyond(self, features: Matrix) -> Bool[np.ndarray, "N"]:
@@ -47,7 +47,7 @@ class RecordModel:
         return ~(np.abs(self.reached(features)) <= 1 + WITHIN).all(axis=1)
 
     def bounded(self, parts: Parts, experiment: Experiment, measured: Matrix | None) -> Trajectory:
-        """A free run cut where it left all bounds."""
+        """Return a free run cut where it left all bounds."""
         whole = trajectory(parts, experiment, measured, self.form.first_row)
         with np.errstate(all="ignore"):
             wild = ~(np.abs(whole.model[self.form.first_row :]) <= RUNAWAY * self.largest_output)
@@ -66,7 +66,7 @@ class RecordModel:
             raise InputError(f"{name} has {len(experiment)} rows, too few: the first value is at row {shown(first)}.")
 
     def _wanted(self, with_outputs: bool) -> str:
-        """A record of the model's channels, in the words of Python."""
+        """Return a record of the model's channels, in the words of Python."""
         given = {
             "u": ("inputs", self.inputs),
             "y": ("outputs", self.outputs if with_outputs or not self.inputs else ()),
@@ -77,7 +77,7 @@ class RecordModel:
         return f"a Record, such as Record.from_arrays({arguments})"
 
     def fitting(self, record: Record, *, need_outputs: bool, gaps: bool = False) -> Record:
-        """The record's channels in the model's order, by name.
+        """Return the record's channels in the model's order, by name.
 
         Raises:
             InputError: a channel is missing, the sampling time differs by more than 0.1 %, or outputs are missing

@@ -158,7 +158,7 @@ class Response:
         return replace(self, trajectories=tuple(found))
 
     def to_frame(self, experiment: int = 0) -> pd.DataFrame:
-        """A table with `time` and, per output, measured, model, baseline and learner; of a free run `extrapolates`.
+        """Return a table with `time` and, per output, measured, model, baseline and learner; of a free run `extrapolates`.
 
         Of an observer's prediction also the 95 % band of what is measured.
         """

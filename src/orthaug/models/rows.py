@@ -65,7 +65,7 @@ class Engine(Protocol):
 
     @property
     def resident(self) -> bool:
-        """Whether all rows are one `Chunk` on the device, so that a whole training run may be compiled around a sum."""
+        """Return whether all rows are one `Chunk` on the device, so that a whole training run may be compiled around a sum."""
         ...
 
     def build_rows(self, z: Matrix, q: Any, e: Matrix, gain: Float[np.ndarray, "N ny ny"]) -> Any:
@@ -86,7 +86,7 @@ class Engine(Protocol):
 
     @property
     def shares(self) -> int:
-        """How many can sum at a time: chunks that are placed should be a multiple."""
+        """Return how many can sum at a time: chunks that are placed should be a multiple."""
         ...
 
     def place(self, chunks: Any, like: Any = None) -> Any:
@@ -110,7 +110,7 @@ class Engine(Protocol):
         ...
 
     def fetch(self, rows: Any) -> Any:
-        """What was placed or kept, (k, …) each, in NumPy."""
+        """Return what was placed or kept, (k, …) each, in NumPy."""
         ...
 
     def map(self, function: Any, given: Any, items: Sequence[Any], heard: Heard = nobody) -> Iterator[Any]:
@@ -182,7 +182,7 @@ def _compiled_sum(function: Callable[..., Any], rows: Chunk, arguments: tuple[An
 
 
 def all_chunks(function: Callable[[Any], Any], partitions: Sequence[Any]) -> Any:
-    """The chunks that a function gives of every partition, (k, …) each."""
+    """Return the chunks that a function gives of every partition, (k, …) each."""
     return together([chunk for partition in partitions for chunk in function(partition)])
 
 
@@ -192,7 +192,7 @@ def together(chunks: Sequence[Any]) -> Any:
 
 
 def brought(source: Any, row_builder: Callable[[Any], Any]) -> tuple[np.ndarray, ...]:
-    """All rows of a source laid out: features, Q, P⊥Y and gain, (N, …) each."""
+    """Return all rows of a source laid out: features, Q, P⊥Y and gain, (N, …) each."""
     pieces = [arrays for partition in source.partitions for arrays in row_builder(partition)]
     return tuple(np.concatenate(parts) for parts in zip(*pieces, strict=True))
 
@@ -246,13 +246,13 @@ def build_chunk(z: Matrix, q: Any, e: Matrix, gain: Any, shape: tuple[int, int])
 
 
 def from_chunks(chunks: Float[np.ndarray, "k ... m"], rows: int) -> Float[np.ndarray, "N ..."]:
-    """The inverse of `in_chunks`."""
+    """Return the inverse of `in_chunks`."""
     moved = np.moveaxis(np.asarray(chunks), -1, 1)
     return moved.reshape(moved.shape[0] * moved.shape[1], *moved.shape[2:])[:rows]
 
 
 def gram(columns: Float[Array, "n rows"]) -> Float[Array, "n n"]:
-    """A Aᵀ of named columns laid out as rows of A; one matrix product."""
+    """Return a Aᵀ of named columns laid out as rows of A; one matrix product."""
     return columns @ columns.T
 
 

@@ -41,7 +41,7 @@ class Windows(NamedTuple):
 
 
 def padded_steps(steps: int) -> int:
-    """What to pad the steps of a window to."""
+    """Return what to pad the steps of a window to."""
     return max(_SHORTEST, 1 << (steps - 1).bit_length())
 
 
@@ -54,7 +54,7 @@ def settle(
     loose: Vector,
     iterations: int = 12,
 ) -> tuple[Float[np.ndarray, "n0 m"], Vector]:
-    """The states at the windows' first rows that lower `‖weight e‖²` most, and its value (m,).
+    """Return the states at the windows' first rows that lower `‖weight e‖²` most, and its value (m,).
 
     A window ends where a step promises to lower it by less than a 10⁻¹⁰th part: that is a 10⁻⁵th of its own noise.
 
@@ -102,7 +102,7 @@ def _steps(
 def _linearised(
     form: Dynamics, numbers: Numbers, states: Matrix, layout: Any, weight: Matrix, begun: Matrix, prior: Vector
 ) -> tuple[Any, Any, Any]:
-    """Normal matrix (m, n0, n0), right-hand side (m, n0) and misfit (m,), infinite where a run is not finite."""
+    """Return normal matrix (m, n0, n0), right-hand side (m, n0) and misfit (m,), infinite where a run is not finite."""
     gram, square = (np.asarray(part) for part in _gram(form, numbers, states, *layout, weight))
     n0, gone = len(states), begun - states
     matrix = np.moveaxis(gram[:, :n0], -1, 0) + np.diag(prior)
@@ -134,7 +134,7 @@ def _gram(
         return jnp.concatenate([following, parts.total])
 
     def sloped(state: Any, row: Any) -> tuple[Any, Any]:
-        """A step and its slopes (n0 + ny, n0)."""
+        """Return a step and its slopes (n0 + ny, n0)."""
         along = jax.vmap(lambda moved: jax.jvp(lambda x: both(x, row), (state,), (moved,)), out_axes=(None, -1))
         return along(directions)
 

@@ -13,7 +13,7 @@ _ROUNDING = 1e-13  # of the largest eigenvalue of a Gram matrix with unit column
 
 
 def column_units(gram: Matrix, nt: int) -> Vector:
-    """One over the norm of each column, θ first. Learner columns that are rounding beside the largest stay small."""
+    """Return one over the norm of each column, θ first. Learner columns that are rounding beside the largest stay small."""
     size = np.sqrt(np.maximum(np.diag(gram), 0.0))
     size[nt:] = np.maximum(size[nt:], np.sqrt(np.finfo(float).eps) * size[nt:].max(initial=0.0))
     return 1 / np.where(size > 1e-150, size, 1.0)

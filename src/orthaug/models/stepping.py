@@ -70,14 +70,14 @@ class Memory:
         return np.array([place[Lag(lag.channel, lag.lag - 1)] for lag in self.lags], dtype=int)
 
     def at(self, experiment: Experiment, record: Record, row: int) -> Vector:
-        """The state before a row of an experiment."""
+        """Return the state before a row of an experiment."""
         column = {c.name: experiment.outputs[:, i] for i, c in enumerate(record.outputs)}
         column |= {c.name: experiment.inputs[:, i] for i, c in enumerate(record.inputs)}
         return np.array([column[lag.channel][row - lag.lag] for lag in self.lags], dtype=float)
 
 
 def step_arguments(state: Any, inputs: Any, states: int, count: int) -> tuple[Any, Any]:
-    """A step's arguments as arrays of JAX, which takes wrong lengths in silence.
+    """Return a step's arguments as arrays of JAX, which takes wrong lengths in silence.
 
     Raises:
         InputError: vectors of other lengths, or no numbers.
@@ -95,14 +95,14 @@ def step_arguments(state: Any, inputs: Any, states: int, count: int) -> tuple[An
 
 
 def step_lagged(form: Lagged, numbers: Numbers, memory: Memory, state: Any, inputs: Any) -> tuple[Any, Any]:
-    """The next state and the outputs (ny,) of one sample."""
+    """Return the next state and the outputs (ny,) of one sample."""
     state, inputs = step_arguments(state, inputs, len(memory.lags), len(memory.inputs))
     y = form.at(numbers, jnp.concatenate([state, inputs])[memory.read]).total
     return jnp.concatenate([y, inputs, state])[memory.following], y
 
 
 def step_inputs(form: MotionDynamics) -> tuple[str, ...]:
-    """What a step of a motion takes: its inputs, and under a first-order hold those of the next sample behind them.
+    """Return what a step of a motion takes: its inputs, and under a first-order hold those of the next sample behind them.
 
     Raises:
         InputError: a hold that needs the whole record.
@@ -118,7 +118,7 @@ def step_inputs(form: MotionDynamics) -> tuple[str, ...]:
 
 
 def with_scheme(form: MotionDynamics, numbers: Numbers) -> Numbers:
-    """The numbers with the exponentials of an exact integrator, whose derivatives a step does not need."""
+    """Return the numbers with the exponentials of an exact integrator, whose derivatives a step does not need."""
     with jax.ensure_compile_time_eval():
         scheme = form.exponentials(numbers)
     return numbers if scheme is None else numbers._replace(scheme=(scheme, None))
@@ -138,7 +138,7 @@ def checked_row(row: Any, first: int, rows: int) -> int:
 
 
 def one_experiment(record: Record) -> Experiment:
-    """The record's only experiment, with outputs.
+    """Return the record's only experiment, with outputs.
 
     Raises:
         InputError: several experiments, or no outputs to start from.

@@ -144,12 +144,12 @@ def write(model: Model | MotionModel, folder: Path) -> None:
 
 
 def digest(model: Model | MotionModel) -> str:
-    """The sha256 that tells a model from others: `checksum` in the file that this version writes of it."""
+    """Return the sha256 that tells a model from others: `checksum` in the file that this version writes of it."""
     return _packed(model)[0]["checksum"]
 
 
 def _packed(model: Model | MotionModel) -> tuple[dict[str, Any], bytes]:
-    """What the two files hold."""
+    """Return what the two files hold."""
     kind = _KINDS[type(model)]
     declared, arrays = kind.declare(model)
     return pack(FORMAT, declared, arrays)
@@ -195,7 +195,7 @@ def load(
 
 
 def pack(number: int, declared: Mapping[str, Any], arrays: Mapping[str, Any]) -> tuple[dict[str, Any], bytes]:
-    """What the two files hold, in the format of this `number`."""
+    """Return what the two files hold, in the format of this `number`."""
     packed = save_arrays({name: np.ascontiguousarray(value, dtype=np.float64) for name, value in arrays.items()})
     declaration = {"format": number, "orthaug": __version__, **declared} | {
         "arrays_sha256": hashlib.sha256(packed).hexdigest()
@@ -212,7 +212,7 @@ def write_packed(packed: tuple[dict[str, Any], bytes], path: Path, arrays: Path)
 def read_packed(
     path: Path, arrays: Path, number: int, what: str, again: str
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """What was declared, and the arrays.
+    """Return what was declared, and the arrays.
 
     Args:
         number: the newest format that is read.

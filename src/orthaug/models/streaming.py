@@ -102,7 +102,7 @@ class PairedChunks:
 
 
 def apart(chunks: Any) -> list[Any]:
-    """The inverse of `together`."""
+    """Return the inverse of `together`."""
     leaves, form = jax.tree.flatten(jax.tree.map(np.asarray, chunks))
     return [jax.tree.unflatten(form, parts) for parts in zip(*leaves, strict=True)]
 
@@ -132,7 +132,7 @@ def summed(function: Callable[..., Any], rows: Iterable[Chunk], arguments: tuple
 
 @cache
 def _compiled(function: Callable[..., Any]) -> tuple[Any, Any]:
-    """The function, and what adds it to a sum."""
+    """Return the function, and what adds it to a sum."""
 
     def more(total: Any, chunk: Chunk, *arguments: Any) -> Any:
         return jax.tree.map(jax.numpy.add, total, function(chunk, *arguments))
@@ -161,7 +161,7 @@ def chunks_of(pieces: Iterable[RowArrays], size: int) -> Iterator[Chunk]:
 
 
 def read_ahead(items: Iterable[Any], ahead: int = _AHEAD) -> Iterator[Any]:
-    """The items in order, made by a thread of their own while the caller works; its errors are raised here."""
+    """Yield the items in order, made by a thread of their own while the caller works; its errors are raised here."""
     ready: queue.Queue[tuple[bool, Any]] = queue.Queue(ahead)
     given_up = threading.Event()
 

@@ -65,7 +65,7 @@ class Tasks(InMemory):
         return smallest_worker(self.client, _MATRICES)
 
     def _shared(self, given: Any) -> Any:
-        """What the workers know `given` by."""
+        """Return what the workers know `given` by."""
         from dask import config
 
         if id(given) not in self._sent:
@@ -76,17 +76,17 @@ class Tasks(InMemory):
 
 
 def runs_on(engine: Any) -> Any:
-    """The engine for several runs over rows in memory: with a cluster they are its tasks."""
+    """Return the engine for several runs over rows in memory: with a cluster they are its tasks."""
     return Tasks(client=engine.client) if isinstance(engine, Dask) else engine
 
 
 def places(client: Any) -> int:
-    """How many tasks the workers take at a time."""
+    """Return how many tasks the workers take at a time."""
     return max(sum(client.nthreads().values()), 1)
 
 
 def ask(client: Any, check: Callable[[], None], function: Callable[..., Any], *args: Any, **named: Any) -> Any:
-    """The result of a function that a worker computes; `check` is called now and then, and may raise to give it up."""
+    """Return the result of a function that a worker computes; `check` is called now and then, and may raise to give it up."""
     from distributed import wait
 
     with told():
@@ -145,7 +145,7 @@ def _sealed(_: None, value: Any) -> DoublePrecision:
 
 
 def _made(shared: DoublePrecision, asked: DoublePrecision, topic: str, number: int) -> Any:
-    """A run on a worker. What it tells goes to the client, from time to time."""
+    """Return a run on a worker. What it tells goes to the client, from time to time."""
     from dask.context import thread_state
     from distributed import get_worker
 

@@ -92,7 +92,7 @@ class Terms:
         return self if not self.degree else replace(self, **_written(self.library(signals)))
 
     def library(self, signals: Sequence[str]) -> TermLibrary:
-        """The terms as products of few factors."""
+        """Return the terms as products of few factors."""
         own = signals if self.inputs is None or not self.degree else self.inputs
         return TermLibrary.of(own, self.degree, self.functions, self.terms, self.exclude)
 
@@ -101,24 +101,24 @@ class Terms:
         return Terms(tuple(kept), beyond=self.beyond)
 
     def scaling(self, features: Matrix) -> Scaling:
-        """Each term by its largest size, without an offset: coefficients stay those of the terms."""
+        """Return each term by its largest size, without an offset: coefficients stay those of the terms."""
         size = np.abs(features).max(axis=0, initial=0.0)
         return Scaling(np.zeros(len(size)), np.where(size > 0, size, 1.0))
 
     def weights(self, nz: int, ny: int) -> int:
-        """How many weights it has for `nz` features and `ny` outputs."""
+        """Return how many weights it has for `nz` features and `ny` outputs."""
         return nz * ny
 
     def silent(self, tree: Tree) -> Tree:
-        """All coefficients zero."""
+        """Return all coefficients zero."""
         return np.zeros_like(tree)
 
     def groups(self, tree: Tree) -> Tree:
-        """Each term by itself."""
+        """Return each term by itself."""
         return np.broadcast_to(np.arange(np.shape(tree)[1]), np.shape(tree))
 
     def layers(self, tree: Tree) -> list[tuple[Any, Any, str]]:
-        """One layer without bias."""
+        """Return one layer without bias."""
         return [(tree, None, "identity")]
 
     def init(self, key: Array, nz: int, ny: int) -> Tree:
@@ -133,7 +133,7 @@ def _written(library: TermLibrary) -> dict[str, Any]:
 
 
 def over_lags(learner: Any, baseline: Baseline, lags: Lags | None, outputs: Names, inputs: Names) -> Any:
-    """A learner whose library waits for the lags, written out; any other as it is."""
+    """Return a learner whose library waits for the lags, written out; any other as it is."""
     if not hasattr(learner, "over"):
         return learner
     return learner.over([str(lag) for lag in regressor_of(baseline, lags, None, outputs, inputs)[0]])
@@ -145,5 +145,5 @@ def over_states(learner: Any, motion: Motion) -> Any:
 
 
 def scaling_of(learner: Any, features: Matrix) -> Scaling:
-    """How a learner's features (N, nz) are scaled: its own way, or into [-1, 1]."""
+    """Return how a learner's features (N, nz) are scaled: its own way, or into [-1, 1]."""
     return learner.scaling(features) if hasattr(learner, "scaling") else Scaling.fit(features)

@@ -119,7 +119,7 @@ class Baseline(NotebookView):
 
     @classmethod
     def from_terms(cls, terms: Sequence[Term], constants: Mapping[str, float] | None = None) -> Baseline:
-        """One term per summand; expressions may use the names in `constants`, and `Ts` for the sampling time.
+        """Return one term per summand; expressions may use the names in `constants`, and `Ts` for the sampling time.
 
         Args:
             terms: the same parameter may stand in several.
@@ -164,7 +164,7 @@ class Baseline(NotebookView):
 
     @property
     def linear(self) -> bool:
-        """Whether the output is linear in θ: here always, by its form."""
+        """Return whether the output is linear in θ: here always, by its form."""
         return True
 
     @property
@@ -208,7 +208,7 @@ class Baseline(NotebookView):
         return tuple(dict.fromkeys(lag for expression in self.expressions for lag in expression.lags))
 
     def sampled(self, sampling_time: float) -> Baseline:
-        """The baseline with this value [s] of `Ts`, where its expressions read that without declaring it.
+        """Return the baseline with this value [s] of `Ts`, where its expressions read that without declaring it.
 
         Raises:
             InputError: a constant `Ts` of another value.
@@ -246,7 +246,7 @@ class Baseline(NotebookView):
         return self._matrix([p.name for p in self.parameters], x, layout, outputs, xp)
 
     def known(self, x: Any, layout: Layout, outputs: Sequence[str], xp: Any) -> Any:
-        """The sum of the fixed terms, (…, ny)."""
+        """Return the sum of the fixed terms, (…, ny)."""
         fixed = {term.parameter: term.initial or 0.0 for term in self.terms if term.fixed}
         if not fixed:
             return xp.zeros((*x.shape[:-1], len(outputs)))
@@ -290,7 +290,7 @@ _SHARED = ("initial", "unit", "fixed", "min", "max")  # what the terms of one pa
 
 
 def _agreed(terms: Sequence[Term]) -> list[Term]:
-    """The terms; what one of them says about a parameter, all of its terms say."""
+    """Return the terms; what one of them says about a parameter, all of its terms say."""
     said: dict[tuple[str, str], Any] = {}
     for term in terms:
         check_parameter_name(term.parameter)
@@ -320,7 +320,7 @@ def _parameter(term: Term) -> Parameter:
 
 
 def derived_units(baseline: Baseline, outputs: Sequence[Channel], inputs: Sequence[Channel]) -> dict[str, str]:
-    """The unit of each parameter by its name, "1" where it has none; without those that the channels do not tell.
+    """Return the unit of each parameter by its name, "1" where it has none; without those that the channels do not tell.
 
     Examples:
         >>> spring = Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "u[k-1]")])

@@ -260,7 +260,7 @@ class Motion(NotebookView):
                 raise InputError(f"the parameter '{name}' is in no equation and no output; use or remove it.")
 
     def _names_in(self, expression: Expression) -> set[str]:
-        """The names of an expression, and those of the definitions that it uses."""
+        """Return the names of an expression, and those of the definitions that it uses."""
         reach = {name: set(given.names) for name, given in self.definitions}
         for name, given in self.definitions:  # each after those that it uses
             for other in given.names:
@@ -268,7 +268,7 @@ class Motion(NotebookView):
         return set(expression.names).union(*(reach.get(name, set()) for name in expression.names))
 
     def parameters_in(self, state: str) -> tuple[str, ...]:
-        """The parameters of a state's equation; of a motion that has expressions."""
+        """Return the parameters of a state's equation; of a motion that has expressions."""
         there = self._names_in(self.equations[state])
         return tuple(name for name in self.names if name in there)
 
@@ -295,7 +295,7 @@ class Motion(NotebookView):
         return {SAMPLING_TIME: 1.0} | named | dict.fromkeys((name for name, _ in self.definitions), 1.0)
 
     def sampled(self, sampling_time: float) -> Motion:
-        """The motion with this value [s] of `Ts`.
+        """Return the motion with this value [s] of `Ts`.
 
         Raises:
             InputError: a constant `Ts` of another value.
@@ -316,7 +316,7 @@ class Motion(NotebookView):
         return tuple(parse_named(o.expression, self.known, f"the output '{o.name}'") for o in self.outputs)
 
     def values(self, x: Any, u: Any, p: Any, xp: Any) -> dict[str, Any]:
-        """What every name stands for; x (nx, …), u (nu, …), p (np,)."""
+        """Return what every name stands for; x (nx, …), u (nu, …), p (np,)."""
         values = dict(self.constants)
         values |= dict(zip(self.names, p, strict=True))
         values |= dict(zip(self.names_of_states, x, strict=True))
@@ -342,7 +342,7 @@ class Motion(NotebookView):
         return xp.stack([xp.broadcast_to(xp.asarray(output, dtype=float), x.shape[1:]) for output in outputs])
 
     def term_without_value(self, i: int, x: Vector, u: Vector) -> str:
-        """What is not finite in equation i, outputs after states, at a point (nx,) and (nu,), in words; or nothing."""
+        """Return what is not finite in equation i, outputs after states, at a point (nx,) and (nu,), in words; or nothing."""
         if self.functions is not None:
             return ""
         with np.errstate(all="ignore"):
@@ -361,7 +361,7 @@ class Motion(NotebookView):
 
     @property
     def coordinates(self) -> Coordinates:
-        """What is estimated of p."""
+        """Return what is estimated of p."""
         return Coordinates(self.parameters)
 
     def check_channels(self, inputs: Sequence[str], outputs: Sequence[str]) -> None:
@@ -382,7 +382,7 @@ class Motion(NotebookView):
 
 
 def _ordered(definitions: Mapping[str, Expression]) -> list[str]:
-    """The names so that each stands after those that it uses.
+    """Return the names so that each stands after those that it uses.
 
     Raises:
         InputError: definitions that need each other.

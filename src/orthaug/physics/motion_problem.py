@@ -64,7 +64,7 @@ class MotionProblem:
         return np.concatenate(states).T, np.concatenate(inputs).T
 
     def without_value(self, over: Callable[[Any], Any]) -> str:
-        """The first equation or output that has no value at the start, in words, at all guessed states or at any.
+        """Return the first equation or output that has no value at the start, in words, at all guessed states or at any.
 
         Args:
             over: np.all or np.any.
@@ -190,7 +190,7 @@ def _check_start(problem: MotionProblem) -> None:
 def guess(
     motion: Motion, outputs: Matrix, rows: Sequence[int] | Int[np.ndarray, "r"], sampling_time: float
 ) -> Float[np.ndarray, "r n0"]:
-    """The states at some rows, made of the outputs (N, ny) that were measured about them."""
+    """Return the states at some rows, made of the outputs (N, ny) that were measured about them."""
     rows = np.asarray(rows, dtype=int)
     width = min(_ROWS, len(outputs))
     begin = np.clip(rows - width // 2, 0, len(outputs) - width)
@@ -212,7 +212,7 @@ def guess(
 
 @cache
 def _polynomials(width: int) -> Float[np.ndarray, "width degree+1 width"]:
-    """What gives the coefficients of a local polynomial about each of its rows from the values of all."""
+    """Return what gives the coefficients of a local polynomial about each of its rows from the values of all."""
     offset = np.arange(width)[None, :] - np.arange(width)[:, None]
     return np.linalg.pinv(offset[..., None] ** np.arange(min(_DEGREE, width - 1) + 1))
 

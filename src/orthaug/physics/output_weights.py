@@ -35,11 +35,11 @@ class OutputWeights:
 
     @property
     def one_output(self) -> bool:
-        """Whether there is nothing to weigh against each other."""
+        """Return whether there is nothing to weigh against each other."""
         return len(self.matrix) == 1
 
     def as_dict(self) -> dict[str, Any]:
-        """What was chosen, and W."""
+        """Return what was chosen, and W."""
         return {"kind": self.kind, "matrix": self.matrix.tolist()}
 
     def __str__(self) -> str:
@@ -52,7 +52,7 @@ class OutputWeights:
         return told[self.kind]
 
     def rows(self, values: Float[np.ndarray, "N ny ..."]) -> Float[np.ndarray, "N ny ..."]:
-        """The rows in whitened outputs."""
+        """Return the rows in whitened outputs."""
         return times(self.matrix, values)
 
     def outputs(self, rows: Float[np.ndarray, "N ny ..."]) -> Float[np.ndarray, "N ny ..."]:
@@ -60,17 +60,17 @@ class OutputWeights:
         return times(np.linalg.inv(self.matrix), rows)
 
     def whitened(self, covariance: Matrix) -> Matrix:
-        """A covariance (ny, ny) of the outputs, of whitened outputs."""
+        """Return a covariance (ny, ny) of the outputs, of whitened outputs."""
         return self.matrix @ covariance @ self.matrix.T
 
     def covariance(self, whitened: Matrix) -> Matrix:
-        """A covariance of whitened outputs, of the outputs."""
+        """Return a covariance of whitened outputs, of the outputs."""
         inverse = np.linalg.inv(self.matrix)
         return inverse @ whitened @ inverse.T
 
 
 def times(matrix: np.ndarray, values: Float[np.ndarray, "N ny ..."]) -> Float[np.ndarray, "N ny ..."]:
-    """Every row's outputs multiplied by one matrix (ny, ny), or by one of its own (N, ny, ny)."""
+    """Return every row's outputs multiplied by one matrix (ny, ny), or by one of its own (N, ny, ny)."""
     if matrix.shape[-1] == 1:  # one output: the same number without a sum
         return values * matrix.reshape(-1, *([1] * (values.ndim - 1)))
     return np.einsum("oi,ki...->ko..." if matrix.ndim == 2 else "koi,ki...->ko...", matrix, values)

@@ -335,7 +335,7 @@ def check_baseline(physics: PhysicsMap, baseline: Baseline) -> None:
 
 
 def with_initial(physics: PhysicsMap, baseline: Baseline) -> Baseline:
-    """The baseline with θ⁰ = h(p⁰), after `check_baseline`."""
+    """Return the baseline with θ⁰ = h(p⁰), after `check_baseline`."""
     check_baseline(physics, baseline)
     given = {name: float(v) for name, v in zip(physics.theta_names, physics.initial_theta(), strict=True)}
     return replace(

@@ -110,7 +110,7 @@ class Problem:
 
     @property
     def count(self) -> int:
-        """How many rows there are."""
+        """Return how many rows there are."""
         return len(self.rows)
 
     @property
@@ -149,7 +149,7 @@ class Problem:
         return Moments.of(self.unexplained)
 
     def unexplained_sizes(self, *, centred: bool) -> tuple[Vector, Vector]:
-        """How large what the physics leaves is in each output (ny,), whitened and not: its deviation, or its RMS."""
+        """Return how large what the physics leaves is in each output (ny,), whitened and not: its deviation, or its RMS."""
         moments, back = self.unexplained_moments, np.linalg.inv(self.weight.matrix)
         found = []
         for change, least in ((np.eye(len(back)), np.ones(len(back))), (back, self.deviation)):
@@ -182,7 +182,7 @@ class Problem:
         return self if self.features.linear else replace(self, features=replace(self.features, linear=True))
 
     def physics_alone(self) -> Problem:
-        """The problem without a learner. It is posed anew where the learner's lags took rows from the physics."""
+        """Return the problem without a learner. It is posed anew where the learner's lags took rows from the physics."""
         outputs, inputs = self.outputs, tuple(channel.name for channel in self.record.inputs)
         if self.baseline.function is not None or in_order(self.baseline.lags, outputs, inputs) == self.layout:
             return replace(self, features=Features(()))
@@ -201,7 +201,7 @@ class Problem:
         return replace(self, weight=weight, projection=projection, excitation=excited)
 
     def feature_rows(self) -> Matrix:
-        """The learner's features (N, nz).
+        """Return the learner's features (N, nz).
 
         Raises:
             InputError: a feature that is not finite on some row.
@@ -292,7 +292,7 @@ def check_defined(problem: Problem, record: Record) -> None:
 
 
 def feature_rows(features: Features, rows: UsableRows, layout: Layout, record: Record) -> Matrix:
-    """The learner's features (N, nz) of some rows; InputError where one is not finite."""
+    """Return the learner's features (N, nz) of some rows; InputError where one is not finite."""
     with np.errstate(all="ignore"):
         z = np.asarray(features.evaluate(rows.x, layout, np))
     for j, entry in enumerate(features.entries):
@@ -307,7 +307,7 @@ def regressor_of(
     outputs: tuple[str, ...],
     inputs: tuple[str, ...],
 ) -> tuple[Layout, Features]:
-    """The regressor of the whole model, and what the learner sees of it.
+    """Return the regressor of the whole model, and what the learner sees of it.
 
     Raises:
         InputError: unknown channels, outputs at lag 0, learner inputs that cannot be read.

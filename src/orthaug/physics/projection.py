@@ -53,14 +53,14 @@ class Factor:
         return (self.scale * scipy.linalg.solve_triangular(self.r, coordinates, check_finite=False).T).T
 
     def along(self, directions: Float[np.ndarray, "nt s"] | None) -> Matrix:
-        """The projector (nθ, nθ) onto some directions of θ, in coordinates of Q; None for all of them."""
+        """Return the projector (nθ, nθ) onto some directions of θ, in coordinates of Q; None for all of them."""
         if directions is None:
             return np.eye(len(self.r))
         basis = np.linalg.qr(self.to_coordinates @ directions)[0]
         return basis @ basis.T
 
     def told_of(self, directions: Float[np.ndarray, "nt s"]) -> Float[np.ndarray, "nt r"]:
-        """A basis of some directions of θ without what Φ takes to zero; the directions as they are where that is none.
+        """Return a basis of some directions of θ without what Φ takes to zero; the directions as they are where that is none.
 
         A parameter that stands in none of the rows has a column of zeros.
         """
@@ -73,7 +73,7 @@ class Factor:
         return directions if rank == directions.shape[1] else unit @ vt[:rank].T
 
     def covariance_factor(self, free: Sequence[int] | None = None) -> Float[np.ndarray, "nf nt"]:
-        """A factor L with `L Lᵀ = (Φ_fᵀΦ_f)⁻¹` for the free columns, all by default; `L = Φ_f⁺Q`."""
+        """Return a factor L with `L Lᵀ = (Φ_fᵀΦ_f)⁻¹` for the free columns, all by default; `L = Φ_f⁺Q`."""
         chosen = list(range(len(self.scale))) if free is None else list(free)
         basis, r = np.linalg.qr(self.r[:, chosen])
         return self.scale[chosen, None] * scipy.linalg.solve_triangular(r, basis.T) if chosen else basis.T
@@ -138,6 +138,6 @@ def _scale(rows: Matrix) -> Vector:
 
 
 def powers_of_two(largest: Vector) -> Vector:
-    """Those that bring the largest entry of each column (nθ,) near 1; 1 for a column of zeros."""
+    """Return those that bring the largest entry of each column (nθ,) near 1; 1 for a column of zeros."""
     moves = largest > 0
     return np.where(moves, 2.0 ** np.clip(-np.round(np.log2(np.where(moves, largest, 1.0))), -1000, 1000), 1.0)

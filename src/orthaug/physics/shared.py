@@ -72,7 +72,7 @@ class Shared:
 
     @property
     def all(self) -> bool:
-        """Whether the learner could imitate all of the physics."""
+        """Return whether the learner could imitate all of the physics."""
         return self.basis.shape[1] == len(self.names)
 
     @property
@@ -90,7 +90,7 @@ class Shared:
         return tuple(told)
 
     def leaving(self, held: Iterable[int]) -> Shared:
-        """The shared directions that leave some entries of θ where they are; in reduced form too."""
+        """Return the shared directions that leave some entries of θ where they are; in reduced form too."""
         basis = self.basis
         for i in held:
             if not basis[i].any():
@@ -106,7 +106,7 @@ class Shared:
 def shared_directions(
     baseline: Baseline, features: Features, layout: Layout, outputs: Sequence[str], x: Float[np.ndarray, "N nx"]
 ) -> Shared:
-    """The directions of θ that a learner on these features could imitate.
+    """Return the directions of θ that a learner on these features could imitate.
 
     Args:
         x: measured regressors, where the moves begin.
@@ -138,7 +138,7 @@ def spanned(
     features: Float[np.ndarray, "N nz"],
     learned: Any = True,
 ) -> Shared:
-    """The directions along which all slopes are linear combinations of features, on the same points.
+    """Return the directions along which all slopes are linear combinations of features, on the same points.
 
     Args:
         learned: which slopes have a learner; the others must not move at all.
@@ -187,19 +187,19 @@ def _combined(values: Float[np.ndarray, "N k"], features: Float[np.ndarray, "N n
 
 
 def _basis(features: Float[np.ndarray, "N nz"]) -> Float[np.ndarray, "N r"]:
-    """An orthonormal basis of what features span."""
+    """Return an orthonormal basis of what features span."""
     size = np.sqrt(np.mean(features**2, axis=0))
     q, sigma, _ = np.linalg.svd(features / np.where(size > 0, size, 1.0), full_matrices=False)
     return q[:, sigma > _ROUNDING * sigma.max(initial=0.0)]
 
 
 def _sees(features: Features, lags: Iterable[Lag]) -> bool:
-    """Whether all of these lags are features as they stand."""
+    """Return whether all of these lags are features as they stand."""
     return {str(lag) for lag in lags} <= {str(entry) for entry in features.entries}
 
 
 def agreeing(before: Matrix, after: Matrix) -> Matrix:
-    """The directions a with `before a = after a`, relative to the size of `before a`, in reduced form."""
+    """Return the directions a with `before a = after a`, relative to the size of `before a`, in reduced form."""
     if not before.size:  # of no points at all, as of a run that diverged
         return np.zeros((before.shape[1], 0))
     scale = np.sqrt(np.mean(before**2 + after**2, axis=0))

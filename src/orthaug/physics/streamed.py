@@ -69,7 +69,7 @@ class Form:
             yield piece, rows, *self.baseline.on(x, self.layout, self.outputs)
 
     def checked(self, piece: Experiment, rows: UsableRows, phi: np.ndarray, known: np.ndarray) -> Matrix:
-        """The learner's features (m, nz), after everything was found to be finite."""
+        """Return the learner's features (m, nz), after everything was found to be finite."""
         alone = replace(self.empty, experiments=(piece,))
         check_physics(phi, known, self.baseline, rows, alone)
         return feature_rows(self.features, rows, self.layout, alone)
@@ -162,7 +162,7 @@ class Basis:
         return np.moveaxis(self.turn.T @ (self.inverse.T @ columns), -1, 0)
 
     def left(self, target: Matrix, q: np.ndarray, coordinates: Vector) -> Matrix:
-        """What is left of a target (m, ny) by rows of Q at these coordinates, in whitened outputs."""
+        """Return what is left of a target (m, ny) by rows of Q at these coordinates, in whitened outputs."""
         return self.weight.rows(target) - (coordinates @ np.moveaxis(q, 0, -1)).T
 
 
@@ -279,7 +279,7 @@ class StreamedProblem(Problem):
         return np.stack(extent)
 
     def row_builder(self, centre: Vector, halfwidth: Vector, rms: float, gain: Matrix) -> RowBuilder:
-        """How its rows are laid out for training."""
+        """Return how its rows are laid out for training."""
         basis = replace(self.basis, form=replace(self.basis.form, features=self.features))
         return RowBuilder(basis, self.target_coordinates, centre, halfwidth, rms, gain)
 
@@ -320,7 +320,7 @@ def pose_streamed(
 
 
 def streamed(seen: Problem, source: Source, passes: Passes) -> StreamedProblem:
-    """The problem of a source, from that of a witness of it."""
+    """Return the problem of a source, from that of a witness of it."""
     empty = replace(seen.record, experiments=(seen.record.experiments[0].rows(0, 0),))
     form = Form(seen.baseline, seen.features, seen.layout, empty)
     survey = _survey(form, source, passes)
@@ -335,7 +335,7 @@ def streamed(seen: Problem, source: Source, passes: Passes) -> StreamedProblem:
 
 
 def _factored(seen: Problem, source: Source, passes: Passes, survey: Survey, form: Form) -> StreamedProblem:
-    """Two passes: R of `[Φ Y]`, and again of what it gives."""
+    """Return two passes: R of `[Φ Y]`, and again of what it gives."""
     weight, nt = seen.weight, len(seen.baseline.names)
     scale = powers_of_two(survey.columns * np.abs(weight.matrix).max())
     first = _merged(passes(Factoring(form, weight, scale), source.partitions), lambda a, b: _triangle([a, b]))

@@ -28,7 +28,7 @@ class SuspectedMotion(Motion):
 
     @classmethod
     def of(cls, physics: Motion, added: Sequence[SuspectedTerm]) -> SuspectedMotion:
-        """The terms read what the equations do."""
+        """Return the terms read what the equations do."""
         own = {field.name: getattr(physics, field.name) for field in fields(Motion)}
         own["parameters"] = (*physics.parameters, *(PhysicalParameter(term.name, 0.0) for term in added))
         return cls(**own, physics=physics, added=tuple(added))

@@ -34,7 +34,7 @@ class BiasMap:
 
     @property
     def colours(self) -> Matrix:
-        """What the colours stand for."""
+        """Return what the colours stand for."""
         return np.sign(self.shares) * np.log10(1 + np.abs(self.shares))
 
     @property
@@ -44,7 +44,7 @@ class BiasMap:
 
     @property
     def cells(self) -> list[list[str]]:
-        """What is written in them."""
+        """Return what is written in them."""
         return [[_cell(value) for value in row] for row in self.shares]
 
 
@@ -58,7 +58,7 @@ def biased_by(rows: Sequence[ParameterResult]) -> dict[tuple[str, float], list[P
 
 
 def bias_map(suspects: Sequence[SuspectResult]) -> BiasMap:
-    """All biases, or those of the suspects and parameters with the largest ones, in the order of the result."""
+    """Return all biases, or those of the suspects and parameters with the largest ones, in the order of the result."""
     names = list(suspects[0].percent)
     shares = np.array([[suspect.percent[name] for name in names] for suspect in suspects], dtype=float)
     shares = np.where(np.abs(shares) < _ZERO, 0.0, shares)
@@ -73,7 +73,7 @@ def bias_map(suspects: Sequence[SuspectResult]) -> BiasMap:
 
 
 def _largest(size: np.ndarray, most: int) -> list[int]:
-    """The places of the largest values, in their order."""
+    """Return the places of the largest values, in their order."""
     return sorted(np.argsort(-size, kind="stable")[:most].tolist())
 
 

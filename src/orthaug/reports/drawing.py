@@ -56,7 +56,7 @@ def plain(draw: Callable[Drawn, Figure]) -> Callable[Drawn, Figure]:
 
 
 def axes_for(ax: Axes | None) -> Axes:
-    """The given axes, or new ones: of pyplot where that is in use, so that a notebook shows them.
+    """Return the given axes, or new ones: of pyplot where that is in use, so that a notebook shows them.
 
     Raises:
         InputError: something else.
@@ -136,7 +136,7 @@ def label(axis: Axes, *, x: str | None = None, y: str | None = None, title: str 
 
 
 def outline(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A curve to draw: of a long one the least and the largest value in every column of pixels."""
+    """Return a curve to draw: of a long one the least and the largest value in every column of pixels."""
     if len(values) <= 4 * _COLUMNS:
         return time, values
     starts = np.linspace(0, len(values), _COLUMNS, endpoint=False).astype(int)
@@ -152,7 +152,7 @@ def extent(response: Response, rows: slice) -> str:
 
 
 def window(response: Response) -> tuple[np.ndarray, slice]:
-    """The instants [s] and the rows that a figure shows of the first experiment."""
+    """Return the instants [s] and the rows that a figure shows of the first experiment."""
     trajectory = response.trajectories[0]
     rows = slice(trajectory.start, min(trajectory.start + _WINDOW, len(trajectory.model)))
     return np.arange(rows.start, rows.stop) * response.sampling_time, rows

@@ -63,7 +63,7 @@ class ExplainResult(ResultHeader):
 
 
 def explain_text(result: ExplainResult) -> str:
-    """What the learner has found, the terms alone, θ with them in the physics, and what to write into the spec."""
+    """Return what the learner has found, the terms alone, θ with them in the physics, and what to write into the spec."""
     blocks = [[_capital(result.text)]]
     if result.noise is not None:
         blocks[0] += [f"Of what it adds, {percent(result.noise)} are its own errors, as far as training tells."]
@@ -110,6 +110,6 @@ def _percent(share: float | None) -> str:
 
 
 def _capital(text: str) -> str:
-    """A sentence; one that begins with an expression stays as it is."""
+    """Return a sentence; one that begins with an expression stays as it is."""
     first = text.split(" ", 1)[0]
     return text[:1].upper() + text[1:] if first.isalpha() else text

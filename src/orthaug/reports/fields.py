@@ -18,7 +18,7 @@ from orthaug._base.checks import finite_or_none
 
 
 def _number(value: Any) -> Any:
-    """A float, or None for what is not finite: JSON has no NaN."""
+    """Return a float, or None for what is not finite: JSON has no NaN."""
     if isinstance(value, float | int | np.number):
         return finite_or_none(float(value))
     return value
@@ -54,7 +54,7 @@ class Content(BaseModel):
         return self.model_dump(mode="json", by_alias=True)
 
     def to_json(self) -> str:
-        """The content as text; never NaN."""
+        """Return the content as text; never NaN."""
         return json.dumps(self.content(), indent=1, ensure_ascii=False, allow_nan=False)
 
 

@@ -34,7 +34,7 @@ def plot(
     title: str | None = None,
     path: str | os.PathLike | None = None,
 ) -> Figure:
-    """A matplotlib figure; also written as a PNG where there is a `path`.
+    """Return a matplotlib figure; also written as a PNG where there is a `path`.
 
     Args:
         what: a response, of `model.simulate` or `model.predict`; what `linearize` returns; a `Recursive`, for θ over
@@ -167,7 +167,7 @@ class FitPlots:
         return axis
 
     def learned(self, feature: str | None = None, *, output: str | None = None, ax: Axes | None = None) -> Axes:
-        """What was learned, over one of the learner's inputs: means of the data with the cloud, or the curve itself.
+        """Return what was learned, over one of the learner's inputs: means of the data with the cloud, or the curve itself.
 
         The curve, all else at its median, is drawn where the data can move the input alone; a band is its 95 %
         interval, dashed is where the training data do not reach.
@@ -204,7 +204,7 @@ class FitPlots:
         return axis
 
     def parameters(self, *, ax: Axes | None = None) -> Axes:
-        """The 95 % interval of every parameter, in per cent of the estimate; values and limits are written above.
+        """Return the 95 % interval of every parameter, in per cent of the estimate; values and limits are written above.
 
         A parameter without an interval, or with the estimate 0, is a hollow point.
         """
@@ -263,7 +263,7 @@ class FitPlots:
         return self.fit.problem.record if record is None else record
 
     def _response(self, verb: str, record: Record | None, output: str | None, experiment: int) -> tuple[Response, int]:
-        """The response on a record, and which of its outputs is drawn."""
+        """Return the response on a record, and which of its outputs is drawn."""
         given = self._record(record)
         if not self.fit.status.ok:
             raise InputError(f"training failed ({self.fit.status.code}); there is nothing to draw.")

@@ -98,5 +98,5 @@ def bias_figure(suspects: Sequence[SuspectResult]) -> Figure:
 
 
 def _floats(values: Sequence[Any]) -> np.ndarray:
-    """The numbers of a result, NaN for None."""
+    """Return the numbers of a result, NaN for None."""
     return np.array(values, dtype=float)

@@ -62,7 +62,7 @@ class Card:
 
 
 def html_of(shown: Any) -> str:
-    """The object, or a card, as HTML, escaped."""
+    """Return the object, or a card, as HTML, escaped."""
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
     card = shown if isinstance(shown, Card) else card_of(shown)
     tables = [Table(t.columns, _shortened(t)) for t in card.tables]
@@ -78,7 +78,7 @@ def _shortened(table: Table) -> Sequence[Sequence[str]]:
 
 @singledispatch
 def card_of(shown: Any) -> Card:
-    """What is shown of an object."""
+    """Return what is shown of an object."""
     return Card(repr(shown))
 
 
@@ -156,7 +156,7 @@ def _fit(fit: Estimate | MotionEstimate) -> Card:
 
 
 def card_of_result(fit: Estimate | MotionEstimate, result: FitResult) -> Card:
-    """A fit with what its result tells of every parameter, and all of the result's warnings."""
+    """Return a fit with what its result tells of every parameter, and all of the result's warnings."""
     parameters = [*result.parameters, *(result.physical_parameters or ())]
     columns = ["parameter", "value", "std", "95 % interval", "unit"]
     rows = [[row.name, _number(row.value), _number(row.std, 3), _ends(row.ci95), row.shown_unit] for row in parameters]

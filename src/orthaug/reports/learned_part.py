@@ -142,7 +142,7 @@ class LearnedPart:
         return Curve(along, (along >= low) & (along <= high), self.at(rows), half)
 
     def telling_pair(self) -> tuple[str, str]:
-        """The most telling feature, and of those that do not move along with it the next; of at least two features."""
+        """Return the most telling feature, and of those that do not move along with it the next; of at least two features."""
         first, *others = self.ranked()
         own = self.seen[:, self.features.index(first)]
         for name in others:
@@ -152,14 +152,14 @@ class LearnedPart:
         return first, others[0]
 
     def tied(self, feature: str, but: str = "") -> bool:
-        """Whether the data move another feature along with it, `but` one: then they hold nothing with that at rest."""
+        """Return whether the data move another feature along with it, `but` one: then they hold nothing with that at rest."""
         moving = [name for name, spread in zip(self.features, self.seen.std(axis=0), strict=True) if spread > 0]
         own = self.seen[:, self.features.index(feature)]
         others = [self.seen[:, self.features.index(n)] for n in moving if n not in (feature, but)]
         return feature in moving and any(abs(np.corrcoef(own, other)[0, 1]) > _TIED for other in others)
 
     def alone(self, across: str, along: str) -> bool:
-        """Whether two features are variables that can be moved with all else at rest."""
+        """Return whether two features are variables that can be moved with all else at rest."""
         known = across in self.variables and along in self.variables
         return known and not self.tied(across, along) and not self.tied(along, across)
 
@@ -205,7 +205,7 @@ class LearnedPart:
 
 
 def learned_of(fit: Estimate | MotionEstimate, record: Record) -> LearnedPart | None:
-    """What a fit learned along a record, with intervals where it has some; None where nothing was learned."""
+    """Return what a fit learned along a record, with intervals where it has some; None where nothing was learned."""
     if fit.model.form.bound is None:
         return None
     if isinstance(fit, Estimate):
@@ -262,7 +262,7 @@ def units_of(model: MotionModel) -> dict[str, str]:
 
 
 def curve_limits(curve: Curve, k: int, cloud: Vector) -> tuple[float, float]:
-    """What a panel of a curve's output k shows: the cloud and the curve within reach, not all that it is beyond."""
+    """Return what a panel of a curve's output k shows: the cloud and the curve within reach, not all that it is beyond."""
     both = np.concatenate([curve.learned[curve.inside, k], cloud])
     low, high = float(np.nanmin(both)), float(np.nanmax(both))
     margin = 0.15 * max(high - low, 1e-12)

@@ -164,7 +164,7 @@ class LinearizeResult(ResultHeader):
 
 
 def gain_unit(view: LinearView, i: int, j: int) -> str:
-    """The unit of output i over that of input j."""
+    """Return the unit of output i over that of input j."""
     upper, lower = view.units.get(view.outputs[i], ""), view.units.get(view.inputs[j], "")
     if not lower:
         return upper

@@ -104,7 +104,7 @@ def _at(found: Linearization, number: int) -> str:
 def _draw_measured(
     found: Linearization, upper: Any, lower: Any, pair: tuple[int, int], model: Vector
 ) -> tuple[Vector, Vector]:
-    """What data alone say of gain and phase, on the turn that the model's phase is on."""
+    """Return what data alone say of gain and phase, on the turn that the model's phase is on."""
     measured, bode = found.measured, found[0].bode
     if measured is None or bode is None:
         return np.zeros(0), np.zeros(0)
@@ -127,7 +127,7 @@ def _log_labels(axis: Any, *, sparse: bool) -> None:
 
 @plain
 def poles_figure(found: Linearization) -> Figure:
-    """The poles of all points of rest beside the unit circle, with 95 % intervals of their magnitudes."""
+    """Return the poles of all points of rest beside the unit circle, with 95 % intervals of their magnitudes."""
     figure = Figure(figsize=(5.2, 5.2 + TOP - 0.3))
     ((axis,),) = grid(figure, 1, 1)
     turn = np.linspace(0, 2 * np.pi, 400)

@@ -21,7 +21,7 @@ _HELD = {
 
 
 def linear_text(found: Linearization) -> str:
-    """All points of rest, each with gains, poles and matrices; then what data alone say, and warnings."""
+    """Return all points of rest, each with gains, poles and matrices; then what data alone say, and warnings."""
     blocks = []
     for i, view in enumerate(found):
         head = "operating point" if len(found) == 1 else f"operating point {i + 1} of {len(found)}"

@@ -27,7 +27,7 @@ _TOLD_ELSEWHERE = ("witness", "free_run_diverged", "residual_not_analysed")
 
 
 def fit_page(page: FitPage) -> str:
-    """The page of a fit."""
+    """Return the page of a fit."""
     result = page.result
     title = _title("Model", page.outputs, result.spec, page.origin)
     kind = f"{result.structure} structure" + (f", {result.measure} measure" if result.measure else "")
@@ -44,14 +44,14 @@ def fit_page(page: FitPage) -> str:
 
 
 def compare_page(page: ComparePage) -> str:
-    """The page of a comparison."""
+    """Return the page of a comparison."""
     title = _title(f"{len(page.result.comparison)} models", page.outputs, page.result.spec, page.origin)
     verdict = compare_verdict(page.result)
     return _page(title, "comparison", verdict, page.result.warnings, compare_sections(page), page.origin, "")
 
 
 def _title(what: str, outputs: Sequence[str], spec: Mapping[str, Any], origin: Origin) -> str:
-    """What a page is about; a spec that is called just that adds nothing."""
+    """Return what a page is about; a spec that is called just that adds nothing."""
     inputs = spec.get("data", {}).get("inputs") or []
     told = f"{what} of {_listed(outputs)}" + (f" from {_listed(inputs)}" if inputs else "")
     return told if origin.name == "spec" else f"{told}: {origin.name}"

@@ -21,7 +21,7 @@ _MINUS = re.compile(r"(?<![\w\])}.-])-(?=[\d.])")  # before a number that stands
 
 
 def number(value: float | None, digits: int = 5, scale: float | None = None) -> str:
-    """A cell; 0 for what is rounding beside a `scale`, a dash where there is no number."""
+    """Return a cell; 0 for what is rounding beside a `scale`, a dash where there is no number."""
     if value is None:
         return "–"
     if value == 0 or (scale is not None and abs(value) <= _ROUNDING * abs(scale)):
@@ -36,7 +36,7 @@ def number(value: float | None, digits: int = 5, scale: float | None = None) -> 
 
 
 def interval(ends: Sequence[float | None] | None, digits: int = 5) -> str:
-    """The two ends of an interval, of so many digits at least that they are told apart; a dash where there is none."""
+    """Return the two ends of an interval, of so many digits at least that they are told apart; a dash where there is none."""
     if ends is None:
         return "–"
     known = [end for end in ends if end is not None]
@@ -64,7 +64,7 @@ def digits_for(value: float | None, spread: float | None, least: int) -> int:
 
 
 def percent(share: float | None, digits: int = 2, *, signed: bool = False) -> str:
-    """A share in per cent."""
+    """Return a share in per cent."""
     if share is None:
         return "–"
     shown = 0.0 if abs(share) < _ROUNDING else 100 * share
@@ -80,12 +80,12 @@ def percent(share: float | None, digits: int = 2, *, signed: bool = False) -> st
 
 
 def chance(p: float | None) -> str:
-    """A p-value; a small one is as good as a smaller one."""
+    """Return a p-value; a small one is as good as a smaller one."""
     return "< 10⁻⁶" if p is not None and p < 1e-6 else number(p, 2)
 
 
 def prose(text: str) -> str:
-    """A sentence with the minus signs that tables have.
+    """Return a sentence with the minus signs that tables have.
 
     Examples:
         >>> prose("moves y[k-1] by -0.015, from -2 to 3")
@@ -95,17 +95,17 @@ def prose(text: str) -> str:
 
 
 def with_unit(name: str, unit: str | None) -> str:
-    """A name with its unit in brackets."""
+    """Return a name with its unit in brackets."""
     return f"{name} [{unit}]" if unit else name
 
 
 def regressor_label(name: str, units: Mapping[str, str]) -> str:
-    """A channel, or a lag of one, with its unit; units by channel."""
+    """Return a channel, or a lag of one, with its unit; units by channel."""
     return with_unit(name, units.get(name.partition("[")[0]))
 
 
 def parameter_label(row: ParameterResult) -> str:
-    """A parameter with its unit, or with the one that the channels ask for where the spec gives none."""
+    """Return a parameter with its unit, or with the one that the channels ask for where the spec gives none."""
     return with_unit(row.name, row.unit or ("" if row.derived_unit == "1" else row.derived_unit))
 
 
@@ -187,7 +187,7 @@ class Section:
 
 
 def plots_of(sections: Sequence[Section]) -> list[Plot]:
-    """All plots in their order."""
+    """Return all plots in their order."""
     blocks = [block for section in sections for block in section.blocks]
     return [
         plot

@@ -40,7 +40,7 @@ class ComparePage:
 
 
 def compare_sections(page: ComparePage) -> list[Section]:
-    """All of them; what a result does not have is left out."""
+    """Return all of them; what a result does not have is left out."""
     result = page.result
     scores = {row.name: row.scores for row in result.comparison}
     found = [

@@ -33,7 +33,7 @@ _KINDS = {"prediction": ("one step", "@physics"), "simulation": ("free run", "@m
 
 
 def interval_plot(rows: Sequence[ParameterResult]) -> Plot | None:
-    """Every parameter on an axis of its own unit: value, intervals, and the initial value where it is near."""
+    """Return every parameter on an axis of its own unit: value, intervals, and the initial value where it is near."""
     drawn = [row for row in rows if row.value is not None and row.ci95 and None not in row.ci95]
     if not drawn:
         return None
@@ -90,19 +90,19 @@ def _interval_traces(row: ParameterResult) -> list[dict[str, Any]]:
 
 
 def _first(rows: Sequence[ParameterResult], holds: Callable[[ParameterResult], bool]) -> int:
-    """The number of the first row of which something holds."""
+    """Return the number of the first row of which something holds."""
     return next((i for i, row in enumerate(rows) if holds(row)), 0)
 
 
 def _tick(row: ParameterResult) -> str:
-    """The name of a parameter, and half its interval in per cent of it."""
+    """Return the name of a parameter, and half its interval in per cent of it."""
     low, high = row.ci95 or (None, None)
     half = None if low is None or high is None or not row.value else abs((high - low) / (2 * row.value))
     return f"<b>{parameter_label(row)}</b>" + ("" if half is None else f"<br>± {percent(half)}")
 
 
 def _reach(row: ParameterResult) -> list[float]:
-    """What the axis of a parameter shows: its intervals with a margin, and the initial value where it is near."""
+    """Return what the axis of a parameter shows: its intervals with a margin, and the initial value where it is near."""
     ends = [row.value, *(row.ci95 or ()), *(row.ci95_with_bias or ()), row.initial if _near(row) else None]
     known = [end for end in ends if end is not None]
     margin = 0.35 * max(max(known) - min(known), 1e-300)
@@ -275,7 +275,7 @@ def bias_plot(suspects: Sequence[SuspectResult]) -> Plot:
 
 
 def restart_plot(restarts: Sequence[RestartResult]) -> Plot | None:
-    """The loss that every start came to."""
+    """Return the loss that every start came to."""
     if len([run for run in restarts if run.loss is not None]) < 3:
         return None
     place = [f"{run.seed}, {run.regularization}" for run in restarts]

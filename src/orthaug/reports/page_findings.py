@@ -12,7 +12,7 @@ from orthaug.reports.result import FitResult
 
 
 def residuals_blocks(result: FitResult, units: Mapping[str, str]) -> list[Any]:
-    """What the residuals tell, output by output; units by channel."""
+    """Return what the residuals tell, output by output; units by channel."""
     blocks: list[Any] = []
     found = result.residuals
     if found is None:
@@ -53,7 +53,7 @@ def _test_cells(what: str, test: ResidualTestResult, units: Mapping[str, str]) -
 
 
 def stability_blocks(result: FitResult) -> list[Any]:
-    """What is known of the free run's stability."""
+    """Return what is known of the free run's stability."""
     found = result.stability
     if found is None:
         return []
@@ -89,7 +89,7 @@ def stability_blocks(result: FitResult) -> list[Any]:
 
 
 def excitation_blocks(result: FitResult) -> list[Any]:
-    """How well the data tell the parameters apart, and what each suspected term does to them."""
+    """Return how well the data tell the parameters apart, and what each suspected term does to them."""
     seen = result.excitation
     told = f"The data tell {seen.rank} of {seen.columns} parameters apart; "
     told += f"the condition number is {number(seen.condition, 3)}."
@@ -133,7 +133,7 @@ _CHOOSES = {
 
 
 def restarts_blocks(result: FitResult) -> list[Any]:
-    """How training ended, from every start."""
+    """Return how training ended, from every start."""
     status = result.status
     told = (
         f"Training ended with “{status.code.replace('_', ' ')}” after {status.iterations} iterations and "

@@ -84,7 +84,7 @@ def units_of_result(result: FitResult | CompareResult) -> dict[str, str]:
 
 
 def fit_sections(page: FitPage) -> list[Section]:
-    """All of them; what a result does not have is left out."""
+    """Return all of them; what a result does not have is left out."""
     result = page.result
     found = [
         Section("parameters", "Parameters", _parameters(result)),
@@ -146,7 +146,7 @@ def _parameters(result: FitResult) -> list[Any]:
 
 
 def bias_cell(row: ParameterResult) -> str:
-    """The bias by what the learner found."""
+    """Return the bias by what the learner found."""
     return number(row.bias.value, 2, row.value) if row.bias else "–"
 
 
@@ -167,7 +167,7 @@ def _parameter_cells(row: ParameterResult, biased: bool, shared: bool) -> list[s
 
 
 def _equations(result: FitResult) -> list[Any]:
-    """The equations of a motion, and the terms that were learned."""
+    """Return the equations of a motion, and the terms that were learned."""
     blocks: list[Any] = []
     declared = result.spec.get("motion")
     if result.motion is not None and declared:
@@ -228,7 +228,7 @@ def _runs(page: FitPage) -> list[Any]:
 
 
 def _shares(page: FitPage) -> list[Any]:
-    """How much of the model's output, or of each equation, is physics and how much the learner."""
+    """Return how much of the model's output, or of each equation, is physics and how much the learner."""
     result = page.result
     if result.motion is not None:
         rows = [(part.equation, part.physics, part.learner, part.share, part.unit) for part in result.motion.parts]

@@ -38,7 +38,7 @@ class Run:
 
 
 def run_plots(runs: Sequence[Run], band: Mapping[str, tuple[float, float]]) -> list[Plot]:
-    """A plot for every part: measured, model, the model without its learner, and the residual.
+    """Return a plot for every part: measured, model, the model without its learner, and the residual.
 
     Args:
         band: of each output the two limits between which 95 % of the errors on the training data lie.
@@ -49,7 +49,7 @@ def run_plots(runs: Sequence[Run], band: Mapping[str, tuple[float, float]]) -> l
 
 
 def compared_plots(responses: Mapping[str, Mapping[str, Response]]) -> list[Plot]:
-    """A plot for every part: measured, and the free run of every model."""
+    """Return a plot for every part: measured, and the free run of every model."""
     parts = list(dict.fromkeys(part for runs in responses.values() for part in runs))
     count = sum(len(t.model) + 1 for runs in responses.values() for r in runs.values() for t in r.trajectories)
     outputs = max((len(r.outputs) for runs in responses.values() for r in runs.values()), default=1)
@@ -103,7 +103,7 @@ def _length(run: Run) -> int:
 
 
 def _fair(lengths: Sequence[int], budget: int) -> int:
-    """How many points a curve may have, so that short ones stay whole and all fit into the budget."""
+    """Return how many points a curve may have, so that short ones stay whole and all fit into the budget."""
     left, ordered = budget, sorted(lengths)
     for i, length in enumerate(ordered):
         share = left // (len(ordered) - i)
@@ -114,7 +114,7 @@ def _fair(lengths: Sequence[int], budget: int) -> int:
 
 
 def packed(values: Vector, x0: float, dx: float, most: int = MOST_POINTS) -> dict[str, Any]:
-    """A curve at even steps as the page reads it; of a longer one the least and the largest value of each stretch."""
+    """Return a curve at even steps as the page reads it; of a longer one the least and the largest value of each stretch."""
     step = dx
     if len(values) > most:
         stride = -(-len(values) // (most // 2))
@@ -156,7 +156,7 @@ class _Panels:
         self._left: list[PanelExit] = []
 
     def keep(self, name: str, i: int, values: Matrix) -> str:
-        """The name by which traces find the curve of output i."""
+        """Return the name by which traces find the curve of output i."""
         self.series[f"{name} {i}"] = packed(values[:, i], self.start, self.step, self.most)
         return f"{name} {i}"
 
@@ -179,7 +179,7 @@ class _Panels:
         self.layout |= _axes(i, 2 * len(self.outputs), self.outputs[i], limits)
 
     def plot(self, label: str, caption: str, time: str) -> Plot:
-        """All of it; `time` stands at the axis that the panels share."""
+        """Return all of it; `time` stands at the axis that the panels share."""
         for one in self._left:
             channel = self.outputs[one.output]
             reached = f"{number(one.farthest, 3)} {channel.unit}".strip()
@@ -206,7 +206,7 @@ class PanelExit:
     farthest: float
 
     def marker(self) -> dict[str, Any]:
-        """A triangle at the edge."""
+        """Return a triangle at the edge."""
         return {
             "x": [self.time],
             "y": [self.edge],
@@ -221,7 +221,7 @@ class PanelExit:
 
 
 def frame_of(measured: Vector, curves: Iterable[Vector]) -> list[float] | None:
-    """What the upper panel shows where a curve leaves what was measured by far; None for all of it."""
+    """Return what the upper panel shows where a curve leaves what was measured by far; None for all of it."""
     low, high = float(np.nanmin(measured)), float(np.nanmax(measured))
     width = max(high - low, 1e-300)
     for curve in curves:
@@ -234,7 +234,7 @@ def frame_of(measured: Vector, curves: Iterable[Vector]) -> list[float] | None:
 def curves_left(
     curves: Mapping[str, Vector], limits: Sequence[float], output: int, start: float, step: float
 ) -> list[PanelExit]:
-    """The curves that are cut off at the edge of a panel, in the order of the drawing."""
+    """Return the curves that are cut off at the edge of a panel, in the order of the drawing."""
     found: list[PanelExit] = []
     for name, curve in curves.items():
         with np.errstate(invalid="ignore"):
@@ -292,7 +292,7 @@ def _upper(curves: Sequence[str], i: int, limits: tuple[float, float] | None) ->
 
 
 def _axes(i: int, panels: int, channel: Channel, limits: list[float] | None) -> dict[str, Any]:
-    """The two panels of an output from the top down, on the x axis that all share."""
+    """Return the two panels of an output from the top down, on the x axis that all share."""
     high = 2 / panels
     top = 1 - i * high
     middle = top - (high - _GAP) * _UPPER
@@ -307,7 +307,7 @@ def _axes(i: int, panels: int, channel: Channel, limits: list[float] | None) -> 
 
 
 def _stacked(name: str, unit: str) -> str:
-    """A title on two lines: the panels are too low on paper for name and unit behind each other."""
+    """Return a title on two lines: the panels are too low on paper for name and unit behind each other."""
     return f"{name}<br>[{unit}]" if unit else name
 
 
@@ -358,7 +358,7 @@ def _label(run: Run) -> str:
 
 
 def _caption(run: Run, most: int) -> str:
-    """What is drawn, in sentences."""
+    """Return what is drawn, in sentences."""
     response = run.response
     rows, count = sum(len(t.model) for t in response.trajectories), len(response.trajectories)
     files = f" of {count} experiments" if count > 1 else ""

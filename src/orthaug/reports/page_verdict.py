@@ -103,7 +103,7 @@ def compare_verdict(result: CompareResult) -> PageVerdict:
 
 
 def _taken(rows: Sequence[RowResult], errors: Mapping[str, float]) -> str:
-    """The model of the lowest error; of such that are as good, one whose θ means something."""
+    """Return the model of the lowest error; of such that are as good, one whose θ means something."""
     best = min(errors, key=errors.__getitem__)
     earns = [row.name for row in rows if row.validation is None or row.validation.verdict == "helps"]
     tied = [name for name in _TIED if name in earns and errors[name] <= _ALIKE * errors[best]]
@@ -134,7 +134,7 @@ def _on(part: str) -> str:
 
 
 def _worse(scores: dict[str, PartScores]) -> tuple[float, str] | None:
-    """How many times as large as in training the free run's error on a held-out part is, where that is a lot."""
+    """Return how many times as large as in training the free run's error on a held-out part is, where that is a lot."""
     found = {}
     trained = scores["train"].simulation.rmse if "train" in scores else None
     for part, score in scores.items():
@@ -163,7 +163,7 @@ def _worst(scores: dict[str, PartScores], kind: str = "simulation") -> tuple[flo
 
 
 def _code(result: FitResult | RowResult) -> str | None:
-    """The verdict on the learner; None without one, and where the model is the physics alone that was taken for it."""
+    """Return the verdict on the learner; None without one, and where the model is the physics alone that was taken for it."""
     return None if result.validation is None or _warned(result, "physics_alone") else result.validation.verdict
 
 
@@ -172,7 +172,7 @@ def _warned(result: FitResult | RowResult, code: str) -> bool:
 
 
 def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
-    """What speaks against the model, the gravest first."""
+    """Yield what speaks against the model, the gravest first."""
     runaway = [w.text.split(":")[0] for w in result.warnings if w.code == _RAN_AWAY]
     if runaway:
         yield f"its free run diverges on {_joined(runaway)}"
@@ -211,7 +211,7 @@ def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
 
 
 def _size_of_bias(rows: Sequence[ParameterResult]) -> str:
-    """How large the biases are; in figures where one is far larger than its standard error."""
+    """Return how large the biases are; in figures where one is far larger than its standard error."""
     one = len(rows) == 1
     worst = max(rows, key=_errors_of)
     if _errors_of(worst) < _FAR or worst.bias is None:
@@ -222,7 +222,7 @@ def _size_of_bias(rows: Sequence[ParameterResult]) -> str:
 
 
 def _errors_of(row: ParameterResult) -> float:
-    """The size of its bias in standard errors."""
+    """Return the size of its bias in standard errors."""
     return abs(row.bias.value or 0.0) / row.std if row.bias and row.std else 0.0
 
 
@@ -266,12 +266,12 @@ def _use(result: FitResult, level: str) -> str:
 
 
 def _noise_alone(result: FitResult) -> bool:
-    """Whether the residual shows nothing that would bias the parameters."""
+    """Return whether the residual shows nothing that would bias the parameters."""
     return result.residuals is None or result.residuals.verdict not in ("unmodelled", "sensor_noise")
 
 
 def _known(row: ParameterResult) -> bool:
-    """Whether a parameter may be read as physics."""
+    """Return whether a parameter may be read as physics."""
     sure = row.std is not None and row.value is not None and 0 < row.std <= _SURE * abs(row.value)
     return sure and not row.shared and not _biased(row)
 
@@ -353,7 +353,7 @@ def _cause_option(cause: BiasResult, learned: bool) -> str:
 
 
 def _undecided(result: FitResult) -> bool:
-    """Whether physics alone was handed over although the learner may help."""
+    """Return whether physics alone was handed over although the learner may help."""
     ratio = None if result.validation is None else result.validation.ratio
     return _warned(result, "physics_alone") and ratio is not None and (ratio.value or 1.0) < 1 < (ratio.high or 0.0)
 

@@ -97,7 +97,7 @@ def residual_figure(response: Response, title: str) -> Figure:
 
 @plain
 def components_figure(response: Response, title: str) -> Figure:
-    """The baseline's and the learner's part of the model's output, each on its own scale; two panels per output."""
+    """Return the baseline's and the learner's part of the model's output, each on its own scale; two panels per output."""
     time, rows = window(response)
     trajectory = response.trajectories[0]
     figure, axes = panels(response, f"{title}: {extent(response, rows)}", heights=(1, 1))
@@ -117,7 +117,7 @@ def components_figure(response: Response, title: str) -> Figure:
 
 @plain
 def states_figure(model: MotionModel, record: Record, title: str) -> Figure:
-    """Every state along the free run of the first experiment."""
+    """Return every state along the free run of the first experiment."""
     states, _ = trajectory_of(model, record)
     motion = model.form.motion
     rows = slice(0, min(len(states), 250))
@@ -151,7 +151,7 @@ def parts_figure(model: MotionModel, record: Record, title: str) -> Figure:
 
 @plain
 def learner_figure(part: LearnedPart, title: str) -> Figure:
-    """What was learned over each input of the learner: along the training run, and as a curve where that is one.
+    """Return what was learned over each input of the learner: along the training run, and as a curve where that is one.
 
     The curve of a state or input is drawn with all others at their medians, dashed beyond the reach of the data.
     """
@@ -257,7 +257,7 @@ def tracking_figure(
     physical: pd.DataFrame | None = None,
     physical_parameters: Sequence[Any] = (),
 ) -> Figure:
-    """A panel for each parameter with its 95 % band, and the alarm below; vertical lines are where it was raised.
+    """Return a panel for each parameter with its 95 % band, and the alarm below; vertical lines are where it was raised.
 
     Args:
         course: `Recursive.history`.
@@ -305,7 +305,7 @@ def _mean_nrmse(row: RowResult, kind: str) -> float:
 
 
 def _floats(values: Sequence[float | None]) -> np.ndarray:
-    """The numbers of a result, NaN for None."""
+    """Return the numbers of a result, NaN for None."""
     return np.array(values, dtype=float)
 
 

@@ -307,12 +307,12 @@ class FitResult(ResultHeader):
 
     @property
     def noise_only(self) -> bool:
-        """Whether the intervals count noise only: the model leaves more than that."""
+        """Return whether the intervals count noise only: the model leaves more than that."""
         return any(row.ci95_counts for row in (*self.parameters, *(self.physical_parameters or ())))
 
     @property
     def learns(self) -> bool:
-        """Whether biases are of what a learner found; of a motion without one they are of what the free run leaves."""
+        """Return whether biases are of what a learner found; of a motion without one they are of what the free run leaves."""
         return self.motion is None or self.shared is not None
 
 
@@ -395,7 +395,7 @@ class DesignResult(Content):
 
     @classmethod
     def of(cls, design: Design) -> DesignResult:
-        """The content of a design, without its signal."""
+        """Return the content of a design, without its signal."""
         by_name = {key: dict(zip(design.names, getattr(design, key), strict=True)) for key in ("bias", "std")}
         return cls.model_validate({**vars(design), **by_name, "samples": len(design.signal)})
 
@@ -429,7 +429,7 @@ def parameter_rows(
 def physical_rows(
     estimate: PhysicalEstimate, profiles: dict[str, tuple[float, float]] | None = None
 ) -> list[ParameterResult]:
-    """The physical parameters as results list them, with the profile intervals that were made."""
+    """Return the physical parameters as results list them, with the profile intervals that were made."""
     columns = (estimate.names, estimate.units, estimate.initial, estimate.value, estimate.std, estimate.ci95)
     keys = ("name", "unit", "initial", "value", "std", "ci95")
     rows = [dict(zip(keys, row, strict=True)) for row in zip(*columns, strict=True)]

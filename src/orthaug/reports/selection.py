@@ -90,7 +90,7 @@ class SelectResult(ResultHeader):
 
 
 def selection_text(result: SelectResult) -> str:
-    """A page: what was chosen, why, and the models beside it."""
+    """Return a page: what was chosen, why, and the models beside it."""
     from orthaug.selection.orders import Delay, Orders
 
     orders = Orders(result.orders.na, tuple(result.orders.nb), tuple(result.orders.nk))

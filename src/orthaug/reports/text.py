@@ -107,7 +107,7 @@ def check_text(result: CheckResult) -> str:
 
 
 def _shared_lines(shared: SharedResult) -> list[str]:
-    """What the learner could imitate, and a table of what other inputs would make of it."""
+    """Return what the learner could imitate, and a table of what other inputs would make of it."""
     lines = [shared.text]
     if shared.alternatives:
         head = ["with learner.inputs", "shared directions", "determined beside it"]
@@ -120,7 +120,7 @@ def _shared_lines(shared: SharedResult) -> list[str]:
 
 
 def compare_text(result: CompareResult, verdicts: Mapping[str, Verdict]) -> str:
-    """Two tables, parameters with standard errors and scores on every part; then the verdicts on each row."""
+    """Return two tables, parameters with standard errors and scores on every part; then the verdicts on each row."""
     lines = [*table(_parameter_cells(result)), "", *table(_score_cells(result.comparison))]
     if result.chosen:
         lines += ["", "* chosen on the validation part"]
@@ -158,7 +158,7 @@ def parameter_table(name: str, rows: Sequence[ParameterResult]) -> list[str]:
 
 
 def design_text(result: DesignResult) -> str:
-    """The design and what else was tried."""
+    """Return the design and what else was tried."""
     rows = [["signal", "error", "bias", "std", "condition"]]
     for signal in result.candidates[:SHOWN]:
         error = None if signal.cost is None else float(np.sqrt(signal.cost))
@@ -185,12 +185,12 @@ def _or_infinite(value: float | None, digits: int = 4) -> str:
 
 
 def warning_lines(warnings: Iterable[WarningResult]) -> list[str]:
-    """A line for each warning."""
+    """Return a line for each warning."""
     return [f"warning: {warning.text}" for warning in warnings]
 
 
 def _suspect_lines(suspects: Sequence[SuspectResult]) -> list[str]:
-    """What each suspect does, biases in per cent."""
+    """Return what each suspect does, biases in per cent."""
     rows = [["suspect", "size", *suspects[0].percent, "cosine", "removed by"]]
     for suspect in suspects:
         guess = suspect.coefficient
@@ -204,7 +204,7 @@ def _suspect_lines(suspects: Sequence[SuspectResult]) -> list[str]:
 
 
 def _bias_lines(result: FitResult) -> list[str]:
-    """The bias of every parameter by what the learner found, and the interval that covers it."""
+    """Return the bias of every parameter by what the learner found, and the interval that covers it."""
     rows = [*result.parameters, *(result.physical_parameters or ())]
     lines, width, causes = [], _width([row for row in rows if row.bias]), biased_by(rows)
     what = ("learner found" if result.learns else "free run leaves") + (" in one equation" if len(causes) > 1 else "")
@@ -262,7 +262,7 @@ def _limit(value: float | None) -> str:
 
 
 def _score_lines(fit: Estimate | MotionEstimate, result: FitResult) -> list[str]:
-    """The scores as a table, one line per part, kind and output."""
+    """Return the scores as a table, one line per part, kind and output."""
     rows = [["part", "horizon", "output", "RMSE", "NRMSE", "FIT %"]]
     for part, scores in result.scores.items():
         for kind, score in scores.kinds.items():
@@ -274,7 +274,7 @@ def _score_lines(fit: Estimate | MotionEstimate, result: FitResult) -> list[str]
 
 
 def _residual_lines(result: FitResult) -> list[str]:
-    """How much the one-step residual follows its own past and the inputs, where all rows were looked at."""
+    """Return how much the one-step residual follows its own past and the inputs, where all rows were looked at."""
     lines = []
     for part, scores in result.scores.items():
         for test in scores.residual or ():

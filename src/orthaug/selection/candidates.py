@@ -34,7 +34,7 @@ class Candidates:
 
 
 def candidates(problem: Problem, library: TermLibrary) -> Candidates:
-    """The terms that the physics does not express already, of more than `SHORTLIST` the most promising.
+    """Return the terms that the physics does not express already, of more than `SHORTLIST` the most promising.
 
     A term is promising by what it lowers the error one step ahead, beside the physics and beside those that are picked
     between rounds of looking through all (iterated screening). Nothing of the size rows × terms is kept.
@@ -109,7 +109,7 @@ def _chunks(runs: TermRuns, chosen: Sequence[int] | np.ndarray) -> Iterator[tupl
 
 
 def _promising(runs: TermRuns, known: _ModelColumns, among: np.ndarray) -> np.ndarray:
-    """The terms that promise most, in rounds: a look through all, and picks among the best of it."""
+    """Return the terms that promise most, in rounds: a look through all, and picks among the best of it."""
     found: dict[int, None] = {}
     for _ in range(_ROUNDS):
         norms, left, right = known.weigh(runs, among)

@@ -81,7 +81,7 @@ class LearnerTarget:
         return float(scipy.special.chdtrc(max(int(kept.sum()), 1), square))
 
     def unit(self, column: Vector) -> Vector:
-        """A column over the points (P,), taken as of size 1, as the learner would show it."""
+        """Return a column over the points (P,), taken as of size 1, as the learner would show it."""
         with np.errstate(all="ignore"):
             column = column / np.linalg.norm(column)
         if not np.isfinite(column).all():
@@ -99,7 +99,7 @@ def without(values: np.ndarray, basis: Float[np.ndarray, "R k"]) -> np.ndarray:
 
 
 def basis_of(columns: Sequence[Vector] | Matrix) -> Float[np.ndarray, "R k"]:
-    """An orthonormal basis of columns, each taken as of size 1."""
+    """Return an orthonormal basis of columns, each taken as of size 1."""
     if not len(columns):
         return np.zeros((0, 0))
     table = np.asarray(columns, dtype=float)
@@ -160,7 +160,7 @@ class Candidate:
 
     @property
     def identity(self) -> tuple[str, str, int]:
-        """What it is whatever its width."""
+        """Return what it is whatever its width."""
         return self.kind, self.text if self.on is None else self.on, self.place
 
     @property
@@ -204,11 +204,11 @@ class Space:
 
     @property
     def empty(self) -> bool:
-        """Whether the learner adds nothing beside the physics, or nothing could explain it."""
+        """Return whether the learner adds nothing beside the physics, or nothing could explain it."""
         return not self.target.any() or not self.candidates
 
     def column(self, candidate: Candidate) -> Vector:
-        """A candidate as the learner would show it, (r,)."""
+        """Return a candidate as the learner would show it, (r,)."""
         return self.shown.unit(self.linearization.column(self.linearization.parse(candidate.text), candidate.place))
 
     def gains(self, chosen: Sequence[Vector]) -> Vector:
@@ -228,7 +228,7 @@ class Space:
 def candidates_of(
     linearization: LearnedLinearization, degree: int, functions: Sequence[str], suspects: Sequence[tuple[str, int]]
 ) -> tuple[Candidate, ...]:
-    """What could explain the learner, simple terms first.
+    """Return what could explain the learner, simple terms first.
 
     Args:
         degree, functions: of products of what the learner sees (`TermLibrary`).
@@ -286,7 +286,7 @@ def _written(kind: str, on: str | None, width: float | None = None) -> str:
 
 
 def select(space: Space, most: int, least: float) -> list[Candidate]:
-    """The terms, in the order in which they explain most.
+    """Return the terms, in the order in which they explain most.
 
     Args:
         most: at most so many.
@@ -306,7 +306,7 @@ def _share(space: Space, chosen: Sequence[Candidate]) -> float:
 
 
 def _grown(space: Space, chosen: list[Candidate]) -> list[Candidate]:
-    """One term more: beside all that are in, or a pair beside all but one; widths refined, the simplest of the best.
+    """Return one term more: beside all that are in, or a pair beside all but one; widths refined, the simplest of the best.
 
     Friction has the sum of a jump and of a peak, neither of which is the best term alone. Two peaks on one variable, or
     two widths of another kind, are the difference of nearly the same, and no law.
@@ -336,7 +336,7 @@ def _best_single(space: Space, chosen: Sequence[Candidate]) -> list[Candidate]:
 
 
 def _best_pairs(space: Space, others: Sequence[Candidate]) -> list[tuple[Candidate, Candidate]]:
-    """The pairs that explain most together beside others, of each two kinds the best."""
+    """Return the pairs that explain most together beside others, of each two kinds the best."""
     basis = basis_of([space.column(one) for one in others])
     x, y = space.columns, without(space.target, basis)
     if basis.size:
@@ -395,7 +395,7 @@ def _pruned(space: Space, chosen: list[Candidate], least: float) -> list[Candida
 
 
 def _ordered(space: Space, chosen: list[Candidate]) -> list[Candidate]:
-    """Each next the one that explains most beside those before it."""
+    """Return each next the one that explains most beside those before it."""
     left, order = list(chosen), []
     while left:
         known = [space.column(one) for one in order]
@@ -413,7 +413,7 @@ class Fit:
     covariance: Matrix | None
 
     def doubtful(self) -> int | None:
-        """The number of the term that stands out least from the learner's own errors, where one does not."""
+        """Return the number of the term that stands out least from the learner's own errors, where one does not."""
         if self.covariance is None or not len(self.coefficients):
             return None
         std = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
@@ -436,7 +436,7 @@ def fit_terms(space: Space, chosen: Sequence[Candidate]) -> Fit:
 
 
 def settled(space: Space, chosen: list[Candidate]) -> tuple[list[Candidate], Fit, bool]:
-    """The terms whose coefficients stand out from the learner's own errors; and whether any other was dropped."""
+    """Return the terms whose coefficients stand out from the learner's own errors; and whether any other was dropped."""
     fit, dropped = fit_terms(space, chosen), False
     while (weak := fit.doubtful()) is not None:
         chosen, dropped = chosen[:weak] + chosen[weak + 1 :], True
@@ -457,7 +457,7 @@ def rivals(space: Space, chosen: Sequence[Candidate], number: int, most: int = 3
 
 
 def alone(space: Space, most: int) -> list[tuple[Candidate, float]]:
-    """The terms that explain most if each is the only one, the best width of each."""
+    """Return the terms that explain most if each is the only one, the best width of each."""
     gains, found = space.gains([]), []
     for i in np.argsort(-gains, kind="stable"):
         candidate = space.candidates[int(i)]

@@ -60,7 +60,7 @@ class NewTerm:
 
 
 def names_for(kinds: Sequence[str], taken: Sequence[str]) -> list[str]:
-    """A parameter's name for each kind of term, none of which is taken."""
+    """Return a parameter's name for each kind of term, none of which is taken."""
     used, names = {*taken, *FUNCTIONS, SAMPLING_TIME, "k"}, []
     for kind in kinds:
         name, number = kind, 1
@@ -73,7 +73,7 @@ def names_for(kinds: Sequence[str], taken: Sequence[str]) -> list[str]:
 
 
 def added_to_baseline(baseline: Baseline, values: Vector, added: Sequence[NewTerm], several: bool) -> Baseline | None:
-    """A baseline with terms, starting from these parameter values; None if it is a function."""
+    """Return a baseline with terms, starting from these parameter values; None if it is a function."""
     if baseline.function is not None:
         return None
     low, high = baseline.bounds
@@ -87,7 +87,7 @@ def added_to_baseline(baseline: Baseline, values: Vector, added: Sequence[NewTer
 
 
 def baseline_lines(added: Sequence[NewTerm], several: bool) -> str:
-    """The terms as tables of a spec."""
+    """Return the terms as tables of a spec."""
     blocks = []
     for one in added:
         entries = {"parameter": one.name, "regressor": one.text, "initial": _short(one.coefficient)}
@@ -106,7 +106,7 @@ class ChangedMotion:
     equations: tuple[tuple[str, str, str], ...]
 
     def lines(self) -> str:
-        """What to change in a spec."""
+        """Return what to change in a spec."""
         blocks = [f"[{table}]\n{key} = {_toml(text)}" for table, key, text in self.equations]
         rows = []
         for one in self.parameters:
@@ -117,7 +117,7 @@ class ChangedMotion:
 
 
 def added_to_motion(motion: Motion, values: Vector, added: Sequence[NewTerm], units: dict[str, str]) -> Any:
-    """A `ChangedMotion` that starts from these parameter values; None if the equations are functions.
+    """Return a `ChangedMotion` that starts from these parameter values; None if the equations are functions.
 
     A term of an equation `(…)/m` goes inside, so that its coefficient is a force. A width becomes a parameter.
     """
@@ -169,7 +169,7 @@ def added_to_motion(motion: Motion, values: Vector, added: Sequence[NewTerm], un
 
 
 def _unit_inside(inner: str, added: NewTerm, units: dict[str, str]) -> str:
-    """The unit of a term's coefficient within a sum; none where the sum's or the term's is not told."""
+    """Return the unit of a term's coefficient within a sum; none where the sum's or the term's is not told."""
     unit = _unit_of_first(inner, units)
     if not unit or added.scale is None:
         return unit
@@ -177,7 +177,7 @@ def _unit_inside(inner: str, added: NewTerm, units: dict[str, str]) -> str:
 
 
 def _unit_of_first(inner: str, units: dict[str, str]) -> str:
-    """The unit of a sum by its first summand, where that is a name with a unit."""
+    """Return the unit of a sum by its first summand, where that is a name with a unit."""
     first = re.match(r"\s*([A-Za-z_]\w*)\s*(?=[-+]|$)", inner)
     return units.get(first[1], "") if first else ""
 
@@ -289,7 +289,7 @@ class Explanation:
 
     @property
     def found(self) -> bool:
-        """Whether there are terms to add."""
+        """Return whether there are terms to add."""
         return bool(self.terms)
 
     def __repr__(self) -> str:
@@ -448,7 +448,7 @@ def _terms(space: Space, chosen: Sequence[Candidate], fitted: Fit) -> tuple[Expl
 
 
 def _scale(kind: str, on: str | None, text: str) -> str:
-    """The expression whose unit a term has."""
+    """Return the expression whose unit a term has."""
     return on if kind in ("dead_zone", "saturation") and on is not None else text
 
 
@@ -459,7 +459,7 @@ def _base_name(candidate: Candidate) -> str:
 def _physics(
     linearization: LearnedLinearization, terms: Sequence[ExplainingTerm], moved: Any
 ) -> tuple[Baseline | Motion | None, str | None]:
-    """The physics with the terms added, and the lines that say so in a spec."""
+    """Return the physics with the terms added, and the lines that say so in a spec."""
     several = len(linearization.places) > 1
     added = [_added(linearization, term) for term in terms]
     if isinstance(linearization.physics, Motion):

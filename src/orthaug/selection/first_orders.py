@@ -83,14 +83,14 @@ def _smallest(
 
 
 def _spread(record: Record) -> Record:
-    """The record, or windows that are spread over it where it is long."""
+    """Return the record, or windows that are spread over it where it is long."""
     if len(record) <= LOOKED_AT:
         return record
     return witness(RecordSource(record, 0), LOOKED_AT)
 
 
 def _delay(record: Record, number: int) -> int | None:
-    """The first lag at which an input acts on any output, beside the output's past and all other lags of the inputs.
+    """Return the first lag at which an input acts on any output, beside the output's past and all other lags of the inputs.
 
     Where rows or excitation do not allow that, by the cross-correlation with the input made white; where none is
     significant, by that of the input's square.
@@ -175,7 +175,7 @@ def _rows(e: Experiment, j: int, orders: Orders, first: int) -> Matrix:
 
 
 def _free_run(e: Experiment, j: int, theta: np.ndarray, orders: Orders, first: int) -> np.ndarray:
-    """The output from its first measured rows on."""
+    """Return the output from its first measured rows on."""
     from scipy.signal import lfilter, lfiltic
 
     driven = _rows(e, j, orders, first)[:, orders.na :] @ theta[orders.na :]

@@ -46,7 +46,7 @@ class Shift:
 
     @property
     def moved(self) -> bool:
-        """Whether the parameter moves by more than its standard errors allow."""
+        """Return whether the parameter moves by more than its standard errors allow."""
         return self.times is None or self.times > 1
 
     def __str__(self) -> str:

@@ -78,13 +78,13 @@ class LearnedLinearization:
     outside: float
 
     def column(self, expression: Expression, place: int) -> Vector:
-        """A term with coefficient 1, whitened, all points and places below each other (M·nl,)."""
+        """Return a term with coefficient 1, whitened, all points and places below each other (M·nl,)."""
         with np.errstate(all="ignore"):
             values = np.broadcast_to(np.asarray(self.evaluate(expression), dtype=float), (len(self.target),))
         return (values[:, None] * self.weight[:, place]).ravel()
 
     def fitted(self, columns: Float[np.ndarray, "P *k"]) -> np.ndarray:
-        """What columns over the points do to what was fitted (R, …)."""
+        """Return what columns over the points do to what was fitted (R, …)."""
         return columns if self.response is None else self.response.forward(columns)
 
     @property
@@ -94,7 +94,7 @@ class LearnedLinearization:
 
 
 def linearization_of(model: Model | MotionModel, record: Record) -> LearnedLinearization:
-    """The learner of a model over a record.
+    """Return the learner of a model over a record.
 
     Raises:
         InputError: a model without a learner, other channels, too few rows, or none with a value.
@@ -230,7 +230,7 @@ class MotionResponse:
         return found.reshape(-1, terms.shape[2])
 
     def adjoint(self, values: Float[np.ndarray, "R k"]) -> Float[np.ndarray, "M n k"]:
-        """The transpose of `forward`."""
+        """Return the transpose of `forward`."""
         count, nx, _ = self.steps.shape
         w = values.reshape(count, -1, values.shape[1])
         direct = np.einsum("oi,mok->mik", self.weight, w)
@@ -248,7 +248,7 @@ class MotionResponse:
         return np.concatenate([found, direct], axis=1)
 
     def starts(self) -> Float[np.ndarray, "R s"]:
-        """What the states at the begin of each segment do."""
+        """Return what the states at the begin of each segment do."""
         count, nx, _ = self.steps.shape
         places = np.flatnonzero(self.begins)
         found = np.zeros((count, self.outputs.shape[1], nx * len(places)))
@@ -286,7 +286,7 @@ class Response:
         return found[:, 0] if single else found
 
     def adjoint(self, values: Float[np.ndarray, "R k"]) -> Float[np.ndarray, "P k"]:
-        """The transpose."""
+        """Return the transpose."""
         return _stacked(self.linear.adjoint(values)[:, list(self.learned)])
 
 
@@ -318,7 +318,7 @@ class _Run(NamedTuple):
 
 
 def _stacked(values: Float[np.ndarray, "M n *k"]) -> np.ndarray:
-    """All points and places below each other."""
+    """Return all points and places below each other."""
     return values.reshape(values.shape[0] * values.shape[1], *values.shape[2:])
 
 
@@ -332,7 +332,7 @@ def _places(model: MotionModel) -> tuple[tuple[str, str], ...]:
 
 
 def _moved(motion: Motion, q: Vector, along: Vector, x: Matrix, u: Matrix) -> Vector:
-    """The parameters after a step of their coordinates q (np,), along a line of the parameters themselves.
+    """Return the parameters after a step of their coordinates q (np,), along a line of the parameters themselves.
 
     A step of logarithms where that would end at a zero that the equations divide by.
     """
@@ -345,7 +345,7 @@ def _moved(motion: Motion, q: Vector, along: Vector, x: Matrix, u: Matrix) -> Ve
 
 
 def _rates_of_change(outputs: Sequence[str], seen: Sequence[str]) -> list[str]:
-    """The velocity of each output of which the learner sees two lags, one after the other."""
+    """Return the velocity of each output of which the learner sees two lags, one after the other."""
     found = []
     for name in outputs:
         lags = [lag for lag in range(1, len(seen) + 2) if f"{name}[k-{lag}]" in seen]
@@ -363,7 +363,7 @@ def _beyond(model: Any, z: Matrix) -> float:
 
 
 def _tangent(model: Any, z: Matrix, weight: Matrix, response: Response | None) -> Tangent | None:
-    """The learner's derivatives at its features z (M, nz)."""
+    """Return the learner's derivatives at its features z (M, nz)."""
     bound, numbers, statistics = model.form.bound, model.numbers, model.statistics
     if not bound.differentiable or numbers.tilt is not None or not 0 < bound.size <= MOST_WEIGHTS:
         return None

@@ -46,7 +46,7 @@ class Nonlinearity:
 
     @property
     def found(self) -> bool:
-        """Whether something nonlinear is missing, at the level of 5 %."""
+        """Return whether something nonlinear is missing, at the level of 5 %."""
         return self.p < LEVEL
 
     @property

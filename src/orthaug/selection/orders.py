@@ -43,7 +43,7 @@ class Orders:
         return self.na + sum(self.nb)
 
     def smaller(self, least: Orders) -> Iterator[Orders]:
-        """One lag less: the oldest output, the oldest or the newest of an input; or an output and an input at once."""
+        """Yield one lag less: the oldest output, the oldest or the newest of an input; or an output and an input at once."""
         shorter = [replace(self, na=self.na - 1)] if self.na > least.na else []
         yield from shorter
         for base in (self, *shorter):
@@ -175,7 +175,7 @@ def _shrink(found: dict[Orders, PathModel], judge: Callable[[Iterable[Orders]], 
 
 
 def correlated_delay(record: Record, number: int, most: int, *, squared: bool = False) -> int | None:
-    """The first lag at which an input, made white, acts on the output; None where none is significant.
+    """Return the first lag at which an input, made white, acts on the output; None where none is significant.
 
     Both signals go through the filter that makes the input white (Box and Jenkins); a lag counts from 1.96/√N on, for
     all `most` lags together.

@@ -177,13 +177,13 @@ class Selection:
 
     @property
     def options(self) -> dict[str, Any]:
-        """What `estimate` is to be called with, beside record and baseline."""
+        """Return what `estimate` is to be called with, beside record and baseline."""
         judged = {"regularization": "none", "fallback": False} if isinstance(self.learner, Terms) else {}
         lags = None if isinstance(self.learner, Terms | None) else self.lags
         return {"learner": self.learner, "lags": lags, "criterion": self.criterion} | judged
 
     def estimate(self, **options: Any) -> Estimate:
-        """The fit of the choice; `options` of `estimate` beside it."""
+        """Return the fit of the choice; `options` of `estimate` beside it."""
         return estimate(self.record, self.baseline, **(self.options | options))
 
     @property
@@ -222,7 +222,7 @@ class Selection:
         return stages
 
     def summary(self) -> str:
-        """A page of text."""
+        """Return a page of text."""
         lines = [f"orders      {self.orders.chosen}"]
         lines += [f"delay       {delay}" for delay in self.delays]
         if self.nonlinearity is not None:
@@ -377,7 +377,7 @@ def _reached(chosen: Orders, asked: Orders, tested: Nonlinearity | None, names: 
 def _terms(
     problem: Problem, learner: Terms, largest: Orders, criterion: Criterion, collinear: float
 ) -> tuple[TermRuns, list[Warning]]:
-    """The library of terms laid out, and what is to be told of it."""
+    """Return the library of terms laid out, and what is to be told of it."""
     outputs, inputs = problem.outputs, tuple(channel.name for channel in problem.record.inputs)
     lags = Lags(largest.na, largest.nb, largest.nk).layout(outputs, inputs)
     known = regressor_of(problem.baseline, None, None, outputs, inputs)[0]
@@ -392,7 +392,7 @@ def _terms(
 
 
 def _reach(problem: Problem, lags: Lags | None) -> tuple[Orders, Orders]:
-    """The largest orders that are looked at, and those that the physics reads already."""
+    """Return the largest orders that are looked at, and those that the physics reads already."""
     output, inputs = problem.outputs[0], [channel.name for channel in problem.record.inputs]
     read: dict[str, list[int]] = {name: [] for name in (output, *inputs)}
     for lag in problem.baseline.lags:

@@ -75,7 +75,7 @@ class RankedModel:
 
 
 def judge_all(rungs: Sequence[PathModel], terms: bool = True) -> tuple[RankedModel, ...]:
-    """Every model beside the best, block by block in pairs; the choice is the smallest that is as good.
+    """Return every model beside the best, block by block in pairs; the choice is the smallest that is as good.
 
     Args:
         terms: whether a model that has any may be chosen.
@@ -102,7 +102,7 @@ class Search:
     rungs: tuple[PathModel, ...]
 
     def judged(self) -> tuple[RankedModel, ...]:
-        """Every model beside the best."""
+        """Return every model beside the best."""
         return judge_all(self.rungs)
 
     @property
@@ -126,7 +126,7 @@ class Blocks:
         self.given = runs, self.folds
 
     def along(self, points: Sequence[Point | None], count: int, able: Able) -> tuple[list[Point], Vector]:
-        """The path anew without each block, by as many terms; and the mean squared errors on the blocks."""
+        """Return the path anew without each block, by as many terms; and the mean squared errors on the blocks."""
         items = [(i, point, count, able) for i, point in enumerate(points)]
         points, errors = zip(*self.runner.map(_along, self.given, items), strict=True)
         return list(points), np.array(errors)
@@ -140,7 +140,7 @@ class Blocks:
             yield np.array(errors), sum(seconds)
 
     def fitted(self, choices: Sequence[Sequence[int]]) -> Iterator[tuple[Point, Vector, float]]:
-        """Each choice fitted to all of the record and judged; and what it took [s]."""
+        """Yield each choice fitted to all of the record and judged; and what it took [s]."""
         points = list(self.runner.map(_on_all, self.given, choices))
         judged = self.judge([point for point, _ in points])
         for (point, fitting), (held, judging) in zip(points, judged, strict=True):
@@ -163,7 +163,7 @@ def _on_all(given: _Given, chosen: Sequence[int], tell: Callable[..., None]) -> 
 
 
 def _on_fold(given: _Given, item: tuple[Point, int], tell: Callable[..., None]) -> tuple[float, float]:
-    """The mean squared error on a block of a model that is fitted without it; and what it took [s]."""
+    """Return the mean squared error on a block of a model that is fitted without it; and what it took [s]."""
     began, (point, number) = time.monotonic(), item
     runs, held = given[1][number]
     own = point._replace(states=None if runs.layout is None else np.asarray(runs.layout.start))
@@ -231,7 +231,7 @@ def climb(
     near: Sequence[Collection[Lag]] = (),
     linear: Sequence[str] = (),
 ) -> TermPath:
-    """The path of up to `most` terms forward, and from the best model on backward.
+    """Return the path of up to `most` terms forward, and from the best model on backward.
 
     Args:
         near: lags whose terms have a way forward of their own, before the one that has all.
@@ -280,7 +280,7 @@ def climb(
 
 
 def _ways(runs: TermRuns, near: Sequence[Collection[Lag]]) -> tuple[tuple[int, ...], ...]:
-    """The terms of some lags by number, where these are some and not all, nor those of the lags before."""
+    """Return the terms of some lags by number, where these are some and not all, nor those of the lags before."""
     own = [tuple(i for i, lags in enumerate(runs.lags) if lags <= frozenset(given)) for given in near if given]
     return tuple(able for able in dict.fromkeys(own) if 0 < len(able) < len(runs.library))
 
@@ -293,7 +293,7 @@ def _given(runs: TermRuns, alone: Point, linear: Sequence[str]) -> tuple[int, ..
 
 
 def steps(most: int) -> int:
-    """How many models are judged at most before terms go: physics alone, three ways forward, the choice picked anew."""
+    """Return how many models are judged at most before terms go: physics alone, three ways forward, the choice picked anew."""
     count, size = 0, 0
     while size < most:
         count, size = count + 1, size + _added_to(size)
@@ -301,7 +301,7 @@ def steps(most: int) -> int:
 
 
 def _added_to(size: int) -> int:
-    """How many terms are added at once to a model of so many."""
+    """Return how many terms are added at once to a model of so many."""
     return 1 if size < _ONE_BY_ONE else max(1, size // 8)
 
 
@@ -359,7 +359,7 @@ def _refitted(runs: TermRuns, point: Point, equations: Equations, chosen: tuple[
 
 
 def _confirmed(folds: Blocks, size: int, able: Able) -> bool:
-    """Whether up to `size` terms beat physics alone on blocks without which they were picked."""
+    """Return whether up to `size` terms beat physics alone on blocks without which they were picked."""
     points: Sequence[Point | None] = [None] * len(folds.folds)
     rungs: list[PathModel] = []
     while size and (not rungs or rungs[-1].size < size):
@@ -373,7 +373,7 @@ def _confirmed(folds: Blocks, size: int, able: Able) -> bool:
 
 
 def _beyond_doubt(alone: Vector, held: Vector) -> bool:
-    """Whether physics alone is so much worse than a model that larger models need not be asked."""
+    """Return whether physics alone is so much worse than a model that larger models need not be asked."""
     worse = alone - held
     if not np.isfinite(held).all() or not np.isfinite(alone).all():
         return False

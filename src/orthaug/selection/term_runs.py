@@ -57,7 +57,7 @@ class Menu(Lagged):
         return len(self.baseline.names) + self.width
 
     def numbers(self, theta: Any, products: Any, weights: Any, sizes: Any) -> Numbers:
-        """The model's numbers, of coefficients (width,) of terms of the factors divided by their `sizes`."""
+        """Return the model's numbers, of coefficients (width,) of terms of the factors divided by their `sizes`."""
         pair = (np.asarray(products), np.asarray(weights, dtype=float))
         return Numbers(np.asarray(theta), np.zeros(len(theta)), pair, np.zeros(len(sizes)), sizes, np.ones(1))
 
@@ -70,7 +70,7 @@ class Menu(Lagged):
         return self._with_slopes(numbers, x)[0]
 
     def _with_slopes(self, numbers: Numbers, x: Any) -> tuple[Parts, Any]:
-        """The prediction at x in parts, and ∂ŷ/∂(c, w) (1, n): it is linear in both."""
+        """Return the prediction at x in parts, and ∂ŷ/∂(c, w) (1, n): it is linear in both."""
         phi = self.baseline.phi(x, self.layout, self.outputs, jnp)
         known = self.baseline.known(x, self.layout, self.outputs, jnp)
         terms = self.terms(numbers, x)[None, :]
@@ -153,7 +153,7 @@ class TermRuns:
 
     @property
     def free_run(self) -> Simulation:
-        """How the free run is laid out, where held-out blocks are flown too."""
+        """Return how the free run is laid out, where held-out blocks are flown too."""
         return self.criterion.free_run or Simulation()
 
     @cached_property
@@ -167,7 +167,7 @@ class TermRuns:
         return next((n for n in narrow if count <= n), _PLACES * max(1, -(-count // _PLACES)))
 
     def factors(self, experiment: Any) -> Float[np.ndarray, "nf T"]:
-        """The factors along an experiment, over their sizes."""
+        """Return the factors along an experiment, over their sizes."""
         x = self.menu.regressors(experiment, self.problem.record)
         with np.errstate(all="ignore"):
             return np.asarray(self.menu.features.evaluate(x, self.menu.layout, np)).T / self.sizes[:, None]
@@ -233,7 +233,7 @@ class TermRuns:
         return objective.samples(objective.evaluate(p, Start(point.states)))[1]
 
     def equations(self, point: Point, able: Able = None, scored: Any = None) -> Equations:
-        """The normal equations of physics and all terms about a point, for p itself: its chosen terms are in the error.
+        """Return the normal equations of physics and all terms about a point, for p itself: its chosen terms are in the error.
 
         Args:
             able: terms that may be chosen, beside those that are; the columns of others are zero.

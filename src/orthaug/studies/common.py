@@ -84,7 +84,7 @@ class Finding(NamedTuple):
 
     @property
     def beyond(self) -> bool:
-        """Whether there is nothing to compare with, so that the row is neither met nor missed."""
+        """Return whether there is nothing to compare with, so that the row is neither met nor missed."""
         return self.as_published is None and self.as_scripts is None
 
 
@@ -139,7 +139,7 @@ def trained(
     iterations: int = 300,
     regularization: str = "none",
 ) -> Estimate:
-    """One fit of an example by a pipeline; `which` names the paper's iterations.
+    """Return one fit of an example by a pipeline; `which` names the paper's iterations.
 
     Args:
         pipeline: "ours", Levenberg-Marquardt with `iterations` and `regularization`; "paper", Adam and L-BFGS on
@@ -153,7 +153,7 @@ def trained(
 
 
 def drawn(data_set: int, *, samples: int = 1024, draw: int = 0, noise: bool = False) -> Example:
-    """The static example's training record drawn anew; `draw` 0 is the paper's own, as `synthetic.static` has it."""
+    """Return the static example's training record drawn anew; `draw` 0 is the paper's own, as `synthetic.static` has it."""
     example = static(data_set, noise=noise, samples=samples)
     if not draw:
         return example
@@ -165,19 +165,19 @@ def drawn(data_set: int, *, samples: int = 1024, draw: int = 0, noise: bool = Fa
 
 
 def rows_of(table: pd.DataFrame, **values: Any) -> pd.DataFrame:
-    """The rows of a table that have these values in the columns of these names, in the table's order."""
+    """Return the rows of a table that have these values in the columns of these names, in the table's order."""
     for column, value in values.items():
         table = table.loc[table[column] == value]
     return table
 
 
 def mean_errors(rows: pd.DataFrame) -> pd.DataFrame:
-    """The mean error of θ per number of samples."""
+    """Return the mean error of θ per number of samples."""
     return rows.groupby("samples").theta_error.mean().reset_index()
 
 
 def slope(samples: Any, errors: Any) -> float:
-    """The exponent p of errors ∝ Nᵖ, by least squares over logarithms."""
+    """Return the exponent p of errors ∝ Nᵖ, by least squares over logarithms."""
     return float(np.polyfit(np.log(np.asarray(samples, dtype=float)), np.log(np.asarray(errors, dtype=float)), 1)[0])
 
 
@@ -246,12 +246,12 @@ def scripts_bars(axis: Axes, x: Any, spreads: Sequence[Spread], name: str, **sty
 
 
 def signed(exponent: float) -> str:
-    """Two decimals with a true minus."""
+    """Return two decimals with a true minus."""
     return f"{exponent:.2f}".replace("-", "−")
 
 
 def agreement(values: Any) -> str:
-    """How far rows of values, one per start, lie apart."""
+    """Return how far rows of values, one per start, lie apart."""
     apart = float(np.ptp(np.asarray(values, dtype=float), axis=0).max())
     return f"starts agree within {apart:.1g}" if apart else "the same number for every start"
 

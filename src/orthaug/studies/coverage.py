@@ -34,7 +34,7 @@ def _noiseless(data_set: int) -> Estimate:
 
 
 def one(data_set: int, draw: int) -> dict[str, Any]:
-    """One draw of the noise, trained on from the noiseless fit: does each interval hold the true θ?"""
+    """Return one draw of the noise, trained on from the noiseless fit: does each interval hold the true θ?"""
     example, start = static(data_set), _noiseless(data_set)
     inputs, clean = example.train.experiments[0].inputs, example.train.experiments[0].outputs
     assert clean is not None
@@ -57,7 +57,7 @@ def one(data_set: int, draw: int) -> dict[str, Any]:
 
 
 def study(pipeline: str, small: bool) -> Study:
-    """Data sets × draws of the noise; intervals belong to a converged fit, so all pipelines share these runs."""
+    """Return data sets × draws of the noise; intervals belong to a converged fit, so all pipelines share these runs."""
     return Study("coverage", one, {"data_set": (1, 3), "draw": range(8 if small else 400)})
 
 

@@ -101,7 +101,7 @@ def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
 
 
 def findings(table: pd.DataFrame) -> list[Finding]:
-    """The two trends, and what the uniform measure makes of them. The paper's own record is in `static_errors`."""
+    """Return the two trends, and what the uniform measure makes of them. The paper's own record is in `static_errors`."""
     compared = []
     two, three = (mean_errors(rows_of(table, data_set=data_set, measure="training")) for data_set in (2, 3))
     rate = slope(two.samples, two.theta_error)

@@ -100,7 +100,7 @@ def _adam(start: Any, data: Data, bound: Bound, projects: bool, iterations: int)
 
 
 def train(example: Example, structure: Structure, iterations: tuple[int, int], seed: int) -> Estimate:
-    """One run of the published scripts on one of their examples.
+    """Return one run of the published scripts on one of their examples.
 
     Args:
         iterations: of Adam, and evaluations of L-BFGS-B.
@@ -128,7 +128,7 @@ def train(example: Example, structure: Structure, iterations: tuple[int, int], s
 
 
 def _run(task: OneStepTask, w: Any, iterations: int, converged: bool, seconds: float) -> TrainingRun:
-    """What the statistics need of a run that ended at `w`."""
+    """Return what the statistics need of a run that ended at `w`."""
     assert task.bound is not None
     nt = len(task.problem.baseline.names)
     hold = Hold(jnp.zeros((nt, nt)), jnp.zeros(nt))

@@ -37,7 +37,7 @@ class Spread(NamedTuple):
         return Spread(factor * self.mean, factor * self.low, factor * self.high, self.runs)
 
     def beside(self, values: Any, *, smaller_is_better: bool = False) -> tuple[bool, str]:
-        """Whether the mean of our runs lies between the smallest and the largest of theirs, and that in words.
+        """Return whether the mean of our runs lies between the smallest and the largest of theirs, and that in words.
 
         Three digits count, as they are shown.
 
@@ -77,7 +77,7 @@ def mass_spring_damper(structure: str, weight: float, quantity: str) -> Spread |
 
 
 def seconds(example: str) -> tuple[float, float]:
-    """The shortest and the longest run of an example, compilation included."""
+    """Return the shortest and the longest run of an example, compilation included."""
     spreads = [_spread(row, "seconds") for row in _tables()[example].values()]
     return min(spread.low for spread in spreads), max(spread.high for spread in spreads)
 

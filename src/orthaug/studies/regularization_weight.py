@@ -47,7 +47,7 @@ ITERATIONS = 3000  # at most, of Levenberg-Marquardt: training ends by its toler
 
 
 def one(structure: str, weight: float, seed: int, pipeline: str) -> dict[str, Any]:
-    """One start: θ, its relative error, test RMSE one step ahead and in free run [mm]."""
+    """Return one start: θ, its relative error, test RMSE one step ahead and in free run [mm]."""
     example = mass_spring_damper()
     chosen = Orthogonal() if structure == "orthogonal" else PENALTIES[structure](weight) if weight else Additive()
     options = {"structure": chosen, "seed": seed, "iterations": ITERATIONS}
@@ -89,7 +89,7 @@ def study(pipeline: str, small: bool) -> Study:
 
 
 def _of(table: pd.DataFrame, structure: str, weight: float | None = None) -> pd.DataFrame:
-    """A structure's rows; those of the weight 0 belong to both penalties."""
+    """Return a structure's rows; those of the weight 0 belong to both penalties."""
     kept = table.structure == structure
     if structure == "baseline-penalty":
         kept |= (table.structure == "orthogonal-penalty") & (table.weight == 0)
@@ -146,7 +146,7 @@ def _panel(axis: Axes, table: pd.DataFrame, quantity: str) -> None:
 
 
 def _scripts(structure: str, weight: float, quantity: str) -> references.Spread | None:
-    """What the scripts gave, in the units of our columns; they have no free run."""
+    """Return what the scripts gave, in the units of our columns; they have no free run."""
     if quantity == "theta_error":
         return references.mass_spring_damper(structure, weight, "theta_error")
     rmse = references.mass_spring_damper(structure, weight, "test_rmse") if quantity == "one_step" else None
@@ -154,7 +154,7 @@ def _scripts(structure: str, weight: float, quantity: str) -> references.Spread 
 
 
 def findings(table: pd.DataFrame) -> list[Finding]:
-    """The paper's trends, and both errors beside the scripts' at every weight that they ran."""
+    """Return the paper's trends, and both errors beside the scripts' at every weight that they ran."""
     own = _of(table, "orthogonal")
     compared = []
     for quantity, label in (("theta_error", "relative error of θ"), ("one_step", "one-step test RMSE [mm]")):
@@ -192,7 +192,7 @@ def _ends(table: pd.DataFrame) -> list[Finding]:
 
 
 def _prices(table: pd.DataFrame) -> list[Finding]:
-    """What a penalty costs in test RMSE, which is "slightly reduced" accuracy in the paper."""
+    """Return what a penalty costs in test RMSE, which is "slightly reduced" accuracy in the paper."""
     own = float(_of(table, "orthogonal").one_step.mean())
     means = {structure: _of(table, structure).groupby("weight").one_step.mean() for structure in PENALTIES}
     ratios = means["orthogonal-penalty"].drop(0.0) / own

@@ -62,7 +62,7 @@ class StudyOutcome:
 
 
 def catalogue() -> dict[str, Reproduction]:
-    """The paper's figures and tables, one file each, in its order."""
+    """Return the paper's figures and tables, one file each, in its order."""
     modules: list[Any] = [
         static_errors,
         data_length,
@@ -77,7 +77,7 @@ def catalogue() -> dict[str, Reproduction]:
 
 
 def chosen(name: str | None) -> list[Reproduction]:
-    """The studies to run: one by name, or all.
+    """Return the studies to run: one by name, or all.
 
     Raises:
         InputError: no study of that name.
@@ -145,7 +145,7 @@ def write(reproduced: Sequence[StudyOutcome], folder: Path, pipeline: str, *, fo
 
 
 def as_rows(reproduced: Sequence[StudyOutcome]) -> list[dict[str, Any]]:
-    """The findings as plain rows, each with its study."""
+    """Return the findings as plain rows, each with its study."""
     return [{"study": study.entry.name, **finding._asdict()} for study in reproduced for finding in study.findings]
 
 
@@ -154,7 +154,7 @@ def _counts(reproduced: Sequence[StudyOutcome]) -> Counts:
 
 
 def when(done: Sequence[Run]) -> str:
-    """How many runs were made now and how many came from a store, when those were made, and their seconds."""
+    """Return how many runs were made now and how many came from a store, when those were made, and their seconds."""
     parts = []
     for stored in (False, True):
         some = [run for run in done if run.stored is stored]
@@ -167,7 +167,7 @@ def when(done: Sequence[Run]) -> str:
 
 
 def text(reproduced: Sequence[StudyOutcome]) -> str:
-    """A table per study, in lines for a terminal, and what is met."""
+    """Return a table per study, in lines for a terminal, and what is met."""
     from rich import box
     from rich.console import Console
     from rich.table import Table

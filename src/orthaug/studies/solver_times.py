@@ -34,7 +34,7 @@ NOISY = 1.25  # the slowest over the fastest start, per iteration, from which a 
 
 
 def declared(name: str, example: str, share: float) -> Any:
-    """A solver with a share of its iterations: the paper's numbers for gradient solvers, 300 for ours."""
+    """Return a solver with a share of its iterations: the paper's numbers for gradient solvers, 300 for ours."""
     adam, lbfgs = PIPELINES[example]
     total = adam + lbfgs
     if name == "levenberg-marquardt":
@@ -44,7 +44,7 @@ def declared(name: str, example: str, share: float) -> Any:
 
 
 def one(example: str, solver: str, share: float, seed: int) -> dict[str, Any]:
-    """A run's seconds and mean squared error; run once before, so that nothing is compiled in it."""
+    """Return a run's seconds and mean squared error; run once before, so that nothing is compiled in it."""
     given = static(1) if example == "static" else mass_spring_damper()
     task = OneStepTask.of(pose(given.train, given.baseline), MLP())
     assert task.bound is not None
@@ -100,7 +100,7 @@ def _line(axis: Axes, rows: pd.DataFrame, label: str, colour: str, marker: str) 
 
 
 def findings(table: pd.DataFrame) -> list[Finding]:
-    """Each solver at its full length, medians over starts; a time that differs from start to start is marked."""
+    """Return each solver at its full length, medians over starts; a time that differs from start to start is marked."""
     compared = []
     full = rows_of(table, share=table.share.max())
     full = full.assign(error=np.sqrt(full.loss), each=full.seconds / full.iterations)

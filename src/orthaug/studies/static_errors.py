@@ -40,7 +40,7 @@ GRID = np.linspace(-1.0, 1.0, 81)  # inputs at which the learner is drawn
 
 
 def one(data_set: int, structure: str, seed: int, pipeline: str) -> dict[str, Any]:
-    """One start: θ, its error, the test RMSE; θ under the uniform measure; the learner on a grid of inputs."""
+    """Return one start: θ, its error, the test RMSE; θ under the uniform measure; the learner on a grid of inputs."""
     example = static(data_set)
     fit = trained(example, "static", pipeline, structure=STRUCTURES[structure], seed=seed)
     uniform = fit.split(UNIFORM)
@@ -58,7 +58,7 @@ def one(data_set: int, structure: str, seed: int, pipeline: str) -> dict[str, An
 
 
 def study(pipeline: str, small: bool) -> Study:
-    """Data sets × structures × starts; the gradient pipelines train θ of the additive structure from θ⁰ anyway."""
+    """Return data sets × structures × starts; the gradient pipelines train θ of the additive structure from θ⁰ anyway."""
     seeds = range(2) if small else range(10)
     structures = tuple(STRUCTURES if pipeline == "ours" else common.STRUCTURES)
     grid = {"data_set": (1, 2, 3), "structure": structures, "seed": tuple(seeds), "pipeline": (pipeline,)}
@@ -94,7 +94,7 @@ def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
 
 
 def _shown(table: pd.DataFrame) -> list[str]:
-    """The structures of the table, in the order in which they are drawn."""
+    """Return the structures of the table, in the order in which they are drawn."""
     return [name for name in ("additive", "additive-initial", "orthogonal") if (table.structure == name).any()]
 
 
@@ -108,7 +108,7 @@ def _label(structure: str, table: pd.DataFrame) -> str:
 
 
 def _of_scripts(structure: str, table: pd.DataFrame) -> str | None:
-    """What the scripts call it. Their additive structure is the one from θ⁰; with θ eliminated they have none."""
+    """Return what the scripts call it. Their additive structure is the one from θ⁰; with θ eliminated they have none."""
     if structure == "orthogonal":
         return structure
     return None if structure == "additive" and _both(table) else "additive"
@@ -183,7 +183,7 @@ def _learner(table: pd.DataFrame) -> Figure:
 
 
 def findings(table: pd.DataFrame) -> list[Finding]:
-    """Both errors of every data set and structure beside the scripts', and what the paper says about them."""
+    """Return both errors of every data set and structure beside the scripts', and what the paper says about them."""
     compared = []
     for data_set in (1, 2, 3):
         for structure in reversed(_shown(table)):

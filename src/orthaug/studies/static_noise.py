@@ -36,7 +36,7 @@ TEST_SAMPLES = 1024
 
 
 def one(structure: str, regularization: str, seed: int, pipeline: str) -> dict[str, Any]:
-    """One start: θ and its error, test RMSE, effective weights; "stopping" is after 50 iterations."""
+    """Return one start: θ and its error, test RMSE, effective weights; "stopping" is after 50 iterations."""
     example, stopped = static(1, noise=True), regularization == "stopping"
     prior, iterations = ("none", 50) if stopped else (regularization, 300)
     # as the scripts train it; evidence needs a θ that is solved
@@ -95,7 +95,7 @@ def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
 
 
 def findings(table: pd.DataFrame) -> list[Finding]:
-    """The table's four numbers from the fits as published, without regularization; what regularization changes."""
+    """Return the table's four numbers from the fits as published, without regularization; what regularization changes."""
     compared = []
     plain = rows_of(table, regularization="none")
     for structure in ("additive", "orthogonal"):
@@ -123,7 +123,7 @@ def _scripts(structure: str) -> dict[str, references.Spread]:
 
 
 def _beside_printed(values: pd.Series, printed: float) -> tuple[bool, str]:
-    """Whether a printed mean is one that our starts could have, and that in words."""
+    """Return whether a printed mean is one that our starts could have, and that in words."""
     ours = float(values.mean())
     if values.min() <= printed <= values.max():
         return True, "the printed number is within our starts"
@@ -154,7 +154,7 @@ def _theta_finding(rows: pd.DataFrame, structure: str) -> Finding:
 
 
 def _regularized(table: pd.DataFrame, kind: str) -> list[Finding]:
-    """What a regularization makes of the errors without any; one row where both structures predict the same."""
+    """Return what a regularization makes of the errors without any; one row where both structures predict the same."""
     own = {structure: rows_of(table, structure=structure) for structure in ("additive", "orthogonal")}
     alike = bool(np.allclose(own["additive"].test_rmse, own["orthogonal"].test_rmse, rtol=1e-6))
     compared = []

@@ -55,13 +55,13 @@ class Study:
     workers: int | None = None
 
     def cases(self) -> list[Case]:
-        """Every combination that runs, as keyword arguments of plain values."""
+        """Return every combination that runs, as keyword arguments of plain values."""
         axes = [[_value(self, axis, value) for value in values] for axis, values in self.grid.items()]
         combinations = (dict(zip(self.grid, values, strict=True)) for values in product(*axes))
         return [case for case in combinations if self.where is None or self.where(**case)]
 
     def key(self, case: Case) -> str:
-        """The key of a stored result: a hash of study, version, arguments, function and this package's code."""
+        """Return the key of a stored result: a hash of study, version, arguments, function and this package's code."""
         declared = {"study": self.name, "version": self.version, "case": case, "code": _text(self.one)}
         declared["orthaug"] = _sources()
         return hashlib.sha256(json.dumps(declared, sort_keys=True).encode()).hexdigest()[:24]
@@ -86,7 +86,7 @@ class Run:
 
 @cache
 def _sources() -> str:
-    """A digest of this package's code: results of older code do not count."""
+    """Return a digest of this package's code: results of older code do not count."""
     digest = hashlib.sha256()
     for path in sorted(Path(__file__).parents[1].rglob("*.py")):
         digest.update(path.read_bytes())
@@ -122,7 +122,7 @@ def run(
 
 
 def as_table(done: Sequence[Run]) -> pd.DataFrame:
-    """A row per run, axes first. It does not tell stored results from those made now."""
+    """Return a row per run, axes first. It does not tell stored results from those made now."""
     import pandas as pd
 
     return pd.DataFrame([{**run.case, **run.result} for run in done])
@@ -172,7 +172,7 @@ def _path(store: Path, study: Study, case: Case) -> Path:
 
 
 def _read(store: Path | None, study: Study, case: Case) -> Run | None:
-    """A stored result; None where there is none, or where it was cut or altered."""
+    """Return a stored result; None where there is none, or where it was cut or altered."""
     if store is None:
         return None
     try:
@@ -185,7 +185,7 @@ def _read(store: Path | None, study: Study, case: Case) -> Run | None:
 
 
 def _checksum(study: Study, case: Case, content: dict[str, Any]) -> str:
-    """A digest of a record and the case it belongs to."""
+    """Return a digest of a record and the case it belongs to."""
     written = json.dumps([study.key(case), content], sort_keys=True, allow_nan=False)
     return hashlib.sha256(written.encode()).hexdigest()
 
@@ -209,7 +209,7 @@ def _plain(study: Study, result: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _value(study: Study, key: str, value: Any) -> Any:
-    """The value as JSON has it; None for a number that is not finite."""
+    """Return the value as JSON has it; None for a number that is not finite."""
     if hasattr(value, "tolist"):
         value = value.tolist()
     if isinstance(value, list | tuple):

@@ -76,7 +76,7 @@ class MassSpringDamper:
         return np.array([2 * self.m - self.cd * ts, -self.m, ts**2]) / gamma
 
     def friction(self, velocity: np.ndarray | float) -> np.ndarray | float:
-        """The Stribeck curve [N] of a velocity [m/s]."""
+        """Return the Stribeck curve [N] of a velocity [m/s]."""
         decay = np.exp(-np.abs(velocity) / self.stribeck)
         return (self.coulomb + (self.static - self.coulomb) * decay) * np.sign(velocity)
 

@@ -119,7 +119,7 @@ async def _refuse(scope: Scope, send: Send) -> None:
 
 
 def _with_headers(send: Send) -> Send:
-    """Every answer says that it is for this page alone; what an answer says itself stands."""
+    """Return every answer says that it is for this page alone; what an answer says itself stands."""
 
     async def sending(message: Message) -> None:
         if message["type"] == "http.response.start":

@@ -57,7 +57,7 @@ class Command:
 
     @property
     def running(self) -> bool:
-        """Whether it has not ended yet."""
+        """Return whether it has not ended yet."""
         return self.code is None
 
     @property
@@ -67,7 +67,7 @@ class Command:
 
     @property
     def complaint(self) -> str:
-        """What it said last where it failed."""
+        """Return what it said last where it failed."""
         told = [line for line in self.lines if line.strip()]
         known = [line for line in told if line.startswith(("error:", "training failed:", "interrupted"))]
         last = (known or ["it ended without a word; is there enough memory?"])[-1]
@@ -84,7 +84,7 @@ class Command:
         self.changed()
 
     async def _followed(self) -> int:
-        """The code that it ended with."""
+        """Return the code that it ended with."""
         program = [sys.executable, "-m", "orthaug.commands.app.child", *self.arguments]
         self.process = await asyncio.create_subprocess_exec(
             *program,
@@ -151,7 +151,7 @@ class WorkerPool:
         self._room = asyncio.Semaphore(_AT_ONCE)
 
     async def ask(self, question: str, **given: Any) -> dict[str, Any]:
-        """The answer of a worker. A caller that is cancelled ends the worker.
+        """Return the answer of a worker. A caller that is cancelled ends the worker.
 
         Raises:
             InputError: what the question is refused with.

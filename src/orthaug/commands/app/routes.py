@@ -129,7 +129,7 @@ class Page:
 
 
 def application(sessions: Sessions, spec: Path | None) -> FastAPI:
-    """All routes, with the pages of NiceGUI behind them."""
+    """Return all routes, with the pages of NiceGUI behind them."""
     app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
 
     @app.get("/")
@@ -180,7 +180,7 @@ def application(sessions: Sessions, spec: Path | None) -> FastAPI:
 
 
 async def _kept(sessions: Sessions, key: str, name: str, request: Request) -> Response:
-    """A file as it comes, a piece at a time, and looked at once it is whole."""
+    """Return a file as it comes, a piece at a time, and looked at once it is whole."""
     session = sessions.find(key)
     if session is None:
         return _refused("this work is not open any more; open the page anew.", 404)

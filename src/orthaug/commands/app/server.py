@@ -25,7 +25,7 @@ _LOOK = 0.2  # s between looks at whether Ctrl-C came
 
 
 def free_port(wanted: int | None) -> socket.socket:
-    """A socket that listens on this machine alone, on the wanted port or a free one.
+    """Return a socket that listens on this machine alone, on the wanted port or a free one.
 
     Raises:
         InputError: a port that is taken or not allowed.

@@ -70,7 +70,7 @@ class Session:
 
     @property
     def untouched(self) -> bool:
-        """Whether nobody has done anything in it yet."""
+        """Return whether nobody has done anything in it yet."""
         return not self.commands and self.data is None and set(self.authors) <= {"file"}
 
     def changed(self, what: str) -> None:
@@ -94,7 +94,7 @@ class Session:
 
     @property
     def first_step(self) -> str:
-        """What begins the work, where there is no spec yet."""
+        """Return what begins the work, where there is no spec yet."""
         return "It begins with a data file." if self.found is None else "Choose the channels in Data first."
 
     # Data
@@ -176,7 +176,7 @@ class Session:
 
     @property
     def _may_begin(self) -> bool:
-        """Whether looking at a file may begin the spec: there is none, or one that it began and nobody worked on."""
+        """Return whether looking at a file may begin the spec: there is none, or one that it began and nobody worked on."""
         return not self.spec.strip() or (set(self.authors) <= {"look"} and not self.apart)
 
     def _begin(self, spec: str) -> None:
@@ -188,11 +188,11 @@ class Session:
 
     @property
     def apart(self) -> bool:
-        """Whether the file that was looked at is one that the spec does not name."""
+        """Return whether the file that was looked at is one that the spec does not name."""
         return self.data is not None and bool(self.spec.strip()) and not self.names(self.data)
 
     def names(self, file: Path) -> bool:
-        """Whether the spec names a file, or has a pattern for it."""
+        """Return whether the spec names a file, or has a pattern for it."""
         whole = os.path.abspath(file)
         named = [os.path.abspath(self.folder / name) for name in files(self.content())]
         return any(whole == name or fnmatch(whole, name) for name in named)
@@ -265,20 +265,20 @@ class Session:
 
     @property
     def units(self) -> dict[str, str]:
-        """What the channels ask for as units of parameters, of the spec as it is; nothing until it is checked."""
+        """Return what the channels ask for as units of parameters, of the spec as it is; nothing until it is checked."""
         if self.checked is None or self.checking or self.stale:
             return {}
         return {name: asked or "1" for name, _, asked in self.checked["units"] if asked is not None}
 
     def content(self) -> dict[str, Any]:
-        """The spec as dictionaries; empty while its TOML is broken."""
+        """Return the spec as dictionaries; empty while its TOML is broken."""
         try:
             return plain(self.spec)
         except InputError:
             return {}
 
     def worded(self, text: Any) -> str:
-        """A message without the session's own folder and file names."""
+        """Return a message without the session's own folder and file names."""
         text = str(text).removeprefix(f"{self.folder / 'check.toml'}: ").removeprefix(f"{self.folder / 'spec.toml'}: ")
         return text.replace(f"{self.folder}/", "").replace(f"{self.folder}\\", "")
 
@@ -347,7 +347,7 @@ class Session:
             self.changed("work")
 
     def download(self, what: str) -> Path:
-        """The file that is handed out under a name: from a list, never a path.
+        """Return the file that is handed out under a name: from a list, never a path.
 
         Raises:
             InputError: nothing there.
@@ -382,7 +382,7 @@ class Sessions:
         self._made = 0
 
     def new(self, spec: Path | None = None) -> Session:
-        """A session in a folder of its own, which nobody else may read.
+        """Return a session in a folder of its own, which nobody else may read.
 
         Raises:
             InputError: too many sessions, or a spec that cannot be read.
@@ -409,7 +409,7 @@ class Sessions:
 
 
 def _as_name(text: str) -> str:
-    """What any system takes as the name of a file."""
+    """Return what any system takes as the name of a file."""
     return re.sub(r"[^\w. -]", "_", text).strip(" .")[-60:]
 
 

@@ -22,7 +22,7 @@ _MARK = 7  # letters behind the title in the name of one
 
 
 def opened(text: str) -> tomlkit.TOMLDocument:
-    """The document.
+    """Return the document.
 
     Raises:
         InputError: broken TOML.
@@ -34,7 +34,7 @@ def opened(text: str) -> tomlkit.TOMLDocument:
 
 
 def in_file(path: Path) -> str:
-    """The text of a spec that stands somewhere.
+    """Return the text of a spec that stands somewhere.
 
     Raises:
         InputError: a file that cannot be read, or broken TOML.
@@ -65,14 +65,14 @@ def keep(title: str, key: str, spec: str) -> None:
 
 
 def earlier() -> list[Path]:
-    """The specs that are kept, the latest first."""
+    """Return the specs that are kept, the latest first."""
     with suppress(OSError):
         return sorted(_folder().glob("*.toml"), key=lambda place: place.stat().st_mtime, reverse=True)
     return []
 
 
 def kept_title(place: Path) -> str:
-    """What it was called."""
+    """Return what it was called."""
     return place.stem[:-_MARK]
 
 
@@ -102,7 +102,7 @@ def _with_files(document: Mapping[str, Any]) -> Iterator[Any]:
 
 
 def files(content: Mapping[str, Any]) -> list[str]:
-    """Every data file that a spec names, the training data first, each once."""
+    """Return every data file that a spec names, the training data first, each once."""
     return list(dict.fromkeys(file for entry in _with_files(content) for file in names(entry, "files")))
 
 
@@ -114,7 +114,7 @@ def columns(content: Mapping[str, Any]) -> dict[str, str]:
 
 
 def section(content: Mapping[str, Any], *path: str) -> Mapping[str, Any]:
-    """The table at the end of the path; an empty one where there is none, or something else in its place."""
+    """Return the table at the end of the path; an empty one where there is none, or something else in its place."""
     for key in path:
         found = content.get(key)
         content = found if isinstance(found, Mapping) else {}
@@ -122,18 +122,18 @@ def section(content: Mapping[str, Any], *path: str) -> Mapping[str, Any]:
 
 
 def names(table: Mapping[str, Any], key: str) -> list[str]:
-    """The strings of a list, such as `outputs`; none where there is no such list."""
+    """Return the strings of a list, such as `outputs`; none where there is no such list."""
     found = table.get(key)
     return [name for name in found if isinstance(name, str)] if isinstance(found, list) else []
 
 
 def shown(value: Any) -> str:
-    """A value as a field shows it."""
+    """Return a value as a field shows it."""
     return "" if value is None else ", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
 
 
 def read(key: str, value: str) -> Any:
-    """What a field says: a number, names, or text; None for nothing. The spec's own check says what is wrong."""
+    """Return what a field says: a number, names, or text; None for nothing. The spec's own check says what is wrong."""
     value = value.strip()
     if not value:
         return None
@@ -148,7 +148,7 @@ def read(key: str, value: str) -> Any:
 
 
 def _made(document: Any, path: Sequence[str]) -> Any:
-    """The table at the end of the path, made where there is none."""
+    """Return the table at the end of the path, made where there is none."""
     for key in path:
         if not isinstance(document.get(key), Mapping):
             document[key] = tomlkit.table()
@@ -157,7 +157,7 @@ def _made(document: Any, path: Sequence[str]) -> Any:
 
 
 def plain(text: str) -> dict[str, Any]:
-    """The content in plain dictionaries and lists.
+    """Return the content in plain dictionaries and lists.
 
     Raises:
         InputError: broken TOML.
@@ -166,7 +166,7 @@ def plain(text: str) -> dict[str, Any]:
 
 
 def changed(text: str, change: Callable[[Any], None]) -> str:
-    """The text after a change of its document.
+    """Return the text after a change of its document.
 
     Raises:
         InputError: broken TOML, or TOML in which the change cannot be written.
@@ -196,7 +196,7 @@ def with_value(text: str, path: Sequence[str], value: Any) -> str:
 
 
 def rows_of(text: str, path: Sequence[str]) -> list[dict[str, Any]]:
-    """The tables of a list of tables, such as `data.prepare`; none where there is no such list."""
+    """Return the tables of a list of tables, such as `data.prepare`; none where there is no such list."""
     found = section(plain(text), *path[:-1]).get(path[-1])
     return [dict(row) for row in found if isinstance(row, Mapping)] if isinstance(found, list) else []
 

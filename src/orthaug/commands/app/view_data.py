@@ -155,17 +155,17 @@ class DataView:
         button("Take it as a test", self.session.add_test, main=not lacking)
 
     def _trained(self) -> list[Path]:
-        """The files that the spec trains on."""
+        """Return the files that the spec trains on."""
         train = spec_text.section(self.session.content(), "data", "train")
         return [self.session.folder / file for file in spec_text.names(train, "files")]
 
     def _lacking(self, found: Mapping[str, Any]) -> list[str]:
-        """The columns that the spec reads and the file does not have."""
+        """Return the columns that the spec reads and the file does not have."""
         heads = {column["header"] for column in found["columns"]}
         return [column for column in spec_text.columns(self.session.content()) if column not in heads]
 
     def _of_spec(self, found: Mapping[str, Any]) -> dict[str, str]:
-        """The use of each column in the spec; empty where there is none, or where the file lacks one of them."""
+        """Return the use of each column in the spec; empty where there is none, or where the file lacks one of them."""
         return {} if self._lacking(found) else spec_text.columns(self.session.content())
 
     def _take_uses(self, found: Mapping[str, Any]) -> None:
@@ -278,7 +278,7 @@ class DataView:
         self.session.edit("more steps", spec_text.with_row, _STEPS, {"step": kind, **first})
 
     def _whole_file(self) -> tuple[str, Mapping[str, Any]]:
-        """A file and its curves: of the training data that were checked, the file looked at where there are none."""
+        """Return a file and its curves: of the training data that were checked, the file looked at where there are none."""
         session, checked = self.session, self.session.checked
         if checked is None:
             if session.found is None or session.data is None:
@@ -331,7 +331,7 @@ class DataView:
 
 
 def _seconds(told: str) -> float | None:
-    """A sampling time; None where nothing is told.
+    """Return a sampling time; None where nothing is told.
 
     Raises:
         InputError: no positive number.

@@ -252,12 +252,12 @@ def _units(units: Sequence[tuple[str, str, str | None]], *, moves: bool) -> None
 
 
 def _biases(percents: Mapping[str, float | None]) -> str:
-    """All on a line that breaks between the parameters only."""
+    """Return all on a line that breaks between the parameters only."""
     return ", ".join(f"{name}\u00a0{_percent(value)}" for name, value in percents.items())
 
 
 def _percent(value: float | None) -> str:
-    """A change in per cent; of a parameter near zero no number says more than that it is a multiple."""
+    """Return a change in per cent; of a parameter near zero no number says more than that it is a multiple."""
     if value is None:
         return "–"
     if abs(value) >= _MULTIPLE:

@@ -118,7 +118,7 @@ class ExportView:
             text(f"The spec names {named}: let {them} stand in one folder.", "p", "hint")
 
     def _beside(self) -> list[str]:
-        """The files that the spec names without a folder, since they were dropped."""
+        """Return the files that the spec names without a folder, since they were dropped."""
         return [file for file in files(self.session.content()) if not Path(file).is_absolute()]
 
     def _draw_code(self) -> None:

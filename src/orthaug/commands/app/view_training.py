@@ -138,7 +138,7 @@ class TrainingView:
 
 
 def _runs_told(runs: set[Run]) -> str:
-    """What the curves are."""
+    """Return what the curves are."""
     told = "Each curve is a run: one training"
     if any(run.start for run in runs):
         kinds = ", ".join(sorted({run.regularization for run in runs if run.start}))
@@ -179,7 +179,7 @@ def _parameters(
 
 
 def _output_units(result: Mapping[str, Any]) -> str:
-    """The units of the outputs behind `RMSE`, in brackets; nothing where none has one."""
+    """Return the units of the outputs behind `RMSE`, in brackets; nothing where none has one."""
     data = section(result["spec"], "data")
     units = [str(section(data, "channels", name).get("unit") or "–") for name in names(data, "outputs")]
     return f" [{', '.join(units)}]" if set(units) - {"–"} else ""

@@ -35,12 +35,12 @@ def _whole(what: Any) -> str:
 
 
 def sentence(told: str) -> str:
-    """A message as it begins on a page; the name of a file stays as it is."""
+    """Return a message as it begins on a page; the name of a file stays as it is."""
     return told if "." in told.partition(" ")[0] else told[:1].upper() + told[1:]
 
 
 def card(title: str, hint: str = "", classes: str = "") -> ui.element:
-    """A section with a heading."""
+    """Return a section with a heading."""
     section = ui.element("section").classes(f"card {classes}")
     if "sticky" in classes:  # it scrolls by itself, by keys too
         named(section.props("tabindex=0 role=region"), title)
@@ -60,7 +60,7 @@ def redrawn(place: ui.element) -> Any:
 
 
 def field(label: str, value: Any, changed: Callable[[str], None], *, classes: str = "", hint: str = "") -> ui.input:
-    """A line of text; told when it is left, or by Enter."""
+    """Return a line of text; told when it is left, or by Enter."""
     made = (
         ui.input(label, value="" if value is None else str(value)).props("outlined dense stack-label").classes(classes)
     )
@@ -79,7 +79,7 @@ def refuse(made: ui.input, why: str) -> None:
 def choice(
     label: str, options: Mapping[str, str], value: str, changed: Callable[[str], None], classes: str = ""
 ) -> ui.element:
-    """A list to choose from, as every phone knows it; the label is above."""
+    """Return a list to choose from, as every phone knows it; the label is above."""
     with ui.element("label").classes(f"choice {classes}"):
         text(label, "span")
         made = named(ui.element("select"), label)
@@ -116,25 +116,25 @@ def table(head: Sequence[str], rows: Sequence[Sequence[Any]], caption: str = "")
 
 
 def number(value: Any, digits: int = 5) -> str:
-    """A number as it is read; a dash where there is none."""
+    """Return a number as it is read; a dash where there is none."""
     return "–" if value is None else f"{value:.{digits}g}"
 
 
 def button(label: str, clicked: Callable[[], Any], *, main: bool = False, classes: str = "") -> ui.button:
-    """A button; the main one of its place is filled."""
+    """Return a button; the main one of its place is filled."""
     made = ui.button(label, on_click=clicked, color=None).props("no-caps unelevated" if main else "no-caps outline")
     return made.classes(("main " if main else "plain ") + classes)
 
 
 def link(label: str, place: str) -> ui.element:
-    """A file to take, as a link that looks like a button."""
+    """Return a file to take, as a link that looks like a button."""
     made = text(label, "a", "download").props("download")
     made.props["href"] = place
     return made
 
 
 def note(what: str, kind: str = "") -> ui.html:
-    """A sentence that must be seen: `bad`, `care` or `good`."""
+    """Return a sentence that must be seen: `bad`, `care` or `good`."""
     return text(what, "p", f"note {kind}").props("role=alert" if kind == "bad" else "role=status")
 
 
@@ -164,7 +164,7 @@ def curves_figure(rows: Sequence[tuple[str, Sequence[Mapping[str, Any]]]], unit:
 
 
 def run_name(run: Run, *, of_structure: bool = False, of_regularization: bool = True) -> str:
-    """What is known of a run; its number where that is nothing."""
+    """Return what is known of a run; its number where that is nothing."""
     words = [run.structure] if of_structure and run.structure else []
     words += [f"start {run.start}"] if run.start else []
     if of_regularization and run.regularization:
@@ -173,12 +173,12 @@ def run_name(run: Run, *, of_structure: bool = False, of_regularization: bool = 
 
 
 def of_several(runs: Iterable[Run]) -> bool:
-    """Whether they are of more structures than one."""
+    """Return whether they are of more structures than one."""
     return len({run.structure for run in runs if run.structure}) > 1
 
 
 def loss_figure(losses: Sequence[tuple[Run, int, float | None]]) -> dict[str, Any]:
-    """The loss of every run over its iterations: each named below the axis, of several structures each one."""
+    """Return the loss of every run over its iterations: each named below the axis, of several structures each one."""
     runs: dict[Run, tuple[list[int], list[float | None]]] = {}
     for run, iteration, loss in losses:
         x, y = runs.setdefault(run, ([], []))
@@ -224,5 +224,5 @@ def _layout(height: int) -> dict[str, Any]:
 
 
 def plot(figure: dict[str, Any], label: str) -> ui.plotly:
-    """A figure, with a sentence that is read aloud in its place."""
+    """Return a figure, with a sentence that is read aloud in its place."""
     return named(ui.plotly(figure).classes("plot").props("role=img"), label)

@@ -79,7 +79,7 @@ def peak() -> float:
 
 
 def look(path: str, out: str, inputs: str | None, outputs: str | None, step: float | None) -> dict[str, Any]:
-    """The columns of a file, their curves, and the first spec for it where its channels are known.
+    """Return the columns of a file, their curves, and the first spec for it where its channels are known.
 
     Args:
         out: where the spec will stand.
@@ -139,7 +139,7 @@ def _curves(found: Survey) -> dict[str, Any]:
 
 
 def examine(path: str, whole: bool) -> dict[str, Any]:
-    """What `orthaug check` tells of a spec, and its training data as they are after preparation.
+    """Return what `orthaug check` tells of a spec, and its training data as they are after preparation.
 
     Args:
         whole: run equations of motion too; without, `check` is None for them, since that takes its time.
@@ -168,7 +168,7 @@ def examine(path: str, whole: bool) -> dict[str, Any]:
 
 
 def verdict(path: str, kind: str) -> dict[str, Any]:
-    """What the report of a result begins with: `level`, and three `sentences`.
+    """Return what the report of a result begins with: `level`, and three `sentences`.
 
     Args:
         kind: fit or compare, of which `path` is the result.json.
@@ -215,7 +215,7 @@ def _prepared_curves(job: Job) -> dict[str, Any]:
 
 
 def thinned(time: Vector, values: Vector, most: int = MOST) -> dict[str, list[float | None]]:
-    """A curve of at most about `most` points: of each stretch the least and the largest value, in their order.
+    """Return a curve of at most about `most` points: of each stretch the least and the largest value, in their order.
 
     Examples:
         >>> thinned(np.arange(6.0), np.array([0.0, 5.0, 1.0, 2.0, -1.0, 0.0]), 4)

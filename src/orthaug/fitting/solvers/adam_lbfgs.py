@@ -115,7 +115,7 @@ class AdamLBFGS:
 
 
 def _going(state: _GradientState) -> Any:
-    """Whether another step makes sense: the loss is finite and still falls."""
+    """Return whether another step makes sense: the loss is finite and still falls."""
     return jnp.isfinite(state.loss) & (state.small < 5)
 
 

@@ -50,7 +50,7 @@ class CheckpointWriter(Protocol):
     """Where the states of a run are kept."""
 
     def state(self) -> State | None:
-        """The last one; None for none."""
+        """Return the last one; None for none."""
         ...
 
     def keep(self, state: State, *, ended: bool = False) -> None:
@@ -114,7 +114,7 @@ class Settings:
     kept: CheckpointWriter | None = None
 
     def prepared(self, w: Any) -> tuple[Options, Any, State | None]:
-        """The numbers of the compiled program, the ridge it starts with, and the state to go on from."""
+        """Return the numbers of the compiled program, the ridge it starts with, and the state to go on from."""
         groups = self.groups
         if groups is None and not self.evidence:  # the program of groups serves a fixed ridge as well
             groups = np.zeros(len(w), dtype=int)
@@ -124,7 +124,7 @@ class Settings:
         return options, start, self.kept.state() if self.kept else None
 
     def runs(self, state: State) -> bool:
-        """Whether there is a step to take."""
+        """Return whether there is a step to take."""
         if int(state.code) != Ending.RUNNING:
             return False
         return not self.limit.reached(int(state.iteration), float(state.mark), float(state.normal.loss))
@@ -145,7 +145,7 @@ class Settings:
         return False
 
     def ended(self, state: State, seconds: float, *, enough: bool = False) -> TrainingRun:
-        """The run, from its last state; `enough` where it was asked to end with that."""
+        """Return the run, from its last state; `enough` where it was asked to end with that."""
         held: Any = (
             np.asarray(state.ridge)
             if self.groups is not None
@@ -216,7 +216,7 @@ def driven(
 
 
 def burst_length(burst: int, spent: float) -> int:
-    """How many steps to take at a time, when `burst` of them took `spent` seconds."""
+    """Return how many steps to take at a time, when `burst` of them took `spent` seconds."""
     return int(np.clip(burst * _SECONDS_PER_BURST / max(spent, 1e-6), 1, 4 * burst))
 
 
@@ -248,7 +248,7 @@ def _advance(criterion: Any, state: State, arguments: tuple[Any, ...], options: 
 
 
 def _trial(criterion: Any, state: State, arguments: tuple[Any, ...], options: Options) -> State:
-    """One damped step: accept it, or damp more."""
+    """Return one damped step: accept it, or damp more."""
     step = _proposed(state)
     return _judged(state, step, one_pass(criterion, state.w + step, arguments, state.normal.overlap), options)
 
@@ -259,14 +259,14 @@ def _downhill(state: State) -> Any:
 
 @jax.jit
 def _proposed(state: State) -> Any:
-    """The damped step."""
+    """Return the damped step."""
     shifted = state.normal.hessian + (state.ridge + state.damping) * jnp.eye(state.w.shape[0])
     return jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(shifted), _downhill(state))
 
 
 @jax.jit
 def _judged(state: State, step: Any, trial: Normal, options: Options) -> State:
-    """The state after a step was tried: moved where the objective is lower, otherwise damped more."""
+    """Return the state after a step was tried: moved where the objective is lower, otherwise damped more."""
     w, normal, alpha, downhill = state.w, state.normal, state.ridge, _downhill(state)
     before = normal.loss + _prior(alpha, w)
     after = trial.loss + _prior(alpha, w + step)
@@ -323,7 +323,7 @@ def _evidence(w: Any, normal: Normal, alpha: Any, options: Options) -> Any:
 
 
 def _effective(normal: Normal, alpha: Any) -> Any:
-    """The diagonal of `H (H + A)⁻¹` for a ridge of each weight, from the eigenvalues of `A^-½ H A^-½`."""
+    """Return the diagonal of `H (H + A)⁻¹` for a ridge of each weight, from the eigenvalues of `A^-½ H A^-½`."""
     unit = 1 / jnp.sqrt(alpha)
     scaled = normal.hessian * unit[:, None] * unit
     values, vectors = jnp.linalg.eigh(jnp.where(jnp.isfinite(scaled), scaled, 0.0))
@@ -351,5 +351,5 @@ def spanned(normal: Normal) -> Any:
 
 
 def _largest_column(normal: Normal) -> Any:
-    """The largest ‖J_i‖², before the projection."""
+    """Return the largest ‖J_i‖², before the projection."""
     return jnp.max(jnp.diag(normal.hessian) + jnp.sum(normal.overlap.jacobian**2, axis=0), initial=0.0)

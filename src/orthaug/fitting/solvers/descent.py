@@ -70,7 +70,7 @@ class LinearModel(Protocol):
 
     @property
     def start(self) -> Any:
-        """What the next trial starts from beside p; the objective's own affair."""
+        """Return what the next trial starts from beside p; the objective's own affair."""
         ...
 
 
@@ -80,19 +80,19 @@ class SquaredResiduals(Protocol):
 
     @property
     def physics(self) -> int:
-        """How many leading entries of p are θ: they have bounds and no ridge."""
+        """Return how many leading entries of p are θ: they have bounds and no ridge."""
         ...
 
     def evaluate(self, p: Vector, start: Any) -> Any:
-        """A trial (`Trial`) at p, from the `start` that the last accepted one left."""
+        """Return a trial (`Trial`) at p, from the `start` that the last accepted one left."""
         ...
 
     def linearise(self, point: Any) -> Any:
-        """The derivative (`LinearModel`) about a trial."""
+        """Return the derivative (`LinearModel`) about a trial."""
         ...
 
     def samples(self, point: Any) -> tuple[float, float]:
-        """Number of residuals of a trial, and the share of them that is independent."""
+        """Return number of residuals of a trial, and the share of them that is independent."""
         ...
 
 
@@ -155,7 +155,7 @@ class _Iterate(NamedTuple):
 
     @property
     def settled(self) -> bool:
-        """Whether the objective falls slowly, after a few steps."""
+        """Return whether the objective falls slowly, after a few steps."""
         return self.coloured and len(self.path) > _FIRST_STEPS
 
 
@@ -247,7 +247,7 @@ def _resumed(objective: Any, paused: Pause) -> tuple[_Iterate, _Counts, Ending]:
 def _trial(
     objective: SquaredResiduals, iterate: _Iterate, limits: Any, tolerance: float, damping: Damping, ceiling: float
 ) -> tuple[_Iterate, Ending]:
-    """One damped step: accept it, or damp more."""
+    """Return one damped step: accept it, or damp more."""
     point, linear, ridge = iterate.point, iterate.linear, iterate.ridge
     p = point.p
     penalty = np.concatenate([np.zeros(objective.physics), np.ones(len(p) - objective.physics)])
@@ -306,7 +306,7 @@ def evidence_ridge(objective: SquaredResiduals, point: Any, effective: float, *,
 def _step(
     hessian: Matrix, downhill: Vector, damping: float, p: Vector, bounds: tuple[Vector, Vector], kind: Damping
 ) -> tuple[Vector, float]:
-    """The damped step inside the bounds, and the decrease that the quadratic model expects of it."""
+    """Return the damped step inside the bounds, and the decrease that the quadratic model expects of it."""
     free = np.flatnonzero(~_held(p, downhill, *bounds))
     curvature = np.diag(hessian)[free] if kind.diagonal else np.ones(len(free))
     scale = np.maximum(curvature, _SMALLEST_CURVATURE * curvature.max(initial=0.0))
@@ -337,7 +337,7 @@ def _level(hessian: Matrix, downhill: Vector, objective: float, held: Bool[np.nd
 
 
 def weights_hessian(hessian: Matrix, physics: int) -> Matrix:
-    """The Hessian of the weights with θ eliminated, (nw, nw)."""
+    """Return the Hessian of the weights with θ eliminated, (nw, nw)."""
     h_tt, h_tw, h_ww = hessian[:physics, :physics], hessian[:physics, physics:], hessian[physics:, physics:]
     size = np.diag(h_tt)
     unit = np.sqrt(np.where(size > 1e-300 * size.max(initial=0.0), size, 1.0))
