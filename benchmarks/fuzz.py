@@ -27,7 +27,15 @@ from machine import describe
 
 TRIALS = {
     **dict.fromkeys(TYPES, 150),
-    **{"specs": 400, "commands": 350, "models": 250, "forged": 150, "states": 150, "folders": 250, "exports": 100},
+    **{
+        "specs": 400,
+        "commands": 350,
+        "models": 250,
+        "forged": 150,
+        "states": 150,
+        "folders": 250,
+        "exports": 100,
+    },
 }
 LONGEST, MEMORY = 30.0, 16 * 2**30  # s and bytes of one trial
 
@@ -72,7 +80,9 @@ def run(kind: str, count: int) -> tuple[Counter, float]:
     ends, longest, seed = Counter(), 0.0, 0
     while seed < count:
         command = [sys.executable, __file__, "--child", kind, str(seed), str(count)]
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env={**os.environ})
+        process = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env={**os.environ}
+        )
         assert process.stdout is not None and process.stderr is not None
         process.stdout.readline()
         while seed < count:
@@ -107,13 +117,20 @@ def main() -> int:
     """Print a row for each kind; return 1 where a trial failed."""
     factor = float(sys.argv[1]) if len(sys.argv) > 1 else 1.0
     print(describe())
-    print("| what | held | trials | refused | equal | faults | longest |\n|---|---|---|---|---|---|---|")
+    print(
+        "| what | held | trials | refused | equal | faults | longest "
+        "|\n|---|---|---|---|---|---|---|"
+    )
     whole = Counter()
     for kind in sys.argv[2:] or TRIALS:
         ends, longest = run(kind, round(factor * TRIALS[kind]))
         counts = " | ".join(str(ends[end]) for end in ("refused", "equal", "fault"))
         whole += ends
-        print(f"| {kind} | {ends.total() - ends['fault']} | {ends.total()} | {counts} | {longest:.1f} s |", flush=True)
+        print(
+            f"| {kind} | {ends.total() - ends['fault']} | {ends.total()} | {counts} | "
+            f"{longest:.1f} s |",
+            flush=True,
+        )
     print(f"\n{whole.total() - whole['fault']} of {whole.total()} trials held.")
     return 1 if whole["fault"] else 0
 

@@ -95,7 +95,9 @@ def colour() -> list[float | None]:
 
     def median() -> float:
         fits = [fit(opened.problem, seed=seed, **options) for seed in range(6)]
-        return float(np.median([one.model.simulate(test.record).scores(test.skip).fit[0] for one in fits]))
+        return float(
+            np.median([one.model.simulate(test.record).scores(test.skip).fit[0] for one in fits])
+        )
 
     with every_error_counts():
         all_rows = median()

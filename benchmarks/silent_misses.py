@@ -47,32 +47,66 @@ def rows(lagged: int = 100, motions: int = 30) -> Iterator[Row]:
     for one in coverage_noise.lagged_rows(lagged):
         yield Row(one.system, one.noise, one.learner, one.draws, one.held, one.silent, one.width)
     for one in coverage_noise.motion_rows(motions):
-        yield Row(f"motion, {one.system}", one.noise, one.learner, one.draws, one.held, one.silent, one.width)
+        yield Row(
+            f"motion, {one.system}",
+            one.noise,
+            one.learner,
+            one.draws,
+            one.held,
+            one.silent,
+            one.width,
+        )
     for one in coverage_causes.rows(lagged, motions):
-        yield Row(one.system, f"{one.noise:g}", one.sees, one.draws, one.held, one.silent, 100 * one.width)
+        yield Row(
+            one.system, f"{one.noise:g}", one.sees, one.draws, one.held, one.silent, 100 * one.width
+        )
     for one in coverage_shared.rows(lagged):
         share = 100 / one.draws
         width = 100 * one.width
-        yield Row(one.system, one.noise, one.sees, one.draws, share * one.held, share * one.silent, width)
+        yield Row(
+            one.system, one.noise, one.sees, one.draws, share * one.held, share * one.silent, width
+        )
     for words, draws in (("lagged", lagged), ("motion", motions)):
         for one in coverage_hidden.rows(draws, words):
             share, value = 100 / one.draws, coverage_hidden.SYSTEMS[one.system][4]
             width = 100 * one.width / value
-            yield Row(one.system, one.noise, one.sees, one.draws, share * one.held, share * one.silent, width)
+            yield Row(
+                one.system,
+                one.noise,
+                one.sees,
+                one.draws,
+                share * one.held,
+                share * one.silent,
+                width,
+            )
 
 
 def main(lagged: int, motions: int) -> int:
     print(describe())
-    print("\n| system | noise | learner sees | draws | held | silent misses | width |\n" + 7 * "|---" + "|")
+    print(
+        "\n| system | noise | learner sees | draws | held | silent misses | width |\n"
+        + 7 * "|---"
+        + "|"
+    )
     began, missed = time.perf_counter(), []
     for row in rows(lagged, motions):
-        shown = [f"{row.held:.0f} %", f"{row.silent:.0f} %", "" if np.isnan(row.width) else f"{row.width:.2g} %"]
-        print(f"| {row.system} | {row.noise} | {row.sees} | {row.draws} | {' | '.join(shown)} |", flush=True)
+        shown = [
+            f"{row.held:.0f} %",
+            f"{row.silent:.0f} %",
+            "" if np.isnan(row.width) else f"{row.width:.2g} %",
+        ]
+        print(
+            f"| {row.system} | {row.noise} | {row.sees} | {row.draws} | {' | '.join(shown)} |",
+            flush=True,
+        )
         missed += [row] if row.silent > row.most else []
     minutes = (time.perf_counter() - began) / 60
     print(f"\n{minutes:.0f} min; rows above {ALLOWED:g} % by two standard errors: {len(missed)}")
     for row in missed:
-        print(f"- {row.system}, {row.noise}, learner sees {row.sees}: {row.silent:.0f} % of {row.draws}")
+        print(
+            f"- {row.system}, {row.noise}, learner sees {row.sees}: {row.silent:.0f} % of "
+            f"{row.draws}"
+        )
     return bool(missed)
 
 

@@ -27,17 +27,27 @@ def differences(before: Any, after: Any, where: str = "", beside: float = 0.0) -
     if key in ASIDE:
         return
     if key == "warnings" and isinstance(before, list) and isinstance(after, list):
-        before, after = ([w["text"] if isinstance(w, dict) else w for w in warnings] for warnings in (before, after))
+        before, after = (
+            [w["text"] if isinstance(w, dict) else w for w in warnings]
+            for warnings in (before, after)
+        )
     if isinstance(before, dict) and isinstance(after, dict):
         yield from (f"{where}.{name}: only in one of them" for name in before.keys() ^ after.keys())
         for name in (name for name in before if name in after):
-            yield from differences(before[name], after[name], f"{where}.{name}" if where else name, largest(before))
+            yield from differences(
+                before[name], after[name], f"{where}.{name}" if where else name, largest(before)
+            )
     elif isinstance(before, list) and isinstance(after, list):
         if len(before) != len(after):
             yield f"{where}: {len(before)} entries, then {len(after)}"
         for i, (one, other) in enumerate(zip(before, after, strict=False)):
             yield from differences(one, other, f"{where}[{i}]", largest(before))
-    elif not same(before, after, allowed(where, beside), SEARCH if "stability.contraction" in where else RELATIVE):
+    elif not same(
+        before,
+        after,
+        allowed(where, beside),
+        SEARCH if "stability.contraction" in where else RELATIVE,
+    ):
         yield f"{where}: {before!r}, then {after!r}"
 
 
@@ -48,7 +58,11 @@ def is_number(value: Any) -> bool:
 def largest(values: Any) -> float:
     """The largest number among the entries of a list or a mapping by parameter; fields of other meanings have none."""
     if isinstance(values, dict):
-        values = [] if {"name", "value", "p", "rmse", "where", "kind", "code"} & values.keys() else values.values()
+        values = (
+            []
+            if {"name", "value", "p", "rmse", "where", "kind", "code"} & values.keys()
+            else values.values()
+        )
     return max((abs(value) for value in values if is_number(value)), default=0.0)
 
 
@@ -68,7 +82,10 @@ def same(before: Any, after: Any, absolute: float, relative: float = RELATIVE) -
 
 def main(before: str, after: str) -> int:
     """Print the differences; 1 if there are any."""
-    results = (json.loads((Path(folder) / "result.json").read_text(encoding="utf-8")) for folder in (before, after))
+    results = (
+        json.loads((Path(folder) / "result.json").read_text(encoding="utf-8"))
+        for folder in (before, after)
+    )
     told = list(differences(*results))
     print("\n".join(told) or "equal")
     return 1 if told else 0

@@ -46,10 +46,16 @@ def model(data: bytes) -> None:
         except (ValueError, RecursionError):
             declared = None
         if isinstance(declared, dict):
-            said = {k: v for k, v in declared.items() if k not in ("format", "orthaug", "arrays_sha256", "checksum")}
+            said = {
+                k: v
+                for k, v in declared.items()
+                if k not in ("format", "orthaug", "arrays_sha256", "checksum")
+            }
             packed = storage.pack(storage.FORMAT, said, {})
             try:
-                storage.write_packed(packed, Path(folder, "model.json"), Path(folder, "arrays.safetensors"))
+                storage.write_packed(
+                    packed, Path(folder, "model.json"), Path(folder, "arrays.safetensors")
+                )
             except UnicodeEncodeError:  # a lone surrogate is no text that a file holds
                 return
         else:

@@ -38,7 +38,16 @@ ONLY_IN = {
     "matplotlib": {"reports.drawing", "studies"},
     "typer": {"commands.cli", "commands.model_cli", "commands.program"},
 }  # a room, or a file
-UNSAFE_MODULES = ("pickle", "cPickle", "_pickle", "cloudpickle", "dill", "joblib", "marshal", "shelve")
+UNSAFE_MODULES = (
+    "pickle",
+    "cPickle",
+    "_pickle",
+    "cloudpickle",
+    "dill",
+    "joblib",
+    "marshal",
+    "shelve",
+)
 UNSAFE_CALLS = ("eval", "exec", "read_pickle", "to_pickle")
 MOST_LINES, MOST_FUNCTION_LINES = 600, 60  # of a file; of a function, its docstring aside
 
@@ -49,7 +58,9 @@ def module_name(path: Path) -> str:
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-FILES = {module_name(path): path for path in sorted(SOURCE.rglob("*.py")) if path.name != "__main__.py"}
+FILES = {
+    module_name(path): path for path in sorted(SOURCE.rglob("*.py")) if path.name != "__main__.py"
+}
 
 
 def imports_of(name: str, tree: ast.AST, is_package: bool) -> Iterator[tuple[int, str]]:
@@ -110,9 +121,12 @@ def breaches(name: str, tree: ast.AST, is_package: bool = False) -> list[str]:
             found.append(f"line {line} imports a computed name, which no one can check")
         target = own(imported)
         if target is not None and (
-            room_of(target) not in ROOMS or (name and ROOMS.index(room_of(target)) > ROOMS.index(room_of(name)))
+            room_of(target) not in ROOMS
+            or (name and ROOMS.index(room_of(target)) > ROOMS.index(room_of(name)))
         ):
-            found.append(f"line {line} imports {imported}, which is not to the left of {name or 'orthaug'}")
+            found.append(
+                f"line {line} imports {imported}, which is not to the left of {name or 'orthaug'}"
+            )
     return found
 
 
@@ -143,19 +157,28 @@ def handed_on(room: str) -> dict[str, str]:
     }
 
 
-def in_files(found: Callable[[str], list[str]], names: Iterable[str] = FILES) -> dict[str, list[str]]:
+def in_files(
+    found: Callable[[str], list[str]], names: Iterable[str] = FILES
+) -> dict[str, list[str]]:
     """What is found in each file where there is anything."""
     return {name: told for name in names if (told := found(name))}
 
 
 def test_the_rooms_are_those_of_the_list() -> None:
-    folders = {path.name for path in SOURCE.iterdir() if path.is_dir() and path.name != "__pycache__"}
+    folders = {
+        path.name for path in SOURCE.iterdir() if path.is_dir() and path.name != "__pycache__"
+    }
     assert folders == set(ROOMS)
     assert {name for name in FILES if "." not in name} == {"", *ROOMS}, "a file belongs into a room"
 
 
 def test_imports_point_to_the_left() -> None:
-    assert in_files(lambda name: breaches(name, parsed(FILES[name]), FILES[name].name == "__init__.py")) == {}
+    assert (
+        in_files(
+            lambda name: breaches(name, parsed(FILES[name]), FILES[name].name == "__init__.py")
+        )
+        == {}
+    )
 
 
 def test_no_files_import_each_other() -> None:
@@ -205,7 +228,11 @@ def test_an_import_from_the_left_is_let_pass(name: str, text: str) -> None:
 
 def test_numerical_rooms_know_no_pictures_and_no_user() -> None:
     def pictures(name: str) -> list[str]:
-        return [what for _, what in all_imports(name) if any(within(what, package) for package in NOT_NUMERICAL)]
+        return [
+            what
+            for _, what in all_imports(name)
+            if any(within(what, package) for package in NOT_NUMERICAL)
+        ]
 
     numerical = [name for name in FILES if room_of(name) in NUMERICAL]
     assert len(numerical) > 100 and in_files(pictures, numerical) == {}
@@ -214,7 +241,9 @@ def test_numerical_rooms_know_no_pictures_and_no_user() -> None:
 @pytest.mark.parametrize("package", ONLY_IN)
 def test_one_place_imports_it(package: str) -> None:
     users = {name for name in FILES if any(within(what, package) for _, what in all_imports(name))}
-    assert {name for name in users if not any(within(name, place) for place in ONLY_IN[package])} == set()
+    assert {
+        name for name in users if not any(within(name, place) for place in ONLY_IN[package])
+    } == set()
 
 
 def test_nothing_prints_or_runs_text_as_code() -> None:
@@ -223,14 +252,19 @@ def test_nothing_prints_or_runs_text_as_code() -> None:
 
 def unsafe(name: str) -> list[str]:
     found = [
-        f"line {line}: {what}" for line, what in all_imports(name) if any(within(what, one) for one in UNSAFE_MODULES)
+        f"line {line}: {what}"
+        for line, what in all_imports(name)
+        if any(within(what, one) for one in UNSAFE_MODULES)
     ]
     for node in ast.walk(parsed(FILES[name])):
         if isinstance(node, ast.Call):
             verb = called(node)
             if verb in UNSAFE_CALLS or (verb == "print" and isinstance(node.func, ast.Name)):
                 found.append(f"line {node.lineno}: {verb}(…)")
-            if any(keyword.arg == "allow_pickle" and not is_false(keyword.value) for keyword in node.keywords):
+            if any(
+                keyword.arg == "allow_pickle" and not is_false(keyword.value)
+                for keyword in node.keywords
+            ):
                 found.append(f"line {node.lineno}: allow_pickle")
         elif isinstance(node, ast.ExceptHandler) and node.type is None:
             found.append(f"line {node.lineno}: a bare except")
@@ -245,7 +279,9 @@ def lines_of(node: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
     """Lines of a function, its docstring aside."""
     first = node.body[0]
     docstring = (
-        isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant) and isinstance(first.value.value, str)
+        isinstance(first, ast.Expr)
+        and isinstance(first.value, ast.Constant)
+        and isinstance(first.value.value, str)
     )
     said = (first.end_lineno or 0) - first.lineno + 1 if docstring else 0
     return (node.end_lineno or node.lineno) - node.lineno + 1 - said
@@ -259,7 +295,10 @@ def too_long(name: str) -> list[str]:
     lines = len(FILES[name].read_text(encoding="utf-8").splitlines())
     found = [f"{lines} lines: there are two concepts in it"] if lines > MOST_LINES else []
     for node in ast.walk(parsed(FILES[name])):
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and lines_of(node) > MOST_FUNCTION_LINES:
+        if (
+            isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+            and lines_of(node) > MOST_FUNCTION_LINES
+        ):
             found.append(f"{node.name} has {lines_of(node)} lines: there are two functions in it")
     return found
 
@@ -267,7 +306,9 @@ def too_long(name: str) -> list[str]:
 def loaded_by(code: str) -> dict[str, object]:
     """What `code` leaves in the dictionary `report`, run in an interpreter of its own."""
     program = f"import json, sys\nreport = {{}}\n{code}\nprint('\\n' + json.dumps(report))"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=False
+    )
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout.splitlines()[-1])
 
@@ -293,18 +334,21 @@ def test_the_import_and_the_help_page_load_nothing_heavy() -> None:
 def test_what_a_fit_seldom_needs_is_not_loaded_for_it(tmp_path: Path) -> None:
     (tmp_path / "run.csv").write_text("u,y\n1,2\n3,4\n", encoding="utf-8")
     report = loaded_by(
-        "from pathlib import Path\n"
-        "import orthaug.commands.fit, orthaug.fitting.estimation, orthaug.analysis.diagnosis\n"
-        "import orthaug.analysis.free_run_stability, orthaug.analysis.validation\n"
-        "from orthaug.data.tables import read_table\n"
-        f"report['rows'] = len(read_table(Path({str(tmp_path / 'run.csv')!r}), ('u', 'y')).columns['u'])\n"
-        "report['loaded'] = [n for n in ('pandas', 'optax', 'scipy.optimize', 'scipy.stats') if n in sys.modules]"
+        "from pathlib import Path\nimport orthaug.commands.fit, orthaug.fitting.estimation, "
+        "orthaug.analysis.diagnosis\nimport orthaug.analysis.free_run_stability, "
+        "orthaug.analysis.validation\nfrom orthaug.data.tables import read_table\n"
+        f"report['rows'] = len(read_table(Path({str(tmp_path / 'run.csv')!r}), ('u', "
+        "'y')).columns['u'])\nreport['loaded'] = [n for n in ('pandas', 'optax', "
+        "'scipy.optimize', 'scipy.stats') if n in sys.modules]"
     )
     assert report == {"rows": 2, "loaded": []}
 
 
 def test_reading_a_spec_and_its_data_does_not_load_jax() -> None:
-    names = [n for n in FILES if room_of(n) in ("data", "physics")] + ["commands.kinds", "commands.run"]
+    names = [n for n in FILES if room_of(n) in ("data", "physics")] + [
+        "commands.kinds",
+        "commands.run",
+    ]
     report = loaded_by(
         "import importlib\n"
         f"for name in {names!r}:\n"
@@ -338,4 +382,8 @@ def test_programs_beside_the_package_import_what_is_there(folder: str) -> None:
     for path in sorted((SOURCE.parents[1] / folder).glob("*.py")):
         for module, name in _imported(path):
             found = importlib.import_module(module)
-            assert hasattr(found, name) or importlib.import_module(f"{module}.{name}"), (path.name, module, name)
+            assert hasattr(found, name) or importlib.import_module(f"{module}.{name}"), (
+                path.name,
+                module,
+                name,
+            )

@@ -59,10 +59,15 @@ def test_a_run_that_was_ended_goes_on_bit_by_bit(tmp_path, engine, step):
         fit(posed(1), **chosen, checkpoints=kept.opened(resume=False), progress=dies_at(step))
     steps = []
     again = Checkpoints(tmp_path / "kept", "this fit", every=0.0).opened(resume=True)
-    found = fit(posed(1), **chosen, checkpoints=again, progress=lambda run, i, loss: steps.append(i))
+    found = fit(
+        posed(1), **chosen, checkpoints=again, progress=lambda run, i, loss: steps.append(i)
+    )
     np.testing.assert_array_equal(found.model.numbers.weights, whole.model.numbers.weights)
     np.testing.assert_array_equal(found.theta, whole.theta)
-    assert found.status.loss == whole.status.loss and found.status.iterations == whole.status.iterations
+    assert (
+        found.status.loss == whole.status.loss
+        and found.status.iterations == whole.status.iterations
+    )
     assert steps[0] > 1 or step == 1
 
 
@@ -78,14 +83,21 @@ def test_a_run_that_was_ended_past_its_limit_goes_on_bit_by_bit(tmp_path, engine
     again = Checkpoints(tmp_path / "kept", "this fit", every=0.0).opened(resume=True)
     found = fit(posed(1), **chosen, checkpoints=again)
     np.testing.assert_array_equal(found.model.numbers.weights, whole.model.numbers.weights)
-    assert found.status.iterations == whole.status.iterations and found.status.message == whole.status.message
+    assert (
+        found.status.iterations == whole.status.iterations
+        and found.status.message == whole.status.message
+    )
 
 
 @pytest.mark.parametrize("engine", [Stream(), InMemory()], ids=["stream", "memory"])
 def test_a_free_run_goes_on_bit_by_bit(folder, tmp_path, engine):  # noqa: F811
     """Killed once in the run of physics alone, once in that of the learner."""
     problem = pose(from_files(folder), BASELINE, oa.Lags(na=2, nb=2))
-    chosen = {"learner": MLP(hidden=(3,)), "criterion": oa.Simulation(40, 20, start_iterations=0), "engine": engine}
+    chosen = {
+        "learner": MLP(hidden=(3,)),
+        "criterion": oa.Simulation(40, 20, start_iterations=0),
+        "engine": engine,
+    }
     chosen |= FLIGHT | {"solver": oa.LevenbergMarquardt(20)}
     whole = fit(problem, **chosen)
     for step in (2, 17):
@@ -132,7 +144,12 @@ def test_a_full_disk_leaves_the_last_good_state(tmp_path, monkeypatch):
     assert not list((tmp_path / "kept").glob("*.partial"))
     steps = []
     again = Checkpoints(tmp_path / "kept", "this fit", every=0.0).opened(resume=True)
-    found = fit(posed(1), **options(Streaming()), checkpoints=again, progress=lambda run, i, loss: steps.append(i))
+    found = fit(
+        posed(1),
+        **options(Streaming()),
+        checkpoints=again,
+        progress=lambda run, i, loss: steps.append(i),
+    )
     assert steps[0] == 5  # the state after the fourth step stood
     np.testing.assert_array_equal(found.theta, whole.theta)
 
@@ -158,7 +175,9 @@ def test_states_of_another_fit_are_refused(tmp_path):
     with pytest.raises(Killed):
         kept = Checkpoints(place, "one fit", every=0.0).opened(resume=False)
         fit(posed(1), **options(Streaming()), checkpoints=kept, progress=dies_at(3))
-    with pytest.raises(oa.InputError, match="is the state of another spec, other data or another version"):
+    with pytest.raises(
+        oa.InputError, match="is the state of another spec, other data or another version"
+    ):
         Checkpoints(place, "another fit").opened(resume=True)
     Checkpoints(place, "another fit").opened(resume=False)
     assert not place.exists()

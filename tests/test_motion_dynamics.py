@@ -42,7 +42,9 @@ def spring(**options) -> oa.Motion:
 
 def numbers(motion: oa.Motion, weights=()) -> Numbers:
     q = motion.coordinates.initial
-    return Numbers(q, np.zeros_like(q), np.asarray(weights), np.zeros(2), np.ones(2), np.array([0.5, 0.1]))
+    return Numbers(
+        q, np.zeros_like(q), np.asarray(weights), np.zeros(2), np.ones(2), np.array([0.5, 0.1])
+    )
 
 
 def with_learner(motion: oa.Motion, substeps: int) -> tuple[MotionDynamics, Numbers]:
@@ -54,7 +56,9 @@ def with_learner(motion: oa.Motion, substeps: int) -> tuple[MotionDynamics, Numb
 
 def record(rows: int = 60) -> oa.Record:
     rng = np.random.default_rng(1)
-    return oa.Record.from_arrays(u=rng.normal(size=rows), y=0.1 * rng.normal(size=rows), sampling_time=TS)
+    return oa.Record.from_arrays(
+        u=rng.normal(size=rows), y=0.1 * rng.normal(size=rows), sampling_time=TS
+    )
 
 
 def run(form: MotionDynamics, made: Numbers, data: oa.Record, start) -> np.ndarray:
@@ -70,7 +74,10 @@ def run(form: MotionDynamics, made: Numbers, data: oa.Record, start) -> np.ndarr
 
 @pytest.mark.parametrize("hold", ["zero-order", "first-order"])
 def test_an_exact_step_is_that_of_the_matrix_exponential(hold: str) -> None:
-    motion, method = spring(integrator="exact", hold=hold), {"zero-order": "zoh", "first-order": "foh"}[hold]
+    motion, method = (
+        spring(integrator="exact", hold=hold),
+        {"zero-order": "zoh", "first-order": "foh"}[hold],
+    )
     m, c, k = motion.initial
     a, b = np.array([[0, 1], [-k / m, -c / m]]), np.array([[0], [1 / m]])
     data = record()
@@ -83,12 +90,16 @@ def test_an_exact_step_is_that_of_the_matrix_exponential(hold: str) -> None:
             np.testing.assert_allclose(ours[i], x, rtol=0, atol=1e-12)
             x = ad @ x + bd[:, 0] * u[i]
         return
-    _, _, x = scipy.signal.lsim((a, b, np.eye(2), np.zeros((2, 1))), u, TS * np.arange(len(u)), [0.3, -0.2])
+    _, _, x = scipy.signal.lsim(
+        (a, b, np.eye(2), np.zeros((2, 1))), u, TS * np.arange(len(u)), [0.3, -0.2]
+    )
     np.testing.assert_allclose(ours, x, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize(("integrator", "substeps"), [("rk4", 6), ("exact", 3)])
-def test_a_nonlinear_motion_under_a_spline_is_that_of_an_adaptive_integrator(integrator: str, substeps: int) -> None:
+def test_a_nonlinear_motion_under_a_spline_is_that_of_an_adaptive_integrator(
+    integrator: str, substeps: int
+) -> None:
     motion = oa.Motion.from_equations(
         states=[oa.State("x", "v"), oa.State("v", "u - 0.4*v - k*x - 3*x**3")],
         outputs=[oa.Output("y", "x")],
@@ -104,7 +115,9 @@ def test_a_nonlinear_motion_under_a_spline_is_that_of_an_adaptive_integrator(int
     def rates(t, x):
         return [x[1], np.sin(3 * t) - 0.4 * x[1] - 4 * x[0] - 3 * x[0] ** 3]
 
-    exact = scipy.integrate.solve_ivp(rates, (0, time[-1]), [0.5, 0.0], t_eval=time, rtol=1e-11, atol=1e-12).y.T
+    exact = scipy.integrate.solve_ivp(
+        rates, (0, time[-1]), [0.5, 0.0], t_eval=time, rtol=1e-11, atol=1e-12
+    ).y.T
     np.testing.assert_allclose(ours, exact, rtol=0, atol=1e-5)
 
 
@@ -117,14 +130,21 @@ def test_inputs_between_samples() -> None:
     np.testing.assert_allclose(spline[:-1, -1], u[1:], atol=1e-12)
 
 
-@pytest.mark.parametrize(("integrator", "substeps", "hold"), [("rk4", 1, "zero-order"), ("rk4", 2, "spline")])
-def test_the_adjoint_of_the_stages_gives_the_derivatives(integrator: str, substeps: int, hold: str) -> None:
+@pytest.mark.parametrize(
+    ("integrator", "substeps", "hold"), [("rk4", 1, "zero-order"), ("rk4", 2, "spline")]
+)
+def test_the_adjoint_of_the_stages_gives_the_derivatives(
+    integrator: str, substeps: int, hold: str
+) -> None:
     form, made = with_learner(spring(integrator=integrator, hold=hold, learned=True), substeps)
     rng = np.random.default_rng(3)
     points = {"zero-order": 1, "spline": 2 * substeps + 1}[hold]
     state, inputs = rng.normal(size=(2, 5)), rng.normal(size=(points, 5))
     given = (made, state, inputs)
-    ours, plain = jax.jit(form.local)(*given), jax.jit(partial(AutodiffDynamics.local, form))(*given)
+    ours, plain = (
+        jax.jit(form.local)(*given),
+        jax.jit(partial(AutodiffDynamics.local, form))(*given),
+    )
     for one, other in zip(ours, plain, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-13)
 
@@ -152,13 +172,21 @@ def test_sensitivities_over_segments_are_those_of_forward_differentiation(integr
     np.testing.assert_allclose(gram, columns.T @ columns, rtol=1e-8, atol=1e-10)
 
 
-def test_sensitivities_of_steps_at_once_are_those_step_by_step(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sensitivities_of_steps_at_once_are_those_step_by_step(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     form, made = with_learner(spring(learned=True), 1)
     segments = build_segments(record(40), form, 19, 3)
     given = (form, made, segments, segments.start, np.array([[2.0]]))
     told = []
-    for block, fewest in ((1 << 15, 1), (8 * 3 * (2 + form.unknowns) * segments.scored.shape[2], 8), (1, 8)):
-        monkeypatch.setattr(laid, "_BLOCK", block)  # one block; three, the last of which is not full; no blocks
+    for block, fewest in (
+        (1 << 15, 1),
+        (8 * 3 * (2 + form.unknowns) * segments.scored.shape[2], 8),
+        (1, 8),
+    ):
+        monkeypatch.setattr(
+            laid, "_BLOCK", block
+        )  # one block; three, the last of which is not full; no blocks
         monkeypatch.setattr(laid, "_FEWEST", fewest)
         told.append(sensitivity.__wrapped__(*given))
     for other in told[1:]:

@@ -38,7 +38,9 @@ def objective(kind="orthogonal") -> StructuredObjective:
     """On the noisy mass-spring-damper; segments have a washout, so their states are free."""
     example = mass_spring_damper()
     (experiment,) = example.train.experiments
-    y = experiment.outputs + 0.02 * experiment.outputs.std() * np.random.default_rng(0).normal(size=(10_000, 1))
+    y = experiment.outputs + 0.02 * experiment.outputs.std() * np.random.default_rng(0).normal(
+        size=(10_000, 1)
+    )
     names = {"inputs": ["force"], "outputs": ["position"], "sampling_time": 0.01}
     record = Record.from_arrays(experiment.inputs, y, **names).rows(0, ROWS)
     baseline = example.baseline
@@ -158,10 +160,18 @@ class Rejecting:
 def test_a_rejected_trial_leaves_nothing_behind(evidence):
     given = objective()
     p, q = points(given)
-    options = {"limit": Limit(6, 6), "tolerance": 1e-9, "damping": MARQUARDT, "ridge": 1.0, "evidence": evidence}
+    options = {
+        "limit": Limit(6, 6),
+        "tolerance": 1e-9,
+        "damping": MARQUARDT,
+        "ridge": 1.0,
+        "evidence": evidence,
+    }
     plain = descend(given, p, nowhere(given), **options)
     disturbed = descend(Rejecting(given, q), p, nowhere(given), **options)
-    assert plain.ending is Ending.RUNNING and plain.point.loss < given.evaluate(p, nowhere(given)).loss
+    assert (
+        plain.ending is Ending.RUNNING and plain.point.loss < given.evaluate(p, nowhere(given)).loss
+    )
     assert_same(plain.point, disturbed.point)
     assert_same(plain.linear, disturbed.linear)
     assert (plain.ridge, plain.effective, plain.iterations) == (

@@ -37,10 +37,18 @@ SHARED = [
 ]
 CASES = {
     "one output": (ONE, Lags(2, 2, 0), NETWORK),
-    "gaps between lags": ([Term("a", "y1[k-1]"), Term("b", "y1[k-3]"), Term("g", "u[k]")], None, NETWORK),
+    "gaps between lags": (
+        [Term("a", "y1[k-1]"), Term("b", "y1[k-3]"), Term("g", "u[k]")],
+        None,
+        NETWORK,
+    ),
     "expressions": (ONE, None, MLP(hidden=(2,), inputs=("sin(y1[k-1])", "y1[k-3]*u[k]"))),
     "nonlinear physics and a fixed term": (
-        [Term("a", "y1[k-1] - 0.1*y1[k-1]**3"), Term("g", "u[k]"), Term("d", "y1[k-2]", 0.2, fixed=True)],
+        [
+            Term("a", "y1[k-1] - 0.1*y1[k-1]**3"),
+            Term("g", "u[k]"),
+            Term("d", "y1[k-2]", 0.2, fixed=True),
+        ],
         None,
         NETWORK,
     ),
@@ -76,7 +84,9 @@ def case(name):
     terms, lags, learner = CASES[name]
     ny = OUTPUTS[name]
     rng = np.random.default_rng(len(name))
-    posed = pose(record_of(ny), Baseline.from_terms(terms), lags, None if learner is None else learner.inputs)
+    posed = pose(
+        record_of(ny), Baseline.from_terms(terms), lags, None if learner is None else learner.inputs
+    )
     nz = posed.feature_rows().shape[1]
     bound = None if learner is None else Bound(learner, nz, ny)
     form = Lagged(posed.baseline, posed.features, posed.layout, posed.outputs, bound)
@@ -89,7 +99,14 @@ def case(name):
         patch.setattr(orthaug.fitting.segments, "CHUNK", 9)
         segments = build_segments(posed.record, form, SEGMENT, WASHOUT)
     states = np.asarray(segments.start) + 0.3 * rng.normal(size=segments.start.shape)
-    return Case(posed.record, form, Numbers(c, 0 * c, w, *scaling), segments, states, rng.normal(size=(ny, ny)))
+    return Case(
+        posed.record,
+        form,
+        Numbers(c, 0 * c, w, *scaling),
+        segments,
+        states,
+        rng.normal(size=(ny, ny)),
+    )
 
 
 def spread_out(part):
@@ -109,7 +126,13 @@ def build_chunk(record, start, memory, segment, washout):
     for i, experiment in enumerate(record.experiments):
         first = start
         while first == start or first + washout < len(experiment):
-            found.append((i, first, [k for k in range(first + washout, first + steps) if k < len(experiment)]))
+            found.append(
+                (
+                    i,
+                    first,
+                    [k for k in range(first + washout, first + steps) if k < len(experiment)],
+                )
+            )
             first += steps - washout
     return found, steps, washout
 
@@ -136,7 +159,9 @@ def test_layout_by_a_double_loop(name, segment, washout):
             np.testing.assert_array_equal(target[s, t], experiment.outputs[first + t])
             lagged = [experiment.inputs[first + t - lag.lag, 0] for lag in form.input_layout]
             np.testing.assert_array_equal(inputs[s, t], lagged)
-    assert not scored[len(expected) :].any() and found.count == sum(len(rows) for *_, rows in expected)
+    assert not scored[len(expected) :].any() and found.count == sum(
+        len(rows) for *_, rows in expected
+    )
 
 
 @pytest.mark.parametrize(("segment", "washout"), [(0, 0), (0, 4), (7, 3), (7, 0), (9, 8)])
@@ -144,7 +169,11 @@ def test_every_usable_row_is_scored_once_but_the_first_washout(segment, washout)
     record, form = case("one output").record, case("one output").form
     layout, _, washout = build_chunk(record, form.first_row, form.memory, segment, washout)
     rows = [(i, k) for i, _, scored in layout for k in scored]
-    usable = [(i, k) for i, e in enumerate(record.experiments) for k in range(form.first_row + washout, len(e))]
+    usable = [
+        (i, k)
+        for i, e in enumerate(record.experiments)
+        for k in range(form.first_row + washout, len(e))
+    ]
     assert sorted(rows) == usable
     assert build_segments(record, form, segment, washout).count == len(usable)
 
@@ -156,7 +185,9 @@ def test_segments_stand_in_chunks_of_one_width(monkeypatch):
     monkeypatch.undo()
     one = build_segments(record, form, SEGMENT, WASHOUT)
     assert one.start.shape[0] == 1 and chunked.start.shape[0] == 4 and chunked.start.shape[-1] <= 4
-    assert {part.shape[0] for part in chunked} == {4} and {part.shape[-1] for part in one} == {one.start.shape[-1]}
+    assert {part.shape[0] for part in chunked} == {4} and {part.shape[-1] for part in one} == {
+        one.start.shape[-1]
+    }
     count = len(build_chunk(record, form.first_row, form.memory, SEGMENT, WASHOUT)[0])
     for found, expected in zip(chunked, one, strict=True):
         np.testing.assert_array_equal(spread_out(found)[:count], spread_out(expected)[:count])
@@ -198,7 +229,12 @@ def test_respond_over_whole_experiments_is_simulate(ny):
     name = "two outputs share theta" if ny == 2 else "one output"
     terms, lags, learner = CASES[name]
     record = record_of(ny)
-    options = {"lags": lags, "learner": learner, "solver": LevenbergMarquardt(5), "regularization": 1.0}
+    options = {
+        "lags": lags,
+        "learner": learner,
+        "solver": LevenbergMarquardt(5),
+        "regularization": 1.0,
+    }
     model = estimate(record, Baseline.from_terms(terms), **options).model
     assert np.abs(model.theta_aux).max() > 1e-3
     whole = build_segments(record, model.form, 0, 0)
@@ -222,7 +258,9 @@ class Dense(NamedTuple):
 def errors(given, p, states):
     nt = len(given.form.baseline.names)
     numbers = given.numbers._replace(theta=p[:nt], weights=p[nt:])
-    miss = jnp.where(given.segments.scored[:, :, None], respond(given.form, numbers, given.segments, states), 0.0)
+    miss = jnp.where(
+        given.segments.scored[:, :, None], respond(given.form, numbers, given.segments, states), 0.0
+    )
     return jnp.einsum("oi,ktim->ktom", given.weight, miss)
 
 
@@ -240,13 +278,21 @@ def dense(name):
 
 def assert_close(found, expected, relative):
     assert found.shape == expected.shape
-    assert np.max(np.abs(found - expected), initial=0.0) <= relative * np.max(np.abs(expected), initial=1e-300)
+    assert np.max(np.abs(found - expected), initial=0.0) <= relative * np.max(
+        np.abs(expected), initial=1e-300
+    )
 
 
 @cache
 def found_of(name):
     given = case(name)
-    return sensitivity(given.form, given.numbers, given.segments, jnp.asarray(given.states), jnp.asarray(given.weight))
+    return sensitivity(
+        given.form,
+        given.numbers,
+        given.segments,
+        jnp.asarray(given.states),
+        jnp.asarray(given.weight),
+    )
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -269,7 +315,11 @@ def test_gram_matrices_of_the_states_are_those_of_autodiff(name):
             others[:, :, k, :, m] = 0
             assert not others.any()  # a state touches its own segment only
             rows = np.column_stack(
-                [start, exact.shared[k, :, :, m].reshape(len(start), -1), exact.error[k, :, :, m].ravel()]
+                [
+                    start,
+                    exact.shared[k, :, :, m].reshape(len(start), -1),
+                    exact.error[k, :, :, m].ravel(),
+                ]
             )
             own[k, :, :, m] = start.T @ rows
     assert_close(np.asarray(found_of(name).own), own, 1e-8)

@@ -1,4 +1,6 @@
-"""What can go wrong because of what was asked, always with the remedy in the text, on one line; and warnings.
+"""What can go wrong because of what was asked, always with the remedy in the text, on one line.
+
+And warnings.
 
 A warning is what the user must know about a result that stands all the same.
 """
@@ -11,7 +13,10 @@ from typing import Any, NamedTuple
 
 LONGEST = 60  # characters of a name or value in a message
 _FEW = 4  # entries of an array that is shown
-_MOST, _HEAD = 1200, 900  # characters of a message, and of its beginning where the middle is left out
+_MOST, _HEAD = (
+    1200,
+    900,
+)  # characters of a message, and of its beginning where the middle is left out
 _SEARCHED = 6 * _MOST  # characters that are looked at for names and values
 _QUOTED = re.compile(r"""(?<!\w)(['"`])(?!\1)(.*?)\1(?!\w)""")
 _LISTED = re.compile(r"\[[^][]+\]")
@@ -20,7 +25,9 @@ _WORD = re.compile(r"""[^\s/\\'"`]+""")
 
 def visible(text: str) -> str:
     """Return the text with line breaks, terminal controls and invisible characters escaped."""
-    return text if text.isprintable() else "".join(c if c.isprintable() else _escaped(c) for c in text)
+    return (
+        text if text.isprintable() else "".join(c if c.isprintable() else _escaped(c) for c in text)
+    )
 
 
 def shown(value: Any) -> str:
@@ -58,7 +65,10 @@ def _escaped(character: str) -> str:
 
 
 class InputError(ValueError):
-    """Bad input. The text says what is there and what was expected. The command line exits with 2."""
+    """Bad input.
+
+    The text says what is there and what was expected. The command line exits with 2.
+    """
 
     def __init__(self, text: str = "") -> None:
         super().__init__(message(str(text)))
@@ -67,10 +77,8 @@ class InputError(ValueError):
 class KeyedError(InputError):
     """Bad input in one key of a declaration.
 
-    Args:
-        text: the whole sentence, for users of Python.
-        key: the key at fault.
-        words: what a spec's or an option's message says after the key, such as `: found 3; expected less than 2`.
+    Args: text: the whole sentence, for users of Python. key: the key at fault. words: what a spec's
+        or an option's message says after the key, such as `: found 3; expected less than 2`.
     """
 
     def __init__(self, text: str, key: str, words: str) -> None:

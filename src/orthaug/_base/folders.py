@@ -1,8 +1,8 @@
 """Folders and files that appear whole or not at all: written beside their place, then renamed.
 
-What stands in the place is replaced only where orthaug wrote it and nobody changed it, or by force. The manifest of a
-folder tells: every file that orthaug wrote into it, with its checksum. What is not in its place yet is named after the
-process, and removed when that ends early.
+What stands in the place is replaced only where orthaug wrote it and nobody changed it, or by force.
+The manifest of a folder tells: every file that orthaug wrote into it, with its checksum. What is
+not in its place yet is named after the process, and removed when that ends early.
 """
 
 from __future__ import annotations
@@ -25,12 +25,21 @@ from orthaug._base.errors import InputError
 
 MANIFEST = "manifest.json"
 _PARTIAL, _OLD = ".orthaug-partial-", ".orthaug-old-"
-_HOST = hashlib.sha256(platform.node().encode()).hexdigest()[:8]  # of a folder that several machines share
-_OF_THE_SYSTEM = {".DS_Store", "Thumbs.db", "desktop.ini"}  # file managers write these into every folder
+_HOST = hashlib.sha256(platform.node().encode()).hexdigest()[
+    :8
+]  # of a folder that several machines share
+_OF_THE_SYSTEM = {
+    ".DS_Store",
+    "Thumbs.db",
+    "desktop.ini",
+}  # file managers write these into every folder
 
 
 class Partials:
-    """The partial folders and files of this process. `lock` is held while one is put in its place."""
+    """The partial folders and files of this process.
+
+    `lock` is held while one is put in its place.
+    """
 
     def __init__(self) -> None:
         self.lock = threading.RLock()
@@ -102,7 +111,10 @@ PARTIALS = Partials()  # of the process, as its signals are
 
 
 def remove_stale(parent: Path, alive: Sequence[Path] | dict[Path, Sequence[Path]] = ()) -> None:
-    """Remove what processes of this machine left in `parent` when they were killed; what stood there comes back."""
+    """Remove what processes of this machine left in `parent` when they were killed.
+
+    What stood there comes back.
+    """
     if os.name != "posix":  # elsewhere asking for a process may end it
         return
     with suppress(OSError):
@@ -154,7 +166,9 @@ def check_replaceable(folder: Path, *, force: bool = False) -> None:
     except OSError as error:
         raise InputError(f"{folder}: cannot be written ({error.strerror}).") from None
     if mine is not None:
-        raise InputError(f"{folder}: holds {mine}; give another folder, or replace all of it with --force.")
+        raise InputError(
+            f"{folder}: holds {mine}; give another folder, or replace all of it with --force."
+        )
     if there:
         _check_parts_writable(folder)
     if there and force:
@@ -265,19 +279,24 @@ def check_new_file(path: Path, *, force: bool = False) -> None:
     except InputError:
         raise
     except (OSError, ValueError) as error:  # such as a NUL byte in the name
-        raise InputError(f"{path}: cannot be written ({getattr(error, 'strerror', None) or error}).") from None
+        raise InputError(
+            f"{path}: cannot be written ({getattr(error, 'strerror', None) or error})."
+        ) from None
 
 
 @contextmanager
 def whole_file(path: Path, *, force: bool = False) -> Iterator[Path]:
     """A file beside `path` that takes its place at the end, and vanishes on any exception.
 
-    A link is followed: its target is written. What is no regular file, such as a pipe, is written into.
+    A link is followed: its target is written. What is no regular file, such as a pipe, is written
+    into.
 
     Raises:
         InputError: the file cannot be written, or exists already and holds something else.
     """
-    check_new_file(path, force=True)  # whether it may be replaced is asked at the end: others write the same
+    check_new_file(
+        path, force=True
+    )  # whether it may be replaced is asked at the end: others write the same
     target = Path(os.path.realpath(path))
     partial = None
     try:
@@ -290,7 +309,10 @@ def whole_file(path: Path, *, force: bool = False) -> Iterator[Path]:
             _place_file(partial, target, force)
             PARTIALS.stands(partial, path)
     except FileExistsError:
-        told = f"{path}: exists and holds something else; give another name, or replace it with --force."
+        told = (
+            f"{path}: exists and holds something else; give another name, or replace it with "
+            "--force."
+        )
         raise InputError(told) from None
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror or error}).") from None
@@ -300,7 +322,10 @@ def whole_file(path: Path, *, force: bool = False) -> Iterator[Path]:
 
 
 def _place_file(partial: Path, target: Path, force: bool) -> None:
-    """Rename; without force only where nothing else has appeared. Whoever wrote the same bytes is no one else."""
+    """Rename; without force only where nothing else has appeared.
+
+    Whoever wrote the same bytes is no one else.
+    """
     if not force:
         try:
             os.link(partial, target)
@@ -322,13 +347,18 @@ def write_manifest(folder: Path) -> None:
     """Write `manifest.json` about all files of a folder."""
     files = {name: file_digest(folder / name) for name in sorted(_names(folder))}
     content = {"orthaug": __version__, "files": files}
-    (folder / MANIFEST).write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    (folder / MANIFEST).write_text(
+        json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8"
+    )
 
 
 def not_ours(folder: Path) -> str | None:
-    """Return a file of a folder that orthaug did not write or that was changed, in words; None where all may be replaced.
+    """Return a file of a folder that orthaug did not write or that was changed, in words.
 
-    Without a manifest nothing says who wrote a file, whatever its name: each counts as the user's own.
+    None where all may be replaced.
+
+    Without a manifest nothing says who wrote a file, whatever its name: each counts as the user's
+    own.
     """
     listed = _listed(folder / MANIFEST)
     if listed is None:
@@ -368,6 +398,10 @@ def _listed(path: Path) -> dict[str, str] | None:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
         return None
-    if not isinstance(content, dict) or "orthaug" not in content or not isinstance(content.get("files"), dict):
+    if (
+        not isinstance(content, dict)
+        or "orthaug" not in content
+        or not isinstance(content.get("files"), dict)
+    ):
         return None
     return content["files"]

@@ -1,10 +1,13 @@
-"""JAX in double precision, imported when it is first used. A declaration of a learner or solver costs no import.
+"""JAX in double precision, imported when it is first used.
 
-`jax` and `jnp` stand for the modules. `jax.jit` compiles at the first call, so that a module with compiled functions
-can be imported without JAX.
+A declaration of a learner or solver costs no import.
 
-Programs that it keeps on disk end with a checksum, and one that was cut, altered or exchanged is compiled again: JAX
-runs whatever it finds under a program's name, and two that are exchanged give an error, or other numbers.
+`jax` and `jnp` stand for the modules. `jax.jit` compiles at the first call, so that a module with
+compiled functions can be imported without JAX.
+
+Programs that it keeps on disk end with a checksum, and one that was cut, altered or exchanged is
+compiled again: JAX runs whatever it finds under a program's name, and two that are exchanged give
+an error, or other numbers.
 """
 
 from __future__ import annotations
@@ -27,7 +30,9 @@ if TYPE_CHECKING:
     import jax.numpy as jnp
     from jax import Array
 else:
-    Array = Any  # in annotations; at run time jaxtyping checks shape and type of whatever is an array
+    Array = (
+        Any  # in annotations; at run time jaxtyping checks shape and type of whatever is an array
+    )
 
 _LENGTH = hashlib.sha256().digest_size
 __all__ = ["Array", "is_traced", "jax", "jnp", "padded_length", "starts", "use_compilation_cache"]
@@ -85,7 +90,10 @@ def _late_jit(function: Callable[..., Any], **options: Any) -> Callable[..., Any
 
 
 def starts() -> bool:
-    """Return whether JAX finds a device to compute on; what it raises where it does not depends on the platform asked for."""
+    """Return whether JAX finds a device to compute on.
+
+    What it raises where it does not depends on the platform asked for.
+    """
     try:
         return bool(_real_jax().devices())
     except Exception:
@@ -110,7 +118,9 @@ class _CompileTimes(threading.local):
         if not event.startswith("/jax/core/compile/"):
             return
         end = time.perf_counter()
-        while self.spans and self.spans[-1][1] > end - duration:  # what a program calls is traced within it
+        while (
+            self.spans and self.spans[-1][1] > end - duration
+        ):  # what a program calls is traced within it
             begin, last = self.spans.pop()
             self.total -= last - begin
             duration = max(duration, end - begin)
@@ -139,12 +149,17 @@ def padded_length(rows: int) -> int:
 
 if not TYPE_CHECKING:
     jax, jnp = _LazyModule(_real_jax, jit=_late_jit), _LazyModule(_real_jnp)
-    if "jax" in sys.modules:  # then it costs nothing, and what the user computes is in double precision too
+    if (
+        "jax" in sys.modules
+    ):  # then it costs nothing, and what the user computes is in double precision too
         _real_jax()
 
 
 def use_compilation_cache() -> None:
-    """Keep compiled programs between processes (the command line does; the library never on its own)."""
+    """Keep compiled programs between processes (the command line does.
+
+    The library never on its own).
+    """
     import platformdirs
 
     folder = os.environ.get("JAX_COMPILATION_CACHE_DIR") or platformdirs.user_cache_dir("orthaug")
@@ -155,7 +170,10 @@ def use_compilation_cache() -> None:
 
 
 class ChecksummedCache:
-    """A cache of JAX whose entries end with a checksum of their key and content; a cache without writing is silent."""
+    """A cache of JAX whose entries end with a checksum of their key and content.
+
+    A cache without writing is silent.
+    """
 
     def __init__(self, cache: Any, folder: str) -> None:
         self._cache, self._folder = cache, Path(folder)
@@ -184,7 +202,10 @@ def _digest(key: str, content: bytes) -> bytes:
 
 
 def _check_cached_programs() -> None:
-    """From now on JAX's cache is a checked one. Where JAX is built otherwise than known, nothing is kept."""
+    """From now on JAX's cache is a checked one.
+
+    Where JAX is built otherwise than known, nothing is kept.
+    """
     try:
         from jax._src import compilation_cache
 

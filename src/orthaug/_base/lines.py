@@ -15,7 +15,10 @@ _GAP = "  "
 
 
 def fit_screen(columns: int) -> None:
-    """Let what is printed from now on fit a terminal of so many columns, 40 to 100; 0 where they are not known."""
+    """Let what is printed from now on fit a terminal of so many columns, 40 to 100.
+
+    0 where they are not known.
+    """
     _screen[0] = min(WIDTH, max(columns, _NARROWEST)) if columns > 0 else WIDTH
 
 
@@ -51,8 +54,8 @@ def plain_number(value: float, digits: int = 2, *, sign: str = "") -> str:
 def table(rows: Sequence[Sequence[str]], width: int | None = None) -> list[str]:
     """Rows of cells as lines of at most `width` columns (None: the screen's), the first row the head.
 
-    Rows may be of different lengths. Columns that do not fit stand below, under the first column again; an interval
-    stays beside its value.
+    Rows may be of different lengths. Columns that do not fit stand below, under the first column
+    again; an interval stays beside its value.
 
     Examples:
         >>> table([["part", "RMSE", "FIT %"], ["test", "0.1 m", "90"]])
@@ -104,7 +107,9 @@ def fold(lines: Iterable[str], width: int | None = None) -> list[str]:
     """
     most = width or _screen[0]
     single = (one for line in lines for one in line.split("\n"))
-    return [part for line in single for part in (_folded(line, most) if len(line) > most else [line])]
+    return [
+        part for line in single for part in (_folded(line, most) if len(line) > most else [line])
+    ]
 
 
 def _folded(line: str, width: int) -> list[str]:

@@ -19,7 +19,10 @@ def available() -> float:
 
 
 def limit() -> float:
-    """Bytes of addresses that this process may take at most (`ulimit -v`); infinite where nothing says so."""
+    """Bytes of addresses that this process may take at most (`ulimit -v`).
+
+    Infinite where nothing says so.
+    """
     try:
         import resource
     except ImportError:
@@ -32,21 +35,26 @@ def check_limit(size: float, what: str) -> None:
     """Raise InputError where a limit on the process, which ends it without a word, leaves less than `size` bytes."""
     there = _allowed()
     if size > there:
-        raise InputError(f"{what} takes {in_words(size)} of memory; the limit (ulimit -v) leaves {in_words(there)}.")
+        raise InputError(
+            f"{what} takes {in_words(size)} of memory; the limit (ulimit -v) leaves "
+            f"{in_words(there)}."
+        )
 
 
 def check_memory(size: float, what: str) -> None:
     """Raise InputError where `size` bytes are more than there are; `what` begins the sentence."""
     there = available()
     if size > there:
-        raise InputError(f"{what} would take {in_words(size)} of memory; {in_words(there)} are available.")
+        raise InputError(
+            f"{what} would take {in_words(size)} of memory; {in_words(there)} are available."
+        )
 
 
 def few_arenas() -> None:
     """Let threads share what they allocate from, where the C library is glibc.
 
-    By default each thread has an arena of its own, which hardly shrinks: with the threads of XLA a streamed fit took a
-    fifth more memory. Threads that run already keep theirs.
+    By default each thread has an arena of its own, which hardly shrinks: with the threads of XLA a
+    streamed fit took a fifth more memory. Threads that run already keep theirs.
     """
     if sys.platform != "linux":
         return

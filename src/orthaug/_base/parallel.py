@@ -39,9 +39,10 @@ def one_core() -> Iterator[None]:
 def one_blas_thread() -> Iterator[None]:
     """BLAS on one thread.
 
-    Its other threads would wait actively after every call, for longer than a pass over 10⁵ rows takes. LAPACK makes the
-    Cholesky factors of a step; XLA's own threads do everything else. Where they shared the cores with waiting threads,
-    an iteration took 45 % longer (benchmarks/lm_iteration.py).
+    Its other threads would wait actively after every call, for longer than a pass over 10⁵ rows
+    takes. LAPACK makes the Cholesky factors of a step; XLA's own threads do everything else. Where
+    they shared the cores with waiting threads, an iteration took 45 % longer
+    (benchmarks/lm_iteration.py).
     """
     with _blas().limit(limits=1):
         yield
@@ -51,8 +52,8 @@ def one_blas_thread() -> Iterator[None]:
 def _blas() -> ThreadpoolController:
     """Return the BLAS libraries of NumPy and SciPy, found once.
 
-    To find them is to read the process's memory map, which gets longer with every compiled program: after some hundred
-    of them it took longer than a small fit.
+    To find them is to read the process's memory map, which gets longer with every compiled program:
+    after some hundred of them it took longer than a small fit.
     """
     import scipy.linalg  # noqa: F401  (brings its own BLAS, which is JAX's as well)
 
@@ -64,22 +65,25 @@ class RunCancelled(Exception):
 
 
 def spread(
-    function: Callable[[Item, Callable[[], None]], Result], items: Sequence[Item], workers: int | None = None
+    function: Callable[[Item, Callable[[], None]], Result],
+    items: Sequence[Item],
+    workers: int | None = None,
 ) -> list[Result]:
     """`[function(item, check) for item in items]`, several at a time; arguments as of `each`."""
     return list(each(function, items, workers))
 
 
 def each(
-    function: Callable[[Item, Callable[[], None]], Result], items: Sequence[Item], workers: int | None = None
+    function: Callable[[Item, Callable[[], None]], Result],
+    items: Sequence[Item],
+    workers: int | None = None,
 ) -> Iterator[Result]:
     """`function(item, check)` of every item, in their order as they come, several at a time.
 
     The first that fails ends the others, and so does a caller that takes no more.
 
-    Args:
-        function: calls `check()` now and then, which raises `RunCancelled` once the results are not wanted.
-        workers: how many at a time; by default the machine's cores.
+    Args: function: calls `check()` now and then, which raises `RunCancelled` once the results are
+        not wanted. workers: how many at a time; by default the machine's cores.
     """
     stop = threading.Event()
 
@@ -124,8 +128,8 @@ class Threads:
     ) -> Iterator[Result]:
         """`function(given, item, tell)` of every item, in their order as they come.
 
-        Args:
-            function: of a module, so that it can be sent elsewhere. It calls `tell(…)` now and then, which raises
+        Args: function: of a module, so that it can be sent elsewhere. It calls `tell(…)` now and
+            then, which raises
                 `RunCancelled` once the results are not wanted.
             given: what all runs share.
             heard: called with the number of an item and what its run tells.

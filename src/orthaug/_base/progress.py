@@ -1,6 +1,7 @@
 """What is told of work: progress of training, to whoever shows it, and the logger `orthaug`, silent until one listens.
 
-Stages of a fit are INFO, what was tried instead is DEBUG. What a user must know stands in warnings of results.
+Stages of a fit are INFO, what was tried instead is DEBUG. What a user must know stands in warnings
+of results.
 """
 
 from __future__ import annotations
@@ -14,7 +15,8 @@ LOG = logging.getLogger("orthaug")
 LOG.addHandler(logging.NullHandler())
 
 ProgressCallback = Callable[[int, int, float], None]
-"""Called now and then with the number of the run, its iteration and the loss; it may raise to stop the training.
+"""Called now and then with the number of the run, its iteration and the loss; it may raise to stop
+the training.
 
 What it raises ends it without a result, but for `StopTraining`.
 """
@@ -46,7 +48,9 @@ def _nothing(run: int, iteration: int, loss: float) -> None:
 
 @dataclass(frozen=True)
 class Progress:
-    """Tells `(run, iteration, loss)`. Runs and iterations are counted on from those that were told before.
+    """Tells `(run, iteration, loss)`.
+
+    Runs and iterations are counted on from those that were told before.
 
     Examples:
         >>> told = Progress(lambda run, iteration, loss: print(run, iteration, loss))

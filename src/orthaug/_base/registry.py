@@ -1,8 +1,8 @@
 """Registries: the kinds of learners, structures, measures, criteria and solvers, each a declaration under a name.
 
-A declaration is a frozen dataclass. Its fields are the keys of its section in a spec: name, type, limits
-(`Annotated[int, Ge(1)]`) and default. A declaration that stands for something else, such as files that hold points,
-has a method `resolve(context)` that makes the real thing.
+A declaration is a frozen dataclass. Its fields are the keys of its section in a spec: name, type,
+limits (`Annotated[int, Ge(1)]`) and default. A declaration that stands for something else, such as
+files that hold points, has a method `resolve(context)` that makes the real thing.
 """
 
 from __future__ import annotations
@@ -22,7 +22,9 @@ from orthaug._base.checks import check_choice, check_count, check_number, neares
 from orthaug._base.errors import InputError, KeyedError
 
 LIBRARY_ONLY = {"library_only": True}
-"""Metadata of a dataclass field that is no key of the spec: `field(default=…, metadata=LIBRARY_ONLY)`."""
+"""Metadata of a dataclass field that is no key of the spec: `field(default=…,
+metadata=LIBRARY_ONLY)`.
+"""
 
 
 @dataclass(frozen=True)
@@ -115,23 +117,31 @@ class Registry(Mapping[str, Any]):
     def add(self, kind: str, declaration: type) -> None:
         """Register a declaration.
 
-        Raises:
-            InputError: a name that is taken, no frozen dataclass, or a key that means something else already.
+        Raises: InputError: a name that is taken, no frozen dataclass, or a key that means something
+            else already.
         """
         if kind in self._entries:
-            raise InputError(f"the {self.axis} '{kind}' is registered already; give it another name.")
+            raise InputError(
+                f"the {self.axis} '{kind}' is registered already; give it another name."
+            )
         if not dataclasses.is_dataclass(declaration) or not declaration.__dataclass_params__.frozen:  # type: ignore[attr-defined]
-            raise InputError(f"the {self.axis} '{kind}' must be a frozen dataclass; got {declaration!r}.")
+            raise InputError(
+                f"the {self.axis} '{kind}' must be a frozen dataclass; got {declaration!r}."
+            )
         for key in keys_of(declaration).values():
             if key.name in self._reserved:
-                raise InputError(f"the {self.axis} '{kind}' has a key '{key.name}', which its section has already.")
+                raise InputError(
+                    f"the {self.axis} '{kind}' has a key '{key.name}', which its section has "
+                    "already."
+                )
             for registry in self._section:
                 for other, known in registry._entries.items():
                     same = keys_of(known).get(key.name)
                     if same is not None and same.meaning != key.meaning:
                         raise InputError(
-                            f"the {self.axis} '{kind}' and the {registry.axis} '{other}' declare the key '{key.name}' "
-                            f"differently: {key.annotation} and {same.annotation}; give one of them another name."
+                            f"the {self.axis} '{kind}' and the {registry.axis} '{other}' "
+                            f"declare the key '{key.name}' differently: {key.annotation} and "
+                            f"{same.annotation}; give one of them another name."
                         )
         self._entries[kind] = declaration
 
@@ -156,8 +166,14 @@ class Registry(Mapping[str, Any]):
         return keys
 
     def kind_of(self, declared: object) -> str | None:
-        """Return the name under which a declaration's class is registered; None for a foreign one."""
-        return next((kind for kind, declaration in self._entries.items() if type(declared) is declaration), None)
+        """Return the name under which a declaration's class is registered.
+
+        None for a foreign one.
+        """
+        return next(
+            (kind for kind, declaration in self._entries.items() if type(declared) is declaration),
+            None,
+        )
 
     def kind_with(self, option: str) -> tuple[str, Key] | None:
         """Return the kind that a command-line option belongs to, with the key that it gives."""
@@ -174,12 +190,21 @@ class Registry(Mapping[str, Any]):
             InputError: an unknown kind, a missing key, or what the declaration refuses.
         """
         if kind not in self._entries:
-            raise InputError(f"unknown {self.axis} '{kind}'{nearest(kind, self) or ', known are ' + ', '.join(self)}.")
+            raise InputError(
+                f"unknown {self.axis} "
+                f"'{kind}'{nearest(kind, self) or ', known are ' + ', '.join(self)}."
+            )
         known = keys_of(self._entries[kind])
         for name, key in known.items():
             if key.default is dataclasses.MISSING and name not in values:
-                raise KeyedError(f"the {self.axis} '{kind}' needs `{name}`.", name, f" is missing; {kind} needs it")
-        return self._entries[kind](**{name: frozen(value) for name, value in values.items() if name in known})
+                raise KeyedError(
+                    f"the {self.axis} '{kind}' needs `{name}`.",
+                    name,
+                    f" is missing; {kind} needs it",
+                )
+        return self._entries[kind](
+            **{name: frozen(value) for name, value in values.items() if name in known}
+        )
 
 
 @functools.cache
@@ -199,7 +224,10 @@ def resolve(declared: Any, context: Any = None) -> Any:
 
 
 def check_fields(declared: Any) -> None:
-    """Raise InputError for a field outside of the limits of its type; for the `__post_init__` of declarations."""
+    """Raise InputError for a field outside of the limits of its type.
+
+    For the `__post_init__` of declarations.
+    """
     for name, key in keys_of(type(declared)).items():
         value, metadata = getattr(declared, name), key.metadata
         low = next((mark.ge for mark in metadata if isinstance(mark, Ge)), None)

@@ -1,6 +1,7 @@
 """What later rooms add to objects of earlier ones: how a notebook shows them, figures of a fit, its page.
 
-The package's root, which may name every room, enters the makers here; they import what they need when they are called.
+The package's root, which may name every room, enters the makers here; they import what they need
+when they are called.
 """
 
 from __future__ import annotations
@@ -28,21 +29,24 @@ class FitView(NotebookView):
 
     @property
     def plot(self) -> Any:
-        """Figures on matplotlib axes, such as `fit.plot.free_run()`; `orthaug.reports.FitPlots` lists them."""
+        """Figures on matplotlib axes, such as `fit.plot.free_run()`.
+
+        `orthaug.reports.FitPlots` lists them.
+        """
         return MAKERS["plot"](self)
 
     def report(self, path: Any = None, *, tests: Any = None) -> Any:
         """Return the page that `orthaug fit` writes, with all figures in one file.
 
-        Args:
-            path: HTML file to write, which is replaced; None to get the page as text that a notebook shows.
-            tests: records to score and judge the model on, by their names; none for the training data alone.
+        Args: path: HTML file to write, which is replaced; None to get the page as text that a
+            notebook shows. tests: records to score and judge the model on, by their names; none for
+            the training data alone.
 
         Returns:
             The `Page`: `html` is its text, `path` its file or None.
 
-        Raises:
-            InputError: training that failed, a path that cannot be written, a record that does not fit the model.
+        Raises: InputError: training that failed, a path that cannot be written, a record that does
+            not fit the model.
         """
         return MAKERS["report"](self, path, tests)
 

@@ -1,8 +1,9 @@
 """What a fit makes of a term that the physics lacks: how far it moves c, and what the learner holds of it (F8).
 
-With `Y = Φθ* + Δ` a learner that can be any function of its features z takes the mean of `Δ − Φd` given z, with
-`d = c − θ*` from the partially linear regression `d = ((I − M)Φ)⁺(I − M)Δ`, M the mean given z. A Δ that is a function
-of z has `(I − M)Δ = 0`: it moves nothing that the learner could not imitate.
+With `Y = Φθ* + Δ` a learner that can be any function of its features z takes the mean of `Δ − Φd`
+given z, with `d = c − θ*` from the partially linear regression `d = ((I − M)Φ)⁺(I − M)Δ`, M the
+mean given z. A Δ that is a function of z has `(I − M)Δ = 0`: it moves nothing that the learner
+could not imitate.
 """
 
 from __future__ import annotations
@@ -36,8 +37,9 @@ _SEED = 20_241_122
 class TermAfterFit:
     """A term of coefficient 1 after the fit.
 
-    `moved` (nθ,) is what it adds to c. `held` (M, ny) is what the learner holds of it on a measure's points. `seen`
-    tells whether it is a function of what the learner sees; None where the learner could imitate all of the physics.
+    `moved` (nθ,) is what it adds to c. `held` (M, ny) is what the learner holds of it on a
+    measure's points. `seen` tells whether it is a function of what the learner sees; None where the
+    learner could imitate all of the physics.
     """
 
     moved: Vector
@@ -49,8 +51,8 @@ class TermAfterFit:
 class Smoother:
     """The mean given the learner's features, over the training rows: least squares on many functions of these.
 
-    The functions are tanh waves with centres on the data, and the shared part of the physics. Of a learner that is
-    linear in its features they are these.
+    The functions are tanh waves with centres on the data, and the shared part of the physics. Of a
+    learner that is linear in its features they are these.
     """
 
     problem: Problem
@@ -70,12 +72,17 @@ class Smoother:
         return (low + high) / 2, np.where(high > low, (high - low) / 2, 1.0)
 
     def _z(self, x: Matrix) -> Matrix:
-        """z on rows of the regressor, over its range in the data; kept, for the same rows are asked for again."""
+        """z on rows of the regressor, over its range in the data.
+
+        Kept, for the same rows are asked for again.
+        """
         known = self._evaluated.get(id(x))
         if known is None or known[0] is not x:
             centre, half = self._unit
             with np.errstate(all="ignore"):
-                z = (np.asarray(self.problem.features.evaluate(x, self.problem.layout, np)) - centre) / half
+                z = (
+                    np.asarray(self.problem.features.evaluate(x, self.problem.layout, np)) - centre
+                ) / half
             known = self._evaluated[id(x)] = (x, np.nan_to_num(z))
         return known[1]
 

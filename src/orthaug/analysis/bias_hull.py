@@ -1,14 +1,15 @@
 """The bias that a learner implies is a set: the hull over all causes that noise cannot tell from the best.
 
-A cause that explains the share s of what the learner holds beside the physics leaves 1 − s of it. The truth leaves what
-the noise puts into the learner, `ν = E‖noise of it‖²/‖it‖²`, and what no form of the catalogue has; so a cause may be
-the true one where
+A cause that explains the share s of what the learner holds beside the physics leaves 1 − s of it.
+The truth leaves what the noise puts into the learner, `ν = E‖noise of it‖²/‖it‖²`, and what no form
+of the catalogue has; so a cause may be the true one where
 
     1 − s ≤ 12 (1 − s_best + ν),    and s at least 0.8 of s_best.
 
-Terms that are nearly the physics itself, `|v|^1.1`, fit anything with a huge size and stay out. Every such cause has an
-interval about the estimate less its bias, as wide as noise and what it leaves. What is shown is the hull of them; where
-that is wider than the value itself, the data do not determine it beside this learner.
+Terms that are nearly the physics itself, `|v|^1.1`, fit anything with a huge size and stay out.
+Every such cause has an interval about the estimate less its bias, as wide as noise and what it
+leaves. What is shown is the hull of them; where that is wider than the value itself, the data do
+not determine it beside this learner.
 """
 
 from __future__ import annotations
@@ -58,7 +59,9 @@ class NamedCause(Candidate):
 
 
 def compatible(candidates: Sequence[Candidate], noise: float) -> list[Candidate]:
-    """Return the causes that noise cannot tell from the best; of these the declared ones alone where there are any.
+    """Return the causes that noise cannot tell from the best.
+
+    Of these the declared ones alone where there are any.
 
     Args:
         noise: ν, the share of what the learner holds that is noise.
@@ -73,14 +76,23 @@ def compatible(candidates: Sequence[Candidate], noise: float) -> list[Candidate]
 
 
 def hull(
-    value: Vector, std: Vector, freedom: float, candidates: Sequence[Candidate], extra: Vector | float = 0.0
+    value: Vector,
+    std: Vector,
+    freedom: float,
+    candidates: Sequence[Candidate],
+    extra: Vector | float = 0.0,
 ) -> Float[np.ndarray, "n 2"]:
     """Return 95 % intervals (n, 2) that hold the truth whichever of the candidates is the cause.
 
     Args:
         extra: a standard deviation that every cause has beside its own.
     """
-    each = np.array([interval(value - c.moved, np.sqrt(std**2 + c.unsure**2 + extra**2), freedom) for c in candidates])
+    each = np.array(
+        [
+            interval(value - c.moved, np.sqrt(std**2 + c.unsure**2 + extra**2), freedom)
+            for c in candidates
+        ]
+    )
     return np.stack([each[..., 0].min(axis=0), each[..., 1].max(axis=0)], axis=-1)
 
 
@@ -90,9 +102,13 @@ def is_determined(value: float, std: float, freedom: float, low: float, high: fl
     return not (high - low > abs(value) and high - low > 2 * noise)
 
 
-def undetermined_warning(names: Sequence[str], candidates: Sequence[Candidate], remedies: Sequence[str]) -> Warning:
+def undetermined_warning(
+    names: Sequence[str], candidates: Sequence[Candidate], remedies: Sequence[str]
+) -> Warning:
     """Return the warning on parameters that the hull leaves open: why, and what would determine them."""
-    shown = ", ".join(names[:_TOLD]) + (f" and {len(names) - _TOLD} more" if len(names) > _TOLD else "")
+    shown = ", ".join(names[:_TOLD]) + (
+        f" and {len(names) - _TOLD} more" if len(names) > _TOLD else ""
+    )
     apart = sorted(candidates, key=lambda c: float(np.sum(np.sign(c.moved) * c.moved**2)))
     pair = [apart[0], apart[-1]] if len(apart) > 1 else apart
     causes = " and ".join(f"{c.name}, {percent(c.share)} of what it found" for c in pair)
@@ -107,5 +123,7 @@ def undetermined_warning(names: Sequence[str], candidates: Sequence[Candidate], 
     )
     verb = "is" if len(names) == 1 else "are"
     return Warning(
-        "not_determined", f"{shown} {verb} not determined by these data beside this learner{of}. To determine: {cure}."
+        "not_determined",
+        f"{shown} {verb} not determined by these data beside this learner{of}. To determine: "
+        f"{cure}.",
     )

@@ -28,19 +28,24 @@ _CLOSE = 1.05  # ratio of two factors at which the bisection ends
 Diverging = Callable[[list[float]], np.ndarray]
 
 
-def divergence_scaling(model: Model | MotionModel, record: Record, largest: float = 1024.0) -> float | None:
+def divergence_scaling(
+    model: Model | MotionModel, record: Record, largest: float = 1024.0
+) -> float | None:
     """Factor on the inputs from which the free run leaves all bounds (10⁶ times the largest training output).
 
-    It scales each input's deviation from its mean over the record; the measured outputs that the run starts from stay.
-    Doubled until a run diverges, then bisected to 5 %; what is returned did diverge, and others below it may. Of longer
-    records 20000 rows are used, the first of each experiment. None where no run up to `largest` diverges, as without
-    a state; at most 1 where the record's own run does, and 0 where it does with its inputs at their means.
+    It scales each input's deviation from its mean over the record; the measured outputs that the
+    run starts from stay. Doubled until a run diverges, then bisected to 5 %; what is returned did
+    diverge, and others below it may. Of longer records 20000 rows are used, the first of each
+    experiment. None where no run up to `largest` diverges, as without a state; at most 1 where the
+    record's own run does, and 0 where it does with its inputs at their means.
 
-    Raises:
-        InputError: a record that does not fit the model, or a `largest` that is not above 1 and at most 10⁴.
+    Raises: InputError: a record that does not fit the model, or a `largest` that is not above 1 and
+        at most 10⁴.
     """
     if not 1 < check_number(largest, "largest", positive=True) <= _LARGEST_FACTOR:
-        raise InputError(f"`largest` must be a factor above 1 and at most {_LARGEST_FACTOR:g}; got {largest!r}.")
+        raise InputError(
+            f"`largest` must be a factor above 1 and at most {_LARGEST_FACTOR:g}; got {largest!r}."
+        )
     if not model.form.states:
         return None
     rows = max(MOST_STEPS // len(record.experiments), model.form.first_row + 1)
@@ -55,18 +60,28 @@ def divergence_scaling(model: Model | MotionModel, record: Record, largest: floa
 
 
 def margin(factor: float | None, searched: float, driven: bool) -> tuple[str, str]:
-    """Such a factor, or that there is none up to `searched`, in a sentence; with the code of a warning, or nothing.
+    """Such a factor, or that there is none up to `searched`, in a sentence.
 
-    A model that is not `driven`, by inputs, has none to scale: its own run leaves the bounds or does not.
+    With the code of a warning, or nothing.
+
+    A model that is not `driven`, by inputs, has none to scale: its own run leaves the bounds or
+    does not.
     """
     if not driven:
-        stays = "stays within all bounds" if factor is None else "leaves all bounds from where it starts"
+        stays = (
+            "stays within all bounds"
+            if factor is None
+            else "leaves all bounds from where it starts"
+        )
         return (
             f"The free run {stays}; it has no inputs that could be larger.",
             "small_margin" if factor is not None else "",
         )
     stays, times = ("stays within", searched) if factor is None else ("leaves", factor)
-    told = f"The free run {stays} all bounds with the inputs' deviations from their means {times:.4g} times as large."
+    told = (
+        f"The free run {stays} all bounds with the inputs' deviations from their means "
+        f"{times:.4g} times as large."
+    )
     return told, "small_margin" if factor is not None and factor < _MARGIN else ""
 
 
@@ -91,7 +106,10 @@ def _below_one(diverges: Diverging) -> float:
 
 
 def _bisected(low: float, high: float, diverges: Diverging) -> float:
-    """Return the lowest factor that is known to diverge once `low` and `high` are close; every middle is tried at once."""
+    """Return the lowest factor that is known to diverge once `low` and `high` are close.
+
+    Every middle is tried at once.
+    """
     middles = _middles(low, high)
     if not middles:
         return high
@@ -114,7 +132,9 @@ def _middle(low: float, high: float) -> float:
     return float(np.sqrt(low * high))
 
 
-def _diverging(model: Model | MotionModel, record: Record, factors: Sequence[float]) -> Bool[np.ndarray, "f"]:
+def _diverging(
+    model: Model | MotionModel, record: Record, factors: Sequence[float]
+) -> Bool[np.ndarray, "f"]:
     """Return whether the free run diverges with the inputs' deviations from their means times each of up to 16 factors.
 
     The runs start from the measured outputs of each experiment and go side by side.
@@ -123,7 +143,9 @@ def _diverging(model: Model | MotionModel, record: Record, factors: Sequence[flo
         InputError: a record that does not fit the model, or has no outputs to start from.
     """
     if not record.outputs:
-        raise InputError("the record has no measured outputs to start from; give those of its first rows.")
+        raise InputError(
+            "the record has no measured outputs to start from; give those of its first rows."
+        )
     form: Dynamics = model.form
     record = usable(model, record)
     mean = np.concatenate([e.inputs for e in record.experiments]).mean(axis=0)
@@ -133,11 +155,18 @@ def _diverging(model: Model | MotionModel, record: Record, factors: Sequence[flo
         if wild.all():
             break
         inputs = form.inputs(experiment, record)
-        resting = form.inputs(replace(experiment, inputs=np.tile(mean, (len(experiment), 1))), record)
+        resting = form.inputs(
+            replace(experiment, inputs=np.tile(mean, (len(experiment), 1))), record
+        )
         padded = np.zeros((2, padded_length(len(inputs)), inputs.shape[1]))
         padded[:, : len(inputs)] = resting, inputs
-        state, bound = form.start(experiment.outputs, [form.first_row])[0], RUNAWAY * model.largest_output
-        wild |= np.asarray(_side_by_side(form, model.numbers, state, *padded, len(inputs), scales, bound))
+        state, bound = (
+            form.start(experiment.outputs, [form.first_row])[0],
+            RUNAWAY * model.largest_output,
+        )
+        wild |= np.asarray(
+            _side_by_side(form, model.numbers, state, *padded, len(inputs), scales, bound)
+        )
     return wild[: len(factors)]
 
 

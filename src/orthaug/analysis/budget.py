@@ -1,10 +1,11 @@
 """What the learner found, explained by a cause, and the bias of every parameter that follows from it.
 
-With F the learner's values under the measure and Δ a cause's, the coefficient is that of P⊥F on P⊥Δ and the bias,
-estimate less truth, `Φ_μ⁺Δ` times it. One cause is named: the declared suspect that explains most of ‖P⊥F‖² if that is
-enough, else the usual suspect or product of lags that does, or the member of a family (`catalogue`) that explains
-clearly more; one of each output where none is sure to be all of it. The interval is the hull over all causes that noise
-cannot tell from it (`bias_hull`).
+With F the learner's values under the measure and Δ a cause's, the coefficient is that of P⊥F on P⊥Δ
+and the bias, estimate less truth, `Φ_μ⁺Δ` times it. One cause is named: the declared suspect that
+explains most of ‖P⊥F‖² if that is enough, else the usual suspect or product of lags that does, or
+the member of a family (`catalogue`) that explains clearly more; one of each output where none is
+sure to be all of it. The interval is the hull over all causes that noise cannot tell from it
+(`bias_hull`).
 """
 
 from __future__ import annotations
@@ -48,18 +49,24 @@ _REMOVED = 0.1  # of the bias may remain
 _MEASURED_ROWS = 50_000  # above which no other measure is tried
 
 
-def remedies(linearization: MeasureLinearization, cause: SuspectedBias, biased: Sequence[str]) -> list[str]:
+def remedies(
+    linearization: MeasureLinearization, cause: SuspectedBias, biased: Sequence[str]
+) -> list[str]:
     """Return sentences on what removes the bias by a cause from the parameters named, the easiest first."""
     return [*_by_inputs(linearization, cause, biased), *_by_measure(linearization, cause, biased)]
 
 
-def _by_inputs(linearization: MeasureLinearization, cause: SuspectedBias, biased: Sequence[str]) -> Iterator[str]:
+def _by_inputs(
+    linearization: MeasureLinearization, cause: SuspectedBias, biased: Sequence[str]
+) -> Iterator[str]:
     """Yield the choice of learner inputs that frees most of the parameters."""
     problem, suspect = linearization.problem, cause.suspect
     layout, x = problem.layout, problem.rows.x
     now = {str(entry) for entry in problem.features.entries}
     best: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())
-    for inputs in dict.fromkeys((*(((suspect.on,),) if suspect.on else ()), *other_inputs(problem))):
+    for inputs in dict.fromkeys(
+        (*(((suspect.on,),) if suspect.on else ()), *other_inputs(problem))
+    ):
         if set(inputs) == now:
             continue
         features = Features(tuple(parse(text, dict(problem.baseline.constants)) for text in inputs))
@@ -80,7 +87,9 @@ def _by_inputs(linearization: MeasureLinearization, cause: SuspectedBias, biased
         yield f"set learner.inputs = [{listed}]{rest}"
 
 
-def _by_measure(linearization: MeasureLinearization, cause: SuspectedBias, biased: Sequence[str]) -> Iterator[str]:
+def _by_measure(
+    linearization: MeasureLinearization, cause: SuspectedBias, biased: Sequence[str]
+) -> Iterator[str]:
     """Yield a measure that brings the bias of all of them near zero."""
     if cause.seen is False or len(linearization.problem.rows) > _MEASURED_ROWS:
         return
@@ -88,7 +97,9 @@ def _by_measure(linearization: MeasureLinearization, cause: SuspectedBias, biase
         if measure.name == linearization.weighed.measure.name:
             continue
         try:
-            other = replace(linearization, weighed=weigh_problem(measure, linearization.problem), learned=None)
+            other = replace(
+                linearization, weighed=weigh_problem(measure, linearization.problem), learned=None
+            )
             left = _bias(other, cause.suspect)
         except InputError:
             continue
@@ -99,7 +110,9 @@ def _by_measure(linearization: MeasureLinearization, cause: SuspectedBias, biase
 
 def _bias(linearization: MeasureLinearization, suspect: Suspect) -> Vector:
     """Return the bias per unit of a suspect that the learner sees."""
-    values = suspect.values(linearization.weighed.points.x, linearization.problem.layout, linearization.problem.outputs)
+    values = suspect.values(
+        linearization.weighed.points.x, linearization.problem.layout, linearization.problem.outputs
+    )
     return linearization.weighed.projection.solve_along(
         times(linearization.weighed.unit, values), linearization.directions
     )
@@ -110,8 +123,12 @@ def _freed(
 ) -> tuple[str, ...]:
     """Parameters, physical ones by their slopes, whose bias shrinks to a small part."""
     names, before = linearization.problem.baseline.names, np.array(cause.bias)
-    rows = dict(zip(names, np.eye(len(names)), strict=True)) | (linearization.slopes[0] if linearization.slopes else {})
-    return tuple(name for name in biased if abs(rows[name] @ left) <= _REMOVED * abs(rows[name] @ before))
+    rows = dict(zip(names, np.eye(len(names)), strict=True)) | (
+        linearization.slopes[0] if linearization.slopes else {}
+    )
+    return tuple(
+        name for name in biased if abs(rows[name] @ left) <= _REMOVED * abs(rows[name] @ before)
+    )
 
 
 LEAST_SHARE = 0.5  # of the learner's energy that a cause must explain to be named
@@ -139,7 +156,9 @@ class ParameterBias:
     ci95: tuple[float, float] | None
     """The hull over all causes that noise cannot tell apart; None where that determines nothing."""
     determined: bool = True
-    """Whether the data determine the parameter beside this learner: the hull is no wider than the value itself."""
+    """Whether the data determine the parameter beside this learner: the hull is no wider than the
+    value itself.
+    """
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,15 +177,22 @@ class Budget:
 
     @property
     def share(self) -> float:
-        """Return how much of the learner that explains; where each output has a cause, of what is learned of its own."""
+        """Return how much of the learner that explains.
+
+        Where each output has a cause, of what is learned of its own.
+        """
         return explains(self.cause)
 
     def of(self, name: str) -> ParameterBias | None:
         """Return the bias of a parameter or physical parameter."""
-        return next((entry for entry in (*self.parameters, *self.physical) if entry.name == name), None)
+        return next(
+            (entry for entry in (*self.parameters, *self.physical) if entry.name == name), None
+        )
 
 
-def linearization_of(fit: Estimate, measure: Measure, physics: PhysicsMap | None = None) -> MeasureLinearization:
+def linearization_of(
+    fit: Estimate, measure: Measure, physics: PhysicsMap | None = None
+) -> MeasureLinearization:
     """Return what biases of a fit are computed on; `measure` is the one that θ was split under."""
     weighed = weigh_problem(measure, fit.problem)
     learns = fit.model.form.bound is not None
@@ -187,11 +213,15 @@ def lagged_budget(
     measure = Training() if measure is None else measure
     name = "training" if fit.measure is None else fit.measure.name
     if measure.name != name:
-        raise InputError(f"`measure` is the {measure.name} measure, but θ was split under the {name} measure.")
+        raise InputError(
+            f"`measure` is the {measure.name} measure, but θ was split under the {name} measure."
+        )
     return budget_on(linearization_of(fit, measure, physics), fit, suspects)
 
 
-def budget_on(linearization: MeasureLinearization, fit: Estimate, suspects: Sequence[Suspect]) -> Budget | None:
+def budget_on(
+    linearization: MeasureLinearization, fit: Estimate, suspects: Sequence[Suspect]
+) -> Budget | None:
     """The same on a ground that is there already."""
     if (
         not linearization.problem.baseline.names
@@ -207,19 +237,30 @@ def budget_on(linearization: MeasureLinearization, fit: Estimate, suspects: Sequ
     found, nameless = _causes(linearization, suspects, something) if something.any() else ([], [])
     if not found:
         return None
-    causes, moved = tuple(cause for _, cause in found), np.array([_moved(cause) for _, cause in found])
-    bias, rest = moved.sum(axis=0), [row for own, cause in found for row in left_over(own, cause, suspects)]
+    causes, moved = (
+        tuple(cause for _, cause in found),
+        np.array([_moved(cause) for _, cause in found]),
+    )
+    bias, rest = (
+        moved.sum(axis=0),
+        [row for own, cause in found for row in left_over(own, cause, suspects)],
+    )
     rest = np.array([*rest, *map(_moved, nameless)])
     candidates = _candidates(found, bias, np.linalg.norm(rest, axis=0), suspects, fit)
     std = np.full(len(bias), np.nan) if fit.std is None else fit.std
     other = _norm([_moved(cause) for cause in nameless])
     ends = hull(fit.theta, std, fit.freedom, candidates, other)
     names = linearization.problem.baseline.names
-    parameters = parameter_biases(names, fit.theta, std, bias, ends, _owners(causes, moved), fit.freedom)
+    parameters = parameter_biases(
+        names, fit.theta, std, bias, ends, _owners(causes, moved), fit.freedom
+    )
     rows, warnings = (), []
     if linearization.physics is not None:
         rows, warnings = _physical_rows(linearization, fit, candidates, moved, causes, other)
-    told = (_warning(own, cause, (*rows, *parameters), suspects, own is not linearization) for own, cause in found)
+    told = (
+        _warning(own, cause, (*rows, *parameters), suspects, own is not linearization)
+        for own, cause in found
+    )
     told = [warning for warning in told if warning is not None]
     open_ones = [row.name for row in (*rows, *parameters) if not row.determined]
     if open_ones:
@@ -239,10 +280,17 @@ def noise_share(linearization: MeasureLinearization, fit: Estimate) -> float:
         return 0.0
     unit = linearization.weighed.unit
     own = orthogonal_part(
-        linearization.weighed.projection, times(unit, np.asarray(linearization.learned)), linearization.directions
+        linearization.weighed.projection,
+        times(unit, np.asarray(linearization.learned)),
+        linearization.directions,
     )
     rows = np.ones((len(own), 1)) * np.sqrt(np.diag(noise))
-    taken = fit.effective_weights / linearization.problem.count * np.sum(times(unit, rows) ** 2) / own.shape[1]
+    taken = (
+        fit.effective_weights
+        / linearization.problem.count
+        * np.sum(times(unit, rows) ** 2)
+        / own.shape[1]
+    )
     return float(taken / max(np.sum(own**2), np.finfo(float).tiny))
 
 
@@ -255,10 +303,14 @@ def _candidates(
 ) -> list[Candidate]:
     """Return the named causes, and what may stand instead of one of them."""
     several = " and ".join(cause.suspect.name for _, cause in found)
-    kept: list[Candidate] = [NamedCause(several, min(explains(cause) for _, cause in found), bias, rest=rest)]
+    kept: list[Candidate] = [
+        NamedCause(several, min(explains(cause) for _, cause in found), bias, rest=rest)
+    ]
     for own, cause in found:
         others = (*_declared(own, suspects), *_usual(own), *_families(own))
-        others += own.table(saturations([entry.suspect for entry in others]), certify=False, every=False)
+        others += own.table(
+            saturations([entry.suspect for entry in others]), certify=False, every=False
+        )
         likely = [
             Candidate(entry.suspect.name, explains(entry), _moved(entry) + bias - _moved(cause),
                       entry.suspect in suspects)
@@ -279,29 +331,45 @@ def _physical_rows(
 ) -> tuple[tuple[ParameterBias, ...], list[Warning]]:
     """Return the biases of the physical parameters: the hull over the causes that move any of them farthest."""
     assert linearization.physics is not None
-    physical, slopes, bias = fit.physical(linearization.physics), linearization.slopes, moved.sum(axis=0)
+    physical, slopes, bias = (
+        fit.physical(linearization.physics),
+        linearization.slopes,
+        moved.sum(axis=0),
+    )
     own = np.array([np.nan if s is None else s for s in physical.std])
-    turned = np.array([slopes[0][name] for name in physical.names]) if slopes else np.zeros((0, len(bias)))
+    turned = (
+        np.array([slopes[0][name] for name in physical.names])
+        if slopes
+        else np.zeros((0, len(bias)))
+    )
     chosen = [candidates[0]]
     for row in turned:
         for sign in (-1.0, 1.0):
-            wide = [sign * row @ c.moved + np.sqrt(np.sum((row * c.unsure) ** 2)) for c in candidates]
+            wide = [
+                sign * row @ c.moved + np.sqrt(np.sum((row * c.unsure) ** 2)) for c in candidates
+            ]
             chosen.append(candidates[int(np.argmax(np.nan_to_num(wide, nan=-np.inf)))])
     ends, shifts = [], np.zeros(len(physical.names))
     for i, c in enumerate({id(c): c for c in chosen}.values()):
         spread = np.outer(c.unsure, c.unsure) + np.diag(np.zeros(len(bias)) + other) ** 2
         spread = spread + (0.0 if fit.covariance is None else fit.covariance)
-        moves, limits = physical_with_bias(linearization, c.moved, fit.covariance, spread, fit.freedom)
+        moves, limits = physical_with_bias(
+            linearization, c.moved, fit.covariance, spread, fit.freedom
+        )
         shifts = shifts if i else moves
         ends.append(limits)
-    ends = np.stack([np.min(ends, axis=0)[:, 0], np.max(ends, axis=0)[:, 1]], axis=-1)  # NaN where one has none
+    ends = np.stack(
+        [np.min(ends, axis=0)[:, 0], np.max(ends, axis=0)[:, 1]], axis=-1
+    )  # NaN where one has none
     owners = _owners(causes, moved @ turned.T) if slopes else []
     rows = parameter_biases(physical.names, physical.value, own, shifts, ends, owners, fit.freedom)
     return rows, _unbounded(physical.names, own, ends)
 
 
 def _causes(
-    linearization: MeasureLinearization, suspects: Sequence[Suspect], something: Bool[np.ndarray, "ny"]
+    linearization: MeasureLinearization,
+    suspects: Sequence[Suspect],
+    something: Bool[np.ndarray, "ny"],
 ) -> tuple[list[tuple[MeasureLinearization, SuspectedBias]], list[SuspectedBias]]:
     """Return what explains the learner, with the ground that it does so on: all of it, or what is learned of one output.
 
@@ -317,17 +385,25 @@ def _causes(
         return found, []
     each, nameless = [], []
     for i in np.flatnonzero(something):
-        own = replace(linearization, learned=np.asarray(linearization.learned) * np.eye(len(outputs))[i])
+        own = replace(
+            linearization, learned=np.asarray(linearization.learned) * np.eye(len(outputs))[i]
+        )
         cause = named_cause(own, suspects) or _likeliest(own, suspects)
         if cause is not None and explains(cause) < LEAST_SHARE:
             nameless.append(cause)
         elif cause is not None and cause.suspect.column_of(outputs) == i:
             each.append((own, cause))
-    each.sort(key=lambda part: -np.linalg.norm(times(linearization.weighed.unit, np.asarray(part[0].learned))))
+    each.sort(
+        key=lambda part: (
+            -np.linalg.norm(times(linearization.weighed.unit, np.asarray(part[0].learned)))
+        )
+    )
     return each if len(each) > len(found) else found, nameless
 
 
-def _owners(causes: Sequence[SuspectedBias], moved: Float[np.ndarray, "k n"]) -> list[tuple[str, float]]:
+def _owners(
+    causes: Sequence[SuspectedBias], moved: Float[np.ndarray, "k n"]
+) -> list[tuple[str, float]]:
     """Of each parameter the cause that moves it most, and its share."""
     return [(causes[i].suspect.name, explains(causes[i])) for i in np.argmax(np.abs(moved), axis=0)]
 
@@ -335,15 +411,21 @@ def _owners(causes: Sequence[SuspectedBias], moved: Float[np.ndarray, "k n"]) ->
 def named_cause(
     linearization: MeasureLinearization, suspects: Sequence[Suspect], least: float = LEAST_SHARE
 ) -> SuspectedBias | None:
-    """Return the cause that explains most of the learner, the declared ones first; None where that is less than `least`.
+    """Return the cause that explains most of the learner, the declared ones first.
 
-    Of what no one declared only what the learner sees counts: the rest is no likely cause of what it found.
+    None where that is less than `least`.
+
+    Of what no one declared only what the learner sees counts: the rest is no likely cause of what
+    it found.
     """
     for table, families in (
         (_declared(linearization, suspects), ()),
         (_usual(linearization), _families(linearization)),
     ):
-        best, other = max(table, key=explains, default=None), max(families, key=explains, default=None)
+        best, other = (
+            max(table, key=explains, default=None),
+            max(families, key=explains, default=None),
+        )
         if other is not None and (best is None or explains(best) < AS_MUCH * explains(other)):
             best = other
         if best is not None and explains(best) >= least:
@@ -351,7 +433,9 @@ def named_cause(
     return None
 
 
-def _likeliest(linearization: MeasureLinearization, suspects: Sequence[Suspect]) -> SuspectedBias | None:
+def _likeliest(
+    linearization: MeasureLinearization, suspects: Sequence[Suspect]
+) -> SuspectedBias | None:
     """Return what explains most of the learner, however little, declared or not."""
     found = (*_declared(linearization, suspects), *_usual(linearization))
     return max((entry for entry in found if entry.explained), key=explains, default=None)
@@ -362,25 +446,37 @@ def explains(entry: SuspectedBias | TermBias) -> float:
     return entry.explained or 0.0
 
 
-def _declared(linearization: MeasureLinearization, suspects: Sequence[Suspect]) -> tuple[SuspectedBias, ...]:
+def _declared(
+    linearization: MeasureLinearization, suspects: Sequence[Suspect]
+) -> tuple[SuspectedBias, ...]:
     return linearization.table(tuple(suspects), certify=False, every=False) if suspects else ()
 
 
 def _usual(linearization: MeasureLinearization) -> tuple[SuspectedBias, ...]:
     terms = (*usual_suspects(linearization.problem), *usual_terms(linearization.problem))
-    return tuple(entry for entry in linearization.table(terms, certify=False, every=False) if entry.seen is not False)
+    return tuple(
+        entry
+        for entry in linearization.table(terms, certify=False, every=False)
+        if entry.seen is not False
+    )
 
 
 def _families(linearization: MeasureLinearization) -> tuple[SuspectedBias, ...]:
     """Return what every member of the catalogue does that the learner sees."""
     table = linearization.table(catalogue(linearization.problem), certify=False, every=False)
-    return tuple(entry for entry in table if entry.seen is not False and (entry.cosine or 0.0) <= MOST_PHYSICS)
+    return tuple(
+        entry
+        for entry in table
+        if entry.seen is not False and (entry.cosine or 0.0) <= MOST_PHYSICS
+    )
 
 
 def rival_of(
     linearization: MeasureLinearization, cause: SuspectedBias, suspects: Sequence[Suspect]
 ) -> SuspectedBias | None:
-    """Return a term that explains as much as a cause that no one declared, and moves θ elsewhere; None where there is none.
+    """Return a term that explains as much as a cause that no one declared, and moves θ elsewhere.
+
+    None where there is none.
 
     As a dead zone and a saturation of what the physics has a term in: their sum is that term.
     """
@@ -388,7 +484,9 @@ def rival_of(
     if cause.suspect in suspects:
         return None
     usual = _usual(linearization)
-    usual += linearization.table(saturations([entry.suspect for entry in usual]), certify=False, every=False)
+    usual += linearization.table(
+        saturations([entry.suspect for entry in usual]), certify=False, every=False
+    )
     equal = [entry for entry in usual if explains(entry) >= AS_MUCH * cause.explained]
     to_coordinates, own = linearization.weighed.projection.to_coordinates, _moved(cause)
 
@@ -396,7 +494,11 @@ def rival_of(
         return float(np.linalg.norm(to_coordinates @ (_moved(entry) - own)))
 
     farthest = max(equal, key=apart, default=None)
-    return farthest if farthest and apart(farthest) > 0.5 * np.linalg.norm(to_coordinates @ own) else None
+    return (
+        farthest
+        if farthest and apart(farthest) > 0.5 * np.linalg.norm(to_coordinates @ own)
+        else None
+    )
 
 
 def near_causes(
@@ -406,7 +508,11 @@ def near_causes(
     assert cause.explained
     if cause.suspect in suspects or cause.explained >= SURE_SHARE:
         return []
-    others = [entry for entry in _usual(linearization) if entry.suspect != cause.suspect and entry.explained]
+    others = [
+        entry
+        for entry in _usual(linearization)
+        if entry.suspect != cause.suspect and entry.explained
+    ]
     near = [entry for entry in others if explains(entry) >= _NEAR * cause.explained]
     best: dict[str, SuspectedBias] = {}
     for entry in sorted(near, key=explains, reverse=True):
@@ -419,11 +525,14 @@ def left_over(
 ) -> Float[np.ndarray, "k nt"]:
     """Return standard deviations of the bias of θ that the cause does not tell: k directions, each of one unknown size.
 
-    What it leaves of the learner counts as biased by as much for its size as the cause, of unknown sign; beside that by
-    what the next best cause makes of it. What may stand instead of the cause is in the hull.
+    What it leaves of the learner counts as biased by as much for its size as the cause, of unknown
+    sign; beside that by what the next best cause makes of it. What may stand instead of the cause
+    is in the hull.
     """
     assert cause.explained
-    after = _likeliest(linearization.without(cause), [suspect for suspect in suspects if suspect != cause.suspect])
+    after = _likeliest(
+        linearization.without(cause), [suspect for suspect in suspects if suspect != cause.suspect]
+    )
     rows = [_moved(cause) * np.sqrt((1 - cause.explained) / cause.explained)]
     return np.array([*rows, *([] if after is None else [_moved(after)])])
 
@@ -442,20 +551,33 @@ def parameter_biases(
     causes: Sequence[tuple[str, float]],
     freedom: float,
 ) -> tuple[ParameterBias, ...]:
-    """Return a row for each parameter whose bias is known; `ends` are those of its interval, `causes` names and shares."""
+    """Return a row for each parameter whose bias is known.
+
+    `ends` are those of its interval, `causes` names and shares.
+    """
     found = []
-    for name, v, s, b, ci, (cause, share) in zip(names, value, std, bias, ends, causes, strict=True):
+    for name, v, s, b, ci, (cause, share) in zip(
+        names, value, std, bias, ends, causes, strict=True
+    ):
         if np.isfinite(b):
             errors, relative = float(abs(b) / s) if s > 0 else None, float(b / v) if v else None
             limits = (float(ci[0]), float(ci[1])) if np.isfinite(ci).all() else None
             told = limits is None or is_determined(float(v), float(s), freedom, *limits)
-            found.append(ParameterBias(name, float(b), cause, share, relative, errors, limits if told else None, told))
+            found.append(
+                ParameterBias(
+                    name, float(b), cause, share, relative, errors, limits if told else None, told
+                )
+            )
     return tuple(found)
 
 
 def _unbounded(names: Sequence[str], std: Vector, ends: Matrix) -> list[Warning]:
     """Which physical parameters have an interval, but none with their bias."""
-    none = [name for name, s, e in zip(names, std, ends, strict=True) if np.isfinite(s) and not np.isfinite(e).all()]
+    none = [
+        name
+        for name, s, e in zip(names, std, ends, strict=True)
+        if np.isfinite(s) and not np.isfinite(e).all()
+    ]
     if not none:
         return []
     told = f"no interval of {', '.join(none)} counts the bias: some theta within those that do have"
@@ -469,25 +591,37 @@ def _warning(
     suspects: Sequence[Suspect],
     of_one: bool,
 ) -> Warning | None:
-    """Return what a cause biases by more than the standard error: its size, remedies; and how sure the cause is."""
+    """Return what a cause biases by more than the standard error: its size, remedies.
+
+    And how sure the cause is.
+    """
     own, name = [row for row in rows if row.cause == cause.suspect.name], cause.suspect.name
     large = [row for row in own if (row.errors or 0.0) > 1 and abs(row.relative or 1.0) > _ROUNDING]
     if not large:
         return None
-    listed, share, there = told_biases(large), explains(cause), f" in {cause.suspect.output}" if of_one else ""
+    listed, share, there = (
+        told_biases(large),
+        explains(cause),
+        f" in {cause.suspect.output}" if of_one else "",
+    )
     rival, cure = (
         rival_of(linearization, cause, suspects),
         " or ".join(remedies(linearization, cause, [row.name for row in large])),
     )
-    other = "" if rival is None else f" ({rival.suspect.name} explains as much and would move them elsewhere)"
+    other = (
+        ""
+        if rival is None
+        else f" ({rival.suspect.name} explains as much and would move them elsewhere)"
+    )
     if share < SURE_SHARE:
         near = near_causes(linearization, cause, suspects)
         close = ", ".join(f"{entry.suspect.name} {percent(explains(entry))}" for entry in near)
         beside = f"; next: {close}" if near else ""
         return Warning(
             "biased",
-            f"what the learner found{there} looks most like {name} ({percent(share)} of it{beside}), which would move "
-            f"{listed}, and the standard errors do not cover that{other}{f': if it is that, {cure}' if cure else ''}.",
+            f"what the learner found{there} looks most like {name} ({percent(share)} of "
+            f"it{beside}), which would move {listed}, and the standard errors do not cover "
+            f"that{other}{f': if it is that, {cure}' if cure else ''}.",
         )
     return Warning(
         "biased",
@@ -505,4 +639,7 @@ def told_biases(large: Sequence[ParameterBias]) -> str:
 
 def _told_bias(entry: ParameterBias) -> str:
     share = "" if entry.relative is None else f", {percent(entry.relative, sign='+')}"
-    return f"{entry.name} by {entry.value:+.2g} ({plain_number(entry.errors or 0.0)} standard errors{share})"
+    return (
+        f"{entry.name} by {entry.value:+.2g} ({plain_number(entry.errors or 0.0)} standard "
+        f"errors{share})"
+    )

@@ -25,21 +25,23 @@ def bias_budget(
     physics: PhysicsMap | None = None,
     measure: Measure | None = None,
 ) -> Budget | MotionBudget | None:
-    """Return the bias that what the learner found implies; None where no cause explains enough of it.
+    """Return the bias that what the learner found implies.
 
-    Args:
-        fit: with a learner and the orthogonal structure; of others there is no budget. Of lagged physics or a motion.
-        suspects: terms that may be missing, looked at first; of a motion `MotionSuspect`.
-        physics: the map from physical parameters to θ, for their biases; a motion has none.
-        measure: what θ was split under, where that is not the training measure; a motion's fit knows its own.
+    None where no cause explains enough of it.
 
-    Returns:
-        The `cause`, the `share` of the learner that it explains, and the bias of each of `parameters` and `physical`,
-        estimate less truth, with an interval that covers bias and noise together: the hull over all causes that noise
-        cannot tell apart. Where `determined` is False that is wider than the value itself, and there is none.
+    Args: fit: with a learner and the orthogonal structure; of others there is no budget. Of lagged
+        physics or a motion. suspects: terms that may be missing, looked at first; of a motion
+        `MotionSuspect`. physics: the map from physical parameters to θ, for their biases; a motion
+        has none. measure: what θ was split under, where that is not the training measure; a
+        motion's fit knows its own.
 
-    Raises:
-        InputError: arguments that the kind of physics does not take; another measure than that of the fit; a suspect on
+    Returns: The `cause`, the `share` of the learner that it explains, and the bias of each of
+        `parameters` and `physical`, estimate less truth, with an interval that covers bias and
+        noise together: the hull over all causes that noise cannot tell apart. Where `determined` is
+        False that is wider than the value itself, and there is none.
+
+    Raises: InputError: arguments that the kind of physics does not take; another measure than that
+        of the fit; a suspect on
             channels or lags that the data do not have.
 
     Examples:
@@ -57,12 +59,19 @@ def bias_budget(
     moves = isinstance(fit, MotionEstimate)
     wanted = MotionSuspect if moves else Suspect
     for suspect in suspects:
-        check_type(suspect, wanted, "suspects", f"a sequence of {wanted.__name__}, as the fit's physics asks for")
+        check_type(
+            suspect,
+            wanted,
+            "suspects",
+            f"a sequence of {wanted.__name__}, as the fit's physics asks for",
+        )
     if not moves:
         return lagged_budget(fit, cast(Any, suspects), physics=physics, measure=measure)
     for name, given in (("physics", physics), ("measure", measure)):
         if given is not None:
-            raise InputError(f"`{name}` does not apply to a fit of equations of motion; leave it out.")
+            raise InputError(
+                f"`{name}` does not apply to a fit of equations of motion; leave it out."
+            )
     if not fit.status.ok:
         return None
     declared = cast("Sequence[MotionSuspect]", suspects)

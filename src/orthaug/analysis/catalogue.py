@@ -1,6 +1,7 @@
 """Families of terms that a physics may lack, their width or power profiled: one catalogue for both kinds of physics.
 
-A family is one line of `FAMILIES`. Of every family each member is tried on everything that the learner sees.
+A family is one line of `FAMILIES`. Of every family each member is tried on everything that the
+learner sees.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ _MOST_ARGUMENTS = 8  # expressions that the families are tried on
 class Family(NamedTuple):
     """Terms of one form: `text(x, w)` writes one from what it acts on and its width or power.
 
-    `members` are the widths in median sizes of x, or the powers themselves where the family is not `scaled`.
+    `members` are the widths in median sizes of x, or the powers themselves where the family is not
+    `scaled`.
     """
 
     name: str
@@ -70,7 +72,14 @@ def catalogue(problem: Problem) -> tuple[Suspect, ...]:
             continue
         for name, text in members_on(on, values):
             found += [
-                Suspect(name if len(problem.outputs) == 1 else f"{name} in {output}", text, output, None, constants, on)
+                Suspect(
+                    name if len(problem.outputs) == 1 else f"{name} in {output}",
+                    text,
+                    output,
+                    None,
+                    constants,
+                    on,
+                )
                 for output in problem.outputs
             ]
     return tuple(found)
@@ -91,5 +100,8 @@ def motion_catalogue(
         for place in places:
             equation = motion.states[place].name
             where = f" in {equation}" if len(places) > 1 else ""
-            found += [MotionSuspect(f"{name}{where}", text, equation) for name, text in members_on(on, values)]
+            found += [
+                MotionSuspect(f"{name}{where}", text, equation)
+                for name, text in members_on(on, values)
+            ]
     return tuple(found)

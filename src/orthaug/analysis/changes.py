@@ -1,8 +1,9 @@
 """Which change of a model would lower its error, and by how much: further lags, an offset, what a learner could find.
 
-A change adds columns h to the prediction. One step ahead the residual is regressed on them beside the physics' own; of
-a free run on what they become there, `S_k = h_k + Σ_i A_{k,i} S_{k−i}`, the sensitivity to their coefficient. The share
-of the error's variance that they explain on rows they were not fitted to is what the change is predicted to gain.
+A change adds columns h to the prediction. One step ahead the residual is regressed on them beside
+the physics' own; of a free run on what they become there, `S_k = h_k + Σ_i A_{k,i} S_{k−i}`, the
+sensitivity to their coefficient. The share of the error's variance that they explain on rows they
+were not fitted to is what the change is predicted to gain.
 """
 
 from __future__ import annotations
@@ -40,8 +41,9 @@ _SIMPLER = 0.8  # of the gain of a learner, with which a single lag is as good
 class Change:
     """A change of a model, and the share `fall` by which the RMS error is predicted to fall.
 
-    `kind` is criterion, input_lag, output_lag, offset or learner, `what` names it, `of` whose error falls: prediction
-    or simulation. `output` is the one whose physics lacks the term; None for one output, or for all.
+    `kind` is criterion, input_lag, output_lag, offset or learner, `what` names it, `of` whose error
+    falls: prediction or simulation. `output` is the one whose physics lacks the term; None for one
+    output, or for all.
     """
 
     kind: str
@@ -71,8 +73,13 @@ class Change:
     def prediction(self) -> str:
         """Return what it is predicted to gain, as a clause."""
         if self.kind == "criterion" and not self.gains:
-            return "the parameters would not be biased so; the error of its free run is not predicted to fall"
-        error = "its error one step ahead" if self.of == "prediction" else "the error of its free run"
+            return (
+                "the parameters would not be biased so; the error of its free run is not "
+                "predicted to fall"
+            )
+        error = (
+            "its error one step ahead" if self.of == "prediction" else "the error of its free run"
+        )
         return f"{error} is predicted to fall by {percent(self.fall)}"
 
     def __str__(self) -> str:
@@ -95,11 +102,11 @@ def model_changes(
 ) -> tuple[Change, ...]:
     """Return the best change of each kind that is worth making, the best one first.
 
-    Args:
-        response: of the training data, whose errors are to be explained: the prediction, or with `simulates` the free run.
-        skip: its leading rows that do not count.
-        one_step: the prediction, for a free run that is far from what was measured; None to go along it all the same.
-        functions: what functions of the regressor are known to explain of the errors one step ahead.
+    Args: response: of the training data, whose errors are to be explained: the prediction, or with
+        `simulates` the free run. skip: its leading rows that do not count. one_step: the
+        prediction, for a free run that is far from what was measured; None to go along it all the
+        same. functions: what functions of the regressor are known to explain of the errors one step
+        ahead.
     """
     off = float(np.max(rms_errors(response, skip) / fit.problem.deviation))
     with one_blas_thread():
@@ -113,12 +120,17 @@ def own_share(fit: Estimate, one_step: Response) -> Share:
     """Return what the physics' own columns explain of the one-step residual: nothing where they were fitted to it."""
     with one_blas_thread():
         candidates = Candidates(fit, one_step, False, 0, own=True)
-        return candidates.sums.share(range(candidates.base)) if candidates.usable else Share(0.0, 0.0)
+        return (
+            candidates.sums.share(range(candidates.base)) if candidates.usable else Share(0.0, 0.0)
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """Columns that a model might be given, over the rows of a response; with `own` none beside the physics'."""
+    """Columns that a model might be given, over the rows of a response.
+
+    With `own` none beside the physics'.
+    """
 
     fit: Estimate
     response: Response
@@ -126,7 +138,9 @@ class Candidates:
     skip: int
     own: bool = False
     measured: bool = False
-    """Whether sensitivities are those along the measured outputs; the response is then the prediction."""
+    """Whether sensitivities are those along the measured outputs; the response is then the
+    prediction.
+    """
 
     @property
     def base(self) -> int:
@@ -142,8 +156,19 @@ class Candidates:
         highest = {name: 0 for name in (*problem.outputs, *inputs)}
         for lag in problem.layout:
             highest[lag.channel] = max(highest[lag.channel], lag.lag)
-        own = [Lag(n, i) for n in problem.outputs for i in range(1, highest[n] + 1 + min(_OUTPUTS_FURTHER, shortest))]
-        return (*own, *(Lag(n, i) for n in inputs for i in range(highest[n] + 1 + min(_INPUTS_FURTHER, shortest))))
+        own = [
+            Lag(n, i)
+            for n in problem.outputs
+            for i in range(1, highest[n] + 1 + min(_OUTPUTS_FURTHER, shortest))
+        ]
+        return (
+            *own,
+            *(
+                Lag(n, i)
+                for n in inputs
+                for i in range(highest[n] + 1 + min(_INPUTS_FURTHER, shortest))
+            ),
+        )
 
     @property
     def first(self) -> int:
@@ -152,19 +177,28 @@ class Candidates:
 
     @cached_property
     def stretches(self) -> list[tuple[Experiment, Trajectory, int, int]]:
-        """Rows that are looked at, from the second number on; from the first on the sensitivities are carried along."""
+        """Rows that are looked at, from the second number on.
+
+        From the first on the sensitivities are carried along.
+        """
         problem, first = self.fit.problem, self.first
         most = _ROWS // len(problem.outputs)
         total = sum(max(len(e) - first, 0) for e in problem.record.experiments)
         found = []
-        for experiment, run in zip(problem.record.experiments, self.response.trajectories, strict=True):
+        for experiment, run in zip(
+            problem.record.experiments, self.response.trajectories, strict=True
+        ):
             rows = len(experiment) - first
             count = 1 if total <= most else max(round(_STRETCHES * rows / total), 1)
             length = min(rows, rows // count, most * rows // total // count + 1) if rows > 0 else 0
-            for begin in np.linspace(first, len(experiment) - length, count).astype(int) if length else ():
+            for begin in (
+                np.linspace(first, len(experiment) - length, count).astype(int) if length else ()
+            ):
                 skipped = max(self.skip - (first - run.start), 0) if begin == first else self.skip
                 if length > skipped:
-                    found.append((experiment.rows(begin - first, begin + length), run, int(begin), skipped))
+                    found.append(
+                        (experiment.rows(begin - first, begin + length), run, int(begin), skipped)
+                    )
         return found
 
     @cached_property
@@ -188,14 +222,18 @@ class Candidates:
         columns, targets = zip(*(self._rows(*stretch) for stretch in self.stretches), strict=True)
         return BlockSums.of(np.concatenate(columns), np.concatenate(targets))
 
-    def _rows(self, piece: Experiment, run: Trajectory, begin: int, skip: int) -> tuple[Matrix, Vector]:
+    def _rows(
+        self, piece: Experiment, run: Trajectory, begin: int, skip: int
+    ) -> tuple[Matrix, Vector]:
         """Columns (rows · ny, width) and errors of one stretch."""
         problem, record, first = self.fit.problem, self.fit.problem.record, self.first
         there = slice(begin, begin + len(piece) - first)
         error = (piece.outputs[first:] - run.model[there])[:, :, None]
         if self.simulates and not self.measured:
             assert run.measured is not None
-            ran = np.where(np.isfinite(run.model), run.model, run.measured)[begin - first : there.stop]
+            ran = np.where(np.isfinite(run.model), run.model, run.measured)[
+                begin - first : there.stop
+            ]
             piece = Experiment(piece.inputs, ran)
         columns = self._columns(piece, record)
         if self.measured:
@@ -203,7 +241,10 @@ class Candidates:
             columns, error = carried[:, :, :-1], carried[:, :, -1:]
         elif self.simulates:
             columns = self._carried(columns, piece, record)
-        error, scaled = error[skip:, :, 0] / problem.deviation, columns[skip:] / problem.deviation[:, None]
+        error, scaled = (
+            error[skip:, :, 0] / problem.deviation,
+            columns[skip:] / problem.deviation[:, None],
+        )
         return scaled.reshape(-1, columns.shape[2]), error.reshape(-1)
 
     def _columns(self, piece: Experiment, record: Record) -> Float[np.ndarray, "N ny m"]:
@@ -214,7 +255,9 @@ class Candidates:
         each = np.eye(len(problem.outputs))
         parts = [phi, np.broadcast_to(each, (len(x), *each.shape))]
         if not self.own:
-            new = np.column_stack([lag_matrix(piece, self.lags, record, self.first) - self._centre, self.functions(x)])
+            new = np.column_stack(
+                [lag_matrix(piece, self.lags, record, self.first) - self._centre, self.functions(x)]
+            )
             parts.append(np.einsum("km,oi->koim", new, each).reshape(len(x), len(each), -1))
         with np.errstate(all="ignore"):
             return np.nan_to_num(np.concatenate(parts, axis=2))
@@ -224,8 +267,13 @@ class Candidates:
         """Mean of each lag's channel."""
         record = self.fit.problem.record
         names = [*record.outputs, *record.inputs]
-        stacked = np.concatenate([np.column_stack([e.outputs, e.inputs]) for e in record.experiments])
-        means = {channel.name: float(mean) for channel, mean in zip(names, stacked.mean(axis=0), strict=True)}
+        stacked = np.concatenate(
+            [np.column_stack([e.outputs, e.inputs]) for e in record.experiments]
+        )
+        means = {
+            channel.name: float(mean)
+            for channel, mean in zip(names, stacked.mean(axis=0), strict=True)
+        }
         return np.array([means[lag.channel] for lag in self.lags])
 
     def _carried(self, columns: np.ndarray, piece: Experiment, record: Record) -> np.ndarray:
@@ -241,7 +289,10 @@ class Candidates:
         return carried
 
     def changes(self, functions: float = 0.0) -> tuple[Change, ...]:
-        """Return the best of each kind that is worth making, the best one first; as `model_changes`."""
+        """Return the best of each kind that is worth making, the best one first.
+
+        As `model_changes`.
+        """
         if not self.usable or not np.isfinite(self.sums.grams).all():
             return ()
         problem, of = self.fit.problem, "simulation" if self.simulates else "prediction"
@@ -249,20 +300,31 @@ class Candidates:
         width = len(self.lags) + len(self.functions)
         found: list[tuple[float, Change]] = []
 
-        def add(share: Share, kind: str, what: str, output: str | None = None, weight: float = 1.0) -> None:
+        def add(
+            share: Share, kind: str, what: str, output: str | None = None, weight: float = 1.0
+        ) -> None:
             if share.value >= WORTH and share.value > _SURE * share.error:
-                found.append((weight * fall_of(share.value), Change(kind, what, fall_of(share.value), of, output)))
+                found.append(
+                    (
+                        weight * fall_of(share.value),
+                        Change(kind, what, fall_of(share.value), of, output),
+                    )
+                )
 
         for o, output in enumerate(outputs):
             own = output if len(outputs) > 1 else None
             add(self.sums.share([nt + o], range(nt)), "offset", "1", own)
             for j, lag in enumerate(self.lags):
                 kind = "output_lag" if lag.channel in outputs else "input_lag"
-                if self.measured and kind == "output_lag":  # it may be about noise, which a free run does not feed back
+                if (
+                    self.measured and kind == "output_lag"
+                ):  # it may be about noise, which a free run does not feed back
                     continue
                 add(self.sums.share([self.base + o * width + j], base), kind, str(lag), own)
         learned = [
-            self.base + o * width + len(self.lags) + j for o in range(len(outputs)) for j in range(len(self.functions))
+            self.base + o * width + len(self.lags) + j
+            for o in range(len(outputs))
+            for j in range(len(self.functions))
         ]
         shares = (self.sums.share(learned, base), Share(functions, 0.0))
         add(max(shares, key=lambda share: share.value), "learner", self._learner(), weight=_SIMPLER)
@@ -278,4 +340,8 @@ class Candidates:
             return "a learner"
         visible = seen(problem.features, problem.layout, problem.rows.x, lambda rows: rows)
         hidden = [str(lag) for lag, one in zip(problem.layout, visible, strict=True) if not one]
-        return f"a learner that also sees {', '.join(hidden)}" if hidden else "a learner of more neurons"
+        return (
+            f"a learner that also sees {', '.join(hidden)}"
+            if hidden
+            else "a learner of more neurons"
+        )

@@ -1,7 +1,7 @@
 """Were the inputs recorded under feedback? Whether past outputs tell an input beside its own past.
 
-In open loop an input is told by nothing but its own past. Under feedback, past outputs carry the reference and the
-disturbances into it (Granger 1969; Söderström and Stoica 1989, ch. 10).
+In open loop an input is told by nothing but its own past. Under feedback, past outputs carry the
+reference and the disturbances into it (Granger 1969; Söderström and Stoica 1989, ch. 10).
 """
 
 from __future__ import annotations
@@ -44,7 +44,10 @@ class Feedback:
 
 
 def feedback_in(record: Record) -> tuple[Feedback, ...]:
-    """Return the inputs that surely follow past outputs; of an input that its own past tells, nothing can be said."""
+    """Return the inputs that surely follow past outputs.
+
+    Of an input that its own past tells, nothing can be said.
+    """
     found = []
     with one_blas_thread():
         for j, channel in enumerate(record.inputs):
@@ -59,27 +62,41 @@ def closed_loop(record: Record) -> tuple[Warning, ...]:
     found = feedback_in(record)
     if not found:
         return ()
-    named = ", ".join(f"{one.name} ({percent(one.share)} of what its own past leaves)" for one in found)
+    named = ", ".join(
+        f"{one.name} ({percent(one.share)} of what its own past leaves)" for one in found
+    )
     outputs = ", ".join(channel.name for channel in record.outputs)
     text = (
-        f"past {outputs} predict{'s' if len(record.outputs) == 1 else ''} {named}: the data look recorded under "
-        "feedback. An estimate is then consistent only with the right noise: one step ahead white noise in the "
-        "equation, on the free run white noise on the sensor, in both the whole physics; else what the feedback makes "
-        "of noise and of missing physics is taken for an effect of the input. Record the reference and model the loop "
-        "with it as the input, move the reference much more than the noise is, or record without the controller."
+        f"past {outputs} predict{'s' if len(record.outputs) == 1 else ''} {named}: the data "
+        "look recorded under feedback. An estimate is then consistent only with the right "
+        "noise: one step ahead white noise in the equation, on the free run white noise on the "
+        "sensor, in both the whole physics; else what the feedback makes of noise and of "
+        "missing physics is taken for an effect of the input. Record the reference and model "
+        "the loop with it as the input, move the reference much more than the noise is, or "
+        "record without the controller."
     )
     return (Warning("closed_loop", text),)
 
 
 def _told(record: Record, j: int) -> tuple[float, float] | None:
-    """Share and level by which past outputs tell input j; None where that is not enough, or cannot be told."""
-    every = (_rows(e.inputs[:, j], np.delete(e.inputs, j, axis=1), e.outputs) for e in record.experiments)
+    """Share and level by which past outputs tell input j.
+
+    None where that is not enough, or cannot be told.
+    """
+    every = (
+        _rows(e.inputs[:, j], np.delete(e.inputs, j, axis=1), e.outputs) for e in record.experiments
+    )
     pieces = [piece for piece in every if piece is not None and len(piece[2])]
     if not pieces:
         return None
     widths = {(own.shape[1], outputs.shape[1]) for own, outputs, _ in pieces}
     if len(widths) > 1:  # some are held and some are not: those of which there are more
-        best = max(widths, key=lambda width: sum(len(p[2]) for p in pieces if (p[0].shape[1], p[1].shape[1]) == width))
+        best = max(
+            widths,
+            key=lambda width: sum(
+                len(p[2]) for p in pieces if (p[0].shape[1], p[1].shape[1]) == width
+            ),
+        )
         pieces = [p for p in pieces if (p[0].shape[1], p[1].shape[1]) == best]
     own, outputs, target = (np.concatenate(parts) for parts in zip(*pieces, strict=True))
     return told_beside(own, outputs, target)
@@ -88,7 +105,8 @@ def _told(record: Record, j: int) -> tuple[float, float] | None:
 def told_beside(own: Matrix, others: Matrix, target: Vector) -> tuple[float, float] | None:
     """Cross-validated share of what `own` leaves of a target that `others` tell, and the level of a robust Wald test.
 
-    None where there are too few rows, `own` leaves nothing, or the share is not surely large enough.
+    None where there are too few rows, `own` leaves nothing, or the share is not surely large
+    enough.
     """
     usual = _usual(own, target)
     own, others, target = _scaled(own[usual]), _scaled(others[usual]), target[usual]
@@ -102,7 +120,9 @@ def told_beside(own: Matrix, others: Matrix, target: Vector) -> tuple[float, flo
         return None
     beside = others - q @ (q.T @ others)
     sums = BlockSums.of(np.column_stack([base, others]), target)
-    share: Share = sums.share(range(base.shape[1], base.shape[1] + others.shape[1]), range(base.shape[1]))
+    share: Share = sums.share(
+        range(base.shape[1], base.shape[1] + others.shape[1]), range(base.shape[1])
+    )
     if share.value < _SHARE or share.value < _SURE * share.error:
         return None
     return share.value, _wald(beside, left)
@@ -110,7 +130,10 @@ def told_beside(own: Matrix, others: Matrix, target: Vector) -> tuple[float, flo
 
 def _usual(own: Matrix, target: Vector) -> np.ndarray:
     """Return the rows on which an input does not jump: those of a reference would hide all that lies between them."""
-    base, kept = np.column_stack([np.ones(len(target)), _scaled(own)]), np.ones(len(target), dtype=bool)
+    base, kept = (
+        np.column_stack([np.ones(len(target)), _scaled(own)]),
+        np.ones(len(target), dtype=bool),
+    )
     for _ in range(_ROUNDS):
         if kept.sum() < _ROWS_PER_COLUMN * base.shape[1]:
             break
@@ -139,7 +162,11 @@ def _rows(u: Vector, beside: Matrix, y: Matrix) -> tuple[Matrix, Matrix, Vector]
         period = _period(levels, _LEVELS)
         past = _LEVELS if period is None else max(period + 1, _LEVELS)
         rows, own = changes[past - 1 :], _own_past(levels, _LEVELS, period, past)
-        own = np.column_stack([own, levels[past - 1 : -1] ** 2, levels[past - 1 : -1] ** 3]) if len(own) else own
+        own = (
+            np.column_stack([own, levels[past - 1 : -1] ** 2, levels[past - 1 : -1] ** 3])
+            if len(own)
+            else own
+        )
         enough = rows >= _BESIDE
         own = np.column_stack([own[enough], _past(beside, rows[enough], _BESIDE)])
         return own, _past(y, rows[enough], _OUTPUT_LAGS), u[rows[enough]]
@@ -150,14 +177,20 @@ def _rows(u: Vector, beside: Matrix, y: Matrix) -> tuple[Matrix, Matrix, Vector]
         return None
     own = _own_past(u, lags, period, past)
     rows = np.arange(past, len(u))
-    return np.column_stack([own, _past(beside, rows, _BESIDE)]), _past(y, rows, _OUTPUT_LAGS), u[past:]
+    return (
+        np.column_stack([own, _past(beside, rows, _BESIDE)]),
+        _past(y, rows, _OUTPUT_LAGS),
+        u[past:],
+    )
 
 
 def _own_past(x: Vector, count: int, period: int | None, first: int) -> Matrix:
     """So many lags, and those about a period."""
     lags = [*range(1, count + 1), *(() if period is None else range(period - 1, period + 2))]
     rows = np.arange(first, len(x))
-    return np.column_stack([x[rows - lag] for lag in lags]) if len(rows) else np.zeros((0, len(lags)))
+    return (
+        np.column_stack([x[rows - lag] for lag in lags]) if len(rows) else np.zeros((0, len(lags)))
+    )
 
 
 def _past(y: Matrix, rows: np.ndarray, lags: int) -> Matrix:
@@ -165,7 +198,10 @@ def _past(y: Matrix, rows: np.ndarray, lags: int) -> Matrix:
 
 
 def _period(x: Vector, beyond: int) -> int | None:
-    """Return the lag, larger than `beyond`, at which a signal repeats itself; None where it does not within its half."""
+    """Return the lag, larger than `beyond`, at which a signal repeats itself.
+
+    None where it does not within its half.
+    """
     n = len(x)
     centred = x - x.mean()
     power = np.abs(np.fft.rfft(centred, 2 * n)) ** 2
@@ -176,7 +212,9 @@ def _period(x: Vector, beyond: int) -> int | None:
     r = (acf / norm)[: n // 2 + 1]
     later = np.arange(beyond + 1, len(r) - 1)
     peaks = (
-        later[(r[later] > _PERIODIC) & (r[later] >= r[later - 1]) & (r[later] >= r[later + 1])] if len(later) else []
+        later[(r[later] > _PERIODIC) & (r[later] >= r[later - 1]) & (r[later] >= r[later + 1])]
+        if len(later)
+        else []
     )
     return int(peaks[np.argmax(r[peaks])]) if len(peaks) else None
 

@@ -1,8 +1,9 @@
 """What the residual says about the noise, which criterion the data ask for, and which change would help.
 
-Noise in the equation leaves a white one-step residual. Noise on the measured output leaves a coloured one. It makes
-one-step least squares inconsistent, and a free run then explains the data as well as a prediction from measured lags.
-With many rows every test rejects; so effects are measured, as shares of variance that could be predicted.
+Noise in the equation leaves a white one-step residual. Noise on the measured output leaves a
+coloured one. It makes one-step least squares inconsistent, and a free run then explains the data as
+well as a prediction from measured lags. With many rows every test rejects; so effects are measured,
+as shares of variance that could be predicted.
 """
 
 from __future__ import annotations
@@ -41,22 +42,29 @@ _SMALL = 0.05  # of the residual's variance: what could be predicted below that 
 _SMALL_SIZE = 0.05  # of the output's deviation, beside it
 _SMALL_COLOUR = 0.2  # the same of what a free run's own past tells: more of it is hardly noise
 _HOLD = 0.5  # share of the squares that stands in wild rows
-_FEW, _LEAST = 0.005, 6  # share of the rows that these are at most, and the number that is always few
+_FEW, _LEAST = (
+    0.005,
+    6,
+)  # share of the rows that these are at most, and the number that is always few
 _WILD = 20.0  # robust deviations; a normal residual reaches five
 _MAD = 1.4826
 _NAMED = 3
 
 
 def diagnose(
-    fit: Estimate | MotionEstimate, *, one_step: Response | None = None, free_run: Response | None = None
+    fit: Estimate | MotionEstimate,
+    *,
+    one_step: Response | None = None,
+    free_run: Response | None = None,
 ) -> Diagnosis | None:
     """Analyse the residuals of a fit on its training data; None where they cannot be tested.
 
-    Of lagged physics those one step ahead and of the free run; of a motion those of the free run, for its states are
-    not measured, with a test of the terms that its equations could lack (`missing`).
+    Of lagged physics those one step ahead and of the free run; of a motion those of the free run,
+    for its states are not measured, with a test of the terms that its equations could lack
+    (`missing`).
 
-    Args:
-        one_step: the prediction of the training data, if it is there already; likewise their `free_run`.
+    Args: one_step: the prediction of the training data, if it is there already; likewise their
+        `free_run`.
 
     Raises:
         InputError: an estimate that is not usable.
@@ -79,19 +87,26 @@ def diagnose(
     return diagnose_motion(fit, own)
 
 
-def _of_lagged(fit: Estimate, one_step: Response | None, free_run: Response | None) -> Diagnosis | None:
+def _of_lagged(
+    fit: Estimate, one_step: Response | None, free_run: Response | None
+) -> Diagnosis | None:
     """By its one-step residual and its free run.
 
-    A one-step fit whose residual is coloured is set beside the free run of the physics alone, trained on it: that is
-    what sensor noise asks for, and it does not suffer from the bias of the fit in question.
+    A one-step fit whose residual is coloured is set beside the free run of the physics alone,
+    trained on it: that is what sensor noise asks for, and it does not suffer from the bias of the
+    fit in question.
     """
     problem, model, simulated = fit.problem, fit.model, fit.criterion.free_run is not None
     one_step = model.predict(problem.record) if one_step is None else one_step
     tests = _tests(problem, one_step)
-    if any(test.white is None for test in tests) or np.all(rms_errors(one_step) / problem.deviation < ROUNDING):
+    if any(test.white is None for test in tests) or np.all(
+        rms_errors(one_step) / problem.deviation < ROUNDING
+    ):
         return None
     white = all(test.practically_white() for test in tests)
-    seen = Finding(fit, simulated, one_step, tests, white=white, free_white=True, ratio=None, noise=None)
+    seen = Finding(
+        fit, simulated, one_step, tests, white=white, free_white=True, ratio=None, noise=None
+    )
     seen = replace(seen, steps={} if white else _steps(problem, tests))
     if not model.form.states:
         return _concluded(replace(seen, **_effects(fit, one_step, one_step, False)))
@@ -116,17 +131,23 @@ def _of_lagged(fit: Estimate, one_step: Response | None, free_run: Response | No
         free_white=free_tests is not None and all(test.practically_white() for test in free_tests),
         free_tests=free_tests,
         **_effects(fit, one_step, free_run if free_runs else None, fit.criterion.simulates),
-        inconsistent=None if sensor or seen.steps else _inconsistent(fit, one_step, free_run if free_runs else None),
+        inconsistent=None
+        if sensor or seen.steps
+        else _inconsistent(fit, one_step, free_run if free_runs else None),
     )
     if not simulated and not white:
-        seen = replace(seen, changes=_with_criterion(seen, free_run if free_runs else None, trained))
+        seen = replace(
+            seen, changes=_with_criterion(seen, free_run if free_runs else None, trained)
+        )
     return _concluded(seen)
 
 
 def _concluded(seen: Finding) -> Diagnosis:
     """Return the verdict and its words."""
     misfit = any(t.follows() or t.curved_over(SHARE) for t in seen.tests) or seen.lacks
-    if not seen.fit.criterion.simulates:  # errors along a free run are slow, and look like functions of what is slow
+    if (
+        not seen.fit.criterion.simulates
+    ):  # errors along a free run are slow, and look like functions of what is slow
         misfit = misfit or any(one.functions > _SMALL for one in seen.predictable)
     complete = seen.white and not misfit and not seen.follows(_SMALL)
     white = (seen.free_white and seen.white) or not seen.fit.model.form.states
@@ -141,15 +162,22 @@ def _concluded(seen: Finding) -> Diagnosis:
         seen = replace(seen, changes=_toward_prediction(seen))
     wild = wild_rows(seen.one_step, seen.fit.problem.record.experiments)
     if wild:  # a larger learner would follow them
-        seen = replace(seen, changes=tuple(change for change in seen.changes if change.kind != "learner"))
+        seen = replace(
+            seen, changes=tuple(change for change in seen.changes if change.kind != "learner")
+        )
     text, warnings = words(verdict, seen)
     warnings = (*wild, *warnings)
     tested = seen.tests, seen.free_tests, seen.ratio, seen.noise
-    return Diagnosis(verdict, text, *tested, warnings, seen.predictable, seen.changes, steps=seen.steps or None)
+    return Diagnosis(
+        verdict, text, *tested, warnings, seen.predictable, seen.changes, steps=seen.steps or None
+    )
 
 
 def _inconsistent(fit: Estimate, one_step: Response, free_run: Response | None) -> Warning | None:
-    """Return the warning that coloured errors move the one-step θ; None where they do not, as far as is seen."""
+    """Return the warning that coloured errors move the one-step θ.
+
+    None where they do not, as far as is seen.
+    """
     with one_blas_thread():
         found = inconsistency(fit, one_step, free_run)
     return found.warning if found is not None and found.found else None
@@ -173,7 +201,10 @@ def _is_small(seen: Finding) -> bool:
     unit = zip(seen.predictable, seen.fit.problem.deviation, strict=True)
     rms = np.array([one.rms / deviation for one, deviation in unit])
     colour = np.array([one.own_past for one in seen.predictable])
-    small = bool(np.all(np.sqrt(shares) * rms < _SMALL_SIZE) and np.all(np.sqrt(colour) * rms < _SMALL_COLOUR))
+    small = bool(
+        np.all(np.sqrt(shares) * rms < _SMALL_SIZE)
+        and np.all(np.sqrt(colour) * rms < _SMALL_COLOUR)
+    )
     return max(shares) < _SMALL and small
 
 
@@ -185,9 +216,19 @@ def _effects(fit: Estimate, one_step: Response, free_run: Response | None, simul
         return {}
     with one_blas_thread():
         shares = predictable(fit.problem, response, skip, simulates=simulates)
-    squares = [(one.rms / deviation) ** 2 for one, deviation in zip(shares, fit.problem.deviation, strict=True)]
-    functions = 0.0 if simulates else float(np.average([one.functions for one in shares], weights=squares))
-    told: dict[str, Any] = {"simulates": simulates, "skip": skip, "one_step": one_step, "functions": functions}
+    squares = [
+        (one.rms / deviation) ** 2
+        for one, deviation in zip(shares, fit.problem.deviation, strict=True)
+    ]
+    functions = (
+        0.0 if simulates else float(np.average([one.functions for one in shares], weights=squares))
+    )
+    told: dict[str, Any] = {
+        "simulates": simulates,
+        "skip": skip,
+        "one_step": one_step,
+        "functions": functions,
+    }
     return {"predictable": shares, "changes": model_changes(fit, response, **told)}
 
 
@@ -199,7 +240,9 @@ def _with_criterion(
         return seen.changes
     (run, skip), unit = trained[0], seen.fit.problem.deviation
     after = float(np.mean((rms_errors(run, skip) / unit) ** 2))
-    before = np.inf if free_run is None else float(np.mean((rms_errors(free_run, skip) / unit) ** 2))
+    before = (
+        np.inf if free_run is None else float(np.mean((rms_errors(free_run, skip) / unit) ** 2))
+    )
     share = 1 - after / before
     change = (Change("criterion", "simulation", fall_of(share), "simulation"),)
     if seen.sensor:
@@ -218,7 +261,10 @@ def _toward_prediction(seen: Finding) -> tuple[Change, ...]:
 def _accounts(problem: Problem, free_run: Response, skip: int) -> bool:
     """Return whether the errors of a free run look like noise on a sensor: white enough, and not following the inputs."""
     tests = _tests(problem, free_run, skip)
-    return all(test.practically_white(_LITTLE_COLOUR) and not test.follows(_LITTLE_FOLLOWED) for test in tests)
+    return all(
+        test.practically_white(_LITTLE_COLOUR) and not test.follows(_LITTLE_FOLLOWED)
+        for test in tests
+    )
 
 
 def _physics_runs(fit: Estimate) -> list[tuple[Response, int]]:
@@ -227,7 +273,9 @@ def _physics_runs(fit: Estimate) -> list[tuple[Response, int]]:
     longest = max(len(e) for e in problem.record.experiments) - fit.model.form.first_row
     if longest <= 2 * criterion.washout:
         criterion = Simulation(segment=0, washout=0)
-    physics = estimate(problem.record, problem.baseline, lags=_lags_of(fit), learner=None, criterion=criterion)
+    physics = estimate(
+        problem.record, problem.baseline, lags=_lags_of(fit), learner=None, criterion=criterion
+    )
     if not physics.status.ok:
         return []
     run = physics.model.simulate(problem.record)
@@ -239,7 +287,10 @@ def _lags_of(fit: Estimate) -> Lags | None:
     if fit.problem.baseline.function is None:
         return None
     layout, outputs = fit.problem.layout, fit.problem.outputs
-    reach = {name: [lag.lag for lag in layout if lag.channel == name] for name in dict.fromkeys(c for c, _ in layout)}
+    reach = {
+        name: [lag.lag for lag in layout if lag.channel == name]
+        for name in dict.fromkeys(c for c, _ in layout)
+    }
     inputs = [c.name for c in fit.problem.record.inputs]
     return Lags(
         na=[len(reach.get(name, [])) for name in outputs],
@@ -256,7 +307,11 @@ def _tests(problem: Problem, response: Response, skip: int = 0) -> tuple[Residua
         residuals.append((experiment.outputs - trajectory.model)[start:][skip:])
         inputs.append(experiment.inputs[start:][skip:])
     regressors = [x[skip:] for x in by_experiment(problem, problem.rows.x)]
-    names = ([c.name for c in record.outputs], [c.name for c in record.inputs], [str(lag) for lag in problem.layout])
+    names = (
+        [c.name for c in record.outputs],
+        [c.name for c in record.inputs],
+        [str(lag) for lag in problem.layout],
+    )
     with one_blas_thread():
         return analyse(residuals, inputs, regressors, *names, lags=LAGS)
 
@@ -298,7 +353,12 @@ def wild_rows(response: Response, experiments: Sequence[Experiment]) -> tuple[Wa
         size = np.abs(error - np.median(error))
         wild = np.flatnonzero(size > _WILD * _MAD * np.median(size))
         held = float(np.sum(size[wild] ** 2)) / max(float(np.sum(size**2)), 1e-300)
-        if not len(wild) or len(wild) > max(_LEAST, _FEW * len(error)) or held < _HOLD or not np.median(size):
+        if (
+            not len(wild)
+            or len(wild) > max(_LEAST, _FEW * len(error))
+            or held < _HOLD
+            or not np.median(size)
+        ):
             continue
         named = [experiments[rows[k][0]].where(rows[k][1]) for k in wild[:_NAMED]]
         more = f" and {len(wild) - _NAMED} more" if len(wild) > _NAMED else ""

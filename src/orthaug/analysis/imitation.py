@@ -22,7 +22,9 @@ from orthaug.physics.shared import Shared, shared_directions
 
 _STILL = 1e-8  # change of a physical parameter along a shared direction, relative: rounding
 _ALTERNATIVES = 8
-_NEARLY = 0.05  # of a regressor's norm: what widens a standard error twenty times, as in `orthaug select`
+_NEARLY = (
+    0.05  # of a regressor's norm: what widens a standard error twenty times, as in `orthaug select`
+)
 
 
 @dataclass(frozen=True)
@@ -35,7 +37,9 @@ class Alternative:
     physical: tuple[str, ...] | None
 
     @classmethod
-    def of(cls, inputs: tuple[str, ...], shared: Shared, physical: tuple[str, ...] | None = None) -> Alternative:
+    def of(
+        cls, inputs: tuple[str, ...], shared: Shared, physical: tuple[str, ...] | None = None
+    ) -> Alternative:
         return cls(inputs, shared.basis.shape[1], shared.untouched, physical)
 
 
@@ -43,8 +47,9 @@ class Alternative:
 class Imitation:
     """What a learner on these inputs could imitate.
 
-    `directions` are those of θ that it shares with the physics. `determined` are the parameters, and `physical` the
-    physical parameters, that no shared direction moves: the fit determines them beside any learner of these inputs.
+    `directions` are those of θ that it shares with the physics. `determined` are the parameters,
+    and `physical` the physical parameters, that no shared direction moves: the fit determines them
+    beside any learner of these inputs.
     """
 
     inputs: tuple[str, ...]
@@ -58,7 +63,9 @@ class Imitation:
     held: tuple[str, ...] = ()
     """Parameters at a bound: known terms, along which nothing is split off."""
     weakest: tuple[str, float] | None = None
-    """The determined parameter that a learner of terms comes nearest to, and what it leaves of its regressor."""
+    """The determined parameter that a learner of terms comes nearest to, and what it leaves of its
+    regressor.
+    """
 
     @classmethod
     def of(cls, inputs: Sequence[str], shared: Shared, *others: Any) -> Self:
@@ -72,10 +79,16 @@ class Imitation:
         if self.terms:
             sees = f"The learner is a sum of {len(self.inputs)} terms"
         if self.everything:
-            return f"{sees} and could imitate all of the physics: θ is split off along every direction."
+            return (
+                f"{sees} and could imitate all of the physics: θ is split off along every "
+                "direction."
+            )
         if self.held:
             columns, them = ("stands", "it") if len(self.held) == 1 else ("stand", "them")
-            sees = f"{_listed(self.held)} {columns} at a bound: θ is not split off along {them}. {sees}"
+            sees = (
+                f"{_listed(self.held)} {columns} at a bound: θ is not split off along {them}. "
+                f"{sees}"
+            )
         if not self.directions:
             rest = " other" if self.held else ""
             told = f"{sees} and could imitate nothing of the{rest} physics"
@@ -83,7 +96,9 @@ class Imitation:
         could = _listed([_combination(direction) for direction in self.directions])
         told = [f"{sees} and could imitate {could}: there, and only there, θ is split off."]
         if self.determined:
-            told.append(f"The fit determines {_listed(self.determined)} beside any learner of these inputs.")
+            told.append(
+                f"The fit determines {_listed(self.determined)} beside any learner of these inputs."
+            )
         if self.physical:
             told.append(f"Of the physical parameters it determines {_listed(self.physical)} so.")
         return " ".join(told) + self._nearly
@@ -95,31 +110,51 @@ class Imitation:
             return ""
         name, left = self.weakest
         return (
-            f" On these rows, however, the terms leave {100 * left:.2g} % of what physics alone has to determine "
-            f"{name}: its value rests on that part, and the terms may have taken over the rest."
+            f" On these rows, however, the terms leave {100 * left:.2g} % of what physics "
+            f"alone has to determine {name}: its value rests on that part, and the terms may "
+            "have taken over the rest."
         )
 
 
 class MotionImitation(Imitation):
-    """The same of a motion; directions are those of the parameters' coordinates, logarithms of positive ones."""
+    """The same of a motion.
+
+    Directions are those of the parameters' coordinates, logarithms of positive ones.
+    """
 
     @property
     def text(self) -> str:
         """In sentences."""
         sees = f"The learner sees {', '.join(self.inputs)}"
         if self.everything:
-            return f"{sees} and could imitate a change of every parameter: they are those of the nearest physics."
+            return (
+                f"{sees} and could imitate a change of every parameter: they are those of the "
+                "nearest physics."
+            )
         if not self.directions:
-            return f"{sees} and could imitate no change of a parameter: the fit determines all of them beside it."
+            return (
+                f"{sees} and could imitate no change of a parameter: the fit determines all of "
+                "them beside it."
+            )
         moved = "; ".join(" with ".join(direction) for direction in self.directions)
-        told = f"{sees} and could imitate a change of {moved}: there, and only there, the nearest physics decides."
+        told = (
+            f"{sees} and could imitate a change of {moved}: there, and only there, the nearest "
+            "physics decides."
+        )
         if self.determined:
-            told += f" The fit determines {', '.join(self.determined)} beside any learner of these inputs."
+            told += (
+                f" The fit determines {', '.join(self.determined)} beside any learner of these "
+                "inputs."
+            )
         return told
 
 
 def imitation(
-    problem: Problem, physics: PhysicsMap | None = None, *, others: bool = True, held: Collection[str] = ()
+    problem: Problem,
+    physics: PhysicsMap | None = None,
+    *,
+    others: bool = True,
+    held: Collection[str] = (),
 ) -> Imitation:
     """Return what the problem's learner could imitate, and what `others`, other inputs, would make of it.
 
@@ -132,13 +167,17 @@ def imitation(
     alternatives = []
     for other in other_inputs(problem) if others and not problem.features.linear else ():
         features = Features(tuple(parse(text, {}) for text in other))
-        shared = shared_directions(problem.baseline, features, problem.layout, problem.outputs, problem.rows.x)
+        shared = shared_directions(
+            problem.baseline, features, problem.layout, problem.outputs, problem.rows.x
+        )
         if not shared.all and set(other) != set(inputs):
             alternatives.append(Alternative.of(other, shared, _untouched(shared, slopes)))
     shown, terms = tuple(alternatives[:_ALTERNATIVES]), problem.features.linear
     found = Imitation.of(inputs, own, _untouched(own, slopes), shown, terms, tuple(held))
     determined = tuple(name for name in found.determined if name not in held)
-    return replace(found, determined=determined, weakest=_weakest(problem, determined) if terms else None)
+    return replace(
+        found, determined=determined, weakest=_weakest(problem, determined) if terms else None
+    )
 
 
 def _weakest(problem: Problem, determined: Collection[str]) -> tuple[str, float] | None:
@@ -152,18 +191,25 @@ def _weakest(problem: Problem, determined: Collection[str]) -> tuple[str, float]
         r = np.linalg.qr(columns / np.where(size > 0, size, 1.0), mode="r")
         inverse = np.linalg.pinv(r, rcond=1e-12)
         left.append(1 / np.maximum(np.linalg.norm(inverse[: physics.shape[1]], axis=1), 1.0))
-    share = dict(zip(problem.baseline.names, np.minimum(left[0] / left[1], 1.0).tolist(), strict=True))
+    share = dict(
+        zip(problem.baseline.names, np.minimum(left[0] / left[1], 1.0).tolist(), strict=True)
+    )
     name = min(determined, key=lambda one: share[one])
     return name, share[name]
 
 
 def _slopes(problem: Problem, physics: PhysicsMap | None) -> dict[str, np.ndarray] | None:
-    """dp/dθ by name, at the spec's initial values or, without any, at least squares; None where there is none."""
+    """dp/dθ by name, at the spec's initial values or, without any, at least squares.
+
+    None where there is none.
+    """
     if physics is None:
         return None
     initial = problem.baseline.initial
     try:
-        found = physical_slopes(physics, problem, initial if np.all(initial) else problem.least_squares)
+        found = physical_slopes(
+            physics, problem, initial if np.all(initial) else problem.least_squares
+        )
     except InputError:
         return None
     return None if found is None else found[0]
@@ -176,7 +222,9 @@ def _untouched(shared: Shared, slopes: dict[str, np.ndarray] | None) -> tuple[st
     return tuple(
         name
         for name, row in slopes.items()
-        if all(abs(row @ column) <= _STILL * np.sum(np.abs(row * column)) for column in shared.basis.T)
+        if all(
+            abs(row @ column) <= _STILL * np.sum(np.abs(row * column)) for column in shared.basis.T
+        )
     )
 
 
@@ -202,7 +250,13 @@ def _combination(direction: dict[str, float]) -> str:
 
 
 def _listed(words: tuple[str, ...] | list[str]) -> str:
-    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}" if words else "nothing"
+    return (
+        words[0]
+        if len(words) == 1
+        else f"{', '.join(words[:-1])} and {words[-1]}"
+        if words
+        else "nothing"
+    )
 
 
 def imitation_before(form: MotionDynamics, q: Vector, x: Matrix, u: Matrix) -> MotionImitation:
@@ -215,8 +269,12 @@ def imitation_before(form: MotionDynamics, q: Vector, x: Matrix, u: Matrix) -> M
     others = []
     for texts in dict.fromkeys(_choices(form.motion)):
         if set(texts) != set(own):
-            features = tuple(parse_named(text, form.motion.known, "learner input") for text in texts)
-            others.append(Alternative.of(texts, shared_of_motion(replace(form, features=features), q, x, u)))
+            features = tuple(
+                parse_named(text, form.motion.known, "learner input") for text in texts
+            )
+            others.append(
+                Alternative.of(texts, shared_of_motion(replace(form, features=features), q, x, u))
+            )
     return MotionImitation.of(own, shared_of_motion(form, q, x, u), None, tuple(others))
 
 

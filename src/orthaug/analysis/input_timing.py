@@ -28,7 +28,10 @@ _REFITTED = 30  # iterations from where the declared hold ended
 
 @dataclass(frozen=True)
 class HoldTrial:
-    """The residual of physics alone under a hold, RMS in deviations of the outputs; None where it has no run."""
+    """The residual of physics alone under a hold, RMS in deviations of the outputs.
+
+    None where it has no run.
+    """
 
     hold: str
     residual: float | None
@@ -55,11 +58,19 @@ class Trial:
         if own is None or len(known) < 2:
             return None
         least = min(known, key=lambda h: h.residual or 0.0)
-        return least.hold if least.residual is not None and least.residual < (1 - _CLEARLY) * own else None
+        return (
+            least.hold
+            if least.residual is not None and least.residual < (1 - _CLEARLY) * own
+            else None
+        )
 
 
 def try_holds(
-    problem: MotionProblem, criterion: Criterion, solver: Any, structure: Structure, learner: Learner | None = None
+    problem: MotionProblem,
+    criterion: Criterion,
+    solver: Any,
+    structure: Structure,
+    learner: Learner | None = None,
 ) -> Trial:
     """Fit physics alone with the declared hold, and go on from there with every other.
 
@@ -80,9 +91,16 @@ def try_holds(
 
 
 def on_longest(
-    problem: MotionProblem, criterion: Criterion, solver: Any, structure: Structure, learner: Learner | None = None
+    problem: MotionProblem,
+    criterion: Criterion,
+    solver: Any,
+    structure: Structure,
+    learner: Learner | None = None,
 ) -> MotionTask:
-    """Physics alone trained on the first rows of the longest experiment; arguments as in `try_holds`."""
+    """Physics alone trained on the first rows of the longest experiment.
+
+    Arguments as in `try_holds`.
+    """
     longest = max(problem.record.experiments, key=len)
     record = replace(problem.record, experiments=(longest.rows(0, ROWS),))
     return MotionTask.of(problem.on(record), learner, criterion).prepared(solver, structure)
@@ -92,7 +110,9 @@ def _under(hold: str, task: MotionTask, solver: Any) -> HoldTrial:
     assert task.physics is not None
     try:
         motion = replace(task.problem.motion, hold=hold)
-        return _held(*refitted(task, task.physics, motion, task.problem.record, solver), declared=False)
+        return _held(
+            *refitted(task, task.physics, motion, task.problem.record, solver), declared=False
+        )
     except InputError:
         return HoldTrial(hold, None, False)
 
@@ -100,15 +120,23 @@ def _under(hold: str, task: MotionTask, solver: Any) -> HoldTrial:
 def refitted(
     task: MotionTask, free_fit: FreeRunFit, motion: Motion, record: Record, solver: Any
 ) -> tuple[SegmentedMotion, FreeRunFit | None]:
-    """Physics alone, trained on from where a flight ended, with another motion or record; None without a usable end.
+    """Physics alone, trained on from where a flight ended, with another motion or record.
+
+    None without a usable end.
 
     Raises:
         InputError: the motion does not take the record.
     """
     plan = task.plan
-    segmented = SegmentedMotion.of(replace(plan.problem, motion=motion, record=record), None, plan.criterion)
-    segmented = segmented.alone.refined(plan.dynamics.substeps).from_states(free_fit.end.point.states)
-    again = segmented.descend(segmented.objective(), free_fit.end.point.theta, solver.at_most(_REFITTED))
+    segmented = SegmentedMotion.of(
+        replace(plan.problem, motion=motion, record=record), None, plan.criterion
+    )
+    segmented = segmented.alone.refined(plan.dynamics.substeps).from_states(
+        free_fit.end.point.states
+    )
+    again = segmented.descend(
+        segmented.objective(), free_fit.end.point.theta, solver.at_most(_REFITTED)
+    )
     return segmented, again if again.ending.usable else None
 
 
@@ -117,7 +145,10 @@ def residual_of(segmented: SegmentedMotion, free_fit: FreeRunFit | None) -> floa
     if free_fit is None:
         return float("inf")
     value = float(
-        np.sqrt(np.sum((free_fit.end.point.errors / segmented.deviation[:, None]) ** 2) / segmented.residuals)
+        np.sqrt(
+            np.sum((free_fit.end.point.errors / segmented.deviation[:, None]) ** 2)
+            / segmented.residuals
+        )
     )
     return value if np.isfinite(value) else float("inf")
 
@@ -127,7 +158,9 @@ def _held(segmented: SegmentedMotion, free_fit: FreeRunFit | None, *, declared: 
     if free_fit is None or value == float("inf"):
         return HoldTrial(motion.hold, None, declared)
     p = motion.coordinates.physical(free_fit.end.point.theta)
-    return HoldTrial(motion.hold, value, declared, dict(zip(motion.names, map(float, p), strict=True)))
+    return HoldTrial(
+        motion.hold, value, declared, dict(zip(motion.names, map(float, p), strict=True))
+    )
 
 
 @dataclass(frozen=True)
@@ -144,8 +177,8 @@ class DeadTime:
         """Return what a delay explains, in words."""
         late = f"{self.samples} sample{'s' * (self.samples > 1)}"
         return (
-            f"with a delay of {late} physics alone leaves {self.residual:.3g} deviations of the output instead of "
-            f"{self.undelayed:.3g}"
+            f"with a delay of {late} physics alone leaves {self.residual:.3g} deviations of "
+            f"the output instead of {self.undelayed:.3g}"
         )
 
     @property
@@ -162,8 +195,8 @@ class DeadTime:
 def dead_times(task: MotionTask, solver: Any) -> tuple[DeadTime, ...]:
     """Return the inputs that act clearly later than they do in the equations, and by how many samples.
 
-    Each input is delayed in turn, by 1, 2, 4, … samples while that explains the data better, then by what lies
-    between; physics alone is refitted each time from where the last one ended.
+    Each input is delayed in turn, by 1, 2, 4, … samples while that explains the data better, then
+    by what lies between; physics alone is refitted each time from where the last one ended.
 
     Args:
         task: with physics alone trained; what it leaves is set against.
@@ -172,7 +205,9 @@ def dead_times(task: MotionTask, solver: Any) -> tuple[DeadTime, ...]:
         return ()
     found, most = [], len(task.problem.record) // _LONGEST
     for number, name in enumerate(task.problem.motion.inputs):
-        delays = _Delays(task, solver, number, {0: (residual_of(task.plan, task.physics), task.physics)})
+        delays = _Delays(
+            task, solver, number, {0: (residual_of(task.plan, task.physics), task.physics)}
+        )
         best = _least(delays.leaves, most)
         if delays.leaves(best) < (1 - _LATE) * delays.leaves(0):
             found.append(DeadTime(name, best, delays.leaves(best), delays.leaves(0)))
@@ -192,7 +227,9 @@ class _Delays:
     def leaves(self, samples: int) -> float:
         """Return what physics alone leaves with the input so many samples later."""
         if samples not in self.tried:
-            near = self.tried[min(self.tried, key=lambda known: (abs(known - samples), self.tried[known][0]))][1]
+            near = self.tried[
+                min(self.tried, key=lambda known: (abs(known - samples), self.tried[known][0]))
+            ][1]
             problem = self.task.problem
             late = _delayed(problem.record, self.number, samples)
             segmented, free_fit = refitted(self.task, near, problem.motion, late, self.solver)
@@ -213,11 +250,18 @@ def _least(leaves: Callable[[int], float], most: int) -> int:
 
 
 def _delayed(record: Record, number: int, samples: int) -> Record:
-    """Return an input later by so many samples; what it was before the record is its first value."""
+    """Return an input later by so many samples.
+
+    What it was before the record is its first value.
+    """
 
     def moved(inputs: np.ndarray) -> np.ndarray:
         column = inputs[:, number]
-        late = np.concatenate([np.full(min(samples, len(column)), column[0]), column])[: len(column)]
+        late = np.concatenate([np.full(min(samples, len(column)), column[0]), column])[
+            : len(column)
+        ]
         return np.where(np.arange(inputs.shape[1]) == number, late[:, None], inputs)
 
-    return replace(record, experiments=tuple(replace(e, inputs=moved(e.inputs)) for e in record.experiments))
+    return replace(
+        record, experiments=tuple(replace(e, inputs=moved(e.inputs)) for e in record.experiments)
+    )

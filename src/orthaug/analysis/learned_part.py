@@ -1,7 +1,7 @@
 """What a motion learned beside its physics: how sure it is at a point, and its share of each equation.
 
-The learner's part `f(x, u; c) + g(x, u; w) − f(x, u; p̂)` follows (c, w) by itself and by p̂, which the split makes of
-them: both count in its intervals.
+The learner's part `f(x, u; c) + g(x, u; w) − f(x, u; p̂)` follows (c, w) by itself and by p̂, which
+the split makes of them: both count in its intervals.
 """
 
 from __future__ import annotations
@@ -39,7 +39,9 @@ def equation_parts(fit: MotionEstimate, x: Matrix, u: Matrix) -> tuple[EquationP
     """Of every learned equation and output, over states (M, nx) and inputs (M, nu)."""
     physics, learner = parts_at(fit.model.form, fit.model.numbers, x, u)
     units, found = {channel.name: channel.unit for channel in fit.model.outputs}, []
-    for (name, unit), own, beside in zip(labels_of(fit.model.form), physics.T, learner.T, strict=True):
+    for (name, unit), own, beside in zip(
+        labels_of(fit.model.form), physics.T, learner.T, strict=True
+    ):
         finite = np.isfinite(own) & np.isfinite(beside)
         if not finite.any():
             continue
@@ -53,7 +55,8 @@ def equation_parts(fit: MotionEstimate, x: Matrix, u: Matrix) -> tuple[EquationP
 def learned_reach(fit: MotionEstimate, x: Matrix, u: Matrix) -> Matrix | None:
     """Half the length of 95 % intervals of the learner's part (M, nl), point by point.
 
-    None without intervals, and where some parameter is not identified: the prior of the weights then holds both.
+    None without intervals, and where some parameter is not identified: the prior of the weights
+    then holds both.
     """
     made, slope = free_covariance(fit), fit.split_by.slope
     if made is None or slope is None or fit.model.form.bound is None or fit.unidentified:

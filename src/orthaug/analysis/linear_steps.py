@@ -1,7 +1,7 @@
 """A model's step as a function to linearise: of its own state and inputs, and what that state holds at rest.
 
-The state of a lagged model is its memory of outputs and inputs, that of a motion its states. At rest the first is made
-of the outputs, so that these are what is looked for.
+The state of a lagged model is its memory of outputs and inputs, that of a motion its states. At
+rest the first is made of the outputs, so that these are what is looked for.
 """
 
 from __future__ import annotations
@@ -56,7 +56,9 @@ class LaggedStep:
     def state_at(self, rest: Any, inputs: Any) -> Any:
         """Return the state that keeps outputs `rest` and inputs for long."""
         now = dict(zip((*self.rest, *self.inputs), (*rest, *inputs), strict=True))
-        return jnp.stack([now[lag.channel] for lag in self.memory.lags] or [jnp.zeros(())])[: len(self.memory.lags)]
+        return jnp.stack([now[lag.channel] for lag in self.memory.lags] or [jnp.zeros(())])[
+            : len(self.memory.lags)
+        ]
 
     def advance(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Any]:
         """Return the next state and the outputs."""
@@ -68,7 +70,10 @@ class LaggedStep:
         return y - rest, y
 
     def seen(self, rest: Vector, inputs: Vector) -> Vector | None:
-        """Return the learner's features at rest; None where there is no telling what training reached of them."""
+        """Return the learner's features at rest.
+
+        None where there is no telling what training reached of them.
+        """
         if self.form.bound is None or not self.form.differentiable:
             return None
         now = dict(zip((*self.rest, *self.inputs), (*rest, *inputs), strict=True))
@@ -112,7 +117,9 @@ class MotionStep:
 
     def field(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Any]:
         """Return the derivatives in time, or the next state of a discrete motion, and the outputs."""
-        return sum(self.form.rates(numbers, state, inputs)), self.form.observed(numbers, state, inputs)
+        return sum(self.form.rates(numbers, state, inputs)), self.form.observed(
+            numbers, state, inputs
+        )
 
     def unrest(self, numbers: Numbers, rest: Any, inputs: Any) -> tuple[Any, Any]:
         rates, y = self.field(numbers, rest, inputs)
@@ -128,7 +135,10 @@ Step = LaggedStep | MotionStep
 
 
 def step_of(model: Model | MotionModel) -> Step:
-    """Return the step to linearise; a spline through the record is replaced by straight lines between samples."""
+    """Return the step to linearise.
+
+    A spline through the record is replaced by straight lines between samples.
+    """
     if isinstance(model, Model):
         return LaggedStep(model.form, model.memory)
     form = model.form
@@ -148,11 +158,15 @@ def sizes_of(model: Model | MotionModel) -> Vector:
 
 
 @partial(jax.jit, static_argnames="step")
-def at_rest(step: Step, numbers: Numbers, rest: Any, inputs: Any, width: Any) -> tuple[Any, Any, Any]:
+def at_rest(
+    step: Step, numbers: Numbers, rest: Any, inputs: Any, width: Any
+) -> tuple[Any, Any, Any]:
     """Return what is zero at rest (ne,), the outputs (ny,), and how both follow rest and inputs (ne + ny, ne + nu)."""
     both, point = partial(_unrest, step, numbers), jnp.concatenate([rest, inputs])
     value = both(point)
-    slope = jax.jacfwd(both)(point) if step.form.differentiable else by_differences(both, point, width)
+    slope = (
+        jax.jacfwd(both)(point) if step.form.differentiable else by_differences(both, point, width)
+    )
     ne = len(step.rest)
     return value[:ne], value[ne:], slope
 
@@ -170,7 +184,9 @@ def _moved(numbers: Numbers, unknowns: Any) -> Numbers:
 
 
 @partial(jax.jit, static_argnames="step")
-def unrest_along(step: Step, numbers: Numbers, rest: Any, inputs: Any, unknowns: Any, root: Any) -> Float[Array, "m r"]:
+def unrest_along(
+    step: Step, numbers: Numbers, rest: Any, inputs: Any, unknowns: Any, root: Any
+) -> Float[Array, "m r"]:
     """Return how what is zero at rest, and the outputs, move along the columns of `root` (n, r)."""
 
     def of(p: Any) -> Any:
@@ -196,7 +212,9 @@ def _slope(step: Step, field: bool, numbers: Numbers, rest: Any, inputs: Any, wi
     both, point = _of_point(step, field, numbers), _build_rows(step, field, rest, inputs)
     if step.form.differentiable:
         return jax.jacfwd(both)(point)
-    return by_differences(both, point, _build_rows(step, field, width[: len(rest)], width[len(rest) :]))
+    return by_differences(
+        both, point, _build_rows(step, field, width[: len(rest)], width[len(rest) :])
+    )
 
 
 @partial(jax.jit, static_argnames="step")
@@ -205,19 +223,29 @@ def one_sided(step: Step, numbers: Numbers, rest: Any, inputs: Any, width: Any) 
     both, point = _of_point(step, False, numbers), _build_rows(step, False, rest, inputs)
     full = _build_rows(step, False, width[: len(rest)], width[len(rest) :])
     each, middle, n = jax.vmap(both), both(point), len(step.states)
-    sides = [(each(point + sign * jnp.diag(full)) - middle) / (sign * full[:, None]) for sign in (-1, 1)]
+    sides = [
+        (each(point + sign * jnp.diag(full)) - middle) / (sign * full[:, None]) for sign in (-1, 1)
+    ]
     return jnp.stack([side.T[:n] for side in sides]), full
 
 
 @partial(jax.jit, static_argnames=("step", "field"))
-def slope_at(step: Step, field: bool, numbers: Numbers, rest: Any, inputs: Any, width: Any) -> Float[Array, "m n"]:
+def slope_at(
+    step: Step, field: bool, numbers: Numbers, rest: Any, inputs: Any, width: Any
+) -> Float[Array, "m n"]:
     """`[[A, B], [C, D]]` at a point of rest."""
     return _slope(step, field, numbers, rest, inputs, width)
 
 
 @partial(jax.jit, static_argnames=("step", "field"))
 def slope_along(
-    step: Step, field: bool, numbers: Numbers, rest: Any, inputs: Any, unknowns: Any, along: tuple[Any, Any, Any]
+    step: Step,
+    field: bool,
+    numbers: Numbers,
+    rest: Any,
+    inputs: Any,
+    unknowns: Any,
+    along: tuple[Any, Any, Any],
 ) -> Float[Array, "r m n"]:
     """Return how `[[A, B], [C, D]]` moves where (rest, inputs, unknowns) move along the columns of `along`."""
 

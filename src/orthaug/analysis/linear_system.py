@@ -1,11 +1,13 @@
 """A linear system with what its matrices move along the directions of a covariance: poles, gains and responses of both.
 
-The covariance of `vec [[A, B], [C, D]]` is `Σ_j m_j m_jᵀ` with the r matrices m_j of `moved`. A function of the
-matrices then has the variance `Σ_j δ_j²`, δ_j its derivative along m_j (delta method): sums of squares.
+The covariance of `vec [[A, B], [C, D]]` is `Σ_j m_j m_jᵀ` with the r matrices m_j of `moved`. A
+function of the matrices then has the variance `Σ_j δ_j²`, δ_j its derivative along m_j (delta
+method): sums of squares.
 
-For continuous time a lagged model is written first with as many states as its transfer function needs (observer form),
-less dead time that belongs to an input alone. Then `zoh`: `[[A, B], [0, 0]] = ln [[A_d, B_d], [0, I]] / Ts`, exact for
-inputs that are held between samples; or `tustin`: `z = (1 + s Ts/2) / (1 − s Ts/2)`.
+For continuous time a lagged model is written first with as many states as its transfer function
+needs (observer form), less dead time that belongs to an input alone. Then `zoh`: `[[A, B], [0, 0]]
+= ln [[A_d, B_d], [0, I]] / Ts`, exact for inputs that are held between samples; or `tustin`: `z =
+(1 + s Ts/2) / (1 − s Ts/2)`.
 """
 
 from __future__ import annotations
@@ -30,9 +32,12 @@ _ROUNDING = 1e-8  # of a matrix: what the logarithm must give back
 
 @dataclass(frozen=True, eq=False)
 class System:
-    """`x⁺ = A x + B u` of a sampling time `step` [s], or `ẋ = A x + B u` where that is None; `y = C x + D u`.
+    """`x⁺ = A x + B u` of a sampling time `step` [s], or `ẋ = A x + B u` where that is None.
 
-    `matrix` is [[A, B], [C, D]], (n + ny, n + nu); `moved` (r, n + ny, n + nu), None where nothing is known.
+    `y = C x + D u`.
+
+    `matrix` is [[A, B], [C, D]], (n + ny, n + nu); `moved` (r, n + ny, n + nu), None where nothing
+    is known.
     """
 
     matrix: Matrix
@@ -68,7 +73,9 @@ class System:
     @cached_property
     def modes(self) -> Modes:
         """Poles with their derivatives."""
-        return modes_of(self.a, None if self.moved is None else self.moved[:, : self.states, : self.states])
+        return modes_of(
+            self.a, None if self.moved is None else self.moved[:, : self.states, : self.states]
+        )
 
     def response(self, z: Complex[np.ndarray, "m"]) -> Response:
         """`C (zI − A)⁻¹ B + D` at m points of the plane."""
@@ -83,13 +90,19 @@ class System:
         ny, nu = self.d.shape
         left = np.concatenate([left, np.broadcast_to(np.eye(ny), (len(z), ny, ny))], axis=2)
         right = np.concatenate([right, np.broadcast_to(np.eye(nu), (len(z), nu, nu))], axis=1)
-        return Response(value, np.einsum("mij,rjk,mkl->mril", left, self.moved, right, optimize=True))
+        return Response(
+            value, np.einsum("mij,rjk,mkl->mril", left, self.moved, right, optimize=True)
+        )
 
     @property
     def integrates(self) -> bool:
         """Return whether a pole stands where the static gain is asked for."""
         rest = 1.0 if self.step is not None else 0.0
-        size = 1.0 if self.step is not None else max(np.abs(self.modes.values).max(initial=0.0), 1e-300)
+        size = (
+            1.0
+            if self.step is not None
+            else max(np.abs(self.modes.values).max(initial=0.0), 1e-300)
+        )
         return bool(np.any(np.abs(self.modes.values - rest) < _UNIT * size)) or (
             self.step is None and self.modes.at_zero > 0
         )
@@ -128,8 +141,8 @@ class Modes(NamedTuple):
 def modes_of(a: Matrix, moved: Float[np.ndarray, "r n n"] | None) -> Modes:
     """Eigenvalues of A; `dλ = wᴴ dA v / wᴴv` with its eigenvectors.
 
-    Those at 0, which shift registers have, are split off before: a chain of k of them is moved by rounding as far as
-    `ε^(1/k)`.
+    Those at 0, which shift registers have, are split off before: a chain of k of them is moved by
+    rounding as far as `ε^(1/k)`.
     """
     if not len(a):
         return Modes(np.zeros(0, dtype=complex), (), 0)
@@ -138,7 +151,13 @@ def modes_of(a: Matrix, moved: Float[np.ndarray, "r n n"] | None) -> Modes:
     nothing = np.zeros(0, dtype=complex), core
     found: Any = scipy.linalg.eig(core, left=True, right=False) if len(core) else nothing
     values, left = found
-    order = np.lexsort((-np.sign(values.imag), np.round(np.abs(np.angle(values)), 9), -np.round(np.abs(values), 12)))
+    order = np.lexsort(
+        (
+            -np.sign(values.imag),
+            np.round(np.abs(np.angle(values)), 9),
+            -np.round(np.abs(values), 12),
+        )
+    )
     slopes: list[Any] = []
     for i in order:
         if moved is None:
@@ -148,7 +167,11 @@ def modes_of(a: Matrix, moved: Float[np.ndarray, "r n n"] | None) -> Modes:
         v = _right(balanced, values[i], w)
         inner = w.conj() @ v
         sure = abs(inner) > _DEFECTIVE * np.linalg.norm(w) * np.linalg.norm(v)
-        slopes.append(np.einsum("i,rij,j->r", w.conj() / scale[0], moved, v * scale[0]) / inner if sure else None)
+        slopes.append(
+            np.einsum("i,rij,j->r", w.conj() / scale[0], moved, v * scale[0]) / inner
+            if sure
+            else None
+        )
     return Modes(values[order], tuple(slopes), len(a) - len(core))
 
 
@@ -190,7 +213,9 @@ def _solved(left: Any, right: Any) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Continuous:
-    """The system in continuous time; `dead_time` [s] (nu,) delays its inputs. `method` is that of the conversion.
+    """The system in continuous time; `dead_time` [s] (nu,) delays its inputs.
+
+    `method` is that of the conversion.
 
     "equations" are a motion's own. `states` are their names.
     """
@@ -201,7 +226,9 @@ class Continuous:
     states: tuple[str, ...]
 
 
-def converted(system: System, method: str, memory: Memory | None, names: tuple[str, ...]) -> Continuous | str:
+def converted(
+    system: System, method: str, memory: Memory | None, names: tuple[str, ...]
+) -> Continuous | str:
     """Return the system in continuous time, or why there is none."""
     step = system.step
     assert step is not None
@@ -213,26 +240,36 @@ def converted(system: System, method: str, memory: Memory | None, names: tuple[s
     if method == "tustin":
         if np.any(np.abs(poles.values + 1) < 1e-9):
             return "a pole at -1 has no counterpart under Tustin's rule."
-        return Continuous(System(_tustin(system, step), system.states, None), dead * step, method, names)
+        return Continuous(
+            System(_tustin(system, step), system.states, None), dead * step, method, names
+        )
     if poles.at_zero:
         count = "a pole at 0 has" if poles.at_zero == 1 else f"{poles.at_zero} poles at 0 have"
-        return f"{count} no counterpart under a hold (what is forgotten within a sample); tustin gives one."
+        return (
+            f"{count} no counterpart under a hold (what is forgotten within a sample); tustin "
+            "gives one."
+        )
     values: Any = poles.values
     negative = values[(values.real < 0) & (np.abs(values.imag) < 1e-9 * np.abs(values))]
     if len(negative):
         told = ", ".join(f"{value.real:.4g}" for value in negative)
         return (
-            f"a real pole below 0 ({told}) alternates from sample to sample, which no real system does under a hold; "
-            "tustin gives one."
+            f"a real pole below 0 ({told}) alternates from sample to sample, which no real "
+            "system does under a hold; tustin gives one."
         )
     found = _logarithm(system, step)
     if found is None:
-        return "the matrix logarithm cannot be computed to the digits that are needed; tustin gives a system."
+        return (
+            "the matrix logarithm cannot be computed to the digits that are needed; tustin "
+            "gives a system."
+        )
     return Continuous(System(found, system.states, None), dead * step, method, names)
 
 
 def observer_form(system: System, memory: Memory) -> tuple[System, Any]:
-    """Return a lagged system with `Σ n_i` states, n_i the largest lag in the equation of output i; and dead samples (nu,).
+    """Return a lagged system with `Σ n_i` states, n_i the largest lag in the equation of output i.
+
+    And dead samples (nu,).
 
     `s_i,l⁺ = s_i,l+1 + Σ_j a_ij,l y_j + Σ_j b_ij,l u_j`, `y_i = s_i,1 + Σ_j d_ij u_j`.
     """
@@ -279,7 +316,9 @@ def _logarithm(system: System, step: float) -> Matrix | None:
     whole[:n] = system.matrix[:n]
     with np.errstate(all="ignore"):
         found: Any = np.asarray(scipy.linalg.logm(whole)) if n else np.zeros((nu, nu))
-    if not np.isfinite(found).all() or np.abs(found.imag).max(initial=0.0) > _ROUNDING * np.abs(found).max(initial=0.0):
+    if not np.isfinite(found).all() or np.abs(found.imag).max(initial=0.0) > _ROUNDING * np.abs(
+        found
+    ).max(initial=0.0):
         return None
     back = scipy.linalg.expm(found.real)
     if np.abs(back - whole).max(initial=0.0) > _ROUNDING * np.abs(whole).max(initial=1.0):

@@ -56,16 +56,17 @@ def linearize(
 ) -> Linearization:
     """Return the model about its points of rest as linear systems, with 95 % intervals from its joint covariance.
 
-    Args:
-        model: a fitted model; of a fit the record is that of training.
-        at: inputs that are held, and outputs or states that are fixed, `"force=0, position=1"` or a mapping. Inputs
-            that nobody names are 0, or their means over the record; with outputs or states fixed, they are looked for.
+    Args: model: a fitted model; of a fit the record is that of training. at: inputs that are held,
+        and outputs or states that are fixed, `"force=0, position=1"` or a mapping. Inputs
+            that nobody names are 0, or their means over the record; with outputs or states fixed,
+            they are looked for.
         record: measured data whose own frequency response is put beside.
-        frequencies: of the frequency response [Hz]; by default 400 up to Nyquist's, on a logarithmic grid.
+        frequencies: of the frequency response [Hz]; by default 400 up to Nyquist's, on a
+            logarithmic grid.
         continuous: how a lagged model is converted to continuous time, zoh or tustin.
 
-    Raises:
-        InputError: no point of rest, a name that the model does not have, a record that does not fit.
+    Raises: InputError: no point of rest, a name that the model does not have, a record that does
+        not fit.
 
     Examples:
         >>> import orthaug as oa
@@ -98,8 +99,8 @@ def linearize(
     warnings += told
     if _smooth(model):
         text = (
-            "a spline through the record has no step: the sampled system is that of straight lines between samples, "
-            "the frequency response that of the equations."
+            "a spline through the record has no step: the sampled system is that of straight "
+            "lines between samples, the frequency response that of the equations."
         )
         warnings.append(Warning("hold_replaced", text))
     views = tuple(_view(model, search, point, spread, frequency, continuous) for point in points)
@@ -124,8 +125,15 @@ def _frequencies(given: Any, step: float) -> Vector | None:
     except (TypeError, ValueError, OverflowError):
         found = np.zeros(0)
     nyquist = 0.5 / step
-    if not len(found) or not np.isfinite(found).all() or np.any(found <= 0) or np.any(found > nyquist * (1 + 1e-9)):
-        raise InputError(f"`frequencies` must be numbers above 0 up to half the sampling rate, {nyquist:.6g} Hz.")
+    if (
+        not len(found)
+        or not np.isfinite(found).all()
+        or np.any(found <= 0)
+        or np.any(found > nyquist * (1 + 1e-9))
+    ):
+        raise InputError(
+            f"`frequencies` must be numbers above 0 up to half the sampling rate, {nyquist:.6g} Hz."
+        )
     return found
 
 
@@ -133,7 +141,10 @@ def _spread(model: Model | MotionModel, fit: Any) -> tuple[_Spread | None, list[
     """Return the covariance to take intervals from, and what is to be said of it."""
     joint, nt = model.statistics.joint(len(model.theta)), len(model.theta)
     if not model.form.differentiable:
-        text = "the learner has no derivatives (a function from another toolbox): differences stand in, no intervals."
+        text = (
+            "the learner has no derivatives (a function from another toolbox): differences "
+            "stand in, no intervals."
+        )
         return None, [Warning("no_intervals", text)]
     if joint is not None and model.numbers.tilt is None:
         root = joint.root()
@@ -142,10 +153,16 @@ def _spread(model: Model | MotionModel, fit: Any) -> tuple[_Spread | None, list[
     covariance = None if fit is None or isinstance(model, MotionModel) else fit.covariance
     if fit is not None and covariance is not None and np.isfinite(covariance).all() and nt:
         values, vectors = np.linalg.eigh(covariance)
-        text = "there is no joint covariance with the learner's weights; intervals are those of θ, the learner frozen."
+        text = (
+            "there is no joint covariance with the learner's weights; intervals are those of "
+            "θ, the learner frozen."
+        )
         spread = _Spread(vectors * np.sqrt(np.maximum(values, 0.0)), float(fit.freedom), True)
         return spread, [Warning("learner_frozen", text)]
-    text = "the model carries no covariance (an ensemble, or trained elsewhere); there are no intervals."
+    text = (
+        "the model carries no covariance (an ensemble, or trained elsewhere); there are no "
+        "intervals."
+    )
     return None, [Warning("no_intervals", text)]
 
 
@@ -164,7 +181,8 @@ def _view(
     if step.ends == 2:
         sampled = _without_next(sampled)
         text = (
-            "inputs run straight between samples: the sampled states are those of the motion less B₁ times the input."
+            "inputs run straight between samples: the sampled states are those of the motion "
+            "less B₁ times the input."
         )
         warnings.append(Warning("shifted_states", text))
     own: System | None = None
@@ -172,10 +190,18 @@ def _view(
         own = _system(search, point, spread, None)
         found: Continuous | str = Continuous(own, np.zeros(len(step.inputs)), "equations", names)
     else:
-        found = converted(sampled, method, None if isinstance(step, MotionStep) else step.memory, names)
+        found = converted(
+            sampled, method, None if isinstance(step, MotionStep) else step.memory, names
+        )
     poles = poles_of(sampled, own, freedom)
-    if any(pole.magnitude_ci95 and pole.magnitude_ci95[0] < 1 < pole.magnitude_ci95[1] for pole in poles):
-        text = "the 95 % interval of a pole contains magnitude 1: whether the point is stable is not sure."
+    if any(
+        pole.magnitude_ci95 and pole.magnitude_ci95[0] < 1 < pole.magnitude_ci95[1]
+        for pole in poles
+    ):
+        text = (
+            "the 95 % interval of a pole contains magnitude 1: whether the point is stable is "
+            "not sure."
+        )
         warnings.append(Warning("stability_not_sure", text))
     gain, gain_ci95 = gain_of(sampled, freedom)
     bode, smooth = None, _smooth(model)
@@ -192,13 +218,17 @@ def _view(
     )  # fmt: skip
 
 
-def _system(search: Search, point: OperatingPoint, spread: _Spread | None, time: float | None) -> System:
+def _system(
+    search: Search, point: OperatingPoint, spread: _Spread | None, time: float | None
+) -> System:
     """Return the matrices of a step of `time`, or of the equations, and how they move along the covariance."""
     step, numbers, field = search.step, search.numbers, time is None
     width = difference_widths(search.size, point.inputs)
     matrix = np.asarray(slope_at(step, field, numbers, point.rest, point.inputs, width))
     if not np.isfinite(matrix).all():
-        raise InputError(f"the model has no finite derivative at {point}; give another operating point.")
+        raise InputError(
+            f"the model has no finite derivative at {point}; give another operating point."
+        )
     moved = None
     if spread is not None:
         weights = [] if spread.frozen else [np.asarray(numbers.weights)]
@@ -208,7 +238,15 @@ def _system(search: Search, point: OperatingPoint, spread: _Spread | None, time:
         rows = [*range(ne), *(ne + i for i in point.slopes.outputs)]
         along = point.slopes.following(change[rows])
         moved = np.asarray(
-            slope_along(step, field, numbers, point.rest, point.inputs, unknowns, (along[:ne], along[ne:], root))
+            slope_along(
+                step,
+                field,
+                numbers,
+                point.rest,
+                point.inputs,
+                unknowns,
+                (along[:ne], along[ne:], root),
+            )
         )
         moved = np.where(np.isfinite(moved), moved, 0.0)
     return System(matrix, len(step.states), time, moved)
@@ -255,14 +293,17 @@ def _kinks(search: Search, point: OperatingPoint, system: System) -> list[Warnin
     if not search.step.form.differentiable:
         return []
     width, n = difference_widths(search.size, point.inputs), system.states
-    sides, full = map(np.asarray, one_sided(search.step, search.numbers, point.rest, point.inputs, width))
+    sides, full = map(
+        np.asarray, one_sided(search.step, search.numbers, point.rest, point.inputs, width)
+    )
     unit = full[:n] / full[:n, None]  # entries in sizes of the states
     apart = np.abs(sides[:, :, :n] - system.a) * unit
     if np.all(apart <= _STEEP * np.abs(system.a * unit).max(initial=1e-300)):
         return []
     text = (
-        "the slope changes abruptly at this point, within a thousandth of the training data's size (such as dry "
-        "friction at rest): the linear system holds for smaller movements only."
+        "the slope changes abruptly at this point, within a thousandth of the training data's "
+        "size (such as dry friction at rest): the linear system holds for smaller movements "
+        "only."
     )
     return [Warning("kink", text)]
 
@@ -282,5 +323,8 @@ def _rough(bode: Any) -> list[Warning]:
     share = float(np.mean(wide))
     if share < 0.05:
         return []
-    text = f"at {percent(share)} of the frequencies the band is so wide that the delta method is rough there."
+    text = (
+        f"at {percent(share)} of the frequencies the band is so wide that the delta method is "
+        "rough there."
+    )
     return [Warning("wide_band", text)]

@@ -29,11 +29,9 @@ _ROUNDING = 1e-9  # of a parameter: an end of its interval that lies so little o
 class MeasureLinearization:
     """What biases are computed on.
 
-    Args:
-        weighed: the measure's points and the physics there, of one parameter or more.
-        physics: the map from physical parameters to θ.
-        theta: θ̂ for relative biases and for dp/dθ.
-        learned: f at the measure's points (M, ny) after a fit, to tell how much of it a suspect explains.
+    Args: weighed: the measure's points and the physics there, of one parameter or more. physics:
+        the map from physical parameters to θ. theta: θ̂ for relative biases and for dp/dθ. learned:
+        f at the measure's points (M, ny) after a fit, to tell how much of it a suspect explains.
         directions: (nθ, s) along which θ is split; None for all.
     """
 
@@ -49,7 +47,9 @@ class MeasureLinearization:
         """dp/dθ by name, and p."""
         return physical_slopes(self.physics, self.problem, self.theta)
 
-    def table(self, suspects: Sequence[Suspect], *, certify: bool, every: bool = True) -> tuple[SuspectedBias, ...]:
+    def table(
+        self, suspects: Sequence[Suspect], *, certify: bool, every: bool = True
+    ) -> tuple[SuspectedBias, ...]:
         """Return what every suspect does to θ.
 
         Args:
@@ -82,7 +82,9 @@ class MeasureLinearization:
             if self.directions is None
             else self._absorbed([entry.suspect])[0].held
         )
-        return replace(self, learned=np.asarray(self.learned) - (entry.coefficient_found or 0.0) * held)
+        return replace(
+            self, learned=np.asarray(self.learned) - (entry.coefficient_found or 0.0) * held
+        )
 
     def _absorbed(self, suspects: Sequence[Suspect]) -> list[TermAfterFit]:
         problem = self.problem
@@ -99,13 +101,16 @@ class MeasureLinearization:
 
 
 def bias_under(
-    linearization: MeasureLinearization, suspects: Sequence[Suspect] = (), *, certify_usual: bool = True
+    linearization: MeasureLinearization,
+    suspects: Sequence[Suspect] = (),
+    *,
+    certify_usual: bool = True,
 ) -> list[dict[str, Any]]:
     """Return the bias of every suspect under a measure, for θ and, to first order, for the physical parameters; for JSON.
 
-    Args:
-        suspects: those that were named; without any, the usual ones that have an effect.
-        certify_usual: seek certificates, a linear program each, for suspects that no one named, too.
+    Args: suspects: those that were named; without any, the usual ones that have an effect.
+        certify_usual: seek certificates, a linear program each, for suspects that no one named,
+        too.
     """
     named, problem, points = bool(suspects), linearization.problem, linearization.weighed.points
     table = linearization.table(
@@ -119,7 +124,9 @@ def bias_under(
         own = {
             "relative_physical_bias": _relative(entry, linearization.slopes),
             "size": float(np.linalg.norm(times(linearization.weighed.unit, delta))),
-            "expected_physical_bias": _expected(entry, linearization.physics, problem, linearization.theta),
+            "expected_physical_bias": _expected(
+                entry, linearization.physics, problem, linearization.theta
+            ),
         }
         found.append(entry.as_dict() | own)
     return found
@@ -131,18 +138,25 @@ def _expected(
     """Return what the guessed coefficient does to each physical parameter: p of θ̂ less p without the bias."""
     if physics is None or entry.expected is None:
         return None
-    biased, true = (physical_of(physics, problem, t) for t in (theta, theta - np.array(entry.expected)))
+    biased, true = (
+        physical_of(physics, problem, t) for t in (theta, theta - np.array(entry.expected))
+    )
     return {
         name: {"bias": float(b - t), "relative": float((b - t) / t) if t else None}
         for name, b, t in zip(physics.names, biased, true, strict=True)
     }
 
 
-def _relative(entry: SuspectedBias, slopes: tuple[dict[str, Vector], Vector] | None) -> dict[str, float | None] | None:
+def _relative(
+    entry: SuspectedBias, slopes: tuple[dict[str, Vector], Vector] | None
+) -> dict[str, float | None] | None:
     """Return the bias of each physical parameter over its value."""
     if slopes is None or entry.physical is None:
         return None
-    return {name: bias / p if p else None for (name, bias), p in zip(entry.physical, slopes[1], strict=True)}
+    return {
+        name: bias / p if p else None
+        for (name, bias), p in zip(entry.physical, slopes[1], strict=True)
+    }
 
 
 def physical_slopes(
@@ -152,7 +166,9 @@ def physical_slopes(
     if physics is None:
         return None
     p = physical_of(physics, problem, theta)
-    of_theta = np.abs(physics.theta(p))  # scales of θ and p, so that the pseudo-inverse sees numbers of one size
+    of_theta = np.abs(
+        physics.theta(p)
+    )  # scales of θ and p, so that the pseudo-inverse sees numbers of one size
     of_theta, of_p = np.where(of_theta > 0, of_theta, 1.0), np.where(p != 0, np.abs(p), 1.0)
     inverse = np.linalg.pinv(physics.jacobian(p) / of_theta[:, None] * of_p)
     rows = np.zeros((len(p), len(problem.baseline.names)))
@@ -160,39 +176,51 @@ def physical_slopes(
     return dict(zip(physics.names, rows, strict=True)), p
 
 
-def physical_of(physics: PhysicsMap, problem: Problem, theta: Vector, covariance: Matrix | None = None) -> Vector:
+def physical_of(
+    physics: PhysicsMap, problem: Problem, theta: Vector, covariance: Matrix | None = None
+) -> Vector:
     """p of θ, weighted by its covariance where that is given."""
     return _solved(physics, problem, theta, covariance).value
 
 
-def _solved(physics: PhysicsMap, problem: Problem, theta: Vector, covariance: Matrix | None) -> PhysicalEstimate:
+def _solved(
+    physics: PhysicsMap, problem: Problem, theta: Vector, covariance: Matrix | None
+) -> PhysicalEstimate:
     order = _order(physics, problem)
     covariance = None if covariance is None else covariance[np.ix_(order, order)]
     return solve(physics, theta[order], covariance, freedom=np.inf)
 
 
 def physical_with_bias(
-    linearization: MeasureLinearization, bias: Vector, covariance: Matrix | None, spread: Matrix, freedom: float
+    linearization: MeasureLinearization,
+    bias: Vector,
+    covariance: Matrix | None,
+    spread: Matrix,
+    freedom: float,
 ) -> tuple[Vector, Matrix]:
     """Biases of the physical parameters (np,), and ends (np, 2) of 95 % intervals that cover bias and noise.
 
-    The interval of p is that of θ in the direction in which p moves most, mapped: p of both of its ends, or p's bound
-    where an end has none. Biases are NaN where θ̂ less its bias has no p.
+    The interval of p is that of θ in the direction in which p moves most, mapped: p of both of its
+    ends, or p's bound where an end has none. Biases are NaN where θ̂ less its bias has no p.
 
-    Args:
-        bias: of θ̂.
-        covariance: of θ̂, by which p is weighted; `spread` counts also what is not known of the bias.
+    Args: bias: of θ̂. covariance: of θ̂, by which p is weighted; `spread` counts also what is not
+        known of the bias.
     """
     physics, problem = linearization.physics, linearization.problem
     assert physics is not None
     centre, order = linearization.theta - bias, _order(physics, problem)
-    now, free = (_solved(physics, problem, theta, covariance) for theta in (linearization.theta, centre))
+    now, free = (
+        _solved(physics, problem, theta, covariance) for theta in (linearization.theta, centre)
+    )
     ends = np.full((len(free.value), 2), np.nan)
     if not _met(free):
         return ends[:, 0], ends
     if free.sensitivities is None or covariance is None:
         return now.value - free.value, ends
-    slopes, at_bounds = np.zeros((len(free.value), len(centre))), physical_slopes(physics, problem, centre)
+    slopes, at_bounds = (
+        np.zeros((len(free.value), len(centre))),
+        physical_slopes(physics, problem, centre),
+    )
     assert at_bounds is not None
     with np.errstate(all="ignore"):
         slopes[:, order] = free.sensitivities * free.value[:, None] / centre[order]

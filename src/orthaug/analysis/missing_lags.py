@@ -1,8 +1,9 @@
 """Is the unmodelled part a function of what the learner sees? The residual against every lag that it does not see.
 
-Under that hypothesis the residual is `(I − P)ε`, P the projection onto the physics and the functions of z. So it has no
-mean product with any function h of a lag from which P is taken off: the score test of `Σ_k h̃_k e_k = 0` with
-h̃ = (I − P)h. Its covariance is that of Newey and West, so that noise may be coloured and of uneven size.
+Under that hypothesis the residual is `(I − P)ε`, P the projection onto the physics and the
+functions of z. So it has no mean product with any function h of a lag from which P is taken off:
+the score test of `Σ_k h̃_k e_k = 0` with h̃ = (I − P)h. Its covariance is that of Newey and West,
+so that noise may be coloured and of uneven size.
 """
 
 from __future__ import annotations
@@ -44,7 +45,10 @@ class LagTest:
 
 @dataclass(frozen=True)
 class MissingLags:
-    """The tests of all lags that the learner does not see. `missing` are those below `level`, surest first."""
+    """The tests of all lags that the learner does not see.
+
+    `missing` are those below `level`, surest first.
+    """
 
     tests: tuple[LagTest, ...]
     level: float = LEVEL
@@ -60,13 +64,20 @@ class MissingLags:
         """In a sentence."""
         tested = ", ".join(test.lag for test in self.tests)
         if not self.missing:
-            return f"The residual does not depend on what the learner does not see ({tested}), as far as it shows."
+            return (
+                f"The residual does not depend on what the learner does not see ({tested}), as "
+                "far as it shows."
+            )
         first = self.missing[0]
-        others = f" (after it {', '.join(test.lag for test in self.missing[1:])})" if len(self.missing) > 1 else ""
+        others = (
+            f" (after it {', '.join(test.lag for test in self.missing[1:])})"
+            if len(self.missing) > 1
+            else ""
+        )
         return (
-            "What the physics lacks is no function of what the learner sees: the residual also depends on "
-            f"{first.lag}{others}, by {percent(first.share)} of its variance, so that θ beside the learner is "
-            "biased; add that lag to learner.inputs."
+            "What the physics lacks is no function of what the learner sees: the residual also "
+            f"depends on {first.lag}{others}, by {percent(first.share)} of its variance, so "
+            "that θ beside the learner is biased; add that lag to learner.inputs."
         )
 
     @property
@@ -76,13 +87,19 @@ class MissingLags:
 
 
 def missing_lags(fit: Estimate, one_step: Response | None = None) -> MissingLags | None:
-    """Return the tests of a one-step fit; None where the learner sees all lags, without a learner, or with too few rows.
+    """Return the tests of a one-step fit.
+
+    None where the learner sees all lags, without a learner, or with too few rows.
 
     Args:
         one_step: the prediction of the training data, if it is there already.
     """
     problem = fit.problem
-    if fit.model.form.bound is None or fit.criterion.free_run is not None or not problem.features.entries:
+    if (
+        fit.model.form.bound is None
+        or fit.criterion.free_run is not None
+        or not problem.features.entries
+    ):
         return None
     visible = seen(problem.features, problem.layout, problem.rows.x, lambda rows: rows)
     hidden = [j for j, one in enumerate(visible) if not one]
@@ -129,7 +146,9 @@ def _functions(lag: Vector, z: Matrix) -> Float[np.ndarray, "N h"]:
     return columns / np.where(norm > 0, norm, 1.0)
 
 
-def _score_test(h: Float[np.ndarray, "N ny q"], e: Matrix, cuts: list[int]) -> tuple[float, float] | None:
+def _score_test(
+    h: Float[np.ndarray, "N ny q"], e: Matrix, cuts: list[int]
+) -> tuple[float, float] | None:
     """p-value of `Σ h e = 0` and the share of e that h explains, chance taken off."""
     scores = np.einsum("koq,ko->kq", h, e)
     rows, rank = scores.shape
@@ -159,5 +178,7 @@ def _without(basis: Matrix, values: np.ndarray) -> np.ndarray:
 
 def _experiments(problem: Problem, rows: int, step: int) -> list[int]:
     """Where experiments end among every `step`-th usable row."""
-    ends = np.cumsum([len(experiment) - problem.rows.start for experiment in problem.record.experiments])[:-1]
+    ends = np.cumsum(
+        [len(experiment) - problem.rows.start for experiment in problem.record.experiments]
+    )[:-1]
     return [min(-(-int(end) // step), rows) for end in ends]

@@ -1,12 +1,14 @@
 """Which equation of a motion lacks what: a test of terms that could be added, of which each is tried at weight 0.
 
-What the free run leaves is regressed on its sensitivities to simple functions of every state and input, added to one
-equation each, beside the sensitivities to all that was estimated: parameters, weights and the segments' starts. That
-is the score test of Rao (1948) of `b = 0`. To first order the errors are `S_p δ + S_b b + e`, so that the F-test of b
-is right whatever the parameters' own errors δ are. Coloured errors are `e = H ε` with the autoregression `H = 1/A`:
-rows and columns are filtered by A (Cochrane and Orcutt 1949). For the test A is that of the errors beside what was
-estimated; beside all terms it would be found too white, and the test would reject too often. To tell terms from each
-other it is that beside all terms, so that what the missing one leaves does not pass for colour.
+What the free run leaves is regressed on its sensitivities to simple functions of every state and
+input, added to one equation each, beside the sensitivities to all that was estimated: parameters,
+weights and the segments' starts. That is the score test of Rao (1948) of `b = 0`. To first order
+the errors are `S_p δ + S_b b + e`, so that the F-test of b is right whatever the parameters' own
+errors δ are. Coloured errors are `e = H ε` with the autoregression `H = 1/A`: rows and columns are
+filtered by A (Cochrane and Orcutt 1949). For the test A is that of the errors beside what was
+estimated; beside all terms it would be found too white, and the test would reject too often. To
+tell terms from each other it is that beside all terms, so that what the missing one leaves does not
+pass for colour.
 """
 
 from __future__ import annotations
@@ -40,8 +42,9 @@ Terms = Callable[[Float[np.ndarray, "n r"]], Float[np.ndarray, "t r"]]
 class Sensitivities:
     """Of some segments (m): errors, and how the outputs follow starts, unknowns and added terms, in this order.
 
-    `columns` (m, T, ny, n0 + n + q), `errors` (m, T, ny), `scored` (m, T); q counts equations times terms, those of the
-    first equation in front. `points` (n, M) are the states and inputs that were scored.
+    `columns` (m, T, ny, n0 + n + q), `errors` (m, T, ny), `scored` (m, T); q counts equations times
+    terms, those of the first equation in front. `points` (n, M) are the states and inputs that were
+    scored.
     """
 
     columns: Float[np.ndarray, "m T ny K"]
@@ -54,7 +57,12 @@ class Sensitivities:
 
 
 @partial(jax.jit, static_argnames="form")
-def _slopes(form: MotionDynamics, numbers: Numbers, states: Float[Array, "n0 m"], inputs: Float[Array, "nu m"]) -> Any:
+def _slopes(
+    form: MotionDynamics,
+    numbers: Numbers,
+    states: Float[Array, "n0 m"],
+    inputs: Float[Array, "nu m"],
+) -> Any:
     """∂x⁺/∂(x, c, w), the outputs, and ∂y/∂(x, c, w) at every point."""
     numbers = form.prepared(numbers)
     return form.tangents(numbers, states, form.first_slopes(states.shape[1]), inputs)[1:]
@@ -72,7 +80,9 @@ def sensitivities(
     """
     segmented, numbers = fit.segmented, fitted_numbers(fit.model.numbers)
     form = segmented.dynamics
-    runs = np.moveaxis(segmented.runs(numbers.theta, numbers.weights, fit.states), -1, 1)  # (k, m, T, n0)
+    runs = np.moveaxis(
+        segmented.runs(numbers.theta, numbers.weights, fit.states), -1, 1
+    )  # (k, m, T, n0)
     segments = [np.moveaxis(np.asarray(part), -1, 1) for part in segmented.segments[1:]]
     k, m = runs.shape[:2]
     x, u, target, scored = (part.reshape(k * m, *part.shape[2:]) for part in (runs, *segments))
@@ -101,12 +111,20 @@ def _at_rows(form: MotionDynamics, numbers: Numbers, x: Any, u: Any) -> tuple[An
     m, steps = x.shape[:2]
     flat = [part.reshape(m * steps, -1).T for part in (x, u)]
     length = padded_length(m * steps)
-    padded = [np.concatenate([part, np.repeat(part[:, -1:], length - m * steps, axis=1)], axis=1) for part in flat]
-    found = [np.moveaxis(np.asarray(part)[..., : m * steps], -1, 0) for part in _slopes(form, numbers, *padded)]
+    padded = [
+        np.concatenate([part, np.repeat(part[:, -1:], length - m * steps, axis=1)], axis=1)
+        for part in flat
+    ]
+    found = [
+        np.moveaxis(np.asarray(part)[..., : m * steps], -1, 0)
+        for part in _slopes(form, numbers, *padded)
+    ]
     return tuple(part.reshape(m, steps, *part.shape[1:]) for part in found)  # type: ignore[return-value]
 
 
-def _followed(to_next: Any, to_output: Any, added: Any, equations: Sequence[int], form: MotionDynamics) -> Any:
+def _followed(
+    to_next: Any, to_output: Any, added: Any, equations: Sequence[int], form: MotionDynamics
+) -> Any:
     """Return the columns (m, T, ny, n0 + n + q) of the outputs, from one row to the next."""
     m, steps, n0, own = to_next.shape
     q, h = len(added), form.sampling_time
@@ -153,8 +171,8 @@ _RIVAL = 0.9  # of the best term's share, with which another one is named beside
 class MissingTerm:
     """A term that could be added: to which equation, of which state or input, its shape, and what it would explain.
 
-    `coefficient` is in the units of equation and variable, `share` that of the errors' variance, less what chance
-    explains.
+    `coefficient` is in the units of equation and variable, `share` that of the errors' variance,
+    less what chance explains.
     """
 
     equation: str
@@ -171,13 +189,19 @@ class MissingTerm:
         """The term in the equation's own names."""
         if self.variable is None:
             return f"{self.coefficient:.3g}"
-        return f"{self.coefficient:.3g}*{_EXPRESSIONS[SHAPES.index(self.shape)].format(self.variable)}"
+        return (
+            f"{self.coefficient:.3g}*{_EXPRESSIONS[SHAPES.index(self.shape)].format(self.variable)}"
+        )
 
     @property
     def meaning(self) -> str:
         """Its kind in words."""
         words = _ONE_SIDED if self.one_sided else _MEANINGS
-        return "constant" if self.variable is None else words[SHAPES.index(self.shape)].format(self.variable)
+        return (
+            "constant"
+            if self.variable is None
+            else words[SHAPES.index(self.shape)].format(self.variable)
+        )
 
     def __str__(self) -> str:
         return f"the equation of {self.equation} lacks something {self.meaning}: {self.expression}"
@@ -187,7 +211,8 @@ class MissingTerm:
 class MissingTest:
     """Whether terms that could be added explain the errors of a free run: `p` of none, F-distributed.
 
-    `share` is what all of them together explain of the variance, `terms` the best single one and its near rivals.
+    `share` is what all of them together explain of the variance, `terms` the best single one and
+    its near rivals.
     """
 
     p: float
@@ -201,7 +226,10 @@ class MissingTest:
 
 
 class _Regression(NamedTuple):
-    """Rows of terms and errors beside what was estimated; `left` counts rows less what that used."""
+    """Rows of terms and errors beside what was estimated.
+
+    `left` counts rows less what that used.
+    """
 
     terms: Matrix
     errors: Vector
@@ -240,7 +268,10 @@ def missing_terms(fit: MotionEstimate) -> MissingTest | None:
 
 
 def doubted(fit: MotionEstimate) -> tuple[int, ...]:
-    """Equations with a parameter or a learner; others, such as ẋ = v, say what a state is. All, if there is none."""
+    """Equations with a parameter or a learner; others, such as ẋ = v, say what a state is.
+
+    All, if there is none.
+    """
     motion, segmented = fit.problem.motion, fit.segmented
     c = np.asarray(fit.model.numbers.theta - fit.model.numbers.theta_aux)
     p = motion.coordinates.physical(c)
@@ -252,14 +283,17 @@ def doubted(fit: MotionEstimate) -> tuple[int, ...]:
             here = np.asarray(motion.rates(point, row, p, np))
             for i in range(len(p)):
                 there = p + _MOVED * np.where(p != 0, np.abs(p), 1.0) * (np.arange(len(p)) == i)
-                moved |= set(np.flatnonzero(np.asarray(motion.rates(point, row, there, np)) != here).tolist())
+                moved |= set(
+                    np.flatnonzero(np.asarray(motion.rates(point, row, there, np)) != here).tolist()
+                )
     return tuple(sorted(moved)) or tuple(range(len(motion.states)))
 
 
 def _values(z: Matrix, one_sided: list[bool]) -> Any:
     """Return a constant, then the shapes of each variable: (1 + 5 n, r) of z (n, r).
 
-    Where a variable keeps its sign a jump at zero is a constant, and its size itself: zeros stand for them.
+    Where a variable keeps its sign a jump at zero is a constant, and its size itself: zeros stand
+    for them.
     """
     shaped = [
         [one, np.tanh(one / _EDGE) * both, np.abs(one) * both, one**2, one**3]
@@ -286,11 +320,18 @@ def _term(
     variable, shape = divmod(number - 1, len(SHAPES))
     power = (1, 0, 1, 2, 3)[shape]
     coefficient /= float(sizes[variable]) ** power
-    return MissingTerm(equation, names[variable], SHAPES[shape], coefficient, share, one_sided[variable])
+    return MissingTerm(
+        equation, names[variable], SHAPES[shape], coefficient, share, one_sided[variable]
+    )
 
 
-def _tested(found: Sensitivities) -> tuple[float, tuple[int, int], float, Vector, Vector, Vector] | None:
-    """p, degrees of freedom and share of all terms; of each its gain in filtered rows, its share and coefficient."""
+def _tested(
+    found: Sensitivities,
+) -> tuple[float, tuple[int, int], float, Vector, Vector, Vector] | None:
+    """p, degrees of freedom and share of all terms.
+
+    Of each its gain in filtered rows, its share and coefficient.
+    """
     plain = _regression(found, None)
     null = None if plain is None else _regression(found, _filters(found, plain.errors))
     if plain is None or null is None:
@@ -321,12 +362,17 @@ def _share(plain: _Regression, basis: Matrix) -> float:
 
 def _shares(plain: _Regression) -> Vector:
     """The same of each term by itself."""
-    total, size = float(plain.errors @ plain.errors), np.einsum("rj,rj->j", plain.terms, plain.terms)
+    total, size = (
+        float(plain.errors @ plain.errors),
+        np.einsum("rj,rj->j", plain.terms, plain.terms),
+    )
     explained = (plain.terms.T @ plain.errors) ** 2 / np.where(size > 0, size, np.inf) / total
     return np.maximum(1 - (1 - explained) * plain.left / max(plain.left - 1, 1), 0.0)
 
 
-def _regression(found: Sensitivities, filters: tuple[list[Vector], Vector] | None) -> _Regression | None:
+def _regression(
+    found: Sensitivities, filters: tuple[list[Vector], Vector] | None
+) -> _Regression | None:
     """Terms and errors with starts and all unknowns projected out, of rows that are filtered first."""
     rows = [_filtered(found, i, filters) for i in range(len(found.scored))]
     parts, used = [], 0
@@ -359,14 +405,20 @@ def _range(columns: Matrix, rank: float = 1e-10) -> Matrix:
     return u[:, s > rank * s[0]]
 
 
-def _filtered(found: Sensitivities, segment: int, filters: tuple[list[Vector], Vector] | None) -> Matrix:
+def _filtered(
+    found: Sensitivities, segment: int, filters: tuple[list[Vector], Vector] | None
+) -> Matrix:
     """Columns and errors of one segment, all outputs below each other, filtered by their autoregressions."""
     there = found.scored[segment]
-    both = np.concatenate([found.columns[segment], found.errors[segment][..., None]], axis=-1)[there]  # (r, ny, K + 1)
+    both = np.concatenate([found.columns[segment], found.errors[segment][..., None]], axis=-1)[
+        there
+    ]  # (r, ny, K + 1)
     ny = both.shape[1]
     if filters is None:
         size = np.sqrt(np.mean(found.errors[found.scored] ** 2, axis=0))
-        return np.moveaxis(both / np.where(size > 0, size, 1.0)[:, None], 1, 0).reshape(ny * len(both), -1)
+        return np.moveaxis(both / np.where(size > 0, size, 1.0)[:, None], 1, 0).reshape(
+            ny * len(both), -1
+        )
     coefficients, unit = filters
     memory = max(map(len, coefficients)) - 1
     filtered = []
@@ -391,7 +443,9 @@ def _filters(found: Sensitivities, left: Vector) -> tuple[list[Vector], Vector]:
     known = [np.ones(1) if a is None else a for a in coefficients]
     unit = []
     for own, a in zip(pieces, known, strict=True):
-        innovations = np.concatenate([np.convolve(part, a, "valid") for part in own if len(part) >= len(a)])
+        innovations = np.concatenate(
+            [np.convolve(part, a, "valid") for part in own if len(part) >= len(a)]
+        )
         size = float(np.sqrt(np.mean(innovations**2)))
         unit.append(size if size > 0 else 1.0)
     scale = np.sqrt(np.mean(found.errors[found.scored] ** 2, axis=0))

@@ -1,10 +1,11 @@
 """What terms that a motion's equations may lack do to its parameters, and what tells of them.
 
-The free run answers for what the fit determines: a term moves these parameters as `motion_response` says. Along the
-directions that the learner could imitate the nearest physics decides, so that there a term moves p̂ by what the measure
-makes of it: `d + B(Φ_μB)⁺G_μ` with d what the term moves c by, Φ the slopes ∂f/∂q of the learned equations over the
-measure's points, and G what the learner holds of the term: all of it, and d = 0, where it is a function of what the
-learner sees.
+The free run answers for what the fit determines: a term moves these parameters as `motion_response`
+says. Along the directions that the learner could imitate the nearest physics decides, so that there
+a term moves p̂ by what the measure
+makes of it: `d + B(Φ_μB)⁺G_μ` with d what the term moves c by, Φ the slopes ∂f/∂q of the learned
+equations over the measure's points, and G what the learner holds of the term: all of it, and d = 0,
+where it is a function of what the learner sees.
 """
 
 from __future__ import annotations
@@ -32,21 +33,30 @@ from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.fitting.motion_measures import field_under
 from orthaug.fitting.motion_task import MotionTask
 from orthaug.fitting.structures import Structure
-from orthaug.inference.motion_split import Field, MotionSplit, learned_places, shared_of_motion, slopes_at
+from orthaug.inference.motion_split import (
+    Field,
+    MotionSplit,
+    learned_places,
+    shared_of_motion,
+    slopes_at,
+)
 from orthaug.models.motion_field import parts_at
 from orthaug.physics.motion import Motion
 from orthaug.physics.projection import Projection
 from orthaug.physics.shared import Shared, moves
 
 _SAME = 1e-6  # of its size: what a term may change over a move that the learner does not see
-CERTIFIED_POINTS = 20_000  # of a measure at most, over which certificates and terms of each equation are sought
+CERTIFIED_POINTS = (
+    20_000  # of a measure at most, over which certificates and terms of each equation are sought
+)
 
 
 @dataclass(frozen=True)
 class ResidualStep:
     """What the free run's residual tells of a term beside all that was fitted: one Gauss-Newton step.
 
-    `share` is by how much of the residual's squares it falls, `left` what stays of them beyond white noise.
+    `share` is by how much of the residual's squares it falls, `left` what stays of them beyond
+    white noise.
     """
 
     coefficient: float
@@ -60,7 +70,8 @@ class ResidualStep:
 class TermBias:
     """What a term of a motion does to its parameters if it is there.
 
-    `moved` (np,) are the coordinates of p̂ less those without the term, per unit of its coefficient.
+    `moved` (np,) are the coordinates of p̂ less those without the term, per unit of its
+    coefficient.
     """
 
     suspect: MotionSuspect
@@ -82,7 +93,10 @@ class TermBias:
 
     @property
     def removed_by(self) -> str | None:
-        """Return what leaves the parameters unbiased by it; None where that is not known, or nothing is to remove."""
+        """Return what leaves the parameters unbiased by it.
+
+        None where that is not known, or nothing is to remove.
+        """
         if self.seen is None:
             return "nothing" if self.moved.any() else None
         return self._told.removed_by
@@ -91,7 +105,12 @@ class TermBias:
     def _told(self) -> SuspectedBias:
         relative = [b / v if v else None for b, v in zip(self.per_unit, self.value, strict=True)]
         shown: Any = self.suspect
-        own = (self.names, tuple(self.per_unit), tuple(relative), None if self.expected is None else (*self.expected,))
+        own = (
+            self.names,
+            tuple(self.per_unit),
+            tuple(relative),
+            None if self.expected is None else (*self.expected,),
+        )
         found = (self.cosine, self.explained, self.coefficient_found, self.certificate, self.seen)
         return SuspectedBias(shown, *own, None, *found)
 
@@ -140,7 +159,9 @@ class MotionLinearization:
     @cached_property
     def phi(self) -> Projection:
         """∂f/∂q of the learned equations over the points, rows times the root of their weights over their sizes."""
-        slopes = np.asarray(slopes_at(self.place.segmented.dynamics.alone, self.q, self.field.x, self.field.u))
+        slopes = np.asarray(
+            slopes_at(self.place.segmented.dynamics.alone, self.q, self.field.x, self.field.u)
+        )
         slopes = slopes[:, learned_places(self.motion)]
         return Projection.factor(self.weighed(np.moveaxis(slopes, 2, 0)).transpose(1, 2, 0))
 
@@ -162,8 +183,8 @@ class MotionLinearization:
     ) -> list[TermBias]:
         """Return what every suspect does; nothing where the free run has no sensitivities.
 
-        Args:
-            used: weights that a fit used, where it is asked what its residual tells; `steps` of a block, where its
+        Args: used: weights that a fit used, where it is asked what its residual tells; `steps` of a
+            block, where its
                 errors are coloured.
         """
         added = tuple(suspect.term(self.motion) for suspect in suspects)
@@ -172,19 +193,32 @@ class MotionLinearization:
             return []
         seen = [self.sees(suspect) if self.learns else None for suspect in suspects]
         residuals: list[ResidualStep | None] = [None] * len(added)
-        if used is not None and not all(seen):  # what the learner sees it has taken from the residual
+        if used is not None and not all(
+            seen
+        ):  # what the learner sees it has taken from the residual
             residuals = told_by_residual(response, used, steps)
         rows = enumerate(zip(suspects, seen, residuals, strict=True))
         return [self._entry(response, k, *row) for k, row in rows]
 
     def _entry(
-        self, response: TermsResponse, k: int, suspect: MotionSuspect, seen: bool | None, residual: ResidualStep | None
+        self,
+        response: TermsResponse,
+        k: int,
+        suspect: MotionSuspect,
+        seen: bool | None,
+        residual: ResidualStep | None,
     ) -> TermBias:
         motion, names = self.motion, self.motion.names
         place = suspect.place(motion)
         basis, certificate, explained, found = self.shared.basis, None, None, None
-        trained = bool(len(self.place.w))  # a learner that is not may hold all along shared directions
-        apart = np.zeros(len(names), dtype=bool) if trained else ~np.isin(np.arange(len(names)), completing(basis))
+        trained = bool(
+            len(self.place.w)
+        )  # a learner that is not may hold all along shared directions
+        apart = (
+            np.zeros(len(names), dtype=bool)
+            if trained
+            else ~np.isin(np.arange(len(names)), completing(basis))
+        )
         moved, dw = response.moved(k, apart)
         if self.learns:
             delta = self._rows(suspect, place)
@@ -210,12 +244,17 @@ class MotionLinearization:
         return TermBias(*own, *told, None if seen else residual)
 
     def after(self, causes: Sequence[TermBias], table: Sequence[TermBias]) -> list[TermBias]:
-        """Return what terms that the learner sees explain of it without causes that it sees; nothing of other causes."""
+        """Return what terms that the learner sees explain of it without causes that it sees.
+
+        Nothing of other causes.
+        """
         if self.learned is None or not all(cause.seen for cause in causes):
             return []
         learned, gone = np.array(self.learned), {cause.suspect for cause in causes}
         for cause in causes:
-            learned -= (cause.coefficient_found or 0.0) * self._rows(cause.suspect, cause.suspect.place(self.motion))
+            learned -= (cause.coefficient_found or 0.0) * self._rows(
+                cause.suspect, cause.suspect.place(self.motion)
+            )
         rest, found = replace(self, learned=learned), []
         for entry in table:
             if entry.seen and entry.suspect not in gone:
@@ -231,7 +270,11 @@ class MotionLinearization:
         """Return the cosine of a term that the learner sees with what the shared directions move."""
         held = self.held(suspect)
         size = float(np.linalg.norm(held))
-        return float(np.sqrt(max(1 - (np.linalg.norm(self.beside(held)) / size) ** 2, 0.0))) if size > 0 else 0.0
+        return (
+            float(np.sqrt(max(1 - (np.linalg.norm(self.beside(held)) / size) ** 2, 0.0)))
+            if size > 0
+            else 0.0
+        )
 
     def seen_entry(self, suspect: MotionSuspect) -> TermBias:
         """Return what a term that the learner sees does, by the measure alone: the free run need not be asked."""
@@ -252,7 +295,11 @@ class MotionLinearization:
     def beside(self, values: Matrix) -> Matrix:
         """Return what the shared directions leave of values (M, nl) that are weighed."""
         basis = self.shared.basis
-        return values - self.phi.phi @ self.phi.solve_along(values, basis) if basis.shape[1] else values
+        return (
+            values - self.phi.phi @ self.phi.solve_along(values, basis)
+            if basis.shape[1]
+            else values
+        )
 
     def _rows(self, suspect: MotionSuspect, place: int) -> Matrix:
         """Return the term (M, nl) in the learned equations, 0 where it acts elsewhere."""
@@ -260,7 +307,9 @@ class MotionLinearization:
         rows = np.zeros((len(self.field.x), len(learned)))
         if place in learned:
             p = self.motion.coordinates.physical(self.q)
-            rows[:, learned.index(place)] = suspect.values(self.motion, p, self.field.x, self.field.u)
+            rows[:, learned.index(place)] = suspect.values(
+                self.motion, p, self.field.x, self.field.u
+            )
         return np.where(np.isfinite(rows), rows, 0.0)
 
     def _explained(self, held: Matrix) -> tuple[float | None, float | None]:
@@ -280,7 +329,9 @@ class MotionLinearization:
             return False
         start, end = self._moves
         p, nx = self.motion.coordinates.physical(self.q), len(self.motion.states)
-        pairs = np.stack([suspect.values(self.motion, p, x[:, :nx], x[:, nx:]) for x in (start, end)])
+        pairs = np.stack(
+            [suspect.values(self.motion, p, x[:, :nx], x[:, nx:]) for x in (start, end)]
+        )
         there: Any = np.isfinite(pairs).all(axis=0)
         pairs = pairs[:, there]
         size = np.sqrt(np.mean(pairs**2)) if pairs.size else 0.0
@@ -291,10 +342,14 @@ class MotionLinearization:
         """Pairs of points that the learner does not tell apart."""
         form, nx = self.place.segmented.dynamics, len(self.motion.states)
         points = np.concatenate([self.field.x, self.field.u], axis=1)
-        return moves(lambda rows: np.asarray(form.seen(rows[:, :nx].T, rows[:, nx:].T, np)).T, points)
+        return moves(
+            lambda rows: np.asarray(form.seen(rows[:, :nx].T, rows[:, nx:].T, np)).T, points
+        )
 
 
-def told_by_residual(response: TermsResponse, used: float, steps: int | None) -> list[ResidualStep | None]:
+def told_by_residual(
+    response: TermsResponse, used: float, steps: int | None
+) -> list[ResidualStep | None]:
     """Return what the residual tells of every term, with standard errors that hold for coloured errors where `steps` is given.
 
     Args:
@@ -302,7 +357,9 @@ def told_by_residual(response: TermsResponse, used: float, steps: int | None) ->
     """
     whole, noise = response.squares()
     free = max(response.place.segmented.residuals - response.parameters - used, 1.0)
-    middle = None if steps is None else response.scores().middle(steps, response.parameters + used)[0]
+    middle = (
+        None if steps is None else response.scores().middle(steps, response.parameters + used)[0]
+    )
     found: list[ResidualStep | None] = []
     for k in range(response.terms):
         step = response.step(k)
@@ -310,10 +367,16 @@ def told_by_residual(response: TermsResponse, used: float, steps: int | None) ->
             found.append(None)
             continue
         coefficient, fall, row = step
-        variance = whole / free * float(row @ response.information @ row) if middle is None else row @ middle @ row
+        variance = (
+            whole / free * float(row @ response.information @ row)
+            if middle is None
+            else row @ middle @ row
+        )
         std = float(np.sqrt(variance)) if variance > 0 else None
         shares = min(fall / whole, 1.0), float(np.clip((whole - noise - fall) / whole, 0.0, 1.0))
-        found.append(ResidualStep(coefficient, std, None if std is None else coefficient / std, *shares))
+        found.append(
+            ResidualStep(coefficient, std, None if std is None else coefficient / std, *shares)
+        )
     return found
 
 
@@ -324,7 +387,10 @@ def suspected_bias(fit: MotionEstimate, suspects: Sequence[MotionSuspect]) -> li
         InputError: suspects that the motion cannot have, or a fit of difference equations.
     """
     check_type(
-        fit, MotionEstimate, "fit", "a fit of equations of motion (of difference equations `bias_budget` tells it)"
+        fit,
+        MotionEstimate,
+        "fit",
+        "a fit of equations of motion (of difference equations `bias_budget` tells it)",
     )
     check_motion_suspects(suspects, fit.problem)
     linearization = linearize_fit(fit)
@@ -349,20 +415,25 @@ def softened_bias(fit: MotionEstimate, suspects: Sequence[MotionSuspect]) -> lis
 def usual_biases(fit: MotionEstimate) -> tuple[list[TermBias], list[TermBias]]:
     """Return what usual terms do that nobody declared, and their smooth forms.
 
-    Of these only what the learner sees counts: the rest is no likely cause of what it found. Nothing where it could
-    imitate no change of a parameter.
+    Of these only what the learner sees counts: the rest is no likely cause of what it found.
+    Nothing where it could imitate no change of a parameter.
     """
     linearization = linearize_fit(fit)
     if linearization is None or not linearization.learns or not fit.shared.basis.shape[1]:
         return [], []
     seen = [suspect for suspect in linearization.usual() if linearization.sees(suspect)]
-    smooth = softened(seen, fit.problem.motion, fit.values, linearization.field.x, linearization.field.u)
+    smooth = softened(
+        seen, fit.problem.motion, fit.values, linearization.field.x, linearization.field.u
+    )
     table = linearization.table((*seen, *smooth))  # one program for all
     return table[: len(seen)], table[len(seen) :]
 
 
 def linearize_fit(fit: MotionEstimate) -> MotionLinearization | None:
-    """Of a fitted motion under the measure that it was split under; None where it has no normal equations."""
+    """Of a fitted motion under the measure that it was split under.
+
+    None where it has no normal equations.
+    """
     if not fit.status.ok or fit.scores is None:
         return None
     numbers, field, learned = fit.model.numbers, fit.split_by.field, None
@@ -373,23 +444,35 @@ def linearize_fit(fit: MotionEstimate) -> MotionLinearization | None:
         learned = parts_at(fit.model.form, fit.model.numbers, field.x, field.u)[1]
         learned = np.where(np.isfinite(learned), learned, 0.0)
     unknown = (*fit.unidentified, *fit.at_bound)
-    return MotionLinearization(place, fit.theta, fit.shared, field, learned, unknown, fit.split_by.slope)
+    return MotionLinearization(
+        place, fit.theta, fit.shared, field, learned, unknown, fit.split_by.slope
+    )
 
 
 def linearize_physics(task: MotionTask, structure: Structure) -> MotionLinearization | None:
-    """Of physics alone, with what a learner of the task's features could hold; None where it has no run."""
+    """Of physics alone, with what a learner of the task's features could hold.
+
+    None where it has no run.
+    """
     if task.physics is None:
         return None
     segmented, point = task.plan, task.physics.end.point
     form, names = segmented.dynamics, segmented.problem.motion.names
     weights = np.zeros(0)
-    place = FreeRunPoint(segmented, point.theta, weights, point.states, task.physics.objective.weight)
+    place = FreeRunPoint(
+        segmented, point.theta, weights, point.states, task.physics.objective.weight
+    )
     none = MotionSplit.none("training", form, point.theta)
     if segmented.bound is None:
         return MotionLinearization(place, point.theta, none.shared, none.field)
     field = field_under(
-        structure.measure, segmented.alone, segmented.alone.numbers(point.theta, weights), point.states
+        structure.measure,
+        segmented.alone,
+        segmented.alone.numbers(point.theta, weights),
+        point.states,
     )[0]
     if structure.shared == "all":
         return MotionLinearization(place, point.theta, Shared(names, np.eye(len(names))), field)
-    return MotionLinearization(place, point.theta, shared_of_motion(form, point.theta, field.x, field.u), field)
+    return MotionLinearization(
+        place, point.theta, shared_of_motion(form, point.theta, field.x, field.u), field
+    )

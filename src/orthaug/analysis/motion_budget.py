@@ -1,7 +1,8 @@
 """What a motion's learner found, or its free run leaves, explained by a term, and the bias that follows from it.
 
-With a learner as of difference equations (`budget`), over the points of the measure. Without one only terms that
-someone suspects are looked at; their size is what the free run's residual tells: one Gauss-Newton step.
+With a learner as of difference equations (`budget`), over the points of the measure. Without one
+only terms that someone suspects are looked at; their size is what the free run's residual tells:
+one Gauss-Newton step.
 """
 
 from __future__ import annotations
@@ -49,7 +50,9 @@ _AS_CLOSE = 2.0  # times what a cause leaves of the learner: a rival that leaves
 _CLOSE = 0.005  # of the learner: what leaves no more is as good as any
 _SURE = 3.3  # standard errors of a coefficient that the residual tells: one in a thousand is so large by chance
 _ELSEWHERE = 0.5  # of a bias, from which that of a rival is another one
-_NOTHING = 0.01  # of the learned equations: a learner that is smaller, and biases nothing, found nothing
+_NOTHING = (
+    0.01  # of the learned equations: a learner that is smaller, and biases nothing, found nothing
+)
 _SAME = 1e-6  # of a term's squares: what others leave of it is none
 _UNMOVED = 0.1  # standard errors of every parameter
 
@@ -82,7 +85,9 @@ class MotionBudget:
 def told_budget(
     fit: MotionEstimate, declared: Sequence[MotionSuspect], table: Sequence[TermBias]
 ) -> MotionBudget | None:
-    """By the declared suspects; where these are not sure to be it, by the usual ones too that the learner sees.
+    """By the declared suspects.
+
+    Where these are not sure to be it, by the usual ones too that the learner sees.
 
     Args:
         table: what every declared suspect does to the fit.
@@ -94,18 +99,29 @@ def told_budget(
     if budget is not None and budget.share >= SURE_SHARE and table:
         return budget
     usual, softer = usual_biases(fit)
-    return motion_budget(fit, (*table, *usual), (*smooth, *softer), families, declared) if usual else budget
+    return (
+        motion_budget(fit, (*table, *usual), (*smooth, *softer), families, declared)
+        if usual
+        else budget
+    )
 
 
 def families_of(linearization: MotionLinearization) -> list[TermBias]:
-    """Return what every member of the catalogue does that the learner sees; nothing where it could imitate no parameter."""
+    """Return what every member of the catalogue does that the learner sees.
+
+    Nothing where it could imitate no parameter.
+    """
     if linearization.learned is None or not linearization.shared.basis.shape[1]:
         return []
     motion, field = linearization.motion, linearization.field
     on = [entry.text for entry in linearization.place.segmented.problem.features]
-    terms = motion_catalogue(motion, motion.coordinates.physical(linearization.q), field.x, field.u, on)
+    terms = motion_catalogue(
+        motion, motion.coordinates.physical(linearization.q), field.x, field.u, on
+    )
     entries = [linearization.seen_entry(term) for term in terms if linearization.sees(term)]
-    return [entry for entry in entries if linearization.physics_cosine(entry.suspect) <= MOST_PHYSICS]
+    return [
+        entry for entry in entries if linearization.physics_cosine(entry.suspect) <= MOST_PHYSICS
+    ]
 
 
 def noise_share(fit: MotionEstimate, linearization: MotionLinearization) -> float:
@@ -114,7 +130,10 @@ def noise_share(fit: MotionEstimate, linearization: MotionLinearization) -> floa
     if half is None or not np.isfinite(half).all():
         return 0.0
     own = np.sum(linearization.told() ** 2)
-    return float(np.sum(linearization.weighed(half / reach(fit.freedom)) ** 2) / max(own, np.finfo(float).tiny))
+    return float(
+        np.sum(linearization.weighed(half / reach(fit.freedom)) ** 2)
+        / max(own, np.finfo(float).tiny)
+    )
 
 
 def motion_budget(
@@ -124,11 +143,12 @@ def motion_budget(
     families: Sequence[TermBias] = (),
     declared: Sequence[MotionSuspect] | None = None,
 ) -> MotionBudget | None:
-    """By the suspect that explains most, or one in each learned equation; None where none explains enough.
+    """By the suspect that explains most, or one in each learned equation.
 
-    Args:
-        table: what every suspect does to the fit.
-        smooth: the same of terms that stand beside those of the table (`softened_bias`), named where they explain
+    None where none explains enough.
+
+    Args: table: what every suspect does to the fit. smooth: the same of terms that stand beside
+        those of the table (`softened_bias`), named where they explain
             clearly more of a learner.
         families: the same of members of the catalogue (`families_of`).
         declared: the suspects that were declared; by default those of the table.
@@ -139,16 +159,24 @@ def motion_budget(
         return None
     value, bias, causes = fit.values, found.moved, found.causes
     std = np.full(len(value), np.nan) if fit.std is None else fit.std
-    if learns and (fit.split_by.share or 0.0) < _NOTHING and not np.any(np.abs(bias) > _UNMOVED * std):
+    if (
+        learns
+        and (fit.split_by.share or 0.0) < _NOTHING
+        and not np.any(np.abs(bias) > _UNMOVED * std)
+    ):
         return None
     own = {entry.suspect for entry in table} if declared is None else set(declared)
     name = " and ".join(cause.suspect.name for cause in causes)
     candidates = [NamedCause(name, found.share, bias, rest=np.linalg.norm(found.unsure, axis=0))]
-    candidates += _instead(fit, (*table, *smooth, *families), own) if learns and len(causes) == 1 else []
+    candidates += (
+        _instead(fit, (*table, *smooth, *families), own) if learns and len(causes) == 1 else []
+    )
     ends = hull(value, std, fit.freedom, candidates)
     parameters = fit.problem.motion.parameters
     ends = np.clip(ends, [[p.min] for p in parameters], [[p.max] for p in parameters])
-    rows = parameter_biases(causes[0].names, value, std, bias, ends, [(name, found.share)] * len(bias), fit.freedom)
+    rows = parameter_biases(
+        causes[0].names, value, std, bias, ends, [(name, found.share)] * len(bias), fit.freedom
+    )
     warning = _motion_warning(found, rows, learns=learns)
     warnings = [] if warning is None else [warning]
     open_ones = [row.name for row in rows if not row.determined]
@@ -156,7 +184,9 @@ def motion_budget(
     return MotionBudget(causes, found.share, rows, tuple(warnings))
 
 
-def _instead(fit: MotionEstimate, table: Sequence[TermBias], declared: set[MotionSuspect]) -> list[Candidate]:
+def _instead(
+    fit: MotionEstimate, table: Sequence[TermBias], declared: set[MotionSuspect]
+) -> list[Candidate]:
     """Return what may be the cause as well as the one that is named."""
     linearization = linearize_fit(fit)
     assert linearization is not None
@@ -165,7 +195,9 @@ def _instead(fit: MotionEstimate, table: Sequence[TermBias], declared: set[Motio
         for entry in table
         if entry.seen
         and entry.explained
-        and (entry.suspect in declared or linearization.physics_cosine(entry.suspect) <= MOST_PHYSICS)
+        and (
+            entry.suspect in declared or linearization.physics_cosine(entry.suspect) <= MOST_PHYSICS
+        )
     ]
     return compatible(likely, noise_share(fit, linearization))
 
@@ -205,10 +237,16 @@ def _moved(entry: TermBias) -> Vector:
 
 
 def _of_learner(
-    fit: MotionEstimate, table: Sequence[TermBias], smooth: Sequence[TermBias], families: Sequence[TermBias] = ()
+    fit: MotionEstimate,
+    table: Sequence[TermBias],
+    smooth: Sequence[TermBias],
+    families: Sequence[TermBias] = (),
 ) -> _Causes | None:
     """Return the term that explains most of the learner, or one of each equation that together leave much less of it."""
-    best, other = max(table, key=explains, default=None), max((*smooth, *families), key=explains, default=None)
+    best, other = (
+        max(table, key=explains, default=None),
+        max((*smooth, *families), key=explains, default=None),
+    )
     if other is not None and (best is None or _is_clearly_less(explains(best), explains(other))):
         best = other
     linearization, every = linearize_fit(fit), (*table, *smooth)
@@ -216,15 +254,23 @@ def _of_learner(
     share = 0.0 if best is None else explains(best)
     if linearization is not None and share < SURE_SHARE:
         tables = (table, every) if smooth else (table,)
-        found = [(explains(each[0][0]), each) for terms in tables if (each := one_of_each(linearization, terms))]
+        found = [
+            (explains(each[0][0]), each)
+            for terms in tables
+            if (each := one_of_each(linearization, terms))
+        ]
         joint, each = next((pair for pair in found if pair[0] >= AS_MUCH * found[-1][0]), (0.0, []))
-        enough = 1 - (1 - LEAST_SHARE) ** len(each)  # as much of what the others leave as one must explain of all
+        enough = 1 - (1 - LEAST_SHARE) ** len(
+            each
+        )  # as much of what the others leave as one must explain of all
         if joint >= enough and (share < LEAST_SHARE or 1 - share >= _AS_CLOSE * (1 - joint)):
             alone, share = each, joint
     return None if share < LEAST_SHARE else _weighed(linearization, alone, share, every)
 
 
-def one_of_each(linearization: MotionLinearization, table: Sequence[TermBias]) -> list[list[TermBias]]:
+def one_of_each(
+    linearization: MotionLinearization, table: Sequence[TermBias]
+) -> list[list[TermBias]]:
     """Terms of each learned equation by what they explain of the learner beside the first of the others, best first.
 
     The first ones explain most together, over 20,000 points at most. Nothing where terms of one
@@ -235,14 +281,20 @@ def one_of_each(linearization: MotionLinearization, table: Sequence[TermBias]) -
     groups = [np.flatnonzero(np.equal(places, place)) for place in dict.fromkeys(places)]
     if len(groups) < 2:
         return []
-    values = (*(linearization.beside(linearization.held(entry.suspect)) for entry in seen), linearization.told())
+    values = (
+        *(linearization.beside(linearization.held(entry.suspect)) for entry in seen),
+        linearization.told(),
+    )
     rows = np.stack([row[:: 1 + len(row) // CERTIFIED_POINTS].ravel() for row in values])
     sizes = np.linalg.norm(rows, axis=1)
     cosines = (rows @ rows.T) / np.outer(sizes, sizes)
 
     def beside(others: list[int]) -> tuple[Vector, Vector]:
         """Return the share of the learner that others explain with each term, and its coefficient."""
-        rest = cosines - cosines[:, others] @ np.linalg.pinv(cosines[np.ix_(others, others)]) @ cosines[others]
+        rest = (
+            cosines
+            - cosines[:, others] @ np.linalg.pinv(cosines[np.ix_(others, others)]) @ cosines[others]
+        )
         own, product = rest.diagonal()[:-1], rest[:-1, -1]
         fitted = np.where(own > _SAME, product / np.where(own > _SAME, own, 1.0), 0.0)
         return 1 - rest[-1, -1] + fitted * product, fitted * sizes[-1] / sizes[:-1]
@@ -258,7 +310,10 @@ def one_of_each(linearization: MotionLinearization, table: Sequence[TermBias]) -
     chosen, found = max(best_from(first) for first in groups[0].tolist())[1], []
     for k, group in enumerate(groups):
         shares, fitted = beside(chosen[:k] + chosen[k + 1 :])
-        told = [replace(seen[i], explained=float(shares[i]), coefficient_found=float(fitted[i])) for i in group]
+        told = [
+            replace(seen[i], explained=float(shares[i]), coefficient_found=float(fitted[i]))
+            for i in group
+        ]
         found.append(sorted(told, key=explains, reverse=True))
     return found
 
@@ -282,7 +337,11 @@ def _weighed(
         apart = [np.abs(_moved(rival) - _moved(cause)) for rival in near]
         if len(each) > 1:  # of a single cause they are in the hull
             unsure.append(np.max([np.zeros(len(bias)), *apart], axis=0))
-        rivals += [rival for rival, by in zip(near, apart, strict=True) if np.any(by > _ELSEWHERE * np.abs(bias))]
+        rivals += [
+            rival
+            for rival, by in zip(near, apart, strict=True)
+            if np.any(by > _ELSEWHERE * np.abs(bias))
+        ]
     after = [] if linearization is None else linearization.after(causes, table)
     unsure += [_moved(max(after, key=explains))] if after else []
     return _Causes(causes, share, bias, np.array(unsure), tuple(rivals))
@@ -293,18 +352,28 @@ def _of_residual(table: Sequence[TermBias]) -> _Causes | None:
 
     What stays beyond white noise counts as biased by as much for its size, of unknown sign.
     """
-    sure = [entry for entry in table if entry.residual is not None and abs(entry.residual.t or 0.0) >= _SURE]
-    best = max(sure, key=lambda entry: entry.residual.share if entry.residual else 0.0, default=None)
+    sure = [
+        entry
+        for entry in table
+        if entry.residual is not None and abs(entry.residual.t or 0.0) >= _SURE
+    ]
+    best = max(
+        sure, key=lambda entry: entry.residual.share if entry.residual else 0.0, default=None
+    )
     if best is None or best.residual is None or best.residual.std is None:
         return None
     told, std = best.residual, best.residual.std
     if told.share < LEAST_SHARE * (told.share + told.left):
         return None
     unsure = np.hypot(std, told.coefficient * np.sqrt(told.left / told.share))
-    return _Causes((best,), told.share, told.coefficient * best.per_unit, np.array([unsure * best.per_unit]))
+    return _Causes(
+        (best,), told.share, told.coefficient * best.per_unit, np.array([unsure * best.per_unit])
+    )
 
 
-def _motion_warning(found: _Causes, rows: Sequence[ParameterBias], *, learns: bool) -> Warning | None:
+def _motion_warning(
+    found: _Causes, rows: Sequence[ParameterBias], *, learns: bool
+) -> Warning | None:
     """Return one sentence on what is biased by more than its standard error: causes and their sizes."""
     large = [entry for entry in rows if (entry.errors or 0.0) > 1]
     if not large:
@@ -314,17 +383,20 @@ def _motion_warning(found: _Causes, rows: Sequence[ParameterBias], *, learns: bo
     other = f" (near it: {named}, and would move them elsewhere)" if first else ""
     what = "the learner" if learns else "the squares that the free run leaves"
     told = " and ".join(
-        f"{c.suspect.name} of size {_size(c):.3g} {c.suspect.unit}".rstrip() + f" in the equation of {c.equation}"
+        f"{c.suspect.name} of size {_size(c):.3g} {c.suspect.unit}".rstrip()
+        + f" in the equation of {c.equation}"
         for c in found.causes
     )
     if learns and found.share < SURE_SHARE:
         return Warning(
             "biased",
-            f"what the learner found looks most like {told} ({percent(found.share)} of it), which would move "
-            f"{told_biases(large)}, and the standard errors do not cover that{other}.",
+            f"what the learner found looks most like {told} ({percent(found.share)} of it), "
+            f"which would move {told_biases(large)}, and the standard errors do not cover "
+            f"that{other}.",
         )
     return Warning(
         "biased",
-        f"{told} explain{'' if several else 's'} {100 * found.share:.0f} % of {what} and move{'' if several else 's'} "
-        f"{told_biases(large)}, which the standard errors do not cover{other}.",
+        f"{told} explain{'' if several else 's'} {100 * found.share:.0f} % of {what} and "
+        f"move{'' if several else 's'} {told_biases(large)}, which the standard errors do not "
+        f"cover{other}.",
     )

@@ -1,8 +1,9 @@
 """What the free run of a motion leaves: noise, or something that a state or an input tells.
 
-The criterion of a motion is right for white noise on its outputs. Coloured errors that follow no input and no state are
-noise within the motion; errors that do are physics that is missing, or that the learner does not see. Simple terms,
-each tried in each equation, tell what it is (`missing_terms`).
+The criterion of a motion is right for white noise on its outputs. Coloured errors that follow no
+input and no state are noise within the motion; errors that do are physics that is missing, or that
+the learner does not see. Simple terms, each tried in each equation, tell what it is
+(`missing_terms`).
 """
 
 from __future__ import annotations
@@ -25,7 +26,9 @@ from orthaug.models.response import Response
 
 _LEVEL = 0.01  # of the test of missing terms
 _SMALL = 0.05  # of the error's variance: what inputs and states tell below that is a small effect
-_SIZABLE = 0.02  # of the output's deviation: a free run that leaves less has no dead time to look for
+_SIZABLE = (
+    0.02  # of the output's deviation: a free run that leaves less has no dead time to look for
+)
 _LITTLE = 0.005  # of the error's variance: what its own past tells below that is none
 _LAGS = 10  # of inputs that may tell the error
 _ROWS_PER_LAG = 20
@@ -33,7 +36,9 @@ _MOST_ROWS = 20_000  # at which the error is set beside states
 
 
 def diagnose_motion(fit: MotionEstimate, free_run: Response) -> Diagnosis | None:
-    """Analyse what the free run of the training data leaves; None where it ran away, or leaves rounding only.
+    """Analyse what the free run of the training data leaves.
+
+    None where it ran away, or leaves rounding only.
 
     Args:
         free_run: of the training data.
@@ -67,7 +72,11 @@ def diagnose_motion(fit: MotionEstimate, free_run: Response) -> Diagnosis | None
     verdict = "unmodelled" if told or late else "white" if white else "equation_noise"
     text = _words(verdict, fit, tests, shares, followed, curved, lacks, late)
     warnings = [one.warning for one in late]
-    warnings += [] if white else [Warning("coloured_residual", _coloured(fit) + (_UNCOUNTED if told else ""))]
+    warnings += (
+        []
+        if white
+        else [Warning("coloured_residual", _coloured(fit) + (_UNCOUNTED if told else ""))]
+    )
     return Diagnosis(verdict, text, (), tests, None, None, tuple(warnings), shares, (), missing)
 
 
@@ -83,10 +92,15 @@ def _coloured(fit: MotionEstimate) -> str:
     told = "the errors of the free run are coloured: held-out errors say how good the model is"
     if fit.std is None or fit.plain_covariance is not None:
         return f"{told}."
-    return f"{told}, and standard errors are those of white ones, as rows are too few: take them for a rough guide."
+    return (
+        f"{told}, and standard errors are those of white ones, as rows are too few: take them "
+        "for a rough guide."
+    )
 
 
-_UNCOUNTED = " Intervals count noise alone: what is missing may have moved the parameters by more than that."
+_UNCOUNTED = (
+    " Intervals count noise alone: what is missing may have moved the parameters by more than that."
+)
 
 
 def _predictable(i: int, test: ResidualTest, errors: list, inputs: list, every: int) -> Predictable:
@@ -94,10 +108,14 @@ def _predictable(i: int, test: ResidualTest, errors: list, inputs: list, every: 
     signal = [piece[:, i] for piece in errors]
     longest = min(_LAGS, min(map(len, signal)) // _ROWS_PER_LAG)
     own = from_own_past(signal, max(longest, 1))
-    driven = [[u[:, j] for u in inputs] for j in range(inputs[0].shape[1])]  # of each input its experiments
+    driven = [
+        [u[:, j] for u in inputs] for j in range(inputs[0].shape[1])
+    ]  # of each input its experiments
     tells = [from_lags(signal, [one], range(longest + 1)) for one in driven]
     best = max((share.sure for share in tells), default=0.0)
-    return Predictable(test.name, float(test.rms or 0.0), own.sure, best, float(test.largest_share or 0.0))
+    return Predictable(
+        test.name, float(test.rms or 0.0), own.sure, best, float(test.largest_share or 0.0)
+    )
 
 
 def _words(
@@ -116,31 +134,45 @@ def _words(
         noise = "is white: noise on the outputs, which is what it is trained for."
         return f"What the free run leaves ({sizes}) {noise}{_traces(tests, shares)}"
     if verdict == "equation_noise":
-        learner = "that the learner does not see" if fit.model.form.bound is not None else "(a learner would tell)"
+        learner = (
+            "that the learner does not see"
+            if fit.model.form.bound is not None
+            else "(a learner would tell)"
+        )
         no_input = "no input, " if fit.problem.motion.inputs else ""
         return (
-            f"What the free run leaves ({sizes}) is coloured ({_colour(tests, shares)}), and follows {no_input}no "
-            "state at the same instant, and no simple term that an equation could lack: disturbances, or physics "
-            f"missing in an equation {learner}."
+            f"What the free run leaves ({sizes}) is coloured ({_colour(tests, shares)}), and "
+            f"follows {no_input}no state at the same instant, and no simple term that an "
+            f"equation could lack: disturbances, or physics missing in an equation {learner}."
         )
     if late:
         return (
-            f"What the free run leaves ({sizes}) holds more than noise. Most likely {late[0].input} acts later than "
-            f"the equations say: {late[0].gain}."
+            f"What the free run leaves ({sizes}) holds more than noise. Most likely "
+            f"{late[0].input} acts later than the equations say: {late[0].gain}."
         )
     if lacks is not None:
         return f"What the free run leaves ({sizes}) holds more than noise. {_named(lacks)}"
     what = [f"{name} follows {', '.join(given)}" for name, given in followed.items()]
     what += [f"{name} is not flat over {', '.join(given)}" for name, given in curved.items()]
     what = what or [f"{100 * max(s.inputs for s in shares):.0f} % follows from the inputs"]
-    held = "Physics is missing" + (", or inputs run otherwise between samples" if fit.problem.motion.inputs else "")
+    held = "Physics is missing" + (
+        ", or inputs run otherwise between samples" if fit.problem.motion.inputs else ""
+    )
     return f"What the free run leaves ({sizes}) holds more than noise: {'; '.join(what)}. {held}."
 
 
 def _traces(tests: tuple[ResidualTest, ...], shares: tuple[Predictable, ...]) -> str:
     """Return what tests surely see beside the noise, too little to conclude otherwise."""
-    told = [f"{test.name} follows {', '.join(test.correlated_inputs)}" for test in tests if test.correlated_inputs]
-    told += [f"{test.name} is not flat over {', '.join(over)}" for test in tests if (over := test.curved_over(0.0))]
+    told = [
+        f"{test.name} follows {', '.join(test.correlated_inputs)}"
+        for test in tests
+        if test.correlated_inputs
+    ]
+    told += [
+        f"{test.name} is not flat over {', '.join(over)}"
+        for test in tests
+        if (over := test.curved_over(0.0))
+    ]
     if not told:
         return ""
     most = max(share.largest(own_past=False) for share in shares)
@@ -153,8 +185,12 @@ def _colour(tests: tuple[ResidualTest, ...], shares: tuple[Predictable, ...]) ->
     for test, share in zip(tests, shares, strict=True):
         if not test.practically_white():
             past = f", and {percent(share.own_past)} of it follows from its own past"
-            past = past if share.own_past > _LITTLE else ", too little to predict it from its own past"
-            told.append(f"{test.name} has autocorrelations of up to {test.largest_acf:.2f} in size{past}")
+            past = (
+                past if share.own_past > _LITTLE else ", too little to predict it from its own past"
+            )
+            told.append(
+                f"{test.name} has autocorrelations of up to {test.largest_acf:.2f} in size{past}"
+            )
     return "; ".join(told)
 
 
@@ -163,5 +199,8 @@ def _named(lacks: MissingTest) -> str:
     best, *others = lacks.terms
     text = f"Most likely {best} would explain {percent(best.share)} of its square"
     if others:
-        text += f", as would {' or '.join(f'{term.expression} in that of {term.equation}' for term in others[:2])}"
+        text += (
+            ", as would "
+            f"{' or '.join(f'{term.expression} in that of {term.equation}' for term in others[:2])}"
+        )
     return f"{text}."

@@ -1,8 +1,9 @@
 """Which parameters of a motion the outputs tell apart, before training.
 
-They are told apart on the record's inputs, or on inputs that excite everything, by the rank of the free run's
-sensitivities to the parameters' coordinates, the starts of all segments eliminated, at the initial parameters and some
-near them. A direction that only rounding or one particular value hides has full rank there.
+They are told apart on the record's inputs, or on inputs that excite everything, by the rank of the
+free run's sensitivities to the parameters' coordinates, the starts of all segments eliminated, at
+the initial parameters and some near them. A direction that only rounding or one particular value
+hides has full rank there.
 """
 
 from __future__ import annotations
@@ -29,10 +30,12 @@ _SEED = 20_250_117
 
 @dataclass(frozen=True, eq=False)
 class RankReport:
-    """What the record's own inputs tell apart, and what rich ones do; with points of a run at the initial parameters.
+    """What the record's own inputs tell apart, and what rich ones do.
 
-    `by_any` is None where no run with rich inputs is finite. `states` (M, nx) and `inputs` (M, nu) are where physics
-    alone goes on the record.
+    With points of a run at the initial parameters.
+
+    `by_any` is None where no run with rich inputs is finite. `states` (M, nx) and `inputs` (M, nu)
+    are where physics alone goes on the record.
     """
 
     on_data: Excitation
@@ -42,10 +45,16 @@ class RankReport:
 
 
 def identified(segmented: SegmentedMotion) -> RankReport | None:
-    """Of the physics alone of a course, over shorter segments where it runs away; None where no run is finite."""
+    """Of the physics alone of a course, over shorter segments where it runs away.
+
+    None where no run is finite.
+    """
     segmented = segmented.alone
     steps = segmented.segments.steps
-    for shorter_runs in (segmented, *(segmented.over(shorter) for shorter in _SHORTER if shorter < steps)):
+    for shorter_runs in (
+        segmented,
+        *(segmented.over(shorter) for shorter in _SHORTER if shorter < steps),
+    ):
         on_data = _rank(shorter_runs)
         if on_data is not None:
             break
@@ -62,9 +71,12 @@ def identified(segmented: SegmentedMotion) -> RankReport | None:
 
 
 def _rank(segmented: SegmentedMotion) -> Excitation | None:
-    """Return the highest rank of some points near the initial parameters; None where no run is finite.
+    """Return the highest rank of some points near the initial parameters.
 
-    Of several of that rank the one that ties most: of `a*b` with a = 0 it looks as if b alone were idle.
+    None where no run is finite.
+
+    Of several of that rank the one that ties most: of `a*b` with a = 0 it looks as if b alone were
+    idle.
     """
     best: Excitation | None = None
     for q in _near(segmented):
@@ -82,7 +94,10 @@ def _telling(found: Excitation) -> tuple[int, int]:
 
 
 def information(segmented: SegmentedMotion, q: Vector) -> Matrix | None:
-    """Gram matrix (np, np) of the outputs' sensitivities to the parameters' coordinates; None where a run diverges."""
+    """Gram matrix (np, np) of the outputs' sensitivities to the parameters' coordinates.
+
+    None where a run diverges.
+    """
     objective = segmented.objective()
     objective = replace(objective, loose=_LOOSER * objective.loose)
     with np.errstate(all="ignore"):
@@ -124,7 +139,11 @@ def _richly_excited(segmented: SegmentedMotion, wide: float) -> SegmentedMotion:
 def _on(segmented: SegmentedMotion, record: Record) -> SegmentedMotion:
     """The same segments on another record."""
     whole = SegmentedMotion.of(segmented.problem.on(record), None, segmented.criterion)
-    return whole if segmented.free_run == segmented.criterion.free_run else whole.over(segmented.free_run.steps)
+    return (
+        whole
+        if segmented.free_run == segmented.criterion.free_run
+        else whole.over(segmented.free_run.steps)
+    )
 
 
 def _levels(count: int, random: np.random.Generator) -> Vector:

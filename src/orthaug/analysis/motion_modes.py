@@ -1,7 +1,7 @@
 """Eigenvalues of the linearised motion along a run, in 1/s: how fast small changes of the state grow or decay there.
 
-They are those of ∂ẋ/∂x with the learner in it; of a discrete motion `ln(λ)/Ts` with those of ∂x⁺/∂x. They are local: a
-run may be bounded where some grow, and need not be where none does.
+They are those of ∂ẋ/∂x with the learner in it; of a discrete motion `ln(λ)/Ts` with those of
+∂x⁺/∂x. They are local: a run may be bounded where some grow, and need not be where none does.
 """
 
 from __future__ import annotations
@@ -34,9 +34,10 @@ _STILL = 1e-9  # of the fastest mode: an integrator's eigenvalue is rounding of 
 class Modes:
     """Local eigenvalues over `points` of a run [1/s].
 
-    `integrators` counts those that are zero everywhere; they are in nothing else here. `rightmost` is the largest real
-    part and `worst` the state and input where it is, `median` that of the largest real part; `growing` is the share of
-    points where it is positive. `slowest` and `fastest` are the least and largest magnitude.
+    `integrators` counts those that are zero everywhere; they are in nothing else here. `rightmost`
+    is the largest real part and `worst` the state and input where it is, `median` that of the
+    largest real part; `growing` is the share of points where it is positive. `slowest` and
+    `fastest` are the least and largest magnitude.
     """
 
     points: int
@@ -57,7 +58,9 @@ class MotionStability:
     warnings: tuple[Warning, ...]
     text: str
     diverges_at: float | None = None
-    """Factor on the inputs from which the free run leaves all bounds, searched up to `searched`; None: nowhere."""
+    """Factor on the inputs from which the free run leaves all bounds, searched up to `searched`;
+    None: nowhere.
+    """
     searched: float | None = None
     radius_beyond: float | None = None
     """Spectral radius of a sample's step far beyond the training (`beyond_training`)."""
@@ -65,7 +68,9 @@ class MotionStability:
     feedback = contraction = lipschitz = None
 
 
-def motion_stability(model: MotionModel, x: Matrix, u: Matrix, record: Record | None = None) -> MotionStability:
+def motion_stability(
+    model: MotionModel, x: Matrix, u: Matrix, record: Record | None = None
+) -> MotionStability:
     """Of the states (N, nx) and inputs (N, nu) of a run; those that are not finite are left out.
 
     With a `record` its free run is tried on larger and larger inputs.
@@ -84,7 +89,9 @@ def motion_stability(model: MotionModel, x: Matrix, u: Matrix, record: Record | 
 
 def _of_steps(model: MotionModel, record: Record) -> Matrix:
     """Return what the steps of a record read, (T, nu)."""
-    return np.concatenate([model.form.inputs(experiment, record) for experiment in record.experiments])
+    return np.concatenate(
+        [model.form.inputs(experiment, record) for experiment in record.experiments]
+    )
 
 
 def _of_modes(model: MotionModel, x: Matrix, u: Matrix) -> MotionStability:
@@ -96,8 +103,9 @@ def _of_modes(model: MotionModel, x: Matrix, u: Matrix) -> MotionStability:
         return MotionStability(found, (), told + _without_growth(found))
     where = ", ".join(f"{name} = {value:.4g}" for name, value in found.worst.items())
     told += (
-        f"At {percent(found.growing, 3)} of its points one grows, by up to {found.rightmost:.4g} 1/s ({where}); median "
-        f"of the largest real part {found.median:.4g} 1/s."
+        f"At {percent(found.growing, 3)} of its points one grows, by up to "
+        f"{found.rightmost:.4g} 1/s ({where}); median of the largest real part "
+        f"{found.median:.4g} 1/s."
     )
     warnings = (Warning("growing_mode", told),) if found.growing > _OFTEN else ()
     return MotionStability(found, warnings, told)
@@ -121,16 +129,30 @@ def _without_growth(found: Modes) -> str:
     elif found.fastest:
         told.append("None grows, and not all decay: the largest real part is 0.")
     if count:
-        told.append(f"What integrates neither decays nor grows: it keeps {'their' if count > 1 else 'its'} errors.")
+        told.append(
+            "What integrates neither decays nor grows: it keeps "
+            f"{'their' if count > 1 else 'its'} errors."
+        )
     return " ".join(told)
 
 
 def modes(model: MotionModel, x: Matrix, u: Matrix) -> Modes | None:
-    """Return the eigenvalues over at most 2000 points, spread evenly; None where no derivative is finite."""
+    """Return the eigenvalues over at most 2000 points, spread evenly.
+
+    None where no derivative is finite.
+    """
     finite = np.isfinite(x).all(axis=1)
     x, u = x[finite], u[finite]
-    rows = np.linspace(0, len(x) - 1, min(len(x), _POINTS)).astype(int) if len(x) else np.zeros(0, dtype=int)
-    slopes = np.asarray(_slopes(model.form, model.numbers, x[rows], u[rows])) if len(rows) else np.zeros((0, 1, 1))
+    rows = (
+        np.linspace(0, len(x) - 1, min(len(x), _POINTS)).astype(int)
+        if len(x)
+        else np.zeros(0, dtype=int)
+    )
+    slopes = (
+        np.asarray(_slopes(model.form, model.numbers, x[rows], u[rows]))
+        if len(rows)
+        else np.zeros((0, 1, 1))
+    )
     kept = np.isfinite(slopes).all(axis=(1, 2))
     if not kept.any():
         return None

@@ -1,14 +1,16 @@
 """How a motion's estimate answers to further terms in its equations: normal equations of the free run with them in it.
 
-With S the sensitivities of the free run to the parameters' coordinates c, the terms' coefficients κ and a learner's
-weights w, the starts eliminated, a term of size κ that the fit does not know moves (c, w) by `(SᵀS + ridge)⁻¹SᵀS_κ κ`:
-estimate less truth. What the free run leaves, r, tells κ itself by one Gauss-Newton step, beside all that was fitted.
+With S the sensitivities of the free run to the parameters' coordinates c, the terms' coefficients κ
+and a learner's weights w, the starts eliminated, a term of size κ that the fit does not know moves
+(c, w) by `(SᵀS + ridge)⁻¹SᵀS_κ κ`: estimate less truth. What the free run leaves, r, tells κ itself
+by one Gauss-Newton step, beside all that was fitted.
 
 Before any training waves stand for the learner. They can be any function of what it sees.
 
-How much of the estimate is an error of its integrator follows likewise. With Δy what twice as many substeps add to the
-outputs, a fit with them ends at `(c, w) − (SᵀS + ridge)⁻¹SᵀΔy`. S is that of the coarse steps; what finer ones change
-in it acts on the residual, which hardly follows S, while Δy follows it as the outputs do.
+How much of the estimate is an error of its integrator follows likewise. With Δy what twice as many
+substeps add to the outputs, a fit with them ends at `(c, w) − (SᵀS + ridge)⁻¹SᵀΔy`. S is that of
+the coarse steps; what finer ones change in it acts on the residual, which hardly follows S, while
+Δy follows it as the outputs do.
 """
 
 from __future__ import annotations
@@ -59,9 +61,12 @@ class FreeRunPoint:
 
 @dataclass(frozen=True, eq=False)
 class TermsResponse:
-    """Normal equations of (c, κ, w), the starts eliminated; `fitted` are those that a fit has, κ left out.
+    """Normal equations of (c, κ, w), the starts eliminated.
 
-    `form` and `numbers` are of the motion with the terms, with waves for a learner that is not trained yet.
+    `fitted` are those that a fit has, κ left out.
+
+    `form` and `numbers` are of the motion with the terms, with waves for a learner that is not
+    trained yet.
     """
 
     place: FreeRunPoint
@@ -77,8 +82,12 @@ class TermsResponse:
     def parameters(self) -> int:
         return len(self.place.c)
 
-    def moved(self, k: int, apart: Bool[np.ndarray, "np"]) -> tuple[Vector, Float[np.ndarray, "nw"]]:
-        """Return what a unit of term k adds to c (np,), and to the weights; parameters in `apart` stay.
+    def moved(
+        self, k: int, apart: Bool[np.ndarray, "np"]
+    ) -> tuple[Vector, Float[np.ndarray, "nw"]]:
+        """Return what a unit of term k adds to c (np,), and to the weights.
+
+        Parameters in `apart` stay.
 
         Args:
             apart: those whose change the learner could undo, so that it holds it instead.
@@ -86,7 +95,9 @@ class TermsResponse:
         free = self.fitted.copy()
         free[: self.parameters] &= ~apart
         found = np.zeros(len(free))
-        found[free] = solved(self.penalised[np.ix_(free, free)], self.information[free, self.parameters + k])
+        found[free] = solved(
+            self.penalised[np.ix_(free, free)], self.information[free, self.parameters + k]
+        )
         return found[: self.parameters], found[self.parameters + self.terms :]
 
     @property
@@ -101,7 +112,10 @@ class TermsResponse:
         return np.asarray(_along(self.form, self.numbers, dw, x, u))
 
     def cosine(self, k: int) -> float | None:
-        """Return how much of the term's effect on the outputs the fit takes up, in [0, 1]; None where it has none."""
+        """Return how much of the term's effect on the outputs the fit takes up, in [0, 1].
+
+        None where it has none.
+        """
         own = self.information[self.parameters + k, self.parameters + k]
         return float(np.sqrt(np.clip(1 - self._beside(k)[1] / own, 0.0, 1.0))) if own > 0 else None
 
@@ -109,7 +123,9 @@ class TermsResponse:
         """RMS effect of a unit of the term on the outputs, in their deviations."""
         segmented, weight = self.place.segmented, self.place.weight
         whole = segmented.segments.count * float(np.sum((weight * segmented.deviation) ** 2))
-        return float(np.sqrt(max(self.information[self.parameters + k, self.parameters + k], 0.0) / whole))
+        return float(
+            np.sqrt(max(self.information[self.parameters + k, self.parameters + k], 0.0) / whole)
+        )
 
     def step(self, k: int) -> tuple[float, float, Vector] | None:
         """Return the coefficient that lowers what is left most, by how much that falls, and the row (n,) of scores it is.
@@ -127,11 +143,13 @@ class TermsResponse:
     def squares(self) -> tuple[float, float]:
         """Return the sum of squares that the free run leaves, and as much of it as neighbouring steps do not share.
 
-        The second is half the sum of squared differences (von Neumann 1941): all of white noise, little of what physics
-        leaves out.
+        The second is half the sum of squared differences (von Neumann 1941): all of white noise,
+        little of what physics leaves out.
         """
         place = self.place
-        errors = place.segmented.objective().errors(place.c, place.w, place.states, place.segmented.segments)
+        errors = place.segmented.objective().errors(
+            place.c, place.w, place.states, place.segmented.segments
+        )
         errors = np.einsum("oi,ktim->ktom", place.weight, errors)
         scored = np.asarray(place.segmented.segments.scored)[:, :, None]
         pairs = scored[:, 1:] & scored[:, :-1]
@@ -190,7 +208,11 @@ def solved(matrix: Matrix, right: Vector) -> Vector:
 
 @partial(jax.jit, static_argnames="form")
 def _along(
-    form: MotionDynamics, numbers: Numbers, dw: Float[Array, "nw"], x: Float[Array, "m nx"], u: Float[Array, "m nu"]
+    form: MotionDynamics,
+    numbers: Numbers,
+    dw: Float[Array, "nw"],
+    x: Float[Array, "m nx"],
+    u: Float[Array, "m nu"],
 ) -> Float[Array, "m nl"]:
     def learned(w: Any) -> Any:
         return jax.vmap(lambda x, u: form.learned(numbers._replace(weights=w), x, u))(x, u)
@@ -215,23 +237,32 @@ class SubstepBias:
 
 
 def substep_bias(fit: MotionEstimate) -> SubstepBias | None:
-    """Return the part of p̂ that is the integrator's; None of a motion that is not integrated, or without normal equations.
+    """Return the part of p̂ that is the integrator's.
+
+    None of a motion that is not integrated, or without normal equations.
 
     Args:
         fit: of a motion, from `estimate`.
 
-    Returns:
-        p̂ less what a fit with twice the substeps would give, to first order, in the units of p and in standard errors.
+    Returns: p̂ less what a fit with twice the substeps would give, to first order, in the units of
+        p and in standard errors.
     """
     motion, segmented, numbers = fit.problem.motion, fit.segmented, fit.model.numbers
     slope, substeps = fit.split_by.slope, segmented.dynamics.substeps
-    if motion.integrator == "discrete" or fit.scores is None or slope is None or 2 * substeps > MOST_SUBSTEPS:
+    if (
+        motion.integrator == "discrete"
+        or fit.scores is None
+        or slope is None
+        or 2 * substeps > MOST_SUBSTEPS
+    ):
         return None
     c, w = np.asarray(numbers.theta - numbers.theta_aux), np.asarray(numbers.weights)
     finer = segmented.refined(2 * substeps)
     outputs = respond(finer.dynamics, finer.numbers(c, w), finer.segments, fit.states)
     moved = segmented.segments._replace(target=outputs)  # whose errors are what the finer steps add
-    slopes = sensitivity(segmented.dynamics, segmented.numbers(c, w), moved, fit.states, fit.scores.weight)
+    slopes = sensitivity(
+        segmented.dynamics, segmented.numbers(c, w), moved, fit.states, fit.scores.weight
+    )
     rows = LOOSER * segmented.objective().start_rows
     at = np.asarray(fit.states)
     information, gradient = InitialStates(at, free=True).eliminate(slopes, at, rows)[:2]
@@ -239,7 +270,9 @@ def substep_bias(fit: MotionEstimate) -> SubstepBias | None:
         return None
     low, high = motion.coordinates.bounds
     free = np.concatenate([(low < c) & (c < high), np.ones(len(w), dtype=bool)])
-    information = information + np.diag(np.concatenate([0 * c, fit.model.statistics.ridge / fit.scores.unit + 0 * w]))
+    information = information + np.diag(
+        np.concatenate([0 * c, fit.model.statistics.ridge / fit.scores.unit + 0 * w])
+    )
     step = np.zeros(len(free))
     step[free] = solved(information[np.ix_(free, free)], gradient[free])
     value = motion.coordinates.slopes(fit.theta) * (slope @ step)
@@ -252,17 +285,27 @@ def substep_bias(fit: MotionEstimate) -> SubstepBias | None:
 def _warnings(found: SubstepBias, fit: MotionEstimate) -> tuple[Warning, ...]:
     """Return one sentence on the parameters that finer steps would move."""
     told = []
-    for name, moved, errors, value in zip(found.names, found.value, found.errors, fit.values, strict=True):
+    for name, moved, errors, value in zip(
+        found.names, found.value, found.errors, fit.values, strict=True
+    ):
         share = f", {percent(moved / value, sign='+')}" if value else ""
         if np.isfinite(errors) and errors > _LARGE:
             told.append(f"{name} by {moved:+.2g} ({errors:.2g} standard errors{share})")
-        elif np.isnan(errors) and name not in fit.unidentified and abs(moved) > _LARGE_SHARE * abs(value):
-            told.append(f"{name} by {moved:+.2g}{share.replace(',', ' (', 1).replace('( ', '(')}{')' if share else ''}")
+        elif (
+            np.isnan(errors)
+            and name not in fit.unidentified
+            and abs(moved) > _LARGE_SHARE * abs(value)
+        ):
+            told.append(
+                f"{name} by "
+                f"{moved:+.2g}{share.replace(',', ' (', 1).replace('( ', '(')}{')' if share else ''}"
+            )
     if not told:
         return ()
     steps = f"{found.substeps} substep{'s' * (found.substeps > 1)} in a sample"
     text = (
-        f"the integrator is too coarse for the parameters: with {steps} instead of {2 * found.substeps} it moves "
-        f"{', '.join(told)}; give substeps = {2 * found.substeps} or more."
+        f"the integrator is too coarse for the parameters: with {steps} instead of "
+        f"{2 * found.substeps} it moves {', '.join(told)}; give substeps = "
+        f"{2 * found.substeps} or more."
     )
     return (Warning("too_few_substeps", text),)

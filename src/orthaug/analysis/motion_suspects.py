@@ -1,7 +1,7 @@
 """Suspected terms of a motion: what its equations may lack, as expressions of states, inputs and parameters.
 
-A suspect adds `coefficient * expression` to the derivative of a state, or to an output. With a `factor` such as -1/m
-the coefficient is a force in N though the equation is one of m/s².
+A suspect adds `coefficient * expression` to the derivative of a state, or to an output. With a
+`factor` such as -1/m the coefficient is a force in N though the equation is one of m/s².
 """
 
 from __future__ import annotations
@@ -13,24 +13,40 @@ import numpy as np
 
 from orthaug._base.checks import Matrix, Vector, check_label, check_unique, nearest
 from orthaug._base.errors import InputError
-from orthaug.analysis.suspects import ODD_JUMPS, WIDTHS, changes_sign, check_coefficient, check_name, written
+from orthaug.analysis.suspects import (
+    ODD_JUMPS,
+    WIDTHS,
+    changes_sign,
+    check_coefficient,
+    check_name,
+    written,
+)
 from orthaug.data.expressions import Expression, parse_named
 from orthaug.physics.motion import Motion
 from orthaug.physics.motion_problem import MotionProblem
 from orthaug.physics.suspected_motion import SuspectedTerm
 
 _OF_STATES = ("coulomb", "quadratic_drag", "cubic")
-_WIDTHS = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0)  # of friction that turns round smoothly, in median sizes of what it acts on
+_WIDTHS = (
+    0.125,
+    0.25,
+    0.5,
+    1.0,
+    2.0,
+    4.0,
+)  # of friction that turns round smoothly, in median sizes of what it acts on
 _OF_INPUTS = ("cubic", "dead_zone", "saturation")
 _OF_FEATURES = (*_OF_STATES, "dead_zone")
 
 
 @dataclass(frozen=True)
 class MotionSuspect:
-    """A term `coefficient * expression` of a state's equation, or of an output; make one of a known kind with `of`.
+    """A term `coefficient * expression` of a state's equation, or of an output.
 
-    `coefficient` is a guess of its size, None where there is none; `unit` is its unit. `equation` may be left out where
-    one state is learned, or only one equation has parameters.
+    Make one of a known kind with `of`.
+
+    `coefficient` is a guess of its size, None where there is none; `unit` is its unit. `equation`
+    may be left out where one state is learned, or only one equation has parameters.
 
     Examples:
         >>> MotionSuspect.of("coulomb", "v", factor="-1/m", equation="v", coefficient=1.5, unit="N").expression
@@ -72,8 +88,8 @@ class MotionSuspect:
             width: in the unit of `on`.
             factor: an expression that multiplies the kind's.
 
-        Raises:
-            InputError: an unknown kind, an argument that is missing, or that the kind does not take.
+        Raises: InputError: an unknown kind, an argument that is missing, or that the kind does not
+            take.
         """
         text, label, _ = written(kind, on, width, _balanced, "v")
         if factor is not None:
@@ -100,11 +116,15 @@ class MotionSuspect:
         if self.equation is not None:
             if self.equation not in known:
                 hint = nearest(self.equation, known) or f"; known are {', '.join(known)}"
-                raise InputError(f"suspect '{self.name}': no equation is that of '{self.equation}'{hint}.")
+                raise InputError(
+                    f"suspect '{self.name}': no equation is that of '{self.equation}'{hint}."
+                )
             return known.index(self.equation)
         likely = usual_places(motion)
         if len(likely) != 1:
-            raise InputError(f"suspect '{self.name}': `equation` is missing; one of {', '.join(known)}.")
+            raise InputError(
+                f"suspect '{self.name}': `equation` is missing; one of {', '.join(known)}."
+            )
         return likely[0]
 
     def term(self, motion: Motion) -> SuspectedTerm:
@@ -143,7 +163,9 @@ def check_motion_suspects(suspects: Sequence[MotionSuspect], problem: MotionProb
             k = int(np.argmax(~np.isfinite(values)))
             at = zip((*motion.names_of_states, *motion.inputs), (*x[:, k], *u[:, k]), strict=True)
             where = ", ".join(f"{name} = {value:.4g}" for name, value in at)
-            raise InputError(f"suspect '{suspect.name}' = {suspect.expression} is not finite at {where}.")
+            raise InputError(
+                f"suspect '{suspect.name}' = {suspect.expression} is not finite at {where}."
+            )
 
 
 def motion_width(on: str, motion: Motion, x: Matrix, u: Matrix) -> float:
@@ -155,7 +177,8 @@ def motion_width(on: str, motion: Motion, x: Matrix, u: Matrix) -> float:
     size = np.abs(MotionSuspect(on, on).values(motion, motion.initial, x, u))
     if not np.isfinite(size).all() or not np.any(size > 0):
         raise InputError(
-            f"'{on}' is zero or not finite over the guessed states; give a `width`, or its state a `start`."
+            f"'{on}' is zero or not finite over the guessed states; give a `width`, or its "
+            "state a `start`."
         )
     return float(f"{np.median(size[size > 0]):.6g}")
 
@@ -168,7 +191,9 @@ def _balanced(text: str) -> None:
         if depth < 0:
             break
     if depth or not text.strip():
-        raise InputError(f"'{text}' is no expression: its parentheses are no pairs, or it is empty.")
+        raise InputError(
+            f"'{text}' is no expression: its parentheses are no pairs, or it is empty."
+        )
 
 
 def softened(
@@ -176,8 +201,8 @@ def softened(
 ) -> tuple[MotionSuspect, ...]:
     """Friction as it is where it turns round smoothly: each suspect that jumps as tanh(v/width), of several widths.
 
-    Args:
-        p: parameters (np,); with states x (M, nx) and inputs u (M, nu) they tell the widths, in median sizes.
+    Args: p: parameters (np,); with states x (M, nx) and inputs u (M, nu) they tell the widths, in
+        median sizes.
     """
     found = []
     for suspect in suspects:
@@ -190,11 +215,15 @@ def softened(
             width = float(f"{share * np.median(size):.3g}")
             soft = f"tanh({on}/{width!r})"
             text = suspect.expression.replace(f"sign({suspect.jump})", soft)
-            found.append(replace(suspect, name=f"{suspect.name} as {soft}", expression=text, jump=None))
+            found.append(
+                replace(suspect, name=f"{suspect.name} as {soft}", expression=text, jump=None)
+            )
     return tuple(found)
 
 
-def usual_motion_suspects(motion: Motion, x: Matrix, u: Matrix, on: Sequence[str] = ()) -> tuple[MotionSuspect, ...]:
+def usual_motion_suspects(
+    motion: Motion, x: Matrix, u: Matrix, on: Sequence[str] = ()
+) -> tuple[MotionSuspect, ...]:
     """Return what is often missing: friction, drag and hardening of every state, what bends an input, an offset.
 
     Args:
@@ -206,7 +235,11 @@ def usual_motion_suspects(motion: Motion, x: Matrix, u: Matrix, on: Sequence[str
     seen = [MotionSuspect(text, text).values(motion, motion.initial, x, u) for text in features]
     moving = [
         (name, kinds, row)
-        for of, rows, kinds in ((names, x.T, _OF_STATES), (inputs, u.T, _OF_INPUTS), (features, seen, _OF_FEATURES))
+        for of, rows, kinds in (
+            (names, x.T, _OF_STATES),
+            (inputs, u.T, _OF_INPUTS),
+            (features, seen, _OF_FEATURES),
+        )
         for name, row in zip(of, rows, strict=True)
         if np.ptp(row) > 0
     ]
@@ -221,6 +254,8 @@ def usual_motion_suspects(motion: Motion, x: Matrix, u: Matrix, on: Sequence[str
                     continue
                 width = motion_width(name, motion, x, u) if kind in WIDTHS else None
                 label = f"{kind} of {name}{where}"
-                found.append(MotionSuspect.of(kind, name, width=width, equation=equation, name=label))
+                found.append(
+                    MotionSuspect.of(kind, name, width=width, equation=equation, name=label)
+                )
         found.append(MotionSuspect.of("offset", equation=equation, name=f"offset{where}"))
     return tuple(found)

@@ -15,7 +15,15 @@ from orthaug.data.record import Experiment, Record
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.models.dynamics import Parts
-from orthaug.models.kalman import FilterRow, Noise, StateEstimate, ahead, filtered, one_row, spread_of
+from orthaug.models.kalman import (
+    FilterRow,
+    Noise,
+    StateEstimate,
+    ahead,
+    filtered,
+    one_row,
+    spread_of,
+)
 from orthaug.models.model import Model
 from orthaug.models.motion_model import MotionModel
 from orthaug.models.on_records import trajectory
@@ -27,13 +35,15 @@ from orthaug.models.stepping import checked_row, one_experiment
 class Observer:
     """An extended Kalman filter of a fitted model, lagged or a motion.
 
-    Args:
-        model: the model, or the fit: of a fit the residual tells how large the noises are (`diagnose`), and where both
-            are there the likelihood of its data does; a model that `orthaug fit` saved carries what they told.
-        noise: the covariances, where they are known better: of the disturbances in a sample, of the sensors.
+    Args: model: the model, or the fit: of a fit the residual tells how large the noises are
+        (`diagnose`), and where both
+            are there the likelihood of its data does; a model that `orthaug fit` saved carries what
+            they told.
+        noise: the covariances, where they are known better: of the disturbances in a sample, of the
+            sensors.
 
-    Raises:
-        InputError: a model whose learner cannot be differentiated, or that has no estimate of its noise; covariances
+    Raises: InputError: a model whose learner cannot be differentiated, or that has no estimate of
+        its noise; covariances
             that are none, or of other sizes.
     """
 
@@ -41,16 +51,25 @@ class Observer:
     noise: Noise = field(default=None)  # type: ignore[assignment]  (made of the model)
 
     def __post_init__(self) -> None:
-        check_type(self.model, Model | MotionModel | Estimate | MotionEstimate, "model", "a fitted model or a fit")
+        check_type(
+            self.model,
+            Model | MotionModel | Estimate | MotionEstimate,
+            "model",
+            "a fitted model or a fit",
+        )
         given, noise = self.model, self.noise
         fit = given if isinstance(given, Estimate | MotionEstimate) else None
         model: Any = given if fit is None else fit.model
         if not model.form.differentiable:
-            raise InputError("the learner is a function without derivatives; an observer needs them.")
+            raise InputError(
+                "the learner is a function without derivatives; an observer needs them."
+            )
         if noise is None:
             noise = by_verdict(model) if fit is None else of_fit(fit)
         object.__setattr__(self, "model", model)
-        object.__setattr__(self, "noise", _checked(noise, model.filtering[0].disturbances, len(model.outputs)))
+        object.__setattr__(
+            self, "noise", _checked(noise, model.filtering[0].disturbances, len(model.outputs))
+        )
 
     def __repr__(self) -> str:
         return f"Observer({self.model!r})"
@@ -68,7 +87,8 @@ class Observer:
     def start(self, record: Record, row: int | None = None) -> ObserverState:
         """Where to begin, before a row of a record of one experiment, by default the first that is estimated.
 
-        A motion's state is guessed from the outputs about the row, and unknown by the size of the states.
+        A motion's state is guessed from the outputs about the row, and unknown by the size of the
+        states.
 
         Raises:
             InputError: other channels, several experiments, a row that is not there.
@@ -97,12 +117,14 @@ class Observer:
 
         A motion's first rows, which tell its state, have no value, as in its `predict`.
 
-        Raises:
-            InputError: other channels, a horizon below 1, too few rows, or an estimate that leaves all bounds.
+        Raises: InputError: other channels, a horizon below 1, too few rows, or an estimate that
+            leaves all bounds.
         """
         horizon = check_count(horizon, "horizon", of="steps")
         record = self._record(record)
-        trajectories = [self._ahead(experiment, record, horizon) for experiment in record.experiments]
+        trajectories = [
+            self._ahead(experiment, record, horizon) for experiment in record.experiments
+        ]
         return Response(tuple(trajectories), horizon, self.model.outputs, record.sampling_time)
 
     @property
@@ -114,19 +136,24 @@ class Observer:
     def _record(self, record: Record) -> Record:
         return self.model.fitting(record, need_outputs=True, gaps=True)
 
-    def _along(self, experiment: Experiment, record: Record) -> tuple[ObserverRun, StateEstimate, Matrix]:
+    def _along(
+        self, experiment: Experiment, record: Record
+    ) -> tuple[ObserverRun, StateEstimate, Matrix]:
         """Return what an experiment tells, what is believed before its rows, and what their steps read."""
         form, numbers, size = self.model.filtering
         first = form.first_row
         self.model.check_rows(experiment, first)
         begun = form.start(experiment, record, first, self.noise, size)
         inputs = form.inputs(experiment, record)
-        before, told = filtered(form, numbers, self.noise, begun, inputs, experiment.outputs[first:])
+        before, told = filtered(
+            form, numbers, self.noise, begun, inputs, experiment.outputs[first:]
+        )
         finite = np.isfinite(told.predicted).all(axis=1) & np.isfinite(before.state).all(axis=1)
         if not finite.all():
             raise InputError(
-                f"{experiment.where(first + int(np.argmin(finite)))}: the estimate leaves all bounds there; the model "
-                "does not hold on this record, or the noise of the observer is wrong."
+                f"{experiment.where(first + int(np.argmin(finite)))}: the estimate leaves all "
+                "bounds there; the model does not hold on this record, or the noise of the "
+                "observer is wrong."
             )
         return _observed(told, experiment, first), before, inputs
 
@@ -143,7 +170,9 @@ class Observer:
                 known = ahead(alone[0], alone[1], self.noise, before, inputs, horizon)[0]
             parts = Parts(known.total, parts.total - known.total, parts.total - known.total)
         skip = first - form.first_row - horizon + 1
-        told = trajectory(Parts(*(part[skip:] for part in parts)), experiment, experiment.outputs, first)
+        told = trajectory(
+            Parts(*(part[skip:] for part in parts)), experiment, experiment.outputs, first
+        )
         whole = np.full(experiment.outputs.shape, np.nan)
         whole[first:] = std[skip:]
         return replace(told, std=whole)
@@ -178,7 +207,10 @@ class ObserverState:
 
     @property
     def state(self) -> Vector:
-        """The state (n,) at the last sample of a motion; of a lagged model that which the next step starts from."""
+        """The state (n,) at the last sample of a motion.
+
+        Of a lagged model that which the next step starts from.
+        """
         return np.asarray(self.belief.state if self.told is None else self.told.state)
 
     @property
@@ -251,7 +283,10 @@ def _row(values: Any, name: str, count: int, *, gaps: bool = False) -> Vector:
     if row.shape != (count,):
         raise InputError(f"`{name}` must have {count} numbers; got the shape {row.shape}.")
     if np.isinf(row).any() or (not gaps and np.isnan(row).any()):
-        raise InputError(f"`{name}` must be finite{' or NaN, where nothing was measured' if gaps else ''}; got {row}.")
+        raise InputError(
+            f"`{name}` must be finite{' or NaN, where nothing was measured' if gaps else ''}; "
+            f"got {row}."
+        )
     return row
 
 
@@ -279,7 +314,9 @@ def _checked(noise: Any, disturbances: int, outputs: int) -> Noise:
     """Return two covariances; raises InputError for anything else."""
     sizes = {"state": disturbances, "output": outputs}
     if not isinstance(noise, Noise):
-        raise InputError(f"`noise` must be an oa.Noise(state, output) of two covariances; got {shown(noise)}.")
+        raise InputError(
+            f"`noise` must be an oa.Noise(state, output) of two covariances; got {shown(noise)}."
+        )
     parts = []
     for (name, size), given in zip(sizes.items(), noise, strict=True):
         try:
@@ -287,12 +324,20 @@ def _checked(noise: Any, disturbances: int, outputs: int) -> Noise:
         except (TypeError, ValueError, OverflowError):
             raise InputError(f"`noise.{name}` is not a matrix of numbers.") from None
         if matrix.shape != (size, size):
-            raise InputError(f"`noise.{name}` has the shape {matrix.shape}; expected ({size}, {size}).")
+            raise InputError(
+                f"`noise.{name}` has the shape {matrix.shape}; expected ({size}, {size})."
+            )
         largest = np.abs(matrix).max(initial=0.0)
-        sound = np.isfinite(matrix).all() and np.allclose(matrix, matrix.T, rtol=0, atol=1e-9 * largest)
+        sound = np.isfinite(matrix).all() and np.allclose(
+            matrix, matrix.T, rtol=0, atol=1e-9 * largest
+        )
         if not sound or np.linalg.eigvalsh(matrix).min(initial=0.0) < -1e-9 * largest:
-            raise InputError(f"`noise.{name}` is no covariance: it must be finite, symmetric, and not negative.")
+            raise InputError(
+                f"`noise.{name}` is no covariance: it must be finite, symmetric, and not negative."
+            )
         parts.append(matrix)
     if not parts[0].any() and not np.linalg.eigvalsh(parts[1]).min(initial=1.0) > 0:
-        raise InputError("`noise`: with no disturbance the sensors' covariance must be positive definite.")
+        raise InputError(
+            "`noise`: with no disturbance the sensors' covariance must be positive definite."
+        )
     return Noise(*parts)

@@ -1,7 +1,7 @@
 """Points where a model rests: its equilibria with inputs held constant, found, or given and checked.
 
-Inputs that nobody fixes are 0, or their means over a record. Where outputs or states are fixed, inputs that nobody
-fixes are looked for with the rest.
+Inputs that nobody fixes are 0, or their means over a record. Where outputs or states are fixed,
+inputs that nobody fixes are looked for with the rest.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ class Slopes:
 class OperatingPoint:
     """A point of rest: `values` of states or outputs and inputs by name, `outputs` likewise.
 
-    `outside` tells whether it lies beyond what training reached, or the learner's features do; `line` whether it is one
-    of a continuum.
+    `outside` tells whether it lies beyond what training reached, or the learner's features do;
+    `line` whether it is one of a continuum.
     """
 
     rest: Vector
@@ -89,7 +89,9 @@ def parse_point(at: str | Mapping[str, float] | None) -> dict[str, float]:
         raise InputError(f"the operating point must be {wanted}; got {shown(at)}.")
     for name, value in at.items():
         if not isinstance(name, str) or not name or not is_number(value):
-            raise InputError(f"the operating point must be {wanted}; got {shown(name)} = {shown(value)}.")
+            raise InputError(
+                f"the operating point must be {wanted}; got {shown(name)} = {shown(value)}."
+            )
     return {name: float(value) for name, value in at.items()}
 
 
@@ -117,7 +119,12 @@ class Search:
 
     @classmethod
     def of(
-        cls, step: Step, model: Model | MotionModel, outputs: Sequence[str], at: Mapping[str, float], held: Vector
+        cls,
+        step: Step,
+        model: Model | MotionModel,
+        outputs: Sequence[str],
+        at: Mapping[str, float],
+        held: Vector,
     ) -> Search:
         """`held` (nu,) are the inputs that nobody fixes.
 
@@ -135,7 +142,9 @@ class Search:
             else:
                 known = list(dict.fromkeys((*step.inputs, *step.rest, *outputs)))
                 hint = nearest(name, known)
-                raise InputError(f"the model has no '{shown(name)[1:-1]}'{hint}; known are {', '.join(known)}.")
+                raise InputError(
+                    f"the model has no '{shown(name)[1:-1]}'{hint}; known are {', '.join(known)}."
+                )
         ne = len(step.rest)
         trims = bool(wanted) or bool(np.isfinite(given[:ne]).any())
         if not trims:
@@ -158,7 +167,9 @@ class Search:
         """Return what must be zero (m,), how it follows rest and inputs (m, k), and the outputs."""
         ne = len(self.step.rest)
         width = difference_widths(self.size, point[ne:])
-        value, outputs, slope = map(np.asarray, at_rest(self.step, self.numbers, point[:ne], point[ne:], width))
+        value, outputs, slope = map(
+            np.asarray, at_rest(self.step, self.numbers, point[:ne], point[ne:], width)
+        )
         rows = list(self.wanted)
         value = np.concatenate([value, outputs[rows] - np.array([self.wanted[i] for i in rows])])
         slope = np.concatenate([slope[:ne], slope[ne:][rows]])
@@ -194,7 +205,10 @@ def operating_points(search: Search) -> tuple[list[OperatingPoint], list[Warning
         if point is None:
             continue
         one = _point(search, point)
-        near = [np.abs((_whole(other) - point) / search.scale).max(initial=0.0) < _SAME for other in found]
+        near = [
+            np.abs((_whole(other) - point) / search.scale).max(initial=0.0) < _SAME
+            for other in found
+        ]
         if any(near) or (one.line and any(other.line for other in found)):
             continue
         found.append(one)
@@ -204,23 +218,36 @@ def operating_points(search: Search) -> tuple[list[OperatingPoint], list[Warning
     return _within_reach(search, found)
 
 
-def _within_reach(search: Search, found: list[OperatingPoint]) -> tuple[list[OperatingPoint], list[Warning]]:
+def _within_reach(
+    search: Search, found: list[OperatingPoint]
+) -> tuple[list[OperatingPoint], list[Warning]]:
     """Return those that training came near to, if there are any, and what is to be said."""
     warnings = []
     ne = len(search.size)
-    near = [one for one in found if np.all(np.abs(one.rest) <= _FAR * search.size[:ne])] or found[:1]
+    near = [one for one in found if np.all(np.abs(one.rest) <= _FAR * search.size[:ne])] or found[
+        :1
+    ]
     if len(near) < len(found):
-        told = f"{len(found) - len(near)} more equilibria lie far outside of the training data; they are left out."
+        told = (
+            f"{len(found) - len(near)} more equilibria lie far outside of the training data; "
+            "they are left out."
+        )
         warnings.append(Warning("equilibria_left_out", told))
     if len(near) > 1:
         told = f"{len(near)} equilibria belong to these inputs; fix an output to choose one."
         warnings.append(Warning("several_equilibria", told))
     if any(one.line for one in near):
-        told = "the equilibrium is one of a continuum (the model integrates, or too little is fixed); one is taken."
+        told = (
+            "the equilibrium is one of a continuum (the model integrates, or too little is "
+            "fixed); one is taken."
+        )
         warnings.append(Warning("continuum_of_equilibria", told))
     if any(one.outside for one in near):
         where = "the operating point lies" if len(near) == 1 else "operating points so marked lie"
-        told = f"{where} outside of the training data, which do not tell what the model is worth there."
+        told = (
+            f"{where} outside of the training data, which do not tell what the model is worth "
+            "there."
+        )
         warnings.append(Warning("outside_training", told))
     return near, warnings
 
@@ -271,23 +298,35 @@ def _point(search: Search, point: Vector) -> OperatingPoint:
     free = search.free
     scaled = slope[:, free] * search.scale[free]
     sizes = np.linalg.svd(scaled, compute_uv=False) if scaled.size else np.ones(1)
-    line = bool(free.any()) and (free.sum() > len(scaled) or sizes[-1] <= _SINGULAR * max(sizes[0], 1e-300))
-    return OperatingPoint(rest, inputs, values, outputs, outside, line, Slopes(slope, free, tuple(search.wanted)))
+    line = bool(free.any()) and (
+        free.sum() > len(scaled) or sizes[-1] <= _SINGULAR * max(sizes[0], 1e-300)
+    )
+    return OperatingPoint(
+        rest, inputs, values, outputs, outside, line, Slopes(slope, free, tuple(search.wanted))
+    )
 
 
 def _nothing(search: Search, starts: Matrix, unit: Vector) -> str:
     """Why there is no point."""
     names = (*search.step.rest, *search.step.inputs)
-    fixed = [f"{name} = {value:.6g}" for name, value in zip(names, search.given, strict=True) if np.isfinite(value)]
+    fixed = [
+        f"{name} = {value:.6g}"
+        for name, value in zip(names, search.given, strict=True)
+        if np.isfinite(value)
+    ]
     fixed += [f"{search.step.form.outputs[i]} = {value:.6g}" for i, value in search.wanted.items()]
     at = f" at {', '.join(fixed)}" if fixed else ""
     if not search.free.any():
         moves = ", ".join(search.step.rest)
-        return f"the model does not rest{at}: {moves} would move. Fix less, so that the rest can be found."
+        return (
+            f"the model does not rest{at}: {moves} would move. Fix less, so that the rest can "
+            "be found."
+        )
     found = f"no equilibrium was found{at}, from {len(starts)} starts: either the model"
     if not search.step.inputs:
         return f"{found} never rests, or these values exclude each other. Give others, or fix less."
     return (
-        f"{found} integrates (it rests at other inputs only), or these values exclude each other. Give other inputs, "
-        "or data whose mean inputs are held, or fix an output and leave inputs open."
+        f"{found} integrates (it rests at other inputs only), or these values exclude each "
+        "other. Give other inputs, or data whose mean inputs are held, or fix an output and "
+        "leave inputs open."
     )

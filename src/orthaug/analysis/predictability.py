@@ -1,7 +1,8 @@
 """How much of a signal could be predicted from others: cross-validated shares of its variance, from Gram sums.
 
-Rows are cut into contiguous blocks. Each is predicted by least squares on the others, so that the share is what a model
-with these columns would gain on rows that it has not seen; chance counts against it.
+Rows are cut into contiguous blocks. Each is predicted by least squares on the others, so that the
+share is what a model with these columns would gain on rows that it has not seen; chance counts
+against it.
 """
 
 from __future__ import annotations
@@ -58,7 +59,10 @@ class SimpleFunctions:
     def __call__(self, x: Matrix) -> Matrix:
         """On rows of the regressor, (N, functions)."""
         columns = []
-        scaled = [np.clip((x @ d - mean) / size, -_FARTHEST, _FARTHEST) for d, mean, size in self.variables]
+        scaled = [
+            np.clip((x @ d - mean) / size, -_FARTHEST, _FARTHEST)
+            for d, mean, size in self.variables
+        ]
         for v in scaled:
             columns += [v**2, v**3, np.abs(v), v * np.abs(v), np.tanh(3 * v)]
         for i, v in enumerate(scaled):
@@ -81,7 +85,9 @@ class Share:
         if not (total > 0 and np.isfinite(gained).all()):
             return cls(0.0, 0.0)
         value = float(gained.sum() / total)
-        off = gained - value * without  # of a ratio of sums: loud blocks may gain more (Cochran 1977, sect. 2.11)
+        off = (
+            gained - value * without
+        )  # of a ratio of sums: loud blocks may gain more (Cochran 1977, sect. 2.11)
         return cls(value, float(np.sqrt(len(off)) * off.std(ddof=1) / total))
 
     @property
@@ -101,7 +107,9 @@ class BlockSums:
         """From rows in their order."""
         both = np.column_stack([columns, target])
         edges = np.linspace(0, len(both), blocks + 1).astype(int)
-        return cls(np.stack([both[a:b].T @ both[a:b] for a, b in zip(edges[:-1], edges[1:], strict=True)]))
+        return cls(
+            np.stack([both[a:b].T @ both[a:b] for a, b in zip(edges[:-1], edges[1:], strict=True)])
+        )
 
     def share(self, columns: Sequence[int], beside: Sequence[int] = ()) -> Share:
         """Return what `columns` explain of the target beyond those `beside` which they stand."""
@@ -117,7 +125,11 @@ class BlockSums:
         size = np.sqrt(np.maximum(np.einsum("bii->bi", rest), np.finfo(float).tiny))
         scaled = rest / (size[:, :, None] * size[:, None, :]) + _RIDGE * np.eye(len(columns))
         found = np.linalg.solve(scaled, (right / size)[..., None])[..., 0] / size
-        return total - 2 * np.sum(found * moment, axis=1) + np.einsum("bi,bij,bj->b", found, inner, found)
+        return (
+            total
+            - 2 * np.sum(found * moment, axis=1)
+            + np.einsum("bi,bij,bj->b", found, inner, found)
+        )
 
 
 def from_own_past(signal: Pieces, lags: int) -> Share:
@@ -134,7 +146,9 @@ def from_lags(signal: Pieces, others: Sequence[Pieces], lags: Sequence[int]) -> 
         rows = range(max(lags), len(one))
         if len(rows):
             target.append(one[rows])
-            columns.append(np.column_stack([x[np.array(rows) - lag] for x in beside for lag in lags]))
+            columns.append(
+                np.column_stack([x[np.array(rows) - lag] for x in beside for lag in lags])
+            )
     count = 1 + len(lags) * len(others)
     if sum(map(len, target)) < 5 * count:
         return Share(0.0, 0.0)
@@ -148,8 +162,9 @@ def from_lags(signal: Pieces, others: Sequence[Pieces], lags: Sequence[int]) -> 
 def from_neighbours(x: Matrix, signal: Vector) -> Share:
     """Return what a smooth function of the rows x explains of a signal (N,), whatever its form.
 
-    Where two rows lie close to each other, their values differ by the rest alone: half the mean square of that is the
-    variance of the rest (Rice 1984). Where they lie far apart, as in many dimensions, it explains less than there is.
+    Where two rows lie close to each other, their values differ by the rest alone: half the mean
+    square of that is the variance of the rest (Rice 1984). Where they lie far apart, as in many
+    dimensions, it explains less than there is.
     """
     from scipy.spatial import KDTree
 
@@ -158,19 +173,24 @@ def from_neighbours(x: Matrix, signal: Vector) -> Share:
     if not scaled.size or len(x) < 4 * BLOCKS * _APART:
         return Share(0.0, 0.0)
     near = np.asarray(KDTree(scaled).query(scaled, 2 * _APART + 2)[1])
-    nearest = near[np.arange(len(x)), np.argmax(np.abs(near - np.arange(len(x))[:, None]) > _APART, axis=1)]
+    nearest = near[
+        np.arange(len(x)), np.argmax(np.abs(near - np.arange(len(x))[:, None]) > _APART, axis=1)
+    ]
     e = signal - signal.mean()
     both = np.stack([e**2, (e - e[nearest]) ** 2 / 2])
-    return Share.of(*np.stack([part.sum(axis=1) for part in np.array_split(both, BLOCKS, axis=1)], axis=1))
+    return Share.of(
+        *np.stack([part.sum(axis=1) for part in np.array_split(both, BLOCKS, axis=1)], axis=1)
+    )
 
 
 @dataclass(frozen=True)
 class Predictable:
     """Of one output's error, in the output's unit: its RMS, and which shares of its square could be predicted.
 
-    From its own past, from lagged inputs, each cross-validated, and from functions of the regressors: products and
-    curves, cross-validated as well, or one step ahead whatever lets neighbours have like errors. Two standard errors
-    are taken off; 0 where that is not surely more than nothing.
+    From its own past, from lagged inputs, each cross-validated, and from functions of the
+    regressors: products and curves, cross-validated as well, or one step ahead whatever lets
+    neighbours have like errors. Two standard errors are taken off; 0 where that is not surely more
+    than nothing.
     """
 
     name: str
@@ -180,7 +200,10 @@ class Predictable:
     functions: float
 
     def largest(self, own_past: bool = True) -> float:
-        """Return the largest share; without the own past where that is of no use, as in a free run."""
+        """Return the largest share.
+
+        Without the own past where that is of no use, as in a free run.
+        """
         return max(self.inputs, self.functions, self.own_past if own_past else 0.0)
 
 
@@ -204,7 +227,9 @@ def predictable(
         e = [piece[:, o] for piece in errors]
         whole, lags = np.concatenate(e), range(min(longest, min(map(len, e)) // 10) + 1)
         own = from_own_past(e, _PAST)
-        driven = from_lags(e, [[u[:, j] for u in inputs] for j in range(len(problem.record.inputs))], lags)
+        driven = from_lags(
+            e, [[u[:, j] for u in inputs] for j in range(len(problem.record.inputs))], lags
+        )
         curved = Share(0.0, 0.0)
         if len(columns) > 5 * columns.shape[1] > 5:
             curved = BlockSums.of(columns, whole[every]).share(range(1, columns.shape[1]), [0])

@@ -34,7 +34,10 @@ class RunPoint:
     regressor: dict[str, float]
 
     def __str__(self) -> str:
-        return f"{self.where} ({', '.join(f'{name} = {value:.4g}' for name, value in self.regressor.items())})"
+        return (
+            f"{self.where} "
+            f"({', '.join(f'{name} = {value:.4g}' for name, value in self.regressor.items())})"
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +51,10 @@ class RowIndex:
     def of(cls, lengths: Sequence[int], first: int) -> RowIndex:
         """So many rows of each experiment, from the row `first` on."""
         experiment = [np.full(length, i) for i, length in enumerate(lengths)]
-        return cls(np.concatenate(experiment), np.concatenate([np.arange(length) + first for length in lengths]))
+        return cls(
+            np.concatenate(experiment),
+            np.concatenate([np.arange(length) + first for length in lengths]),
+        )
 
     def __len__(self) -> int:
         return len(self.row)
@@ -59,12 +65,17 @@ class RowIndex:
 
     def and_nowhere(self, count: int) -> RowIndex:
         """With `count` points more that no run has visited."""
-        return RowIndex(*(np.concatenate([known, np.full(count, -1)]) for known in (self.experiment, self.row)))
+        return RowIndex(
+            *(np.concatenate([known, np.full(count, -1)]) for known in (self.experiment, self.row))
+        )
 
     def worst(
         self, record: Record, values: Vector, entries: Callable[[int], dict[str, float]]
     ) -> tuple[float | None, RunPoint | None]:
-        """Return the largest of the values (m,) and its place, with the entries of that point; None where none is finite."""
+        """Return the largest of the values (m,) and its place, with the entries of that point.
+
+        None where none is finite.
+        """
         values = np.where(np.isfinite(values), values, -1.0)
         if values.max(initial=-1.0) < 0:
             return None, None
@@ -89,14 +100,21 @@ class RunPoints:
 
     def take(self, which: Any) -> RunPoints:
         """Return those at the indices `which`, or where a mask is true."""
-        return replace(self, states=self.states[which], inputs=self.inputs[which], where=self.where.take(which))
+        return replace(
+            self, states=self.states[which], inputs=self.inputs[which], where=self.where.take(which)
+        )
 
     def with_box(self, of: RunPoints, count: int) -> RunPoints:
-        """With `count` points more, uniform in the box that others span; the same ones on every call."""
+        """With `count` points more, uniform in the box that others span.
+
+        The same ones on every call.
+        """
         if not count:
             return self
         spanned = np.hstack([of.states, of.inputs])
-        more = np.random.default_rng(0).uniform(spanned.min(axis=0), spanned.max(axis=0), (count, spanned.shape[1]))
+        more = np.random.default_rng(0).uniform(
+            spanned.min(axis=0), spanned.max(axis=0), (count, spanned.shape[1])
+        )
         states, inputs = np.split(more, [self.states.shape[1]], axis=1)
         where = self.where.and_nowhere(count)
         return replace(
@@ -106,8 +124,13 @@ class RunPoints:
             where=where,
         )
 
-    def worst(self, record: Record, values: Vector, describe: Describe) -> tuple[float | None, RunPoint | None]:
-        """Return the largest of the values (m,) and its place in words of the dynamics; None where no value is finite."""
+    def worst(
+        self, record: Record, values: Vector, describe: Describe
+    ) -> tuple[float | None, RunPoint | None]:
+        """Return the largest of the values (m,) and its place in words of the dynamics.
+
+        None where no value is finite.
+        """
         return self.where.worst(record, values, lambda i: describe(self.states[i], self.inputs[i]))
 
 
@@ -115,8 +138,8 @@ class RunPoints:
 class RunSample:
     """At most so many `points` of a run of `steps` steps, and where it `diverged`.
 
-    `unit` (n0,) is what counts as one in each entry of the state: the deviation of the measured output it stands for,
-    or else its own over the points.
+    `unit` (n0,) is what counts as one in each entry of the state: the deviation of the measured
+    output it stands for, or else its own over the points.
     """
 
     points: RunPoints
@@ -143,7 +166,9 @@ def visited_by(model: Model, record: Record, free_run: Response, most: int) -> R
     record, start, runs = usable(model, record), form.first_row, free_run.trajectories
     ends = [t.diverged[0] + 1 if t.diverged else len(t.model) for t in runs]
 
-    def states(i: int, experiment: Experiment, inputs: Matrix, rows: Int[np.ndarray, "r"]) -> Matrix:
+    def states(
+        i: int, experiment: Experiment, inputs: Matrix, rows: Int[np.ndarray, "r"]
+    ) -> Matrix:
         outputs = np.concatenate([experiment.outputs[:start], runs[i].model[start:]])
         return form.states_at(model.numbers, outputs, inputs, rows)
 
@@ -181,11 +206,18 @@ def _visits(
         pieces.append((states(i, experiment, inputs, rows), inputs[rows - form.first_row]))
     visited, inputs = (np.concatenate(piece) for piece in zip(*pieces, strict=True))
     points = RunPoints(visited, inputs, some)
-    return RunSample(points, len(every), _units(form, points, np.concatenate([e.outputs for e in record.experiments])))
+    return RunSample(
+        points,
+        len(every),
+        _units(form, points, np.concatenate([e.outputs for e in record.experiments])),
+    )
 
 
 def _units(form: Dynamics, points: RunPoints, outputs: Matrix) -> Vector:
-    """Return one over what an entry costs in deviations of the outputs; its own deviation where it is free."""
+    """Return one over what an entry costs in deviations of the outputs.
+
+    Its own deviation where it is free.
+    """
     if not len(points):
         return np.ones(form.states)  # of what may be too long for a matrix
     per_output = positive(outputs.std(axis=0))
@@ -195,7 +227,9 @@ def _units(form: Dynamics, points: RunPoints, outputs: Matrix) -> Vector:
 
 def evenly(count: int, most: int) -> Int[np.ndarray, "m"]:
     """At most `most` of `count` indices, spread evenly."""
-    return np.arange(count) if count <= most else np.linspace(0, count - 1, most).round().astype(int)
+    return (
+        np.arange(count) if count <= most else np.linspace(0, count - 1, most).round().astype(int)
+    )
 
 
 def positive(scale: Vector) -> Vector:

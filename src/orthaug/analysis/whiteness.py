@@ -15,18 +15,27 @@ import scipy.special
 from orthaug._base.checks import Vector
 from orthaug.fitting.colour import burg
 
-Pieces = Sequence[Vector] | Vector  # a signal in one piece per experiment; a plain vector is one experiment
+Pieces = (
+    Sequence[Vector] | Vector
+)  # a signal in one piece per experiment; a plain vector is one experiment
 
-CONSTANT = 64 * np.finfo(float).eps  # rounding of the mean: a smaller deviation, against the largest value, is none
+CONSTANT = (
+    64 * np.finfo(float).eps
+)  # rounding of the mean: a smaller deviation, against the largest value, is none
 LARGEST = 1e150  # squares of larger values overflow: a model that left all bounds has no statistics
-_FEW_LAGS = 100  # their products take half as long as the transforms at 10⁶ rows, twice as long at 10⁴
-ROWS_PER_LAG = 20  # with fewer, Ljung-Box rejects too often (3 % instead of 1 % at 4) and AIC overfits
+_FEW_LAGS = (
+    100  # their products take half as long as the transforms at 10⁶ rows, twice as long at 10⁴
+)
+ROWS_PER_LAG = (
+    20  # with fewer, Ljung-Box rejects too often (3 % instead of 1 % at 4) and AIC overfits
+)
 
 
 def autocorrelation(signal: Pieces, lags: int = 25) -> Vector | None:
     """r_e(τ) = Σ e_k e_{k−τ} / Σ e_k², e less its mean, for τ = 0…lags, (lags + 1,).
 
-    The mean is that of all experiments. Lags as long as the longest experiment are cut; None for a constant signal.
+    The mean is that of all experiments. Lags as long as the longest experiment are cut; None for a
+    constant signal.
     """
     values = cross_correlation(signal, signal, lags)
     return None if values is None else values[len(values) // 2 :]
@@ -35,7 +44,8 @@ def autocorrelation(signal: Pieces, lags: int = 25) -> Vector | None:
 def cross_correlation(residual: Pieces, inputs: Pieces, lags: int = 25) -> Vector | None:
     """r_eu(τ) = Σ e_k u_{k−τ} / √(Σ e_k² Σ u_k²), means removed, for τ = −lags…lags, (2 lags + 1,).
 
-    At τ ≥ 0 the residual follows the input. Lags are cut as in `autocorrelation`; None where one signal is constant.
+    At τ ≥ 0 the residual follows the input. Lags are cut as in `autocorrelation`; None where one
+    signal is constant.
     """
     e, u = standardised(residual), standardised(inputs)
     if e is None or u is None:
@@ -49,9 +59,13 @@ def _products(x: Vector, y: Vector, reach: int) -> Vector:
     if reach <= _FEW_LAGS or not len(x):
         own = max(min(reach, len(x) - 1), 0)
         lags = range(-own, own + 1)
-        found = [x[max(t, 0) : len(x) + min(t, 0)] @ y[max(-t, 0) : len(y) - max(t, 0)] for t in lags]
+        found = [
+            x[max(t, 0) : len(x) + min(t, 0)] @ y[max(-t, 0) : len(y) - max(t, 0)] for t in lags
+        ]
         return np.pad(found, reach - own)
-    size = 1 << (len(x) + reach).bit_length()  # zeros behind the record, so that it does not meet its start
+    size = (
+        1 << (len(x) + reach).bit_length()
+    )  # zeros behind the record, so that it does not meet its start
     products = np.fft.irfft(np.fft.rfft(x, size) * np.fft.rfft(y, size).conj(), size)
     return np.concatenate([products[size - reach :], products[: reach + 1]])
 
@@ -63,7 +77,10 @@ def pieces_of(signal: Pieces) -> list[Vector]:
 
 
 def standardised(signal: Pieces) -> list[Vector] | None:
-    """Less the mean of all samples, with a sum of squares of 1; None for a signal that is constant or not finite."""
+    """Less the mean of all samples, with a sum of squares of 1.
+
+    None for a signal that is constant or not finite.
+    """
     parts = pieces_of(signal)
     whole = np.concatenate(parts) if len(parts) else np.zeros(0)
     size = np.abs(whole).max(initial=0.0)
@@ -90,7 +107,10 @@ class LjungBox:
 
 @dataclass(frozen=True)
 class Normality:
-    """Jarque-Bera statistic (χ² with 2 degrees of freedom) and p-value; skewness and excess kurtosis."""
+    """Jarque-Bera statistic (χ² with 2 degrees of freedom) and p-value.
+
+    Skewness and excess kurtosis.
+    """
 
     statistic: float
     p: float
@@ -101,8 +121,9 @@ class Normality:
 def ljung_box(signal: Pieces, lags: int = 25, fitted: int = 0) -> LjungBox | None:
     """Whiteness: `Q = N (N + 2) Σ_τ r_e(τ)² / n_τ` ~ χ²(lags − fitted), τ = 1…lags (Ljung and Box 1978).
 
-    n_τ is the number of pairs of samples τ apart within experiments; for one experiment N − τ. At most a lag for every
-    20 rows; None for a residual that is constant, not finite, or shorter than that.
+    n_τ is the number of pairs of samples τ apart within experiments; for one experiment N − τ. At
+    most a lag for every 20 rows; None for a residual that is constant, not finite, or shorter than
+    that.
     """
     lengths = np.array([len(one) for one in pieces_of(signal)])
     n = int(lengths.sum())
@@ -123,7 +144,8 @@ def ljung_box_of(acf: Vector, pairs: Vector, n: int, fitted: int = 0) -> LjungBo
 def normality(signal: Pieces) -> Normality | None:
     """Jarque-Bera, `N/6 (S² + K²/4)` ~ χ²(2), of skewness S and excess kurtosis K (population moments).
 
-    For independent samples. The distribution is approached slowly: below some 2000 rows the p-value is rough.
+    For independent samples. The distribution is approached slowly: below some 2000 rows the p-value
+    is rough.
     """
     e = standardised(signal)
     if e is None:

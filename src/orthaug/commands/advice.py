@@ -1,9 +1,9 @@
 """Advice that was tried: changes of a spec, each refitted, and what it does to the free run where nothing was fitted.
 
-The model as it is and every change of it are fitted to the same rows and run over the same others: the validation part,
-or the last third of the training rows as one long run. A change is advised where it lowers the error there surely, by
-the rule that all models are compared by (`Ratio`). A few changes are tried, the same on every machine; the rest is
-counted.
+The model as it is and every change of it are fitted to the same rows and run over the same others:
+the validation part, or the last third of the training rows as one long run. A change is advised
+where it lowers the error there surely, by the rule that all models are compared by (`Ratio`). A few
+changes are tried, the same on every machine; the rest is counted.
 """
 
 from __future__ import annotations
@@ -30,7 +30,13 @@ from orthaug.physics.motion import HOLDS
 from orthaug.reports.findings import AdviceResult, AdviceTrialsResult, ChangeResult, SuspectResult
 from orthaug.reports.result import FitResult
 
-_SHAPES = {"linear": "{}", "jump": "sign({})", "absolute": "abs({})", "square": "{}**2", "cube": "{}**3"}
+_SHAPES = {
+    "linear": "{}",
+    "jump": "sign({})",
+    "absolute": "abs({})",
+    "square": "{}**2",
+    "cube": "{}**3",
+}
 _TERMS = 3  # suspected terms that are proposed
 _LITTLE = 0.05  # of what was learned or left: what explains less is not proposed
 _ROWS = 20_000  # of the residual that are looked at
@@ -60,7 +66,11 @@ class Proposal:
 
 def proposals(job: Job, result: FitResult, fit: Any) -> list[Proposal]:
     """Return what the findings of a fit suggest, the likeliest first, each once."""
-    if result.residuals is not None and result.residuals.verdict == "white" and not result.residuals.changes:
+    if (
+        result.residuals is not None
+        and result.residuals.verdict == "white"
+        and not result.residuals.changes
+    ):
         return _once(list(_suspected_terms(job, result, fit)) if _biased(result) else [])
     found = [
         *_missing_terms(job, result),
@@ -77,7 +87,9 @@ def _once(found: list[Proposal]) -> list[Proposal]:
 
 
 def _biased(result: FitResult) -> bool:
-    return any(row.bias is not None for row in (*result.parameters, *(result.physical_parameters or ())))
+    return any(
+        row.bias is not None for row in (*result.parameters, *(result.physical_parameters or ()))
+    )
 
 
 def _missing_terms(job: Job, result: FitResult) -> Iterator[Proposal]:
@@ -103,11 +115,15 @@ def _suspected_terms(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal
         elif left is not None:
             share, size = _residual_share(fit, entry, *left)
         positive = entry.name.startswith(_ZONE)
-        if (share or 0.0) > _LITTLE and not (positive and (size or 0.0) < 0):  # that would be no dead zone
+        if (share or 0.0) > _LITTLE and not (
+            positive and (size or 0.0) < 0
+        ):  # that would be no dead zone
             found.append((share or 0.0, entry, size, positive))
     for _, entry, size, positive in sorted(found, key=lambda one: -one[0])[:_TERMS]:
         where = entry.output if job.spec.motion is None else entry.equation
-        yield from _term(job, entry.expression, where, size or entry.coefficient, "", positive=positive)
+        yield from _term(
+            job, entry.expression, where, size or entry.coefficient, "", positive=positive
+        )
 
 
 def _residual_columns(fit: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -117,7 +133,12 @@ def _residual_columns(fit: Any) -> tuple[np.ndarray, np.ndarray]:
     phi = np.asarray(problem.baseline.phi(x, problem.layout, problem.outputs, np)) / unit[:, None]
     basis = np.linalg.qr(phi.reshape(-1, phi.shape[2]))[0]
     runs = fit.model.predict(problem.record).trajectories
-    error = np.concatenate([(run.measured - run.model)[problem.rows.start :] for run in runs])[:: _every(fit)] / unit
+    error = (
+        np.concatenate([(run.measured - run.model)[problem.rows.start :] for run in runs])[
+            :: _every(fit)
+        ]
+        / unit
+    )
     return basis, error.ravel() - basis @ (basis.T @ error.ravel())
 
 
@@ -126,12 +147,17 @@ def _every(fit: Any) -> int:
     return 1 + len(fit.problem.rows.x) // _ROWS
 
 
-def _residual_share(fit: Any, entry: SuspectResult, basis: np.ndarray, error: np.ndarray) -> tuple[float, float]:
+def _residual_share(
+    fit: Any, entry: SuspectResult, basis: np.ndarray, error: np.ndarray
+) -> tuple[float, float]:
     """Return the share of the one-step residual that a suspect explains beside the physics, and its coefficient."""
     problem = fit.problem
     constants = {SAMPLING_TIME: problem.record.sampling_time} | dict(problem.baseline.constants)
     suspect = Suspect(entry.name, entry.expression, entry.output, constants=constants)
-    column = suspect.values(problem.rows.x[:: _every(fit)], problem.layout, problem.outputs) / problem.deviation
+    column = (
+        suspect.values(problem.rows.x[:: _every(fit)], problem.layout, problem.outputs)
+        / problem.deviation
+    )
     rest = column.ravel() - basis @ (basis.T @ column.ravel())
     along, size = float(rest @ error), float(rest @ rest)
     if not size > _SPANNED * float(column.ravel() @ column.ravel()):
@@ -140,9 +166,18 @@ def _residual_share(fit: Any, entry: SuspectResult, basis: np.ndarray, error: np
 
 
 def _term(
-    job: Job, expression: str, equation: str | None, size: float | None, words: str, *, positive: bool = False
+    job: Job,
+    expression: str,
+    equation: str | None,
+    size: float | None,
+    words: str,
+    *,
+    positive: bool = False,
 ) -> Iterator[Proposal]:
-    """Yield the proposal of a term with its size as a parameter; nothing where the spec has the term."""
+    """Yield the proposal of a term with its size as a parameter.
+
+    Nothing where the spec has the term.
+    """
     spec, declared = job.spec, job.declaration
     name, initial = _new_name(job), float(size or 0.0)
     if spec.motion is not None:
@@ -162,10 +197,15 @@ def _term(
     else:
         terms = declared["baseline"]["terms"]
         several = len(spec.data.outputs) > 1
-        if any(_same(str(term["regressor"]), expression, term.get("output"), equation) for term in terms):
+        if any(
+            _same(str(term["regressor"]), expression, term.get("output"), equation)
+            for term in terms
+        ):
             return
         own_output = {"output": equation} if several and equation is not None else {}
-        change = {"baseline.terms": [*terms, {"parameter": name, "regressor": expression, **own_output}]}
+        change = {
+            "baseline.terms": [*terms, {"parameter": name, "regressor": expression, **own_output}]
+        }
         if spec.physics is not None:
             change[f"physics.parameters.{name}"] = {"initial": initial or 1.0}
             change[f"physics.theta.{name}"] = name
@@ -190,7 +230,12 @@ def _new_name(job: Job) -> str:
     spec, number = job.spec, 1
     taken = set(spec.data.inputs) | set(spec.data.outputs)
     if spec.motion is not None:
-        taken |= {*spec.motion.states, *spec.motion.parameters, *spec.motion.define, *spec.motion.constants}
+        taken |= {
+            *spec.motion.states,
+            *spec.motion.parameters,
+            *spec.motion.define,
+            *spec.motion.constants,
+        }
     elif spec.baseline is not None:
         taken |= {term.parameter for term in spec.baseline.terms} | set(spec.baseline.constants)
         taken |= set(spec.physics.parameters) if spec.physics is not None else set()
@@ -204,7 +249,9 @@ def _squeezed(text: str) -> str:
 
 
 def _same(one: str, other: str, output: str | None, equation: str | None) -> bool:
-    return _squeezed(one) == _squeezed(other) and (output is None or equation is None or output == equation)
+    return _squeezed(one) == _squeezed(other) and (
+        output is None or equation is None or output == equation
+    )
 
 
 def _predicted_changes(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal]:
@@ -214,8 +261,14 @@ def _predicted_changes(job: Job, result: FitResult, fit: Any) -> Iterator[Propos
             yield from _term(job, change.what, change.output, None, _lag_words(change))
         elif change.kind == "learner":
             yield from _learner(job, result, fit)
-        elif change.kind == "criterion" and not _compared(result) and change.what != CRITERIA.kind_of(fit.criterion):
-            yield Proposal(f'focus = "{change.what}"', {"training.focus": change.what}, refocuses=True)
+        elif (
+            change.kind == "criterion"
+            and not _compared(result)
+            and change.what != CRITERIA.kind_of(fit.criterion)
+        ):
+            yield Proposal(
+                f'focus = "{change.what}"', {"training.focus": change.what}, refocuses=True
+            )
 
 
 def _compared(result: FitResult) -> bool:
@@ -244,13 +297,19 @@ def _learner(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal]:
     now = spec.learner_inputs()
     if hidden and now is not None:
         yield Proposal(
-            f"a learner that also sees {', '.join(hidden)}", {"learner.inputs": [*now, *hidden]}, learns=True
+            f"a learner that also sees {', '.join(hidden)}",
+            {"learner.inputs": [*now, *hidden]},
+            learns=True,
         )
     wild = any(warning.code == "wild_rows" for warning in result.warnings)
     widths = getattr(bound.learner, "hidden", None)
     if not hidden and widths and not wild:
         wider = [_WIDER * width for width in widths]
-        yield Proposal(f"a learner of {' and '.join(map(str, wider))} neurons", {"learner.hidden": wider}, learns=True)
+        yield Proposal(
+            f"a learner of {' and '.join(map(str, wider))} neurons",
+            {"learner.hidden": wider},
+            learns=True,
+        )
 
 
 def _learner_for_equation(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal]:
@@ -262,13 +321,21 @@ def _learner_for_equation(job: Job, result: FitResult, fit: Any) -> Iterator[Pro
     if result.residuals.verdict != "unmodelled" or best.variable is None:
         return
     if job.spec.declared_learner() is None:
-        change = {f"motion.states.{best.equation}.learned": True, "learner": {"inputs": [best.variable]}}
+        change = {
+            f"motion.states.{best.equation}.learned": True,
+            "learner": {"inputs": [best.variable]},
+        }
         words = f"a learner that sees {best.variable} in the equation of {best.equation}"
         yield Proposal(words, change, learns=True)
         return
     now = job.spec.learner_inputs()
     learned = {job.problem.motion.names_of_states[i] for i in job.problem.motion.learned[0]}
-    if fit.model.form.bound is None or now is None or best.equation not in learned or _reads(now, best.variable):
+    if (
+        fit.model.form.bound is None
+        or now is None
+        or best.equation not in learned
+        or _reads(now, best.variable)
+    ):
         return
     change = {"learner.inputs": [*now, best.variable]}
     yield Proposal(f"a learner that also sees {best.variable}", change, learns=True)
@@ -291,7 +358,10 @@ def _holds(job: Job, result: FitResult) -> Iterator[Proposal]:
 
 
 _PIECES = 3  # of the training rows, the last of which is held out where there is no validation part
-_MOST, _MOST_OF_A_MOTION = 3, 2  # changes that are tried: together they take about as long as the fit
+_MOST, _MOST_OF_A_MOTION = (
+    3,
+    2,
+)  # changes that are tried: together they take about as long as the fit
 _SAME = 1e-6  # relative: two terms of one error span the same beside the physics, as a dead zone and a limit
 _LISTED = 3  # changes without gain that the text names
 
@@ -314,7 +384,13 @@ class ValidationRows:
             InputError: too few rows.
         """
         if job.validation is not None:
-            return cls(job.train.record, job.validation.record, job.validation.skips, "the validation part", "")
+            return cls(
+                job.train.record,
+                job.validation.record,
+                job.validation.skips,
+                "the validation part",
+                "",
+            )
         training, held = blocked(job.train.record, _PIECES, job.first_row)[-1]
         return cls(training, held, 0, "rows held out", " (the last third of the training data)")
 
@@ -351,10 +427,17 @@ class Trials:
             InputError: the change is not possible; ValueError likewise.
         """
         fixed = {} if self.substeps is None else {"motion.substeps": self.substeps}
-        return self.job.changed(spec_model().model_validate(changed(self.job.declaration, change | fixed)))
+        return self.job.changed(
+            spec_model().model_validate(changed(self.job.declaration, change | fixed))
+        )
 
-    def run(self, job: Job, variant: Variant, accepts: Callable[[Any], bool] = lambda fit: True) -> Pieces | None:
-        """Squared errors of the free run of a job's model; None where there is none, or it is not accepted."""
+    def run(
+        self, job: Job, variant: Variant, accepts: Callable[[Any], bool] = lambda fit: True
+    ) -> Pieces | None:
+        """Squared errors of the free run of a job's model.
+
+        None where there is none, or it is not accepted.
+        """
         try:
             fit = job.fold_fit(variant)(self.rows.training)
             if not fit.status.ok or not accepts(fit):
@@ -391,7 +474,9 @@ def changed(declaration: dict[str, Any], change: dict[str, Any]) -> dict[str, An
     return found
 
 
-def advise(job: Job, fit: Any, result: FitResult) -> tuple[list[AdviceResult], AdviceTrialsResult] | None:
+def advise(
+    job: Job, fit: Any, result: FitResult
+) -> tuple[list[AdviceResult], AdviceTrialsResult] | None:
     """Return the changes that better the free run where nothing was fitted, and an account of all trials.
 
     None where nothing is proposed, or nothing can be tried.
@@ -420,31 +505,50 @@ def _concluded(
     base: Pieces, tried: Sequence[ProposalErrors], rows: ValidationRows, left: int, learns: bool
 ) -> tuple[list[AdviceResult], AdviceTrialsResult]:
     before = math.sqrt(mean_square(base))
-    helps = [one for one in tried if one.pieces is not None and _ratio(one.pieces, base).code == "helps"]
+    helps = [
+        one for one in tried if one.pieces is not None and _ratio(one.pieces, base).code == "helps"
+    ]
     better: list[ProposalErrors] = []
     for one in sorted(helps, key=lambda one: one.error):
         if not any(math.isclose(one.error, other.error, rel_tol=_SAME) for other in better):
             better.append(one)
     advice = [
-        AdviceResult(change=one.proposal.change, text=_advice_text(one, before, rows), before=before, after=one.error)
+        AdviceResult(
+            change=one.proposal.change,
+            text=_advice_text(one, before, rows),
+            before=before,
+            after=one.error,
+        )
         for one in better
     ]
     worse = [one for one in tried if one not in helps]
-    text = f"Tried by a refit of {'physics and learner' if learns else 'the physics'} and a free run over {rows.where}"
-    text += f"{rows.which}: {counted(len(tried), 'change')} of the spec, {_which(len(helps), len(tried))}."
+    text = (
+        f"Tried by a refit of {'physics and learner' if learns else 'the physics'} and a free "
+        f"run over {rows.where}"
+    )
+    text += (
+        f"{rows.which}: {counted(len(tried), 'change')} of the spec, "
+        f"{_which(len(helps), len(tried))}."
+    )
     if worse:
         named = "; ".join(f"{one.proposal.words} ({_after(one)})" for one in worse[:_LISTED])
         more = f" and {len(worse) - _LISTED} more" if len(worse) > _LISTED else ""
         text += f" No gain from {_error(before)}: {named}{more}."
     if left:
-        text += f" {counted(left, 'change')} {'was' if left == 1 else 'were'} not tried, to spare time."
+        text += (
+            f" {counted(left, 'change')} {'was' if left == 1 else 'were'} not tried, to spare time."
+        )
     return advice, AdviceTrialsResult(text=text, tried=len(tried), not_tried=left)
 
 
 def _which(better: int, tried: int) -> str:
     if tried == 1:
         return "which betters it" if better else "which does not better it"
-    return f"of which {'none betters' if not better else 'one betters' if better == 1 else f'{better} better'} it"
+    return (
+        "of which "
+        f"{'none betters' if not better else 'one betters' if better == 1 else f'{better} better'} "
+        "it"
+    )
 
 
 def _ratio(pieces: Pieces, base: Pieces) -> Ratio:
@@ -460,12 +564,23 @@ def _advice_text(one: ProposalErrors, before: float, rows: ValidationRows) -> st
     alone = " of physics alone" if one.physics_only else ""
     text = f"With {one.proposal.words} the free run{alone} on {rows.where}"
     if math.isinf(before):
-        return f"{text} no longer diverges: its error is {_error(one.error)} of the output's deviation."
-    return f"{text} improves from {_error(before)} to {_error(one.error)} of the output's deviation."
+        return (
+            f"{text} no longer diverges: its error is {_error(one.error)} of the output's "
+            "deviation."
+        )
+    return (
+        f"{text} improves from {_error(before)} to {_error(one.error)} of the output's deviation."
+    )
 
 
 def _after(one: ProposalErrors) -> str:
-    return "no fit" if one.pieces is None else "diverges" if math.isinf(one.error) else _error(one.error)
+    return (
+        "no fit"
+        if one.pieces is None
+        else "diverges"
+        if math.isinf(one.error)
+        else _error(one.error)
+    )
 
 
 def _error(value: float) -> str:

@@ -12,7 +12,13 @@ from orthaug._base.progress import LOG
 
 T = TypeVar("T")
 _NUMERICAL = (ArithmeticError, np.linalg.LinAlgError)
-DEFECTS: tuple[type[BaseException], ...] = (AttributeError, IndexError, KeyError, TypeError, ValueError)
+DEFECTS: tuple[type[BaseException], ...] = (
+    AttributeError,
+    IndexError,
+    KeyError,
+    TypeError,
+    ValueError,
+)
 
 
 def attempt(what: str, analysis: Callable[[], T], warnings: list[Any], otherwise: T) -> T:
@@ -27,12 +33,17 @@ def attempt(what: str, analysis: Callable[[], T], warnings: list[Any], otherwise
     try:
         return analysis()
     except _NUMERICAL as error:
-        told = f"{what} failed numerically ({str(error).rstrip('.')}): the result stands without it."
+        told = (
+            f"{what} failed numerically ({str(error).rstrip('.')}): the result stands without it."
+        )
     except InputError:
         raise
     except DEFECTS as error:
         LOG.info("%s failed", what, exc_info=True)
-        told = f"{what} failed by a defect of orthaug ({type(error).__name__}: {error}): the result stands without it."
+        told = (
+            f"{what} failed by a defect of orthaug ({type(error).__name__}: {error}): the "
+            "result stands without it."
+        )
     warnings.append(Warning("analysis_failed", told))
     return otherwise
 
@@ -40,7 +51,10 @@ def attempt(what: str, analysis: Callable[[], T], warnings: list[Any], otherwise
 def attempt_warned(
     what: str, analysis: Callable[[], T | None], warnings: list[Any], without: Warning | None = None
 ) -> T | None:
-    """As `attempt`, with the warnings that the finding has, or `without` where there is none; None where it fails."""
+    """As `attempt`, with the warnings that the finding has, or `without` where there is none.
+
+    None where it fails.
+    """
 
     def found() -> T | None:
         finding: Any = analysis()

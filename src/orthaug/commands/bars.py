@@ -24,9 +24,13 @@ if TYPE_CHECKING:
     from rich.progress import ProgressColumn
 
 TOLD_AS = "ORTHAUG_PROGRESS"
-"""Variable of the environment; where it is `json`, training tells of itself by lines of JSON on standard error."""
+"""Variable of the environment; where it is `json`, training tells of itself by lines of JSON on
+standard error.
+"""
 ENOUGH = threading.Event()
-"""Of the process: once it is set, training ends with what it has reached, as a result with the warning `stopped`."""
+"""Of the process: once it is set, training ends with what it has reached, as a result with the
+warning `stopped`.
+"""
 ENOUGH_LINE = b"enough\n"
 """What sets it, on the standard input of a child of the page."""
 _OFTEN = 0.02  # s between such lines
@@ -36,25 +40,35 @@ _SEEN = 3  # models after which the time of the rest is told: the first ones com
 
 
 def on_terminal() -> bool:
-    """Return whether a person sees standard error. FORCE_COLOR, which build servers set, does not make it one."""
+    """Return whether a person sees standard error.
+
+    FORCE_COLOR, which build servers set, does not make it one.
+    """
     return sys.stderr is not None and sys.stderr.isatty()
 
 
 def drawn_bar(*columns: ProgressColumn, transient: bool = True) -> Bar:
-    """Return a bar with its description and these columns, drawn on a terminal only. NO_COLOR is heeded."""
+    """Return a bar with its description and these columns, drawn on a terminal only.
+
+    NO_COLOR is heeded.
+    """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn
 
     shown = (TextColumn("{task.description}"), BarColumn(), *columns)
-    return Progress(*shown, console=Console(stderr=True), transient=transient, disable=not on_terminal())
+    return Progress(
+        *shown, console=Console(stderr=True), transient=transient, disable=not on_terminal()
+    )
 
 
 @contextmanager
-def training_bar(runs: int, iterations: int, wanted: bool = True, rows: int = 0) -> Iterator[Progress]:
+def training_bar(
+    runs: int, iterations: int, wanted: bool = True, rows: int = 0
+) -> Iterator[Progress]:
     """A progress bar on standard error where that is a terminal; Ctrl-C says what it stopped.
 
-    Args:
-        rows: of the training data. Where there are many, it says how many are gone through in a second.
+    Args: rows: of the training data. Where there are many, it says how many are gone through in a
+        second.
     """
     if not wanted:
         yield SILENT
@@ -94,7 +108,10 @@ def training_bar(runs: int, iterations: int, wanted: bool = True, rows: int = 0)
 
 
 class _Lines:
-    """Writes a line of JSON now and then, for a program that follows this one; nothing unless it is asked for."""
+    """Writes a line of JSON now and then, for a program that follows this one.
+
+    Nothing unless it is asked for.
+    """
 
     def __init__(self, runs: int, iterations: int) -> None:
         self.runs, self.iterations = runs, iterations
@@ -109,16 +126,28 @@ class _Lines:
         if not self._wanted or time.monotonic() - self._last < _OFTEN:
             return
         self._last = time.monotonic()
-        told = {"run": run + 1, "runs": self.runs, "iteration": iteration, "iterations": self.iterations}
+        told = {
+            "run": run + 1,
+            "runs": self.runs,
+            "iteration": iteration,
+            "iterations": self.iterations,
+        }
         share = min(1.0, passes / max(self.runs * self.iterations, 1))
         own = run - self._first  # one that is made again has a number after those that are planned
         known = self._plan[own] if 0 <= own < len(self._plan) else {}
-        streams.say(json.dumps({**told, "loss": loss if math.isfinite(loss) else None, "done": share, **known}))
+        streams.say(
+            json.dumps(
+                {**told, "loss": loss if math.isfinite(loss) else None, "done": share, **known}
+            )
+        )
 
 
 @contextmanager
 def study_bars() -> Iterator[Callable[[str, int, int], None]]:
-    """A bar per study on standard error where that is a terminal; Ctrl-C stops after the run at hand."""
+    """A bar per study on standard error where that is a terminal.
+
+    Ctrl-C stops after the run at hand.
+    """
     from rich.progress import MofNCompleteColumn, TimeElapsedColumn
 
     reached = "the start of the studies"
@@ -143,9 +172,12 @@ def study_bars() -> Iterator[Callable[[str, int, int], None]]:
 
 @contextmanager
 def selection_bar(most: int) -> Iterator[Callable[[str, Any], None]]:
-    """A bar of the models that were judged, on standard error; Ctrl-C keeps what there is, a second one ends at once.
+    """A bar of the models that were judged, on standard error.
 
-    Once terms have been judged for a while, it says what the rest takes at most, also where there is no terminal.
+    Ctrl-C keeps what there is, a second one ends at once.
+
+    Once terms have been judged for a while, it says what the rest takes at most, also where there
+    is no terminal.
     """
     from rich.progress import MofNCompleteColumn, TimeElapsedColumn, TimeRemainingColumn
 
@@ -165,7 +197,10 @@ def selection_bar(most: int) -> Iterator[Callable[[str, Any], None]]:
             bar.update(tasks[stage], advance=1)
             whole = done[-1] * most
             if stage == "terms" and len(done) == _SEEN and whole > _LONG and not on_terminal():
-                say(f"note: a model takes {done[-1]:.1f} s; at most {most} are judged, {whole:.0f} s.")
+                say(
+                    f"note: a model takes {done[-1]:.1f} s; at most {most} are judged, "
+                    f"{whole:.0f} s."
+                )
             if asked.is_set():
                 raise KeyboardInterrupt
 
@@ -185,7 +220,9 @@ def _asked_to_stop() -> Iterator[threading.Event]:
 
 @contextmanager
 def _deferred_interrupt() -> Iterator[threading.Event]:
-    """Ctrl-C sets the event, so that it never lands inside compiled code; a second one interrupts at once.
+    """Ctrl-C sets the event, so that it never lands inside compiled code.
+
+    A second one interrupts at once.
 
     Where a thread watches for signals, it ends the program itself.
     """
@@ -229,7 +266,9 @@ def _display() -> Any:
 def _in_notebook(display: Any) -> Iterator[ProgressCallback]:
     lock, began = threading.Lock(), time.monotonic()
     runs: dict[int, tuple[int, float]] = {}
-    handle: Any = display({"text/html": _line("compiling", ended=False), "text/plain": ""}, raw=True, display_id=True)
+    handle: Any = display(
+        {"text/html": _line("compiling", ended=False), "text/plain": ""}, raw=True, display_id=True
+    )
 
     def show(words: str, *, ended: bool) -> None:
         handle.update({"text/html": _line(words, ended=ended), "text/plain": words}, raw=True)
@@ -243,7 +282,10 @@ def _in_notebook(display: Any) -> Iterator[ProgressCallback]:
         yield tell
     finally:
         steps = sum(iteration for iteration, _ in runs.values())
-        show(f"{len(runs) or 1} runs, {steps} iterations, {time.monotonic() - began:.1f} s", ended=True)
+        show(
+            f"{len(runs) or 1} runs, {steps} iterations, {time.monotonic() - began:.1f} s",
+            ended=True,
+        )
 
 
 def _on_terminal() -> Iterator[ProgressCallback]:
@@ -251,7 +293,9 @@ def _on_terminal() -> Iterator[ProgressCallback]:
 
     with drawn_bar(TimeElapsedColumn()) as shown:
         task = shown.add_task("compiling", total=None)
-        yield lambda run, iteration, loss: shown.update(task, description=_words(run, iteration, loss))
+        yield lambda run, iteration, loss: shown.update(
+            task, description=_words(run, iteration, loss)
+        )
 
 
 def _words(run: int, iteration: int, loss: float) -> str:
@@ -260,5 +304,9 @@ def _words(run: int, iteration: int, loss: float) -> str:
 
 def _line(words: str, *, ended: bool) -> str:
     """Return a bar that moves as long as it is not known how long it takes."""
-    moving = "" if ended else '<progress aria-label="training" style="vertical-align:middle"></progress> '
+    moving = (
+        ""
+        if ended
+        else '<progress aria-label="training" style="vertical-align:middle"></progress> '
+    )
     return f"<div>{moving}{escape(words)}</div>"

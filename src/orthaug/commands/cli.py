@@ -1,4 +1,7 @@
-"""The command line: arguments in, text out. Results go to standard output, progress and errors to standard error."""
+"""The command line: arguments in, text out.
+
+Results go to standard output, progress and errors to standard error.
+"""
 
 from __future__ import annotations
 
@@ -54,7 +57,9 @@ def demo(out: OutFolder = None, force: Force = False) -> None:
 def check(
     spec: SpecPath,
     as_json: AsJson = False,
-    figure: Annotated[Path | None, typer.Option("--figure", metavar="PNG", help="Heat map of the biases.")] = None,
+    figure: Annotated[
+        Path | None, typer.Option("--figure", metavar="PNG", help="Heat map of the biases.")
+    ] = None,
     force: Force = False,
 ) -> None:
     """Report excitation and identifiability; trains nothing."""
@@ -81,7 +86,9 @@ def check(
 def fit(
     spec: SpecPath,
     out: OutFolder = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on from where an earlier fit was ended.")] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on from where an earlier fit was ended.")
+    ] = False,
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
@@ -107,7 +114,8 @@ def fit(
     tell(fitted.result, fit_text(fitted.fit, fitted.result), as_json, folder)
     if not fitted.fit.status.ok:
         raise TrainingError(
-            f"{fitted.result.status.message.removesuffix('.')}. The account is in {folder / 'result.json'}."
+            f"{fitted.result.status.message.removesuffix('.')}. The account is in "
+            f"{folder / 'result.json'}."
         )
 
 
@@ -116,7 +124,8 @@ def compare(
     spec: SpecPath,
     out: OutFolder = None,
     model: Annotated[
-        list[Path] | None, typer.Option("--model", metavar="MODEL", help="A saved model to put beside; any number.")
+        list[Path] | None,
+        typer.Option("--model", metavar="MODEL", help="A saved model to put beside; any number."),
     ] = None,
     as_json: AsJson = False,
     force: Force = False,
@@ -171,7 +180,9 @@ def design(
 
 
 @app.command()
-def select(spec: SpecPath, out: OutFolder = None, as_json: AsJson = False, force: Force = False) -> None:
+def select(
+    spec: SpecPath, out: OutFolder = None, as_json: AsJson = False, force: Force = False
+) -> None:
     """Choose orders, delay and terms, and write a spec with them.
 
     Or a network's width and inputs: [selection] of the spec.
@@ -196,12 +207,19 @@ def select(spec: SpecPath, out: OutFolder = None, as_json: AsJson = False, force
 @app.command(cls=ListOptionCommand)
 def init(
     data: Annotated[Path, typer.Argument(metavar="DATA", help="Data file.")],
-    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="The spec to write.")] = Path("spec.toml"),
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="The spec to write.")] = Path(
+        "spec.toml"
+    ),
     inputs: Annotated[
-        list[str] | None, typer.Option("--inputs", metavar="A B", help="Columns of the inputs; A,B as well.")
+        list[str] | None,
+        typer.Option("--inputs", metavar="A B", help="Columns of the inputs; A,B as well."),
     ] = None,
-    outputs: Annotated[list[str] | None, typer.Option("--outputs", metavar="Y", help="Columns of the outputs.")] = None,
-    sampling_time: Annotated[float | None, typer.Option("--sampling-time", metavar="S", help="Between rows.")] = None,
+    outputs: Annotated[
+        list[str] | None, typer.Option("--outputs", metavar="Y", help="Columns of the outputs.")
+    ] = None,
+    sampling_time: Annotated[
+        float | None, typer.Option("--sampling-time", metavar="S", help="Between rows.")
+    ] = None,
     force: Force = False,
 ) -> None:
     """Look at a data file, and write a first spec that runs.
@@ -232,8 +250,16 @@ def init(
         if outputs is None:
             outputs = [_asked("outputs", partial(assign, found, inputs), default=None)]
         roles = assign(found, inputs, outputs, sampling_time)
-    if roles is not None and sampling_time is None and found.clock.step is None and sys.stdin.isatty():
-        roles = replace(roles, sampling_time=check_step(typer.prompt("seconds between rows", type=float, default=1.0)))
+    if (
+        roles is not None
+        and sampling_time is None
+        and found.clock.step is None
+        and sys.stdin.isatty()
+    ):
+        roles = replace(
+            roles,
+            sampling_time=check_step(typer.prompt("seconds between rows", type=float, default=1.0)),
+        )
     assert roles is not None  # both are given
     told("looking at signals, delays and orders")
     spec = draft(found, roles, out)
@@ -247,7 +273,10 @@ def _unsaid(line: str) -> None:
 
 
 def _asked(text: str, check: Callable[[str], Any], default: str | None = "") -> str:
-    """Return an answer that `check` accepts; what is wrong with another one is said, and it is asked again."""
+    """Return an answer that `check` accepts.
+
+    What is wrong with another one is said, and it is asked again.
+    """
     from orthaug._base.errors import InputError
 
     while True:
@@ -265,8 +294,12 @@ def page(
     spec: Annotated[
         Path | None, typer.Argument(metavar="[SPEC]", help="Spec to begin with; it is not written.")
     ] = None,
-    port: Annotated[int | None, typer.Option("--port", metavar="N", help="A free one without it.")] = None,
-    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open it in the browser.")] = True,
+    port: Annotated[
+        int | None, typer.Option("--port", metavar="N", help="A free one without it.")
+    ] = None,
+    browser: Annotated[
+        bool, typer.Option("--browser/--no-browser", help="Open it in the browser.")
+    ] = True,
 ) -> None:
     """A page on this machine to do all of this in a browser.
 
@@ -283,8 +316,8 @@ def schema(
         str,
         typer.Argument(
             metavar="[WHAT]",
-            help="fit, check, compare, split, design, select, explain, linearize or track: what the command writes; "
-            "spec: a spec file; keys: every key of a spec, in words.",
+            help="fit, check, compare, split, design, select, explain, linearize or track: what "
+            "the command writes; spec: a spec file; keys: every key of a spec, in words.",
         ),
     ] = "fit",
 ) -> None:
@@ -300,14 +333,24 @@ def schema(
 
 @app.command()
 def reproduce(
-    name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="One study; all without it.")] = None,
+    name: Annotated[
+        str | None, typer.Argument(metavar="[NAME]", help="One study; all without it.")
+    ] = None,
     out: OutFolder = None,
     pipeline: Annotated[
-        str, typer.Option("--pipeline", metavar="ours|paper|scripts", help="Who trains; scripts: as published.")
+        str,
+        typer.Option(
+            "--pipeline", metavar="ours|paper|scripts", help="Who trains; scripts: as published."
+        ),
     ] = "ours",
-    small: Annotated[bool, typer.Option("--small", help="The reduced size that the tests run.")] = False,
+    small: Annotated[
+        bool, typer.Option("--small", help="The reduced size that the tests run.")
+    ] = False,
     scheduler: Annotated[
-        str | None, typer.Option("--scheduler", metavar="ADDRESS", help="A Dask cluster whose workers make the runs.")
+        str | None,
+        typer.Option(
+            "--scheduler", metavar="ADDRESS", help="A Dask cluster whose workers make the runs."
+        ),
     ] = None,
     force: Force = False,
 ) -> None:
@@ -328,7 +371,9 @@ def reproduce(
 
         client = connected(scheduler, None)
     with study_bars() as progress:
-        reproduced = reproduction.reproduce(entries, pipeline=pipeline, small=small, progress=progress, client=client)
+        reproduced = reproduction.reproduce(
+            entries, pipeline=pipeline, small=small, progress=progress, client=client
+        )
     reproduction.write(reproduced, folder, pipeline, force=force)
     streams.echo(f"{reproduction.text(reproduced)}\n\nwritten to {folder}/index.html")
 

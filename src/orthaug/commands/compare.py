@@ -14,7 +14,14 @@ from orthaug._base.folders import whole_folder
 from orthaug._base.progress import SILENT, Progress
 from orthaug.analysis.validation import Verdict, dominance
 from orthaug.commands.doubts import doubted
-from orthaug.commands.fit import FitReport, cross_validated, fit_variant, judge_fit, score_part, wanted_blocks
+from orthaug.commands.fit import (
+    FitReport,
+    cross_validated,
+    fit_variant,
+    judge_fit,
+    score_part,
+    wanted_blocks,
+)
 from orthaug.commands.job import ALONE, Job, Variant, origin_of
 from orthaug.data.record import same_step
 from orthaug.fitting.criteria import Criterion, Prediction
@@ -35,7 +42,9 @@ class Comparison:
     result: CompareResult
 
     def __repr__(self) -> str:
-        codes = {kind: self.verdicts[kind].code if kind in self.verdicts else "–" for kind in self.fitted}
+        codes = {
+            kind: self.verdicts[kind].code if kind in self.verdicts else "–" for kind in self.fitted
+        }
         return f"Comparison({', '.join(f'{kind}: {code}' for kind, code in codes.items())})"
 
     def summary(self) -> str:
@@ -48,8 +57,9 @@ class Comparison:
 def compare(job: Job, saved: Sequence[Path] = (), progress: Progress = SILENT) -> Comparison:
     """Fit every structure as the spec trains, score each on every part, and put saved models beside them.
 
-    A structure that the spec does not allow (a baseline penalty with an initial value of 0) is left out with
-    the reason. With a validation part the row of the lowest error there is marked as chosen.
+    A structure that the spec does not allow (a baseline penalty with an initial value of 0) is left
+    out with the reason. With a validation part the row of the lowest error there is marked as
+    chosen.
     """
     models = {str(path): _matching(path, job) for path in saved}
     fitted, left_out = {}, {}
@@ -60,10 +70,16 @@ def compare(job: Job, saved: Sequence[Path] = (), progress: Progress = SILENT) -
         if refusal is not None:
             left_out[kind] = refusal
             continue
-        if decided is not None and kind == job.spec.structure.kind and decided.fit.model.form.bound is not None:
+        if (
+            decided is not None
+            and kind == job.spec.structure.kind
+            and decided.fit.model.form.bound is not None
+        ):
             fitted[kind] = decided
             continue
-        fitted[kind] = doubted(fit_variant(job, variant, progress.after(runs=number * job.run_count)))
+        fitted[kind] = doubted(
+            fit_variant(job, variant, progress.after(runs=number * job.run_count))
+        )
     verdicts = _verdicts(job, fitted)
     rows = [_row(kind, fit, verdicts.get(kind)) for kind, fit in fitted.items()]
     rows += [_saved_row(name, model, job) for name, model in models.items()]
@@ -99,9 +115,14 @@ def _verdicts(job: Job, fitted: dict[str, FitReport]) -> dict[str, Verdict]:
     if simulates or not blocks:  # free runs were chosen by the same trials
         trials = [None] * len(kinds)
     else:
-        trials = cross_validated(job, blocks, [Variant(kind, criterion=criterion) for kind in kinds])
+        trials = cross_validated(
+            job, blocks, [Variant(kind, criterion=criterion) for kind in kinds]
+        )
     ran = fitted[ALONE].responses
-    verdicts = {k: judge_fit(fitted[k], lambda: alone, own, ran) for k, own in zip(kinds, trials, strict=True)}
+    verdicts = {
+        k: judge_fit(fitted[k], lambda: alone, own, ran)
+        for k, own in zip(kinds, trials, strict=True)
+    }
     return {kind: verdict for kind, verdict in verdicts.items() if verdict is not None}
 
 
@@ -130,7 +151,9 @@ def compare_report(comparison: Comparison) -> str:
         for name, fitted in comparison.fitted.items()
         if fitted.responses
     }
-    return compare_page(ComparePage(origin_of(comparison.job, "compare"), comparison.result, responses))
+    return compare_page(
+        ComparePage(origin_of(comparison.job, "compare"), comparison.result, responses)
+    )
 
 
 def _matching(path: Path, job: Job) -> Model | MotionModel:
@@ -143,12 +166,14 @@ def _matching(path: Path, job: Job) -> Model | MotionModel:
         raise InputError(f"{path}: uses the input {', '.join(lacking)}; the spec has {known}.")
     if not same_step(model.sampling_time, record.sampling_time):
         raise InputError(
-            f"{path}: sampled every {model.sampling_time:g} s, the spec's data every {record.sampling_time:g} s."
+            f"{path}: sampled every {model.sampling_time:g} s, the spec's data every "
+            f"{record.sampling_time:g} s."
         )
     wanted = [c.name for c in record.outputs]
     if [c.name for c in model.outputs] != wanted:
         raise InputError(
-            f"{path}: its outputs are {', '.join(c.name for c in model.outputs)}; expected {', '.join(wanted)}."
+            f"{path}: its outputs are {', '.join(c.name for c in model.outputs)}; expected "
+            f"{', '.join(wanted)}."
         )
     return model
 
@@ -164,14 +189,21 @@ def _row(kind: str, fitted: FitReport, verdict: Verdict | None) -> RowResult:
 def _saved_row(name: str, model: Model | MotionModel, job: Job) -> RowResult:
     warnings: list[Any] = []
     scores = {part.name: score_part(model, part, warnings)[0] for part in job.parts}
-    return _row_of(name, model, scores, warnings, status="saved", parameters=parameter_rows(*model.estimated))
+    return _row_of(
+        name, model, scores, warnings, status="saved", parameters=parameter_rows(*model.estimated)
+    )
 
 
-def _row_of(name: str, model: Model | MotionModel, scores: Any, warnings: Sequence[Any], **told: Any) -> RowResult:
+def _row_of(
+    name: str, model: Model | MotionModel, scores: Any, warnings: Sequence[Any], **told: Any
+) -> RowResult:
     """Return a row; null for what is not `told`."""
     own = {"name": name, "weights": model.form.bound.size if model.form.bound else 0}
     return RowResult.model_validate(
-        dict.fromkeys(RowResult.model_fields) | own | {"scores": scores, "warnings": warnings} | told
+        dict.fromkeys(RowResult.model_fields)
+        | own
+        | {"scores": scores, "warnings": warnings}
+        | told
     )
 
 

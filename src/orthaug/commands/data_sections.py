@@ -12,7 +12,15 @@ from pydantic import Field, model_validator
 from orthaug._base.checks import check_label
 from orthaug._base.errors import InputError
 from orthaug._base.memory import available
-from orthaug.commands.sections import Count, Finite, KindSection, PhysicalSection, Positive, Section, with_kinds
+from orthaug.commands.sections import (
+    Count,
+    Finite,
+    KindSection,
+    PhysicalSection,
+    Positive,
+    Section,
+    with_kinds,
+)
 from orthaug.data.preparation import STEPS
 from orthaug.data.record import LONGEST_STEP
 from orthaug.physics.motion import HOLDS, INTEGRATORS, MOST_SUBSTEPS, Motion, Output, State
@@ -90,7 +98,10 @@ class Data(Section):
         for name in self.tests:
             check_label(name, "the name of a test")
             if name in ("train", "validation"):
-                raise ValueError(f"`tests.{name}` has the name of another part of the data; expected another name")
+                raise ValueError(
+                    f"`tests.{name}` has the name of another part of the data; expected "
+                    "another name"
+                )
         return self
 
     def _no_channel(self, name: str) -> str:
@@ -99,11 +110,15 @@ class Data(Section):
         open_names = [other for other in known if other not in self.channels]
         close = difflib.get_close_matches(name, open_names, n=1)
         if not close:
-            return f"`channels.{name}` is neither an input nor an output; expected one of {', '.join(known)}"
+            return (
+                f"`channels.{name}` is neither an input nor an output; expected one of "
+                f"{', '.join(known)}"
+            )
         kind = "inputs" if close[0] in self.inputs else "outputs"
         return (
-            f"`channels.{name}` is neither an input nor an output, and `{kind}` has '{close[0]}', of which `channels` "
-            "knows nothing; expected the same name in both, so one of them is misspelt"
+            f"`channels.{name}` is neither an input nor an output, and `{kind}` has "
+            f"'{close[0]}', of which `channels` knows nothing; expected the same name in both, "
+            "so one of them is misspelt"
         )
 
 
@@ -145,7 +160,10 @@ def engine_of(section: EngineSection, kind: str) -> Engine:
 
         hosts.join()
         if hosts.several() and section.devices is not None:
-            raise InputError(f"`engine.devices`: found {section.devices}; over several hosts all devices are used.")
+            raise InputError(
+                f"`engine.devices`: found {section.devices}; over several hosts all devices "
+                "are used."
+            )
         return Devices(section.devices)
     from orthaug.models.rows import InMemory
     from orthaug.models.streaming import Stream
@@ -198,17 +216,25 @@ class MotionSection(Section):
     @property
     def learns(self) -> bool:
         """Return whether a learner is added to any equation or output."""
-        outputs = (output.learned for output in self.outputs.values() if not isinstance(output, str))
+        outputs = (
+            output.learned for output in self.outputs.values() if not isinstance(output, str)
+        )
         return any(state.learned for state in self.states.values()) or any(outputs)
 
     def declared(self, inputs: Sequence[str], outputs: Sequence[str]) -> Motion:
         """Return the motion, its channels in the order of the data.
 
-        Raises:
-            InputError: names and expressions that cannot be, and what else `Motion.from_equations` refuses.
+        Raises: InputError: names and expressions that cannot be, and what else
+            `Motion.from_equations` refuses.
         """
-        given = {name: OutputSection(expression=o) if isinstance(o, str) else o for name, o in self.outputs.items()}
-        known = [*(name for name in outputs if name in given), *(name for name in given if name not in outputs)]
+        given = {
+            name: OutputSection(expression=o) if isinstance(o, str) else o
+            for name, o in self.outputs.items()
+        }
+        known = [
+            *(name for name in outputs if name in given),
+            *(name for name in given if name not in outputs),
+        ]
         states = []
         for name, state in self.states.items():
             equation = state.next if self.integrator == "discrete" else state.derivative

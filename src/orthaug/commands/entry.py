@@ -11,13 +11,23 @@ import sys
 
 from orthaug.commands.signals import WATCH
 
-_OF_JAX = ("JAX_PLATFORMS", "JAX_ENABLE_X64", "JAX_COMPILATION_CACHE_DIR", "JAX_DISABLE_JIT")  # the others are dropped
-_LEAST_MEMORY, _MEMORY_PER_CORE = 3.0 * 2**30, 0.15 * 2**30  # bytes of addresses that JAX and BLAS take for themselves
+_OF_JAX = (
+    "JAX_PLATFORMS",
+    "JAX_ENABLE_X64",
+    "JAX_COMPILATION_CACHE_DIR",
+    "JAX_DISABLE_JIT",
+)  # the others are dropped
+_LEAST_MEMORY, _MEMORY_PER_CORE = (
+    3.0 * 2**30,
+    0.15 * 2**30,
+)  # bytes of addresses that JAX and BLAS take for themselves
 
 
 def main() -> None:
     """Entry point of the program."""
-    gc.set_threshold(100_000, 50, 100)  # what imports and traces leave is no garbage: looking for it costs a tenth
+    gc.set_threshold(
+        100_000, 50, 100
+    )  # what imports and traces leave is no garbage: looking for it costs a tenth
     _open_streams()
     WATCH.start()
     from orthaug.commands import streams
@@ -37,7 +47,10 @@ def main() -> None:
 
 
 def _open_streams() -> None:
-    """Open standard streams that are closed, so that no file takes their number. Writing to a closed output fails."""
+    """Open standard streams that are closed, so that no file takes their number.
+
+    Writing to a closed output fails.
+    """
     for number, way in ((0, os.O_RDONLY), (1, os.O_RDONLY), (2, os.O_WRONLY)):
         try:
             os.fstat(number)
@@ -56,8 +69,8 @@ def _complaint() -> str | None:
     needed = _LEAST_MEMORY + _MEMORY_PER_CORE * (os.cpu_count() or 1)
     if limit() < needed and not {"--help", "--version"} & set(sys.argv):
         return (
-            f"the limit on memory (ulimit -v) is {in_words(limit())}; with its libraries orthaug takes "
-            f"{in_words(needed)} of addresses on this machine. Raise the limit."
+            f"the limit on memory (ulimit -v) is {in_words(limit())}; with its libraries "
+            f"orthaug takes {in_words(needed)} of addresses on this machine. Raise the limit."
         )
     return None
 

@@ -36,4 +36,8 @@ def run(model: Path, to: str, out: Path, name: str, *, force: bool = False) -> t
         own = str(error).startswith(str(out))
         raise InputError(str(error) if own else f"{model}: {error}") from None
     what = "The code stands for data after these steps: a delay by `shift`, say, is not in it."
-    return prepared_notes(loaded, what=what) if any(done.step not in MENDING for done in loaded.prepared) else ()
+    return (
+        prepared_notes(loaded, what=what)
+        if any(done.step not in MENDING for done in loaded.prepared)
+        else ()
+    )

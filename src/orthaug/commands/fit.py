@@ -82,9 +82,16 @@ def advised(fitted: FitReport) -> FitReport:
     if not fitted.fit.status.ok or _stopped(fitted.fit):
         return fitted
     failed: list[Any] = []
-    found = attempt("the trial of advice", lambda: advise(fitted.job, fitted.fit, fitted.result), failed, None)
-    warnings = [*fitted.result.warnings, *(WarningResult.model_validate(warning) for warning in failed)]
-    told = {"warnings": warnings} if found is None else {"advice": found[0], "advice_trials": found[1]}
+    found = attempt(
+        "the trial of advice", lambda: advise(fitted.job, fitted.fit, fitted.result), failed, None
+    )
+    warnings = [
+        *fitted.result.warnings,
+        *(WarningResult.model_validate(warning) for warning in failed),
+    ]
+    told = (
+        {"warnings": warnings} if found is None else {"advice": found[0], "advice_trials": found[1]}
+    )
     return replace(fitted, result=FitResult.model_validate({**dict(fitted.result), **told}))
 
 
@@ -96,7 +103,12 @@ def judged(fitted: FitReport) -> FitReport:
     failed: list[Any] = []
     physics = cache(partial(_physics_alone, fitted))
     alone = fitted.alone or None
-    verdict = attempt("the judgement of the learner", lambda: judge_fit(fitted, physics, alone=alone), failed, None)
+    verdict = attempt(
+        "the judgement of the learner",
+        lambda: judge_fit(fitted, physics, alone=alone),
+        failed,
+        None,
+    )
     warnings += failed
     asked = fit.model.form.bound is not None and job.spec.validation.blocks != 0
     if verdict is None and asked and not failed:
@@ -105,23 +117,30 @@ def judged(fitted: FitReport) -> FitReport:
         told = f"whether the learner helps is not judged: no part is held out, and {why}."
         warnings.append(WarningResult(code="not_judged", text=told))
     if verdict is not None and fit.model.form.bound is not None:
-        told = (*verdict.warnings, *_unexplained(fitted, None if verdict.code == "helps" else physics))
+        told = (
+            *verdict.warnings,
+            *_unexplained(fitted, None if verdict.code == "helps" else physics),
+        )
         warnings += [WarningResult.model_validate(warning) for warning in told]
-    result = FitResult.model_validate({**dict(fitted.result), "validation": verdict, "warnings": warnings})
+    result = FitResult.model_validate(
+        {**dict(fitted.result), "validation": verdict, "warnings": warnings}
+    )
     return replace(fitted, result=result)
 
 
 def _physics_alone(fitted: FitReport) -> Any:
     """Return the fit of physics alone that the learner had to beat: the one that was made, or one by the same criterion."""
     made = fitted.fit.physics_alone
-    return made if made is not None else fitted.job.run(Variant(ALONE, criterion=fitted.fit.criterion))
+    return (
+        made if made is not None else fitted.job.run(Variant(ALONE, criterion=fitted.fit.criterion))
+    )
 
 
 def _unexplained(fitted: FitReport, physics: Callable[[], Any] | None) -> list[Warning]:
     """That a learner may have taken from parameters that it could imitate, where no cause tells by how much.
 
-    Args:
-        physics: the fit without the learner, where that does not help: it may still take up what physics alone leaves.
+    Args: physics: the fit without the learner, where that does not help: it may still take up what
+        physics alone leaves.
     """
     from orthaug.analysis.diagnosis import diagnose
 
@@ -135,19 +154,27 @@ def _unexplained(fitted: FitReport, physics: Callable[[], Any] | None) -> list[W
         if not result.residuals or result.residuals.verdict == "unmodelled":
             return []
         own = physics()
-        alone = own.status.ok and attempt("the residual of physics alone", lambda: diagnose(own), failed, None)
+        alone = own.status.ok and attempt(
+            "the residual of physics alone", lambda: diagnose(own), failed, None
+        )
         if not alone or alone.verdict != "unmodelled":
             return failed
-        told = "physics alone leaves more than noise, which the learner takes up without better free runs"
+        told = (
+            "physics alone leaves more than noise, which the learner takes up without better "
+            "free runs"
+        )
     told += (
-        f": a part of that may belong to {', '.join(shared)}, and no interval counts it. `orthaug explain` looks for "
-        "its terms, [[suspects]] declares them; another measure, or a learner that sees less, may tell them apart."
+        f": a part of that may belong to {', '.join(shared)}, and no interval counts it. "
+        "`orthaug explain` looks for its terms, [[suspects]] declares them; another measure, "
+        "or a learner that sees less, may tell them apart."
     )
     return [Warning("unexplained", told)]
 
 
 def keeping(job: Job, folder: Path, *, resume: bool = False) -> Job:
-    """Return the job with the states of its training kept beside the result folder; with `resume` it goes on from them.
+    """Return the job with the states of its training kept beside the result folder.
+
+    With `resume` it goes on from them.
 
     Raises:
         InputError: states of another fit; hosts that do not run the same one.
@@ -158,7 +185,9 @@ def keeping(job: Job, folder: Path, *, resume: bool = False) -> Job:
     if job.spec.engine.kind == "devices" and hosts.several():
         hosts.check_alike(job.fingerprint)
         if resume:
-            raise InputError("--resume: a fit over several hosts keeps no states to go on from; leave it out.")
+            raise InputError(
+                "--resume: a fit over several hosts keeps no states to go on from; leave it out."
+            )
         return job
     place = folder.with_name(f"{folder.name}.training")
     kept = Checkpoints(place, job.fingerprint, job.spec.engine.checkpoint)
@@ -175,11 +204,17 @@ def told_of(job: Job, fit: Any) -> FitReport:
     """Scores of a fit on every part of its job, and all that results tell of it but the verdict on the learner."""
     warnings: list[Any] = [*job.warnings, *fit.warnings]
     if job.checkpoints is not None and job.checkpoints.lost:
-        warnings.append(Warning("checkpoint_lost", f"the last state of training was not kept: {job.checkpoints.lost}."))
+        warnings.append(
+            Warning(
+                "checkpoint_lost",
+                f"the last state of training was not kept: {job.checkpoints.lost}.",
+            )
+        )
     if job.checkpoints is not None and job.checkpoints.spoilt:
         text = (
-            f"a kept state of training is damaged ({job.checkpoints.folder.name}/{job.checkpoints.spoilt[0]}), so "
-            "training began anew there; the result is that of a whole training."
+            "a kept state of training is damaged "
+            f"({job.checkpoints.folder.name}/{job.checkpoints.spoilt[0]}), so training began "
+            "anew there; the result is that of a whole training."
         )
         warnings.append(Warning("checkpoint_spoilt", text))
     scores, responses = {}, {}
@@ -190,8 +225,14 @@ def told_of(job: Job, fit: Any) -> FitReport:
     if physics is not None and physics.status.ok:
         ran = {part.name: score_part(physics.model, part, []) for part in job.parts}
         alone = {name: scored for name, (scored, _) in ran.items()}
-    if fit.status.ok and job.spec.training.chosen_focus() == "prediction" and fit.model.form.bound is not None:
-        warnings += _one_step_only(scores, alone, [part.name for part in job.parts if part not in job.tests])
+    if (
+        fit.status.ok
+        and job.spec.training.chosen_focus() == "prediction"
+        and fit.model.form.bound is not None
+    ):
+        warnings += _one_step_only(
+            scores, alone, [part.name for part in job.parts if part not in job.tests]
+        )
     fit, told = kind_of(job).content(job, fit, responses, warnings)
     if fit.status.ok and told["residuals"] is not None:
         fit = _for_observers(fit, told["residuals"].verdict, warnings)
@@ -215,12 +256,19 @@ def told_of(job: Job, fit: Any) -> FitReport:
         written = {writing: equation(fit.model, writing) for writing in ("text", "latex")}
         content |= {"terms": terms, "equation": written}
     return FitReport(
-        job, fit, FitResult.model_validate(content), responses, {name: both for name, (_, both) in ran.items()}
+        job,
+        fit,
+        FitResult.model_validate(content),
+        responses,
+        {name: both for name, (_, both) in ran.items()},
     )
 
 
 def _status(fit: Any, warnings: Sequence[Any]) -> Any:
-    """Return how training ended; of a model that does not run freely its message begins with that."""
+    """Return how training ended.
+
+    Of a model that does not run freely its message begins with that.
+    """
     first = next((warning.text for warning in warnings if warning.code == "one_step_only"), "")
     last = "" if fit.status.ok else describe_scales(fit.problem.record)
     if not (first or last):
@@ -237,13 +285,23 @@ def _one_step_only(
     """That a model trained one step ahead by hand is of no use in free run: it diverges, or physics alone is better."""
     diverges = any(scores[part].simulation.nrmse is None for part in parts)
     worse = [
-        bool(np.all(np.asarray(scores[part].simulation.nrmse) > np.asarray(alone[part].simulation.nrmse)))
+        bool(
+            np.all(
+                np.asarray(scores[part].simulation.nrmse) > np.asarray(alone[part].simulation.nrmse)
+            )
+        )
         for part in parts
-        if part in alone and scores[part].simulation.nrmse is not None and alone[part].simulation.nrmse is not None
+        if part in alone
+        and scores[part].simulation.nrmse is not None
+        and alone[part].simulation.nrmse is not None
     ]
     if not diverges and not (worse and all(worse)):
         return []
-    why = "its free run diverges" if diverges else "physics alone follows the outputs better in free run"
+    why = (
+        "its free run diverges"
+        if diverges
+        else "physics alone follows the outputs better in free run"
+    )
     text = (
         f'the model is for one-step prediction only: {why}. `focus = "auto"`, the default, trains the free run, too, '
         "where one step ahead is not enough."
@@ -272,9 +330,8 @@ def judge_fit(
 
     Where the fit fell back to physics alone, that is judged by which it did.
 
-    Args:
-        physics: gives the fit of physics alone, where a part is held out.
-        blocks: trials of blocked cross-validation; None for those by which the fit was chosen, or to make them, where
+    Args: physics: gives the fit of physics alone, where a part is held out. blocks: trials of
+        blocked cross-validation; None for those by which the fit was chosen, or to make them, where
             there is no validation or test part or where the spec asks for them.
         alone: the responses of physics alone by part, where they are there already.
     """
@@ -300,9 +357,19 @@ def judge_fit(
         ran = None if alone is None else alone[part.name][1]
         response = fitted.responses[part.name][1]
         trials.append(
-            trial_on(part.name, part.record, part.skips, physics().model, model, alone_response=ran, response=response)
+            trial_on(
+                part.name,
+                part.record,
+                part.skips,
+                physics().model,
+                model,
+                alone_response=ran,
+                response=response,
+            )
         )
-        beyond += extrapolation(part.name, job.reach(model, part.record)[0], *job.reach(model, job.train.record))
+        beyond += extrapolation(
+            part.name, job.reach(model, part.record)[0], *job.reach(model, job.train.record)
+        )
     return judge(trials, beyond)
 
 
@@ -321,7 +388,10 @@ def cross_validated(job: Job, blocks: int, variants: Sequence[Variant]) -> list[
     """Trials of every variant on every block; none where the record is too short for that."""
     from orthaug.analysis.validation import block_trials, cross_validate
 
-    fits = [job.fold_fit(variant) for variant in (Variant(ALONE, criterion=variants[0].criterion), *variants)]
+    fits = [
+        job.fold_fit(variant)
+        for variant in (Variant(ALONE, criterion=variants[0].criterion), *variants)
+    ]
     try:
         options: dict[str, Any] = {"start": job.first_row, "runner": job.runner}
         errors = cross_validate(job.train.record, fits, blocks=blocks, **options)
@@ -330,8 +400,13 @@ def cross_validated(job: Job, blocks: int, variants: Sequence[Variant]) -> list[
     return [block_trials(errors, 1 + j) for j in range(len(variants))]
 
 
-def score_part(model: Any, part: Part, warnings: list[Any]) -> tuple[PartScores, tuple[Response, Response]]:
-    """Scores of a part, and the responses they come from. For a score that does not exist a warning is added."""
+def score_part(
+    model: Any, part: Part, warnings: list[Any]
+) -> tuple[PartScores, tuple[Response, Response]]:
+    """Scores of a part, and the responses they come from.
+
+    For a score that does not exist a warning is added.
+    """
     responses = model.predict(part.record), model.simulate(part.record)
     if part.source is not None:
         return _scored_along(model, part, warnings), responses
@@ -342,12 +417,22 @@ def score_part(model: Any, part: Part, warnings: list[Any]) -> tuple[PartScores,
         scores[kind] = ScoreResult() if runaway is not None else scored
         if runaway is not None:
             step, output = runaway
-            told = f"{part.name}: the free run diverged in output '{output}' at step {step}; no simulation scores."
+            told = (
+                f"{part.name}: the free run diverged in output '{output}' at step {step}; no "
+                "simulation scores."
+            )
             warnings.append(Warning("free_run_diverged", told))
         elif np.isnan(scored.rmse).any():
-            warnings.append(Warning("not_finite", f"{part.name}: the {kind} is not finite on some rows; no scores."))
+            warnings.append(
+                Warning(
+                    "not_finite", f"{part.name}: the {kind} is not finite on some rows; no scores."
+                )
+            )
         elif np.isnan(scored.nrmse).any():
-            told = f"{part.name}: an output is constant over the scored samples; no NRMSE and FIT of its {kind}."
+            told = (
+                f"{part.name}: an output is constant over the scored samples; no NRMSE and FIT "
+                f"of its {kind}."
+            )
             warnings.append(Warning("constant_output", told))
     return PartScores.model_validate(scores), responses
 
@@ -364,15 +449,23 @@ def _scored_along(model: Any, part: Part, warnings: list[Any]) -> PartScores:
     found = scores_along(model, part.source, part.skip, None if whole else residual.watch)
     if found.diverged is not None:
         file, row, output = found.diverged
-        told = f"{part.name}: the free run diverged in output '{output}' at row {row} of {file}; no simulation scores."
+        told = (
+            f"{part.name}: the free run diverged in output '{output}' at row {row} of {file}; "
+            "no simulation scores."
+        )
         warnings.append(Warning("free_run_diverged", told))
     simulation = ScoreResult() if found.diverged is not None else found.simulation
     tests = residual.tests() or None
-    return PartScores.model_validate({"prediction": found.prediction, "simulation": simulation, "residual": tests})
+    return PartScores.model_validate(
+        {"prediction": found.prediction, "simulation": simulation, "residual": tests}
+    )
 
 
 def write_result(fitted: FitReport, folder: Path, *, force: bool = False) -> None:
-    """result.json, model/ and figures/, whole or not at all; without a model where training failed."""
+    """result.json, model/ and figures/, whole or not at all.
+
+    Without a model where training failed.
+    """
     with whole_folder(folder, force=force) as partial:
         fill_result(fitted, partial)
     if fitted.job.checkpoints is not None:
@@ -389,7 +482,11 @@ def fill_result(fitted: FitReport, folder: Path) -> None:
     (folder / "model").mkdir()
     storage.write(fitted.fit.model, folder / "model")
     physics = fitted.fit.physics_alone
-    if physics is None and fitted.fit.model.form.bound is None and fitted.job.spec.declared_learner() is not None:
+    if (
+        physics is None
+        and fitted.fit.model.form.bound is None
+        and fitted.job.spec.declared_learner() is not None
+    ):
         physics = fitted.fit  # the learner was left out
     if physics is not None and physics.status.ok:
         (folder / PHYSICS).mkdir()
@@ -408,7 +505,10 @@ def _draw(fitted: FitReport, folder: Path) -> None:
 
 
 def fit_report(fitted: FitReport, origin: Origin | None = None) -> str:
-    """Return the page of a fit that has a model; `origin` is where it comes from, None for its spec."""
+    """Return the page of a fit that has a model.
+
+    `origin` is where it comes from, None for its spec.
+    """
     from orthaug.reports.learned_part import learned_of
     from orthaug.reports.page import fit_page
     from orthaug.reports.page_fit import FitPage
@@ -416,4 +516,6 @@ def fit_report(fitted: FitReport, origin: Origin | None = None) -> str:
     job, fit, responses = fitted.job, fitted.fit, fitted.responses
     alone = {} if fit.model.form.bound is None else kind_of(job).physics_alone(job, fit, responses)
     learned = learned_of(fit, job.train.record)
-    return fit_page(FitPage(origin or origin_of(job, "fit"), fitted.result, responses, alone, learned))
+    return fit_page(
+        FitPage(origin or origin_of(job, "fit"), fitted.result, responses, alone, learned)
+    )

@@ -33,13 +33,17 @@ def chosen_model(model: Path, which: str) -> Path:
     whole = model.parent if model.name == "model" else model
     if not (whole / PHYSICS).is_dir():
         raise InputError(
-            f"{whole}: holds no {PHYSICS}; expected a result of `orthaug fit` with a learner, or no --model physics."
+            f"{whole}: holds no {PHYSICS}; expected a result of `orthaug fit` with a learner, "
+            "or no --model physics."
         )
     return whole / PHYSICS
 
 
 def results_beside(model: Path) -> Iterator[Any]:
-    """Yield what is read from result.json in the folder of a model, or the one above; for the caller to check."""
+    """Yield what is read from result.json in the folder of a model, or the one above.
+
+    For the caller to check.
+    """
     for folder in (model, model.parent):
         with suppress(OSError, ValueError, RecursionError):
             yield json.loads((folder / "result.json").read_text(encoding="utf-8"))

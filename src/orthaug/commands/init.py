@@ -46,7 +46,9 @@ def time_of(found: Survey, roles: Roles) -> str | None:
     """Return the column of instants, where there is one that is to be used: uneven steps, or such as every part has."""
     clock = found.clock
     used = clock.column is not None and clock.instants and not roles.sampling_time
-    return clock.column.header if used and clock.column and (clock.steady or not clock.even) else None
+    return (
+        clock.column.header if used and clock.column and (clock.steady or not clock.even) else None
+    )
 
 
 def steps_of(found: Survey, roles: Roles) -> list[tuple[str, dict[str, Any]]]:
@@ -54,7 +56,10 @@ def steps_of(found: Survey, roles: Roles) -> list[tuple[str, dict[str, Any]]]:
     steps: list[tuple[str, dict[str, Any]]] = []
     if any(column.spikes for column in roles.outputs):
         threshold = min(column.threshold for column in roles.outputs)
-        steps += [("outliers", {"threshold": threshold}), ("fill", {"most": FILLED, "method": "pchip"})]
+        steps += [
+            ("outliers", {"threshold": threshold}),
+            ("fill", {"most": FILLED, "method": "pchip"}),
+        ]
     if time_of(found, roles) and not found.clock.even:
         steps.append(("resample", {"sampling_time": found.clock.step}))
     return steps
@@ -82,20 +87,31 @@ def spec_text(
 ) -> str:
     """Return the spec with comments; `gaps` says which rows will be left out, "" for none."""
     document = tomlkit.document()
-    document.add(tomlkit.comment(f"Written by orthaug init from {found.path.name}. Run: orthaug fit {out.name}"))
-    document.add(tomlkit.comment("Every key: orthaug schema keys. What is written here is a start, not a verdict."))
+    document.add(
+        tomlkit.comment(
+            f"Written by orthaug init from {found.path.name}. Run: orthaug fit {out.name}"
+        )
+    )
+    document.add(
+        tomlkit.comment(
+            "Every key: orthaug schema keys. What is written here is a start, not a verdict."
+        )
+    )
     document.add("data", _data(found, roles, out, rows, cut, gaps, named))
     document.add(tomlkit.nl())
     document.add(
         tomlkit.comment(
-            "The physics: linear difference equations, to be replaced by what you know ([motion]: equations of motion)."
+            "The physics: linear difference equations, to be replaced by what you know "
+            "([motion]: equations of motion)."
         )
     )
     document.add("baseline", _baseline(named, model))
     learner = tomlkit.table()
     learner.add("kind", "mlp")
     learner.add("hidden", [8])
-    learner["hidden"].comment("sees the lags that the physics reads; [lags] gives it more, `inputs` fewer")
+    learner["hidden"].comment(
+        "sees the lags that the physics reads; [lags] gives it more, `inputs` fewer"
+    )
     document.add("learner", learner)
     training = tomlkit.table()
     training.add("restarts", 3)
@@ -104,7 +120,13 @@ def spec_text(
 
 
 def _data(
-    found: Survey, roles: Roles, out: Path, rows: int, cut: int, gaps: str, named: tuple[list[str], list[str]]
+    found: Survey,
+    roles: Roles,
+    out: Path,
+    rows: int,
+    cut: int,
+    gaps: str,
+    named: tuple[list[str], list[str]],
 ) -> Any:
     file, clock = relative(found.path, out.resolve().parent), found.clock
     data = tomlkit.table()
@@ -156,18 +178,27 @@ def _baseline(named: tuple[list[str], list[str]], model: FirstModel) -> Any:
     told = {}
     for name, nk, seen in zip(inputs, orders.nk, model.delays, strict=True):
         if seen != nk:
-            why = "no lag of it is significant, so this is a guess" if seen is None else _CLEARLY.format(seen)
+            why = (
+                "no lag of it is significant, so this is a guess"
+                if seen is None
+                else _CLEARLY.format(seen)
+            )
             told[f"{name}[k-{nk}]" if nk else f"{name}[k]"] = why
     for output in outputs:
         own = f"_{output}" if len(outputs) > 1 else ""
         found = [(f"a{i}{own}", f"{output}[k-{i}]") for i in range(1, orders.na + 1)]
         for name, nb, nk in zip(inputs, orders.nb, orders.nk, strict=True):
             by = f"_{name}" if len(inputs) > 1 else ""
-            found += [(f"b{lag}{by}{own}", f"{name}[k-{lag}]" if lag else f"{name}[k]") for lag in range(nk, nk + nb)]
+            found += [
+                (f"b{lag}{by}{own}", f"{name}[k-{lag}]" if lag else f"{name}[k]")
+                for lag in range(nk, nk + nb)
+            ]
         found += [(f"offset{own}", "1")] if model.offset else []
         for parameter, regressor in found:
             term = tomlkit.table()
-            term.add("parameter", f"{parameter}_" if parameter in (*inputs, *outputs) else parameter)
+            term.add(
+                "parameter", f"{parameter}_" if parameter in (*inputs, *outputs) else parameter
+            )
             term.add("regressor", regressor)
             if regressor in told:
                 term["regressor"].comment(told[regressor])
@@ -217,22 +248,35 @@ def assign(
         known = found.roles()
         return None if known is None else Roles(tuple(known[0]), tuple(known[1]), sampling_time)
     named = {"input": inputs, "output": outputs}
-    chosen = [None if n is None else columns_of(found, n, kind, sampling_time) for kind, n in named.items()]
+    chosen = [
+        None if n is None else columns_of(found, n, kind, sampling_time)
+        for kind, n in named.items()
+    ]
     if outputs is not None and not chosen[1]:
-        raise InputError(f"{found.path}: no output is named; give --outputs, a column or several separated by commas.")
+        raise InputError(
+            f"{found.path}: no output is named; give --outputs, a column or several separated "
+            "by commas."
+        )
     both = [column for group in chosen for column in group or ()]
     for column in both:
         if both.count(column) > 1:
-            raise InputError(f"{found.path}: column '{column.header}' is named twice among inputs and outputs.")
+            raise InputError(
+                f"{found.path}: column '{column.header}' is named twice among inputs and outputs."
+            )
     if chosen[0] is None or chosen[1] is None:
         return None
     if not found.same_lengths(both):
         listing = ", ".join(f"'{c.header}' {c.filled}" for c in both)
-        raise InputError(f"{found.path}: the columns have unequal lengths: {listing} rows. Name those of one run.")
+        raise InputError(
+            f"{found.path}: the columns have unequal lengths: {listing} rows. Name those of "
+            "one run."
+        )
     return Roles(tuple(chosen[0]), tuple(chosen[1]), sampling_time)
 
 
-def columns_of(found: Survey, names: Names, kind: str, sampling_time: float | None = None) -> list[Column]:
+def columns_of(
+    found: Survey, names: Names, kind: str, sampling_time: float | None = None
+) -> list[Column]:
     """Return the columns of these names; a text may hold several, separated by commas.
 
     Args:
@@ -253,25 +297,41 @@ def columns_of(found: Survey, names: Names, kind: str, sampling_time: float | No
 
 
 def _check_no_time(found: Survey, column: Column, kind: str, sampling_time: float | None) -> None:
-    """Raise InputError for the time as a channel; an input may rise as evenly where the time is known otherwise."""
+    """Raise InputError for the time as a channel.
+
+    An input may rise as evenly where the time is known otherwise.
+    """
     place, refused = f"{found.path}: column '{column.header}'", found.looks_like_time(column)
     if column is found.clock.column and found.clock.by_name:
         raise InputError(f"{place} is the time; it is no channel.")
     if column is found.clock.column and (kind == "output" or sampling_time is None):
-        remedy = "it is no output" if kind == "output" else "if it is an input, give --sampling-time, the step in s"
-        raise InputError(f"{place} rises by {found.clock.step:g} s in each row, as time does; {remedy}.")
+        remedy = (
+            "it is no output"
+            if kind == "output"
+            else "if it is an input, give --sampling-time, the step in s"
+        )
+        raise InputError(
+            f"{place} rises by {found.clock.step:g} s in each row, as time does; {remedy}."
+        )
     if refused is not None and (kind == "output" or is_time(column.header)):
-        raise InputError(f"{place} {refused.reason}; it is no {'channel' if is_time(column.header) else 'output'}.")
+        raise InputError(
+            f"{place} {refused.reason}; it is no "
+            f"{'channel' if is_time(column.header) else 'output'}."
+        )
 
 
 def question(found: Survey, inputs: Names | None = None, outputs: Names | None = None) -> str:
-    """Return what to give where the columns do not say what they are; `inputs` and `outputs` are what was given.
+    """Return what to give where the columns do not say what they are.
+
+    `inputs` and `outputs` are what was given.
 
     Raises:
         InputError: no column could be a channel, or none is left for an output.
     """
     kinds = {"input": inputs, "output": outputs}
-    given = {id(c): c for kind, names in kinds.items() for c in columns_of(found, names or "", kind)}
+    given = {
+        id(c): c for kind, names in kinds.items() for c in columns_of(found, names or "", kind)
+    }
     free = [c for c in found.signals if id(c) not in given]
     if not found.signals or (outputs is None and not free):
         raise InputError(f"{found.path}: {_nothing_left(found, _joined(inputs))}")
@@ -281,15 +341,18 @@ def question(found: Survey, inputs: Names | None = None, outputs: Names | None =
     alike = [c.header for c in free if c.filled == rows] or [c.header for c in free]
     named = ",".join(alike[:_LISTED]) if outputs is not None else alike[0] if alike else ""
     into = named if inputs is None else _joined(inputs)
-    proposed = f'--inputs "{into}" --outputs "{_joined(outputs) if output is None else output.header}"'
+    proposed = (
+        f'--inputs "{into}" --outputs "{_joined(outputs) if output is None else output.header}"'
+    )
     said = "the names of the columns do not tell inputs from outputs"
     if inputs is not None or outputs is not None:
         said = f"only {'inputs' if outputs is None else 'outputs'} are named"
     none = ' (--inputs "" for none)' if inputs is None and named else ""
     others = left_out(found, [*found.signals])
     return (
-        f"{found.path}: {said}: {some}. Say both, separated by commas, such as {proposed}{none}; columns that are not "
-        f"named are left out." + (f" No channels: {others}." if others else "")
+        f"{found.path}: {said}: {some}. Say both, separated by commas, such as "
+        f"{proposed}{none}; columns that are not named are left out."
+        + (f" No channels: {others}." if others else "")
     )
 
 
@@ -304,17 +367,22 @@ def _nothing_left(found: Survey, inputs: str | None) -> str:
     others = left_out(found, [*found.signals])
     if not found.signals:
         return (
-            f"no column could be a channel, {rows}: {others}. A first model needs an output that varies, over some "
-            "dozens of rows."
+            f"no column could be a channel, {rows}: {others}. A first model needs an output "
+            "that varies, over some dozens of rows."
         )
-    text = f"every column that could be a channel is an input already ({inputs}), and none is left for an output"
+    text = (
+        f"every column that could be a channel is an input already ({inputs}), and none is "
+        "left for an output"
+    )
     return f"{text}; left out: {others}." if others else f"{text}."
 
 
 def left_out(found: Survey, used: Sequence[Column]) -> str:
     """Return the columns that are not used, and why, in a list; the time is none of them."""
     apart = {id(c) for c in (*used, found.clock.column)}
-    return _listed([f"{c.header} ({found.why_not(c)})" for c in found.columns if id(c) not in apart])
+    return _listed(
+        [f"{c.header} ({found.why_not(c)})" for c in found.columns if id(c) not in apart]
+    )
 
 
 def _listed(columns: Sequence[str]) -> str:
@@ -336,11 +404,15 @@ def draft(found: Survey, roles: Roles, out: Path) -> Draft:
     model = first_model(record)
     if model is None:
         raise InputError(
-            f"{found.path}: {len(record)} usable rows are too few for a first model of these channels, or the inputs "
-            "are combinations of each other. Give more rows, or fewer inputs."
+            f"{found.path}: {len(record)} usable rows are too few for a first model of these "
+            "channels, or the inputs are combinations of each other. Give more rows, or fewer "
+            "inputs."
         )
     named = (channel_names(roles.inputs), channel_names(roles.outputs))
-    wild = f"{counted(lost, 'training row')} in longer runs of wild samples {'is' if lost == 1 else 'are'} left out"
+    wild = (
+        f"{counted(lost, 'training row')} in longer runs of wild samples "
+        f"{'is' if lost == 1 else 'are'} left out"
+    )
     gaps = lacking(missing) if missing else wild if lost else ""
     text = spec_text(found, roles, out, rows, cut, gaps, named, model)
     return Draft(
@@ -369,7 +441,9 @@ def write_spec(found: Draft, out: Path, *, force: bool = False) -> None:
                 open_job(partial)
             except InputError as error:
                 told = str(error).removeprefix(f"{partial}: ")
-                raise InputError(f"{out}: a spec for these columns would be refused: {told}") from None
+                raise InputError(
+                    f"{out}: a spec for these columns would be refused: {told}"
+                ) from None
 
 
 def _extent(roles: Roles) -> tuple[int, int]:
@@ -386,15 +460,23 @@ def _extent(roles: Roles) -> tuple[int, int]:
 
 def _record(found: Survey, roles: Roles, cut: int, missing: int) -> tuple[Record, int]:
     """Return the training rows, and how many are left out because a sample is missing."""
-    inputs, outputs = ([Channel(c.name, c.unit, c.header) for c in group] for group in (roles.inputs, roles.outputs))
-    options: dict[str, Any] = {"rows": (0, cut), "missing": "skip" if missing or not found.clock.even else "error"}
+    inputs, outputs = (
+        [Channel(c.name, c.unit, c.header) for c in group]
+        for group in (roles.inputs, roles.outputs)
+    )
+    options: dict[str, Any] = {
+        "rows": (0, cut),
+        "missing": "skip" if missing or not found.clock.even else "error",
+    }
     options["prepare"] = [STEPS.declare(kind, keys) for kind, keys in steps_of(found, roles)]
     if not found.clock.even:
         options["time"] = time_of(found, roles)
     try:
         record = read_record(found.path, inputs=inputs, outputs=outputs, **options)
     except MissingSampleError:  # more samples in a row were wild than a gap is filled over
-        record = read_record(found.path, inputs=inputs, outputs=outputs, **{**options, "missing": "skip"})
+        record = read_record(
+            found.path, inputs=inputs, outputs=outputs, **{**options, "missing": "skip"}
+        )
     return record, record.missing
 
 
@@ -413,7 +495,10 @@ def _account(
     if roles.sampling_time is None and found.clock.step is None:
         step += "; 1 s is written: change it"
     told = f"; {found.note}" if found.note else ""
-    lines = [f"{found.path.name}: {rows} rows, {len(found.columns)} columns{told}", f"sampling time: {step}"]
+    lines = [
+        f"{found.path.name}: {rows} rows, {len(found.columns)} columns{told}",
+        f"sampling time: {step}",
+    ]
     for kind, columns in (("input", roles.inputs), ("output", roles.outputs)):
         lines += [f"{kind:<7}{as_seen(column, spikes=kind == 'output')}" for column in columns]
     used = {id(c) for c in (*roles.inputs, *roles.outputs, found.clock.column)}
@@ -427,19 +512,33 @@ def _account(
         filled = any(kind == "fill" for kind, _ in steps_of(found, roles))
         lines.append(f"{lacking(missing)} and will be left out, with all windows that touch them")
         if filled:
-            lines[-1] = f"{lacking(missing)}: gaps of up to {FILLED} rows are filled, longer ones left out"
+            lines[-1] = (
+                f"{lacking(missing)}: gaps of up to {FILLED} rows are filled, longer ones left out"
+            )
     lines += [wild] if wild else []
     lines += notes
-    for name, late, seen in zip(channel_names(roles.inputs), model.orders.nk, model.delays, strict=True):
+    for name, late, seen in zip(
+        channel_names(roles.inputs), model.orders.nk, model.delays, strict=True
+    ):
         if seen is not None and seen != late:
-            lines.append(f"the spec takes {name} from lag {late} on, which runs clearly better on rows held out")
+            lines.append(
+                f"the spec takes {name} from lag {late} on, which runs clearly better on rows "
+                "held out"
+            )
     size, errors = model.orders, ", ".join(percent(error, 3) for error in model.free_run)
     told = "one step ahead" if not roles.inputs else "in free run"
-    lines.append(f"first physics: linear, {size}{', with a constant' if model.offset else ''}; {told} its error")
+    lines.append(
+        f"first physics: linear, {size}{', with a constant' if model.offset else ''}; {told} "
+        "its error"
+    )
     lines[-1] += f" on rows held out is {errors} of the output's standard deviation"
     if cut - missing > LOOKED_AT:
-        lines.append(f"delays and orders are found on {LOOKED_AT} of these rows, in windows spread over them")
-    lines.append("test: " + (f"rows {cut} to {rows}" if cut < rows else "none, for there are few rows"))
+        lines.append(
+            f"delays and orders are found on {LOOKED_AT} of these rows, in windows spread over them"
+        )
+    lines.append(
+        "test: " + (f"rows {cut} to {rows}" if cut < rows else "none, for there are few rows")
+    )
     return "\n".join(lines)
 
 
@@ -452,21 +551,31 @@ def _delay(delay: int | None) -> str:
 def _order(order: int) -> str:
     from orthaug.selection.first_orders import PERSISTENCE
 
-    return f"up to order {order}" + (" or more" if order >= PERSISTENCE else ": few lags can be told apart")
+    return f"up to order {order}" + (
+        " or more" if order >= PERSISTENCE else ": few lags can be told apart"
+    )
 
 
 def as_seen(column: Column, *, spikes: bool) -> str:
     """Return a channel in words: range, and what is odd about it."""
     low, high = float(column.finite.min()), float(column.finite.max())
-    text = f"{column.name}" + (f" = column '{column.header}'" if column.header != column.name else "")
+    text = f"{column.name}" + (
+        f" = column '{column.header}'" if column.header != column.name else ""
+    )
     text += f": {low:.4g} to {high:.4g} {column.unit}".rstrip()
     if column.missing:
         text += f"; {counted(column.missing, 'cell')} missing"
     if spikes and column.spikes:
-        text += f"; {counted(column.spikes, 'sample')} far from all neighbours, which the spec replaces"
+        text += (
+            f"; {counted(column.spikes, 'sample')} far from all neighbours, which the spec replaces"
+        )
     for value, count in column.limits:
         text += f"; {counted(count, 'row')} at {value:.4g}, perhaps a limit of sensor or actuator"
     if column.quantum is not None:
-        moves = f", while it moves by {column.movement:.2g} from row to row" if column.quantum > column.movement else ""
+        moves = (
+            f", while it moves by {column.movement:.2g} from row to row"
+            if column.quantum > column.movement
+            else ""
+        )
         text += f"; in steps of {column.quantum:.3g}{moves}"
     return text

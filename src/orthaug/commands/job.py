@@ -141,7 +141,10 @@ class Job(ABC):
         return tuple(data_warnings(self.train.record, self.without))
 
     def without(self, samples: Any) -> str:
-        """Return what a fit without these samples of the training data gives, in a sentence; "" where that is dear."""
+        """Return what a fit without these samples of the training data gives, in a sentence.
+
+        "" where that is dear.
+        """
         return ""
 
     @property
@@ -155,7 +158,10 @@ class Job(ABC):
         return False
 
     def planned(self, variant: Variant) -> Plan:
-        """Return what is known of each run of a variant; nothing where fits to new weights of the outputs follow."""
+        """Return what is known of each run of a variant.
+
+        Nothing where fits to new weights of the outputs follow.
+        """
         spec = self.spec
         if spec.training.output_weights == "covariance":
             return ()
@@ -164,18 +170,27 @@ class Job(ABC):
         kind, validated = variant.kind or spec.structure.kind, spec.data.validation is not None
         choices = spec.regularizations(linear=self.linear, validated=validated, kind=kind)
         starts = range(1, spec.training.restarts + 1)
-        return tuple({"structure": kind, "start": i, "regularization": choice} for choice in choices for i in starts)
+        return tuple(
+            {"structure": kind, "start": i, "regularization": choice}
+            for choice in choices
+            for i in starts
+        )
 
     @property
     def iterations(self) -> int:
         """Steps of a run at most."""
         free_run = self.spec.declared_criterion().free_run
-        return self.spec.declared_solver().iterations + (free_run.start_iterations if free_run else 0)
+        return self.spec.declared_solver().iterations + (
+            free_run.start_iterations if free_run else 0
+        )
 
     @property
     def files(self) -> tuple[Path, ...]:
         """Every file that the job reads."""
-        return (self.path, *(self.path.parent / entry.file for part in self.parts for entry in part.files))
+        return (
+            self.path,
+            *(self.path.parent / entry.file for part in self.parts for entry in part.files),
+        )
 
     @property
     def parts(self) -> tuple[Part, ...]:
@@ -199,8 +214,10 @@ class Job(ABC):
         return DataResult(
             train=list(self.train.files),
             validation=list(self.validation.files) if self.validation else None,
-            tests={part.name.removeprefix("tests."): list(part.files) for part in self.tests} or None,
-            prepare=[PreparedResult.model_validate(done) for done in self.train.record.prepared] or None,
+            tests={part.name.removeprefix("tests."): list(part.files) for part in self.tests}
+            or None,
+            prepare=[PreparedResult.model_validate(done) for done in self.train.record.prepared]
+            or None,
         )
 
     def training_options(self, variant: Variant) -> dict[str, Any]:
@@ -208,18 +225,26 @@ class Job(ABC):
         from orthaug.fitting.training import FOLD_ITERATIONS
 
         fold, spec, training = variant.fold, self.spec, self.spec.training
-        solver, choices, blocks = spec.declared_solver(), training.regularization, spec.validation.blocks
+        solver, choices, blocks = (
+            spec.declared_solver(),
+            training.regularization,
+            spec.validation.blocks,
+        )
         validated = self.validation is not None and fold is None
         return {
             "learner": None if variant.alone else spec.declared_learner(),
             "criterion": variant.criterion or spec.declared_criterion(),
             "solver": solver if fold is None else solver.at_most(FOLD_ITERATIONS),
-            "regularization": choices[0] if fold is not None and isinstance(choices, list) else choices,
+            "regularization": choices[0]
+            if fold is not None and isinstance(choices, list)
+            else choices,
             "restarts": training.restarts if fold is None else 1,
             "seed": training.seed,
             "blocks": 0 if fold is not None else DEFAULT_BLOCKS if blocks is None else blocks,
             "fallback": training.fallback,
-            "validation": self.validation.scored(self.first_row) if validated and self.validation else None,
+            "validation": self.validation.scored(self.first_row)
+            if validated and self.validation
+            else None,
         }
 
 
@@ -235,10 +260,12 @@ def date_of_results() -> datetime:
     epoch = os.environ.get("SOURCE_DATE_EPOCH", "")
     if not epoch:
         return datetime.now(UTC)
-    if not (epoch.isascii() and epoch.isdecimal() and len(epoch) <= 12 and int(epoch) < _YEAR_10000):
+    if not (
+        epoch.isascii() and epoch.isdecimal() and len(epoch) <= 12 and int(epoch) < _YEAR_10000
+    ):
         raise InputError(
-            f"SOURCE_DATE_EPOCH: found {shown(epoch)}; expected whole seconds since 1970 up to the year 9999. Unset it "
-            "for the date of today."
+            f"SOURCE_DATE_EPOCH: found {shown(epoch)}; expected whole seconds since 1970 up to "
+            "the year 9999. Unset it for the date of today."
         )
     return datetime.fromtimestamp(int(epoch), UTC)
 
@@ -266,7 +293,10 @@ def origin_of(job: Job, command: str) -> Origin:
 
 
 def _toml(job: Job) -> str:
-    """Return the spec as it was written; where its file is another one by now, what was read of it."""
+    """Return the spec as it was written.
+
+    Where its file is another one by now, what was read of it.
+    """
     import tomlkit
 
     try:

@@ -24,7 +24,10 @@ class Kind(Protocol):
     """What a module of a kind has."""
 
     def checked(self, job: Any) -> CheckResult:
-        """Return what can be said before training: excitation, identifiability, what may bias; nothing is kept."""
+        """Return what can be said before training: excitation, identifiability, what may bias.
+
+        Nothing is kept.
+        """
         ...
 
     def refused(self, job: Any, result: CheckResult) -> InputError | None:
@@ -32,13 +35,21 @@ class Kind(Protocol):
         ...
 
     def content(
-        self, job: Any, fit: Any, responses: Mapping[str, tuple[Response, Response]], warnings: list[Any]
+        self,
+        job: Any,
+        fit: Any,
+        responses: Mapping[str, tuple[Response, Response]],
+        warnings: list[Any],
     ) -> tuple[Any, dict[str, Any]]:
         """Return the fit as it is handed over, and what results tell of it beside what all kinds do; warnings are added."""
         ...
 
     def figures(
-        self, job: Any, fit: Any, result: FitResult, responses: Mapping[str, tuple[Response, Response]]
+        self,
+        job: Any,
+        fit: Any,
+        result: FitResult,
+        responses: Mapping[str, tuple[Response, Response]],
     ) -> dict[str, Figure]:
         """Return the figures of a result by their names."""
         ...

@@ -20,7 +20,13 @@ from orthaug.inference.measures import weigh_problem
 from orthaug.inference.nearly_shared import shared_warnings
 from orthaug.physics.baseline import derived_units
 from orthaug.physics.excitation import identifiability, require_rank
-from orthaug.reports.result import CheckResult, FitResult, ParameterResult, parameter_rows, physical_rows
+from orthaug.reports.result import (
+    CheckResult,
+    FitResult,
+    ParameterResult,
+    parameter_rows,
+    physical_rows,
+)
 
 if TYPE_CHECKING:
     from orthaug.analysis.budget import Budget
@@ -45,7 +51,9 @@ def checked(job: LaggedJob) -> CheckResult:
             "regressor": [str(lag) for lag in problem.layout],
             "rows": problem.count,
             "excitation": problem.excitation,
-            "identifiability": identifiability(problem.baseline, problem.layout, problem.outputs, problem.rows.x),
+            "identifiability": identifiability(
+                problem.baseline, problem.layout, problem.outputs, problem.rows.x
+            ),
             "shared": _shared_of(job),
             "bias": _bias_of(job) if problem.excitation.full_rank else None,
             "warnings": [*job.warnings, *_said_of_shared(job), *closed_loop(job.train.record)],
@@ -63,7 +71,10 @@ def refused(job: LaggedJob, result: CheckResult) -> InputError | None:
 
 
 def content(
-    job: LaggedJob, fit: Estimate, responses: Mapping[str, tuple[Response, Response]], warnings: list[Any]
+    job: LaggedJob,
+    fit: Estimate,
+    responses: Mapping[str, tuple[Response, Response]],
+    warnings: list[Any],
 ) -> tuple[Estimate, dict[str, Any]]:
     """Return the fit with the standard errors that its residual asks for, and what results tell of it; warnings are added."""
     from orthaug.analysis.robustness import robust_where_asked
@@ -72,7 +83,9 @@ def content(
     if fit.status.ok:
         one_step, free_run = responses[job.train.name]
         plain = fit
-        fit = attempt("the robust covariance", lambda: robust_where_asked(plain, one_step), warnings, plain)
+        fit = attempt(
+            "the robust covariance", lambda: robust_where_asked(plain, one_step), warnings, plain
+        )
         told |= _physical_content(job, fit, warnings)
         told["bias"] = attempt("the bias by suspects", partial(_bias_of, job, fit), warnings, None)
         told |= _analysed(fit, one_step, free_run, warnings)
@@ -85,10 +98,19 @@ def content(
         fit.one_step_theta,
         None if fit.plain_covariance is None else np.sqrt(np.diag(fit.plain_covariance)),
     )
-    units = derived_units(fit.problem.baseline, fit.problem.record.outputs, fit.problem.record.inputs)
-    rows = [row if row.unit else row.model_copy(update={"derived_unit": units.get(row.name)}) for row in rows]
+    units = derived_units(
+        fit.problem.baseline, fit.problem.record.outputs, fit.problem.record.inputs
+    )
+    rows = [
+        row if row.unit else row.model_copy(update={"derived_unit": units.get(row.name)})
+        for row in rows
+    ]
     told |= {
-        "standard_errors": None if fit.std is None else "plain" if fit.plain_covariance is None else "robust",
+        "standard_errors": None
+        if fit.std is None
+        else "plain"
+        if fit.plain_covariance is None
+        else "robust",
         "standard_errors_by": None if fit.std_kind == "plain" else fit.std_kind,
         "measure_detail": fit.measure,
         "excitation": fit.excitation,
@@ -97,11 +119,17 @@ def content(
     warnings += _said_of_shared(job, fit) if fit.status.ok else ()
     budget = None
     if fit.status.ok:
-        budget = attempt("the bias that the learner implies", partial(_budget_of, job, fit), warnings, None)
+        budget = attempt(
+            "the bias that the learner implies", partial(_budget_of, job, fit), warnings, None
+        )
     warnings += budget.warnings if budget else ()
-    if fit.model.structure != "orthogonal" or fit.model.form.bound is None:  # a variant of what the spec declares
+    if (
+        fit.model.structure != "orthogonal" or fit.model.form.bound is None
+    ):  # a variant of what the spec declares
         shared = None
-    told["parameters"] = _with_biases(rows, shared.determined if shared else None, budget, fit.at_bound)
+    told["parameters"] = _with_biases(
+        rows, shared.determined if shared else None, budget, fit.at_bound
+    )
     if told["physical_parameters"] is not None:
         physical = shared.physical if shared else None
         told["physical_parameters"] = _with_biases(told["physical_parameters"], physical, budget)
@@ -109,7 +137,10 @@ def content(
 
 
 def figures(
-    job: LaggedJob, fit: Estimate, result: FitResult, responses: Mapping[str, tuple[Response, Response]]
+    job: LaggedJob,
+    fit: Estimate,
+    result: FitResult,
+    responses: Mapping[str, tuple[Response, Response]],
 ) -> dict[str, Figure]:
     """Return the figures of a result by their names."""
     from orthaug.reports import finding_plots, plots
@@ -124,7 +155,10 @@ def figures(
     }
     if result.residuals is not None:
         units = {channel.name: channel.unit for channel in (*fit.model.inputs, *fit.model.outputs)}
-        for kind, tests in (("one-step", result.residuals.one_step), ("free-run", result.residuals.free_run)):
+        for kind, tests in (
+            ("one-step", result.residuals.one_step),
+            ("free-run", result.residuals.free_run),
+        ):
             if tests is not None:
                 title = f"{kind} residual on the training data, {structure}"
                 figure = finding_plots.residual_analysis_figure(tests, title, units)
@@ -132,7 +166,9 @@ def figures(
     if result.bias:
         drawn["bias"] = finding_plots.bias_figure(result.bias)
     if fit.model.form.bound is not None:
-        drawn["components"] = plots.components_figure(one_step, f"parts of the one-step prediction, {where}")
+        drawn["components"] = plots.components_figure(
+            one_step, f"parts of the one-step prediction, {where}"
+        )
     return drawn
 
 
@@ -145,12 +181,19 @@ def physics_alone(
 
 
 def _physical_content(job: LaggedJob, fit: Estimate, warnings: list[Any]) -> dict[str, Any]:
-    """Return the physical parameters of θ̂ and what belongs to them, where the spec has a map; warnings are added."""
+    """Return the physical parameters of θ̂ and what belongs to them, where the spec has a map.
+
+    Warnings are added.
+    """
     if job.physics is None:
         return {}
     physical, profiles, slopes = fit.physical(job.physics), None, None
     warnings += physical.warnings
-    if job.spec.physics is not None and job.spec.physics.profile and physical.covariance is not None:
+    if (
+        job.spec.physics is not None
+        and job.spec.physics.profile
+        and physical.covariance is not None
+    ):
         profiles = {name: fit.physical_profile(job.physics, name) for name in physical.names}
     if physical.sensitivities is not None:  # ∂ln p / ∂ln θ by name
         slopes = {
@@ -164,7 +207,9 @@ def _physical_content(job: LaggedJob, fit: Estimate, warnings: list[Any]) -> dic
     }
 
 
-def _analysed(fit: Estimate, one_step: Response, free_run: Response, warnings: list[Any]) -> dict[str, Any]:
+def _analysed(
+    fit: Estimate, one_step: Response, free_run: Response, warnings: list[Any]
+) -> dict[str, Any]:
     """Return what the residuals and the free run's sensitivity say; warnings are added."""
     from orthaug.analysis.diagnosis import diagnose
     from orthaug.analysis.free_run_stability import stability
@@ -184,19 +229,26 @@ def _analysed(fit: Estimate, one_step: Response, free_run: Response, warnings: l
             warnings,
             _NOT_ANALYSED,
         ),
-        "missing_lags": attempt_warned("the search for missing lags", lambda: missing_lags(fit, one_step), warnings),
+        "missing_lags": attempt_warned(
+            "the search for missing lags", lambda: missing_lags(fit, one_step), warnings
+        ),
     }
 
 
 def _bias_of(job: LaggedJob, fit: Estimate | None = None) -> list[dict[str, Any]]:
-    """Return the table of suspects under the spec's measure; after a fit with its θ and what its learner explains.
+    """Return the table of suspects under the spec's measure.
 
-    Whether a measure can remove a bias is asked before a fit: then it is answered for the usual suspects, too.
+    After a fit with its θ and what its learner explains.
+
+    Whether a measure can remove a bias is asked before a fit: then it is answered for the usual
+    suspects, too.
     """
     if not job.problem.baseline.names:
         return []
     linearization = _linearization(job, fit)
-    return bias_under(linearization, declared(job.spec.suspects, linearization.problem), certify_usual=fit is None)
+    return bias_under(
+        linearization, declared(job.spec.suspects, linearization.problem), certify_usual=fit is None
+    )
 
 
 def _budget_of(job: LaggedJob, fit: Estimate) -> Budget | None:
@@ -215,17 +267,27 @@ def _with_biases(
     budget: Budget | None,
     held: Collection[str] = (),
 ) -> list[ParameterResult]:
-    """Parameters with whether the learner could imitate them, and what biases them; not of those `held` at a bound."""
-    shared = [None if determined is None or row.name in held else row.name not in determined for row in rows]
+    """Parameters with whether the learner could imitate them, and what biases them.
+
+    Not of those `held` at a bound.
+    """
+    shared = [
+        None if determined is None or row.name in held else row.name not in determined
+        for row in rows
+    ]
     biases = [budget.of(row.name) if budget and row.name not in held else None for row in rows]
-    return [row.told(imitated, bias) for row, imitated, bias in zip(rows, shared, biases, strict=True)]
+    return [
+        row.told(imitated, bias) for row, imitated, bias in zip(rows, shared, biases, strict=True)
+    ]
 
 
 def _linearization(job: LaggedJob, fit: Estimate | None) -> MeasureLinearization:
     problem, weighed, structure = job.problem, job.weighed, job.spec.declared_structure()
     if fit is None:
         along = directions(structure, problem) if job.spec.declared_learner() is not None else None
-        return MeasureLinearization(weighed, problem, problem.least_squares, job.physics, None, along)
+        return MeasureLinearization(
+            weighed, problem, problem.least_squares, job.physics, None, along
+        )
     if fit.problem.weight.kind != problem.weight.kind:  # weighed by the errors that the fit left
         problem = fit.problem
         weighed = weigh_problem(job.measure, problem)
@@ -238,13 +300,21 @@ def _said_of_shared(job: LaggedJob, fit: Estimate | None = None) -> list[Warning
     structure, problem = job.spec.declared_structure(), fit.problem if fit else job.problem
     if job.spec.declared_learner() is None or not structure.projects or structure.shared == "all":
         return []
-    if not problem.baseline.names or not problem.features.entries or (fit and fit.model.form.bound is None):
+    if (
+        not problem.baseline.names
+        or not problem.features.entries
+        or (fit and fit.model.form.bound is None)
+    ):
         return []
     return shared_warnings(problem.shared, [str(entry) for entry in problem.features.entries])
 
 
-def _shared_of(job: LaggedJob, fit: Estimate | None = None, *, others: bool = True) -> Imitation | None:
-    """Before training already; None without a learner, or where the structure splits nothing along chosen directions.
+def _shared_of(
+    job: LaggedJob, fit: Estimate | None = None, *, others: bool = True
+) -> Imitation | None:
+    """Before training already.
+
+    None without a learner, or where the structure splits nothing along chosen directions.
 
     Args:
         fit: of the job's problem; None for the problem as it was posed.

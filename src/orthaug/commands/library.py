@@ -45,9 +45,8 @@ def load_spec(path: str | os.PathLike) -> Job:
     Args:
         path: of the spec, a TOML file; paths in it start at its folder.
 
-    Returns:
-        What `fit_spec` and `compare` take. `train.record`, `validation` and `tests` are its data, `problem` the rows
-        with the physics, `spec` the declarations.
+    Returns: What `fit_spec` and `compare` take. `train.record`, `validation` and `tests` are its
+        data, `problem` the rows with the physics, `spec` the declarations.
 
     Raises:
         InputError: anything wrong with spec, files or physics; one line that names it.
@@ -63,9 +62,9 @@ def fit_spec(spec: Spec, out: str | os.PathLike | None = None) -> FitReport:
         spec: a spec file, or what `load_spec` returned.
         out: folder to write result, model, figures and report into; None to write nothing.
 
-    Returns:
-        `fit`, the `Estimate`; `result`, the content of result.json; `summary()`, what the command prints. Where
-        training failed numerically `fit.status` says so, and there are no scores.
+    Returns: `fit`, the `Estimate`; `result`, the content of result.json; `summary()`, what the
+        command prints. Where training failed numerically `fit.status` says so, and there are no
+        scores.
 
     Raises:
         InputError: as `load_spec`; a folder that cannot be written or holds something else.
@@ -77,7 +76,9 @@ def fit_spec(spec: Spec, out: str | os.PathLike | None = None) -> FitReport:
     return fitted
 
 
-def compare(spec: Spec, models: Sequence[str | os.PathLike] = (), out: str | os.PathLike | None = None) -> Comparison:
+def compare(
+    spec: Spec, models: Sequence[str | os.PathLike] = (), out: str | os.PathLike | None = None
+) -> Comparison:
     """Return what `orthaug compare` does: physics alone and every structure on the same data and seeds.
 
     Args:
@@ -85,9 +86,8 @@ def compare(spec: Spec, models: Sequence[str | os.PathLike] = (), out: str | os.
         models: folders of saved models to put beside.
         out: folder to write result, models and figure into; None to write nothing.
 
-    Returns:
-        `fitted`, one `FitReport` by the name of the structure; `verdicts`, whether the learner helps in each; `result`,
-        the content of result.json; `summary()`, what the command prints.
+    Returns: `fitted`, one `FitReport` by the name of the structure; `verdicts`, whether the learner
+        helps in each; `result`, the content of result.json; `summary()`, what the command prints.
 
     Raises:
         InputError: as `fit_spec`; a model that does not fit the data.
@@ -120,7 +120,10 @@ def _opened(spec: Spec, out: str | os.PathLike | None) -> tuple[Job, Path | None
 
 @dataclass(frozen=True)
 class Page:
-    """A page of a fit: `html` is all of it; `path` the file that has it, or None. A notebook shows it."""
+    """A page of a fit: `html` is all of it; `path` the file that has it, or None.
+
+    A notebook shows it.
+    """
 
     html: str = field(repr=False)
     path: Path | None = None
@@ -173,21 +176,28 @@ class FitFacts:
 
 
 def page_of(
-    fit: Estimate | MotionEstimate, path: str | os.PathLike | None = None, tests: Mapping[str, Record] | None = None
+    fit: Estimate | MotionEstimate,
+    path: str | os.PathLike | None = None,
+    tests: Mapping[str, Record] | None = None,
 ) -> Page:
     """Return what `fit.report` returns: parameters, free runs, what was learned, residuals, stability.
 
-    Raises:
-        TrainingError: a fit without a usable model. InputError: a path that cannot be written, records that do not fit.
+    Raises: TrainingError: a fit without a usable model. InputError: a path that cannot be written,
+        records that do not fit.
     """
     place = _checked(fit, path)
     job = job_of(fit, {} if tests is None else tests)
-    made = replace(origin_of(job, "fit"), name="spec", command=f"{NAME} in Python", toml=_account(fit))
+    made = replace(
+        origin_of(job, "fit"), name="spec", command=f"{NAME} in Python", toml=_account(fit)
+    )
     return _written(fit_report(doubted(judged(told_of(job, fit))), made), place)
 
 
 def page_of_spec(fitted: FitReport, path: str | os.PathLike | None, tests: None = None) -> Page:
-    """Return the page of what `fit_spec` returned, as the command line writes it; errors as `page_of`."""
+    """Return the page of what `fit_spec` returned, as the command line writes it.
+
+    Errors as `page_of`.
+    """
     place = _checked(fitted.fit, path)
     return _written(fit_report(fitted), place)
 
@@ -221,15 +231,27 @@ def _account(fit: Estimate | MotionEstimate) -> str:
 
 def job_of(fit: Any, tests: Mapping[str, Record]) -> Job:
     """Return the job whose result the fit is, as far as the fit knows it."""
-    if not isinstance(tests, Mapping) or not all(isinstance(record, Record) for record in tests.values()):
+    if not isinstance(tests, Mapping) or not all(
+        isinstance(record, Record) for record in tests.values()
+    ):
         raise InputError("`tests` must be records by their names, such as {'steps': record}.")
     problem = fit.problem
-    named: dict[str, Any] = {"path": Path(NAME), "spec": FitFacts(fit), "validation": None, "problem": problem}
+    named: dict[str, Any] = {
+        "path": Path(NAME),
+        "spec": FitFacts(fit),
+        "validation": None,
+        "problem": problem,
+    }
     named["train"] = Part("train", problem.record, 0, ())
     named["tests"] = tuple(
-        Part(f"tests.{name}", fit.model.fitting(record, need_outputs=True), 0, ()) for name, record in tests.items()
+        Part(f"tests.{name}", fit.model.fitting(record, need_outputs=True), 0, ())
+        for name, record in tests.items()
     )
-    measure = Training() if fit.model.measure == "training" else getattr(fit.measure, "measure", None) or Training()
+    measure = (
+        Training()
+        if fit.model.measure == "training"
+        else getattr(fit.measure, "measure", None) or Training()
+    )
     if isinstance(fit, MotionEstimate):
         return MotionJob(measure=measure, engine=InMemory(), **named)
     weighed = weigh_problem(measure, problem)

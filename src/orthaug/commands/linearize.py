@@ -34,7 +34,9 @@ def check_place(out: Path | None, *read: Path, force: bool = False) -> None:
     elif suffix == ".json":
         check_file(out, *read, force=force)
     elif suffix in (".txt", ".csv", ".toml", ".html"):
-        raise InputError(f"{out}: found the ending '{out.suffix}'; give a folder, or .json, .png, .pdf or .svg.")
+        raise InputError(
+            f"{out}: found the ending '{out.suffix}'; give a folder, or .json, .png, .pdf or .svg."
+        )
     else:
         check_replaceable(out, force=force)
         for file in read:
@@ -66,7 +68,9 @@ def open_linear(model: Path, data: Path | None) -> tuple[Model | MotionModel, Re
 
 
 def write(found: Linearization, out: Path, *, force: bool = False) -> None:
-    """A folder with result.json, linear.txt and figures/; or one file, by its ending JSON or the frequency response.
+    """A folder with result.json, linear.txt and figures/.
+
+    Or one file, by its ending JSON or the frequency response.
 
     Whole or not at all.
     """
@@ -83,7 +87,10 @@ def write(found: Linearization, out: Path, *, force: bool = False) -> None:
 
     if suffix in _FIGURES:
         if not found[0].inputs:
-            raise InputError("the model has no inputs, so that it has no frequency response to draw; give a folder.")
+            raise InputError(
+                "the model has no inputs, so that it has no frequency response to draw; give a "
+                "folder."
+            )
         save_figure(bode_figure(found), out, force=force)
         return
     with whole_folder(out, force=force) as partial:

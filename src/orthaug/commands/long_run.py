@@ -41,7 +41,11 @@ def long_run(model: Path, data: Path, reading: ReadOptions, *, free: bool) -> Lo
     Raises:
         InputError: no model, a file that cannot be read, a model of data that had other instants.
     """
-    if data.suffix.lower() != ".parquet" or reading != ReadOptions(columns=reading.columns) or not data.is_file():
+    if (
+        data.suffix.lower() != ".parquet"
+        or reading != ReadOptions(columns=reading.columns)
+        or not data.is_file()
+    ):
         return None
     with parquet_file(data) as file:
         if file.metadata.num_rows <= LONG:
@@ -51,7 +55,9 @@ def long_run(model: Path, data: Path, reading: ReadOptions, *, free: bool) -> Lo
 
     loaded = load(model)
     check_instants(loaded, data)
-    if not isinstance(loaded, Model) or len(held_outputs(loaded, data, reading)) < len(loaded.outputs):
+    if not isinstance(loaded, Model) or len(held_outputs(loaded, data, reading)) < len(
+        loaded.outputs
+    ):
         return None
     source = open_parquet(
         [data],
@@ -64,8 +70,12 @@ def long_run(model: Path, data: Path, reading: ReadOptions, *, free: bool) -> Lo
     return LongRun(loaded, source, free)
 
 
-def write(run: LongRun, out: Path | None, *, force: bool = False) -> tuple[Scores | None, list[Warning]]:
-    """Return the table of `run.write_csv`, to a file (whole or not at all) or standard output; scores of all rows, warnings.
+def write(
+    run: LongRun, out: Path | None, *, force: bool = False
+) -> tuple[Scores | None, list[Warning]]:
+    """Return the table of `run.write_csv`, to a file (whole or not at all) or standard output.
+
+    Scores of all rows, warnings.
 
     No scores where a free run left all bounds.
     """
@@ -85,7 +95,9 @@ def write(run: LongRun, out: Path | None, *, force: bool = False) -> tuple[Score
             if told.diverged is not None:
                 row, output = told.diverged
                 text = f"the free run diverged in output '{output}' at step {piece.offset + row}; "
-                warnings.append(Warning("free_run_diverged", text + "it has no values from there on."))
+                warnings.append(
+                    Warning("free_run_diverged", text + "it has no values from there on.")
+                )
     return (None if warnings or not scored.rows else scored.scores()), warnings
 
 
@@ -94,5 +106,8 @@ def _opened(out: Path | None, force: bool) -> Iterator[Any]:
     if out is None:
         yield sys.stdout
         return
-    with whole_file(out, force=force) as partial, partial.open("w", encoding="utf-8", newline="") as file:
+    with (
+        whole_file(out, force=force) as partial,
+        partial.open("w", encoding="utf-8", newline="") as file,
+    ):
         yield file

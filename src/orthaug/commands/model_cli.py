@@ -72,7 +72,10 @@ def predict(
     out: OutFile = None,
     initial: Initial = None,
     observer: Annotated[
-        bool, typer.Option("--observer", help="From an estimated state, with 95 % bands; outputs may be missing.")
+        bool,
+        typer.Option(
+            "--observer", help="From an estimated state, with 95 % bands; outputs may be missing."
+        ),
     ] = False,
     missing: Missing = "error",
     rows: Rows = None,
@@ -104,17 +107,28 @@ def predict(
 @app.command()
 def split(
     model: ModelPath,
-    data: Annotated[list[Path], typer.Argument(metavar="DATA…", help="The files that the model was trained on.")],
+    data: Annotated[
+        list[Path], typer.Argument(metavar="DATA…", help="The files that the model was trained on.")
+    ],
     measure: Annotated[
-        str, typer.Option("--measure", metavar="KIND", help="As `kind` in the spec's [structure.measure].")
+        str,
+        typer.Option(
+            "--measure", metavar="KIND", help="As `kind` in the spec's [structure.measure]."
+        ),
     ] = "training",
-    rows: Annotated[str | None, typer.Option("--rows", metavar="A:B", help="Rows of each file, half-open.")] = None,
-    box: Annotated[
-        list[str] | None, typer.Option("--box", metavar="LAG=LOW:HIGH", help="Limits of the uniform measure.")
+    rows: Annotated[
+        str | None, typer.Option("--rows", metavar="A:B", help="Rows of each file, half-open.")
     ] = None,
-    samples: Annotated[str | None, typer.Option("--samples", metavar="FILE", help="Points, a column per lag.")] = None,
+    box: Annotated[
+        list[str] | None,
+        typer.Option("--box", metavar="LAG=LOW:HIGH", help="Limits of the uniform measure."),
+    ] = None,
+    samples: Annotated[
+        str | None, typer.Option("--samples", metavar="FILE", help="Points, a column per lag.")
+    ] = None,
     weights: Annotated[
-        str | None, typer.Option("--weights", metavar="FILE", help="A column `weight`, a row per row of DATA.")
+        str | None,
+        typer.Option("--weights", metavar="FILE", help="A column `weight`, a row per row of DATA."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -127,7 +141,11 @@ def split(
     from orthaug.reports.text import split_text
 
     opened = splitting.open_training(model, data, read_rows(rows))
-    given = {"box": box or [], "samples": [samples] if samples else [], "weights": [weights] if weights else []}
+    given = {
+        "box": box or [],
+        "samples": [samples] if samples else [],
+        "weights": [weights] if weights else [],
+    }
     chosen = splitting.read_measure(measure, given, opened)
     prepare_jax()
     for line in opened.notes:
@@ -139,10 +157,16 @@ def split(
 @app.command()
 def explain(
     model: ModelPath,
-    data: Annotated[list[Path], typer.Argument(metavar="DATA…", help="Best the files that the model was trained on.")],
-    degree: Annotated[int, typer.Option("--degree", metavar="D", help="Of products of what the learner sees.")] = 3,
+    data: Annotated[
+        list[Path],
+        typer.Argument(metavar="DATA…", help="Best the files that the model was trained on."),
+    ],
+    degree: Annotated[
+        int, typer.Option("--degree", metavar="D", help="Of products of what the learner sees.")
+    ] = 3,
     functions: Annotated[
-        list[str] | None, typer.Option("--function", metavar="NAME", help="In products, such as abs; any number.")
+        list[str] | None,
+        typer.Option("--function", metavar="NAME", help="In products, such as abs; any number."),
     ] = None,
     most: Annotated[int, typer.Option("--terms", metavar="N", help="Terms at most.")] = 6,
     rows: Rows = None,
@@ -170,7 +194,12 @@ def explain(
 @app.command()
 def export(
     model: ModelPath,
-    to: Annotated[str, typer.Option("--to", metavar="TARGET", help="c, casadi, control, fmu, numpy, onnx or latex.")],
+    to: Annotated[
+        str,
+        typer.Option(
+            "--to", metavar="TARGET", help="c, casadi, control, fmu, numpy, onnx or latex."
+        ),
+    ],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the code.")],
     name: Annotated[str, typer.Option("--name", help="Of files and functions.")] = "model",
     which: Which = "fitted",
@@ -192,16 +221,24 @@ def export(
 def linearize(
     model: ModelPath,
     at: Annotated[
-        str | None, typer.Option("--at", metavar="'NAME=VALUE, …'", help="Held inputs; outputs or states to fix.")
+        str | None,
+        typer.Option(
+            "--at", metavar="'NAME=VALUE, …'", help="Held inputs; outputs or states to fix."
+        ),
     ] = None,
     data: Annotated[
-        Path | None, typer.Option("--data", metavar="DATA|SPEC", help="Measured data to compare with.")
+        Path | None,
+        typer.Option("--data", metavar="DATA|SPEC", help="Measured data to compare with."),
     ] = None,
     continuous: Annotated[
-        str, typer.Option("--continuous", metavar="zoh|tustin", help="How to convert to continuous time.")
+        str,
+        typer.Option(
+            "--continuous", metavar="zoh|tustin", help="How to convert to continuous time."
+        ),
     ] = "zoh",
     out: Annotated[
-        Path | None, typer.Option("--out", metavar="DIR|FILE", help="Folder; or a .json, .png, .pdf or .svg.")
+        Path | None,
+        typer.Option("--out", metavar="DIR|FILE", help="Folder; or a .json, .png, .pdf or .svg."),
     ] = None,
     as_json: AsJson = False,
     force: Force = False,
@@ -216,7 +253,9 @@ def linearize(
     linearizing.check_place(out, model, *([data] if data else []), force=force)
     opened, record = linearizing.open_linear(model, data)
     prepare_jax()
-    for line in prepared_notes(opened, what="Operating points are those of data after these steps."):
+    for line in prepared_notes(
+        opened, what="Operating points are those of data after these steps."
+    ):
         streams.say(line)
     from orthaug.analysis.linearization import linearize as linearized
 
@@ -232,21 +271,32 @@ def linearize(
 def track(
     model: ModelPath,
     data: Annotated[
-        list[Path] | None, typer.Option("--data", metavar="FILE", help="New data; any number, a gap between them.")
+        list[Path] | None,
+        typer.Option("--data", metavar="FILE", help="New data; any number, a gap between them."),
     ] = None,
     training: Annotated[
-        list[Path] | None, typer.Option("--training", metavar="FILE", help="The files that the model was trained on.")
+        list[Path] | None,
+        typer.Option("--training", metavar="FILE", help="The files that the model was trained on."),
     ] = None,
-    rows: Annotated[str | None, typer.Option("--rows", metavar="A:B", help="Rows of each training file.")] = None,
+    rows: Annotated[
+        str | None, typer.Option("--rows", metavar="A:B", help="Rows of each training file.")
+    ] = None,
     forgetting: Annotated[
-        float | None, typer.Option("--forgetting", metavar="λ", help="Weight of a row against the next one.")
+        float | None,
+        typer.Option("--forgetting", metavar="λ", help="Weight of a row against the next one."),
     ] = None,
-    memory: Annotated[float | None, typer.Option("--memory", metavar="S", help="The same in seconds.")] = None,
+    memory: Annotated[
+        float | None, typer.Option("--memory", metavar="S", help="The same in seconds.")
+    ] = None,
     state: Annotated[
-        Path | None, typer.Option("--state", metavar="DIR", help="Result of an earlier run, to go on from.")
+        Path | None,
+        typer.Option("--state", metavar="DIR", help="Result of an earlier run, to go on from."),
     ] = None,
     follows: Annotated[
-        bool, typer.Option("--follows", help="The new data follow on the state's last row without a gap.")
+        bool,
+        typer.Option(
+            "--follows", help="The new data follow on the state's last row without a gap."
+        ),
     ] = False,
     out: OutFolder = None,
     as_json: AsJson = False,
@@ -268,14 +318,21 @@ def track(
     prepare_jax()
     for line in prepared_notes(opened.model, opened.record):
         streams.say(line)
-    tracked = tracking.track(opened, forgetting=forgetting, memory=memory, state=state, follows=follows)
+    tracked = tracking.track(
+        opened, forgetting=forgetting, memory=memory, state=state, follows=follows
+    )
     text = track_text(tracked.result)
     tracking.write_tracked(tracked, folder, text, force=force)
     tell(tracked.result, text, as_json, folder)
 
 
-def _written_long(model: Path, data: Path, reading: ReadOptions, out: Path | None, force: bool, *, free: bool) -> bool:
-    """Return whether the file is one that is not read at once; then its table is written piece by piece."""
+def _written_long(
+    model: Path, data: Path, reading: ReadOptions, out: Path | None, force: bool, *, free: bool
+) -> bool:
+    """Return whether the file is one that is not read at once.
+
+    Then its table is written piece by piece.
+    """
     from orthaug.commands import long_run
     from orthaug.commands.folder import check_file
     from orthaug.commands.run import prepared_notes
@@ -298,7 +355,11 @@ def _written_long(model: Path, data: Path, reading: ReadOptions, out: Path | Non
 
 
 def _write_response(
-    response: Response, opened: ModelOnData, out: Path | None, force: bool, notes: Sequence[str] = ()
+    response: Response,
+    opened: ModelOnData,
+    out: Path | None,
+    force: bool,
+    notes: Sequence[str] = (),
 ) -> None:
     """The CSV and what is to say about it: scores go where the CSV does not."""
     from orthaug.commands import run

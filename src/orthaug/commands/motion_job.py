@@ -18,7 +18,13 @@ from orthaug.commands.spec import Spec
 from orthaug.commands.suspects import declared_terms
 from orthaug.data.record import Record, check_channels
 from orthaug.data.regressors import Layout
-from orthaug.fitting.rules import check_cost, check_motion_choices, check_scored, check_solver, tried
+from orthaug.fitting.rules import (
+    check_cost,
+    check_motion_choices,
+    check_scored,
+    check_solver,
+    tried,
+)
 from orthaug.fitting.structures import Structure
 from orthaug.inference.kinds import MeasurePlace
 from orthaug.inference.measures import Measure, Support
@@ -103,13 +109,24 @@ def open_motion(path: Path, spec: Spec) -> MotionJob:
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     least = len(motion.states) + 1  # rows of a run that tell where it starts
-    train, validation, *tests = (p and p.without_short(0, least) for p in _parts(load_parts(path, spec)))
+    train, validation, *tests = (
+        p and p.without_short(0, least) for p in _parts(load_parts(path, spec))
+    )
     assert train is not None
     try:
         inputs = spec.learner_inputs() if spec.declared_learner() is not None else None
         problem = pose_motion(train.record, motion, inputs, spec.training.output_weights)
-        named = {"path": path, "spec": spec, "train": train, "validation": validation, "tests": tuple(tests)}
-        own = {"measure": _measure_of(spec, problem, path.parent), "suspects": declared_terms(spec.suspects, problem)}
+        named = {
+            "path": path,
+            "spec": spec,
+            "train": train,
+            "validation": validation,
+            "tests": tuple(tests),
+        }
+        own = {
+            "measure": _measure_of(spec, problem, path.parent),
+            "suspects": declared_terms(spec.suspects, problem),
+        }
         kind = spec.engine_kind([path.parent / entry.file for entry in train.files])
         job = MotionJob(**named, problem=problem, engine=engine_of(spec.engine, kind), **own)
         for part in job.parts:
@@ -158,7 +175,9 @@ def _check_sizes(spec: Spec, problem: MotionProblem) -> None:
         "outputs": max(len(states) + len(outputs), 1),
     }
     runs = spec.runs(linear=False)
-    check_cost(spec.declared_learner(), **sizes, iterations=spec.declared_solver().iterations, runs=runs)
+    check_cost(
+        spec.declared_learner(), **sizes, iterations=spec.declared_solver().iterations, runs=runs
+    )
 
 
 def _measure_of(spec: Spec, problem: MotionProblem, folder: Path) -> Measure:

@@ -12,7 +12,13 @@ from orthaug.analysis.closed_loop import closed_loop
 from orthaug.commands.attempt import attempt, attempt_warned
 from orthaug.commands.motion_job import MotionJob
 from orthaug.commands.scales import describe_scales
-from orthaug.reports.result import CheckResult, FitResult, MeasureResult, ParameterResult, parameter_rows
+from orthaug.reports.result import (
+    CheckResult,
+    FitResult,
+    MeasureResult,
+    ParameterResult,
+    parameter_rows,
+)
 
 if TYPE_CHECKING:
     from orthaug.analysis.input_timing import Trial
@@ -25,11 +31,13 @@ _UNKNOWN = ("physical_parameters", "physical_consistency", "sensitivities", "bia
 _STIFF = 20  # substeps from which a motion is told to be stiff for its sampling
 _NOT_ANALYSED = Warning(
     "residual_not_analysed",
-    "the residual is not analysed: the free run ran away, has too few rows, or leaves rounding only.",
+    "the residual is not analysed: the free run ran away, has too few rows, or leaves rounding "
+    "only.",
 )
 _NOT_RICH = Warning(
     "rich_inputs_run_away",
-    "physics alone runs away with rich inputs: what is told of identifiability is that of the record's own.",
+    "physics alone runs away with rich inputs: what is told of identifiability is that of the "
+    "record's own.",
 )
 
 
@@ -50,18 +58,28 @@ def checked(job: MotionJob) -> CheckResult:
     segmented = SegmentedMotion.of(without_learner(problem), None, criterion)
     told = identified(segmented)
     if told is None:
-        wild = "".join(f" {warning.text}" for warning in job.warnings if warning.code == "wild_samples")
+        wild = "".join(
+            f" {warning.text}" for warning in job.warnings if warning.code == "wild_samples"
+        )
         scales = describe_scales(problem.record)
         cause = f" {scales[0].upper()}{scales[1:]}" if scales else ""
         remedy = f"it runs on a sample that is none.{wild}" if wild else f"give others.{cause}"
-        raise InputError(f"{job.path}: physics alone has no finite free run from its initial values; {remedy}")
+        raise InputError(
+            f"{job.path}: physics alone has no finite free run from its initial values; {remedy}"
+        )
     shared, on_rows = None, []
     if spec.declared_learner() is not None and job.structure.shared != "all":
-        form = MotionDynamics(motion, problem.features, None, problem.record.sampling_time, problem.substeps)
+        form = MotionDynamics(
+            motion, problem.features, None, problem.record.sampling_time, problem.substeps
+        )
         shared = imitation_before(form, motion.coordinates.initial, told.states, told.inputs)
         seen = shared_of_motion(form, motion.coordinates.initial, told.states, told.inputs)
         on_rows = shared_warnings(seen, [str(entry) for entry in form.features])
-    posed, waves = (problem, Waves()) if spec.declared_learner() is not None else (without_learner(problem), None)
+    posed, waves = (
+        (problem, Waves())
+        if spec.declared_learner() is not None
+        else (without_learner(problem), None)
+    )
     trial = try_holds(posed, criterion, spec.declared_solver(), job.structure, waves)
     text, warnings = _about_steps(job, trial)
     warnings += [late.warning for late in dead_times(trial.task, spec.declared_solver())]
@@ -93,7 +111,9 @@ def checked(job: MotionJob) -> CheckResult:
 
 
 def _biases(job: MotionJob, trial: Trial) -> list[dict[str, Any]] | None:
-    """Return what every suspect would do, about physics alone; of the usual ones those that do anything, where none is named.
+    """Return what every suspect would do, about physics alone.
+
+    Of the usual ones those that do anything, where none is named.
 
     None where physics alone has no run.
     """
@@ -112,7 +132,9 @@ def refused(job: MotionJob, result: CheckResult) -> InputError | None:
     if found.rank == found.columns:
         return None
     groups = "; ".join(
-        f"{group[0]} changes no output" if len(group) == 1 else f"{', '.join(group)} cannot be told apart"
+        f"{group[0]} changes no output"
+        if len(group) == 1
+        else f"{', '.join(group)} cannot be told apart"
         for group in found.collinear
     )
     lacking = found.columns - found.rank
@@ -121,7 +143,8 @@ def refused(job: MotionJob, result: CheckResult) -> InputError | None:
     if result.identifiability.identifiable:
         remedy += ", or use data that excite them separately"
     return RankError(
-        f"the outputs do not determine the parameters (rank {found.rank} of {found.columns}): {groups}; {remedy}."
+        f"the outputs do not determine the parameters (rank {found.rank} of {found.columns}): "
+        f"{groups}; {remedy}."
     )
 
 
@@ -140,7 +163,9 @@ def content(
     motion, form = job.problem.motion, fit.model.form
     count, gram = len(motion.names), fit.model.statistics.gram
     found: dict[str, Any] = dict.fromkeys(("budget", "coarse", "parts"))
-    told: dict[str, Any] = dict.fromkeys((*_UNKNOWN, "residuals", "stability", "shared", "measure_detail"))
+    told: dict[str, Any] = dict.fromkeys(
+        (*_UNKNOWN, "residuals", "stability", "shared", "measure_detail")
+    )
     if fit.status.ok:
         plain = fit
         fit = attempt("the robust covariance", lambda: robust_free_run(plain), warnings, plain)
@@ -155,9 +180,15 @@ def content(
         told["measure_detail"] = MeasureResult.of_motion(fit.split_by)
     return fit, told | {
         "parameters": _parameters(fit, budget),
-        "standard_errors": None if fit.std is None else "plain" if fit.plain_covariance is None else "robust",
+        "standard_errors": None
+        if fit.std is None
+        else "plain"
+        if fit.plain_covariance is None
+        else "robust",
         "standard_errors_by": None if fit.std_kind == "plain" else fit.std_kind,
-        "excitation": Excitation(0, count, None, ()) if gram is None else of_gram(gram[:count, :count], motion.names),
+        "excitation": Excitation(0, count, None, ())
+        if gram is None
+        else of_gram(gram[:count, :count], motion.names),
         "motion": {
             "states": motion.names_of_states,
             "integrator": motion.integrator,
@@ -170,8 +201,13 @@ def content(
     }
 
 
-def _analysed(job: MotionJob, fit: MotionEstimate, free_run: Response, warnings: list[Any]) -> dict[str, Any]:
-    """Return what is asked of a fit behind its training; None for an analysis that fails. Warnings are added."""
+def _analysed(
+    job: MotionJob, fit: MotionEstimate, free_run: Response, warnings: list[Any]
+) -> dict[str, Any]:
+    """Return what is asked of a fit behind its training; None for an analysis that fails.
+
+    Warnings are added.
+    """
     from orthaug.analysis.learned_part import equation_parts
     from orthaug.analysis.motion_bias import suspected_bias
     from orthaug.analysis.motion_budget import told_budget
@@ -184,29 +220,43 @@ def _analysed(job: MotionJob, fit: MotionEstimate, free_run: Response, warnings:
         budget = told_budget(fit, job.suspects, table)
         warnings.extend(budget.warnings if budget else ())
         listed = {entry.suspect for entry in table}
-        usual = [cause for cause in (budget.causes if budget else ()) if cause.suspect not in listed]
+        usual = [
+            cause for cause in (budget.causes if budget else ()) if cause.suspect not in listed
+        ]
         return [entry.as_dict() for entry in (*table, *usual)] or None, budget
 
     points = job.reach(fit.model, job.train.record)[0]
     x, u = np.split(points, [fit.model.form.states], axis=1)
     found = {
         "residuals": attempt_warned(
-            "the analysis of the residual", lambda: diagnose_motion(fit, free_run), warnings, _NOT_ANALYSED
+            "the analysis of the residual",
+            lambda: diagnose_motion(fit, free_run),
+            warnings,
+            _NOT_ANALYSED,
         ),
         "stability": attempt_warned(
-            "the analysis of the modes", lambda: motion_stability(fit.model, x, u, record=job.train.record), warnings
+            "the analysis of the modes",
+            lambda: motion_stability(fit.model, x, u, record=job.train.record),
+            warnings,
         ),
         "parts": None,
     }
     if fit.model.form.bound is not None:
-        found["parts"] = attempt("the size of the learned part", lambda: equation_parts(fit, x, u), warnings, None)
-    found["coarse"] = attempt_warned("the analysis of the substeps", lambda: substep_bias(fit), warnings)
+        found["parts"] = attempt(
+            "the size of the learned part", lambda: equation_parts(fit, x, u), warnings, None
+        )
+    found["coarse"] = attempt_warned(
+        "the analysis of the substeps", lambda: substep_bias(fit), warnings
+    )
     table, budget = attempt("the bias by suspects", biases, warnings, (None, None))
     return found | {"bias": table, "budget": budget}
 
 
 def figures(
-    job: MotionJob, fit: MotionEstimate, result: FitResult, responses: Mapping[str, tuple[Response, Response]]
+    job: MotionJob,
+    fit: MotionEstimate,
+    result: FitResult,
+    responses: Mapping[str, tuple[Response, Response]],
 ) -> dict[str, Figure]:
     """Return the figures of a result by their names."""
     from orthaug.reports import finding_plots, plots
@@ -218,13 +268,17 @@ def figures(
     drawn = {
         "simulation": plots.output_figure(free, f"free run, {part.name}", learns=learns),
         "residual": plots.residual_figure(free, f"free-run residual, {part.name}"),
-        "states": plots.states_figure(fit.model, part.record, f"states of the free run, {part.name}"),
+        "states": plots.states_figure(
+            fit.model, part.record, f"states of the free run, {part.name}"
+        ),
     }
     if result.bias:
         drawn["bias"] = finding_plots.bias_figure(result.bias)
     drawn["prediction"] = plots.output_figure(one_step, f"one-step prediction, {part.name}")
     if learns:
-        drawn["components"] = plots.parts_figure(fit.model, part.record, f"physics and learner, {part.name}")
+        drawn["components"] = plots.parts_figure(
+            fit.model, part.record, f"physics and learner, {part.name}"
+        )
         part = learned_of(fit, job.train.record)
         assert part is not None
         title = f"learned beside the physics, by the {fit.model.measure} measure"
@@ -257,11 +311,15 @@ def _about_steps(job: MotionJob, trial: Trial) -> tuple[str, list[Warning]]:
     if motion.integrator == "discrete":
         return "The equations give the state one sample later: nothing is integrated.", warnings
     if trial.substeps is None:
-        told = "physics alone has no finite free run from its initial values, so substeps and holds were not tried."
+        told = (
+            "physics alone has no finite free run from its initial values, so substeps and "
+            "holds were not tried."
+        )
         return "", [Warning("physics_runs_away", told)]
     told = [
-        f"The fastest mode of the initial physics is {problem.fastest:.3g} 1/s, sampled every {step:g} s; "
-        f"{trial.substeps} substep{'s' * (trial.substeps > 1)} of {motion.integrator} in a sample"
+        f"The fastest mode of the initial physics is {problem.fastest:.3g} 1/s, sampled every "
+        f"{step:g} s; {trial.substeps} substep{'s' * (trial.substeps > 1)} of "
+        f"{motion.integrator} in a sample"
         + (
             " are as declared."
             if motion.substeps is not None
@@ -269,15 +327,17 @@ def _about_steps(job: MotionJob, trial: Trial) -> tuple[str, list[Warning]]:
         )
     ]
     if trial.substeps >= _STIFF:
-        text = (
-            f'the motion is stiff for its sampling: {trial.substeps} substeps; `integrator = "exact"` may need fewer.'
-        )
+        text = f'the motion is stiff for its sampling: {trial.substeps} substeps; `integrator = "exact"` may need fewer.'
         warnings.append(Warning("stiff", text))
     if len(trial.holds) > 1:
         shown = ", ".join(
-            f"{held.hold} {'no run' if held.residual is None else f'{held.residual:.4g}'}" for held in trial.holds
+            f"{held.hold} {'no run' if held.residual is None else f'{held.residual:.4g}'}"
+            for held in trial.holds
         )
-        told.append(f"Physics alone leaves, by the hold of its inputs, in deviations of the output: {shown}.")
+        told.append(
+            "Physics alone leaves, by the hold of its inputs, in deviations of the output: "
+            f"{shown}."
+        )
         if trial.best is None:
             told.append("None explains the data clearly better than the declared one.")
         else:

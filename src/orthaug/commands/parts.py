@@ -45,19 +45,24 @@ class Part:
         """
         if not self.record.missing:
             return self
-        record, gaps = long_stretches(self.record, self.skips, first, least, f"data.{self.name}: ", self.skip)
+        record, gaps = long_stretches(
+            self.record, self.skips, first, least, f"data.{self.name}: ", self.skip
+        )
         told = Warning("missing_rows", f"{self.name}: {gaps}")
         return replace(self, record=record, warnings=(*self.warnings, told))
 
     @property
     def skips(self) -> tuple[int, ...]:
         """Return how many leading samples of each experiment are not scored."""
-        return tuple(max(0, self.skip - experiment.offset) for experiment in self.record.experiments)
+        return tuple(
+            max(0, self.skip - experiment.offset) for experiment in self.record.experiments
+        )
 
     def scored(self, start: int) -> Record:
         """Return the record of the scored rows and their lags, where the first usable row is `start`."""
         kept = tuple(
-            e.rows(max(0, skip - start), None) for e, skip in zip(self.record.experiments, self.skips, strict=True)
+            e.rows(max(0, skip - start), None)
+            for e, skip in zip(self.record.experiments, self.skips, strict=True)
         )
         return replace(self.record, experiments=kept)
 
@@ -65,20 +70,21 @@ class Part:
         """Raise InputError where an experiment has no row to score or fewer than `least`, or another sampling time."""
         if not same_step(self.record.sampling_time, sampling_time):
             raise InputError(
-                f"data.{self.name}: sampled every {self.record.sampling_time:g} s, the training data every "
-                f"{sampling_time:g} s; one model has one sampling time."
+                f"data.{self.name}: sampled every {self.record.sampling_time:g} s, the "
+                f"training data every {sampling_time:g} s; one model has one sampling time."
             )
         for experiment, skip in zip(self.record.experiments, self.skips, strict=True):
             first = max(start, skip)
             if len(experiment) < least:
                 raise InputError(
-                    f"{experiment.source}: data.{self.name} has {len(experiment)} rows, too few; at least {least} tell "
-                    "where a run of this motion starts."
+                    f"{experiment.source}: data.{self.name} has {len(experiment)} rows, too "
+                    f"few; at least {least} tell where a run of this motion starts."
                 )
             if len(experiment) <= first:
                 raise InputError(
-                    f"{experiment.source}: data.{self.name} has {len(experiment)} rows, too few; the first {first} are "
-                    f"lags or skipped, so at least {first + 1} are needed."
+                    f"{experiment.source}: data.{self.name} has {len(experiment)} rows, too "
+                    f"few; the first {first} are lags or skipped, so at least {first + 1} are "
+                    "needed."
                 )
 
 
@@ -102,12 +108,14 @@ def long_stretches(
         needed = f"the first {max(first, skip)} are lags or skipped"
         needed = f"at least {least} are needed" if most < least else needed
         raise InputError(
-            f"{record.experiments[0].source}: {what}the longest stretch between missing samples has "
-            f"{counted(most, 'row')}, too few: {needed}."
+            f"{record.experiments[0].source}: {what}the longest stretch between missing "
+            f"samples has {counted(most, 'row')}, too few: {needed}."
         )
     kept = replace(record, experiments=long)
     usable = sum(len(experiment) - first for experiment in long)
-    lost = "row has missing cells and is" if record.missing == 1 else "rows have missing cells and are"
+    lost = (
+        "row has missing cells and is" if record.missing == 1 else "rows have missing cells and are"
+    )
     return kept, (
         f"{record.missing} {lost} left out with all windows that touch them; "
         f"{counted(usable, 'usable row')} remain, in {len(long)} stretch{'es' * (len(long) > 1)}."
@@ -119,8 +127,13 @@ def load_parts(path: Path, spec: Spec) -> tuple[Part, Part | None, tuple[Part, .
     files = [path.parent / file for file in expanded(path, spec.data.train.files, "train")]
     stays = spec.engine_kind(files) in ("stream", "dask") and not spec.brought
     train = _load(path, spec, spec.data.train, "train", stays=stays)
-    validation = _load(path, spec, spec.data.validation, "validation") if spec.data.validation else None
-    tests = [_load(path, spec, part, f"tests.{name}", stays=stays) for name, part in spec.data.tests.items()]
+    validation = (
+        _load(path, spec, spec.data.validation, "validation") if spec.data.validation else None
+    )
+    tests = [
+        _load(path, spec, part, f"tests.{name}", stays=stays)
+        for name, part in spec.data.tests.items()
+    ]
     return train, validation, tuple(tests)
 
 
@@ -140,21 +153,30 @@ def expanded(path: Path, entries: Sequence[str], name: str) -> list[str]:
             continue
         if not files:
             raise InputError(
-                f"{path}: 'data.{name}.files': no file fits '{entry}'; expected one of {', '.join(KNOWN)}."
+                f"{path}: 'data.{name}.files': no file fits '{entry}'; expected one of "
+                f"{', '.join(KNOWN)}."
             )
         found += sorted(file for file in files if Path(file).suffix)
     return found
 
 
 def _load(path: Path, spec: Spec, part: PartSection, name: str, *, stays: bool = False) -> Part:
-    """Read a part's files. Messages begin with the file at fault; once it is read, with its name in the spec.
+    """Read a part's files.
+
+    Messages begin with the file at fault; once it is read, with its name in the spec.
 
     Args:
         stays: leave the rows of Parquet files where they are, and read a witness of them.
     """
-    unknown = [channel for channel in part.columns if channel not in (*spec.data.inputs, *spec.data.outputs)]
+    unknown = [
+        channel
+        for channel in part.columns
+        if channel not in (*spec.data.inputs, *spec.data.outputs)
+    ]
     if unknown:
-        raise InputError(f"{path}: 'data.{name}.columns': '{unknown[0]}' is neither an input nor an output.")
+        raise InputError(
+            f"{path}: 'data.{name}.columns': '{unknown[0]}' is neither an input nor an output."
+        )
     files = expanded(path, part.files, name)
     if stays and all(Path(file).suffix.lower() == ".parquet" for file in files):
         return _left(path, spec, part, name, files)
@@ -171,18 +193,28 @@ def _load(path: Path, spec: Spec, part: PartSection, name: str, *, stays: bool =
             every=part.every,
             prepare=spec.data.steps,
         )
-        results.append(FileResult(file=file, sha256=file_digest(path.parent / file), rows=len(record)))
+        results.append(
+            FileResult(file=file, sha256=file_digest(path.parent / file), rows=len(record))
+        )
         records.append(record)
     record = Record.join(records)
     sources = (file for read, file in zip(records, files, strict=True) for _ in read.experiments)
-    told = tuple(replace(e, source=file) for e, file in zip(record.experiments, sources, strict=True))
+    told = tuple(
+        replace(e, source=file) for e, file in zip(record.experiments, sources, strict=True)
+    )
     record = replace(record, experiments=told)
     warnings = ()
     if part.every > 1:
         given = spec.data.sampling_time
-        apart = f", so that rows are {part.every * given:g} s apart instead of {given:g} s" if given else ""
+        apart = (
+            f", so that rows are {part.every * given:g} s apart instead of {given:g} s"
+            if given
+            else ""
+        )
         kept = f"{name}: one row in {part.every} is kept without a filter{apart}"
-        warnings = (Warning("thinned", f"{kept}; content above the new Nyquist frequency folds back."),)
+        warnings = (
+            Warning("thinned", f"{kept}; content above the new Nyquist frequency folds back."),
+        )
     if spec.data.time is None:
         warnings += _other_step(path, spec, files, name, part.columns)
     if name == "train":
@@ -209,17 +241,24 @@ def _left(path: Path, spec: Spec, part: PartSection, name: str, files: Sequence[
     for partition in source.partitions:
         rows[partition.path] = rows.get(partition.path, 0) + partition.rows
     results = [
-        FileResult(file=file, sha256=file_digest(path.parent / file), rows=rows[str(path.parent / file)])
+        FileResult(
+            file=file, sha256=file_digest(path.parent / file), rows=rows[str(path.parent / file)]
+        )
         for file in files
     ]
     names = {str(path.parent / file): file for file in files}
     record = witness(source)
-    record = replace(record, experiments=tuple(replace(e, source=names[e.source]) for e in record.experiments))
+    record = replace(
+        record, experiments=tuple(replace(e, source=names[e.source]) for e in record.experiments)
+    )
     total, warnings = sum(rows.values()), ()
     if spec.data.time is None:
         warnings = _other_step(path, spec, files, name, part.columns)
     if len(record) < total:
-        told = f"{name}: findings and figures look at {len(record)} of {total} rows, in windows spread over them."
+        told = (
+            f"{name}: findings and figures look at {len(record)} of {total} rows, in windows "
+            "spread over them."
+        )
         warnings += (Warning("witness", told),)
     return Part(name, record, part.skip, tuple(results), warnings, source)
 
@@ -248,9 +287,16 @@ def _other_step(
         clock = told_clock(path.parent / file, used)
         if clock.column is None or clock.step is None or abs(clock.step - step) <= DRIFT * step:
             continue
-        said = f"`sampling_time` is {step:g} s" if given else "the spec says no sampling time, so 1 s is taken"
+        said = (
+            f"`sampling_time` is {step:g} s"
+            if given
+            else "the spec says no sampling time, so 1 s is taken"
+        )
         header = clock.column.header
         remedy = f'time = "{header}"' if clock.instants else f"sampling_time = {clock.step:g}"
-        text = f"{name}: {said}, but column '{header}' of {file} tells {clock.step:g} s; perhaps {remedy} is meant."
+        text = (
+            f"{name}: {said}, but column '{header}' of {file} tells {clock.step:g} s; perhaps "
+            f"{remedy} is meant."
+        )
         return (Warning("other_sampling_time", text),)
     return ()

@@ -28,7 +28,10 @@ class Interrupted(Exception):
 
 
 class OutputClosed(Exception):
-    """Nobody reads the output any more, as after `| head`; typer would turn a BrokenPipeError into exit code 1."""
+    """Nobody reads the output any more, as after `| head`.
+
+    Typer would turn a BrokenPipeError into exit code 1.
+    """
 
 
 class _Group(typer.core.TyperGroup):
@@ -47,8 +50,12 @@ class ListOptionCommand(typer.core.TyperCommand):
     """A command each of whose repeatable options takes several values too: `--inputs a b`."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        valued = {name: option for option in self.params for name in option.opts if name.startswith("-")}
-        valued = {name: option for name, option in valued.items() if not getattr(option, "is_flag", False)}
+        valued = {
+            name: option for option in self.params for name in option.opts if name.startswith("-")
+        }
+        valued = {
+            name: option for name, option in valued.items() if not getattr(option, "is_flag", False)
+        }
         lists = {name for name, option in valued.items() if getattr(option, "multiple", False)}
         return super().parse_args(ctx, _repeated(args, lists, set(valued)))
 
@@ -56,7 +63,8 @@ class ListOptionCommand(typer.core.TyperCommand):
 def _repeated(args: Sequence[str], lists: Set[str], valued: Set[str]) -> list[str]:
     """Return arguments where an option of a list stands before each of its values.
 
-    One value is left to be the argument of the command where there would be none: a file that exists, or the last.
+    One value is left to be the argument of the command where there would be none: a file that
+    exists, or the last.
 
     Examples:
         >>> _repeated(["run.csv", "--inputs", "a", "b", "--out", "c"], {"--inputs"}, {"--inputs", "--out"})
@@ -86,36 +94,62 @@ def _repeated(args: Sequence[str], lists: Set[str], valued: Set[str]) -> list[st
 app = typer.Typer(
     name="orthaug",
     cls=_Group,
-    help="Fit physics together with a learned correction, so that the physics keeps all that physics can explain.",
+    help="Fit physics together with a learned correction, so that the physics keeps all that "
+    "physics can explain.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
 _NO_READER = (errno.EPIPE, errno.EINVAL) if os.name == "nt" else (errno.EPIPE,)
 SpecPath = Annotated[Path, typer.Argument(metavar="SPEC", help="Spec file (TOML).")]
-ModelPath = Annotated[Path, typer.Argument(metavar="MODEL", help="Result folder of `fit`, or its model/.")]
-Which = Annotated[
-    str, typer.Option("--model", metavar="fitted|physics", help="The fitted model, or the physics without a learner.")
+ModelPath = Annotated[
+    Path, typer.Argument(metavar="MODEL", help="Result folder of `fit`, or its model/.")
 ]
-DataPath = Annotated[Path, typer.Argument(metavar="DATA", help="Data file with the model's channels.")]
+Which = Annotated[
+    str,
+    typer.Option(
+        "--model",
+        metavar="fitted|physics",
+        help="The fitted model, or the physics without a learner.",
+    ),
+]
+DataPath = Annotated[
+    Path, typer.Argument(metavar="DATA", help="Data file with the model's channels.")
+]
 OutFolder = Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Result folder.")]
-OutFile = Annotated[Path | None, typer.Option("--out", metavar="FILE", help="CSV file; standard output without it.")]
+OutFile = Annotated[
+    Path | None, typer.Option("--out", metavar="FILE", help="CSV file; standard output without it.")
+]
 Initial = Annotated[
     str | None,
-    typer.Option("--initial", metavar="measured|zero|INIT", help="Outputs before the first step; INIT is a CSV."),
+    typer.Option(
+        "--initial",
+        metavar="measured|zero|INIT",
+        help="Outputs before the first step; INIT is a CSV.",
+    ),
 ]
 Missing = Annotated[
-    str, typer.Option("--missing", metavar="error|skip", help="Rows with missing cells; skip leaves them out.")
+    str,
+    typer.Option(
+        "--missing", metavar="error|skip", help="Rows with missing cells; skip leaves them out."
+    ),
 ]
-Rows = Annotated[str | None, typer.Option("--rows", metavar="A:B", help="Rows of the file, half-open.")]
+Rows = Annotated[
+    str | None, typer.Option("--rows", metavar="A:B", help="Rows of the file, half-open.")
+]
 Every = Annotated[int, typer.Option("--every", metavar="N", help="Keep each N-th row.")]
 Columns = Annotated[
     list[str] | None,
-    typer.Option("--column", metavar="NAME=COLUMN", help="The file's column of a channel; any number."),
+    typer.Option(
+        "--column", metavar="NAME=COLUMN", help="The file's column of a channel; any number."
+    ),
 ]
 Prepare = Annotated[
     bool | None,
-    typer.Option("--prepare/--no-prepare", help="Prepare the rows as the training data were, by the model's steps."),
+    typer.Option(
+        "--prepare/--no-prepare",
+        help="Prepare the rows as the training data were, by the model's steps.",
+    ),
 ]
 Force = Annotated[bool, typer.Option("--force", help="Replace what is there, whoever wrote it.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of the summary.")]
@@ -131,19 +165,30 @@ def main() -> None:
     except TrainingError as error:
         _fail(f"training failed: {error}", 1)
     except (Interrupted, KeyboardInterrupt) as interrupt:
-        _fail(f"interrupted{''.join(f' during {text}' for text in interrupt.args)}; nothing is written", 130)
+        _fail(
+            f"interrupted{''.join(f' during {text}' for text in interrupt.args)}; nothing is "
+            "written",
+            130,
+        )
     except (OutputClosed, BrokenPipeError):
         streams.silence(sys.stdout)
         sys.exit(0)
     except OSError as error:
         streams.silence(sys.stdout)
         what = error.filename or "standard output"
-        _fail(f"error: {InputError(f'{what}: cannot be read or written ({error.strerror or error}).')}", 2)
+        _fail(
+            "error: "
+            f"{InputError(f'{what}: cannot be read or written ({error.strerror or error}).')}",
+            2,
+        )
     except Exception as error:
         text = _complaint(error)
         if text is None:
             raise
-        _fail(text if text.startswith("Usage") else f"error: {' '.join(text.split())}", getattr(error, "exit_code", 2))
+        _fail(
+            text if text.startswith("Usage") else f"error: {' '.join(text.split())}",
+            getattr(error, "exit_code", 2),
+        )
     sys.exit(code if isinstance(code, int) else 0)
 
 
@@ -172,7 +217,14 @@ def _version(show: bool) -> None:
 @app.callback()
 def options(
     verbose: Annotated[
-        int, typer.Option("--verbose", "-v", count=True, help="Tell what is done; twice for more.", show_default=False)
+        int,
+        typer.Option(
+            "--verbose",
+            "-v",
+            count=True,
+            help="Tell what is done; twice for more.",
+            show_default=False,
+        ),
     ] = 0,
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
@@ -183,7 +235,9 @@ def options(
     if verbose or level:
         from orthaug._base.progress import show_log
 
-        show_log(levels[min(verbose, 2) - 1] if verbose else check_choice(level, levels, "ORTHAUG_LOG"))
+        show_log(
+            levels[min(verbose, 2) - 1] if verbose else check_choice(level, levels, "ORTHAUG_LOG")
+        )
 
 
 def _fail(message: str, code: int) -> None:
@@ -197,8 +251,8 @@ def tell(result: Content, text: str, as_json: bool, place: object = None) -> Non
     written = f"\n\nwritten to {place}" if place is not None else ""
     if place in PARTIALS.overtaken:
         streams.say(
-            f"warning: {place}: another run wrote a result here while this one ran, and this one has replaced it; run "
-            "it again with another --out to have both."
+            f"warning: {place}: another run wrote a result here while this one ran, and this "
+            "one has replaced it; run it again with another --out to have both."
         )
     streams.echo(result.to_json() if as_json else f"{text}{written}")
 
@@ -226,7 +280,9 @@ def arguments(command: str, spec: Path, **options: Any) -> tuple[str, ...]:
             told.append(f"--{name}")
         elif value:
             told += [
-                part for one in (value if isinstance(value, list) else [value]) for part in (f"--{name}", str(one))
+                part
+                for one in (value if isinstance(value, list) else [value])
+                for part in (f"--{name}", str(one))
             ]
     return tuple(told)
 

@@ -40,11 +40,18 @@ class ReadOptions:
     every: int = 1
     columns: Mapping[str, str] = field(default_factory=dict)
     prepare: bool | None = None
-    """Whether the rows go through the steps of the model's training data; None where nobody has said."""
+    """Whether the rows go through the steps of the model's training data; None where nobody has
+    said.
+    """
 
     @classmethod
     def of(
-        cls, missing: str, rows: str | None, every: int, columns: Sequence[str], prepare: bool | None
+        cls,
+        missing: str,
+        rows: str | None,
+        every: int,
+        columns: Sequence[str],
+        prepare: bool | None,
     ) -> ReadOptions:
         """Of the options of a command.
 
@@ -58,7 +65,9 @@ class ReadOptions:
         for text in columns:
             name, equal, column = text.partition("=")
             if not (name and equal and column):
-                raise InputError(f"--column: found '{text}'; expected NAME=COLUMN, such as position=yVal.")
+                raise InputError(
+                    f"--column: found '{text}'; expected NAME=COLUMN, such as position=yVal."
+                )
             named[name] = column
         return cls(missing, read_rows(rows), every, named, prepare)
 
@@ -81,19 +90,26 @@ def read_rows(text: str | None) -> tuple[int, int] | None:
         return None
     start, _, stop = text.partition(":")
     if not (start.isdecimal() and stop.isdecimal() and text.isascii()):
-        raise InputError(f"--rows: found '{text}'; expected a half-open range of rows such as 0:1000.")
+        raise InputError(
+            f"--rows: found '{text}'; expected a half-open range of rows such as 0:1000."
+        )
     return int(start), int(stop)
 
 
 def trained_reading(model: Path, data: Path) -> ReadOptions | None:
-    """Return how a file was read to train a model, by the result beside that; None where it is none of its files."""
+    """Return how a file was read to train a model, by the result beside that.
+
+    None where it is none of its files.
+    """
     digest = file_digest(data)
     for content in results_beside(model):
         with suppress(AttributeError, KeyError, TypeError, ValueError):
             if digest in [file["sha256"] for file in content["data"]["train"]]:
                 part = content["spec"]["data"]["train"]
                 rows = np.reshape(part.get("rows") or [], (-1, 2)).astype(int).tolist() or None
-                return ReadOptions("skip", rows, int(part.get("every") or 1), dict(part.get("columns") or {}), True)
+                return ReadOptions(
+                    "skip", rows, int(part.get("every") or 1), dict(part.get("columns") or {}), True
+                )
     return None
 
 
@@ -111,23 +127,38 @@ def open_explained(model: Path, data: Sequence[Path], rows: tuple[int, int] | No
         opened.append(open_run(model, path, reading=replace(reading, rows=rows or reading.rows)))
         taken = rows_taken(trained) if trained and not rows else ""
         notes += opened[-1].notes
-        notes += [f"note: {path.name}: {taken}, those of the training; --rows takes others."] if taken else []
+        notes += (
+            [f"note: {path.name}: {taken}, those of the training; --rows takes others."]
+            if taken
+            else []
+        )
     whole = Record.join([one.record for one in opened]) if len(opened) > 1 else opened[0].record
     return replace(opened[0], record=whole, notes=tuple(dict.fromkeys(notes)))
 
 
 def rows_taken(reading: ReadOptions) -> str:
     """Which rows of a file were trained on, where that is not all."""
-    return "rows " + " and ".join(f"{start}:{stop}" for start, stop in reading.rows) if reading.rows else ""
+    return (
+        "rows " + " and ".join(f"{start}:{stop}" for start, stop in reading.rows)
+        if reading.rows
+        else ""
+    )
 
 
 def open_run(
-    model: Path, data: Path, *, need_outputs: bool = False, reading: ReadOptions | None = None, ahead: int = 0
+    model: Path,
+    data: Path,
+    *,
+    need_outputs: bool = False,
+    reading: ReadOptions | None = None,
+    ahead: int = 0,
 ) -> ModelOnData:
-    """Load a model and read its channels from a file; outputs only where the file has them, unless needed.
+    """Load a model and read its channels from a file.
 
-    Args:
-        ahead: rows behind the first usable one before a stretch between missing samples has a value.
+    Outputs only where the file has them, unless needed.
+
+    Args: ahead: rows behind the first usable one before a stretch between missing samples has a
+        value.
 
     Raises:
         InputError: no model, no file, missing columns, no stretch that is long enough.
@@ -140,7 +171,8 @@ def open_run(
     for name in reading.columns:
         if name not in names:
             raise InputError(
-                f"--column: '{name}' is no channel of the model{nearest(name, names)}; it has {', '.join(names)}."
+                f"--column: '{name}' is no channel of the model{nearest(name, names)}; it has "
+                f"{', '.join(names)}."
             )
     if reading.prepare is None:
         check_instants(loaded, data)
@@ -149,21 +181,31 @@ def open_run(
         held = list(loaded.outputs)
     elif held:
         missing = [c.name for c in loaded.outputs if c not in held]
-        raise InputError(f"{data}: has some of the model's outputs but not {', '.join(missing)}; give all or none.")
+        raise InputError(
+            f"{data}: has some of the model's outputs but not {', '.join(missing)}; give all "
+            "or none."
+        )
     try:
         record = record_for(loaded, data, held, reading)
     except MissingSampleError as error:
         raise InputError(f"{error} --missing skip leaves such rows out.") from None
-    rows, told = len(record) + record.missing, prepared_notes(loaded, record if reading.prepare else None)
+    rows, told = (
+        len(record) + record.missing,
+        prepared_notes(loaded, record if reading.prepare else None),
+    )
     if record.missing:
-        estimated = need_outputs and loaded.form.states and not loaded.form.memory  # a state to predict from
+        estimated = (
+            need_outputs and loaded.form.states and not loaded.form.memory
+        )  # a state to predict from
         first = loaded.form.first_row + ahead + bool(estimated)
         record, text = long_stretches(record, [0] * len(record.experiments), first)
         told += (f"note: {data}: {text}",)
     return ModelOnData(loaded, record, data, rows, told)
 
 
-def record_for(model: Model | MotionModel, data: Path, outputs: Sequence[Channel], reading: ReadOptions) -> Record:
+def record_for(
+    model: Model | MotionModel, data: Path, outputs: Sequence[Channel], reading: ReadOptions
+) -> Record:
     """Return a model's inputs, and some outputs, from a file.
 
     Raises:
@@ -191,21 +233,26 @@ def check_instants(model: Model | MotionModel, data: Path) -> None:
     steps = [done.named for done in model.prepared if done.step in SAMPLING]
     if steps:
         raise InputError(
-            f"{data}: the model was fitted to data after {', '.join(steps)}; give --prepare for a file as it was "
-            f"measured, or --no-prepare for one that has a row every {model.sampling_time:g} s already."
+            f"{data}: the model was fitted to data after {', '.join(steps)}; give --prepare "
+            "for a file as it was measured, or --no-prepare for one that has a row every "
+            f"{model.sampling_time:g} s already."
         )
 
 
 def held_outputs(model: Model | MotionModel, data: Path, reading: ReadOptions) -> list[Channel]:
     """Return the outputs that a file has columns of."""
-    return [c for c in model.outputs if has_column(data, reading.columns.get(c.name, c.file_column))]
+    return [
+        c for c in model.outputs if has_column(data, reading.columns.get(c.name, c.file_column))
+    ]
 
 
 _RAW = "The rows of this file are taken as they are; --prepare does the same to them."
 _DETRENDED = " Detrended signals are deviations from their trend in each file."
 
 
-def prepared_notes(model: Model | MotionModel, record: Record | None = None, what: str = _RAW) -> tuple[str, ...]:
+def prepared_notes(
+    model: Model | MotionModel, record: Record | None = None, what: str = _RAW
+) -> tuple[str, ...]:
     """Return what to know of a model whose training data were prepared.
 
     Args:
@@ -214,7 +261,10 @@ def prepared_notes(model: Model | MotionModel, record: Record | None = None, wha
     """
     if not model.prepared:
         return ()
-    named = f"note: the model was fitted to prepared data: {', '.join(done.named for done in model.prepared)}."
+    named = (
+        "note: the model was fitted to prepared data: "
+        f"{', '.join(done.named for done in model.prepared)}."
+    )
     trends = _DETRENDED if any(done.step == "detrend" for done in model.prepared) else ""
     if record is None:
         return (f"{named} {what}",)
@@ -227,19 +277,32 @@ def read_initial(initial: str | None, opened: ModelOnData) -> str | Any:
     """Return the `initial` of `Model.simulate`: measured where the data have outputs, zero otherwise, or a CSV's rows."""
     gaps, measured = len(opened.record.experiments) > 1, bool(opened.record.outputs)
     if gaps and not (measured and initial in (None, "measured")):
-        remedy = "leave --initial out" if measured else "a free run without measured outputs cannot go on behind them"
+        remedy = (
+            "leave --initial out"
+            if measured
+            else "a free run without measured outputs cannot go on behind them"
+        )
         raise InputError(
-            f"{opened.source}: has missing samples, and each stretch starts from its own outputs; {remedy}."
+            f"{opened.source}: has missing samples, and each stretch starts from its own "
+            f"outputs; {remedy}."
         )
     if initial is None:
         return "measured" if measured else "zero"
     if initial in ("measured", "zero"):
         if initial == "measured" and not opened.record.outputs:
-            raise InputError(f"{opened.source}: has no measured outputs to start from; use --initial zero or a CSV.")
+            raise InputError(
+                f"{opened.source}: has no measured outputs to start from; use --initial zero "
+                "or a CSV."
+            )
         return initial
     if not Path(initial).suffix and "/" not in initial:
-        raise InputError(f"--initial: found '{initial}'; expected measured, zero, or a CSV file of the first outputs.")
-    record = read_record(initial, outputs=opened.model.outputs, sampling_time=opened.model.sampling_time)
+        raise InputError(
+            f"--initial: found '{initial}'; expected measured, zero, or a CSV file of the "
+            "first outputs."
+        )
+    record = read_record(
+        initial, outputs=opened.model.outputs, sampling_time=opened.model.sampling_time
+    )
     try:
         opened.model.check_initial(record.experiments[0].outputs)
     except InputError as error:
@@ -254,7 +317,8 @@ def notes(opened: ModelOnData, initial: str | None) -> list[str]:
     names = ", ".join(channel.name for channel in opened.model.outputs)
     return [
         *opened.notes,
-        f"note: {opened.source} has no {names}: the free run starts from 0; --initial CSV gives other outputs.",
+        f"note: {opened.source} has no {names}: the free run starts from 0; --initial CSV "
+        "gives other outputs.",
     ]
 
 
@@ -265,8 +329,8 @@ def with_initial(opened: ModelOnData, initial: str | Any) -> Record:
     start = opened.model.form.first_row
     if opened.model.form.states and not opened.model.form.memory:
         raise InputError(
-            "--initial: found with a motion, whose predictions start from states that are estimated from the rows "
-            "before them; leave it out."
+            "--initial: found with a motion, whose predictions start from states that are "
+            "estimated from the rows before them; leave it out."
         )
     (experiment,) = opened.record.experiments
     outputs = experiment.outputs.copy()
@@ -276,18 +340,33 @@ def with_initial(opened: ModelOnData, initial: str | Any) -> Record:
 
 
 def open_ahead(
-    model: Path, data: Path, reading: ReadOptions, horizon: int, initial: str | None, *, observer: bool = False
+    model: Path,
+    data: Path,
+    reading: ReadOptions,
+    horizon: int,
+    initial: str | None,
+    *,
+    observer: bool = False,
 ) -> ModelOnData:
-    """As `open_run` for predictions `horizon` steps ahead; an observer's record keeps missing outputs.
+    """As `open_run` for predictions `horizon` steps ahead.
+
+    An observer's record keeps missing outputs.
 
     Raises:
         InputError: as there; other first outputs for an observer.
     """
     if observer and initial is not None:
-        raise InputError("--initial: found with --observer, which estimates where it starts; leave one of them out.")
+        raise InputError(
+            "--initial: found with --observer, which estimates where it starts; leave one of "
+            "them out."
+        )
     reading = replace(reading, missing="keep") if observer else reading
     opened = open_run(model, data, need_outputs=True, reading=reading, ahead=max(horizon, 1) - 1)
-    return opened if observer else replace(opened, record=with_initial(opened, read_initial(initial, opened)))
+    return (
+        opened
+        if observer
+        else replace(opened, record=with_initial(opened, read_initial(initial, opened)))
+    )
 
 
 def observed(opened: ModelOnData, horizon: int) -> tuple[Response, list[str]]:
@@ -300,24 +379,36 @@ def observed(opened: ModelOnData, horizon: int) -> tuple[Response, list[str]]:
 
 
 def _of_band(found: Consistency, response: Response) -> list[str]:
-    """NIS with its interval where outputs were measured; a warning where it leaves that, for the band is then wrong."""
+    """NIS with its interval where outputs were measured.
+
+    A warning where it leaves that, for the band is then wrong.
+    """
     from orthaug.models.response import BAND
 
-    apart = [(t.measured - t.model) / t.std for t in response.trajectories if t.measured is not None]
-    apart = np.concatenate([errors[np.isfinite(errors)] for errors in apart]) if apart else np.zeros(0)
+    apart = [
+        (t.measured - t.model) / t.std for t in response.trajectories if t.measured is not None
+    ]
+    apart = (
+        np.concatenate([errors[np.isfinite(errors)] for errors in apart]) if apart else np.zeros(0)
+    )
     if not np.isfinite(found.nis) or not len(apart):
         return []
     held, (low, high) = float(np.mean(np.abs(apart) <= BAND)), found.expected
     told = (
-        f"the innovations' squares are {found.nis:.3g} times what the observer expects (NIS, {low:.3g} to {high:.3g} "
-        f"where it knows its noise); its 95 % band holds {percent(held, 3)} of what was measured."
+        f"the innovations' squares are {found.nis:.3g} times what the observer expects (NIS, "
+        f"{low:.3g} to {high:.3g} where it knows its noise); its 95 % band holds "
+        f"{percent(held, 3)} of what was measured."
     )
     if found.consistent:
         return [f"note: {told}"]
-    why = "its noises are too small, or the model is wrong here" if found.nis > high else "its noises are too large"
+    why = (
+        "its noises are too small, or the model is wrong here"
+        if found.nis > high
+        else "its noises are too large"
+    )
     return [
-        f"warning: {told} Do not take the band for one of 95 %: {why}. oa.Observer(oa.load(MODEL)).tuned(record) finds "
-        "noises by the likelihood of a record."
+        f"warning: {told} Do not take the band for one of 95 %: {why}. "
+        "oa.Observer(oa.load(MODEL)).tuned(record) finds noises by the likelihood of a record."
     ]
 
 
@@ -328,8 +419,13 @@ def warnings(response: Response) -> list[Warning]:
     return [Warning("free_run_diverged", told.format(output, step)) for step, output in ends]
 
 
-def write_csv(response: Response, opened: ModelOnData, out: Path | None, *, force: bool = False) -> None:
-    """One row per data row, empty cells where there is no value; to a file (whole or not at all) or standard output."""
+def write_csv(
+    response: Response, opened: ModelOnData, out: Path | None, *, force: bool = False
+) -> None:
+    """One row per data row, empty cells where there is no value.
+
+    To a file (whole or not at all) or standard output.
+    """
     frame = _table(response, opened)
     if out is None:
         frame.to_csv(sys.stdout, index=False)
@@ -339,14 +435,20 @@ def write_csv(response: Response, opened: ModelOnData, out: Path | None, *, forc
 
 
 def _table(response: Response, opened: ModelOnData) -> Any:
-    """Return the tables of all stretches in the rows of the file; of rows that were left out the time alone."""
+    """Return the tables of all stretches in the rows of the file.
+
+    Of rows that were left out the time alone.
+    """
     stretches = opened.record.experiments
     frames = [response.to_frame(i) for i in range(len(stretches))]
     if len(stretches[0]) == opened.rows:
         return frames[0]
     import pandas as pd
 
-    placed = [frame.set_axis(range(e.offset, e.offset + len(e))) for frame, e in zip(frames, stretches, strict=True)]
+    placed = [
+        frame.set_axis(range(e.offset, e.offset + len(e)))
+        for frame, e in zip(frames, stretches, strict=True)
+    ]
     whole = pd.concat(placed).reindex(range(opened.rows))
     first = stretches[0]
     time = first.start_time + (np.arange(opened.rows) - first.offset) * response.sampling_time
@@ -365,11 +467,13 @@ def explain_notes(model: Path) -> list[str]:
     return []
 
 
-def explain_model(opened: ModelOnData, *, degree: int, functions: Sequence[str], most: int) -> ExplainResult:
+def explain_model(
+    opened: ModelOnData, *, degree: int, functions: Sequence[str], most: int
+) -> ExplainResult:
     """Return the content of the explanation of a model over its data.
 
-    Raises:
-        InputError: physics alone, data without what the learner is evaluated at, too many candidates.
+    Raises: InputError: physics alone, data without what the learner is evaluated at, too many
+        candidates.
     """
     from orthaug.analysis.hidden_state import structure_test
     from orthaug.commands.attempt import attempt
@@ -378,14 +482,18 @@ def explain_model(opened: ModelOnData, *, degree: int, functions: Sequence[str],
     from orthaug.selection.explanation import explain
 
     try:
-        explained = explain(opened.model, opened.record, degree=degree, functions=functions, most=most)
+        explained = explain(
+            opened.model, opened.record, degree=degree, functions=functions, most=most
+        )
     except InputError as error:
         raise type(error)(f"{opened.source}: {error}") from None
     result = ExplainResult.model_validate(explained)
     if not opened.record.outputs:
         return result
     failed: list[Any] = []
-    test = attempt("the search for memory", lambda: structure_test(opened.model, opened.record), failed, None)
+    test = attempt(
+        "the search for memory", lambda: structure_test(opened.model, opened.record), failed, None
+    )
     memory = [memory_result(one) for one in test.families if one.sure] if test is not None else []
     warnings = [*result.warnings, *map(WarningResult.model_validate, failed)]
     return result.model_copy(update={"memory": memory, "warnings": warnings})

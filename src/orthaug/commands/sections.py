@@ -41,12 +41,18 @@ class PhysicalSection(Section):
 
     def declared(self, name: str) -> PhysicalParameter:
         """Return the parameter of this name."""
-        low, high = -math.inf if self.min is None else self.min, math.inf if self.max is None else self.max
+        low, high = (
+            -math.inf if self.min is None else self.min,
+            math.inf if self.max is None else self.max,
+        )
         return PhysicalParameter(name, self.initial, self.unit, low, high)
 
 
 class KindSection(Section):
-    """A table whose keys are those of the kinds in a registry; keys of kinds that are not chosen have no effect."""
+    """A table whose keys are those of the kinds in a registry.
+
+    Keys of kinds that are not chosen have no effect.
+    """
 
     registries: ClassVar[Mapping[str, Registry]] = {}
     """By the key that chooses a kind."""
@@ -84,7 +90,10 @@ def with_kinds(section: type[Kinds], **other: Any) -> type[Kinds]:
 
 
 def _field(key: Key) -> tuple[Any, Any]:
-    """Return a key as pydantic's type and default; one that its kind needs is None where another kind is chosen."""
+    """Return a key as pydantic's type and default.
+
+    One that its kind needs is None where another kind is chosen.
+    """
     if key.default is MISSING:
         return Union[_in_file(key.annotation), None], None  # noqa: UP007  (the parts are known at run time only)
     return _in_file(key.annotation), _thawed(key.default)
@@ -98,11 +107,19 @@ def _in_file(annotation: Any) -> Any:
         for limit in annotation.__metadata__:
             if isinstance(limit, OneOf):
                 return Literal[tuple(limit.choices)]
-            limits += [limit.limit] if isinstance(limit, SpecLimit) else [] if isinstance(limit, Option) else [limit]
+            limits += (
+                [limit.limit]
+                if isinstance(limit, SpecLimit)
+                else []
+                if isinstance(limit, Option)
+                else [limit]
+            )
         plain = _in_file(inner[0])
         return Annotated[(plain, *limits)] if limits else plain  # type: ignore[return-value]
     if origin is tuple and inner[-1] is not Ellipsis:
-        return Annotated[list[_in_file(inner[0])], Field(min_length=len(inner), max_length=len(inner))]
+        return Annotated[
+            list[_in_file(inner[0])], Field(min_length=len(inner), max_length=len(inner))
+        ]
     if origin in (tuple, list, Sequence):
         return list[_in_file(inner[0])]
     if origin is Mapping:
@@ -116,7 +133,11 @@ def _thawed(value: Any) -> Any:
     """Tuples as lists, as files hold them."""
     if isinstance(value, tuple | list):
         return [_thawed(item) for item in value]
-    return {name: _thawed(item) for name, item in value.items()} if isinstance(value, Mapping) else value
+    return (
+        {name: _thawed(item) for name, item in value.items()}
+        if isinstance(value, Mapping)
+        else value
+    )
 
 
 def first_message(error: ValidationError, content: dict[str, Any], model: type[BaseModel]) -> str:
@@ -130,7 +151,9 @@ def first_message(error: ValidationError, content: dict[str, Any], model: type[B
     if kind == "extra_forbidden":
         *parents, name = [part for part in first["loc"] if isinstance(part, str | int)]
         known = _known_keys(parents, model)
-        return f"unknown key '{key}'{nearest(str(name), known) or ', known are ' + ', '.join(known)}"
+        return (
+            f"unknown key '{key}'{nearest(str(name), known) or ', known are ' + ', '.join(known)}"
+        )
     if kind == "missing":
         return f"the key '{key}' is missing"
     if kind == "value_error":
@@ -147,7 +170,11 @@ def first_message(error: ValidationError, content: dict[str, Any], model: type[B
 def _shown(value: Any) -> str:
     """Return a value as the file writes it, cut where it is long."""
     try:
-        text = json.dumps(value, default=str, ensure_ascii=False).replace("Infinity", "inf").replace("NaN", "nan")
+        text = (
+            json.dumps(value, default=str, ensure_ascii=False)
+            .replace("Infinity", "inf")
+            .replace("NaN", "nan")
+        )
     except RecursionError:
         return "what is nested too deeply"
     return cut(text)
@@ -159,7 +186,11 @@ def _plain(message: str) -> str:
         return "at least one entry" if "item" in message else "some text"
     if "after validation" in message:
         return "two numbers, [start, stop]"
-    message = message.removeprefix("Input should be ").replace("a valid ", "a ").replace("a integer", "an integer")
+    message = (
+        message.removeprefix("Input should be ")
+        .replace("a valid ", "a ")
+        .replace("a integer", "an integer")
+    )
     return "a table" if "dictionary" in message else message
 
 

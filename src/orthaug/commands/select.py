@@ -55,8 +55,14 @@ def open_select(path: Path) -> tuple[LaggedJob, Spec]:
             '(kind = "terms"), or a network, and ask `orthaug explain` what it found.'
         )
     if spec.engine.kind not in ("auto", "memory", "dask"):
-        raise InputError(f"{path}: `engine.kind`: found {spec.engine.kind}; expected memory, or dask, to select.")
-    parts = {"learner": LearnerSection(kind="none"), "lags": None, "engine": EngineSection(kind="memory")}
+        raise InputError(
+            f"{path}: `engine.kind`: found {spec.engine.kind}; expected memory, or dask, to select."
+        )
+    parts = {
+        "learner": LearnerSection(kind="none"),
+        "lags": None,
+        "engine": EngineSection(kind="memory"),
+    }
     alone = spec.model_copy(update=parts)
     return open_lagged(path, alone), spec
 
@@ -85,14 +91,19 @@ def select_for(job: LaggedJob, spec: Spec, folder: Path, told: Told) -> Selectio
         "collinear": section.collinear,
     }
     if section.halves and len(job.train.record.experiments) != 1:
-        raise InputError(f"{job.path}: 'selection.halves' needs training data of one experiment, to be cut in two.")
+        raise InputError(
+            f"{job.path}: 'selection.halves' needs training data of one experiment, to be cut "
+            "in two."
+        )
     options["engine"] = engine_of(spec.engine, "dask") if spec.engine.kind == "dask" else None
     try:
         selection = select(job.train.record, job.problem.baseline, **options, progress=told)
     except InputError as error:
         raise InputError(f"{job.path}: {error}") from None
     result = _result(job, selection, time.monotonic() - began)
-    return SelectionReport(job, selection, result, _new_spec(job, folder, selection, halved=section.halves))
+    return SelectionReport(
+        job, selection, result, _new_spec(job, folder, selection, halved=section.halves)
+    )
 
 
 def steps_at_most(terms: int | None) -> int:
@@ -155,10 +166,19 @@ def _result(job: LaggedJob, selection: Selection, seconds: float) -> SelectResul
         "delays": selection.delays,
         "nonlinearity": None
         if test is None
-        else {"p": test.p, "regressors": test.regressors, "matter": list(test.matter), "text": str(test)},
+        else {
+            "p": test.p,
+            "regressors": test.regressors,
+            "matter": list(test.matter),
+            "text": str(test),
+        },
         "learner": _declared(learner),
         "focus": CRITERIA.kind_of(selection.criterion),
-        "terms": [{"term": t, "chosen": shares.get(t), "left": physics and physics.left.get(t)} for t in terms] or None,
+        "terms": [
+            {"term": t, "chosen": shares.get(t), "left": physics and physics.left.get(t)}
+            for t in terms
+        ]
+        or None,
         "physics": physics and [_moved(shift) for shift in physics.shifts],
         "condition": physics and physics.condition,
         "models": selection.table.to_dict("records"),
@@ -170,7 +190,12 @@ def _result(job: LaggedJob, selection: Selection, seconds: float) -> SelectResul
 
 
 def _moved(shift: Shift) -> dict[str, Any]:
-    own = {"parameter": shift.parameter, "unit": shift.unit, "left": shift.left, "moved": shift.moved}
+    own = {
+        "parameter": shift.parameter,
+        "unit": shift.unit,
+        "left": shift.left,
+        "moved": shift.moved,
+    }
     values = {
         "before": shift.before,
         "before_std": shift.before_std,
@@ -191,7 +216,10 @@ def _declared(learner: Learner | None) -> dict[str, Any] | None:
 
 
 def _new_spec(job: LaggedJob, folder: Path, selection: Selection, *, halved: bool) -> str:
-    """Return the spec with the choice in it; comments and order are kept, paths made relative to the new folder."""
+    """Return the spec with the choice in it.
+
+    Comments and order are kept, paths made relative to the new folder.
+    """
     path = job.path
     document: Any = tomlkit.parse(path.read_text(encoding="utf-8-sig"))
     _rebase(document, path.parent, folder)
@@ -208,7 +236,9 @@ def _new_spec(job: LaggedJob, folder: Path, selection: Selection, *, halved: boo
         document["learner"]["terms"].multiline(True)
     training = document.setdefault("training", tomlkit.table())
     training["focus"] = CRITERIA.kind_of(selection.criterion)
-    if learner is None or learner["kind"] == "terms":  # linear in its weights: one start, and no prior
+    if (
+        learner is None or learner["kind"] == "terms"
+    ):  # linear in its weights: one start, and no prior
         training["regularization"] = "none"
         training["restarts"] = 1
         training["fallback"] = False  # physics alone was judged beside it
@@ -224,4 +254,6 @@ def _rebase(table: Any, old: Path, new: Path) -> None:
         if isinstance(value, dict):
             _rebase(value, old, new)
         elif key == "files" and isinstance(value, list):
-            table[key] = [file if Path(file).is_absolute() else relative(old / file, new) for file in value]
+            table[key] = [
+                file if Path(file).is_absolute() else relative(old / file, new) for file in value
+            ]

@@ -1,8 +1,9 @@
 """Signals that end the program: Ctrl-C, a request to terminate, a terminal that is closed.
 
-A thread waits for them, so that the program ends at once, whatever compiled code runs: what is partial is removed, one
-line says so, and the exit code is 128 and the signal's number. An exception in the main thread would come late, or
-inside a callback of JAX, which swallows it and prints a traceback instead.
+A thread waits for them, so that the program ends at once, whatever compiled code runs: what is
+partial is removed, one line says so, and the exit code is 128 and the signal's number. An exception
+in the main thread would come late, or inside a callback of JAX, which swallows it and prints a
+traceback instead.
 
 Little is imported here: signals may come while everything else is being imported.
 """
@@ -30,7 +31,10 @@ def _nothing() -> str:
 
 
 class SignalWatch:
-    """Ends the program on a signal, once it is started; before that, signals do what they always do."""
+    """Ends the program on a signal, once it is started.
+
+    Before that, signals do what they always do.
+    """
 
     def __init__(self) -> None:
         self.active = self.ending = False
@@ -39,7 +43,10 @@ class SignalWatch:
         self._asked: threading.Event | None = None
 
     def start(self) -> None:
-        """Wait for signals from now on. Those that the program is to ignore, as `nohup` asks, are ignored."""
+        """Wait for signals from now on.
+
+        Those that the program is to ignore, as `nohup` asks, are ignored.
+        """
         if os.name != "posix":  # elsewhere Ctrl-C is an exception in the main thread
             return
         reader, writer = os.pipe()
@@ -63,7 +70,10 @@ class SignalWatch:
 
     @contextmanager
     def asking(self) -> Iterator[threading.Event]:
-        """The first Ctrl-C sets the event, for whoever can stop with what there is; the next ends the program."""
+        """The first Ctrl-C sets the event, for whoever can stop with what there is.
+
+        The next ends the program.
+        """
         import threading
 
         self._asked = threading.Event()
@@ -95,9 +105,16 @@ class SignalWatch:
                 partials.discard_all()
             kept = ", ".join(str(path) for path in getattr(partials, "placed", ()) if path.exists())
             self._stop_drawing()
-            line = f"{words}{f' during {during}' if during else ''}; {kept or 'nothing'} is written\n"
+            line = (
+                f"{words}{f' during {during}' if during else ''}; {kept or 'nothing'} is written\n"
+            )
             with suppress(OSError):
-                os.write(2, line.encode("utf-8" if sys.stderr is None else sys.stderr.encoding, "backslashreplace"))
+                os.write(
+                    2,
+                    line.encode(
+                        "utf-8" if sys.stderr is None else sys.stderr.encoding, "backslashreplace"
+                    ),
+                )
         finally:
             os._exit(128 + number)
 

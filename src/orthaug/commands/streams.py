@@ -12,8 +12,29 @@ from typing import Any, TextIO
 from orthaug._base.lines import fit_screen
 
 _PLAIN = {
-    **{"‖": "||", "±": "+-", "…": "...", "–": "-", "−": "-", "×": "x", "·": "*", "⊥": "_|_", "ᵀ": "^T", "\u0303": "~"},
-    **{"≤": "<=", "≥": ">=", "≠": "!=", "≈": "~", "→": "->", "½": "1/2", "\u2011": "-", "√": "sqrt", "∂": "d"},
+    **{
+        "‖": "||",
+        "±": "+-",
+        "…": "...",
+        "–": "-",
+        "−": "-",
+        "×": "x",
+        "·": "*",
+        "⊥": "_|_",
+        "ᵀ": "^T",
+        "\u0303": "~",
+    },
+    **{
+        "≤": "<=",
+        "≥": ">=",
+        "≠": "!=",
+        "≈": "~",
+        "→": "->",
+        "½": "1/2",
+        "\u2011": "-",
+        "√": "sqrt",
+        "∂": "d",
+    },
     **{"✓": "", "\u0302": "^", "“": '"', "”": '"', "’": "'", "─": "-", "━": "-"},
 }
 
@@ -33,7 +54,10 @@ def prepare() -> None:
 
 
 def plain(error: UnicodeError) -> tuple[str, int]:
-    """Return what stands for letters that an encoding lacks: words and ASCII; in JSON the escape that means the same."""
+    """Return what stands for letters that an encoding lacks: words and ASCII.
+
+    In JSON the escape that means the same.
+    """
     if not isinstance(error, UnicodeEncodeError):
         raise error
     missing = error.object[error.start : error.end]

@@ -49,12 +49,16 @@ class TrackingReport:
 
 
 def open_track(
-    model: Path, data: Sequence[Path], training: Sequence[Path], rows: tuple[int, int] | None, state: Path | None
+    model: Path,
+    data: Sequence[Path],
+    training: Sequence[Path],
+    rows: tuple[int, int] | None,
+    state: Path | None,
 ) -> TrackingInput:
     """Load a model, new data, and the files that it was trained on.
 
-    Raises:
-        InputError: no model, no data, a motion, training files missing where no state is given, or given beside one.
+    Raises: InputError: no model, no data, a motion, training files missing where no state is given,
+        or given beside one.
     """
     from orthaug.models.model import Model
     from orthaug.models.storage import load
@@ -62,9 +66,15 @@ def open_track(
     if not data:
         raise InputError("--data: is missing; give at least one file of new data.")
     if state is None and not training:
-        raise InputError("--training: is missing; give the files that the model was trained on, or --state of a run.")
+        raise InputError(
+            "--training: is missing; give the files that the model was trained on, or --state "
+            "of a run."
+        )
     if state is not None and training:
-        raise InputError("--training: found beside --state, which holds what training left; leave one of them out.")
+        raise InputError(
+            "--training: found beside --state, which holds what training left; leave one of "
+            "them out."
+        )
     for path in data:
         check_readable(path)
     loaded = load(model)
@@ -77,7 +87,9 @@ def open_track(
         records.append(record_for(loaded, path, loaded.outputs, ReadOptions("skip", prepare=True)))
         files.append(FileResult(file=str(path), sha256=file_digest(path), rows=len(records[-1])))
     given = open_training(model, training, rows).record if training else None
-    return TrackingInput(loaded, Record.join(records), given, tuple(files), _physics_of(model, loaded.sampling_time))
+    return TrackingInput(
+        loaded, Record.join(records), given, tuple(files), _physics_of(model, loaded.sampling_time)
+    )
 
 
 def _physics_of(model: Path, sampling_time: float) -> PhysicsMap | None:
@@ -100,21 +112,27 @@ def track(
 ) -> TrackingReport:
     """Follow the new rows.
 
-    Raises:
-        InputError: forgetting beside a state, a state of another model, other than the training data.
+    Raises: InputError: forgetting beside a state, a state of another model, other than the training
+        data.
     """
     from orthaug.fitting.recursive import Recursive
     from orthaug.models.storage import digest
 
     if state is None:
-        online = Recursive(opened.model, training=opened.training, forgetting=forgetting, memory=memory)
+        online = Recursive(
+            opened.model, training=opened.training, forgetting=forgetting, memory=memory
+        )
     else:
         if forgetting is not None or memory is not None:
-            raise InputError("--forgetting, --memory: found beside --state, which holds them; leave them out.")
+            raise InputError(
+                "--forgetting, --memory: found beside --state, which holds them; leave them out."
+            )
         place = state / STATE if (state / STATE).is_dir() else state
         online = Recursive.load(place)
         if digest(online.fitted) != digest(opened.model):
-            raise InputError(f"{state}: is the state of another model; give the one that it was begun with.")
+            raise InputError(
+                f"{state}: is the state of another model; give the one that it was begun with."
+            )
     online.update(opened.record, gap=not follows)
     return TrackingReport(online, _result(opened, online), opened.physics)
 
@@ -147,7 +165,9 @@ def _result(opened: TrackingInput, online: Recursive) -> TrackResult:
             "forgetting": factor,
             "memory": None if factor == 1 else -step / math.log(factor),
             "effective_rows": online.effective_rows,
-            "parameters": parameter_rows(baseline.parameters, online.theta, online.std, online.interval),
+            "parameters": parameter_rows(
+                baseline.parameters, online.theta, online.std, online.interval
+            ),
             "physical_parameters": physical,
             "alarms": list(online.alarms),
             "alarmed": online.alarmed,
@@ -173,7 +193,9 @@ def write_tracked(tracked: TrackingReport, folder: Path, text: str, *, force: bo
         if physical is not None:
             physical.to_csv(partial / "physical.csv")
         (partial / "figures").mkdir()
-        figure = tracking_figure(history, result.parameters, alarms, None, physical, result.physical_parameters or ())
+        figure = tracking_figure(
+            history, result.parameters, alarms, None, physical, result.physical_parameters or ()
+        )
         save(figure, partial / "figures" / "parameters.png")
         (partial / STATE).mkdir()
         online.fill(partial / STATE)

@@ -24,14 +24,19 @@ DATES = "dates"
 _JITTERS = 0.02  # largest deviation of a step that is not told, relative
 _HEAD = 10_000  # rows of a text file that tell its step well enough
 _FEWEST = 10  # rows from which on rising evenly is no chance
-_MOSTLY = 0.98  # share of the steps of a time that are as usual at least; the others are lost samples
+_MOSTLY = (
+    0.98  # share of the steps of a time that are as usual at least; the others are lost samples
+)
 _RISES = 0.9  # share of the steps of a column named as the time that rise, from which on it is a time with a fault
 _COUNTING = (0.0, 1.0)  # where counters of rows begin
 
 
 @dataclass(frozen=True, eq=False)
 class RefusedColumn:
-    """A column that could be the time and is not, with the reason; `signal` says whether it may be a channel."""
+    """A column that could be the time and is not, with the reason.
+
+    `signal` says whether it may be a channel.
+    """
 
     column: Column
     reason: str
@@ -76,12 +81,18 @@ class Clock:
         header, known = self.column.header, ""
         if not self.by_name:
             known = ", which rises as time does"
-            known += "" if split_header(header)[1] else " and whose header names no unit, so s is taken"
+            known += (
+                "" if split_header(header)[1] else " and whose header names no unit, so s is taken"
+            )
         if not self.even:
             text = f"{self.step:g} s is usual in column '{header}'{known}, but the steps are uneven"
         else:
             text = f"{self.step:g} s, from column '{header}'{known}"
-        steps = np.diff(self.seconds[np.isfinite(self.seconds)]) if self.seconds is not None else np.zeros(0)
+        steps = (
+            np.diff(self.seconds[np.isfinite(self.seconds)])
+            if self.seconds is not None
+            else np.zeros(0)
+        )
         if len(steps) and np.abs(steps - self.step).max() > _JITTERS * self.step:
             text += f"; single steps are {steps.min():.3g} to {steps.max():.3g} s"
         return text
@@ -96,7 +107,9 @@ def find_clock(columns: Sequence[Column], near: str = "") -> Clock:
     rows = max(column.filled for column in columns)
     parent = _parent(near)
     clock, refused = Clock(), []
-    for column in sorted(columns, key=lambda c: (not is_time(c.header), bool(near) and _parent(c.header) != parent)):
+    for column in sorted(
+        columns, key=lambda c: (not is_time(c.header), bool(near) and _parent(c.header) != parent)
+    ):
         values, dates = column.finite, column.unusable == DATES
         if column.unusable and not dates:
             continue
@@ -109,9 +122,13 @@ def find_clock(columns: Sequence[Column], near: str = "") -> Clock:
         if fault is not None and not column.constant:
             refused.append(fault)
         elif fault is None and clock.column is None:
-            clock = _ticking(column, column.values if dates else in_seconds(column.values, column.header))
+            clock = _ticking(
+                column, column.values if dates else in_seconds(column.values, column.header)
+            )
         elif fault is None and not dates:
-            refused.append(RefusedColumn(column, "rises as a time does, and another column is the time", False))
+            refused.append(
+                RefusedColumn(column, "rises as a time does, and another column is the time", False)
+            )
     for column in columns:
         if column.unusable or column is clock.column or is_time(column.header):
             continue
@@ -119,10 +136,16 @@ def find_clock(columns: Sequence[Column], near: str = "") -> Clock:
         if verdict is None and clock.column is None and column.filled == rows:
             clock = _ticking(column, in_seconds(column.values, column.header))
         elif verdict is None:
-            refused.append(RefusedColumn(column, f"rises by {_mean_step(column):g} in each row, as a time does", False))
+            refused.append(
+                RefusedColumn(
+                    column, f"rises by {_mean_step(column):g} in each row, as a time does", False
+                )
+            )
         elif verdict:
             refused.append(verdict)
-    kept = tuple(one for one in refused if not clock.instants or not one.signal or is_time(one.column.header))
+    kept = tuple(
+        one for one in refused if not clock.instants or not one.signal or is_time(one.column.header)
+    )
     return replace(clock, refused=kept)
 
 
@@ -143,7 +166,9 @@ def _fault(column: Column, rows: int) -> RefusedColumn | None:
     if len(steps) and (steps > 0).all() and column.filled == rows:
         return None
     if column.filled != rows:
-        return RefusedColumn(column, f"ends after {column.filled} of {rows} rows, so it is not the time", False)
+        return RefusedColumn(
+            column, f"ends after {column.filled} of {rows} rows, so it is not the time", False
+        )
     if len(steps) and not ((steps > 0).mean() >= _RISES or (steps >= 0).all()):
         return RefusedColumn(column, "falls in many rows, so it is taken for a signal", True)
     at = int(np.flatnonzero(steps <= 0)[0]) + 1 if len(steps) else 0
@@ -167,13 +192,21 @@ def _resemblance(column: Column) -> RefusedColumn | bool | None:
     line = np.interp(rows, rows[[0, -1]], values[[0, -1]])
     on_line = bool(np.abs(values - line).max() < 0.5 * steps.mean())
     thirds = [float(np.median(part)) for part in np.array_split(steps, 3)]
-    alike = (np.abs(steps - usual) <= JITTER * usual).mean() >= _MOSTLY and max(thirds) - min(thirds) <= DRIFT * usual
+    alike = (np.abs(steps - usual) <= JITTER * usual).mean() >= _MOSTLY and max(thirds) - min(
+        thirds
+    ) <= DRIFT * usual
     if not (on_line or alike):
-        reason = f"rises, but in steps of {steps.min():.3g} to {steps.max():.3g}, so it is taken for a signal"
+        reason = (
+            f"rises, but in steps of {steps.min():.3g} to {steps.max():.3g}, so it is taken "
+            "for a signal"
+        )
         return RefusedColumn(column, reason, True)
     unit = unit_of_time(header)[1]
     if unit is None:
-        reason = f"rises evenly, but its unit {split_header(header)[1]} is none of time, so it is taken for a signal"
+        reason = (
+            f"rises evenly, but its unit {split_header(header)[1]} is none of time, so it is "
+            "taken for a signal"
+        )
         return RefusedColumn(column, reason, True)
     if (steps == 1).all() and values[0] in _COUNTING and not split_header(header)[1]:
         return RefusedColumn(column, "counts the rows", False)
@@ -197,13 +230,18 @@ def told_clock(path: Path, apart: Collection[str] = (), *, by_content: bool = Fa
         with suppress(InputError):
             named = header if is_time(header) else None  # it comes in s, as dates do
             if named or header not in values:
-                values = {**values, header: read_table(path, [header], named, most=_HEAD).columns[header]}
+                values = {
+                    **values,
+                    header: read_table(path, [header], named, most=_HEAD).columns[header],
+                }
             columns.append(Column(header, header, "", values[header], DATES if named else ""))
     clock = find_clock(columns) if columns else Clock()
     return clock if clock.column else by_single_number(path)
 
 
-def thinned_twice(path: Path, sampling_time: float | None, every: int, apart: Collection[str]) -> str:
+def thinned_twice(
+    path: Path, sampling_time: float | None, every: int, apart: Collection[str]
+) -> str:
     """Return what is wrong where a sampling time is that of the rows that are kept and not that of the file's rows.
 
     Args:
@@ -220,9 +258,10 @@ def thinned_twice(path: Path, sampling_time: float | None, every: int, apart: Co
     header, step = clock.column.header, clock.step
     other = f', or time = "{header}" instead' if clock.instants else ""
     return (
-        f"every = {every} multiplies the sampling time {sampling_time:g} s to {every * sampling_time:g} s, but column "
-        f"'{header}' of {path.name} tells {step:g} s from row to row, so rows of which one in {every} is kept are "
-        f"{every * step:g} s apart. Give sampling_time = {step:g}, that of the file's rows{other}."
+        f"every = {every} multiplies the sampling time {sampling_time:g} s to "
+        f"{every * sampling_time:g} s, but column '{header}' of {path.name} tells {step:g} s "
+        f"from row to row, so rows of which one in {every} is kept are {every * step:g} s "
+        f"apart. Give sampling_time = {step:g}, that of the file's rows{other}."
     )
 
 

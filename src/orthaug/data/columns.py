@@ -27,7 +27,13 @@ _FINEST = 1e5  # steps within the range from which on rounding of the numbers co
 _COARSE = 0.02  # steps of a signal over its standard deviation that are told
 SPIKE = 15.0
 """Deviations from its neighbours that a sample is a spike from on."""
-_LOWER = (SPIKE, 10.0, 7.0, 5.0, 4.0)  # tried where a sample stands far outside the range of all others
+_LOWER = (
+    SPIKE,
+    10.0,
+    7.0,
+    5.0,
+    4.0,
+)  # tried where a sample stands far outside the range of all others
 _BEYOND = 0.5  # of that range
 _OUTSIDE = 2.5  # interquartile ranges from the middle
 _FEW = 0.01  # share of samples that spikes are at most
@@ -68,15 +74,24 @@ class Column:
 
     @property
     def limits(self) -> tuple[tuple[float, int], ...]:
-        """Extreme values where the signal stands much more often than elsewhere, with the rows; perhaps saturated."""
+        """Extreme values where the signal stands much more often than elsewhere, with the rows.
+
+        Perhaps saturated.
+        """
         levels, counts = np.unique(self.finite, return_counts=True)
         if len(levels) < _LEVELS:
             return ()
         x = self.finite
         edges = np.concatenate([[0], np.flatnonzero(np.diff(x)) + 1, [len(x)]])
         held = np.diff(edges)
-        held = held[(held > 1) & ~np.isin(x[edges[:-1]], levels[[0, -1]])]  # as inputs are, between their steps
-        least = max(_HELD, _OFTEN * float(np.median(counts)), _LONGER * float(np.median(held)) if len(held) else 0.0)
+        held = held[
+            (held > 1) & ~np.isin(x[edges[:-1]], levels[[0, -1]])
+        ]  # as inputs are, between their steps
+        least = max(
+            _HELD,
+            _OFTEN * float(np.median(counts)),
+            _LONGER * float(np.median(held)) if len(held) else 0.0,
+        )
         return tuple((float(levels[i]), int(counts[i])) for i in (0, -1) if counts[i] >= least)
 
     @property
@@ -126,7 +141,10 @@ class Column:
 
 
 def quantum_of(values: Vector) -> float | None:
-    """Return the step of which all differences between values are multiples, up to rounding; None where there is none."""
+    """Return the step of which all differences between values are multiples, up to rounding.
+
+    None where there is none.
+    """
     levels = np.unique(values)
     if len(levels) < 3 or not np.isfinite(levels[[0, -1]]).all():
         return None
@@ -137,8 +155,14 @@ def quantum_of(values: Vector) -> float | None:
 
 
 def channel_name(text: str, taken: Iterable[str] = ()) -> str:
-    """Return an identifier for a column: other letters become underscores; a name that is taken gets a number."""
-    name = re.sub(r"\W+", "_", unicodedata.normalize("NFKC", text)).strip("_")[: LONGEST - 4] or "channel"
+    """Return an identifier for a column: other letters become underscores.
+
+    A name that is taken gets a number.
+    """
+    name = (
+        re.sub(r"\W+", "_", unicodedata.normalize("NFKC", text)).strip("_")[: LONGEST - 4]
+        or "channel"
+    )
     name = f"x{name}" if name[0].isdigit() else name
     if not is_name(name) or keyword.iskeyword(name) or name in (SAMPLING_TIME, "time"):
         name += "_"

@@ -18,7 +18,10 @@ _HISTORY = 10_000  # rows of the partition before that are kept beside each: no 
 
 @dataclass(frozen=True, eq=False)
 class FramePartition:
-    """One partition of a DataFrame; `held` are futures of it and of the last rows of the one before."""
+    """One partition of a DataFrame.
+
+    `held` are futures of it and of the last rows of the one before.
+    """
 
     name: str
     rows: int
@@ -66,17 +69,23 @@ class FramePartitionData:
         known = 0 if self.before is None else len(self.before)
         if known < min(lead, own.first_row):
             raise InputError(
-                f"{own.name}: the one before has {known} rows, fewer than the largest lag, {lead}; repartition the "
-                "DataFrame."
+                f"{own.name}: the one before has {known} rows, fewer than the largest lag, "
+                f"{lead}; repartition the DataFrame."
             )
         frames = [self.frame] if self.before is None else [self.before, self.frame]
         try:
-            values = np.concatenate([frame[list(own.columns)].to_numpy(dtype=float) for frame in frames])
+            values = np.concatenate(
+                [frame[list(own.columns)].to_numpy(dtype=float) for frame in frames]
+            )
         except (KeyError, TypeError, ValueError) as error:
-            raise InputError(f"{own.name}: {error}; expected the columns {', '.join(own.columns)}, numbers.") from None
+            raise InputError(
+                f"{own.name}: {error}; expected the columns {', '.join(own.columns)}, numbers."
+            ) from None
         labels = np.zeros(len(values))
         if own.experiment is not None:
-            labels = np.concatenate([frame[own.experiment].to_numpy(dtype=float) for frame in frames])
+            labels = np.concatenate(
+                [frame[own.experiment].to_numpy(dtype=float) for frame in frames]
+            )
         borders = [0, *(1 + np.flatnonzero(np.diff(labels))).tolist(), len(values)]
         for start, stop in zip(borders, borders[1:], strict=False):
             first = max(start, known - lead)
@@ -91,14 +100,18 @@ class FramePartitionData:
             values[:, part] * [c.scale for c in group] + [c.offset for c in group]
             for part, group in ((slice(len(outputs)), outputs), (slice(len(outputs), None), inputs))
         ]
-        experiment = Experiment(signals[1], signals[0], f"{_NAME}{label}", first_row=row, offset=row)
+        experiment = Experiment(
+            signals[1], signals[0], f"{_NAME}{label}", first_row=row, offset=row
+        )
         if self.of.missing == "skip":
             yield from stretches(experiment, lead)
             return
         bad = np.argwhere(~np.isfinite(values))
         if len(bad):
             where = f"row {row + bad[0][0]}, column '{self.of.columns[bad[0][1]]}'"
-            raise InputError(f"{self.name}: {where}: found {values[tuple(bad[0])]}; expected a finite number.")
+            raise InputError(
+                f"{self.name}: {where}: found {values[tuple(bad[0])]}; expected a finite number."
+            )
         yield experiment
 
 
@@ -117,7 +130,10 @@ class FrameSource:
         """Rows `[start, stop)`, brought here."""
         found = []
         for partition in self.partitions:
-            a, b = max(start - partition.first_row, 0), min(stop - partition.first_row, partition.rows)
+            a, b = (
+                max(start - partition.first_row, 0),
+                min(stop - partition.first_row, partition.rows),
+            )
             if a < b:
                 frame = self.client.submit(_rows, partition.held[0], a, b, pure=False).result()
                 shown = replace(partition, first_row=partition.first_row + a, rows=b - a, held=())
@@ -156,14 +172,21 @@ def open_frame(
     check_channels(groups[1], groups[0])
     given = dict(columns or {})
     own = tuple(given.get(c.name, c.file_column) for group in groups for c in group)
-    absent = [name for name in (*own, *([experiment] if experiment else [])) if name not in frame.columns]
+    absent = [
+        name for name in (*own, *([experiment] if experiment else [])) if name not in frame.columns
+    ]
     if absent:
-        raise InputError(f"the DataFrame has no column '{absent[0]}'; it has {', '.join(map(str, frame.columns))}.")
+        raise InputError(
+            f"the DataFrame has no column '{absent[0]}'; it has "
+            f"{', '.join(map(str, frame.columns))}."
+        )
     if client is None:
         try:
             client = default_client()
         except ValueError:
-            raise InputError("there is no Dask client; make one, `distributed.Client()`, or give `client`.") from None
+            raise InputError(
+                "there is no Dask client; make one, `distributed.Client()`, or give `client`."
+            ) from None
     frames = client.compute(frame.to_delayed())
     tails = [None, *(client.submit(_tail, future, pure=False) for future in frames[:-1])]
     counts = client.gather(client.map(len, frames, pure=False))
@@ -173,7 +196,14 @@ def open_frame(
     first = np.concatenate([[0], np.cumsum(counts)]).astype(int).tolist()
     partitions = tuple(
         FramePartition(
-            f"{_NAME}, partition {i}", count, own, experiment, groups, first[i], missing, (frames[i], tails[i])
+            f"{_NAME}, partition {i}",
+            count,
+            own,
+            experiment,
+            groups,
+            first[i],
+            missing,
+            (frames[i], tails[i]),
         )
         for i, count in enumerate(counts)
     )

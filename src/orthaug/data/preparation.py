@@ -16,7 +16,11 @@ from orthaug.data.prepared import Prepared
 from orthaug.data.record import Experiment, Record, same_step, unbroken
 from orthaug.data.steps import Channels, Detrend, Fill, Outliers, Resample, Run, Shift, Step
 
-_ANTI_ALIAS, _RIPPLE, _CORNER = 8, 0.05, 0.8  # Chebyshev filter of decimation: order, dB, share of the new Nyquist
+_ANTI_ALIAS, _RIPPLE, _CORNER = (
+    8,
+    0.05,
+    0.8,
+)  # Chebyshev filter of decimation: order, dB, share of the new Nyquist
 
 Phase = Annotated[str, OneOf(("zero", "causal"))]
 
@@ -44,7 +48,10 @@ def _filtered(values: Matrix, sections: Matrix, phase: str, what: str) -> Matrix
 
 @dataclass(frozen=True)
 class _Butterworth:
-    """A Butterworth filter. Of zero phase it goes forth and back, which squares its gain: −6 dB at the cutoff."""
+    """A Butterworth filter.
+
+    Of zero phase it goes forth and back, which squares its gain: −6 dB at the cutoff.
+    """
 
     cutoff: Annotated[float, Gt(0)]
     """Hz"""
@@ -64,25 +71,26 @@ class _Butterworth:
         nyquist = 0.5 / run.step
         if self.cutoff >= nyquist:
             raise InputError(
-                f"`cutoff`: {self.cutoff:g} Hz is not below {nyquist:g} Hz, half the sampling frequency at steps of "
-                f"{run.step:g} s; take a lower one."
+                f"`cutoff`: {self.cutoff:g} Hz is not below {nyquist:g} Hz, half the sampling "
+                f"frequency at steps of {run.step:g} s; take a lower one."
             )
         columns = run.columns(self.channels)
         sections = np.asarray(butter(self.order, self.cutoff / nyquist, kind, output="sos"))
-        return run.holding(columns, _filtered(run.values[:, columns], sections, self.phase, f"`{kind}`"))
+        return run.holding(
+            columns, _filtered(run.values[:, columns], sections, self.phase, f"`{kind}`")
+        )
 
 
 @dataclass(frozen=True)
 class Lowpass(_Butterworth):
     """A Butterworth low-pass over all channels alike; `cutoff` in Hz.
 
-    Args:
-        cutoff: Hz, below half the sampling frequency.
-        order: 1 to 10.
-        phase: "zero" goes forth and back: nothing is delayed, the gain is squared (−6 dB at the cutoff), and a sample
-            depends on later ones, which a loop does not have. "causal" goes forth once and delays what it filters.
-        channels: names; None for all. Inputs and outputs that are filtered alike keep the linear relation between
-            them; filter some alone, and the filter becomes part of the model.
+    Args: cutoff: Hz, below half the sampling frequency. order: 1 to 10. phase: "zero" goes forth
+        and back: nothing is delayed, the gain is squared (−6 dB at the cutoff), and a sample
+            depends on later ones, which a loop does not have. "causal" goes forth once and delays
+            what it filters.
+        channels: names; None for all. Inputs and outputs that are filtered alike keep the linear
+            relation between them; filter some alone, and the filter becomes part of the model.
 
     Examples:
         >>> Lowpass(cutoff=10.0, phase="causal")
@@ -97,13 +105,12 @@ class Lowpass(_Butterworth):
 class Highpass(_Butterworth):
     """A Butterworth high-pass over all channels alike; `cutoff` in Hz.
 
-    Args:
-        cutoff: Hz, below half the sampling frequency.
-        order: 1 to 10.
-        phase: "zero" goes forth and back: nothing is delayed, the gain is squared (−6 dB at the cutoff), and a sample
-            depends on later ones, which a loop does not have. "causal" goes forth once and delays what it filters.
-        channels: names; None for all. Inputs and outputs that are filtered alike keep the linear relation between
-            them; filter some alone, and the filter becomes part of the model.
+    Args: cutoff: Hz, below half the sampling frequency. order: 1 to 10. phase: "zero" goes forth
+        and back: nothing is delayed, the gain is squared (−6 dB at the cutoff), and a sample
+            depends on later ones, which a loop does not have. "causal" goes forth once and delays
+            what it filters.
+        channels: names; None for all. Inputs and outputs that are filtered alike keep the linear
+            relation between them; filter some alone, and the filter becomes part of the model.
     """
 
     def apply(self, run: Run) -> Run:
@@ -114,9 +121,8 @@ class Highpass(_Butterworth):
 class Decimate:
     """Keeps each `factor`-th row behind a Chebyshev low-pass of order 8 at 0.8 of the new Nyquist frequency.
 
-    Args:
-        factor: 2 or more; the sampling time is multiplied by it.
-        phase: of the low-pass, over all channels: "zero" (forth and back, no delay, looks at later samples) or
+    Args: factor: 2 or more; the sampling time is multiplied by it. phase: of the low-pass, over all
+        channels: "zero" (forth and back, no delay, looks at later samples) or
             "causal" (delays all channels alike).
 
     Examples:
@@ -138,7 +144,9 @@ class Decimate:
         run.check_even("`decimate`")
         sections = np.asarray(cheby1(_ANTI_ALIAS, _RIPPLE, _CORNER / self.factor, output="sos"))
         values = _filtered(run.values, sections, self.phase, "`decimate`")[:: self.factor]
-        kept = replace(run, values=values, instants=run.instants[:: self.factor], step=run.step * self.factor)
+        kept = replace(
+            run, values=values, instants=run.instants[:: self.factor], step=run.step * self.factor
+        )
         return replace(kept, stride=run.stride * self.factor)
 
 
@@ -164,10 +172,13 @@ SAMPLING = ("decimate", "resample")
 
 
 def prepare(record: Record, *steps: Any) -> Record:
-    """Return a record after steps such as `Detrend()` and `Lowpass(cutoff=10.0)`, in this order; `.prepared` tells of them.
+    """Return a record after steps such as `Detrend()` and `Lowpass(cutoff=10.0)`, in this order.
 
-    Every step acts within an experiment, never across. Samples that are missing afterwards split experiments. Gaps
-    that were left out when the record was read are not seen: to fill them give the steps to `read_record(prepare=…)`.
+    `.prepared` tells of them.
+
+    Every step acts within an experiment, never across. Samples that are missing afterwards split
+    experiments. Gaps that were left out when the record was read are not seen: to fill them give
+    the steps to `read_record(prepare=…)`.
 
     Raises:
         InputError: no step, or one that cannot be done with these samples.
@@ -188,15 +199,22 @@ def prepare(record: Record, *steps: Any) -> Record:
         values = np.hstack([e.inputs, e.outputs])
         runs.append((Run(values, instants, names, len(record.inputs), record.sampling_time), e))
     experiments, step, done, lost = prepared_experiments(runs, steps)
-    changed = replace(record, experiments=experiments, sampling_time=step, missing=record.missing + lost)
+    changed = replace(
+        record, experiments=experiments, sampling_time=step, missing=record.missing + lost
+    )
     return replace(changed, prepared=(*record.prepared, *done))
 
 
 def check_steps(steps: Any) -> None:
     """Raise InputError for what are no steps."""
-    if not isinstance(steps, list | tuple) or not all(type(step) in STEPS.values() for step in steps):
+    if not isinstance(steps, list | tuple) or not all(
+        type(step) in STEPS.values() for step in steps
+    ):
         known = ", ".join(kind.__name__ for kind in STEPS.values())
-        raise InputError(f"preparation takes steps, which are {known}, each with its arguments; got {steps!r:.80}.")
+        raise InputError(
+            f"preparation takes steps, which are {known}, each with its arguments; got "
+            f"{steps!r:.80}."
+        )
 
 
 def prepared_experiments(
@@ -226,10 +244,14 @@ def prepared_experiments(
         sampling.append(run.step)
         where = place.source
     if not found:
-        raise InputError(f"{where + ': ' if where else ''}after preparation every row has a missing sample.")
+        raise InputError(
+            f"{where + ': ' if where else ''}after preparation every row has a missing sample."
+        )
     if not all(same_step(step, sampling[0]) for step in sampling):
         apart = f"{min(sampling):g} to {max(sampling):g} s"
-        raise InputError(f"after preparation samples are {apart} apart; say one `sampling_time` in `resample`.")
+        raise InputError(
+            f"after preparation samples are {apart} apart; say one `sampling_time` in `resample`."
+        )
     return tuple(found), sampling[0], tuple(account.told() for account in done), lost
 
 
@@ -255,7 +277,9 @@ class _Account:
 def _options_of(step: Any) -> dict[str, Any]:
     """Return the fields of a step that have values."""
     found = {name: getattr(step, name) for name in type(step).__dataclass_fields__}
-    plain = {name: list(value) if isinstance(value, tuple) else value for name, value in found.items()}
+    plain = {
+        name: list(value) if isinstance(value, tuple) else value for name, value in found.items()
+    }
     return {name: value for name, value in plain.items() if value is not None}
 
 
@@ -271,7 +295,14 @@ def _pieces(run: Run, place: Experiment, keep: bool) -> list[Experiment]:
     for a, b in unbroken(run.values[:, : run.inputs] if keep else run.values):
         first = a if run.moved else place.first_row + place.stride * run.first + stride * a
         values = run.values[a:b]
-        where = (place.source, first, 1 if run.moved else stride, line, float(run.instants[a]), place.offset + a)
+        where = (
+            place.source,
+            first,
+            1 if run.moved else stride,
+            line,
+            float(run.instants[a]),
+            place.offset + a,
+        )
         pieces.append(Experiment(values[:, : run.inputs], values[:, run.inputs :], *where))
     return pieces
 
@@ -287,7 +318,10 @@ def steps_again(
     """
     steps: list[Step] = []
     for done in reversed(prepared):
-        options = {name: tuple(value) if isinstance(value, list) else value for name, value in done.options.items()}
+        options = {
+            name: tuple(value) if isinstance(value, list) else value
+            for name, value in done.options.items()
+        }
         if done.step == "resample":
             options["sampling_time"] = sampling_time
         if done.step == "decimate":
@@ -308,8 +342,9 @@ def warnings_of(prepared: Sequence[Prepared], names: Sequence[str]) -> tuple[War
             found.append(
                 Warning(
                     "filtered_alone",
-                    f"{done.step} acts on {', '.join(channels)} only: the model then explains the filter too, and θ "
-                    "is biased. Leave `channels` out, so that inputs and outputs are filtered alike.",
+                    f"{done.step} acts on {', '.join(channels)} only: the model then explains "
+                    "the filter too, and θ is biased. Leave `channels` out, so that inputs and "
+                    "outputs are filtered alike.",
                 )
             )
         if done.step not in _FILTERS:

@@ -20,7 +20,9 @@ class Prepared:
     @property
     def named(self) -> str:
         """The step with its options in words."""
-        values = {name: " ".join(v) if isinstance(v, list) else v for name, v in self.options.items()}
+        values = {
+            name: " ".join(v) if isinstance(v, list) else v for name, v in self.options.items()
+        }
         return f"{self.step} ({', '.join(f'{name} {value}' for name, value in values.items())})"
 
     @property
@@ -36,12 +38,19 @@ class Prepared:
 
 
 def added_up(prepared: Sequence[tuple[Prepared, ...]]) -> tuple[Prepared, ...]:
-    """Return what was done to records that are joined, their samples added up; all went through the same steps.
+    """Return what was done to records that are joined, their samples added up.
+
+    All went through the same steps.
 
     Raises:
         InputError: they did not.
     """
     kinds = {tuple((done.step, repr(done.options)) for done in one) for one in prepared}
     if len(kinds) > 1:
-        raise InputError("records that went through different preparation cannot be joined; prepare all alike.")
-    return tuple(done[0].with_samples(sum(one.samples for one in done)) for done in zip(*prepared, strict=True))
+        raise InputError(
+            "records that went through different preparation cannot be joined; prepare all alike."
+        )
+    return tuple(
+        done[0].with_samples(sum(one.samples for one in done))
+        for done in zip(*prepared, strict=True)
+    )

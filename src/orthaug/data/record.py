@@ -8,7 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from orthaug._base.checks import Matrix, as_signal, check_choice, check_label, check_type, check_unique, is_number
+from orthaug._base.checks import (
+    Matrix,
+    as_signal,
+    check_choice,
+    check_label,
+    check_type,
+    check_unique,
+    is_number,
+)
 from orthaug._base.errors import LONGEST, InputError, shown, visible
 from orthaug._base.views import NotebookView
 from orthaug.data.expressions import RESERVED, is_name
@@ -48,9 +56,9 @@ class Channel:
     def __post_init__(self) -> None:
         if not is_name(self.name):
             raise InputError(
-                f"{_quoted(self.name)} cannot name a channel; use letters, digits and underscores, at most {LONGEST}, "
-                f"not starting with a digit, and none of {', '.join(sorted(RESERVED))}. A column of another name is "
-                "its `column`."
+                f"{_quoted(self.name)} cannot name a channel; use letters, digits and "
+                f"underscores, at most {LONGEST}, not starting with a digit, and none of "
+                f"{', '.join(sorted(RESERVED))}. A column of another name is its `column`."
             )
         check_label(self.unit, f"the unit of '{self.name}'")
         check_type(self.column, str, f"column of '{self.name}'", "a column's name")
@@ -81,9 +89,17 @@ def as_channels(given: Any, what: str) -> tuple[Channel, ...]:
     Raises:
         InputError: one text instead of several, or anything else that names no channels.
     """
-    if isinstance(given, str) or not isinstance(given, Iterable) or isinstance(given, np.ndarray) and not given.ndim:
+    if (
+        isinstance(given, str)
+        or not isinstance(given, Iterable)
+        or isinstance(given, np.ndarray)
+        and not given.ndim
+    ):
         example = given if isinstance(given, str) else "y"
-        raise InputError(f"`{what}` must be a list of names or Channels, such as ['{example}']; got {shown(given)}.")
+        raise InputError(
+            f"`{what}` must be a list of names or Channels, such as ['{example}']; got "
+            f"{shown(given)}."
+        )
     return tuple(name if isinstance(name, Channel) else Channel(name) for name in given)
 
 
@@ -91,7 +107,8 @@ def check_step(value: Any) -> float:
     """Return `value` if it is a sampling time in seconds, otherwise raise InputError."""
     if not is_number(value) or not 0 < value <= LONGEST_STEP:
         raise InputError(
-            f"the sampling time must be a positive number of seconds, at most {LONGEST_STEP:g}; got {shown(value)}."
+            "the sampling time must be a positive number of seconds, at most "
+            f"{LONGEST_STEP:g}; got {shown(value)}."
         )
     return float(value)
 
@@ -102,16 +119,18 @@ def check_channels(inputs: Sequence[Channel], outputs: Sequence[Channel]) -> Non
     derived = [f"{c.name}_{part}" for c in outputs for part in _DERIVED]
     for channel in outputs:
         if channel.name in ("time", *derived):
-            raise InputError(f"an output cannot be called '{channel.name}': results have a column of that name.")
+            raise InputError(
+                f"an output cannot be called '{channel.name}': results have a column of that name."
+            )
 
 
 @dataclass(frozen=True, eq=False)
 class Experiment:
     """One uninterrupted run: `inputs` (N, nu) and `outputs` (N, ny), row k taken at the same instant.
 
-    Messages say where a row came from: `source`, `first_row`, `stride` and `first_line`, the file's line of its row 0.
-    `start_time` [s] is the instant of the first row. A stretch between missing samples is a part of a recording, and
-    begins `offset` rows into it.
+    Messages say where a row came from: `source`, `first_row`, `stride` and `first_line`, the file's
+    line of its row 0. `start_time` [s] is the instant of the first row. A stretch between missing
+    samples is a part of a recording, and begins `offset` rows into it.
     """
 
     inputs: Matrix
@@ -136,28 +155,33 @@ class Experiment:
         found = np.shape(self.inputs), np.shape(self.outputs)
         if found != wanted:
             raise InputError(
-                f"{self.source or 'an experiment'}: `inputs` and `outputs` have the shapes {found[0]} and {found[1]}; "
-                f"expected (rows, {inputs}) and (rows, {outputs}), one column for each channel."
+                f"{self.source or 'an experiment'}: `inputs` and `outputs` have the shapes "
+                f"{found[0]} and {found[1]}; expected (rows, {inputs}) and (rows, {outputs}), "
+                "one column for each channel."
             )
 
     def where(self, row: int) -> str:
         """`run.csv: line 17 (row 15)` for a row of this experiment, as much of it as is known."""
         row = self.first_row + self.stride * row
-        place = f"row {row}" if self.first_line is None else f"line {self.first_line + row} (row {row})"
+        place = (
+            f"row {row}" if self.first_line is None else f"line {self.first_line + row} (row {row})"
+        )
         return f"{visible(self.source)}: {place}" if self.source else place
 
     def rows(self, start: int | None, stop: int | None) -> Experiment:
         """Return the half-open range of rows `[start, stop)` as an experiment of its own."""
         first = self.first_row + self.stride * range(len(self))[start:stop].start
-        return replace(self, inputs=self.inputs[start:stop], outputs=self.outputs[start:stop], first_row=first)
+        return replace(
+            self, inputs=self.inputs[start:stop], outputs=self.outputs[start:stop], first_row=first
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class Record(NotebookView):
     """Experiments that share channels and sampling time; lags never reach across experiments.
 
-    `sampling_time` is in seconds. `outputs` is empty for a record that only carries inputs (something
-    to simulate), and `inputs` is empty for an autonomous system.
+    `sampling_time` is in seconds. `outputs` is empty for a record that only carries inputs
+    (something to simulate), and `inputs` is empty for an autonomous system.
 
     Examples:
         >>> import numpy as np
@@ -177,7 +201,9 @@ class Record(NotebookView):
     time_column: str | None = None
     """The column of the file that holds the instants, where there is one."""
     missing: int = 0
-    """Rows that were left out because a sample was missing: 0 unless it was read with `missing="skip"` or prepared."""
+    """Rows that were left out because a sample was missing: 0 unless it was read with
+    `missing="skip"` or prepared.
+    """
     prepared: tuple[Prepared, ...] = ()
     """What was done to the samples, in order."""
 
@@ -255,16 +281,22 @@ class Record(NotebookView):
         first = records[0]
         for other in records[1:]:
             if (other.inputs, other.outputs) != (first.inputs, first.outputs):
-                raise InputError(f"records with other channels cannot be joined: {first!r} and {other!r}.")
+                raise InputError(
+                    f"records with other channels cannot be joined: {first!r} and {other!r}."
+                )
             if not same_step(other.sampling_time, first.sampling_time):
                 raise InputError(
-                    f"{other.experiments[0].source or 'a record'}: sampled every {other.sampling_time:g} s, "
-                    f"{first.experiments[0].source or 'another'} every {first.sampling_time:g} s; resample one of them."
+                    f"{other.experiments[0].source or 'a record'}: sampled every "
+                    f"{other.sampling_time:g} s, {first.experiments[0].source or 'another'} "
+                    f"every {first.sampling_time:g} s; resample one of them."
                 )
         experiments = tuple(e for record in records for e in record.experiments)
         missing = sum(record.missing for record in records)
         return replace(
-            first, experiments=experiments, missing=missing, prepared=added_up([r.prepared for r in records])
+            first,
+            experiments=experiments,
+            missing=missing,
+            prepared=added_up([r.prepared for r in records]),
         )
 
     def __len__(self) -> int:
@@ -273,10 +305,12 @@ class Record(NotebookView):
     __iter__ = None  # rows of several experiments would follow each other without a sign
 
     def __getitem__(self, rows: slice) -> Record:
-        """Return the half-open range of rows `record[start:stop]`; negative ones count from the end.
+        """Return the half-open range of rows `record[start:stop]`.
 
-        Rows count over all experiments, one behind the other, as `len(record)` does. Experiments stay apart: the range
-        cuts the first and the last of them, and those outside are left out.
+        Negative ones count from the end.
+
+        Rows count over all experiments, one behind the other, as `len(record)` does. Experiments
+        stay apart: the range cuts the first and the last of them, and those outside are left out.
 
         Raises:
             InputError: a row, a step, places that are no whole numbers, or a range without rows.
@@ -297,7 +331,10 @@ class Record(NotebookView):
             for kind, channels in (("inputs", self.inputs), ("outputs", self.outputs))
         )
         plural = "s" if count != 1 else ""
-        return f"Record({count} experiment{plural}, {len(self)} samples, Ts = {self.sampling_time:g} s, {names})"
+        return (
+            f"Record({count} experiment{plural}, {len(self)} samples, Ts = "
+            f"{self.sampling_time:g} s, {names})"
+        )
 
     @property
     def channels(self) -> tuple[Channel, ...]:
@@ -315,19 +352,23 @@ class Record(NotebookView):
                 )
 
     def rows(self, start: int | None = None, stop: int | None = None) -> Record:
-        """Return the half-open range of rows `[start, stop)` of a single experiment; negative ones count from its end."""
+        """Return the half-open range of rows `[start, stop)` of a single experiment.
+
+        Negative ones count from its end.
+        """
         for name, value in (("start", start), ("stop", stop)):
             check_type(value, int | np.integer | None, name, "a whole number or None")
         if len(self.experiments) != 1:
-            raise InputError(f"`rows` needs a record of one experiment; this one has {len(self.experiments)}.")
+            raise InputError(
+                f"`rows` needs a record of one experiment; this one has {len(self.experiments)}."
+            )
         return replace(self, experiments=(self._piece(self.experiments[0], start, stop),))
 
     def split(self, fraction: float, by: str = "rows") -> tuple[Record, Record]:
         """Return two records: the first `fraction` and the rest.
 
-        Args:
-            fraction: between 0 and 1, rounded to whole rows or experiments.
-            by: "rows" cuts every experiment, the first `fraction` of its rows into the first record; "experiments"
+        Args: fraction: between 0 and 1, rounded to whole rows or experiments. by: "rows" cuts every
+            experiment, the first `fraction` of its rows into the first record; "experiments"
                 leaves each whole, and puts the first `fraction` of them into the first record.
 
         Raises:
@@ -348,9 +389,14 @@ class Record(NotebookView):
         cuts = [round(fraction * len(piece)) for piece in pieces]
         for piece, cut in zip(pieces, cuts, strict=True):
             if not 0 < cut < len(piece):
-                held = f"an experiment has {len(piece)} rows" if by == "rows" else f"there are {len(piece)} experiments"
+                held = (
+                    f"an experiment has {len(piece)} rows"
+                    if by == "rows"
+                    else f"there are {len(piece)} experiments"
+                )
                 raise InputError(
-                    f"a part of the split at {fraction:g} would be empty: {held}. Take another `fraction`."
+                    f"a part of the split at {fraction:g} would be empty: {held}. Take another "
+                    "`fraction`."
                 )
         if by == "experiments":
             first, second = self.experiments[: cuts[0]], self.experiments[cuts[0] :]
@@ -363,19 +409,31 @@ class Record(NotebookView):
     def _piece(self, experiment: Experiment, start: int | None, stop: int | None) -> Experiment:
         """Rows of an experiment, with the instant of their first."""
         first = range(len(experiment))[start:stop].start
-        return replace(experiment.rows(start, stop), start_time=experiment.start_time + first * self.sampling_time)
+        return replace(
+            experiment.rows(start, stop),
+            start_time=experiment.start_time + first * self.sampling_time,
+        )
 
 
 def _range_of(rows: Any, count: int) -> tuple[int, int]:
     """Return start and stop of a slice of `count` rows."""
     if not isinstance(rows, slice):
-        raise InputError(f"a record is cut by a range of rows, such as record[100:500]; got record[{shown(rows)}].")
+        raise InputError(
+            "a record is cut by a range of rows, such as record[100:500]; got "
+            f"record[{shown(rows)}]."
+        )
     for place in (rows.start, rows.stop, rows.step):
-        check_type(place, int | np.integer | None, "the range of rows", "record[start:stop] with whole numbers")
+        check_type(
+            place,
+            int | np.integer | None,
+            "the range of rows",
+            "record[start:stop] with whole numbers",
+        )
     if rows.step not in (None, 1):
         raise InputError(
-            f"record[start:stop:{rows.step}]: a step would leave out rows without a filter, and change the sampling "
-            "time. Read the file with `every`, or take `prepare(record, Decimate(factor))`."
+            f"record[start:stop:{rows.step}]: a step would leave out rows without a filter, "
+            "and change the sampling time. Read the file with `every`, or take "
+            "`prepare(record, Decimate(factor))`."
         )
     start, stop, _ = rows.indices(count)
     if start >= stop:
@@ -384,10 +442,15 @@ def _range_of(rows: Any, count: int) -> tuple[int, int]:
     return start, stop
 
 
-def _channels(given: Sequence[str | Channel] | None, default: str, count: int) -> tuple[Channel, ...]:
+def _channels(
+    given: Sequence[str | Channel] | None, default: str, count: int
+) -> tuple[Channel, ...]:
     if given is None:
         given = [default] if count == 1 else [f"{default}{i + 1}" for i in range(count)]
     given = as_channels(given, "inputs" if default == "u" else "outputs")
     if len(given) != count:
-        raise InputError(f"{len(given)} names for {count} channels of `{default}`; give one name for each column.")
+        raise InputError(
+            f"{len(given)} names for {count} channels of `{default}`; give one name for each "
+            "column."
+        )
     return given

@@ -43,18 +43,25 @@ class Lags:
         na = _per_channel(self.na, outputs, "na", "output")
         nb = _per_channel(self.nb, inputs, "nb", "input")
         nk = _per_channel(self.nk, inputs, "nk", "input")
-        past_outputs = [Lag(name, i) for name, n in zip(outputs, na, strict=True) for i in range(1, n + 1)]
-        past_inputs = [Lag(name, i) for name, n, d in zip(inputs, nb, nk, strict=True) for i in range(d, d + n)]
+        past_outputs = [
+            Lag(name, i) for name, n in zip(outputs, na, strict=True) for i in range(1, n + 1)
+        ]
+        past_inputs = [
+            Lag(name, i) for name, n, d in zip(inputs, nb, nk, strict=True) for i in range(d, d + n)
+        ]
         return (*past_outputs, *past_inputs)
 
 
-def _per_channel(value: int | Sequence[int], names: Sequence[str], key: str, kind: str) -> list[int]:
+def _per_channel(
+    value: int | Sequence[int], names: Sequence[str], key: str, kind: str
+) -> list[int]:
     given: Any = value
     several = isinstance(given, Sequence) or (isinstance(given, np.ndarray) and given.ndim > 0)
     values: list[Any] = list(given) if several else [given] * len(names)
     if len(values) != len(names):
         raise InputError(
-            f"`{key}` has {len(values)} numbers but there are {len(names)} {kind}s; give one number, or one per {kind}."
+            f"`{key}` has {len(values)} numbers but there are {len(names)} {kind}s; give one "
+            f"number, or one per {kind}."
         )
     if any(isinstance(v, bool) or not isinstance(v, int | np.integer) or v < 0 for v in values):
         raise InputError(f"`{key}` must be whole numbers, 0 or more; got {shown(value)}.")
@@ -66,16 +73,19 @@ def _per_channel(value: int | Sequence[int], names: Sequence[str], key: str, kin
 def in_order(lags: Iterable[Lag], outputs: Sequence[str], inputs: Sequence[str]) -> Layout:
     """Return the distinct lags in regressor order.
 
-    Raises:
-        InputError: an unknown channel, or an output at lag 0 (the model would look at what it predicts).
+    Raises: InputError: an unknown channel, or an output at lag 0 (the model would look at what it
+        predicts).
     """
     place = {name: i for i, name in enumerate((*outputs, *inputs))}
     for lag in lags:
         if lag.channel not in place:
-            raise InputError(f"'{lag}' uses the unknown channel '{lag.channel}'; known are {', '.join(place)}.")
+            raise InputError(
+                f"'{lag}' uses the unknown channel '{lag.channel}'; known are {', '.join(place)}."
+            )
         if lag.lag == 0 and lag.channel in outputs:
             raise InputError(
-                f"'{lag}' is the output that is to be predicted; outputs are used from lag 1, {lag.channel}[k-1]."
+                f"'{lag}' is the output that is to be predicted; outputs are used from lag 1, "
+                f"{lag.channel}[k-1]."
             )
     return tuple(sorted(set(lags), key=lambda lag: (place[lag.channel], lag.lag)))
 
@@ -101,7 +111,9 @@ def lag_matrix(experiment: Experiment, layout: Layout, record: Record, start: in
 def lag_rows(record: Record, layout: Layout) -> Matrix:
     """Return the regressors of all rows from the largest lag on, experiment after experiment, (N, len(layout))."""
     start = largest_lag(layout)
-    return np.concatenate([lag_matrix(experiment, layout, record, start) for experiment in record.experiments])
+    return np.concatenate(
+        [lag_matrix(experiment, layout, record, start) for experiment in record.experiments]
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,4 +178,6 @@ class Features:
             return xp.zeros((*x.shape[:-1], 0))
         columns = {lag: x[..., j] for j, lag in enumerate(layout)}
         values = [xp.asarray(entry.evaluate(columns, xp), dtype=float) for entry in self.entries]
-        return xp.moveaxis(xp.stack([xp.broadcast_to(v, x.shape[:-1]) for v in values]), 0, -1)  # a column in one piece
+        return xp.moveaxis(
+            xp.stack([xp.broadcast_to(v, x.shape[:-1]) for v in values]), 0, -1
+        )  # a column in one piece

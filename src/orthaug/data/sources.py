@@ -1,7 +1,7 @@
 """Rows that stay where they are: files larger than memory, read piece by piece with the rows that lags need.
 
-A source is cut into partitions. Each can be read on its own, here or by another process, and gives pieces: experiments
-whose first rows are history only.
+A source is cut into partitions. Each can be read on its own, here or by another process, and gives
+pieces: experiments whose first rows are history only.
 """
 
 from __future__ import annotations
@@ -35,7 +35,9 @@ class Partition(Protocol):
         ...
 
     def pieces(self, lead: int) -> Iterator[Experiment]:
-        """Its rows in order. The first `lead` rows of a piece are history, or the begin of an experiment.
+        """Its rows in order.
+
+        The first `lead` rows of a piece are history, or the begin of an experiment.
 
         Raises:
             InputError: cells that are no finite numbers, a file that has changed.
@@ -76,7 +78,9 @@ def rows_of(source: Source) -> int:
 
 def as_record(source: Source, experiments: Sequence[Experiment]) -> Record:
     """Return some of its rows as a record in memory."""
-    return Record(source.inputs, source.outputs, source.sampling_time, tuple(experiments), source.time_column)
+    return Record(
+        source.inputs, source.outputs, source.sampling_time, tuple(experiments), source.time_column
+    )
 
 
 def witness(source: Source, limit: int = WITNESS_ROWS) -> Record:
@@ -86,7 +90,9 @@ def witness(source: Source, limit: int = WITNESS_ROWS) -> Record:
         return as_record(source, source.window(0, total))
     size = limit // _WINDOWS
     begins = np.linspace(0, total - size, _WINDOWS).astype(int)
-    return as_record(source, [e for begin in begins for e in source.window(int(begin), int(begin) + size)])
+    return as_record(
+        source, [e for begin in begins for e in source.window(int(begin), int(begin) + size)]
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +133,9 @@ class Span:
             partitions = (*partitions[:-1], partitions[-1].head(rows))
         held = [getattr(partition, "held", ()) for partition in partitions]
         bare = (replace(p, held=()) if own else p for p, own in zip(partitions, held, strict=True))
-        return cls(tuple(bare), tuple(future for own in held for future in own), tuple(map(len, held)))
+        return cls(
+            tuple(bare), tuple(future for own in held for future in own), tuple(map(len, held))
+        )
 
     def on(self, *held: Any) -> Span:
         """The same where the rows are."""
@@ -191,7 +199,9 @@ class RecordSource:
         for experiment in self.record.experiments:
             for begin in range(0, len(experiment), self.size):
                 first = max(begin - self.lead, 0)
-                held.append(RowPartition(_later(experiment, first, begin + self.size), begin - first))
+                held.append(
+                    RowPartition(_later(experiment, first, begin + self.size), begin - first)
+                )
         return tuple(held)
 
     def window(self, start: int, stop: int) -> list[Experiment]:

@@ -48,7 +48,10 @@ class Run:
         for name in channels:
             if name not in self.names:
                 known = ", ".join(self.names)
-                raise InputError(f"`channels`: no channel '{name}'{nearest(name, self.names)}; there are {known}.")
+                raise InputError(
+                    f"`channels`: no channel '{name}'{nearest(name, self.names)}; there are "
+                    f"{known}."
+                )
         return [self.names.index(name) for name in channels]
 
     def holding(self, columns: list[int], values: Matrix) -> Run:
@@ -97,7 +100,9 @@ class Detrend:
     def __post_init__(self) -> None:
         check_fields(self)
         if self.degree > 1:
-            raise InputError(f"`degree` must be 0, the mean, or 1, a straight line; got {shown(self.degree)}.")
+            raise InputError(
+                f"`degree` must be 0, the mean, or 1, a straight line; got {shown(self.degree)}."
+            )
 
     def apply(self, run: Run) -> Run:
         columns, t = run.columns(self.channels), run.instants - run.instants[0]
@@ -111,12 +116,14 @@ class Detrend:
 
 @dataclass(frozen=True)
 class Resample:
-    """Uneven time stamps onto an even grid, from the first on; nothing across more than three steps.
+    """Uneven time stamps onto an even grid, from the first on.
 
-    Args:
-        sampling_time: s; None for the median of the steps.
-        method: "linear" between neighbours, or "pchip", a smooth cubic without overshoot. Both look at the next
-            sample, and neither removes what is faster than the new grid: put a `Lowpass` before it where that matters.
+    Nothing across more than three steps.
+
+    Args: sampling_time: s; None for the median of the steps. method: "linear" between neighbours,
+        or "pchip", a smooth cubic without overshoot. Both look at the next
+            sample, and neither removes what is faster than the new grid: put a `Lowpass` before it
+            where that matters.
     """
 
     sampling_time: float | None = None
@@ -131,15 +138,24 @@ class Resample:
     def apply(self, run: Run) -> Run:
         step, t = self.sampling_time or run.step, run.instants
         if len(t) < 2 or not (np.diff(t) > 0).all():
-            raise InputError("`resample` needs at least two instants, each later than the one before it.")
+            raise InputError(
+                "`resample` needs at least two instants, each later than the one before it."
+            )
         count = np.floor((t[-1] - t[0]) / step + _SAME) + 1
         if count > 100 * len(t):
-            raise InputError(f"`resample`: {step:g} s would make {count:.3g} samples of {len(t)}; take a longer one.")
+            raise InputError(
+                f"`resample`: {step:g} s would make {count:.3g} samples of {len(t)}; take a "
+                "longer one."
+            )
         grid = t[0] + step * np.arange(int(count))
         most = _APART * max(step, run.step)
         at = _measured(t, grid, _SAME * step)
-        values = np.column_stack([_between(t, column, at, self.method, most) for column in run.values.T])
-        return replace(run, values=values, instants=grid, step=step, even=True, first=0, stride=1, moved=True)
+        values = np.column_stack(
+            [_between(t, column, at, self.method, most) for column in run.values.T]
+        )
+        return replace(
+            run, values=values, instants=grid, step=step, even=True, first=0, stride=1, moved=True
+        )
 
 
 def _measured(t: Vector, grid: Vector, near: float) -> Vector:
@@ -150,7 +166,10 @@ def _measured(t: Vector, grid: Vector, near: float) -> Vector:
 
 
 def _between(t: Vector, column: Vector, grid: Vector, method: str, most: float) -> Vector:
-    """Return a channel at other instants; NaN outside of it, and between neighbours more than `most` apart."""
+    """Return a channel at other instants.
+
+    NaN outside of it, and between neighbours more than `most` apart.
+    """
     there = np.isfinite(column)
     known, values = t[there], column[there]
     if len(known) < 2:
@@ -162,7 +181,11 @@ def _between(t: Vector, column: Vector, grid: Vector, method: str, most: float) 
     else:
         result = np.interp(grid, known, values, left=np.nan, right=np.nan)
     after = np.clip(np.searchsorted(known, grid, side="left"), 1, len(known) - 1)
-    apart = (known[after] - known[after - 1] > most) & (known[after] != grid) & (known[after - 1] != grid)
+    apart = (
+        (known[after] - known[after - 1] > most)
+        & (known[after] != grid)
+        & (known[after - 1] != grid)
+    )
     result[apart] = np.nan
     return result
 
@@ -204,11 +227,16 @@ class Outliers:
         return distance > self.threshold * deviation
 
     def distances(self, x: Vector) -> tuple[Vector, Vector]:
-        """Return how far each sample is from the median of its window, and the deviation there; NaN where one is missing."""
+        """Return how far each sample is from the median of its window, and the deviation there.
+
+        NaN where one is missing.
+        """
         if len(x) < 2:
             return np.zeros(len(x)), np.zeros(len(x))
         width = min(self.window, len(x) - 1)
-        rows = np.lib.stride_tricks.sliding_window_view(np.pad(x, width, mode="reflect"), 2 * width + 1)
+        rows = np.lib.stride_tricks.sliding_window_view(
+            np.pad(x, width, mode="reflect"), 2 * width + 1
+        )
         middle, spread = np.full(len(x), np.nan), np.full(len(x), np.nan)
         for begin in range(0, len(x), _CHUNK):
             part = slice(begin, begin + _CHUNK)
@@ -255,7 +283,9 @@ class Fill:
 
 @dataclass(frozen=True)
 class Shift:
-    """Delays an input by `samples`: row k gets what was at row k − samples. The rows without one are cut off.
+    """Delays an input by `samples`: row k gets what was at row k − samples.
+
+    The rows without one are cut off.
 
     Args:
         channel: an input's name.
@@ -279,12 +309,15 @@ class Shift:
     def apply(self, run: Run) -> Run:
         if self.channel not in run.names[: run.inputs]:
             raise InputError(
-                f"`channel`: '{self.channel}' is no input; the inputs are {', '.join(run.names[: run.inputs])}."
+                f"`channel`: '{self.channel}' is no input; the inputs are "
+                f"{', '.join(run.names[: run.inputs])}."
             )
         run.check_even("`shift`")
         j, n, late = run.names.index(self.channel), len(run.values), self.samples
         if abs(late) >= n:
-            raise InputError(f"`samples`: an experiment has {n} rows, too few to be shifted by {late}.")
+            raise InputError(
+                f"`samples`: an experiment has {n} rows, too few to be shifted by {late}."
+            )
         kept = slice(max(late, 0), n + min(late, 0))
         values = run.values[kept].copy()
         values[:, j] = run.values[kept.start - late : kept.stop - late, j]

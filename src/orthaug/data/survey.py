@@ -38,23 +38,36 @@ class Survey:
 
     def looks_like_time(self, column: Column) -> RefusedColumn | None:
         """Return why a column is no channel although it has numbers that vary: it rises as a time does."""
-        return next((one for one in self.clock.refused if one.column is column and not one.signal), None)
+        return next(
+            (one for one in self.clock.refused if one.column is column and not one.signal), None
+        )
 
     def why_not(self, column: Column) -> str:
         """Return why a column is no channel."""
         refused = self.looks_like_time(column)
-        return column.unusable or ("constant" if column.constant else refused.reason if refused else "not named")
+        return column.unusable or (
+            "constant" if column.constant else refused.reason if refused else "not named"
+        )
 
     def same_lengths(self, columns: Sequence[Column]) -> bool:
         """Return whether columns belong to one run: those of a table do, arrays where they have as many rows."""
-        return self.path.suffix.lower() not in ENDINGS or len({len(column.values) for column in columns}) < 2
+        return (
+            self.path.suffix.lower() not in ENDINGS
+            or len({len(column.values) for column in columns}) < 2
+        )
 
     def beside(self, channels: Sequence[Column]) -> Survey:
         """Return the survey with the clock of these channels, where the file has columns of several lengths."""
         rows = max(column.filled for column in channels)
-        if all(column.filled == rows for column in self.columns) or not self.clock.instants and self.clock.column:
+        if (
+            all(column.filled == rows for column in self.columns)
+            or not self.clock.instants
+            and self.clock.column
+        ):
             return self
-        clock = find_clock([c for c in self.columns if c.filled == rows and c not in channels], channels[0].header)
+        clock = find_clock(
+            [c for c in self.columns if c.filled == rows and c not in channels], channels[0].header
+        )
         return replace(self, clock=clock if clock.column else self.clock)
 
     def find(self, name: str) -> Column:
@@ -65,16 +78,27 @@ class Survey:
         """
         twice = [c.header for c in self.columns if c.header in (f"{name}.0", f"{name}.1")]
         if len(twice) == 2 and not any(c.header == name for c in self.columns):
-            raise InputError(f"{self.path}: the name '{name}' stands twice; from the left: {', '.join(twice)}.")
-        named = [c for c in self.columns if c.header == name] or [c for c in self.columns if c.name == name]
+            raise InputError(
+                f"{self.path}: the name '{name}' stands twice; from the left: {', '.join(twice)}."
+            )
+        named = [c for c in self.columns if c.header == name] or [
+            c for c in self.columns if c.name == name
+        ]
         if not named:
             known = [c.header for c in self.columns]
-            raise InputError(f"{self.path}: no column '{name}'{nearest(name, known)}; the file has {', '.join(known)}.")
+            raise InputError(
+                f"{self.path}: no column '{name}'{nearest(name, known)}; the file has "
+                f"{', '.join(known)}."
+            )
         column = named[0]
         if column.unusable:
-            raise InputError(f"{self.path}: column '{name}' cannot be a channel: {column.unusable}.")
+            raise InputError(
+                f"{self.path}: column '{name}' cannot be a channel: {column.unusable}."
+            )
         if column.constant:
-            raise InputError(f"{self.path}: column '{name}' is {column.finite[0]:g} in every row; leave it out.")
+            raise InputError(
+                f"{self.path}: column '{name}' is {column.finite[0]:g} in every row; leave it out."
+            )
         return column
 
     def roles(self) -> tuple[list[Column], list[Column]] | None:
@@ -95,13 +119,16 @@ class Survey:
 def survey(path: Path) -> Survey:
     """Look at every column of a file.
 
-    Raises:
-        InputError: no such file, an unknown ending, a file that cannot be read or has no column of numbers.
+    Raises: InputError: no such file, an unknown ending, a file that cannot be read or has no column
+        of numbers.
     """
     columns: list[Column] = []
     every = list(column_names(path))
     if numbers_only(every):
-        raise InputError(f"{path}: the first line holds numbers; a header with names is expected there. Write one.")
+        raise InputError(
+            f"{path}: the first line holds numbers; a header with names is expected there. "
+            "Write one."
+        )
     headers = list(dict.fromkeys(every))
     try:
         table = read_table(path, headers).columns
@@ -122,8 +149,9 @@ def survey(path: Path) -> Survey:
         columns.append(Column(header, name, unit, values, unusable))
     if all(c.unusable for c in columns):
         raise InputError(
-            f"{path}: no column holds numbers; expected one for each signal, under a header. The names that were found "
-            f"are {shown(', '.join(every))}; a line above the header must begin with # or %."
+            f"{path}: no column holds numbers; expected one for each signal, under a header. "
+            f"The names that were found are {shown(', '.join(every))}; a line above the header "
+            "must begin with # or %."
         )
     clock = find_clock(columns)
     if clock.column is None:

@@ -1,4 +1,7 @@
-"""Named columns of floats from files, by the file's ending. What is no number is kept, so that messages can name it."""
+"""Named columns of floats from files, by the file's ending.
+
+What is no number is kept, so that messages can name it.
+"""
 
 from __future__ import annotations
 
@@ -28,10 +31,12 @@ _NAMED = 30  # columns that a message lists
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """Columns of a file as floats, NaN where the cell is empty or no number. `where` and `cell` are for messages.
+    """Columns of a file as floats, NaN where the cell is empty or no number.
 
-    `filled` counts the rows of each column up to its last cell that holds anything. In a text file `first_line` is
-    the line of row 0; `dated` is the column of time where it held dates.
+    `where` and `cell` are for messages.
+
+    `filled` counts the rows of each column up to its last cell that holds anything. In a text file
+    `first_line` is the line of row 0; `dated` is the column of time where it held dates.
     """
 
     path: Path
@@ -43,23 +48,28 @@ class Table:
 
     def where(self, row: int) -> str:
         """`line 17 (row 15)` in a text file, `row 15` otherwise."""
-        return f"row {row}" if self.first_line is None else f"line {self.first_line + row} (row {row})"
+        return (
+            f"row {row}" if self.first_line is None else f"line {self.first_line + row} (row {row})"
+        )
 
 
-def read_table(path: Path, columns: Sequence[str], time: str | None = None, *, most: int | None = None) -> Table:
+def read_table(
+    path: Path, columns: Sequence[str], time: str | None = None, *, most: int | None = None
+) -> Table:
     """Return the named columns of a file.
 
-    Args:
-        time: the one of them that holds instants, numbers in the unit of its header or dates: it comes in s.
-        most: rows that are enough, where a file can be read in part; None for all.
+    Args: time: the one of them that holds instants, numbers in the unit of its header or dates: it
+        comes in s. most: rows that are enough, where a file can be read in part; None for all.
 
-    Raises:
-        InputError: no such file, an unknown ending, content that does not fit it, or missing columns.
+    Raises: InputError: no such file, an unknown ending, content that does not fit it, or missing
+        columns.
     """
     check_readable(path)
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
-        raise InputError(f"{path}: unknown file type '{path.suffix}'; known are {', '.join(_READERS)}.")
+        raise InputError(
+            f"{path}: unknown file type '{path.suffix}'; known are {', '.join(_READERS)}."
+        )
     with foreign(path):
         part = {"most": most} if reader is _read_text else {}
         table = reader(path, columns, time, **part)
@@ -90,7 +100,9 @@ def column_names(path: Path) -> list[str]:
     check_readable(path)
     ending = path.suffix.lower()
     if ending not in _READERS:
-        raise InputError(f"{path}: unknown file type '{path.suffix}'; known are {', '.join(_READERS)}.")
+        raise InputError(
+            f"{path}: unknown file type '{path.suffix}'; known are {', '.join(_READERS)}."
+        )
     with foreign(path):
         if ending in ENDINGS:
             return variable_names(path)
@@ -129,7 +141,9 @@ def check_readable(path: Path) -> None:
         raise InputError(f"{path}: the file is empty (0 bytes).")
 
 
-def _read_text(path: Path, columns: Sequence[str], time: str | None, most: int | None = None) -> Table:
+def _read_text(
+    path: Path, columns: Sequence[str], time: str | None, most: int | None = None
+) -> Table:
     """Text tables as they occur: byte-order mark, trailing separators, units in headers, decimal commas, no header."""
     found = layout(path, columns)
     header, header_line = found.names, found.header_line
@@ -137,7 +151,9 @@ def _read_text(path: Path, columns: Sequence[str], time: str | None, most: int |
         LOG.info("%s: %s", path, found.note)
     place = {
         name: str(index)
-        for name, index in zip(columns, places(path, columns, header, headed=found.headed), strict=True)
+        for name, index in zip(
+            columns, places(path, columns, header, headed=found.headed), strict=True
+        )
     }
     commas = found.has_decimal_commas(path)
     beyond = str(len(header))  # a column that must stay empty: cells behind the last header
@@ -145,7 +161,11 @@ def _read_text(path: Path, columns: Sequence[str], time: str | None, most: int |
     numbers, texts, held = _cells(path, found, [*place.values(), beyond], commas, apart, most)
     extra = np.flatnonzero(np.asarray(held[beyond]))
     if extra.size:
-        under = f"under {len(header)} headers" if found.headed else f"and line {header_line + 1} has {len(header)}"
+        under = (
+            f"under {len(header)} headers"
+            if found.headed
+            else f"and line {header_line + 1} has {len(header)}"
+        )
         raise InputError(
             f"{path}: line {header_line + 1 + extra[0]} has {len(header) + 1} cells {under}; "
             "is a separator or a decimal comma wrong?"
@@ -164,7 +184,9 @@ def _read_text(path: Path, columns: Sequence[str], time: str | None, most: int |
         return "" if np.isnan(value) else str(value)
 
     filled = {name: _up_to_last(np.asarray(held[place[name]])) for name in columns}
-    return Table(path, values, filled, header_line + 1, cell, time if time and dates is not None else "")
+    return Table(
+        path, values, filled, header_line + 1, cell, time if time and dates is not None else ""
+    )
 
 
 def _cells(
@@ -200,8 +222,12 @@ def _cells(
         return frame
 
     if not commas:
-        with suppress(ValueError):  # something is no number: read again as text, to be able to name it
-            numbers = read(dtype=dict.fromkeys(used, np.float64), na_values=[""], float_precision="round_trip")
+        with suppress(
+            ValueError
+        ):  # something is no number: read again as text, to be able to name it
+            numbers = read(
+                dtype=dict.fromkeys(used, np.float64), na_values=[""], float_precision="round_trip"
+            )
             return numbers, None, numbers.notna()
     if not commas and apart is not None:
         kinds: dict[str, Any] = {**dict.fromkeys(used, np.float64), apart: str}
@@ -216,7 +242,11 @@ def _cells(
         if "found 0" in str(error) or isinstance(error, pd.errors.EmptyDataError):
             raise InputError(f"{path}: there are no data rows below the header.") from None
         raise InputError(f"{path}: not a readable table ({short(error)}).") from None
-    return texts.apply(lambda column: column.map(_comma_number if commas else text_number)), texts, texts != ""
+    return (
+        texts.apply(lambda column: column.map(_comma_number if commas else text_number)),
+        texts,
+        texts != "",
+    )
 
 
 def _plain_numbers(path: Path, found: Layout) -> Matrix | None:
@@ -247,7 +277,10 @@ def _plain_numbers(path: Path, found: Layout) -> Matrix | None:
 
 
 def _comma_number(text: str) -> float:
-    """Return a number where decimals are commas; a point would be one of thousands, and is refused."""
+    """Return a number where decimals are commas.
+
+    A point would be one of thousands, and is refused.
+    """
     return np.nan if "." in text else text_number(text.replace(",", "."))
 
 
@@ -258,7 +291,10 @@ def _up_to_last(held: np.ndarray) -> int:
 def _read_parquet(path: Path, columns: Sequence[str], time: str | None) -> Table:
     with parquet_file(path) as file:
         check_present(path, columns, file.schema_arrow.names)
-        check_memory(16 * file.metadata.num_rows * len(columns), f"{path}: reading {file.metadata.num_rows} rows")
+        check_memory(
+            16 * file.metadata.num_rows * len(columns),
+            f"{path}: reading {file.metadata.num_rows} rows",
+        )
         table = file.read(columns=list(columns))
         table.validate(full=True)
     arrays = {name: table.column(name).to_numpy(zero_copy_only=False) for name in columns}
@@ -266,11 +302,14 @@ def _read_parquet(path: Path, columns: Sequence[str], time: str | None) -> Table
     if time and arrays[time].dtype.kind not in "fiub":
         dates = dated(arrays.pop(time), f"{path}: column '{time}'")
         if dates is None:
-            raise InputError(f"{path}: column '{time}' holds text; expected instants, numbers or dates.")
+            raise InputError(
+                f"{path}: column '{time}' holds text; expected instants, numbers or dates."
+            )
     values = {name: _as_floats(array, name, path) for name, array in arrays.items()}
     values |= {time: dates} if time and dates is not None else {}
     return replace(
-        _full(path, {name: values[name] for name in columns}), dated=time if time and dates is not None else ""
+        _full(path, {name: values[name] for name in columns}),
+        dated=time if time and dates is not None else "",
     )
 
 
@@ -285,9 +324,13 @@ def parquet_file(path: Path) -> Iterator[Any]:
         import pyarrow as pa
         import pyarrow.parquet as pq
     except ImportError:
-        raise InputError(f"{path}: reading Parquet needs pyarrow; install orthaug[parquet].") from None
+        raise InputError(
+            f"{path}: reading Parquet needs pyarrow; install orthaug[parquet]."
+        ) from None
     try:
-        with pq.ParquetFile(path, page_checksum_verification=True, pre_buffer=False, buffer_size=1 << 20) as file:
+        with pq.ParquetFile(
+            path, page_checksum_verification=True, pre_buffer=False, buffer_size=1 << 20
+        ) as file:
             yield file
     except (pa.ArrowException, OSError) as error:
         raise InputError(f"{path}: not a readable Parquet file ({short(error)}).") from None
@@ -301,8 +344,13 @@ def _read_excel(path: Path, columns: Sequence[str], time: str | None) -> Table:
 
     top, found = read_sheet(path, place)
     cells = dict(zip(columns, found, strict=True))
-    values = {name: np.array([as_number(cell) for cell in column]) for name, column in cells.items()}
-    filled = {name: _up_to_last(np.array([c is not None for c in column])) for name, column in cells.items()}
+    values = {
+        name: np.array([as_number(cell) for cell in column]) for name, column in cells.items()
+    }
+    filled = {
+        name: _up_to_last(np.array([c is not None for c in column]))
+        for name, column in cells.items()
+    }
 
     def cell(column: str, row: int) -> str:
         return "" if cells[column][row] is None else str(cells[column][row])
@@ -330,7 +378,9 @@ def _as_floats(array: np.ndarray, name: str, path: Path) -> Vector:
             raise TypeError
         return np.asarray(array, dtype=float)
     except (TypeError, ValueError):
-        raise InputError(f"{path}: column '{name}' holds {array.dtype} values; expected numbers.") from None
+        raise InputError(
+            f"{path}: column '{name}' holds {array.dtype} values; expected numbers."
+        ) from None
 
 
 _READERS: dict[str, Callable[..., Table]] = {
@@ -346,7 +396,12 @@ KNOWN = tuple(_READERS)
 
 
 def check_present(
-    path: Path, columns: Sequence[str], header: Sequence[str], *, named_apart: bool = False, headed: bool = True
+    path: Path,
+    columns: Sequence[str],
+    header: Sequence[str],
+    *,
+    named_apart: bool = False,
+    headed: bool = True,
 ) -> None:
     """Raise InputError for a column that is not there, or stands twice."""
     for name in columns:
@@ -354,29 +409,47 @@ def check_present(
             if not headed:
                 called = ", ".join(h for h in list(header)[:_NAMED] if h)
                 raise MissingColumnError(
-                    f"{path}: no column '{name}': the file has no header, so its columns are called {called}."
+                    f"{path}: no column '{name}': the file has no header, so its columns are "
+                    f"called {called}."
                 )
             if numbers_only(list(header)):
                 raise MissingColumnError(
-                    f"{path}: no column '{name}': the first line holds numbers; a header with names is expected."
+                    f"{path}: no column '{name}': the first line holds numbers; a header with "
+                    "names is expected."
                 )
             known = ", ".join(f"'{h}'" for h in list(header)[:_NAMED] if h) or "no column names"
             known += f" and {len(header) - _NAMED} more" if len(header) > _NAMED else ""
-            raise MissingColumnError(f"{path}: no column '{name}'{nearest(name, header)}; the file has {known}.")
+            raise MissingColumnError(
+                f"{path}: no column '{name}'{nearest(name, header)}; the file has {known}."
+            )
         if list(header).count(name) > 1:
-            twice = f"the column '{name}' stands {list(header).count(name)} times; names must differ"
-            apart = f", or be told apart from the left as '{name}.0', '{name}.1'" if named_apart else ""
+            twice = (
+                f"the column '{name}' stands {list(header).count(name)} times; names must differ"
+            )
+            apart = (
+                f", or be told apart from the left as '{name}.0', '{name}.1'" if named_apart else ""
+            )
             raise InputError(f"{path}: {twice}{apart}.")
 
 
-def places(path: Path, columns: Sequence[str], header: Sequence[str], *, headed: bool = True) -> list[int]:
-    """Where the columns stand in a header; columns of one name are `name.0`, `name.1`, ... from the left.
+def places(
+    path: Path, columns: Sequence[str], header: Sequence[str], *, headed: bool = True
+) -> list[int]:
+    """Where the columns stand in a header.
+
+    Columns of one name are `name.0`, `name.1`, ... from the left.
 
     Raises:
         InputError: a column that is not there, or a name that stands twice.
     """
     apart = told_apart(header)
-    check_present(path, [name for name in columns if name not in apart], header, named_apart=True, headed=headed)
+    check_present(
+        path,
+        [name for name in columns if name not in apart],
+        header,
+        named_apart=True,
+        headed=headed,
+    )
     return [apart.index(name) for name in columns]
 
 

@@ -1,4 +1,7 @@
-"""Files of named variables: npz, MATLAB (v5 and v7.3) and HDF5. A channel is a vector or a matrix column."""
+"""Files of named variables: npz, MATLAB (v5 and v7.3) and HDF5.
+
+A channel is a vector or a matrix column.
+"""
 
 from __future__ import annotations
 
@@ -23,19 +26,27 @@ from orthaug.data.matlab import MOST_ELEMENTS, Variable, read_mat5
 _NAMED = 30  # variables that a message lists
 _HDF5, _USERBLOCK = b"\x89HDF\r\n", 4096  # how such a file begins, and before which byte it does
 _DIGITS = 10  # of an index at most
-Wanted = Sequence[str] | Callable[[str], bool] | None  # names, a choice of single numbers, or all names
+Wanted = (
+    Sequence[str] | Callable[[str], bool] | None
+)  # names, a choice of single numbers, or all names
 _MOST_HELD, _DEEPEST = 10_000, 8  # variables that are noted, and references one behind the other
-_LABELS = {"Data": "Name", "values": "label"}  # fields of dSPACE and of Simulink: a signal, and what it is called
+_LABELS = {
+    "Data": "Name",
+    "values": "label",
+}  # fields of dSPACE and of Simulink: a signal, and what it is called
 _LONGEST_NAME = 200  # characters of such a name at most
 _ROOT = re.compile(r"[./\[]")  # what follows the name of a variable in a path
-_ELEMENT = re.compile(r"[({]\s*(?::\s*,\s*)?([1-9]\d{0,8})\s*(,\s*:\s*)?[)}]")  # as MATLAB writes it
+_ELEMENT = re.compile(
+    r"[({]\s*(?::\s*,\s*)?([1-9]\d{0,8})\s*(,\s*:\s*)?[)}]"
+)  # as MATLAB writes it
 
 
 @dataclass(frozen=True)
 class FileVariable:
     """A variable of a file: what it is, in words, and how to read it (None where it holds no numbers).
 
-    `text` reads a text. `named` is the name that the file itself gives to the signal, beside its path.
+    `text` reads a text. `named` is the name that the file itself gives to the signal, beside its
+    path.
     """
 
     what: str
@@ -48,10 +59,11 @@ class FileVariable:
 def read_variables(path: Path, names: Sequence[str]) -> dict[str, Vector]:
     """Return the named channels: a vector (1×N or N×1), or a line of a matrix, counted from 0.
 
-    A column is written `"U[2]"`, a row `"U[2,:]"`; what is in MATLAB's structs or in groups of HDF5 `"data.u"`.
+    A column is written `"U[2]"`, a row `"U[2,:]"`; what is in MATLAB's structs or in groups of HDF5
+    `"data.u"`.
 
-    Raises:
-        InputError: a missing variable, a struct, text, complex numbers, a corrupt file; the message lists
+    Raises: InputError: a missing variable, a struct, text, complex numbers, a corrupt file; the
+        message lists
             what the file holds.
     """
     with foreign(path):
@@ -75,7 +87,10 @@ def scalars(path: Path, wanted: Callable[[str], bool]) -> dict[str, float]:
         InputError: a corrupt file.
     """
     with foreign(path):
-        return {name: float(value[0]) for name, value in _FORMATS[path.suffix.lower()](path, wanted).items()}
+        return {
+            name: float(value[0])
+            for name, value in _FORMATS[path.suffix.lower()](path, wanted).items()
+        }
 
 
 @contextmanager
@@ -91,7 +106,9 @@ def foreign(path: Path) -> Iterator[None]:
         raise InputError(f"{path}: reading the file takes more memory than there is.") from None
     except Exception as error:  # there is no list of what they raise for corrupt files
         reason = "no archive of plain arrays" if path.suffix.lower() == ".npz" else short(error)
-        raise InputError(f"{path}: cannot be read as {path.suffix.lower()} ({reason}); is it cut or corrupt?") from None
+        raise InputError(
+            f"{path}: cannot be read as {path.suffix.lower()} ({reason}); is it cut or corrupt?"
+        ) from None
 
 
 def _from_npz(path: Path, names: Wanted) -> dict[str, Vector]:
@@ -101,18 +118,26 @@ def _from_npz(path: Path, names: Wanted) -> dict[str, Vector]:
             try:
                 held[info.filename.removesuffix(".npy")] = _member(path, archive, info)
             except Exception as error:  # one that cannot be read matters only where it is asked for
-                held[info.filename.removesuffix(".npy")] = FileVariable(f"unreadable: {short(error)}", None)
+                held[info.filename.removesuffix(".npy")] = FileVariable(
+                    f"unreadable: {short(error)}", None
+                )
         return _taken(path, names, held)
 
 
-_LARGE, _DENSEST = 2**28, 300  # bytes of an array that may shrink as it likes, and by how much a larger one may
+_LARGE, _DENSEST = (
+    2**28,
+    300,
+)  # bytes of an array that may shrink as it likes, and by how much a larger one may
 
 
 def _member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> FileVariable:
     """Return an array of an archive by its header; Python objects are never opened."""
     with archive.open(info) as member:
         version = np.lib.format.read_magic(member)
-        read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}[version]
+        read = {
+            (1, 0): np.lib.format.read_array_header_1_0,
+            (2, 0): np.lib.format.read_array_header_2_0,
+        }[version]
         shape, _, kind = read(member)
         begin = member.tell()
     if kind.hasobject:
@@ -126,7 +151,9 @@ def _member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> File
     if size > _LARGE and size > _DENSEST * info.compress_size:
         packed = in_words(info.compress_size)
         return FileVariable(
-            f"{in_words(size)} in {packed} of the file, denser than measurements; store it uncompressed", None
+            f"{in_words(size)} in {packed} of the file, denser than measurements; store it "
+            "uncompressed",
+            None,
         )
 
     def load() -> np.ndarray:
@@ -145,7 +172,9 @@ def _from_mat(path: Path, names: Wanted) -> dict[str, Vector]:
     roots = {_ROOT.split(name.lstrip("/"))[0] for name in asked}
     held: dict[str, FileVariable] = {}
     for name, variable in variables.items():
-        held |= _held(path, variable, deep=not roots or name in roots or not roots <= variables.keys())
+        held |= _held(
+            path, variable, deep=not roots or name in roots or not roots <= variables.keys()
+        )
     return _taken(path, names, _with_names(held))
 
 
@@ -177,7 +206,10 @@ def _from_hdf5(path: Path, names: Wanted) -> dict[str, Vector]:
 
 @dataclass(frozen=True, eq=False)
 class _Datasets:
-    """What an HDF5 file holds, by path. MATLAB keeps cells and arrays of structs as references to `#refs#`."""
+    """What an HDF5 file holds, by path.
+
+    MATLAB keeps cells and arrays of structs as references to `#refs#`.
+    """
 
     path: Path
     file: Any
@@ -283,46 +315,74 @@ def _lazy(path: Path, shape: Sequence[int], itemsize: int, read: Callable[[], An
 
 
 def _taken(path: Path, names: Wanted, held: Mapping[str, FileVariable]) -> dict[str, Vector]:
-    """Return the named channels; without names an empty one for each that could be named; or the single numbers wanted."""
+    """Return the named channels.
+
+    Without names an empty one for each that could be named; or the single numbers wanted.
+    """
     if callable(names):
-        single = {name: one for name, one in held.items() if one.read and math.prod(one.shape) == 1 and names(name)}
+        single = {
+            name: one
+            for name, one in held.items()
+            if one.read and math.prod(one.shape) == 1 and names(name)
+        }
         read = {name: np.asarray(one.read()).ravel() for name, one in single.items() if one.read}
-        return {name: value.astype(float) for name, value in read.items() if value.dtype.kind in "fiu"}
+        return {
+            name: value.astype(float) for name, value in read.items() if value.dtype.kind in "fiu"
+        }
     if names is not None:
         return {name: _pick(path, name, held) for name in names}
     lines = {}
     for name, variable in held.items():
-        sides = [n for n in variable.shape if n != 1] if variable.read and not variable.named else []
+        sides = (
+            [n for n in variable.shape if n != 1] if variable.read and not variable.named else []
+        )
         if len(variable.shape) <= 2 and len(sides) == 1:
             lines[name] = np.empty(0)
         elif len(sides) == len(variable.shape) == 2 and min(sides) <= _NAMED:
             tall = sides[0] >= sides[1]
-            lines |= {f"{name}[{i}]" if tall else f"{name}[{i},:]": np.empty(0) for i in range(min(sides))}
+            lines |= {
+                f"{name}[{i}]" if tall else f"{name}[{i},:]": np.empty(0) for i in range(min(sides))
+            }
     return lines
 
 
 def _pick(path: Path, name: str, held: Mapping[str, FileVariable]) -> Vector:
     name = _known_as(name, held)
     variable, axis, index = (name, 0, 0) if name in held else _line(path, name)
-    listing = ", ".join(f"{key} ({value.what})" for key, value in list(held.items())[:_NAMED]) or "nothing"
+    listing = (
+        ", ".join(f"{key} ({value.what})" for key, value in list(held.items())[:_NAMED])
+        or "nothing"
+    )
     listing += f" and {len(held) - _NAMED} more" if len(held) > _NAMED else ""
     if variable not in held:
         ours = _ELEMENT.sub(lambda m: f"[{int(m[1]) - 1}{',:' if m[2] else ''}]", name)
         hint = f'; elements are counted from 0 here, "{ours}"' if ours != name else ""
         raise MissingColumnError(
-            f"{path}: no variable '{variable}'{hint or nearest(variable, held)}; the file holds {listing}."
+            f"{path}: no variable '{variable}'{hint or nearest(variable, held)}; the file "
+            f"holds {listing}."
         )
     read = held[variable].read
     if read is None:
-        hint = f' Name a field of it, such as "{variable}.u".' if held[variable].what.startswith("a struct") else ""
-        raise InputError(f"{path}: '{variable}' is {held[variable].what}, no numbers; the file holds {listing}.{hint}")
+        hint = (
+            f' Name a field of it, such as "{variable}.u".'
+            if held[variable].what.startswith("a struct")
+            else ""
+        )
+        raise InputError(
+            f"{path}: '{variable}' is {held[variable].what}, no numbers; the file holds "
+            f"{listing}.{hint}"
+        )
     array = np.asarray(read())
     if np.iscomplexobj(array) or array.dtype.names is not None:
-        raise InputError(f"{path}: '{variable}' is complex; expected real numbers. The file holds {listing}.")
+        raise InputError(
+            f"{path}: '{variable}' is complex; expected real numbers. The file holds {listing}."
+        )
     if variable != name:
         if array.ndim != 2 or index >= array.shape[axis]:
             kind = "column" if axis else "row"
-            raise InputError(f"{path}: '{name}': no such {kind} (counted from 0); the file holds {listing}.")
+            raise InputError(
+                f"{path}: '{name}': no such {kind} (counted from 0); the file holds {listing}."
+            )
         array = array.take(index, axis=axis)
     if array.ndim == 2 and 1 in array.shape:
         array = array.ravel()
@@ -351,7 +411,9 @@ def _line(path: Path, name: str) -> tuple[str, int, int]:
     first, comma, second = (part.strip() for part in place.partition(","))
     axis = 0 if comma and second == ":" else 1
     index = second if comma and first == ":" else first
-    if not (index.isascii() and index.isdecimal() and len(index) < _DIGITS) or (comma and ":" not in (first, second)):
+    if not (index.isascii() and index.isdecimal() and len(index) < _DIGITS) or (
+        comma and ":" not in (first, second)
+    ):
         raise InputError(
             f'{path}: \'{name}\': a column of a matrix is written "{variable}[0]", a row "{variable}[0,:]", '
             "counted from 0."

@@ -9,9 +9,27 @@ from fractions import Fraction
 
 from orthaug.data.expressions import Expression
 
-_PLAIN = ("sign", "tanh", "sin", "cos", "tan", "atan", "atan2", "exp", "log", "floor")  # of numbers without unit
+_PLAIN = (
+    "sign",
+    "tanh",
+    "sin",
+    "cos",
+    "tan",
+    "atan",
+    "atan2",
+    "exp",
+    "log",
+    "floor",
+)  # of numbers without unit
 _SAME = ("abs", "min", "max")
-_LATEX = {"sin": r"\sin", "cos": r"\cos", "tan": r"\tan", "atan": r"\arctan", "exp": r"\exp", "log": r"\ln"}
+_LATEX = {
+    "sin": r"\sin",
+    "cos": r"\cos",
+    "tan": r"\tan",
+    "atan": r"\arctan",
+    "exp": r"\exp",
+    "log": r"\ln",
+}
 _LATEX |= {"tanh": r"\tanh", "sign": r"\operatorname{sgn}", "min": r"\min", "max": r"\max"}
 Unit = Counter[str]
 """Powers by the name of a unit."""
@@ -107,7 +125,11 @@ def _latex(node: ast.AST) -> str:
     if isinstance(node.op, ast.Div):
         return rf"\frac{{{_latex(node.left)}}}{{{_latex(node.right)}}}"
     if isinstance(node.op, ast.Pow):
-        base = _latex(node.left) if isinstance(node.left, ast.Name | ast.Subscript) else f"({_latex(node.left)})"
+        base = (
+            _latex(node.left)
+            if isinstance(node.left, ast.Name | ast.Subscript)
+            else f"({_latex(node.left)})"
+        )
         return f"{base}^{{{_latex(node.right)}}}"
     if isinstance(node.op, ast.Mult):
         return rf"{_tight(node.left)}\,{_tight(node.right)}"
@@ -123,8 +145,18 @@ def _tight(node: ast.AST) -> str:
 
 _TEX = {
     **{letter: rf"\{letter}" for letter in "_%&#${}"},
-    **{"\\": r"\textbackslash{}", "^": r"\textasciicircum{}", "~": r"\textasciitilde{}", "<": r"\textless{}"},
-    **{">": r"\textgreater{}", "|": r"\textbar{}", '"': r"\textquotedbl{}", "`": r"\textasciigrave{}"},
+    **{
+        "\\": r"\textbackslash{}",
+        "^": r"\textasciicircum{}",
+        "~": r"\textasciitilde{}",
+        "<": r"\textless{}",
+    },
+    **{
+        ">": r"\textgreater{}",
+        "|": r"\textbar{}",
+        '"': r"\textquotedbl{}",
+        "`": r"\textasciigrave{}",
+    },
 }
 
 

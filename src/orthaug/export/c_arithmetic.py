@@ -9,7 +9,20 @@ import numpy as np
 from orthaug.export.nodes import ACTIVATIONS, Language, decimal, functions_in, names_in, wrapped
 from orthaug.export.program import Block, Constant, Layer, Program
 
-_MATH = {"sin", "cos", "tan", "atan", "atan2", "exp", "log", "sqrt", "floor", "tanh", "expm1", "log1p"}
+_MATH = {
+    "sin",
+    "cos",
+    "tan",
+    "atan",
+    "atan2",
+    "exp",
+    "log",
+    "sqrt",
+    "floor",
+    "tanh",
+    "expm1",
+    "log1p",
+}
 _OWN = {
     "sign": "static real sign(real a) { return a > 0 ? 1 : a < 0 ? -1 : a; } /* NaN stays NaN */",
     "min": "static real least(real a, real b) { return a < b || isnan(a) ? a : b; }",
@@ -63,7 +76,10 @@ def arithmetic(program: Program) -> str:
     """Everything before the functions that the header declares."""
     parts = [_functions(program)]
     parts += [
-        "\n".join(f"static const real {c.name} = {_number(c.value)}; /* {_safe(c.meaning)} */" for c in _used(program))
+        "\n".join(
+            f"static const real {c.name} = {_number(c.value)}; /* {_safe(c.meaning)} */"
+            for c in _used(program)
+        )
     ]
     for name in sorted(program.activations - {"identity"}):
         written = _language(_plain).write(ACTIVATIONS[name])
@@ -87,20 +103,34 @@ def _used(program: Program) -> list[Constant]:
 
 def _functions(program: Program) -> str:
     """Names of the mathematical functions for either precision, and those that C lacks."""
-    wanted = program.functions | set[str]().union(*(functions_in(ACTIVATIONS[name]) for name in program.activations))
-    called = sorted({"abs": "fabs", "power": "pow"}.get(name, name) for name in wanted & (_MATH | {"abs", "power"}))
+    wanted = program.functions | set[str]().union(
+        *(functions_in(ACTIVATIONS[name]) for name in program.activations)
+    )
+    called = sorted(
+        {"abs": "fabs", "power": "pow"}.get(name, name)
+        for name in wanted & (_MATH | {"abs", "power"})
+    )
     upper = program.name.upper()
     lines = []
     if called:
-        lines += [f"#ifdef {upper}_FLOAT", *(f"#define {name}_ {name}f" for name in called), "#else"]
+        lines += [
+            f"#ifdef {upper}_FLOAT",
+            *(f"#define {name}_ {name}f" for name in called),
+            "#else",
+        ]
         lines += [*(f"#define {name}_ {name}" for name in called), "#endif"]
     return "\n".join([*lines, *(text for name, text in _OWN.items() if name in wanted)])
 
 
 def _table(name: str, values: np.ndarray) -> str:
     if values.ndim == 1:
-        return f"static const real {name}[{len(values)}] = {{\n{wrapped(list(map(_number, values)), ' ' * 4)}\n}};"
-    rows = ",\n".join(f"    {{{wrapped(list(map(_number, row)), ' ' * 5).strip()}}}" for row in values)
+        return (
+            f"static const real {name}[{len(values)}] = "
+            f"{{\n{wrapped(list(map(_number, values)), ' ' * 4)}\n}};"
+        )
+    rows = ",\n".join(
+        f"    {{{wrapped(list(map(_number, row)), ' ' * 5).strip()}}}" for row in values
+    )
     return f"static const real {name}[{values.shape[0]}][{values.shape[1]}] = {{\n{rows}\n}};"
 
 
@@ -175,7 +205,10 @@ def advance(program: Program) -> list[str]:
         "        int j;",
         f"        for (j = 0; j < {held}; j++) {{",
         f"            const real slope = (u[{held} + j] - u[j]) / {halves};",
-        *(f"            {point}[j] = u[j] + (real)(i{f' + {k}' * (k > 0)}) * slope;" for k, point in enumerate(points)),
+        *(
+            f"            {point}[j] = u[j] + (real)(i{f' + {k}' * (k > 0)}) * slope;"
+            for k, point in enumerate(points)
+        ),
         "        }",
         "        substep(x, first, middle, last);",
         "    }",
@@ -189,7 +222,10 @@ def _integrator(program: Program) -> list[str]:
     if scheme.kind == "discrete":
         return []
     if scheme.kind == "rk4":
-        return [f"static const real step = {_number(scheme.step)}; /* s */\n{_RK4.replace('NX', str(n))}"]
+        return [
+            f"static const real step = {_number(scheme.step)}; /* s "
+            f"*/\n{_RK4.replace('NX', str(n))}"
+        ]
     tables = [_table(f"m_{name}", matrix) for name, matrix in scheme.matrices]
     return ["\n".join(tables), _EXACT.replace("NX", str(n))]
 

@@ -63,7 +63,9 @@ def fields_of(program: Program) -> list[tuple[str, Signal, int]]:
 
 def places_of(fields: list[tuple[str, Signal, int]]) -> list[str]:
     """Return every entry of the state as a member of its struct."""
-    return [f"{name}[{i}]" if depth else name for name, _, depth in fields for i in range(max(depth, 1))]
+    return [
+        f"{name}[{i}]" if depth else name for name, _, depth in fields for i in range(max(depth, 1))
+    ]
 
 
 def _header(program: Program, fields: list[tuple[str, Signal, int]]) -> str:
@@ -71,11 +73,22 @@ def _header(program: Program, fields: list[tuple[str, Signal, int]]) -> str:
     members = []
     for identifier, signal, depth in fields:
         unit = f" [{signal.unit}]" if signal.unit else ""
-        what = f"{signal.name}[k-1] to {signal.name}[k-{depth}]" if depth > 1 else f"{signal.name}[k-1]"
+        what = (
+            f"{signal.name}[k-1] to {signal.name}[k-{depth}]"
+            if depth > 1
+            else f"{signal.name}[k-1]"
+        )
         size = f"[{depth}]" if depth else ""
-        members.append(f"    {name}_real {identifier}{size}; /* {comment((what if depth else signal.name) + unit)} */")
-    inputs = "".join(f"\n *   u[{i}]  {comment(signal.label)}" for i, signal in enumerate(program.inputs))
-    outputs = "".join(f"\n *   y[{i}]  {comment(signal.label)}" for i, signal in enumerate(program.outputs))
+        members.append(
+            f"    {name}_real {identifier}{size}; /* "
+            f"{comment((what if depth else signal.name) + unit)} */"
+        )
+    inputs = "".join(
+        f"\n *   u[{i}]  {comment(signal.label)}" for i, signal in enumerate(program.inputs)
+    )
+    outputs = "".join(
+        f"\n *   y[{i}]  {comment(signal.label)}" for i, signal in enumerate(program.outputs)
+    )
     done = comment(program.preparation)
     prepared = f" * Inputs and outputs stand for data after {done}.\n" if done else ""
     return f"""/* {name}: one step of a fitted model, every {program.sampling_time!r} s. Written by orthaug.
@@ -130,7 +143,9 @@ def comment(text: str) -> str:
 
 def _source(program: Program, fields: list[tuple[str, Signal, int]]) -> str:
     name, upper = program.name, program.name.upper()
-    step = _lagged_step(program, fields) if program.scheme is None else _motion_step(program, fields)
+    step = (
+        _lagged_step(program, fields) if program.scheme is None else _motion_step(program, fields)
+    )
     zeros = []
     for identifier, _, depth in fields:
         if depth:
@@ -187,13 +202,18 @@ def _lagged_step(program: Program, fields: list[tuple[str, Signal, int]]) -> str
     """Return the block in place on the state's fields, then every line moved on by one sample."""
     place = [f"state->{place}" for place in places_of(fields)]
     lines = [*_step_head(program), "    int i, ok = 1;"]
-    lines += c_arithmetic.body(program.output, "y", lambda vector, i: place[i] if vector == "x" else f"{vector}[{i}]")
+    lines += c_arithmetic.body(
+        program.output, "y", lambda vector, i: place[i] if vector == "x" else f"{vector}[{i}]"
+    )
     lines += _checks(program, following=False)
     now = {s.name: f"y[{i}]" for i, s in enumerate(program.outputs)}
     now |= {s.name: f"u[{i}]" for i, s in enumerate(program.inputs)}
     for identifier, signal, depth in fields:
         if depth > 1:
-            lines.append(f"    for (i = {depth - 1}; i > 0; i--) state->{identifier}[i] = state->{identifier}[i - 1];")
+            lines.append(
+                f"    for (i = {depth - 1}; i > 0; i--) state->{identifier}[i] = "
+                f"state->{identifier}[i - 1];"
+            )
         lines.append(f"    state->{identifier}[0] = {now[signal.name]};")
     return "\n".join([*lines, "}"])
 
@@ -203,7 +223,11 @@ def _motion_step(program: Program, fields: list[tuple[str, Signal, int]]) -> str
     assert scheme is not None
     lines = [*_step_head(program), f"    real x[{len(program.states)}];", "    int i, ok = 1;"]
     lines += [f"    x[{i}] = state->{identifier};" for i, (identifier, *_) in enumerate(fields)]
-    lines += ["    output(x, u, y);", *c_arithmetic.advance(program), *_checks(program, following=True)]
+    lines += [
+        "    output(x, u, y);",
+        *c_arithmetic.advance(program),
+        *_checks(program, following=True),
+    ]
     lines += [f"    state->{identifier} = x[{i}];" for i, (identifier, *_) in enumerate(fields)]
     return "\n".join([*lines, "}"])
 
@@ -215,11 +239,16 @@ def _check(program: Program, fields: list[tuple[str, Signal, int]], vectors: Vec
     def table(kind: str, values: list[list[float]]) -> str:
         body = ",\n".join("    {" + ", ".join(map(repr, row)) + "}" for row in values or [[0.0]])
         return (
-            f"static const double {kind}[{max(rows, 1)}][{max(len(values[0]) if values else 1, 1)}] = {{\n{body}\n}};"
+            "static const double "
+            f"{kind}[{max(rows, 1)}][{max(len(values[0]) if values else 1, 1)}] = "
+            f"{{\n{body}\n}};"
         )
 
     inputs = vectors.inputs.tolist() if program.inputs else [[0.0]] * rows
-    setting = "\n".join(f"        state.{place} = (real)states[k][{i}];" for i, place in enumerate(places_of(fields)))
+    setting = "\n".join(
+        f"        state.{place} = (real)states[k][{i}];"
+        for i, place in enumerate(places_of(fields))
+    )
     states = vectors.states.tolist() if program.states else [[0.0]] * rows
     return f"""/* Runs the test vectors: `cc -std=c99 -O2 {name}.c check.c -lm -o check && ./check`. */
 #include "{name}.h"

@@ -1,4 +1,7 @@
-"""The verb `export`: a folder with the code of a model, its test vectors and how to run it; whole or not at all."""
+"""The verb `export`: a folder with the code of a model, its test vectors and how to run it.
+
+Whole or not at all.
+"""
 
 from __future__ import annotations
 
@@ -60,17 +63,27 @@ def check_target(to: str) -> str:
 def check_export(to: str, folder: Path, name: str = "model", *, force: bool = False) -> None:
     """Raise InputError early where there is no such target, name or place."""
     check_target(to)
-    plain = isinstance(name, str) and re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) and len(name) <= _LONGEST
+    plain = (
+        isinstance(name, str)
+        and re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name)
+        and len(name) <= _LONGEST
+    )
     if not plain or keyword.iskeyword(name) or name in _TAKEN:
         raise InputError(
-            f"{shown(name)} cannot name the exported code; use ASCII letters, digits and underscores, at most "
-            f"{_LONGEST}, starting with a letter, and no word of a language or library."
+            f"{shown(name)} cannot name the exported code; use ASCII letters, digits and "
+            f"underscores, at most {_LONGEST}, starting with a letter, and no word of a "
+            "language or library."
         )
     check_replaceable(folder, force=force)
 
 
 def export(
-    model: Model | MotionModel, folder: str | Path, to: str, *, name: str = "model", force: bool = False
+    model: Model | MotionModel,
+    folder: str | Path,
+    to: str,
+    *,
+    name: str = "model",
+    force: bool = False,
 ) -> Program:
     """Write a model as code that needs no orthaug, and return the program that was written.
 
@@ -81,8 +94,8 @@ def export(
         name: stands in front of the functions in C, and names the files.
         force: replace the folder whatever it holds.
 
-    Raises:
-        InputError: an unknown target, a model that has no code (a Python function, an ensemble, a spline hold), or a
+    Raises: InputError: an unknown target, a model that has no code (a Python function, an ensemble,
+        a spline hold), or a
             folder that cannot be written.
 
     Examples:
@@ -104,10 +117,15 @@ def export(
     program = program_of(model, name, storage.digest(model))
     vectors = _vectors_of(model, program)
     files = dict(target.files(program, vectors))
-    files |= {VECTORS: vectors.csv(program), "README.md": _readme(program, target, len(vectors.outputs))}
+    files |= {
+        VECTORS: vectors.csv(program),
+        "README.md": _readme(program, target, len(vectors.outputs)),
+    }
     with whole_folder(folder, force=force) as partial:
         for file, content in files.items():
-            (partial / file).write_bytes(content if isinstance(content, bytes) else content.encode("utf-8"))
+            (partial / file).write_bytes(
+                content if isinstance(content, bytes) else content.encode("utf-8")
+            )
     return program
 
 
@@ -118,8 +136,8 @@ def _readme(program: Program, target: Target, rows: int) -> str:
         hold = "\nInputs are held from one sample to the next.\n"
         if program.ends == 2:
             hold = (
-                "\nInputs run straight from one sample to the next, so that a step takes those of the next sample too: "
-                "a step can be made when the next inputs are known.\n"
+                "\nInputs run straight from one sample to the next, so that a step takes those "
+                "of the next sample too: a step can be made when the next inputs are known.\n"
             )
     prepared = _of_prepared(program)
     return f"""# {program.name}
@@ -148,8 +166,9 @@ def _of_prepared(program: Program) -> str:
     if not program.preparation:
         return ""
     return (
-        f"**The model was fitted to prepared data: {program.preparation}.** Inputs and outputs here stand for data "
-        "after these steps: what a `shift` delays comes late by as much, and of `detrend` they are deviations.\n\n"
+        f"**The model was fitted to prepared data: {program.preparation}.** Inputs and outputs "
+        "here stand for data after these steps: what a `shift` delays comes late by as much, "
+        "and of `detrend` they are deviations.\n\n"
     )
 
 
@@ -165,8 +184,12 @@ def _vectors_of(model: Any, program: Program) -> Vectors:
     """
     rng = np.random.default_rng(_SEED)
     middle, reach = _range(model, program)
-    drawn = middle + reach * np.repeat(rng.uniform(-1, 1, (_ROWS // _HELD, program.held)), _HELD, axis=0)
-    inputs = drawn if program.ends == 1 else np.concatenate([drawn, np.roll(drawn, -1, axis=0)], axis=1)
+    drawn = middle + reach * np.repeat(
+        rng.uniform(-1, 1, (_ROWS // _HELD, program.held)), _HELD, axis=0
+    )
+    inputs = (
+        drawn if program.ends == 1 else np.concatenate([drawn, np.roll(drawn, -1, axis=0)], axis=1)
+    )
 
     def run(state: Any, rows: Any) -> Any:
         def one(state: Any, row: Any) -> Any:
@@ -189,8 +212,13 @@ def _starts(model: Any, program: Program) -> Iterator[np.ndarray]:
     zero = np.zeros(len(program.states))
     if model.form.bound is not None:
         entries = model.form.features.entries if isinstance(model, Model) else model.form.features
-        centres = {entry.text.partition("[")[0]: c for entry, c in zip(entries, model.numbers.centre, strict=True)}
-        yield np.array([float(centres.get(signal.name.partition("[")[0], 0.0)) for signal in program.states])
+        centres = {
+            entry.text.partition("[")[0]: c
+            for entry, c in zip(entries, model.numbers.centre, strict=True)
+        }
+        yield np.array(
+            [float(centres.get(signal.name.partition("[")[0], 0.0)) for signal in program.states]
+        )
     yield zero
     yield zero + 1
 
@@ -202,8 +230,12 @@ def _range(model: Any, program: Program) -> tuple[Any, Any]:
         return middle, reach
     entries = model.form.features.entries if isinstance(model, Model) else model.form.features
     names = [signal.name for signal in program.inputs[: program.held]]
-    for entry, centre, width in zip(entries, model.numbers.centre, model.numbers.halfwidth, strict=True):
+    for entry, centre, width in zip(
+        entries, model.numbers.centre, model.numbers.halfwidth, strict=True
+    ):
         name = entry.text.partition("[")[0]
-        if name in names and (entry.text == name or str(entry.lags[0] if entry.lags else "") == entry.text):
+        if name in names and (
+            entry.text == name or str(entry.lags[0] if entry.lags else "") == entry.text
+        ):
             middle[names.index(name)], reach[names.index(name)] = float(centre), float(width)
     return middle, reach

@@ -1,4 +1,7 @@
-"""What a target of `orthaug export --to` is, and all of them. A new one is a file with a declaration, and an entry."""
+"""What a target of `orthaug export --to` is, and all of them.
+
+A new one is a file with a declaration, and an entry.
+"""
 
 from __future__ import annotations
 

@@ -38,7 +38,11 @@ class FadeNodes:
 
     @classmethod
     def of(
-        cls, form: Lagged | MotionField, numbers: Numbers, features: Sequence[Node], points: Sequence[Node]
+        cls,
+        form: Lagged | MotionField,
+        numbers: Numbers,
+        features: Sequence[Node],
+        points: Sequence[Node],
     ) -> FadeNodes:
         """Return the intermediate results for features z (nz,) of the entries of a point x (nx,)."""
         low, high = np.asarray(numbers.limits).tolist()
@@ -55,13 +59,18 @@ class FadeNodes:
         ]
         over = [apply("sub", there, node) for there, node in zip(inside, seen, strict=True)]
         moved = []
-        for j, (point, row) in enumerate(zip(points, np.asarray(numbers.pull).tolist(), strict=True)):
+        for j, (point, row) in enumerate(
+            zip(points, np.asarray(numbers.pull).tolist(), strict=True)
+        ):
             steps = [apply("mul", Number(by), over[i]) for i, by in enumerate(row) if by]
             moved.append(name(f"h_point_{j}", total([point, *steps])) if steps else point)
         share = None
         if form.beyond == "fade":
             halves = [(b - a) / 2 or 1.0 for a, b in zip(low, high, strict=True)]
-            apart = [apply("div", step, Number(half * FADED)) for step, half in zip(over, halves, strict=True)]
+            apart = [
+                apply("div", step, Number(half * FADED))
+                for step, half in zip(over, halves, strict=True)
+            ]
             squares = total([apply("mul", part, part) for part in apart])
             share = name("h_share", apply("exp", apply("neg", squares)))
         return cls(tuple(found.items()), tuple(inside), tuple(moved), share)
@@ -83,16 +92,16 @@ def _read(key: str) -> str:
 
 
 _OWN_FUNCTION = (
-    "is a Python function, which no target can write; give it as expressions, or call `model.step` where Python with "
-    "JAX runs"
+    "is a Python function, which no target can write; give it as expressions, or call "
+    "`model.step` where Python with JAX runs"
 )
 
 
 def program_of(model: Model | MotionModel, name: str = "model", digest: str = "") -> Program:
     """Return the step of a model in the intermediate form.
 
-    Raises:
-        InputError: physics or a learner that is a Python function, an ensemble, a hold that needs the whole record.
+    Raises: InputError: physics or a learner that is a Python function, an ensemble, a hold that
+        needs the whole record.
     """
     check_type(model, Model | MotionModel, "model", "a fitted model")
     numbers = model.numbers
@@ -124,7 +133,10 @@ class _Constants:
 
     def of(self, expression: Expression) -> dict[str, Node]:
         """Return the constants of an expression of lagged channels."""
-        return {name: self.node("c", name, value, f"constant {name}") for name, value in expression.constants}
+        return {
+            name: self.node("c", name, value, f"constant {name}")
+            for name, value in expression.constants
+        }
 
 
 def _lagged(model: Model, name: str, digest: str) -> Program:
@@ -133,8 +145,9 @@ def _lagged(model: Model, name: str, digest: str) -> Program:
         raise InputError(f"the physics {_OWN_FUNCTION}.")
     if numbers.tilt is not None:
         raise InputError(
-            "the model is an ensemble, whose learner is the median of several; fit with `restarts` but without an "
-            "ensemble to export it, or call `model.step` where Python with JAX runs."
+            "the model is an ensemble, whose learner is the median of several; fit with "
+            "`restarts` but without an ensemble to export it, or call `model.step` where "
+            "Python with JAX runs."
         )
     channels = {channel.name: channel for channel in (*model.outputs, *model.inputs)}
     lags: dict[Lag, Node] = {lag: Entry("x", i) for i, lag in enumerate(memory.lags)}
@@ -146,7 +159,11 @@ def _lagged(model: Model, name: str, digest: str) -> Program:
 
     limited = numbers.limits is not None
     features = [written(entry) for entry in form.features.entries]
-    held = FadeNodes.of(form, numbers, features, [lags[lag] for lag in form.layout]) if limited else None
+    held = (
+        FadeNodes.of(form, numbers, features, [lags[lag] for lag in form.layout])
+        if limited
+        else None
+    )
     constants.symbols |= {} if held is None else held.symbols
     sums, corrections = _weighted_terms(model, constants, written, held)
     network = None
@@ -159,7 +176,8 @@ def _lagged(model: Model, name: str, digest: str) -> Program:
     block = Block("output", () if held is None else held.locals, network, tuple(map(total, sums)))
     lines = tuple((_signal(channels[channel]), depth) for channel, depth in memory.depths)
     states = tuple(
-        Signal(str(lag), f"{identifier(lag.channel)}_{lag.lag}", channels[lag.channel].unit) for lag in memory.lags
+        Signal(str(lag), f"{identifier(lag.channel)}_{lag.lag}", channels[lag.channel].unit)
+        for lag in memory.lags
     )
     return Program(
         name=name,
@@ -196,7 +214,9 @@ def _weighted_terms(
         row = form.outputs.index(term.output) if term.output is not None else 0
         sums[row].append(apply("mul", factor, written(expression)))
         if held is not None and not term.fixed and moved[term.parameter]:
-            aux = constants.node("p", f"{term.parameter}_aux", moved[term.parameter], f"{named}, theta_aux")
+            aux = constants.node(
+                "p", f"{term.parameter}_aux", moved[term.parameter], f"{named}, theta_aux"
+            )
             inside = dict(zip(form.layout, held.inside, strict=True))
             corrections[row].append(apply("neg", apply("mul", aux, written(expression, inside))))
     return sums, corrections
@@ -205,21 +225,30 @@ def _weighted_terms(
 def _motion_names(model: MotionModel, constants: _Constants) -> dict[str, Node]:
     """Return what the names of constants, parameters, states and inputs stand for."""
     form, numbers, motion = model.form, model.numbers, model.form.motion
-    values = np.asarray(motion.coordinates.physical(np.asarray(numbers.theta) - np.asarray(numbers.theta_aux)))
+    values = np.asarray(
+        motion.coordinates.physical(np.asarray(numbers.theta) - np.asarray(numbers.theta_aux))
+    )
     names: dict[str, Node] = {
         key: constants.node("c", key, value, f"constant {key}") for key, value in motion.constants
     }
     for parameter, value in zip(motion.parameters, values.tolist(), strict=True):
         unit = f" [{parameter.unit}]" if parameter.unit else ""
         beside = "" if form.bound is None else ", beside the learner"
-        names[parameter.name] = constants.node("p", parameter.name, value, f"{parameter.name}{unit}{beside}")
+        names[parameter.name] = constants.node(
+            "p", parameter.name, value, f"{parameter.name}{unit}{beside}"
+        )
     names |= {state.name: Entry("x", i) for i, state in enumerate(motion.states)}
     names |= {channel: Entry("u", i) for i, channel in enumerate(motion.inputs)}
     return names
 
 
-def _with_correction(correction: Node, physics: Node, held: FadeNodes | None, rows: Sequence[Node]) -> Node:
-    """Return a learned equation with what is added to it; `rows` are its physics at p̂, and where it is held at c and at p̂."""
+def _with_correction(
+    correction: Node, physics: Node, held: FadeNodes | None, rows: Sequence[Node]
+) -> Node:
+    """Return a learned equation with what is added to it.
+
+    `rows` are its physics at p̂, and where it is held at c and at p̂.
+    """
     if rows:
         physics, own, split = rows
         correction = apply("add", correction, apply("sub", own, split))
@@ -231,7 +260,9 @@ def _split_parameters(model: MotionModel, constants: _Constants) -> dict[str, No
     motion = model.form.motion
     values = np.asarray(motion.coordinates.physical(np.asarray(model.numbers.theta))).tolist()
     return {
-        parameter.name: constants.node("p", f"{parameter.name}_split", value, f"{parameter.name}, as estimated")
+        parameter.name: constants.node(
+            "p", f"{parameter.name}_split", value, f"{parameter.name}, as estimated"
+        )
         for parameter, value in zip(motion.parameters, values, strict=True)
     }
 
@@ -265,26 +296,42 @@ def _motion(model: MotionModel, name: str, digest: str) -> Program:
     results = {kind: list(map(written, expressions)) for kind, expressions in equations.items()}
     held, changed = None, list[dict[str, Node]]()
     if numbers.limits is not None:
-        points: list[Node] = [*(Entry("x", i) for i in range(form.states)), *(names[key] for key in motion.inputs)]
+        points: list[Node] = [
+            *(Entry("x", i) for i in range(form.states)),
+            *(names[key] for key in motion.inputs),
+        ]
         held = FadeNodes.of(form, numbers, features, points)
         defined |= dict(held.locals)
         constants.symbols |= held.symbols
-        if np.any(numbers.theta_aux):  # the physics itself extrapolates with the parameters that were split off
+        if np.any(
+            numbers.theta_aux
+        ):  # the physics itself extrapolates with the parameters that were split off
             split = _split_parameters(model, constants)
             inside = dict(zip((*motion.names_of_states, *motion.inputs), held.inside, strict=True))
             bare = {key: node for key, node in names.items() if key not in dict(motion.definitions)}
-            changed = [define(bare | split, "_s"), define(bare | inside, "_h"), define(bare | inside | split, "_hs")]
+            changed = [
+                define(bare | split, "_s"),
+                define(bare | inside, "_h"),
+                define(bare | inside | split, "_hs"),
+            ]
     blocks = {}
-    for kind, learned, first in (("output", learned_outputs, len(learned_states)), ("rate", learned_states, 0)):
+    for kind, learned, first in (
+        ("output", learned_outputs, len(learned_states)),
+        ("rate", learned_states, 0),
+    ):
         network = None
         if form.bound is not None and learned:
             seen = features if held is None else held.features
             network = _network(form.bound, numbers, seen, first + np.arange(len(learned)))
             for i, place in enumerate(learned):
                 rows = [written(equations[kind][place], there) for there in changed]
-                results[kind][place] = _with_correction(Entry("g", i), results[kind][place], held, rows)
+                results[kind][place] = _with_correction(
+                    Entry("g", i), results[kind][place], held, rows
+                )
         seen = list(network.features) if network is not None else []
-        blocks[kind] = Block(kind, _needed(defined, [*results[kind], *seen]), network, tuple(results[kind]))
+        blocks[kind] = Block(
+            kind, _needed(defined, [*results[kind], *seen]), network, tuple(results[kind])
+        )
     return _moving_program(model, blocks, constants, name, digest)
 
 
@@ -295,7 +342,9 @@ def _moving_program(
     units = {channel.name: channel.unit for channel in model.inputs}
     return Program(
         name=name,
-        states=tuple(Signal(state.name, identifier(state.name), state.unit) for state in motion.states),
+        states=tuple(
+            Signal(state.name, identifier(state.name), state.unit) for state in motion.states
+        ),
         inputs=tuple(_step_input(key, units) for key in step_inputs),
         outputs=tuple(map(_signal, model.outputs)),
         sampling_time=model.sampling_time,
@@ -343,9 +392,10 @@ def _network(bound: Bound, numbers: Numbers, features: Sequence[Node], rows: Vec
     declared = getattr(bound.learner, "layers", None)
     if declared is None:
         raise InputError(
-            f"the learner {type(bound.learner).__name__} is a function that no target can write; fit with an MLP or "
-            "Terms, or give its class a method `layers(tree)` that returns weight, bias and activation of each layer. "
-            "`model.step` runs it where Python with JAX does."
+            f"the learner {type(bound.learner).__name__} is a function that no target can "
+            "write; fit with an MLP or Terms, or give its class a method `layers(tree)` that "
+            "returns weight, bias and activation of each layer. `model.step` runs it where "
+            "Python with JAX does."
         )
     centre, halfwidth = np.asarray(numbers.centre), np.asarray(numbers.halfwidth)
     scaled: list[Node] = []
@@ -355,13 +405,22 @@ def _network(bound: Bound, numbers: Numbers, features: Sequence[Node], rows: Vec
     layers = []
     for weight, bias, activation in declared(bound.tree(bound.leaves(np.asarray(numbers.weights)))):
         if activation not in ACTIVATIONS:
-            raise InputError(f"the learner has the activation {activation!r}; known are {', '.join(ACTIVATIONS)}.")
+            raise InputError(
+                f"the learner has the activation {activation!r}; known are "
+                f"{', '.join(ACTIVATIONS)}."
+            )
         layers.append(
-            Layer(np.asarray(weight, dtype=float), None if bias is None else np.asarray(bias, dtype=float), activation)
+            Layer(
+                np.asarray(weight, dtype=float),
+                None if bias is None else np.asarray(bias, dtype=float),
+                activation,
+            )
         )
     last, gain = layers[-1], np.asarray(numbers.gain, dtype=float)[rows]
     layers[-1] = Layer(
-        gain[:, None] * last.weight[rows], None if last.bias is None else gain * last.bias[rows], last.activation
+        gain[:, None] * last.weight[rows],
+        None if last.bias is None else gain * last.bias[rows],
+        last.activation,
     )
     return Network(tuple(scaled), tuple(layers))
 

@@ -1,7 +1,7 @@
 """Scalar expressions in the intermediate form: numbers, names, entries of vectors, functions of them, and activations.
 
-Targets write them, those in languages that write sums and products as C and Python do by a `Language`; nothing of
-Python's syntax tree, of NumPy or of JAX is left in them.
+Targets write them, those in languages that write sums and products as C and Python do by a
+`Language`; nothing of Python's syntax tree, of NumPy or of JAX is left in them.
 """
 
 from __future__ import annotations
@@ -54,7 +54,9 @@ class Entry:
 
 @dataclass(frozen=True)
 class Apply:
-    """A function of nodes: of `ARITHMETIC` or of `FUNCTIONS` of expressions; `min` and `max` of two.
+    """A function of nodes: of `ARITHMETIC` or of `FUNCTIONS` of expressions.
+
+    `min` and `max` of two.
 
     The second argument of `whole_power` is a whole `Number`.
     """
@@ -67,7 +69,10 @@ Node = Union[Number, Name, Entry, Apply]  # noqa: UP007  (refers to itself)
 
 
 def apply(function: str, *arguments: Node) -> Node:
-    """Return a function of nodes; arithmetic on numbers is done here, by the rules of floating point."""
+    """Return a function of nodes.
+
+    Arithmetic on numbers is done here, by the rules of floating point.
+    """
     numbers = [argument.value for argument in arguments if isinstance(argument, Number)]
     if function in ARITHMETIC and len(numbers) == len(arguments):
         with np.errstate(all="ignore"):
@@ -101,7 +106,12 @@ def node_of(
     return _node(expression.tree, names, lags, numbers)
 
 
-def _node(tree: ast.expr, names: Mapping[str, Node], lags: Mapping[Lag, Node], numbers: Mapping[str, float]) -> Node:
+def _node(
+    tree: ast.expr,
+    names: Mapping[str, Node],
+    lags: Mapping[Lag, Node],
+    numbers: Mapping[str, float],
+) -> Node:
     if isinstance(tree, ast.Constant):
         return Number(float(tree.value))  # type: ignore[arg-type]  (checked by the parser)
     if isinstance(tree, ast.Name):
@@ -159,7 +169,9 @@ def names_in(node: Node) -> set[str]:
 def identifier(name: str) -> str:
     """Return a name in ASCII: other letters by their code point, as `u03b8` for θ."""
     plain = unicodedata.normalize("NFKC", name)
-    return "".join(c if c.isascii() and (c.isalnum() or c == "_") else f"u{ord(c):04x}" for c in plain)
+    return "".join(
+        c if c.isascii() and (c.isalnum() or c == "_") else f"u{ord(c):04x}" for c in plain
+    )
 
 
 def _of(function: str, *arguments: Node) -> Node:
@@ -182,7 +194,9 @@ ACTIVATIONS: dict[str, Node] = {
     "sigmoid": _SIGMOID,
     "silu": _of("mul", _A, _SIGMOID),
     "elu": _of("add", _of("max", _A, _NULL), _of("expm1", _of("min", _A, _NULL))),
-    "softplus": _of("add", _of("max", _A, _NULL), _of("log1p", _of("exp", _of("neg", _of("abs", _A))))),
+    "softplus": _of(
+        "add", _of("max", _A, _NULL), _of("log1p", _of("exp", _of("neg", _of("abs", _A))))
+    ),
     "identity": _A,
 }
 """The activations of networks as nodes of `a`, so that no target needs a table of them; the names are those of

@@ -8,7 +8,21 @@ from dataclasses import dataclass
 from orthaug.export.program import Program, Vectors
 from orthaug.export.python_code import Dialect, arithmetic, declarations, python_language
 
-_SAME = ("sin", "cos", "tan", "exp", "log", "sqrt", "abs", "sign", "floor", "tanh", "expm1", "log1p", "power")
+_SAME = (
+    "sin",
+    "cos",
+    "tan",
+    "exp",
+    "log",
+    "sqrt",
+    "abs",
+    "sign",
+    "floor",
+    "tanh",
+    "expm1",
+    "log1p",
+    "power",
+)
 _OTHER = {"atan": "np.arctan", "atan2": "np.arctan2", "min": "np.minimum", "max": "np.maximum"}
 NUMPY = Dialect(
     python_language({name: f"np.{name}" for name in _SAME} | _OTHER),
@@ -89,7 +103,8 @@ class ControlModule:
 
     def files(self, program: Program, vectors: Vectors) -> Mapping[str, str]:
         labels = {
-            kind: [signal.identifier for signal in getattr(program, kind)] for kind in ("inputs", "outputs", "states")
+            kind: [signal.identifier for signal in getattr(program, kind)]
+            for kind in ("inputs", "outputs", "states")
         }
         text = _SYSTEM.replace("NAME", program.name).replace("LABELS", repr(labels))
         return {f"{program.name}.py": module(program) + text}

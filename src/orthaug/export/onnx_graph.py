@@ -13,9 +13,23 @@ from orthaug._base.errors import InputError
 from orthaug.export.nodes import ACTIVATIONS, Apply, Entry, Name, Node, Number
 from orthaug.export.program import Block, Program, Vectors
 
-_OPERATORS = {"add": "Add", "sub": "Sub", "mul": "Mul", "div": "Div", "power": "Pow", "whole_power": "Pow"}
+_OPERATORS = {
+    "add": "Add",
+    "sub": "Sub",
+    "mul": "Mul",
+    "div": "Div",
+    "power": "Pow",
+    "whole_power": "Pow",
+}
 _OPERATORS |= {"neg": "Neg", "sin": "Sin", "cos": "Cos", "exp": "Exp", "log": "Log", "sqrt": "Sqrt"}
-_OPERATORS |= {"abs": "Abs", "sign": "Sign", "floor": "Floor", "tanh": "Tanh", "min": "Min", "max": "Max"}
+_OPERATORS |= {
+    "abs": "Abs",
+    "sign": "Sign",
+    "floor": "Floor",
+    "tanh": "Tanh",
+    "min": "Min",
+    "max": "Max",
+}
 _OPSET = 18
 
 
@@ -49,7 +63,8 @@ class _Graph:
             import onnx  # pyright: ignore[reportMissingImports]  (optional)
         except ImportError:
             raise InputError(
-                "an ONNX graph is written by the package onnx, which is not installed; pip install onnx."
+                "an ONNX graph is written by the package onnx, which is not installed; pip "
+                "install onnx."
             ) from None
         self.onnx, self.program = onnx, program
         self.nodes: list[Any] = []
@@ -67,13 +82,21 @@ class _Graph:
         sizes = {"state": program.states, "inputs": program.inputs}
         results = {"next_state": program.states, "outputs": program.outputs}
         given, made = (
-            [helper.make_tensor_value_info(name, real, [len(signals)]) for name, signals in group.items() if signals]
+            [
+                helper.make_tensor_value_info(name, real, [len(signals)])
+                for name, signals in group.items()
+                if signals
+            ]
             for group in (sizes, results)
         )
-        tables = [self.onnx.numpy_helper.from_array(value, name) for name, value in self.tables.items()]
+        tables = [
+            self.onnx.numpy_helper.from_array(value, name) for name, value in self.tables.items()
+        ]
         graph = helper.make_graph(self.nodes, program.name, given, made, tables)
         about = {"producer_name": "orthaug", "doc_string": f"sha256 {program.digest}"}
-        model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", _OPSET)], ir_version=8, **about)
+        model = helper.make_model(
+            graph, opset_imports=[helper.make_opsetid("", _OPSET)], ir_version=8, **about
+        )
         self.onnx.checker.check_model(model)
         return model.SerializeToString()
 
@@ -108,12 +131,20 @@ class _Graph:
             for layer in block.network.layers:
                 z = self.product(layer.weight, z)
                 z = z if layer.bias is None else self.add("Add", z, self.table(layer.bias))
-                z = z if layer.activation == "identity" else self.node(ACTIVATIONS[layer.activation], {"a": z})
+                z = (
+                    z
+                    if layer.activation == "identity"
+                    else self.node(ACTIVATIONS[layer.activation], {"a": z})
+                )
             known["g"] = z
         return self.joined([self.node(node, known) for node in block.results])
 
     def product(self, weight: Matrix, z: str) -> str:
-        """W z. Of one entry it is no matrix product: runtimes would draw its scaling in, in single precision."""
+        """W z.
+
+        Of one entry it is no matrix product: runtimes would draw its scaling in, in single
+        precision.
+        """
         if weight.shape[1] == 1:
             return self.add("Mul", self.table(weight[:, 0]), z)
         return self.add("MatMul", self.table(weight), z)
@@ -161,7 +192,11 @@ class _Graph:
         """Return the next state."""
         program, scheme = self.program, self.program.scheme
         if scheme is None or program.rate is None:
-            parts = [name for name, there in ((y, True), (u, program.inputs), ("state", program.states)) if there]
+            parts = [
+                name
+                for name, there in ((y, True), (u, program.inputs), ("state", program.states))
+                if there
+            ]
             return self.part(self.joined(parts), program.following)
         if scheme.kind == "discrete":
             return self.block(program.rate, "state", u)
@@ -188,7 +223,9 @@ class _Graph:
         k2 = self.block(rate, self.combined(x, (h / 2, k1)), middle)
         k3 = self.block(rate, self.combined(x, (h / 2, k2)), middle)
         k4 = self.block(rate, self.combined(x, (h, k3)), last)
-        return self.combined(x, (h / 6, self.add("Add", self.combined(k1, (2.0, self.add("Add", k2, k3))), k4)))
+        return self.combined(
+            x, (h / 6, self.add("Add", self.combined(k1, (2.0, self.add("Add", k2, k3))), k4))
+        )
 
     def exact(self, x: str, first: str, middle: str, last: str) -> str:
         rate, scheme = self.program.rate, self.program.scheme

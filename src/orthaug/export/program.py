@@ -49,7 +49,10 @@ class Layer:
 
 @dataclass(frozen=True, eq=False)
 class Network:
-    """The learner: layers on scaled features. Its values are the vector `g` of the block that it stands in."""
+    """The learner: layers on scaled features.
+
+    Its values are the vector `g` of the block that it stands in.
+    """
 
     features: tuple[Node, ...]
     layers: tuple[Layer, ...]
@@ -96,9 +99,10 @@ class Scheme:
 class Program:
     """A step: `output` gives y of state x and inputs u; then the state goes on.
 
-    Of a lagged model `lines` are the channels that it remembers with how many samples of each, outputs first; the state
-    is these lines, newest first, and outputs and inputs are put in front of them. Of a motion `rate` and `scheme` make
-    the next state; under a first-order hold, `ends` = 2, the inputs of the next sample stand behind those of this one.
+    Of a lagged model `lines` are the channels that it remembers with how many samples of each,
+    outputs first; the state is these lines, newest first, and outputs and inputs are put in front
+    of them. Of a motion `rate` and `scheme` make the next state; under a first-order hold, `ends` =
+    2, the inputs of the next sample stand behind those of this one.
     """
 
     name: str
@@ -128,7 +132,9 @@ class Program:
     @property
     def functions(self) -> set[str]:
         """The functions of all expressions."""
-        return set[str]().union(*(functions_in(node) for block in self.blocks for node in block.nodes))
+        return set[str]().union(
+            *(functions_in(node) for block in self.blocks for node in block.nodes)
+        )
 
     @property
     def activations(self) -> set[str]:
@@ -154,7 +160,9 @@ class Vectors:
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
         kinds = {"input": program.inputs, "state": program.states, "output": program.outputs}
-        writer.writerow([f"{kind}:{signal.name}" for kind, signals in kinds.items() for signal in signals])
+        writer.writerow(
+            [f"{kind}:{signal.name}" for kind, signals in kinds.items() for signal in signals]
+        )
         for row in np.concatenate([self.inputs, self.states, self.outputs], axis=1):
             writer.writerow([repr(float(value)) for value in row])
         return text.getvalue()

@@ -1,6 +1,7 @@
 """States of training that outlive the process: written every so often, whole or not at all, and taken up again.
 
-A state is that of the Levenberg-Marquardt loop between two steps, so a resumed run takes the same steps, bit by bit.
+A state is that of the Levenberg-Marquardt loop between two steps, so a resumed run takes the same
+steps, bit by bit.
 """
 
 from __future__ import annotations
@@ -29,7 +30,18 @@ _ABOUT = "training.json"
 _FORMAT = b"orthaug state 1 "
 _HEAD = len(_FORMAT) + 65  # bytes: format, checksum, end of line
 _ONE: Any = 0
-_LEAVES = State(_ONE, Normal(_ONE, _ONE, _ONE, Overlap(_ONE, _ONE)), _ONE, _ONE, _ONE, _ONE, _ONE, _ONE, _ONE, _ONE)
+_LEAVES = State(
+    _ONE,
+    Normal(_ONE, _ONE, _ONE, Overlap(_ONE, _ONE)),
+    _ONE,
+    _ONE,
+    _ONE,
+    _ONE,
+    _ONE,
+    _ONE,
+    _ONE,
+    _ONE,
+)
 
 OF_DESCENT = Pause((_ONE,) * 5, _ONE, _ONE, _ONE, _ONE, _ONE, _ONE, _ONE, _ONE)
 """The form of what a descent keeps."""
@@ -37,7 +49,9 @@ OF_DESCENT = Pause((_ONE,) * 5, _ONE, _ONE, _ONE, _ONE, _ONE, _ONE, _ONE, _ONE)
 
 @dataclass(eq=False)
 class Checkpoints:
-    """A folder with the state of every run of one fit; `fingerprint` is of all that the fit depends on.
+    """A folder with the state of every run of one fit.
+
+    `fingerprint` is of all that the fit depends on.
 
     `every` is the time [s] between two states of a run.
     """
@@ -62,7 +76,8 @@ class Checkpoints:
             raise InputError(f"{self.folder}: holds no state of a training; give another --out.")
         if resume and known not in (None, self.fingerprint):
             raise InputError(
-                f"{self.folder}: is the state of another spec, other data or another version; fit without --resume."
+                f"{self.folder}: is the state of another spec, other data or another version; "
+                "fit without --resume."
             )
         if not resume:
             self.discard()
@@ -72,7 +87,11 @@ class Checkpoints:
         """Return what is kept of a run that begins with these weights and choices, in the form of the solver's states."""
         digest = hashlib.sha256(self.fingerprint.encode())
         for part in parts:
-            digest.update(np.ascontiguousarray(part).tobytes() if isinstance(part, np.ndarray) else repr(part).encode())
+            digest.update(
+                np.ascontiguousarray(part).tobytes()
+                if isinstance(part, np.ndarray)
+                else repr(part).encode()
+            )
         return RunCheckpoint(self, self.folder / f"{digest.hexdigest()[:24]}.safetensors", form)
 
     def discard(self) -> None:
@@ -101,7 +120,9 @@ class RunCheckpoint:
         from safetensors.numpy import load
 
         try:
-            content = self.path.read_bytes()  # mapped into memory, it could not be replaced on Windows
+            content = (
+                self.path.read_bytes()
+            )  # mapped into memory, it could not be replaced on Windows
         except OSError:
             return None
         try:
@@ -116,7 +137,10 @@ class RunCheckpoint:
         return state
 
     def keep(self, state: Any, *, ended: bool = False) -> None:
-        """Write the state, or what makes it, if it is time or the run `ended`. A full disk leaves the one before."""
+        """Write the state, or what makes it, if it is time or the run `ended`.
+
+        A full disk leaves the one before.
+        """
         now = time.monotonic()
         if now - self.written < self.checkpoints.every and not (ended and self.path.exists()):
             return
@@ -135,9 +159,13 @@ class RunCheckpoint:
         if folder not in PARTIALS.placed:
             PARTIALS.placed.append(folder)
         if not (folder / _ABOUT).exists():
-            _replace(folder / _ABOUT, json.dumps({"fingerprint": self.checkpoints.fingerprint}).encode())
+            _replace(
+                folder / _ABOUT, json.dumps({"fingerprint": self.checkpoints.fingerprint}).encode()
+            )
         leaves = jax.tree.leaves(state)
-        content = save({str(i): np.atleast_1d(leaf).reshape(np.shape(leaf)) for i, leaf in enumerate(leaves)})
+        content = save(
+            {str(i): np.atleast_1d(leaf).reshape(np.shape(leaf)) for i, leaf in enumerate(leaves)}
+        )
         _replace(self.path, _head(content) + content)
 
 

@@ -47,7 +47,9 @@ def autoregression(pieces: Sequence[Vector]) -> Autoregression:
     rows = sum(map(len, pieces))
     size = float(np.sqrt(sum(float(piece @ piece) for piece in pieces) / max(rows, 1))) or 1.0
     a = burg([piece / size for piece in pieces], _MOST_ORDERS)
-    left = np.concatenate([np.convolve(piece, a, mode="valid") for piece in pieces if len(piece) >= len(a)])
+    left = np.concatenate(
+        [np.convolve(piece, a, mode="valid") for piece in pieces if len(piece) >= len(a)]
+    )
     return Autoregression(-a[1:], float(np.mean(left**2)))
 
 
@@ -69,7 +71,9 @@ def burg(pieces: Sequence[Vector], largest: int) -> Vector:
         energy = sum(f @ f + b @ b for f, b in zip(forward, backward, strict=True))
         product = sum(f @ b for f, b in zip(forward, backward, strict=True))
         k = -2 * product / energy if energy > rows * _ROUNDING**2 else 1.0
-        if rows < _ROWS_PER_LAG * order or 1 - k**2 < _ROUNDING:  # too few rows, or nothing is left to predict
+        if (
+            rows < _ROWS_PER_LAG * order or 1 - k**2 < _ROUNDING
+        ):  # too few rows, or nothing is left to predict
             break
         both = list(zip(forward, backward, strict=True))
         forward, backward = [f + k * b for f, b in both], [b + k * f for f, b in both]
@@ -81,15 +85,18 @@ def burg(pieces: Sequence[Vector], largest: int) -> Vector:
 
 
 def autocorrelation(residuals: Matrix) -> Vector | None:
-    """Return the correlations ρ_1, ρ_2, … of stretches (s, T); None of fewer than 3 steps, and of zeros."""
+    """Return the correlations ρ_1, ρ_2, … of stretches (s, T).
+
+    None of fewer than 3 steps, and of zeros.
+    """
     return _correlations(_spectrum(residuals), residuals.shape[1])
 
 
 def independent_share(residuals: Matrix) -> float:
     """1 / (1 + 2 Σ ρ_i), the inverse autocorrelation time, summed up to the first correlation that is noise.
 
-    Args:
-        residuals: stretches (s, T), 0 where there is no residual; lags never reach from one into the next.
+    Args: residuals: stretches (s, T), 0 where there is no residual; lags never reach from one into
+        the next.
     """
     longest = residuals.shape[1]
     return share_of(_spectrum(residuals), longest, int(np.count_nonzero(residuals)))
@@ -116,9 +123,9 @@ def spectrum_size(longest: int) -> int:
 def correlation_length(residuals: Matrix) -> int | None:
     """Return the lag τ from which to twice it correlations are noise, so that a resonance is not cut where it is 0.
 
-    Their root mean square there is that of correlations of coloured noise, `√((1 + 2 Σ_{j<τ} ρ_j²) / N)` (Bartlett
-    1946), or hardly more; or it is too small to count. None where there is no such lag among the first N / 20, or in
-    the first half of the stretches.
+    Their root mean square there is that of correlations of coloured noise, `√((1 + 2 Σ_{j<τ} ρ_j²)
+    / N)` (Bartlett 1946), or hardly more; or it is too small to count. None where there is no such
+    lag among the first N / 20, or in the first half of the stretches.
 
     Args:
         residuals: as above.
@@ -152,4 +159,6 @@ def _autocovariances(spectrum: Vector, longest: int) -> Vector:
 
 
 def _spectrum(residuals: Matrix) -> Vector:
-    return np.sum(np.abs(np.fft.rfft(residuals, spectrum_size(residuals.shape[1]), axis=1)) ** 2, axis=0)
+    return np.sum(
+        np.abs(np.fft.rfft(residuals, spectrum_size(residuals.shape[1]), axis=1)) ** 2, axis=0
+    )

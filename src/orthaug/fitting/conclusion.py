@@ -44,8 +44,8 @@ from orthaug.physics.excitation import ILL_CONDITIONED
 from orthaug.physics.problem import Problem, pose
 
 _UNDETERMINED = (
-    "no standard errors: beside the learner's weights the data do not determine θ to rounding. Use more data, a "
-    "smaller learner, or one that sees less."
+    "no standard errors: beside the learner's weights the data do not determine θ to rounding. "
+    "Use more data, a smaller learner, or one that sees less."
 )
 
 
@@ -60,7 +60,9 @@ def conclude(task: OneStepTask, structure: Structure, learned: TrainedLearner) -
     told: list[Warning] = []
     if unfinished(learned) and follows_training(structure, problem, learned):
         learned = withheld(learned)
-        told += [not_converged(learned)] if learned.tilt is None else []  # longer training gives an ensemble none
+        told += (
+            [not_converged(learned)] if learned.tilt is None else []
+        )  # longer training gives an ensemble none
     share = task.share(learned)
     finite = bool(np.isfinite(share.square) and np.isfinite(share.coordinates).all())
     ending = learned.ending if finite else Ending.NON_FINITE
@@ -80,9 +82,16 @@ def conclude(task: OneStepTask, structure: Structure, learned: TrainedLearner) -
     if any(warning.code == NOT_CONVERGED for warning in told):
         pass
     elif known and errors.covariance is None and learned.errors is None:
-        text = "no standard errors: beside a learner that sees only some features, an ensemble leaves none."
+        text = (
+            "no standard errors: beside a learner that sees only some features, an ensemble "
+            "leaves none."
+        )
         told.append(Warning("no_standard_errors", text))
-    elif known and errors.covariance is not None and np.isnan(np.diag(errors.covariance)).sum() > len(fixed):
+    elif (
+        known
+        and errors.covariance is not None
+        and np.isnan(np.diag(errors.covariance)).sum() > len(fixed)
+    ):
         told.append(Warning("no_standard_errors", _UNDETERMINED))
     reason = ALONE.get(ending, "") if learned.bound is None else ""
     reason = reason or ending_in_words(ending, learned.tail)
@@ -91,7 +100,9 @@ def conclude(task: OneStepTask, structure: Structure, learned: TrainedLearner) -
     shared = problem.shared if partly and problem.features.entries else None
     return Estimate(
         model=model,
-        status=Status(ending, learned.iterations, learned.seconds, errors.mean_square, reason=reason),
+        status=Status(
+            ending, learned.iterations, learned.seconds, errors.mean_square, reason=reason
+        ),
         restarts=(),
         excitation=problem.excitation,
         covariance=grown(errors.covariance, model.statistics, shared) if known else None,
@@ -115,11 +126,20 @@ def _model(
     noise: Matrix | None,
 ) -> Model:
     record, scaling = problem.record, learned.scaling
-    numbers = (parameters.theta, parameters.theta_aux, learned.weights, scaling.centre, scaling.halfwidth, learned.unit)
+    numbers = (
+        parameters.theta,
+        parameters.theta_aux,
+        learned.weights,
+        scaling.centre,
+        scaling.halfwidth,
+        learned.unit,
+    )
     middle = _middle(problem, learned, noise)
     decoupled = structure.projects and directions(structure, problem) is None
     held = {} if decoupled else parameters.fixed
-    form = Lagged(problem.baseline, problem.features, problem.layout, problem.outputs, learned.bound)
+    form = Lagged(
+        problem.baseline, problem.features, problem.layout, problem.outputs, learned.bound
+    )
     limits, pull = _limits(problem, form)
     return Model(
         form=form,
@@ -150,7 +170,9 @@ def _limits(problem: Problem, form: Lagged) -> tuple[Matrix | None, Matrix | Non
     limits = None if form.beyond == "free" else limits_of(problem.feature_range)
     if limits is None:
         return None, None
-    return limits, pull_of(lambda x: np.asarray(form.features.evaluate(x, form.layout, np)), problem.rows.x)
+    return limits, pull_of(
+        lambda x: np.asarray(form.features.evaluate(x, form.layout, np)), problem.rows.x
+    )
 
 
 def _one_step_errors(
@@ -159,7 +181,9 @@ def _one_step_errors(
     """Return the statistics of the one-step residual."""
     problem, ny = task.problem, len(task.problem.outputs)
     whitened = task.residual_gram(learned, c)
-    freedom = degrees_of_freedom(problem.count, problem.freedom_used, learned.effective) + len(fixed) / ny
+    freedom = (
+        degrees_of_freedom(problem.count, problem.freedom_used, learned.effective) + len(fixed) / ny
+    )
     finite = bool(np.isfinite(whitened).all())
     mixed = noise_covariance(whitened, freedom) if finite else None
     noise = covariance = None
@@ -189,7 +213,9 @@ def _beside_the_learner(
     nt = len(taken)
     overlap = np.linalg.solve(factor.to_coordinates.T, gram[:nt, nt:])  # QᵀJ
     k = np.column_stack([np.eye(nt), factor.from_coordinates(taken @ overlap)])
-    covariance = JointCovariance(_beside(fixed, gram), learned.ridge, _beside(fixed, middle), nt).of(k)
+    covariance = JointCovariance(
+        _beside(fixed, gram), learned.ridge, _beside(fixed, middle), nt
+    ).of(k)
     held = list(fixed)
     covariance[held] = covariance[:, held] = np.nan
     return covariance
@@ -213,9 +239,16 @@ def _middle(problem: Problem, learned: TrainedLearner, noise: Matrix | None) -> 
 
 
 def _defect(
-    task: OneStepTask, structure: Structure, share: Share, parameters: ThetaSplit, learned: TrainedLearner
+    task: OneStepTask,
+    structure: Structure,
+    share: Share,
+    parameters: ThetaSplit,
+    learned: TrainedLearner,
 ) -> float | None:
-    """‖QᵀF̃‖ / ‖F‖ with F̃ = F − Φ θ_aux (eq:orth_property), along the shared directions; None for F = 0."""
+    """‖QᵀF̃‖ / ‖F‖ with F̃ = F − Φ θ_aux (eq:orth_property), along the shared directions.
+
+    None for F = 0.
+    """
     size = np.sqrt(share.square)
     if not 0 < size < np.inf:
         return None
@@ -228,8 +261,8 @@ def without_loss(mean_square: float) -> list[Warning]:
     if np.isfinite(mean_square):
         return []
     text = (
-        "the free run diverges over whole experiments of the training data, so it has no loss; train with longer "
-        "segments, or bound what makes it run away."
+        "the free run diverges over whole experiments of the training data, so it has no loss; "
+        "train with longer segments, or bound what makes it run away."
     )
     return [Warning("free_run_diverges", text)]
 
@@ -246,40 +279,48 @@ def _warnings(
     condition = problem.excitation.condition
     if condition is not None and condition > ILL_CONDITIONED:
         text = (
-            f"the physics is ill-conditioned on the data (condition {condition:.1e} of the scaled columns): "
-            "θ is determined, but small changes of the data move it far."
+            f"the physics is ill-conditioned on the data (condition {condition:.1e} of the "
+            "scaled columns): θ is determined, but small changes of the data move it far."
         )
         told.append(Warning("ill_conditioned", text))
     if learned.ending is Ending.SPANNED:
         text = (
-            "the learner lies in the span of the physics (P⊥J = 0): there is nothing for it to learn that the "
-            "physics does not express already. Give it another form or other inputs, or leave it out."
+            "the learner lies in the span of the physics (P⊥J = 0): there is nothing for it to "
+            "learn that the physics does not express already. Give it another form or other "
+            "inputs, or leave it out."
         )
         told.append(Warning("learner_spanned", text))
     if learned.errors is not None:
         told += without_loss(learned.errors.mean_square)
     if learned.elsewhere:
-        told.append(Warning("no_standard_errors", "no standard errors: the function was trained elsewhere."))
+        told.append(
+            Warning("no_standard_errors", "no standard errors: the function was trained elsewhere.")
+        )
     elif not identified:
         text = (
-            f"θ of the {structure.name} structure is not unique (it depends on the learner's start or on the "
-            "penalty), so it has no standard error; use the orthogonal structure for parameters."
+            f"θ of the {structure.name} structure is not unique (it depends on the learner's "
+            "start or on the penalty), so it has no standard error; use the orthogonal "
+            "structure for parameters."
         )
         told.append(Warning(NOT_UNIQUE, text))
     elif noise is None:
         text = (
             f"no standard errors: {problem.count} rows leave no degrees of freedom for "
-            f"{len(problem.baseline.names)} parameters and {learned.effective:.1f} effective weights; "
-            "use more data or a smaller learner."
+            f"{len(problem.baseline.names)} parameters and {learned.effective:.1f} effective "
+            "weights; use more data or a smaller learner."
         )
         told.append(Warning("no_standard_errors", text))
     if fixed:
         names = ", ".join(f"{problem.baseline.names[i]} = {value:g}" for i, value in fixed.items())
         text = (
-            f"at a bound: {names}. What stands at a bound is a known term, as with `fixed = true`: it has no standard "
-            "error, and the others and theirs hold with it there; "
+            f"at a bound: {names}. What stands at a bound is a known term, as with `fixed = "
+            "true`: it has no standard error, and the others and theirs hold with it there; "
         )
-        if structure.projects and learned.bound is not None and directions(structure, problem) is not None:
+        if (
+            structure.projects
+            and learned.bound is not None
+            and directions(structure, problem) is not None
+        ):
             text += "the learner is not made orthogonal to it; "
         text += "data that contradict a bound contradict the physics or the bound."
         told.append(Warning("at_a_bound", text))
@@ -291,15 +332,13 @@ def orthogonalize(
 ) -> Estimate:
     """Split a model trained elsewhere into physics and an orthogonal rest (F2).
 
-    Args:
-        record: the rows over which the rest is made orthogonal, usually the training data.
-        baseline: the physics.
-        function: `g(x)` on NumPy regressors (N, nx) in `Lags` order, giving (N, ny); from any toolbox.
-        lags: the regressor that `function` expects; None for the raw lags of the baseline.
+    Args: record: the rows over which the rest is made orthogonal, usually the training data.
+        baseline: the physics. function: `g(x)` on NumPy regressors (N, nx) in `Lags` order, giving
+        (N, ny); from any toolbox. lags: the regressor that `function` expects; None for the raw
+        lags of the baseline.
 
-    Returns:
-        An estimate whose model predicts what `function` does, with `θ = Φ⁺G` and the learner `g − φθ`.
-        There are no standard errors: they belong to how `function` was trained.
+    Returns: An estimate whose model predicts what `function` does, with `θ = Φ⁺G` and the learner
+        `g − φθ`. There are no standard errors: they belong to how `function` was trained.
     """
     problem = pose(record, baseline, lags)
     ny, nz = len(problem.outputs), len(problem.features.entries)
@@ -308,9 +347,13 @@ def orthogonalize(
     scaling, unit = Scaling(np.zeros(nz), np.ones(nz)), np.ones(ny)
     task = OneStepTask.of(problem, None)
     gain = np.broadcast_to(problem.weight.matrix / task.rms, (*values.shape, ny))
-    rows = task.engine.build_rows(values, problem.projection.q, problem.unexplained / task.rms, gain)
+    rows = task.engine.build_rows(
+        values, problem.projection.q, problem.unexplained / task.rms, gain
+    )
     task = replace(task, rows=rows, unit=unit, bound=Bound(_GIVEN, ny, ny))
-    concluded = conclude(task, Orthogonal(), TrainedLearner(task.bound, np.zeros(0), scaling, unit, elsewhere=True))
+    concluded = conclude(
+        task, Orthogonal(), TrainedLearner(task.bound, np.zeros(0), scaling, unit, elsewhere=True)
+    )
     form = replace(concluded.model.form, bound=Bound(external, nz, ny))
     return replace(concluded, model=replace(concluded.model, form=form))
 

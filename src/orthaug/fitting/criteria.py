@@ -70,7 +70,9 @@ _LOOKED_AT = 2**17  # samples of which the autocorrelation is taken
 
 @dataclass(frozen=True)
 class Prediction:
-    """Declaration: the error of the prediction `horizon` steps ahead; 1 is the paper's criterion (eq:cost_fun).
+    """Declaration: the error of the prediction `horizon` steps ahead.
+
+    1 is the paper's criterion (eq:cost_fun).
 
     Examples:
         >>> Prediction(10).free_run
@@ -93,8 +95,15 @@ class Prediction:
 
     @property
     def free_run(self) -> Simulation | None:
-        """The free run that gives it: segments of `horizon` steps whose last one is scored; None for one step."""
-        return Simulation(self.horizon, self.horizon - 1, exact_start=True) if self.horizon > 1 else None
+        """The free run that gives it: segments of `horizon` steps whose last one is scored.
+
+        None for one step.
+        """
+        return (
+            Simulation(self.horizon, self.horizon - 1, exact_start=True)
+            if self.horizon > 1
+            else None
+        )
 
     def on(self, record: Record, first_row: int = 0) -> Prediction:
         """Return itself: nothing of it depends on a record."""
@@ -114,15 +123,17 @@ class Prediction:
 class Simulation:
     """Declaration: the error of a free run over segments that start from measured lags.
 
-    With a washout, or over whole experiments, the outputs before a segment count as noisy like all others: they are
-    unknowns too (`InitialStates`). Segments without a washout start exactly from what was measured.
+    With a washout, or over whole experiments, the outputs before a segment count as noisy like all
+    others: they are unknowns too (`InitialStates`). Segments without a washout start exactly from
+    what was measured.
 
-    Args:
-        segment: steps of a segment; 0 for whole experiments; "auto" for 20 times as many steps as the outputs remember
+    Args: segment: steps of a segment; 0 for whole experiments; "auto" for 20 times as many steps as
+        the outputs remember
             themselves, 512 or more, and whole experiments where these are not twice as long.
         washout: leading steps of a segment that are not scored, until its start is forgotten.
         start_iterations: one-step iterations that training starts from.
-        exact_start: whether a segment starts exactly from what was measured; None for the rule above.
+        exact_start: whether a segment starts exactly from what was measured; None for the rule
+            above.
 
     Examples:
         >>> Simulation(segment=0, washout=0).estimates_pasts  # whole experiments, from starts that are estimated
@@ -143,7 +154,8 @@ class Simulation:
         _check_segment(self.segment)
         if isinstance(self.segment, int) and self.segment and self.washout >= self.segment:
             raise KeyedError(
-                f"`washout` must be shorter than `segment`; got {self.washout} and {self.segment}: nothing is scored.",
+                f"`washout` must be shorter than `segment`; got {self.washout} and "
+                f"{self.segment}: nothing is scored.",
                 "washout",
                 f": found {self.washout}; expected less than the segment, {self.segment}",
             )
@@ -155,12 +167,19 @@ class Simulation:
 
     @property
     def steps(self) -> int:
-        """Steps of a segment, 0 for whole experiments; the fewest where their number is left to a record."""
+        """Steps of a segment, 0 for whole experiments.
+
+        The fewest where their number is left to a record.
+        """
         return max(SHORT, 2 * self.washout) if isinstance(self.segment, str) else self.segment
 
     def on(self, record: Record, first_row: int = 0) -> Simulation:
         """Return the same with segments of so many steps as a record asks for, where that is left to it."""
-        return self if self.segment != "auto" else replace(self, segment=segment_for(record, first_row, self.washout))
+        return (
+            self
+            if self.segment != "auto"
+            else replace(self, segment=segment_for(record, first_row, self.washout))
+        )
 
     @property
     def streamed(self) -> Simulation:
@@ -183,9 +202,10 @@ class Simulation:
 class Auto:
     """Declaration: the error one step ahead, and that of the free run where one step ahead is not enough.
 
-    A fit one step ahead stays where its free run is finite and no worse than that of physics alone where nothing was
-    fitted, and where its residual is noise of the equation. Otherwise physics and learner are trained on the free run
-    as well, and the best of all in free run is the result (`Estimate.focus`).
+    A fit one step ahead stays where its free run is finite and no worse than that of physics alone
+    where nothing was fitted, and where its residual is noise of the equation. Otherwise physics and
+    learner are trained on the free run as well, and the best of all in free run is the result
+    (`Estimate.focus`).
 
     Args:
         segment, washout, start_iterations: of the free run, as in `Simulation`.
@@ -234,8 +254,8 @@ class Auto:
 def segment_for(record: Record, first_row: int, washout: int) -> int:
     """Return how many steps a segment of a free run has; 0 for whole experiments.
 
-    It is 20 times as long as the outputs remember themselves (their autocorrelation is below 1/e), so that it shows
-    the slowest mode that they have, and longer than its washout.
+    It is 20 times as long as the outputs remember themselves (their autocorrelation is below 1/e),
+    so that it shows the slowest mode that they have, and longer than its washout.
     """
     longest = max(record.experiments, key=len)
     steps = len(longest) - first_row

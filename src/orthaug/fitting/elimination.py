@@ -22,9 +22,8 @@ def settle(fixed: Fixed, run: Callable[[Fixed], Fixed | None]) -> Fixed:
 
     What was held together once before is not released again, so that this ends.
 
-    Args:
-        fixed: what is held first.
-        run: runs with some entries held, and gives those that stand at one then; None to leave it at that.
+    Args: fixed: what is held first. run: runs with some entries held, and gives those that stand at
+        one then; None to leave it at that.
     """
     tried = [fixed]
     while (active := run(fixed)) is not None:
@@ -40,10 +39,11 @@ def settle(fixed: Fixed, run: Callable[[Fixed], Fixed | None]) -> Fixed:
 class Elimination:
     """θ eliminated from `‖p − (I − P) f − Tθ‖² + ‖e − A θ − B f‖²`, f = QᵀF, p = QᵀY, `T` = coordinates of θ.
 
-    P, `taken`, is the projector onto what a split moves from the learner to θ: all in the paper's structure, nothing in
-    the additive one. `(A, B, e)` are the structure's rows. An active set meets the bounds: some entries of θ stand at a
-    bound, and the others minimise the rest. Where the learner can imitate part of the physics only, they are known
-    terms then, which a split moves nothing to: P is that of the `shared` directions that leave them alone.
+    P, `taken`, is the projector onto what a split moves from the learner to θ: all in the paper's
+    structure, nothing in the additive one. `(A, B, e)` are the structure's rows. An active set
+    meets the bounds: some entries of θ stand at a bound, and the others minimise the rest. Where
+    the learner can imitate part of the physics only, they are known terms then, which a split moves
+    nothing to: P is that of the `shared` directions that leave them alone.
     """
 
     to_coordinates: Matrix
@@ -82,7 +82,9 @@ class Elimination:
         return np.concatenate([self.to_coordinates, self.rows.theta])
 
     def _learner(self, fixed: Fixed) -> Matrix:
-        return np.concatenate([np.eye(len(self.outputs)) - self.taken_beside(fixed), self.rows.learner])
+        return np.concatenate(
+            [np.eye(len(self.outputs)) - self.taken_beside(fixed), self.rows.learner]
+        )
 
     @property
     def _target(self) -> Vector:
@@ -120,8 +122,8 @@ class Elimination:
     def active(self, f: Vector) -> Fixed:
         """Which entries of θ stand at which bound, for the learner's coordinates f.
 
-        Those of the nearest θ in the bounds where nothing is held; what a held entry leaves to the learner may move
-        others past theirs, and these are added (`past`).
+        Those of the nearest θ in the bounds where nothing is held; what a held entry leaves to the
+        learner may move others past theirs, and these are added (`past`).
         """
         if not self.bounded:
             return {}
@@ -130,7 +132,11 @@ class Elimination:
         matrix, right = self._theta, self._target - self._learner({}) @ f
         scale = np.linalg.norm(matrix, axis=0)
         solution = lsq_linear(
-            matrix / scale, right, bounds=(self.lower * scale, self.upper * scale), method="bvls", tol=1e-14
+            matrix / scale,
+            right,
+            bounds=(self.lower * scale, self.upper * scale),
+            method="bvls",
+            tol=1e-14,
         )
         return self.past(
             f,
@@ -142,10 +148,12 @@ class Elimination:
         )
 
     def settled(self, run: Callable[[Fixed], Vector | None]) -> Fixed:
-        """Return what stands at a bound where training with the same entries held ended; those of physics alone at first.
+        """Return what stands at a bound where training with the same entries held ended.
 
-        Args:
-            run: trains with some entries held, and gives the learner's coordinates f; None to leave it at that.
+        Those of physics alone at first.
+
+        Args: run: trains with some entries held, and gives the learner's coordinates f; None to
+            leave it at that.
         """
         first = {} if self.decoupled else self.active(np.zeros_like(self.outputs))
         return settle(first, lambda fixed: None if (f := run(fixed)) is None else self.active(f))
@@ -154,7 +162,11 @@ class Elimination:
         """Return the `fixed`, and at their bounds all entries that would else leave them, for the learner's coordinates f."""
         while True:
             theta = self.theta(f, fixed)
-            beyond = {i: float(v) for i, v in enumerate(np.clip(theta, self.lower, self.upper)) if v != theta[i]}
+            beyond = {
+                i: float(v)
+                for i, v in enumerate(np.clip(theta, self.lower, self.upper))
+                if v != theta[i]
+            }
             if not beyond or not np.isfinite(theta).all():
                 return fixed
             fixed = fixed | beyond
@@ -175,7 +187,9 @@ def eliminate(structure: Structure, problem: Problem) -> Elimination:
     return Elimination(
         to_coordinates=projection.to_coordinates,
         outputs=problem.target_coordinates,
-        taken=projection.along(directions(structure, problem)) if structure.projects else np.zeros((nt, nt)),
+        taken=projection.along(directions(structure, problem))
+        if structure.projects
+        else np.zeros((nt, nt)),
         rows=structure.penalty(baseline.names, baseline.initial, problem.weight.unit),
         lower=baseline.bounds[0],
         upper=baseline.bounds[1],
@@ -189,7 +203,9 @@ def _shared(structure: Structure, problem: Problem) -> Shared:
 
 
 def directions(structure: Structure, problem: Problem, fixed: Iterable[int] = ()) -> Matrix | None:
-    """Return the directions of θ (nθ, s) along which a split makes the learner orthogonal; None for all.
+    """Return the directions of θ (nθ, s) along which a split makes the learner orthogonal.
+
+    None for all.
 
     Args:
         fixed: entries of θ that stand at a bound, which no direction moves.
@@ -221,11 +237,17 @@ def split_theta(
     """
     baseline, factor = problem.baseline, problem.projection
     elimination = eliminate(structure, problem)
-    if coefficients is not None and fixed is None:  # an iterate need not satisfy what only its end satisfies
+    if (
+        coefficients is not None and fixed is None
+    ):  # an iterate need not satisfy what only its end satisfies
         apart = elimination.shared is not None  # nothing is moved to what stands at a bound
-        reached = coefficients + (0.0 if apart else factor.from_coordinates(elimination.taken @ share))
+        reached = coefficients + (
+            0.0 if apart else factor.from_coordinates(elimination.taken @ share)
+        )
         inside = np.clip(reached, *baseline.bounds)
-        fixed = elimination.active(share) | {i: value for i, value in enumerate(inside) if value != reached[i]}
+        fixed = elimination.active(share) | {
+            i: value for i, value in enumerate(inside) if value != reached[i]
+        }
     fixed = elimination.active(share) if fixed is None else fixed
     taken = elimination.taken_beside(fixed) @ share
     aux = factor.from_coordinates(taken)

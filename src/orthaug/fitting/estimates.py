@@ -19,7 +19,12 @@ from orthaug.fitting.block_scores import FreeRunScores
 from orthaug.fitting.criteria import Criterion, Prediction
 from orthaug.fitting.held_out import Focus, HeldOutErrors
 from orthaug.fitting.status import Status
-from orthaug.inference.covariance import interval, joint_covariance, robust_covariance, robust_split_covariance
+from orthaug.inference.covariance import (
+    interval,
+    joint_covariance,
+    robust_covariance,
+    robust_split_covariance,
+)
 from orthaug.inference.influence import hc3, one_step_slopes
 from orthaug.inference.learned_terms import equation, learned_terms, term_frame, term_lines
 from orthaug.inference.measures import Measure, Points, Support, Training
@@ -44,7 +49,8 @@ STD_KINDS = {
     "hc3": "robust (HC3), for the errors are of uneven size",
     "newey-west": "robust (Newey-West), for the one-step residual is coloured",
     "batch-means": "robust (batch means), for the errors of the free run are coloured",
-    "autoregressive": "robust (an autoregressive model of the errors), for the errors of the free run are coloured",
+    "autoregressive": "robust (an autoregressive model of the errors), for the errors of the free run are "
+    "coloured",
     "batch-means-uneven": "robust (batch means), for the errors of the free run are of uneven size",
     "none": "none: the errors of the free run remember each other for too long",
 }
@@ -62,7 +68,8 @@ class Restart:
     chosen: bool
     regularization: str | float = "none"
     validation: float | None = None
-    """Mean squared error where nothing was fitted: on the validation record, or on held-out blocks."""
+    """Mean squared error where nothing was fitted: on the validation record, or on held-out blocks.
+    """
     score: float | None = None
     """Generalised cross-validation, where that chose among the runs."""
 
@@ -80,11 +87,16 @@ class AnyFit(FitView):
 
     @cached_property
     def terms(self) -> pd.DataFrame:
-        """Table with a row per term of a learner of terms: coefficient, unit, std, 95 % interval; else empty."""
+        """Table with a row per term of a learner of terms: coefficient, unit, std, 95 % interval.
+
+        Else empty.
+        """
         return term_frame(learned_terms(self.model))
 
     def equation(self, writing: str = "text") -> str:
-        """Return the fitted equations with their numbers, where the learner is a sum of terms; as "text", "latex", "python".
+        """Return the fitted equations with their numbers, where the learner is a sum of terms.
+
+        As "text", "latex", "python".
 
         Raises:
             InputError: another learner, physics that are Python functions, another writing.
@@ -97,7 +109,9 @@ class AnyFit(FitView):
 
     def summary(self) -> str:
         """Return a page of text: status, parameters, what is known of them, warnings."""
-        warnings = ["", *(f"warning: {warning}" for warning in self.warnings)] if self.warnings else []
+        warnings = (
+            ["", *(f"warning: {warning}" for warning in self.warnings)] if self.warnings else []
+        )
         return "\n".join(fold([*self.lines(), *warnings]))
 
 
@@ -116,7 +130,9 @@ class Estimate(AnyFit):
     blocks less one."""
     effective_weights: float
     defect: float | None
-    """‖QᵀF̃‖ / ‖F‖ over the training rows: how much of the learner the physics could express; None without one."""
+    """‖QᵀF̃‖ / ‖F‖ over the training rows: how much of the learner the physics could express; None
+    without one.
+    """
     problem: Problem = field(repr=False)
     criterion: Criterion = Prediction()  # noqa: RUF009  (frozen)
     measure: MeasureSplit | None = None
@@ -153,7 +169,10 @@ class Estimate(AnyFit):
 
     @property
     def one_step_theta(self) -> Vector | None:
-        """Φ⁺Y (nθ,), what one-step least squares gives, where θ was trained on something else; None otherwise."""
+        """Φ⁺Y (nθ,), what one-step least squares gives, where θ was trained on something else.
+
+        None otherwise.
+        """
         if self.criterion.free_run is None:
             return None
         return self.problem.least_squares
@@ -172,7 +191,9 @@ class Estimate(AnyFit):
     @cached_property
     def parameters(self) -> pd.DataFrame:
         """Table with a row per parameter: unit, initial, value, std, and the 95 % interval."""
-        return parameter_frame(self.problem.baseline.parameters, self.theta, self.std, self.interval)
+        return parameter_frame(
+            self.problem.baseline.parameters, self.theta, self.std, self.interval
+        )
 
     def split(self, measure: Measure) -> Estimate:
         """The same fitted function with θ, θ_aux, components and intervals under a measure, without training (F2).
@@ -183,15 +204,22 @@ class Estimate(AnyFit):
         check_type(measure, Measure, "measure", "a measure such as Uniform()")
         if self.at_bound:
             raise InputError(
-                f"{', '.join(self.at_bound)} stand at a bound, and a split under the {measure.name} measure knows "
-                "none: drop the bounds, keep the training measure, or give them `fixed = true` there."
+                f"{', '.join(self.at_bound)} stand at a bound, and a split under the "
+                f"{measure.name} measure knows none: drop the bounds, keep the training "
+                "measure, or give them `fixed = true` there."
             )
-        support = Support(self.problem.record, self.problem.layout, self.model.form.used, self.problem.rows.x)
+        support = Support(
+            self.problem.record, self.problem.layout, self.model.form.used, self.problem.rows.x
+        )
         joint = self.model.statistics.joint(len(self.theta))
         under = split_under(measure, self.model, support, joint)
         if under.covariance is not None:
             training = self.covariance if self.measure is None else None
-            training = split_under(Training(), self.model, support, joint).covariance if training is None else training
+            training = (
+                split_under(Training(), self.model, support, joint).covariance
+                if training is None
+                else training
+            )
             with np.errstate(all="ignore"):
                 price = np.sqrt(np.diag(under.covariance) / np.diag(np.asarray(training)))
             under = replace(under, price=price)
@@ -204,45 +232,63 @@ class Estimate(AnyFit):
         numbers = self.model.numbers._replace(theta=under.theta, theta_aux=under.theta_aux)
         return replace(
             self,
-            model=replace(self.model, numbers=numbers, structure="orthogonal", measure=measure.name),
+            model=replace(
+                self.model, numbers=numbers, structure="orthogonal", measure=measure.name
+            ),
             covariance=None if self.std_kind == "none" else under.covariance,
             plain_covariance=plain,
             std_kind=self.std_kind if plain is not None or self.std_kind == "none" else "plain",
             defect=under.defect,
             measure=under,
-            warnings=(*(w for w in self.warnings if w.code != NOT_UNIQUE), *under.warnings, *unknown),
+            warnings=(
+                *(w for w in self.warnings if w.code != NOT_UNIQUE),
+                *under.warnings,
+                *unknown,
+            ),
         )
 
     def joint_covariance(self, convention: str = "calibrated") -> Matrix:
-        """Cov of θ̂ and the weights from the raw `[Φ P⊥J]`, (nθ + nw)²; convention "paper" for eq:cov_approx / N."""
+        """Cov of θ̂ and the weights from the raw `[Φ P⊥J]`, (nθ + nw)².
+
+        Convention "paper" for eq:cov_approx / N.
+        """
         if self.criterion.free_run is not None or (
             self.model.statistics.gram is None and self.model.numbers.tilt is None
         ):
-            raise InputError("the joint covariance is that of a one-step fit with statistics of its own.")
+            raise InputError(
+                "the joint covariance is that of a one-step fit with statistics of its own."
+            )
         return joint_covariance(self.problem, self.model, convention)
 
     def robust(self, lags: int | None = None, kind: str | None = None) -> Estimate:
         """The same with standard errors of θ that hold for coloured and uneven noise.
 
-        One step ahead they are those of Newey and West, or HC3 for noise that is uneven and white. On the free run they
-        are batch means of the scores (`fitting/block_scores.py`). Both these hold for predictions too.
+        One step ahead they are those of Newey and West, or HC3 for noise that is uneven and white.
+        On the free run they are batch means of the scores (`fitting/block_scores.py`). Both these
+        hold for predictions too.
 
-        Args:
-            lags: of the autocovariances; on the free run steps of a block. By default `⌊4 (N/100)^(2/9)⌋`, on the free
+        Args: lags: of the autocovariances; on the free run steps of a block. By default `⌊4
+            (N/100)^(2/9)⌋`, on the free
                 run three times as many as the correlation of the errors lasts.
-            kind: "newey-west" or "hc3" one step ahead; on the free run "batch-means", or "autoregressive" for errors of
-                an autoregressive process; None for the first that there is.
+            kind: "newey-west" or "hc3" one step ahead; on the free run "batch-means", or
+                "autoregressive" for errors of an autoregressive process; None for the first that
+                there is.
 
-        Raises:
-            InputError: a fit without standard errors or with a parameter at a bound; errors that remember each other
+        Raises: InputError: a fit without standard errors or with a parameter at a bound; errors
+            that remember each other
                 for too long; a kind that is not for this criterion.
         """
         simulates = self.criterion.free_run is not None
-        kinds = ("batch-means", "batch-means-uneven", "autoregressive") if simulates else ("newey-west", "hc3")
+        kinds = (
+            ("batch-means", "batch-means-uneven", "autoregressive")
+            if simulates
+            else ("newey-west", "hc3")
+        )
         kind = kinds[0] if kind is None else check_choice(kind, kinds, "`kind`")
         if self.covariance is None or self.at_bound or (simulates and self.scores is None):
             raise InputError(
-                "robust standard errors are those of a fit that has standard errors, with no parameter at a bound."
+                "robust standard errors are those of a fit that has standard errors, with no "
+                "parameter at a bound."
             )
         if simulates:
             return replace(self._robust_free_run(lags, kind), std_kind=kind)
@@ -263,31 +309,48 @@ class Estimate(AnyFit):
     def _hc3(self) -> Estimate:
         """With every row's own error in place of one noise variance."""
         statistics = self.plain_statistics or self.model.statistics
-        if statistics.gram is None or self.model.numbers.tilt is not None or isinstance(self.problem, StreamedProblem):
-            raise InputError("the fit has no statistics that robust standard errors could be made of.")
+        if (
+            statistics.gram is None
+            or self.model.numbers.tilt is not None
+            or isinstance(self.problem, StreamedProblem)
+        ):
+            raise InputError(
+                "the fit has no statistics that robust standard errors could be made of."
+            )
         trajectories = self.model.predict(self.problem.record).trajectories
         residual = np.concatenate([(t.measured - t.model)[t.start :] for t in trajectories])  # type: ignore[operator]
-        slopes, share = one_step_slopes(self.problem, self.model), self.problem.count / len(self.problem.rows)
-        own = hc3(statistics, slopes, residual @ self.problem.weight.matrix.T, len(self.theta), share)
+        slopes, share = (
+            one_step_slopes(self.problem, self.model),
+            self.problem.count / len(self.problem.rows),
+        )
+        own = hc3(
+            statistics, slopes, residual @ self.problem.weight.matrix.T, len(self.theta), share
+        )
         return replace(
             self,
             model=replace(self.model, statistics=own),
             covariance=self._grown(self._cov_along(own, self._slope()), own),
-            plain_covariance=self.covariance if self.plain_covariance is None else self.plain_covariance,
+            plain_covariance=self.covariance
+            if self.plain_covariance is None
+            else self.plain_covariance,
             plain_statistics=statistics,
             std_kind="hc3",
         )
 
     def _grown(self, covariance: Matrix | None, statistics: Statistics) -> Matrix | None:
         """Return Cov θ̂, larger along directions that the learner could nearly imitate on the rows."""
-        return grown(covariance, statistics, None if self.model.shared is None else self.problem.shared)
+        return grown(
+            covariance, statistics, None if self.model.shared is None else self.problem.shared
+        )
 
     def _robust_free_run(self, steps: int | None, kind: str) -> Estimate:
         """From blocks of so many steps of the free run, or from the colour of its errors."""
         assert self.scores is not None
         statistics = self.model.statistics
         if statistics.gram is None or self.model.numbers.tilt is not None:
-            raise InputError("the fit has no statistics that robust standard errors could be made of.")
+            raise InputError(
+                "the fit has no statistics that robust standard errors could be made of."
+            )
         steps = None if steps is None else check_count(steps, "lags")
         used = len(self.theta) + self.effective_weights
         modelled = kind == "autoregressive"
@@ -296,15 +359,21 @@ class Estimate(AnyFit):
             self,
             model=replace(self.model, statistics=statistics),
             covariance=self._cov_along(statistics, self._slope()),
-            plain_covariance=self.covariance if self.plain_covariance is None else self.plain_covariance,
-            plain_statistics=self.model.statistics if self.plain_statistics is None else self.plain_statistics,
+            plain_covariance=self.covariance
+            if self.plain_covariance is None
+            else self.plain_covariance,
+            plain_statistics=self.model.statistics
+            if self.plain_statistics is None
+            else self.plain_statistics,
             freedom=statistics.freedom,
         )
 
     def _cov_along(self, statistics: Statistics, slope: Matrix) -> Matrix | None:
         """Cov of `θ = c + θ_aux(w)` from statistics of (c, w)."""
         joint = statistics.joint(len(self.theta))
-        return None if joint is None else joint.of(np.column_stack([np.eye(len(self.theta)), slope]))
+        return (
+            None if joint is None else joint.of(np.column_stack([np.eye(len(self.theta)), slope]))
+        )
 
     def moves_by(self) -> tuple[Matrix, Vector] | None:
         """Return how θ follows (c, w), [I ∂θ_aux/∂w], and which entries of these move."""
@@ -330,7 +399,10 @@ class Estimate(AnyFit):
         return solve(physics, self.theta[order], covariance, freedom=max(self.freedom, 1.0))
 
     def physical_profile(self, physics: PhysicsMap, name: str) -> tuple[float, float]:
-        """95 % profile-likelihood interval of one physical parameter; a side without limit is infinite."""
+        """95 % profile-likelihood interval of one physical parameter.
+
+        A side without limit is infinite.
+        """
         order, covariance = self._in_order_of(physics)
         if covariance is None:
             raise InputError("θ has no standard errors, so physical parameters have no profile.")
@@ -341,13 +413,20 @@ class Estimate(AnyFit):
         return order, None if self.covariance is None else self.covariance[np.ix_(order, order)]
 
     def __repr__(self) -> str:
-        values = ", ".join(f"{n} = {v:.6g}" for n, v in zip(self.problem.baseline.names, self.theta, strict=True))
-        return f"Estimate({self.model.structure}, {self.status.code}, loss {self.status.loss:.3g}, {values})"
+        values = ", ".join(
+            f"{n} = {v:.6g}" for n, v in zip(self.problem.baseline.names, self.theta, strict=True)
+        )
+        return (
+            f"Estimate({self.model.structure}, {self.status.code}, loss "
+            f"{self.status.loss:.3g}, {values})"
+        )
 
     def lines(self) -> list[str]:
         baseline, bound, learner = self.problem.baseline, self.model.form.bound, "none"
         if bound is not None:
-            learner = f"{bound.learner}, {bound.size} weights, {self.effective_weights:.1f} effective"
+            learner = (
+                f"{bound.learner}, {bound.size} weights, {self.effective_weights:.1f} effective"
+            )
         lines = [
             f"structure   {self.model.structure}",
             f"learner     {learner}",
@@ -356,7 +435,10 @@ class Estimate(AnyFit):
         ]
         if self.defect is not None:
             weight = self.problem.weight
-            lines.append(f"orthogonal  ‖QᵀF̃‖/‖F‖ = {self.defect:.1e}" + ("" if weight.one_output else f", {weight}"))
+            lines.append(
+                f"orthogonal  ‖QᵀF̃‖/‖F‖ = {self.defect:.1e}"
+                + ("" if weight.one_output else f", {weight}")
+            )
         condition = self.excitation.condition
         lines.append(
             f"excitation  rank {self.excitation.rank} of {self.excitation.columns}"
@@ -366,7 +448,9 @@ class Estimate(AnyFit):
             lines.append(f"measure     {self.measure}")
         one_step = self.one_step_theta
         if one_step is not None:
-            moved = ", ".join(f"{name} {value:.6g}" for name, value in zip(baseline.names, one_step, strict=True))
+            moved = ", ".join(
+                f"{name} {value:.6g}" for name, value in zip(baseline.names, one_step, strict=True)
+            )
             lines.append(f"one step    Φ⁺Y would give {moved}")
         if self.plain_covariance is not None:
             lines.append(f"std         {STD_KINDS[self.std_kind]}")
@@ -377,19 +461,26 @@ class Estimate(AnyFit):
 def order_of(physics: PhysicsMap, names: Sequence[str], sampling_time: float) -> list[int]:
     """Where the θ that the physics gives are among `names`.
 
-    Raises:
-        InputError: no PhysicsMap, a θ that is not among them, a constant `Ts` that is not the sampling time.
+    Raises: InputError: no PhysicsMap, a θ that is not among them, a constant `Ts` that is not the
+        sampling time.
     """
     check_type(physics, PhysicsMap, "physics", "a PhysicsMap, such as PhysicsMap.of(…)")
     check_sampling_constant(physics.constants, sampling_time)
     missing = [name for name in physics.theta_names if name not in names]
     if missing:
-        raise InputError(f"the physics gives {', '.join(missing)}, which the baseline does not have.")
+        raise InputError(
+            f"the physics gives {', '.join(missing)}, which the baseline does not have."
+        )
     return [names.index(name) for name in physics.theta_names]
 
 
-def parameter_frame(parameters: Sequence[Any], values: Vector, std: Vector | None, ci: Matrix | None) -> pd.DataFrame:
-    """Return a row per parameter: unit, initial, value, std, and the 95 % interval; NaN where there is none."""
+def parameter_frame(
+    parameters: Sequence[Any], values: Vector, std: Vector | None, ci: Matrix | None
+) -> pd.DataFrame:
+    """Return a row per parameter: unit, initial, value, std, and the 95 % interval.
+
+    NaN where there is none.
+    """
     import pandas as pd
 
     nothing = np.full(len(parameters), np.nan)
@@ -407,10 +498,15 @@ def parameter_frame(parameters: Sequence[Any], values: Vector, std: Vector | Non
     )
 
 
-def parameter_lines(parameters: Sequence[Any], values: Vector, std: Vector | None, ci: Matrix | None) -> list[str]:
+def parameter_lines(
+    parameters: Sequence[Any], values: Vector, std: Vector | None, ci: Matrix | None
+) -> list[str]:
     """The same as lines of text, a heading first; a dash where there is no interval."""
     width = max([9, *(len(p.name) for p in parameters)])
-    lines = [f"{'parameter':<{width}}  {'value':>14}  {'std':>11}  {'95 % interval':^29}  {'initial':>11}  unit"]
+    lines = [
+        f"{'parameter':<{width}}  {'value':>14}  {'std':>11}  {'95 % interval':^29}  "
+        f"{'initial':>11}  unit"
+    ]
     for i, parameter in enumerate(parameters):
         spread, reach = f"{'–':>11}", f"{'–':^29}"
         if std is not None and ci is not None and np.isfinite(std[i]):

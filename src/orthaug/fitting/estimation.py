@@ -55,9 +55,8 @@ def reweighted(first: Estimate, again: Callable[[Problem, Estimate], Estimate]) 
         first: a fit with any output weights.
         again: the fit of a problem with other weights, begun from an earlier estimate.
 
-    Returns:
-        The last fit, with the restarts of the first one. It stays at the weights it has where the errors' covariance is
-        singular; a warning tells that the turns did not settle.
+    Returns: The last fit, with the restarts of the first one. It stays at the weights it has where
+        the errors' covariance is singular; a warning tells that the turns did not settle.
     """
     estimate, problem = first, first.problem
     covariance = problem.target_covariance
@@ -67,13 +66,16 @@ def reweighted(first: Estimate, again: Callable[[Problem, Estimate], Estimate]) 
         if white is None:
             return replace(estimate, restarts=first.restarts)
         weight = by_covariance(white, covariance)
-        change = np.linalg.norm(weight.matrix - problem.weight.matrix) / np.linalg.norm(weight.matrix)
+        change = np.linalg.norm(weight.matrix - problem.weight.matrix) / np.linalg.norm(
+            weight.matrix
+        )
         if change <= _SETTLED:
             return replace(estimate, restarts=first.restarts)
         problem = problem.weighed(weight)
         estimate = again(problem, estimate)
     text = (
-        f"the weights of the outputs still change by {change:.1g} after {_TURNS} fits; θ depends on where they stopped."
+        f"the weights of the outputs still change by {change:.1g} after {_TURNS} fits; θ "
+        "depends on where they stopped."
     )
     told = (*estimate.warnings, Warning("output_weights_unsettled", text))
     return replace(estimate, restarts=first.restarts, warnings=told)
@@ -104,7 +106,9 @@ class Options(TypedDict, total=False):
 
 
 @overload
-def estimate(record: Record | Source, baseline: Baseline, **options: Unpack[Options]) -> Estimate: ...
+def estimate(
+    record: Record | Source, baseline: Baseline, **options: Unpack[Options]
+) -> Estimate: ...
 @overload
 def estimate(record: Record, baseline: Motion, **options: Unpack[Options]) -> MotionEstimate: ...
 @with_progress
@@ -131,42 +135,48 @@ def estimate(
 ) -> Estimate | MotionEstimate:
     """Fit `y_k = φ(x_k)θ + learner(x_k) + e_k` by prediction error (eq:cost_fun) or by the error of a free run.
 
-    θ is solved, never iterated (F1): with the orthogonal structure it is `Φ⁺Y` whatever the learner does. Equations of
-    motion (`Motion`) are fitted on their free run, and their parameters are the physics nearest to the fitted motion.
+    θ is solved, never iterated (F1): with the orthogonal structure it is `Φ⁺Y` whatever the learner
+    does. Equations of motion (`Motion`) are fitted on their free run, and their parameters are the
+    physics nearest to the fitted motion.
 
-    Args:
-        record: measured inputs and outputs; or `open_parquet(…)`, `open_frame(…)`, whose rows stay where they are.
-        baseline: the physics; a `Motion` has no `lags`, `ensemble` and `initial`.
-        lags: the learner's regressor; None for the raw lags that the baseline's expressions use.
-        learner: a declaration such as `MLP(hidden=(16,))`; None for physics alone.
+    Args: record: measured inputs and outputs; or `open_parquet(…)`, `open_frame(…)`, whose rows
+        stay where they are. baseline: the physics; a `Motion` has no `lags`, `ensemble` and
+        `initial`. lags: the learner's regressor; None for the raw lags that the baseline's
+        expressions use. learner: a declaration such as `MLP(hidden=(16,))`; None for physics alone.
         structure: `Orthogonal()`, `Additive()`, `OrthogonalPenalty(λ)` or `BaselinePenalty(λ)`.
-        criterion: `Prediction(horizon)`, 1 step by default, or `Simulation(segment, washout)`, the free run: then θ is
-            trained with the weights and split off at the end (F2). A motion takes the latter, by default without
-            washout.
+        criterion: `Prediction(horizon)`, 1 step by default, or `Simulation(segment, washout)`, the
+        free run: then θ is
+            trained with the weights and split off at the end (F2). A motion takes the latter, by
+            default without washout.
         solver: `LevenbergMarquardt(…)`, or `AdamLBFGS(…)`, the paper's pipeline from θ⁰.
-        regularization: "none"; "evidence" (MacKay; the weights' prior is estimated too); "ard" (automatic relevance
-            determination: the prior of each neuron, one step ahead); or a number: the ridge α on the weights, against
-            squared errors in units of the baseline's RMS residual. Several may be given with `validation` or `blocks`,
-            which then choose. "auto" runs none and ard from every start, one step ahead with Levenberg-Marquardt, and
-            keeps the lower generalised cross-validation; it is none otherwise, and none and evidence where
-            `validation` chooses on the free run. For a motion it is evidence.
-        restarts: runs from initial weights of seeds `seed … seed + restarts - 1`, spread over the cores. Kept is the
-            one of the lowest error of the criterion on `validation`; without that, of free runs and of several
-            regularizations, on `blocks` that are held out; else of the lowest generalised cross-validation under
-            "auto", and of the lowest training loss otherwise.
+        regularization: "none"; "evidence" (MacKay; the weights' prior is estimated too); "ard"
+            (automatic relevance determination: the prior of each neuron, one step ahead); or a
+            number: the ridge α on the weights, against squared errors in units of the baseline's
+            RMS residual. Several may be given with `validation` or `blocks`, which then choose.
+            "auto" runs none and ard from every start, one step ahead with Levenberg-Marquardt, and
+            keeps the lower generalised cross-validation; it is none otherwise, and none and
+            evidence where `validation` chooses on the free run. For a motion it is evidence.
+        restarts: runs from initial weights of seeds `seed … seed + restarts - 1`, spread over the
+            cores. Kept is the one of the lowest error of the criterion on `validation`; without
+            that, of free runs and of several regularizations, on `blocks` that are held out; else
+            of the lowest generalised cross-validation under "auto", and of the lowest training loss
+            otherwise.
         seed: of the initial weights.
         ensemble: the median of all restarts as one model, instead of the best one.
         blocks: parts into which the training data are cut for that, each held out once; 0 for none.
-        fallback: whether physics alone is the result where no free run of the learner is better than its there.
-        initial: warm start from an earlier estimate or model. Its learner, features, scaling and weights replace
-            `learner`, `restarts` and `seed`.
+        fallback: whether physics alone is the result where no free run of the learner is better
+            than its there.
+        initial: warm start from an earlier estimate or model. Its learner, features, scaling and
+            weights replace `learner`, `restarts` and `seed`.
         validation: a record that chooses between restarts and regularizations; it is never fitted.
-        output_weights: how several outputs are weighed against each other, in criterion and measure alike: "none" for
-            the plain sum of squares, as in the paper; "std" for each in its standard deviation; "covariance" by that
-            of their errors, fit and weights in turn until they agree; numbers for the weights of the squared errors.
-            "auto" is "std" one step ahead and "covariance" on the free run.
+        output_weights: how several outputs are weighed against each other, in criterion and measure
+            alike: "none" for the plain sum of squares, as in the paper; "std" for each in its
+            standard deviation; "covariance" by that of their errors, fit and weights in turn until
+            they agree; numbers for the weights of the squared errors. "auto" is "std" one step
+            ahead and "covariance" on the free run.
         progress: called about twice a second with (restart, iteration, loss); True for a bar.
-        engine: who sums over the rows: `Stream()`, `Devices()`, `Dask(client)`; None for what suits the record.
+        engine: who sums over the rows: `Stream()`, `Devices()`, `Dask(client)`; None for what suits
+            the record.
 
     Raises:
         InputError: data and physics that do not fit together; RankError where θ is not determined.
@@ -180,30 +190,56 @@ def estimate(
         >>> f"{fit.theta[0]:.3f}"
         '2.000'
     """
-    options: dict[str, Any] = {"structure": structure, "solver": solver, "regularization": regularization, "seed": seed}
-    options |= {"restarts": restarts, "fallback": fallback, "validation": validation, "progress": progress}
+    options: dict[str, Any] = {
+        "structure": structure,
+        "solver": solver,
+        "regularization": regularization,
+        "seed": seed,
+    }
+    options |= {
+        "restarts": restarts,
+        "fallback": fallback,
+        "validation": validation,
+        "progress": progress,
+    }
     if isinstance(baseline, Motion):
         if lags is not None or initial is not None or ensemble:
-            raise InputError("a motion has no `lags`, no `initial` and no `ensemble`; leave them out.")
+            raise InputError(
+                "a motion has no `lags`, no `initial` and no `ensemble`; leave them out."
+            )
         check_record(record, moves=True)
         assert isinstance(record, Record)
         learner = over_states(learner, baseline)
         problem = pose_for(record, baseline, learner, output_weights)
-        options |= {"criterion": criterion or DEFAULT, "blocks": _check_blocks(blocks), "engine": engine or InMemory()}
+        options |= {
+            "criterion": criterion or DEFAULT,
+            "blocks": _check_blocks(blocks),
+            "engine": engine or InMemory(),
+        }
         return fit_motion(problem, learner=learner, **options)
     check_record(record)
     _check_types(baseline=baseline, lags=lags, learner=learner)
     check_type(initial, Estimate | Model | None, "initial", "an Estimate, a Model or None")
     criterion = Prediction() if criterion is None else criterion
     model = initial.model if isinstance(initial, Estimate) else initial
-    channels = (tuple(channel.name for channel in group) for group in (record.outputs, record.inputs))
+    channels = (
+        tuple(channel.name for channel in group) for group in (record.outputs, record.inputs)
+    )
     learner = over_lags(learner, baseline, lags, *channels)
     inputs = None if learner is None else learner.inputs
     if model is not None:
         inputs = tuple(str(entry) for entry in model.form.features.entries)
     _check_types(criterion=criterion)
-    problem, engine = posed_on(record, engine, baseline, lags, inputs, output_weights=output_weights)
-    options |= {"criterion": criterion, "ensemble": ensemble, "blocks": blocks, "initial": model, "engine": engine}
+    problem, engine = posed_on(
+        record, engine, baseline, lags, inputs, output_weights=output_weights
+    )
+    options |= {
+        "criterion": criterion,
+        "ensemble": ensemble,
+        "blocks": blocks,
+        "initial": model,
+        "engine": engine,
+    }
     return fit(problem, learner=learner, **options)
 
 
@@ -228,11 +264,11 @@ def fit(
 ) -> Estimate:
     """`estimate` for a problem that is posed already.
 
-    Args:
-        problem: record, physics and learner inputs; the other arguments as of `estimate`.
-        learner: None for physics alone, on the rows of the problem.
-        engine: where the rows are, or segments of a free run, and who sums over them. On a cluster several runs over
-            rows that are in memory are tasks, each whole on one worker, and so are their held-out blocks.
+    Args: problem: record, physics and learner inputs; the other arguments as of `estimate`.
+        learner: None for physics alone, on the rows of the problem. engine: where the rows are, or
+        segments of a free run, and who sums over them. On a cluster several runs over
+            rows that are in memory are tasks, each whole on one worker, and so are their held-out
+            blocks.
         checkpoints: where the states of its runs are kept, to go on from; None to keep none.
 
     Raises:
@@ -241,14 +277,35 @@ def fit(
     _check_types(learner=learner, structure=structure, criterion=criterion, solver=solver)
     _check_types(initial=initial, validation=validation)
     _check_splittable(structure, problem.baseline, learner)
-    if criterion.automatic and _undecided(problem, solver, structure, warm=initial is not None, ensemble=ensemble):
-        options: dict[str, Any] = {"learner": learner, "structure": structure, "solver": solver, "seed": seed}
-        options |= {"regularization": regularization, "restarts": restarts, "blocks": blocks, "fallback": fallback}
-        options |= {"validation": validation, "progress": progress, "engine": engine, "checkpoints": checkpoints}
+    if criterion.automatic and _undecided(
+        problem, solver, structure, warm=initial is not None, ensemble=ensemble
+    ):
+        options: dict[str, Any] = {
+            "learner": learner,
+            "structure": structure,
+            "solver": solver,
+            "seed": seed,
+        }
+        options |= {
+            "regularization": regularization,
+            "restarts": restarts,
+            "blocks": blocks,
+            "fallback": fallback,
+        }
+        options |= {
+            "validation": validation,
+            "progress": progress,
+            "engine": engine,
+            "checkpoints": checkpoints,
+        }
         return choose_focus(problem, fit, options, criterion)
     criterion = _settled(criterion, problem)
     blocks = _check_blocks(blocks)
-    given = {"linear": problem.baseline.linear, "validated": validation is not None, "learner": learner}
+    given = {
+        "linear": problem.baseline.linear,
+        "validated": validation is not None,
+        "learner": learner,
+    }
     choices = tried(regularization, solver, criterion, structure, **given)
     auto = _check_regularizations(regularization, choices, validation is not None or blocks > 0)
     restarts, seed = checked_starts(restarts, seed, warm=initial is not None, ensemble=ensemble)
@@ -268,16 +325,26 @@ def fit(
     if task.bound is None and solved:
         estimate = _physics_alone(task, structure)
     else:
-        task = replace(task, checkpoints=None if isinstance(task.engine, Tasks) else checkpoints)  # not a worker's disk
+        task = replace(
+            task, checkpoints=None if isinstance(task.engine, Tasks) else checkpoints
+        )  # not a worker's disk
         trained = task if solved else FreeRunTask.of(task, criterion, warm)
-        chosen = Choice(validation, blocks if initial is None else 0, fallback, ensemble, scored=auto and solved)
+        chosen = Choice(
+            validation, blocks if initial is None else 0, fallback, ensemble, scored=auto and solved
+        )
         estimate = train(trained, starts, structure, solver, chosen, progress, runner=engine)
         if _splits(structure) and estimate.status.ok and estimate.model.form.bound is not None:
             estimate = estimate.split(structure.measure)
     estimate = replace(estimate, warnings=(*told, *estimate.warnings))
     if problem.weight.choice != "covariance" or problem.weight.kind == "covariance" or not solved:
         return estimate
-    more = {"learner": learner, "structure": structure, "criterion": criterion, "solver": solver, "engine": engine}
+    more = {
+        "learner": learner,
+        "structure": structure,
+        "criterion": criterion,
+        "solver": solver,
+        "engine": engine,
+    }
     return reweighted(estimate, partial(_again, **more, progress=progress))
 
 
@@ -288,14 +355,21 @@ def _again(problem: Problem, last: Estimate, **options: Any) -> Estimate:
     return fit(problem, initial=start, regularization=chosen, **options)
 
 
-def _undecided(problem: Problem, solver: Solver, structure: Structure, *, warm: bool, ensemble: bool) -> bool:
+def _undecided(
+    problem: Problem, solver: Solver, structure: Structure, *, warm: bool, ensemble: bool
+) -> bool:
     """Return whether the data may decide for the free run: not where nothing but one step ahead can be trained."""
-    able = solver.gauss_newton and problem.baseline.linear and not isinstance(problem, StreamedProblem)
+    able = (
+        solver.gauss_newton and problem.baseline.linear and not isinstance(problem, StreamedProblem)
+    )
     return able and not (warm or ensemble or structure.from_initial)
 
 
 def _settled(criterion: Criterion, problem: Problem) -> Criterion:
-    """Return the criterion with what it left to the record; one step ahead where nothing else can be trained."""
+    """Return the criterion with what it left to the record.
+
+    One step ahead where nothing else can be trained.
+    """
     criterion = Prediction() if criterion.automatic else criterion
     if isinstance(problem, StreamedProblem):
         return criterion.streamed
@@ -313,10 +387,23 @@ def _physics_alone(task: OneStepTask, structure: Structure) -> Estimate:
     return replace(estimate, status=replace(estimate.status, start_loss=estimate.status.loss))
 
 
-def _check_cost(problem: Problem, learner: Learner | None, solver: Solver, runs: int, engine: Engine) -> None:
+def _check_cost(
+    problem: Problem, learner: Learner | None, solver: Solver, runs: int, engine: Engine
+) -> None:
     """Raise InputError for what would take more memory or time than there is."""
-    sizes = {"rows": problem.count, "features": len(problem.features.entries), "outputs": len(problem.outputs)}
-    check_cost(learner, **sizes, held=len(problem.rows), iterations=solver.iterations, runs=runs, room=engine.room())
+    sizes = {
+        "rows": problem.count,
+        "features": len(problem.features.entries),
+        "outputs": len(problem.outputs),
+    }
+    check_cost(
+        learner,
+        **sizes,
+        held=len(problem.rows),
+        iterations=solver.iterations,
+        runs=runs,
+        room=engine.room(),
+    )
 
 
 def _check_blocks(blocks: int) -> int:
@@ -332,9 +419,15 @@ def _check_blocks(blocks: int) -> int:
 
 
 def _check_ensemble(ensemble: bool, problem: Problem) -> bool:
-    """Return whether there is one; raise InputError for a median of outputs that are mixed with each other."""
+    """Return whether there is one.
+
+    Raise InputError for a median of outputs that are mixed with each other.
+    """
     if ensemble and problem.weight.choice == "covariance":
-        raise InputError("an ensemble takes the median of each output; use `output_weights` std, none or numbers.")
+        raise InputError(
+            "an ensemble takes the median of each output; use `output_weights` std, none or "
+            "numbers."
+        )
     return ensemble
 
 
@@ -345,8 +438,8 @@ def _check_splittable(structure: Structure, baseline: Baseline, learner: Learner
     bounded = [p.name for p in baseline.parameters if np.isfinite(p.min) or np.isfinite(p.max)]
     if bounded:
         raise InputError(
-            f"{', '.join(bounded)} have bounds, which hold under the training measure only: under another one θ is "
-            "split off after training. Drop the bounds or the measure."
+            f"{', '.join(bounded)} have bounds, which hold under the training measure only: "
+            "under another one θ is split off after training. Drop the bounds or the measure."
         )
 
 
@@ -355,15 +448,24 @@ def _splits(structure: Structure) -> bool:
     return structure.measure != Training()
 
 
-def _warm_start(problem: Problem, model: Model, engine: Engine) -> tuple[OneStepTask, Vector, Vector]:
-    """Return the task of going on from an earlier model's weights, in its scaling; and the model's c."""
+def _warm_start(
+    problem: Problem, model: Model, engine: Engine
+) -> tuple[OneStepTask, Vector, Vector]:
+    """Return the task of going on from an earlier model's weights, in its scaling.
+
+    And the model's c.
+    """
     bound, numbers = model.form.bound, model.numbers
     if numbers.tilt is not None:
-        raise InputError("`initial` is an ensemble, which has no single weights to start from; fit anew.")
+        raise InputError(
+            "`initial` is an ensemble, which has no single weights to start from; fit anew."
+        )
     if bound is None:
         raise InputError("`initial` is physics alone and has nothing to start from; leave it out.")
     if len(problem.outputs) != bound.ny:
-        raise InputError(f"`initial` has {bound.ny} outputs, the record {len(problem.outputs)}; fit anew.")
+        raise InputError(
+            f"`initial` has {bound.ny} outputs, the record {len(problem.outputs)}; fit anew."
+        )
     scaling = Scaling(np.asarray(numbers.centre), np.asarray(numbers.halfwidth))
     problem = problem.seen_linearly() if model.form.features.linear else problem
     task = OneStepTask.of(problem, bound.learner, scaling, np.asarray(numbers.gain), engine)
@@ -390,15 +492,23 @@ def _check_types(**given: Any) -> None:
 
 
 def _check_regularizations(given: Any, choices: Sequence[Any], chosen: bool) -> bool:
-    """Return whether "auto" was given; raise InputError for what is none, or for several that nothing chooses between."""
+    """Return whether "auto" was given.
+
+    Raise InputError for what is none, or for several that nothing chooses between.
+    """
     auto = isinstance(given, str) and given == "auto"
     if len(choices) > 1 and not (auto or chosen):
-        raise InputError("several regularizations need `validation` or `blocks` to choose between them.")
+        raise InputError(
+            "several regularizations need `validation` or `blocks` to choose between them."
+        )
     for choice in choices:
         if isinstance(choice, str):
             check_choice(choice, ("none", "evidence", "ard"), "`regularization`")
         elif isinstance(choice, bool) or not isinstance(choice, int | float | np.number):
-            raise InputError(f"`regularization` must be auto, none, evidence, ard or a number; got {shown(choice)}.")
+            raise InputError(
+                "`regularization` must be auto, none, evidence, ard or a number; got "
+                f"{shown(choice)}."
+            )
         elif not (is_number(choice) and choice >= 0):
             raise InputError(f"`regularization` must be 0 or more; got {shown(choice)}.")
     if not choices:
@@ -411,8 +521,8 @@ def posed_on(
 ) -> tuple[Problem, Engine]:
     """Return the problem with the engine that sums over its rows; further arguments as of `pose`.
 
-    Args:
-        engine: None for what suits the record: memory, a stream of its files, the cluster that holds it.
+    Args: engine: None for what suits the record: memory, a stream of its files, the cluster that
+        holds it.
 
     Raises:
         InputError: as `pose`.
@@ -440,6 +550,6 @@ def check_record(record: Any, *, moves: bool = False) -> None:
         check_type(record, Record, "record", "a Record")
     elif moves and not isinstance(record, Record):
         raise InputError(
-            "a motion takes a Record, whose segments an engine may share out; read these rows into memory "
-            "(read_record, Record.join), or fit the physics in its lagged form."
+            "a motion takes a Record, whose segments an engine may share out; read these rows "
+            "into memory (read_record, Record.join), or fit the physics in its lagged form."
         )

@@ -1,9 +1,9 @@
 """One step ahead or the free run: what `Auto` chooses, by free runs over rows that were not fitted.
 
-A fit one step ahead stays where its free run is finite, no worse than that of physics alone, and where its residual is
-noise of the equation. Otherwise physics and learner are trained on the free run, too. Of all candidates, physics alone
-among them, the one is handed over that predicts the held-out free runs best. `benchmarks/defaults.py` has the records
-by which these rules were chosen.
+A fit one step ahead stays where its free run is finite, no worse than that of physics alone, and
+where its residual is noise of the equation. Otherwise physics and learner are trained on the free
+run, too. Of all candidates, physics alone among them, the one is handed over that predicts the
+held-out free runs best. `benchmarks/defaults.py` has the records by which these rules were chosen.
 """
 
 from __future__ import annotations
@@ -54,7 +54,10 @@ def choose_focus(problem: Any, fit: Fit, options: Mapping[str, Any], criterion: 
         return first
     reason = _why_not(problem, first, fit, options)
     if reason is None:
-        text = "one step ahead is enough: the free run holds where nothing was fitted, and the residual is white."
+        text = (
+            "one step ahead is enough: the free run holds where nothing was fitted, and the "
+            "residual is white."
+        )
         return replace(first, focus=Focus(ONE_STEP, text))
     LOG.info("auto: %s; the free run is trained, too", reason)
     free_run = _free_run(criterion, problem)
@@ -74,18 +77,34 @@ def _why_not(problem: Any, first: Any, fit: Fit, options: Mapping[str, Any]) -> 
         return f"{wrong} over the training data"
     if first.model.form.bound is not None:
         validation = options["validation"]
-        where = "over the half of the rows that was held out" if validation is None else "on the validation part"
-        made, held = (first, validation) if validation is not None else _on_half(problem, fit, options)
+        where = (
+            "over the half of the rows that was held out"
+            if validation is None
+            else "on the validation part"
+        )
+        made, held = (
+            (first, validation) if validation is not None else _on_half(problem, fit, options)
+        )
         wrong = None if made is None else _beside_physics(made, [held], problem)
         if wrong is not None:
             return f"{wrong} {where}"
-    return "its residual remembers its past, as noise on the sensor makes it" if _coloured(first) else None
+    return (
+        "its residual remembers its past, as noise on the sensor makes it"
+        if _coloured(first)
+        else None
+    )
 
 
 def _beside_physics(fit: Any, records: Sequence[Record], problem: Any) -> str | None:
-    """Return what is wrong with the free runs of a fit beside those of its physics alone; None for nothing."""
+    """Return what is wrong with the free runs of a fit beside those of its physics alone.
+
+    None for nothing.
+    """
     physics = fit if fit.physics_alone is None else fit.physics_alone
-    own, alone = (mean_square([p for r in records for p in _errors(one, r, problem)]) for one in (fit, physics))
+    own, alone = (
+        mean_square([p for r in records for p in _errors(one, r, problem)])
+        for one in (fit, physics)
+    )
     if math.isinf(own):
         return "its free run diverges"
     return "its free run is worse than that of physics alone" if own > _SLACK**2 * alone else None
@@ -138,7 +157,9 @@ def _free_run(criterion: Any, problem: Any) -> Any:
     """Return the free run that is trained, with a washout that leaves most of a short record to be scored."""
     usable = max(map(len, problem.record.experiments)) - problem.first_row
     declared = criterion.simulation
-    return replace(declared, washout=min(declared.washout, usable // 4)).on(problem.record, problem.first_row)
+    return replace(declared, washout=min(declared.washout, usable // 4)).on(
+        problem.record, problem.first_row
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,10 +179,15 @@ class _FocusChoice:
 
     @cached_property
     def free(self) -> Any:
-        """The fit on the free run, from one start, for all begin at physics alone; within its limit, to save time."""
+        """The fit on the free run, from one start, for all begin at physics alone.
+
+        Within its limit, to save time.
+        """
         chosen = {**self.options, "fallback": False, "blocks": 0, "restarts": 1}
         return self.fit(
-            self.problem, criterion=self.free_run, **chosen | {"solver": self.options["solver"].within_limit}
+            self.problem,
+            criterion=self.free_run,
+            **chosen | {"solver": self.options["solver"].within_limit},
         )
 
     @cached_property
@@ -182,7 +208,11 @@ class _FocusChoice:
     @cached_property
     def errors(self) -> dict[Key, float]:
         """RMS errors of the free runs of all candidates where nothing was fitted, the simplest first."""
-        keys = [(focus, own) for focus in (ONE_STEP, FREE_RUN) for own in ((False, True) if self.learns else (False,))]
+        keys = [
+            (focus, own)
+            for focus in (ONE_STEP, FREE_RUN)
+            for own in ((False, True) if self.learns else (False,))
+        ]
         validation = self.options["validation"]
         records = [(self.problem.record, validation)] if validation is not None else self._folds()
         pieces: dict[Key, list[Any]] = {key: [] for key in keys}
@@ -196,9 +226,14 @@ class _FocusChoice:
         return {key: math.sqrt(mean_square(found)) for key, found in pieces.items()}
 
     def _folds(self) -> list[tuple[Record, Record]]:
-        """Return what blocks are left out of, and these; of few rows the training data themselves."""
+        """Return what blocks are left out of, and these.
+
+        Of few rows the training data themselves.
+        """
         try:
-            return blocked(self.problem.record, self.options["blocks"] or BLOCKS, self.problem.first_row)
+            return blocked(
+                self.problem.record, self.options["blocks"] or BLOCKS, self.problem.first_row
+            )
         except InputError:
             return [(self.problem.record, self.problem.record)]
 
@@ -223,41 +258,60 @@ def _best(choosing: _FocusChoice, reason: str) -> Any:
     chosen = next((key for key in ranked if _sound(choosing, key)), None)
     lost = chosen is None
     key = (ONE_STEP, False) if chosen is None else chosen
-    best, compared = choosing.estimate(key), tuple(Candidate(*one, error) for one, error in errors.items())
+    best, compared = (
+        choosing.estimate(key),
+        tuple(Candidate(*one, error) for one, error in errors.items()),
+    )
     named = {(one.focus, one.learner): one for one in compared}
     text = (
-        f"trained one step ahead and, because {reason}, on the free run as well. Errors of free runs where nothing was "
-        f"fitted, in standard deviations of the output: {'; '.join(one.described for one in compared)}. The result is "
-        f"{named[key]}."
+        f"trained one step ahead and, because {reason}, on the free run as well. Errors of "
+        "free runs where nothing was fitted, in standard deviations of the output: "
+        f"{'; '.join(one.described for one in compared)}. The result is {named[key]}."
     )
     warnings = list(best.warnings)
     if any(warning.code == NOT_CONVERGED for warning in warnings):
         text += ' Training on the free run stopped at its limit to save time; `focus = "simulation"` goes on.'
     if choosing.learns and not key[1]:
         rival = min((one for one in compared if one.learner), key=lambda one: one.error)
-        told = f"no learner is better in free run where nothing was fitted ({rival.described}), so the result is"
+        told = (
+            f"no learner is better in free run where nothing was fitted ({rival.described}), "
+            "so the result is"
+        )
         warnings.append(Warning("physics_alone", f"{told} {named[key].described}."))
     if lost:
-        told = "every free run diverges, over training or held-out rows: the model is for one-step prediction only."
+        told = (
+            "every free run diverges, over training or held-out rows: the model is for "
+            "one-step prediction only."
+        )
         warnings.append(Warning("one_step_only", told))
     physics = min((one for one in errors if not one[1]), key=lambda one: errors[one])
     kept = choosing.estimate(physics) if key[1] else None
-    return replace(best, focus=Focus(key[0], text, compared), physics_alone=kept, warnings=tuple(warnings))
+    return replace(
+        best, focus=Focus(key[0], text, compared), physics_alone=kept, warnings=tuple(warnings)
+    )
 
 
 def _ranked(errors: Mapping[Key, float], *, with_learner: bool) -> list[Key]:
-    """Return the candidates, the least error first and of alike ones the simplest; wanted learners before physics.
+    """Return the candidates, the least error first and of alike ones the simplest.
 
-    Physics alone that was fitted to the free run stands before that of one step ahead where the errors of a few
-    blocks do not clearly speak against it: it minimises what is compared.
+    Wanted learners before physics.
+
+    Physics alone that was fitted to the free run stands before that of one step ahead where the
+    errors of a few blocks do not clearly speak against it: it minimises what is compared.
     """
     among = [key for key in errors if key[1] or not with_learner]
     least = min(errors[key] for key in among)
     alike = [key for key in among if errors[key] <= _SLACK * least]
     one_step, free_run = (ONE_STEP, False), (FREE_RUN, False)
-    if alike[:1] == [one_step] and free_run in among and errors[free_run] <= _PREFERRED * errors[one_step]:
+    if (
+        alike[:1] == [one_step]
+        and free_run in among
+        and errors[free_run] <= _PREFERRED * errors[one_step]
+    ):
         alike = [free_run, *(key for key in alike if key != free_run)]
-    return alike + sorted((key for key in errors if key not in alike), key=lambda key: (key not in among, errors[key]))
+    return alike + sorted(
+        (key for key in errors if key not in alike), key=lambda key: (key not in among, errors[key])
+    )
 
 
 def _sound(choosing: _FocusChoice, key: Key) -> bool:
@@ -268,4 +322,6 @@ def _sound(choosing: _FocusChoice, key: Key) -> bool:
     own = mean_square(_errors(choosing.estimate(key), problem.record, problem))
     if not key[1] or not math.isfinite(own) or not choosing.options["fallback"]:
         return math.isfinite(own)
-    return own <= _SLACK**2 * mean_square(_errors(choosing.estimate((key[0], False)), problem.record, problem))
+    return own <= _SLACK**2 * mean_square(
+        _errors(choosing.estimate((key[0], False)), problem.record, problem)
+    )

@@ -1,10 +1,11 @@
 """Training on the free run: θ and the weights together, from physics alone (the criterion `Simulation`).
 
-Here θ is an unknown beside the weights (F1 does not hold). The split at the end is over the *measured* regressors (F2),
-which keeps the orthogonal structure exact.
+Here θ is an unknown beside the weights (F1 does not hold). The split at the end is over the
+*measured* regressors (F2), which keeps the orthogonal structure exact.
 
-Physics alone is what every learner has to beat, and where it starts: from random weights a learner often ends above
-it, since its start runs away. From physics alone, with a silent learner, a descent cannot.
+Physics alone is what every learner has to beat, and where it starts: from random weights a learner
+often ends above it, since its start runs away. From physics alone, with a silent learner, a descent
+cannot.
 """
 
 from __future__ import annotations
@@ -32,23 +33,38 @@ from orthaug.fitting.structures import Structure
 from orthaug.physics.streamed import StreamedProblem
 
 _SHORTEST = 4  # steps of a segment
-_LONGER = (4.0, 2.0, 1.4, 1.15)  # times, from one length of the segments to the next: the first that flies
+_LONGER = (
+    4.0,
+    2.0,
+    1.4,
+    1.15,
+)  # times, from one length of the segments to the next: the first that flies
 _SHRUNK = (0.99, 0.9, 0.5, 0.0)  # of the one-step θ: less feedback flies longer
 
 
 def train_physics_only(
-    plan: SegmentedLagged, solver: LevenbergMarquardt, structure: Structure, tell: RunProgress = quiet
+    plan: SegmentedLagged,
+    solver: LevenbergMarquardt,
+    structure: Structure,
+    tell: RunProgress = quiet,
 ) -> FreeRunFit | None:
-    """θ of physics alone under the plan's criterion and the structure's rows and bounds; None where none can fly.
+    """θ of physics alone under the plan's criterion and the structure's rows and bounds.
 
-    Training starts at the one-step solution, or at the initial values where these fly better. Where neither flies, or
-    the end runs away over whole experiments, it goes over segments that lengthen. Of all ends the best over whole
-    experiments is kept; where a start was better than them, whole experiments are trained on too.
+    None where none can fly.
+
+    Training starts at the one-step solution, or at the initial values where these fly better. Where
+    neither flies, or the end runs away over whole experiments, it goes over segments that lengthen.
+    Of all ends the best over whole experiments is kept; where a start was better than them, whole
+    experiments are trained on too.
     """
     plan = plan.alone
     objective = plan.objective(structure)
     least_squares, initial = objective.begin(np.zeros(0)), plan.problem.baseline.initial
-    starts = [least_squares, *([initial] if initial.any() else []), *(share * least_squares for share in _SHRUNK)]
+    starts = [
+        least_squares,
+        *([initial] if initial.any() else []),
+        *(share * least_squares for share in _SHRUNK),
+    ]
     losses = [objective.evaluate(p, Start(objective.initial.measured)).loss for p in starts]
     ends: list[FreeRunFit] = []
     if np.isfinite(losses).any():
@@ -63,7 +79,10 @@ def train_physics_only(
 
 
 def _lengthening(
-    plan: SegmentedLagged, solver: LevenbergMarquardt, structure: Structure, starts: Sequence[Vector]
+    plan: SegmentedLagged,
+    solver: LevenbergMarquardt,
+    structure: Structure,
+    starts: Sequence[Vector],
 ) -> list[FreeRunFit]:
     """Return the end over the plan's own segments, reached over shorter ones, from the first start that flies over them."""
     p, segment, shortest = None, _SHORTEST, plan.over(_SHORTEST)
@@ -77,7 +96,9 @@ def _lengthening(
             steps = min(int(np.ceil(longer * segment)), plan.segments.steps)
             segmented = plan if steps == plan.segments.steps else plan.over(steps)
             end = segmented.descend(
-                segmented.objective(structure), p, solver if segmented is plan else solver.within_limit
+                segmented.objective(structure),
+                p,
+                solver if segmented is plan else solver.within_limit,
             )
             if end.ending.usable:
                 break
@@ -110,7 +131,9 @@ def _over_whole(
     end = whole.descend(whole.objective(structure), best[1], solver)
     if not end.ending.usable:
         return []
-    own = plan.descend(objective, end.end.point.p, solver.at_most(0))  # its statistics are those of the plan's segments
+    own = plan.descend(
+        objective, end.end.point.p, solver.at_most(0)
+    )  # its statistics are those of the plan's segments
     if not own.ending.usable:
         return []
     own = own._replace(end=own.end._replace(ending=end.ending, tail=end.end.tail))
@@ -149,7 +172,10 @@ class FreeRunTask(SimulationTask):
         return self.plan.task
 
     def physics_alone(self) -> tuple[OneStepTask, TrainedLearner]:
-        """Return the rows without a learner, and what physics alone leaves on them; least squares where it cannot fly."""
+        """Return the rows without a learner, and what physics alone leaves on them.
+
+        Least squares where it cannot fly.
+        """
         if self.physics is None:
             return self.rows_task.physics_alone()
         plan = self.plan.alone
@@ -175,8 +201,9 @@ class FreeRunTask(SimulationTask):
     ) -> FreeRunFit:
         """As any run on the free run, with an orthogonal θ at a bound a known term beside the learner.
 
-        What stands at a bound where physics alone ends is held there from the start. The run is made again, from there
-        too, where other entries stand at one at its end; what was held once before is not released again.
+        What stands at a bound where physics alone ends is held there from the start. The run is
+        made again, from there too, where other entries stand at one at its end; what was held once
+        before is not released again.
         """
         alone: Any = self.physics
         first: Fixed = {}
@@ -186,12 +213,16 @@ class FreeRunTask(SimulationTask):
 
         def evaluate(fixed: Fixed, solver: LevenbergMarquardt = solver) -> Fixed | None:
             own = replace(self, plan=replace(self.plan, fixed=fixed))
-            free_fits.append(super(FreeRunTask, own).run(solver, w, structure, regularization, progress))
+            free_fits.append(
+                super(FreeRunTask, own).run(solver, w, structure, regularization, progress)
+            )
             end, objective = free_fits[-1].end, free_fits[-1].objective
             assert isinstance(objective, StructuredObjective)
             return objective.held(end) if end.ending.usable and objective.apart else None
 
-        if settle(first, evaluate) != first and alone is not None:  # other bounds than those of its start
+        if (
+            settle(first, evaluate) != first and alone is not None
+        ):  # other bounds than those of its start
             point = free_fits[-1].end.point
             if alone.mean_square < self.plan.mean_square(point.c, point.w):
                 evaluate(first, solver.at_most(0))
@@ -224,7 +255,9 @@ class FreeRunTask(SimulationTask):
         if self.bound is not None and plan.free_run.start_iterations and self.warm is None:
             steps = plan.free_run.start_iterations
             short = LevenbergMarquardt(steps, solver.tolerance, longest=steps)
-            begun = objective.begin(np.asarray(plan.task.run(short, w, structure, regularization).w))
+            begun = objective.begin(
+                np.asarray(plan.task.run(short, w, structure, regularization).w)
+            )
             if self._simulates_better(objective, begun):
                 add(begun)
         return places
@@ -232,7 +265,9 @@ class FreeRunTask(SimulationTask):
     def _simulates_better(self, objective: StructuredObjective, p: Vector) -> bool:
         """Return whether over whole experiments the loss at p is no higher than that of physics alone."""
         square = self.plan.mean_square(*objective.place(p)[1:])
-        return bool(np.isfinite(square)) and (self.physics is None or square <= self.physics.mean_square)
+        return bool(np.isfinite(square)) and (
+            self.physics is None or square <= self.physics.mean_square
+        )
 
     def median(self, members: list[TrainedLearner], best: int) -> TrainedLearner:
         """Return the median of several, with the error of its own free run."""

@@ -16,7 +16,9 @@ _LEFT = 3e-5  # of a term's norm: what the physics and the terms before it leave
 _NAMED = 6
 
 
-def independent_terms(problem: Problem, learner: Learner | None) -> tuple[Problem, Learner | None, tuple[Warning, ...]]:
+def independent_terms(
+    problem: Problem, learner: Learner | None
+) -> tuple[Problem, Learner | None, tuple[Warning, ...]]:
     """Problem and learner without the terms that the physics or the terms before them express on these rows.
 
     Another learner is left as it is; without one the problem has no features.
@@ -29,11 +31,16 @@ def independent_terms(problem: Problem, learner: Learner | None) -> tuple[Proble
     if not isinstance(learner, Terms):
         return problem, learner, ()
     problem = problem.seen_linearly()
-    texts, rows, nt = [str(entry) for entry in problem.features.entries], problem.rows, len(problem.baseline.names)
+    texts, rows, nt = (
+        [str(entry) for entry in problem.features.entries],
+        problem.rows,
+        len(problem.baseline.names),
+    )
     if len(texts) + nt > rows.y.size:
         raise InputError(
-            f"the learner has {len(texts)} terms beside {nt} parameters, but there are {rows.y.size} usable samples; "
-            "give fewer terms, or let `orthaug select` choose among them."
+            f"the learner has {len(texts)} terms beside {nt} parameters, but there are "
+            f"{rows.y.size} usable samples; give fewer terms, or let `orthaug select` choose "
+            "among them."
         )
     z = problem.feature_rows()
     phi = problem.projection.phi[:, 0] if len(problem.outputs) == 1 else np.ones((len(z), 0))
@@ -43,7 +50,9 @@ def independent_terms(problem: Problem, learner: Learner | None) -> tuple[Proble
     if not gone:
         return problem, learner if len(learner.terms) == len(texts) else learner.among(texts), ()
     told = (_warning([texts[i] for i in gone]),)
-    left = replace(problem, features=Features(tuple(problem.features.entries[i] for i in kept), linear=True))
+    left = replace(
+        problem, features=Features(tuple(problem.features.entries[i] for i in kept), linear=True)
+    )
     return left, learner.among([texts[i] for i in kept]) if kept else None, told
 
 
@@ -55,9 +64,11 @@ def _told_apart(columns: np.ndarray, first: int) -> tuple[list[int], list[int]]:
 
 
 def _warning(gone: list[str]) -> Warning:
-    named = ", ".join(gone[:_NAMED]) + (f" and {len(gone) - _NAMED} more" if len(gone) > _NAMED else "")
+    named = ", ".join(gone[:_NAMED]) + (
+        f" and {len(gone) - _NAMED} more" if len(gone) > _NAMED else ""
+    )
     text = (
-        f"left out of the learner: {named}. On these data the physics, or the terms before, express "
-        f"{'them' if len(gone) > 1 else 'it'} already."
+        f"left out of the learner: {named}. On these data the physics, or the terms before, "
+        f"express {'them' if len(gone) > 1 else 'it'} already."
     )
     return Warning("terms_left_out", text)

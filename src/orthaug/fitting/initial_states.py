@@ -1,8 +1,9 @@
 """The states that segments start from: unknowns of their own, eliminated from the normal equations.
 
-A state is scored against the measured one, `‖L (x − measured)‖²`, because past outputs have errors like all others. A
-state acts on its own segment only, so a Schur complement per segment removes it. If the states were not unknowns, noise
-in a segment's measured lags would be a disturbance that the model has to explain.
+A state is scored against the measured one, `‖L (x − measured)‖²`, because past outputs have errors
+like all others. A state acts on its own segment only, so a Schur complement per segment removes it.
+If the states were not unknowns, noise in a segment's measured lags would be a disturbance that the
+model has to explain.
 """
 
 from __future__ import annotations
@@ -36,7 +37,10 @@ class Start(NamedTuple):
         return self.slope is not None or self.there is not None
 
     def at(self, unknowns: Vector) -> Float[np.ndarray, "k n0 m"] | None:
-        """Return the best states to first order where (c, w) is `unknowns`; None where that is not known."""
+        """Return the best states to first order where (c, w) is `unknowns`.
+
+        None where that is not known.
+        """
         if self.offset is None or self.slope is None or self.unknowns is None:
             return None
         moved = self.offset - self.slope @ (unknowns - self.unknowns)
@@ -57,7 +61,9 @@ class InitialStates:
 
     def eliminate(
         self, sensitivity: Sensitivity, values: Float[np.ndarray, "k n0 m"], rows: Matrix
-    ) -> tuple[Matrix, Vector, Float[np.ndarray, "k m n0"] | None, Float[np.ndarray, "k m n0 n"] | None]:
+    ) -> tuple[
+        Matrix, Vector, Float[np.ndarray, "k m n0"] | None, Float[np.ndarray, "k m n0 n"] | None
+    ]:
         """Return normal matrix and right-hand side of (c, w) with the states at their best, and how these follow (c, w).
 
         The best states are `values + offset − slope · step` for a small step of (c, w).
@@ -69,12 +75,16 @@ class InitialStates:
         missed = np.moveaxis(self.measured - values, -1, 1)
         try:
             return without_states(shared, own, missed, rows.T @ rows, np)
-        except np.linalg.LinAlgError:  # states that no output shows: no normal equations, and the trial is rejected
+        except (
+            np.linalg.LinAlgError
+        ):  # states that no output shows: no normal equations, and the trial is rejected
             nothing = np.full_like(shared[:-1, :-1], np.nan)
             return nothing, nothing[0], None, None
 
 
-def without_states(shared: Any, own: Any, missed: Any, prior: Any, xp: Any) -> tuple[Any, Any, Any, Any]:
+def without_states(
+    shared: Any, own: Any, missed: Any, prior: Any, xp: Any
+) -> tuple[Any, Any, Any, Any]:
     """Return normal matrix and right-hand side of (c, w), offset and slope of the states: a Schur complement per segment.
 
     Args:

@@ -23,8 +23,8 @@ class Solver(Protocol):
     def gauss_newton(self) -> bool:
         """Return whether it works on normal equations over the weights, with θ eliminated.
 
-        Evidence and the free run need them. Other solvers get the criterion of θ and the weights together
-        (`PaperCriterion`).
+        Evidence and the free run need them. Other solvers get the criterion of θ and the weights
+        together (`PaperCriterion`).
         """
         ...
 
@@ -53,8 +53,22 @@ STRUCTURES = Registry(
     },
     reserved=("kind", "measure"),
 )
-_BESIDE = ("solver", "focus", "restarts", "ensemble", "seed", "regularization")  # the other keys of [training]
-CRITERIA = Registry("criterion", {"auto": Auto, "prediction": Prediction, "simulation": Simulation}, reserved=_BESIDE)
+_BESIDE = (
+    "solver",
+    "focus",
+    "restarts",
+    "ensemble",
+    "seed",
+    "regularization",
+)  # the other keys of [training]
+CRITERIA = Registry(
+    "criterion",
+    {"auto": Auto, "prediction": Prediction, "simulation": Simulation},
+    reserved=_BESIDE,
+)
 SOLVERS = Registry(
-    "solver", {"levenberg-marquardt": LevenbergMarquardt, "adam-lbfgs": AdamLBFGS}, reserved=_BESIDE, beside=CRITERIA
+    "solver",
+    {"levenberg-marquardt": LevenbergMarquardt, "adam-lbfgs": AdamLBFGS},
+    reserved=_BESIDE,
+    beside=CRITERIA,
 )

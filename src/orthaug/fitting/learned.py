@@ -119,7 +119,10 @@ class Task(Protocol):
         regularization: str | float = "none",
         progress: RunProgress = quiet,
     ) -> Any:
-        """Return one run from the weights `w`, with `ending`, `iterations` and `seconds`; arguments as in `estimate`."""
+        """Return one run from the weights `w`, with `ending`, `iterations` and `seconds`.
+
+        Arguments as in `estimate`.
+        """
         ...
 
     def loss(self, run: Any) -> float:

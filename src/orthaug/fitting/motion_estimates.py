@@ -43,17 +43,23 @@ _ROUNDING = 1e-11  # of the largest eigenvalue of the information with unit colu
 
 @dataclass(frozen=True, eq=False)
 class MotionEstimate(AnyFit):
-    """What `estimate` returns for a motion. Print `fit.summary()`; use `fit.model`; read `fit.parameters`."""
+    """What `estimate` returns for a motion.
+
+    Print `fit.summary()`; use `fit.model`; read `fit.parameters`.
+    """
 
     model: MotionModel
     status: Status
     restarts: tuple[Restart, ...]
     covariance: Matrix | None
-    """Covariance of the parameters' coordinates (np, np), NaN where one has none; None where there is none at all."""
+    """Covariance of the parameters' coordinates (np, np), NaN where one has none; None where there
+    is none at all.
+    """
     freedom: float
     effective_weights: float
     defect: float | None
-    """How much of the learner the shared directions of the physics could express; None without one."""
+    """How much of the learner the shared directions of the physics could express; None without one.
+    """
     problem: MotionProblem = field(repr=False)
     criterion: Criterion
     split_by: MotionSplit = field(repr=False)
@@ -107,14 +113,19 @@ class MotionEstimate(AnyFit):
 
     @property
     def plain_std(self) -> Vector | None:
-        """The standard errors for white noise, where those of `std` are robust; None where they are not."""
+        """The standard errors for white noise, where those of `std` are robust.
+
+        None where they are not.
+        """
         return self._std_of(self.plain_covariance)
 
     def _std_of(self, covariance: Matrix | None) -> Vector | None:
         """By the delta method, from a covariance of the coordinates."""
         if covariance is None:
             return None
-        return np.sqrt(np.diag(covariance)) * np.abs(self.problem.motion.coordinates.slopes(self.theta))
+        return np.sqrt(np.diag(covariance)) * np.abs(
+            self.problem.motion.coordinates.slopes(self.theta)
+        )
 
     @property
     def interval(self) -> Matrix | None:
@@ -122,7 +133,9 @@ class MotionEstimate(AnyFit):
         if self.covariance is None:
             return None
         ends = interval(self.theta, np.sqrt(np.diag(self.covariance)), max(self.freedom, 1.0))
-        return np.stack([self.problem.motion.coordinates.physical(side) for side in ends.T], axis=-1)
+        return np.stack(
+            [self.problem.motion.coordinates.physical(side) for side in ends.T], axis=-1
+        )
 
     @cached_property
     def parameters(self) -> pd.DataFrame:
@@ -147,7 +160,9 @@ class MotionEstimate(AnyFit):
         field, support, told = field_under(measure, segmented, whole, self.states)
         moving = None
         if isinstance(measure, Training) and self.slope is not None:
-            moving = partial(wobble, form, whole, segmented.segments, self.states, self.slope, field.size)
+            moving = partial(
+                wobble, form, whole, segmented.segments, self.states, self.slope, field.size
+            )
         bounds = self.problem.motion.coordinates.bounds
         options = {"everything": shared == "all", "wobble": moving}
         split = split_motion(measure.name, form, whole, self.alone, field, bounds, **options)
@@ -156,34 +171,45 @@ class MotionEstimate(AnyFit):
     def robust(self, steps: int | None = None, kind: str = "batch-means") -> MotionEstimate:
         """The same with standard errors that hold for coloured errors: batch means of the scores (`block_scores`).
 
-        Args:
-            steps: of a block; None to choose it by how long the errors remember each other.
-            kind: "batch-means", "batch-means-uneven" where the errors are white and of uneven size, or "autoregressive"
+        Args: steps: of a block; None to choose it by how long the errors remember each other. kind:
+            "batch-means", "batch-means-uneven" where the errors are white and of uneven size, or
+            "autoregressive"
                 for errors of an autoregressive process.
 
-        Raises:
-            InputError: another kind, no statistics, or errors that remember each other for too long.
+        Raises: InputError: another kind, no statistics, or errors that remember each other for too
+            long.
         """
         statistics = self.model.statistics
         check_choice(kind, ("batch-means", "batch-means-uneven", "autoregressive"), "`kind`")
         if self.scores is None or self.covariance is None or statistics.gram is None:
-            raise InputError("the fit has no statistics that robust standard errors could be made of.")
+            raise InputError(
+                "the fit has no statistics that robust standard errors could be made of."
+            )
         used = len(self.theta) + self.effective_weights
         modelled = kind == "autoregressive"
         statistics = self.scores.robust(statistics, self.freedom, used, steps, modelled=modelled)
         plain = self.covariance if self.plain_covariance is None else self.plain_covariance
         model = replace(self.model, statistics=statistics)
         kept = tuple(w for w in self.warnings if w.code == "measure_beyond_data")
-        robust = replace(self, model=model, freedom=statistics.freedom, plain_covariance=plain, std_kind=kind)
+        robust = replace(
+            self, model=model, freedom=statistics.freedom, plain_covariance=plain, std_kind=kind
+        )
         return _with_split(robust, self.split_by, kept)
 
     def moves_by(self) -> tuple[Matrix, Vector] | None:
-        """Return how the coordinates follow (c, w), and which entries of these move; None without statistics."""
+        """Return how the coordinates follow (c, w), and which entries of these move.
+
+        None without statistics.
+        """
         made = free_covariance(self)
-        return None if made is None or self.split_by.slope is None else (self.split_by.slope, made[1])
+        return (
+            None if made is None or self.split_by.slope is None else (self.split_by.slope, made[1])
+        )
 
     def __repr__(self) -> str:
-        values = ", ".join(f"{n} = {v:.6g}" for n, v in zip(self.problem.motion.names, self.values, strict=True))
+        values = ", ".join(
+            f"{n} = {v:.6g}" for n, v in zip(self.problem.motion.names, self.values, strict=True)
+        )
         return f"MotionEstimate({self.status.code}, loss {self.status.loss:.3g}, {values})"
 
     def lines(self) -> list[str]:
@@ -191,16 +217,23 @@ class MotionEstimate(AnyFit):
         seen = ", ".join(str(entry) for entry in form.features)
         learner = "none"
         if bound is not None:
-            learner = f"{bound.learner} of {seen}, {bound.size} weights, {self.effective_weights:.1f} effective"
+            learner = (
+                f"{bound.learner} of {seen}, {bound.size} weights, "
+                f"{self.effective_weights:.1f} effective"
+            )
         steps = f"{form.substeps} substep{'s' * (form.substeps > 1)}"
         lines = [
-            f"motion      {', '.join(motion.names_of_states)}; {motion.integrator}, {steps}, {motion.hold} hold",
+            f"motion      {', '.join(motion.names_of_states)}; {motion.integrator}, {steps}, "
+            f"{motion.hold} hold",
             f"learner     {learner}",
             f"data        {self.problem.record!r}",
             *self.status.lines,
         ]
         if bound is not None:
-            lines += [f"shared      {shared_in_words(self.shared)}", f"measure     {self.split_by.name}"]
+            lines += [
+                f"shared      {shared_in_words(self.shared)}",
+                f"measure     {self.split_by.name}",
+            ]
         if self.plain_covariance is not None:
             lines.append(f"std         {STD_KINDS[self.std_kind]}")
         lines += ["", *parameter_lines(motion.parameters, self.values, self.std, self.interval)]
@@ -213,20 +246,32 @@ def fitted_numbers(numbers: Numbers) -> Numbers:
     return numbers._replace(theta=c, theta_aux=np.zeros_like(c))
 
 
-def _with_split(fit: MotionEstimate, split: MotionSplit, told: tuple[Warning, ...] = ()) -> MotionEstimate:
+def _with_split(
+    fit: MotionEstimate, split: MotionSplit, told: tuple[Warning, ...] = ()
+) -> MotionEstimate:
     """Return the estimate with p̂, its intervals and its warnings as a split gives them."""
     motion, numbers = fit.problem.motion, fit.model.numbers
     c = np.asarray(numbers.theta - numbers.theta_aux)
     bounds = motion.coordinates.bounds
-    at_bound = tuple(n for n, q, low, high in zip(motion.names, split.q, *bounds, strict=True) if q <= low or q >= high)
+    at_bound = tuple(
+        n
+        for n, q, low, high in zip(motion.names, split.q, *bounds, strict=True)
+        if q <= low or q >= high
+    )
     covariance, unseen = _covariance(fit, split, at_bound)
     warnings = [*told, *_doubts(split, at_bound, unseen, fit.model.form.bound is not None)]
-    model = replace(fit.model, numbers=numbers._replace(theta=split.q, theta_aux=split.q - c), measure=split.name)
+    model = replace(
+        fit.model,
+        numbers=numbers._replace(theta=split.q, theta_aux=split.q - c),
+        measure=split.name,
+    )
     own = {"not_unique", "at_a_bound", "not_identified", "measure_beyond_data"}
     return replace(
         fit,
         model=model,
-        covariance=None if fit.std_kind == "none" else grown(covariance, fit.model.statistics, split.shared),
+        covariance=None
+        if fit.std_kind == "none"
+        else grown(covariance, fit.model.statistics, split.shared),
         defect=split.defect,
         split_by=split,
         at_bound=at_bound,
@@ -247,7 +292,9 @@ def _covariance(
     covariance = joint.of(slope)
     std, wider = np.sqrt(np.diag(covariance)), _wider_without_prior(joint, slope)
     vague = fit.problem.motion.coordinates.positive & (std > _VAGUE / wider)
-    unseen = tuple(name for name, hidden in zip(names, vague | (wider > _LEANING), strict=True) if hidden)
+    unseen = tuple(
+        name for name, hidden in zip(names, vague | (wider > _LEANING), strict=True) if hidden
+    )
     for i, name in enumerate(names):
         if name in unseen or name in at_bound:
             covariance[i] = covariance[:, i] = np.nan
@@ -255,13 +302,18 @@ def _covariance(
 
 
 def free_covariance(fit: MotionEstimate) -> tuple[JointCovariance, Bool[np.ndarray, "n"]] | None:
-    """Cov (c, w) of what is not at a bound, and which entries these are; None without statistics."""
+    """Cov (c, w) of what is not at a bound, and which entries these are.
+
+    None without statistics.
+    """
     numbers, statistics = fit.model.numbers, fit.model.statistics
     if statistics.gram is None or statistics.middle is None:
         return None
     c = np.asarray(numbers.theta - numbers.theta_aux)
     low, high = fit.problem.motion.coordinates.bounds
-    moves = np.concatenate([(low < c) & (c < high), np.ones(len(statistics.gram) - len(c), dtype=bool)])
+    moves = np.concatenate(
+        [(low < c) & (c < high), np.ones(len(statistics.gram) - len(c), dtype=bool)]
+    )
     kept = np.ix_(moves, moves)  # what stands at a bound is a constant
     own = replace(statistics, gram=statistics.gram[kept], middle=statistics.middle[kept])
     joint = own.joint(int(moves[: len(c)].sum()))
@@ -269,7 +321,9 @@ def free_covariance(fit: MotionEstimate) -> tuple[JointCovariance, Bool[np.ndarr
 
 
 def _wider_without_prior(joint: JointCovariance, slope: Matrix) -> Vector:
-    """Return how many times wider the intervals of K (c, w) were without the ridge on w (m,); inf where nothing tells them.
+    """Return how many times wider the intervals of K (c, w) were without the ridge on w (m,).
+
+    Inf where nothing tells them.
 
     Both for white noise: the question is where the information comes from.
     """
@@ -280,36 +334,43 @@ def _wider_without_prior(joint: JointCovariance, slope: Matrix) -> Vector:
     own = slope * unit
     share = np.linalg.norm(own @ hidden, axis=1) / np.maximum(np.linalg.norm(own, axis=1), 1e-300)
     white = replace(joint, middle=gram)
-    with_prior, by_data = (np.sqrt(np.diag(one.of(slope))) for one in (white, replace(white, ridge=0.0)))
+    with_prior, by_data = (
+        np.sqrt(np.diag(one.of(slope))) for one in (white, replace(white, ridge=0.0))
+    )
     wider = by_data / np.where(with_prior > 0, with_prior, 1.0)
     return np.where(share > _UNSEEN, np.inf, np.maximum(wider, 1.0))
 
 
-def _doubts(split: MotionSplit, at_bound: tuple[str, ...], unseen: tuple[str, ...], learns: bool) -> list[Warning]:
+def _doubts(
+    split: MotionSplit, at_bound: tuple[str, ...], unseen: tuple[str, ...], learns: bool
+) -> list[Warning]:
     told = []
     if split.slope is None:
         text = (
-            "the distance between the fitted motion and the physics has no unique minimum near the estimate (it does "
-            f"not curve upwards, {split.curvature:.2g} of its curvature at a good fit), so there are no intervals: the "
-            "learner found something that several parameters could explain as well."
+            "the distance between the fitted motion and the physics has no unique minimum near "
+            f"the estimate (it does not curve upwards, {split.curvature:.2g} of its curvature "
+            "at a good fit), so there are no intervals: the learner found something that "
+            "several parameters could explain as well."
         )
         told.append(Warning("not_unique", text))
     if at_bound:
         text = (
-            f"at a bound: {', '.join(at_bound)}. What stands at a bound has no interval, and the others and theirs "
-            "hold with it there; data that contradict a bound contradict the physics or the bound."
+            f"at a bound: {', '.join(at_bound)}. What stands at a bound has no interval, and "
+            "the others and theirs hold with it there; data that contradict a bound contradict "
+            "the physics or the bound."
         )
         told.append(Warning("at_a_bound", text))
     if unseen:
         text = (
-            f"not identified: {', '.join(unseen)}. Other values, with other weights of the learner, give the same "
-            "outputs or nearly so, and what picks among them is the prior of the weights, so there is no interval; "
-            "measure more, fix one of them as a constant, or let the learner see less or add it to fewer equations."
+            f"not identified: {', '.join(unseen)}. Other values, with other weights of the "
+            "learner, give the same outputs or nearly so, and what picks among them is the "
+            "prior of the weights, so there is no interval; measure more, fix one of them as a "
+            "constant, or let the learner see less or add it to fewer equations."
         )
         if not learns:
             text = (
-                f"not identified: {', '.join(unseen)}. Other values of them together give the same outputs, so there "
-                "is no interval; give some of them as constants."
+                f"not identified: {', '.join(unseen)}. Other values of them together give the "
+                "same outputs, so there is no interval; give some of them as constants."
             )
         told.append(Warning("not_identified", text))
     return told
@@ -322,4 +383,7 @@ def shared_in_words(shared: Shared) -> str:
     if shared.all:
         return "all parameters: they are those of the physics nearest to the fitted motion"
     moved = [" with ".join(direction) for direction in shared.directions]
-    return f"{'; '.join(moved)} (by the nearest physics); told by the fit: {', '.join(shared.untouched) or 'none'}"
+    return (
+        f"{'; '.join(moved)} (by the nearest physics); told by the fit: "
+        f"{', '.join(shared.untouched) or 'none'}"
+    )

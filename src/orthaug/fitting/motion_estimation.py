@@ -38,7 +38,9 @@ from orthaug.physics.motion import Motion
 from orthaug.physics.motion_problem import MotionProblem, pose_motion
 
 DEFAULT = Simulation(washout=0)
-"""The criterion of a motion: its segments start at estimated states, so that none of their steps is left out."""
+"""The criterion of a motion: its segments start at estimated states, so that none of their steps is
+left out.
+"""
 
 
 def pose_for(
@@ -105,7 +107,9 @@ _WINDOWS = (4, 16)  # times (states + 1): rows of a window to predict from
 _TRIED_ROWS = 1000  # on which windows are compared
 
 
-def conclude_motion(task: MotionTask, structure: Structure, learned: TrainedLearner) -> MotionEstimate:
+def conclude_motion(
+    task: MotionTask, structure: Structure, learned: TrainedLearner
+) -> MotionEstimate:
     """Split the fitted motion and attach statistics."""
     plan = task.plan
     assert learned.coefficients is not None and learned.errors is not None
@@ -115,7 +119,9 @@ def conclude_motion(task: MotionTask, structure: Structure, learned: TrainedLear
     learned = withheld(learned) if unsettled else learned
     errors = learned.errors
     assert errors is not None and learned.coefficients is not None
-    alone = np.asarray(learned.coefficients if task.physics is None else task.physics.end.point.theta)
+    alone = np.asarray(
+        learned.coefficients if task.physics is None else task.physics.end.point.theta
+    )
     layout = (plan.free_run.steps, plan.free_run.washout, plan.segments.count)
     trained = TrainedSegments(*layout, np.asarray(states), slope, alone)
     model = replace(_model(plan, structure, learned), trained=trained)
@@ -126,7 +132,9 @@ def conclude_motion(task: MotionTask, structure: Structure, learned: TrainedLear
     reason = reason or ending_in_words(learned.ending, learned.tail)
     fit = MotionEstimate(
         model=model,
-        status=Status(learned.ending, learned.iterations, learned.seconds, errors.mean_square, reason=reason),
+        status=Status(
+            learned.ending, learned.iterations, learned.seconds, errors.mean_square, reason=reason
+        ),
         restarts=(),
         covariance=None,
         freedom=errors.freedom,
@@ -142,11 +150,18 @@ def conclude_motion(task: MotionTask, structure: Structure, learned: TrainedLear
         scores=learned.scores,
         warnings=(*without_loss(errors.mean_square), *unsettled, *silent),
     )
-    return fit.split(structure.measure, getattr(structure, "shared", "auto")) if learned.ending.usable else fit
+    return (
+        fit.split(structure.measure, getattr(structure, "shared", "auto"))
+        if learned.ending.usable
+        else fit
+    )
 
 
 def _learner_values(plan: SegmentedMotion, learned: TrainedLearner) -> Matrix | None:
-    """Return the values (N, nl) of a learner with few effective weights along the training runs; None of others."""
+    """Return the values (N, nl) of a learner with few effective weights along the training runs.
+
+    None of others.
+    """
     bound = plan.bound
     if bound is None or learned.scores is None or not silenced(learned.effective, bound.ny):
         return None
@@ -179,12 +194,18 @@ def _model(plan: SegmentedMotion, structure: Structure, learned: TrainedLearner)
         window=_WINDOWS[0] * (plan.dynamics.states + 1),
         time_column=record.time_column,
         prepared=record.prepared,
-        statistics=Statistics(learned.gram, middle, noise, learned.ridge, learned.errors.freedom, simulated=True),
+        statistics=Statistics(
+            learned.gram, middle, noise, learned.ridge, learned.errors.freedom, simulated=True
+        ),
     )
     if not learned.ending.usable:
         return model
     model = replace(model, window=_best_window(model, record))
-    return model if model.form.bound is None else _limited(replace(model, seen=_seen(model, record)), record)
+    return (
+        model
+        if model.form.bound is None
+        else _limited(replace(model, seen=_seen(model, record)), record)
+    )
 
 
 def _limited(model: MotionModel, record: Record) -> MotionModel:
@@ -202,7 +223,10 @@ def _limited(model: MotionModel, record: Record) -> MotionModel:
 
 
 def _seen(model: MotionModel, record: Record) -> Matrix | None:
-    """Least and largest (2, nz) of the learner's features over the free run; None where it has no finite ones."""
+    """Least and largest (2, nz) of the learner's features over the free run.
+
+    None where it has no finite ones.
+    """
     states, inputs = np.split(model.reach(record), [model.form.states], axis=1)
     with np.errstate(all="ignore"):
         features = np.asarray(model.form.seen(states.T, inputs.T, np))
@@ -226,7 +250,9 @@ def _best_window(model: MotionModel, record: Record) -> int:
         (trajectory,) = response.trajectories
         assert trajectory.measured is not None
         with np.errstate(all="ignore"):
-            errors = (trajectory.model - trajectory.measured)[tried[-1] if len(longest) > 4 * tried[-1] else window :]
+            errors = (trajectory.model - trajectory.measured)[
+                tried[-1] if len(longest) > 4 * tried[-1] else window :
+            ]
             square = float(np.mean(np.sum((errors @ model.weight.T) ** 2, axis=1)))
         if square < 0.98 * least:  # a longer one only where it is clearly better
             best, least = window, square
@@ -247,12 +273,21 @@ def reopened(model: MotionModel, record: Record) -> MotionEstimate:
     problem = replace(problem, weight=replace(problem.weight, matrix=model.weight))
     criterion = Simulation(kept.segment, kept.washout)
     segmented = SegmentedMotion.of(problem, form.bound, criterion).refined(form.substeps)
-    centre, half = (numbers.centre, numbers.halfwidth) if form.bound is not None else (np.zeros(0), np.ones(0))
-    segmented = replace(segmented, scaling=Scaling(np.asarray(centre), np.asarray(half)), unit=np.asarray(numbers.gain))
-    if segmented.segments.count != kept.rows or np.shape(segmented.segments.start) != np.shape(kept.states):
+    centre, half = (
+        (numbers.centre, numbers.halfwidth) if form.bound is not None else (np.zeros(0), np.ones(0))
+    )
+    segmented = replace(
+        segmented,
+        scaling=Scaling(np.asarray(centre), np.asarray(half)),
+        unit=np.asarray(numbers.gain),
+    )
+    if segmented.segments.count != kept.rows or np.shape(segmented.segments.start) != np.shape(
+        kept.states
+    ):
         raise InputError(
-            f"the model was trained on other rows: on {kept.rows} where these have {segmented.segments.count}, or in "
-            "other experiments. Give the files, and --rows, that it was trained on."
+            f"the model was trained on other rows: on {kept.rows} where these have "
+            f"{segmented.segments.count}, or in other experiments. Give the files, and --rows, "
+            "that it was trained on."
         )
     c = np.asarray(numbers.theta - numbers.theta_aux)
     return MotionEstimate(

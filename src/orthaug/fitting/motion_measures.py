@@ -27,8 +27,8 @@ def field_under(
 ) -> tuple[Field, float, tuple[Warning, ...]]:
     """Points of a measure with the sizes of the learned equations, its support by the data, and what to tell.
 
-    Raises:
-        InputError: a measure that does not fit the motion, or points at which the motion has no value.
+    Raises: InputError: a measure that does not fit the motion, or points at which the motion has no
+        value.
     """
     motion, form = segmented.problem.motion, segmented.dynamics
     c, w = np.asarray(numbers.theta - numbers.theta_aux), numbers.weights
@@ -40,7 +40,9 @@ def field_under(
     points = measure.points(support)
     at, beside = points.x[:, :nx], points.x[:, nx:]
     size = sizes_learned(segmented, c, x, u)
-    found = np.asarray(motion.rates(at.T, beside.T, motion.coordinates.physical(c), np), dtype=float)
+    found = np.asarray(
+        motion.rates(at.T, beside.T, motion.coordinates.physical(c), np), dtype=float
+    )
     if not np.isfinite(found).any():
         raise InputError(f"the motion has no value on the {measure.name} measure; narrow it.")
     finite = np.isfinite(found).all(axis=0)
@@ -49,8 +51,8 @@ def field_under(
     told = ()
     if share < SUPPORTED and form.bound is not None:
         text = (
-            f"only {100 * share:.0f} % of the {measure.name} measure lies within reach of the training data: elsewhere "
-            "the parameters rest on how the learner extrapolates."
+            f"only {100 * share:.0f} % of the {measure.name} measure lies within reach of the "
+            "training data: elsewhere the parameters rest on how the learner extrapolates."
         )
         told = (Warning("measure_beyond_data", text),)
     return Field(at[finite], beside[finite], weight[finite] / weight.sum(), size), share, told
@@ -64,7 +66,9 @@ def sizes_learned(segmented: SegmentedMotion, c: Any, x: Any, u: Any) -> Any:
     if motion.integrator == "discrete":
         rates = rates - x.T
     states, outputs = motion.learned
-    size = np.concatenate([np.nanstd(rates[list(states)], axis=1), segmented.deviation[list(outputs)]])
+    size = np.concatenate(
+        [np.nanstd(rates[list(states)], axis=1), segmented.deviation[list(outputs)]]
+    )
     return np.where(np.isfinite(size) & (size > 0), size, 1.0)
 
 
@@ -79,9 +83,9 @@ def wobble(
 ) -> Matrix:
     """Return how the points of a motion's own measure follow its unknowns: they are where the fitted run goes.
 
-    A split under the training measure depends on the unknowns twice, through the fitted field and through these points.
-    Intervals that leave the second out cover too little. `Σ φ_qx dx/d(c, w)` (np, n) is over the scored steps with
-    equal weights that add up to 1.
+    A split under the training measure depends on the unknowns twice, through the fitted field and
+    through these points. Intervals that leave the second out cover too little. `Σ φ_qx dx/d(c, w)`
+    (np, n) is over the scored steps with equal weights that add up to 1.
 
     Args:
         slope: how the segments' starts follow the unknowns, less its sign.
@@ -89,7 +93,9 @@ def wobble(
         q: coordinates of the split.
     """
     total = np.zeros((len(q), form.unknowns))
-    for start, inputs, _, scored, own in zip(states, *map(np.asarray, segments[1:]), slope, strict=True):
+    for start, inputs, _, scored, own in zip(
+        states, *map(np.asarray, segments[1:]), slope, strict=True
+    ):
         n0 = start.shape[0]
         found = np.asarray(_summed(form, numbers, start, inputs, scored, q, size))
         of_start = np.moveaxis(found[:, :n0], -1, 0)  # (m, np, n0)

@@ -1,8 +1,9 @@
 """Training of a motion on its free run: the parameters' coordinates, the weights and the segments' starts together.
 
-Physics alone is where every learner starts, and what it has to beat. It is trained over segments that lengthen: first
-the starts of short ones are found, then the parameters over them, then over longer ones, which begin at the states that
-the shorter ones went through. Every length may also begin anew from the initial parameters.
+Physics alone is where every learner starts, and what it has to beat. It is trained over segments
+that lengthen: first the starts of short ones are found, then the parameters over them, then over
+longer ones, which begin at the states that the shorter ones went through. Every length may also
+begin anew from the initial parameters.
 """
 
 from __future__ import annotations
@@ -35,10 +36,14 @@ from orthaug.physics.motion import MOST_SUBSTEPS
 from orthaug.physics.motion_problem import MotionProblem
 
 _SHORTEST = 15  # steps of a segment
-_LONGER = 8  # times, from one length of the segments to the next; every length compiles its own programs
+_LONGER = (
+    8  # times, from one length of the segments to the next; every length compiles its own programs
+)
 _POOR = 0.5  # of the output's deviation: what is left above it may not be the best minimum
 _SHORT_ITERATIONS = 15  # over segments that are not the last
-_SETTLING = 200  # steps at most by which starts follow the outputs: a descent damps no step of theirs
+_SETTLING = (
+    200  # steps at most by which starts follow the outputs: a descent damps no step of theirs
+)
 _FINE = 0.01  # of the residual: how much the outputs may move when the substeps are doubled
 _LOOSER = 1e-4  # times the weight of the guesses, where it is asked what the outputs tell
 
@@ -46,7 +51,10 @@ _LOOSER = 1e-4  # times the weight of the guesses, where it is asked what the ou
 def train_motion_physics(
     segmented: SegmentedMotion, solver: LevenbergMarquardt, tell: RunProgress = quiet
 ) -> tuple[SegmentedMotion, FreeRunFit | None]:
-    """Parameters of the physics alone, and the course with segments that start where its runs do; None: none flies."""
+    """Parameters of the physics alone, and the course with segments that start where its runs do.
+
+    None: none flies.
+    """
     own, initial = segmented.alone, segmented.problem.motion.coordinates.initial
     steps = own.segments.steps
     lengths = [steps // _LONGER**i for i in range(20, 0, -1) if steps // _LONGER**i >= _SHORTEST]
@@ -89,7 +97,10 @@ def _descended(
     rows: list[np.ndarray] | None,
     tell: RunProgress = quiet,
 ) -> FreeRunFit | None:
-    """From the best of the starts, whose segments begin at states that follow the outputs; None where none flies."""
+    """From the best of the starts, whose segments begin at states that follow the outputs.
+
+    None where none flies.
+    """
     if rows is not None:
         segmented = segmented.starting_from(rows)
     objective = segmented.objective()
@@ -110,7 +121,10 @@ def _follows(segmented: SegmentedMotion, free_fit: FreeRunFit) -> bool:
 
 
 def _left(segmented: SegmentedMotion, free_fit: FreeRunFit) -> float:
-    """Return the sum of squared errors, each output in its deviation; infinite where they are too large to square."""
+    """Return the sum of squared errors, each output in its deviation.
+
+    Infinite where they are too large to square.
+    """
     squares = free_fit.objective.squares(free_fit.end.point)
     return np.inf if squares is None else float(np.sum(np.diag(squares) / segmented.deviation**2))
 
@@ -120,7 +134,11 @@ def _fine_enough(
 ) -> tuple[SegmentedMotion, FreeRunFit]:
     """Twice the substeps until they move the outputs by less than 1 % of what the physics leaves."""
     motion = segmented.problem.motion
-    while motion.substeps is None and motion.integrator != "discrete" and segmented.dynamics.substeps < MOST_SUBSTEPS:
+    while (
+        motion.substeps is None
+        and motion.integrator != "discrete"
+        and segmented.dynamics.substeps < MOST_SUBSTEPS
+    ):
         finer = segmented.refined(2 * segmented.dynamics.substeps)
         if moved_by(segmented.alone, finer.alone, free_fit) <= _FINE:
             break
@@ -136,7 +154,11 @@ def moved_by(segmented: SegmentedMotion, finer: SegmentedMotion, free_fit: FreeR
     point = free_fit.end.point
     runs = []
     for one in (segmented, finer):
-        runs.append(np.asarray(respond(one.dynamics, one.numbers(point.c, point.w), one.segments, point.states)))
+        runs.append(
+            np.asarray(
+                respond(one.dynamics, one.numbers(point.c, point.w), one.segments, point.states)
+            )
+        )
     scored = np.asarray(segmented.segments.scored)[:, :, None]
     with np.errstate(all="ignore"):
         moved = np.where(scored, runs[1] - runs[0], 0.0) / segmented.deviation[:, None]
@@ -144,7 +166,9 @@ def moved_by(segmented: SegmentedMotion, finer: SegmentedMotion, free_fit: FreeR
     return float(ratio) if np.isfinite(ratio) else 0.0
 
 
-def _descended_on(segmented: SegmentedMotion, solver: LevenbergMarquardt, free_fit: FreeRunFit) -> FreeRunFit | None:
+def _descended_on(
+    segmented: SegmentedMotion, solver: LevenbergMarquardt, free_fit: FreeRunFit
+) -> FreeRunFit | None:
     point = free_fit.end.point
     again = segmented.descend(segmented.objective(), point.theta, solver, states=point.states)
     return again if again.ending.usable else None
@@ -158,7 +182,11 @@ class MotionTask(SimulationTask):
 
     @classmethod
     def of(
-        cls, problem: MotionProblem, learner: Learner | None, criterion: Criterion, engine: Engine | None = None
+        cls,
+        problem: MotionProblem,
+        learner: Learner | None,
+        criterion: Criterion,
+        engine: Engine | None = None,
     ) -> MotionTask:
         """Bind a learner to the equations and outputs that it is added to, and lay the record out.
 
@@ -166,9 +194,15 @@ class MotionTask(SimulationTask):
             InputError: nothing would be scored.
         """
         states, outputs = problem.motion.learned
-        bound = None if learner is None else Bound(learner, len(problem.features), len(states) + len(outputs))
+        bound = (
+            None
+            if learner is None
+            else Bound(learner, len(problem.features), len(states) + len(outputs))
+        )
         return cls(
-            SegmentedMotion.of(problem, bound, criterion, sums=None if engine is None else SegmentSums.of(engine))
+            SegmentedMotion.of(
+                problem, bound, criterion, sums=None if engine is None else SegmentSums.of(engine)
+            )
         )
 
     @property
@@ -178,17 +212,27 @@ class MotionTask(SimulationTask):
     def on(self, record: Record) -> MotionTask:
         """The same motion on another record."""
         sums = None if self.plan.sums is None else SegmentSums.of(self.plan.sums.engine)
-        segmented = SegmentedMotion.of(self.problem.on(record), self.bound, self.criterion, self.plan, sums)
+        segmented = SegmentedMotion.of(
+            self.problem.on(record), self.bound, self.criterion, self.plan, sums
+        )
         return MotionTask(segmented)
 
     def physics_alone(self) -> tuple[MotionTask, TrainedLearner]:
-        """Return the task without a learner, and what physics alone leaves; without an end where it cannot fly."""
+        """Return the task without a learner, and what physics alone leaves.
+
+        Without an end where it cannot fly.
+        """
         alone = replace(self, plan=self.plan.alone)
         if self.physics is not None:
             return alone, alone.learned(self.physics)
         unknown = ErrorStatistics(None, None, 0.0, np.nan, {})
         initial = self.problem.motion.coordinates.initial
-        nothing: dict[str, Any] = {"bound": None, "weights": np.zeros(0), "errors": unknown, "coefficients": initial}
+        nothing: dict[str, Any] = {
+            "bound": None,
+            "weights": np.zeros(0),
+            "errors": unknown,
+            "coefficients": initial,
+        }
         return alone, TrainedLearner(
             scaling=alone.plan.scaling, unit=alone.plan.unit, ending=Ending.NON_FINITE, **nothing
         )
@@ -198,12 +242,17 @@ class MotionTask(SimulationTask):
         return members[best]
 
     def learned(self, run: FreeRunFit) -> TrainedLearner:
-        """Return the learner as a run left it. The information counts what the outputs tell, hardly what the guesses do."""
+        """Return the learner as a run left it.
+
+        The information counts what the outputs tell, hardly what the guesses do.
+        """
         end, objective = run.end, run.objective
         if end.linear is None:
             return super().learned(run)
         information = objective.eliminated(end.point, _LOOSER * objective.start_rows)[0]
-        return super().learned(run._replace(end=end._replace(linear=end.linear._replace(information=information))))
+        return super().learned(
+            run._replace(end=end._replace(linear=end.linear._replace(information=information)))
+        )
 
     def train_physics_only(
         self, solver: LevenbergMarquardt, structure: Structure, tell: RunProgress
@@ -219,7 +268,9 @@ class MotionTask(SimulationTask):
         with np.errstate(all="ignore"):
             features = np.asarray(plan.dynamics.seen(x, u, np)).T
         finite = features[np.isfinite(features).all(axis=1)]
-        scaling = scaling_of(plan.bound.learner, finite if len(finite) else np.zeros((1, features.shape[1])))
+        scaling = scaling_of(
+            plan.bound.learner, finite if len(finite) else np.zeros((1, features.shape[1]))
+        )
         return replace(plan, scaling=scaling, unit=sizes_learned(plan, point.c, x.T, u.T))
 
     def places(
@@ -230,9 +281,18 @@ class MotionTask(SimulationTask):
         structure: Structure,
         regularization: str | float,
     ) -> list[StartPoint]:
-        """Physics alone with a silent learner; a learner that cannot be silenced starts as it is."""
-        silenced = w if self.bound is None else self.bound.silent(w)  # no learner: physics alone did not fly
-        q = self.problem.motion.coordinates.initial if self.physics is None else self.physics.end.point.theta
+        """Physics alone with a silent learner.
+
+        A learner that cannot be silenced starts as it is.
+        """
+        silenced = (
+            w if self.bound is None else self.bound.silent(w)
+        )  # no learner: physics alone did not fly
+        q = (
+            self.problem.motion.coordinates.initial
+            if self.physics is None
+            else self.physics.end.point.theta
+        )
         p = np.concatenate([q, w if silenced is None else silenced])
         states = objective.initial.measured
         loss = objective.evaluate(p, Start(states)).loss

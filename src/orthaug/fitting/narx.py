@@ -36,19 +36,22 @@ class Group(NamedTuple):
 class AugmentedNARX(Augmented):
     """`y_k = φ(x_k)θ + learner(x_k) + e_k`, x_k past outputs and inputs, in the manners of scikit-learn.
 
-    The rows of X are inputs at successive samples and those of y the outputs measured with them. `groups` labels the
-    experiments; rows of one label belong together in their order, and lags never reach into another. It passes on to
-    `estimate` and gives the same numbers.
+    The rows of X are inputs at successive samples and those of y the outputs measured with them.
+    `groups` labels the experiments; rows of one label belong together in their order, and lags
+    never reach into another. It passes on to `estimate` and gives the same numbers.
 
-    The first `first_row_` rows of every experiment have no prediction, for there is no past that it could be made from:
-    they are NaN in what `predict` and `simulate` return, and no score counts them.
+    The first `first_row_` rows of every experiment have no prediction, for there is no past that it
+    could be made from: they are NaN in what `predict` and `simulate` return, and no score counts
+    them.
 
     Args:
         physics: "linear", a line in every lag with an intercept; expressions such as
-            `["y[k-1]", "x0[k-1]*abs(x0[k-1])"]`, of parameters theta1, theta2, …; a mapping `{"pole": "y[k-1]"}`;
-            `Term`s; a `Baseline`; or a JAX function of the regressor, returning (n_outputs, n_parameters). Inputs are
-            named by the columns of a DataFrame, else x0, x1, …; the output is y, or y0, y1, … of several.
-        lags: a `Lags`, the learner's regressor; None for what the physics reads, of "linear" one sample back.
+            `["y[k-1]", "x0[k-1]*abs(x0[k-1])"]`, of parameters theta1, theta2, …; a mapping
+            `{"pole": "y[k-1]"}`; `Term`s; a `Baseline`; or a JAX function of the regressor,
+            returning (n_outputs, n_parameters). Inputs are named by the columns of a DataFrame,
+            else x0, x1, …; the output is y, or y0, y1, … of several.
+        lags: a `Lags`, the learner's regressor; None for what the physics reads, of "linear" one
+            sample back.
         learner: a declaration; "auto" for `MLP()`, None for physics alone.
         structure: as of `estimate`; None for `Orthogonal()`.
         criterion: `Prediction(…)` or `Simulation(…)`; None for one step ahead.
@@ -57,7 +60,8 @@ class AugmentedNARX(Augmented):
         restarts: runs from different initial weights.
         output_weights: as of `estimate`.
         sampling_time: seconds between rows.
-        score_on: whether `score` is that of the free run, "simulation", or one step ahead, "prediction".
+        score_on: whether `score` is that of the free run, "simulation", or one step ahead,
+            "prediction".
         random_state: seed of the initial weights; a RandomState or None draws it.
 
     Attributes:
@@ -119,10 +123,10 @@ class AugmentedNARX(Augmented):
             y: outputs.
             groups: the experiment of every row (n,); None for one.
 
-        Raises:
-            InputError (a ValueError): data and physics that do not fit together, a signal that does not move, too short
-                an experiment; RankError where the rows do not determine θ. TrainingError where training gives no finite
-                model.
+        Raises: InputError (a ValueError): data and physics that do not fit together, a signal that
+            does not move, too short
+                an experiment; RankError where the rows do not determine θ. TrainingError where
+                training gives no finite model.
         """
         check_choice(self.score_on, SCORED_ON, "`score_on`")
         given = y
@@ -153,15 +157,14 @@ class AugmentedNARX(Augmented):
     def simulate(self, X: Any, initial: Any = None, groups: Any = None) -> np.ndarray:
         """ŷ of the free run, whose past outputs are the model's own, (n,) or (n, n_outputs) as y was in the fit.
 
-        Args:
-            X: inputs.
-            initial: outputs before the first prediction: y itself, (n,) or (n, n_outputs), of which only the first
-                `first_row_` rows of each experiment are looked at; or these rows alone, the same for every experiment;
-                None for zero.
+        Args: X: inputs. initial: outputs before the first prediction: y itself, (n,) or (n,
+            n_outputs), of which only the first
+                `first_row_` rows of each experiment are looked at; or these rows alone, the same
+                for every experiment; None for zero.
             groups: the experiment of every row (n,); None for one.
 
-        Raises:
-            InputError (a ValueError): other columns than in the fit, too short an experiment or `initial`.
+        Raises: InputError (a ValueError): other columns than in the fit, too short an experiment or
+            `initial`.
         """
         model = self._fitted().model
         X = checked_again(self, X)
@@ -186,10 +189,16 @@ class AugmentedNARX(Augmented):
         from sklearn.metrics import r2_score
 
         check_choice(self.score_on, SCORED_ON, "`score_on`")
-        found = self.simulate(X, y, groups) if self.score_on == "simulation" else self.predict(X, y, groups)
+        found = (
+            self.simulate(X, y, groups)
+            if self.score_on == "simulation"
+            else self.predict(X, y, groups)
+        )
         measured = self._outputs(y, len(found))
         found = found.reshape(measured.shape)
-        scored = np.concatenate([group.rows[self.first_row_ :] for group in _groups(groups, len(found))])
+        scored = np.concatenate(
+            [group.rows[self.first_row_ :] for group in _groups(groups, len(found))]
+        )
         if not np.isfinite(found[scored]).all():
             return -np.inf
         return float(r2_score(measured[scored], found[scored]))
@@ -203,7 +212,11 @@ class AugmentedNARX(Augmented):
         """Return the experiments, with their outputs where they are given."""
         outputs = np.empty((len(x), 0)) if y is None else y
         experiments = [
-            Experiment(x[group.rows], outputs[group.rows], "" if group.label is None else f"group {group.label}")
+            Experiment(
+                x[group.rows],
+                outputs[group.rows],
+                "" if group.label is None else f"group {group.label}",
+            )
             for group in groups
         ]
         named = () if y is None else self.output_names_
@@ -213,12 +226,17 @@ class AugmentedNARX(Augmented):
         """Measured outputs (rows, n_outputs)."""
         y = as_signal(y, "y")
         if y.shape != (rows, len(self.output_names_)):
-            raise InputError(f"`y` has the shape {y.shape}; expected {(rows, len(self.output_names_))}, rows as in X.")
+            raise InputError(
+                f"`y` has the shape {y.shape}; expected {(rows, len(self.output_names_))}, "
+                "rows as in X."
+            )
         return y
 
 
 def _groups(groups: Any, rows: int) -> Iterator[Group]:
-    """Yield the experiments in order of first appearance; `groups` (rows,) labels them, None is one.
+    """Yield the experiments in order of first appearance.
+
+    `groups` (rows,) labels them, None is one.
 
     Raises:
         InputError: not one label for every row.
@@ -228,14 +246,20 @@ def _groups(groups: Any, rows: int) -> Iterator[Group]:
         return
     labels = np.asarray(groups)
     if labels.shape != (rows,):
-        raise InputError(f"`groups` has the shape {labels.shape}; expected one label for each of {rows} rows.")
+        raise InputError(
+            f"`groups` has the shape {labels.shape}; expected one label for each of {rows} rows."
+        )
     bare = [k for k, label in enumerate(labels.tolist()) if label is None or label != label]
     if bare:
-        raise InputError(f"`groups` has no label at row {bare[0]}: found {labels[bare[0]]}; every row needs one.")
+        raise InputError(
+            f"`groups` has no label at row {bare[0]}: found {labels[bare[0]]}; every row needs one."
+        )
     try:
         found, first = np.unique(labels, return_index=True)
     except TypeError:
         kinds = sorted({type(label).__name__ for label in labels})
-        raise InputError(f"`groups` mixes labels of the types {', '.join(kinds)}; take one type.") from None
+        raise InputError(
+            f"`groups` mixes labels of the types {', '.join(kinds)}; take one type."
+        ) from None
     for label in found[np.argsort(first)]:
         yield Group(label, np.flatnonzero(labels == label))

@@ -1,7 +1,7 @@
 """The prediction criterion over the learner's weights, as normal equations from one pass over rows (F1, F4).
 
-Rows are whitened: each output is divided by its standard deviation, and all rows by the RMS of the baseline's
-residual. So a residual of 1 is as large as the baseline's own.
+Rows are whitened: each output is divided by its standard deviation, and all rows by the RMS of the
+baseline's residual. So a residual of 1 is as large as the baseline's own.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ class Normal(NamedTuple):
 class Blocks:
     """Gram matrix of the columns `[Q r J]` of one chunk: its share of the sum.
 
-    Where J lies almost in the span of Q, `JᵀJ − (QᵀJ)ᵀ(QᵀJ)` cancels. So the overlap of the previous pass is
-    subtracted first.
+    Where J lies almost in the span of Q, `JᵀJ − (QᵀJ)ᵀ(QᵀJ)` cancels. So the overlap of the
+    previous pass is subtracted first.
     """
 
     bound: Bound
@@ -67,7 +67,8 @@ def collect(total: Float[Array, "n n"], hold: Hold, before: Overlap) -> Normal:
     return Normal(
         hessian=g_jj - g_qj.T @ g_qj + held.T @ held,
         gradient=g_jr - g_qj.T @ g_qr + held.T @ miss,
-        loss=jnp.maximum(g_rr - g_qr @ g_qr, 0.0) + miss @ miss,  # a difference may round below zero
+        loss=jnp.maximum(g_rr - g_qr @ g_qr, 0.0)
+        + miss @ miss,  # a difference may round below zero
         overlap=overlap,
     )
 
@@ -88,14 +89,20 @@ class OneStep:
 
 @partial(jax.jit, static_argnames="criterion")
 def one_pass(
-    criterion: Callable[..., Normal], w: Float[Array, "nw"], arguments: tuple[Any, ...], overlap: Overlap
+    criterion: Callable[..., Normal],
+    w: Float[Array, "nw"],
+    arguments: tuple[Any, ...],
+    overlap: Overlap,
 ) -> Normal:
     """Return the criterion at w. The programs around it trace it once, together."""
     return criterion(w, *arguments, overlap)
 
 
 def linearise(
-    criterion: Callable[..., Normal], w: Float[Array, "nw"], arguments: tuple[Any, ...], overlap: Overlap
+    criterion: Callable[..., Normal],
+    w: Float[Array, "nw"],
+    arguments: tuple[Any, ...],
+    overlap: Overlap,
 ) -> Normal:
     """Return the criterion at w, in two passes: the second subtracts the overlap of the first."""
     first = one_pass(criterion, w, arguments, overlap)
@@ -113,7 +120,9 @@ class SummedOneStep:
 
     def __call__(self, w: Any, before: Overlap) -> Normal:
         """Return the normal equations at w; `before` is the overlap from the previous pass."""
-        return _collect(self.engine.sum(Blocks(self.bound), self.rows, w, before), self.hold, before)
+        return _collect(
+            self.engine.sum(Blocks(self.bound), self.rows, w, before), self.hold, before
+        )
 
 
 _collect = jax.jit(collect)

@@ -1,4 +1,7 @@
-"""The free-run criterion as a function of p = (θ, w): a trial, and its linearisation. Both are pure."""
+"""The free-run criterion as a function of p = (θ, w): a trial, and its linearisation.
+
+Both are pure.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,8 @@ _LARGEST_ERROR = 1e120
 class TrialPoint(NamedTuple):
     """A trial at p: the unknown θ, c and w, the states that its segments started from, and the errors (k, T, ny, m).
 
-    Where an engine keeps the segments, their `squares` Σ e eᵀ (ny, ny) are known instead of the errors.
+    Where an engine keeps the segments, their `squares` Σ e eᵀ (ny, ny) are known instead of the
+    errors.
     """
 
     p: Vector
@@ -53,10 +57,11 @@ class LinearisedFreeRun(NamedTuple):
 class FreeRunObjective:
     """`‖r‖²` of the free run.
 
-    `numbers` makes a model's numbers of (c, w). `weight` (ny, ny) multiplies the errors of a step; `rms` is their unit,
-    in whitened outputs; `deviation` (ny,) is that of the measured outputs. `physics` is nθ, and `bounds` are θ's.
-    `colour` holds longer segments, where the others are too short to show how long the errors remember. `sums` makes
-    the sums where an engine keeps the segments.
+    `numbers` makes a model's numbers of (c, w). `weight` (ny, ny) multiplies the errors of a step;
+    `rms` is their unit, in whitened outputs; `deviation` (ny,) is that of the measured outputs.
+    `physics` is nθ, and `bounds` are θ's. `colour` holds longer segments, where the others are too
+    short to show how long the errors remember. `sums` makes the sums where an engine keeps the
+    segments.
     """
 
     dynamics: Dynamics
@@ -81,7 +86,10 @@ class FreeRunObjective:
         return p[: self.physics], p[: self.physics], p[self.physics :]
 
     def evaluate(self, p: Vector, start: Start) -> TrialPoint:
-        """Return a trial at p. The states follow p to first order. Where that does not lower the misfit, they stay."""
+        """Return a trial at p.
+
+        The states follow p to first order. Where that does not lower the misfit, they stay.
+        """
         theta, c, w = self.place(p)
         trials: list[TrialPoint] = []
         for follows in (True, False) if self.initial.free and start.follows else (False,):
@@ -92,10 +100,14 @@ class FreeRunObjective:
                 break
         best = min(trials, key=lambda trial: trial.misfit)
         if self.sums is not None and best is trials[0] and self.initial.free and start.follows:
-            return best._replace(states=self.sums.moved(start, np.concatenate([c, w]) - start.unknowns))
+            return best._replace(
+                states=self.sums.moved(start, np.concatenate([c, w]) - start.unknowns)
+            )
         return best
 
-    def _tried(self, c: Vector, w: Vector, start: Start, follows: bool) -> tuple[float, Any, Any, Matrix | None]:
+    def _tried(
+        self, c: Vector, w: Vector, start: Start, follows: bool
+    ) -> tuple[float, Any, Any, Matrix | None]:
         """`‖r‖²`, states, errors and their squares from the start's states, or from those that follow (c, w).
 
         An engine's states stay where they are: given are those of the start.
@@ -104,7 +116,9 @@ class FreeRunObjective:
         if self.sums is not None:
             step = unknowns - start.unknowns if follows and start.unknowns is not None else None
             made = (self.weight, self.start_rows)
-            total, squares = self.sums.tried(self.dynamics, self.numbers(c, w), self.segments, start, step, *made)
+            total, squares = self.sums.tried(
+                self.dynamics, self.numbers(c, w), self.segments, start, step, *made
+            )
             return total, start.values, None, squares
         states: Any = start.at(unknowns) if follows else start.values
         errors = self.errors(c, w, states, self.segments)
@@ -130,7 +144,9 @@ class FreeRunObjective:
         theta, c, w = self.place(p)
         known = self.sums is not None
         errors = None if known else self.errors(c, w, states, self.segments)
-        return TrialPoint(p, theta, c, w, states, errors, float(misfit), float(loss), squares if known else None)
+        return TrialPoint(
+            p, theta, c, w, states, errors, float(misfit), float(loss), squares if known else None
+        )
 
     def eliminated(self, point: TrialPoint, rows: Matrix) -> tuple[Matrix, Vector, dict[str, Any]]:
         """Return normal matrix and right-hand side of (c, w), L = `rows`, and how the states follow, as `Start` has it."""
@@ -145,14 +161,23 @@ class FreeRunObjective:
 
     def slope(self, start: Start) -> Float[np.ndarray, "k m n0 n"] | None:
         """Return how the best states follow (c, w)."""
-        return start.slope if self.sums is None or start.there is None else self.sums.slope(start.there)
+        return (
+            start.slope
+            if self.sums is None or start.there is None
+            else self.sums.slope(start.there)
+        )
 
     def theta_information(self, linear: LinearisedFreeRun, w: Vector) -> Matrix:
         """Return the information of (θ, w), with θ as it is split from the learner."""
         return linear.information
 
-    def errors(self, c: Vector, w: Vector, states: Any, segments: Segments) -> Float[np.ndarray, "k T ny m"]:
-        """Errors of every segment from its state, in the outputs' units; 0 where they are not scored."""
+    def errors(
+        self, c: Vector, w: Vector, states: Any, segments: Segments
+    ) -> Float[np.ndarray, "k T ny m"]:
+        """Errors of every segment from its state, in the outputs' units.
+
+        0 where they are not scored.
+        """
         return errors_of(self.dynamics, self.numbers(c, w), states, segments)
 
     def samples(self, point: TrialPoint) -> tuple[float, float]:
@@ -167,32 +192,49 @@ class FreeRunObjective:
                 errors = long if np.abs(long).max() < _LARGEST_ERROR else errors
         if errors is not None:
             moved = np.moveaxis(errors, 1, -1).swapaxes(1, 2)  # (k, m, ny, T)
-            shares = [independent_share(moved[:, :, i].reshape(-1, moved.shape[-1])) for i in range(ny)]
+            shares = [
+                independent_share(moved[:, :, i].reshape(-1, moved.shape[-1])) for i in range(ny)
+            ]
         else:
             shares = self._shares(point, segments, states)
         return self.segments.count * ny - self.physics, float(np.mean(shares))
 
     def _colour_errors(self, point: TrialPoint) -> Any:
-        """Errors of the longer segments; None where they are not in memory, or the run is lost there."""
+        """Errors of the longer segments.
+
+        None where they are not in memory, or the run is lost there.
+        """
         if not isinstance(self.colour, Segments):
             return None
         return self.errors(point.c, point.w, self.colour.start, self.colour)
 
     def _shares(self, point: TrialPoint, segments: Any, states: Any) -> list[float]:
-        """Independent shares of each output's errors, from sums; of the own segments where a longer run is lost."""
+        """Independent shares of each output's errors, from sums.
+
+        Of the own segments where a longer run is lost.
+        """
         assert self.sums is not None
         numbers = self.numbers(point.c, point.w)
         for one, start in ((segments, states), (self.segments, point.states)):
             found = self.sums.spectra(self.dynamics, numbers, one, start, spectrum_size(one.steps))
             if np.all(found[0] < _LARGEST_ERROR**2):
-                return [share_of(spectrum, one.steps, n) for spectrum, n in zip(*found, strict=True)]
+                return [
+                    share_of(spectrum, one.steps, n) for spectrum, n in zip(*found, strict=True)
+                ]
         return [1.0] * len(self.weight)
 
     def squares(self, point: TrialPoint) -> Matrix | None:
-        """Σ e eᵀ (ny, ny) of a trial's errors, in the outputs' units; None where they are too large to square."""
+        """Σ e eᵀ (ny, ny) of a trial's errors, in the outputs' units.
+
+        None where they are too large to square.
+        """
         if point.errors is None:
             found = point.squares
-            return found if found is not None and np.abs(found).max(initial=0.0) < _LARGEST_ERROR**2 else None
+            return (
+                found
+                if found is not None and np.abs(found).max(initial=0.0) < _LARGEST_ERROR**2
+                else None
+            )
         errors = np.moveaxis(point.errors, 2, -1).reshape(-1, len(self.weight))
         return errors.T @ errors if np.abs(errors).max(initial=0.0) < _LARGEST_ERROR else None
 
@@ -202,8 +244,15 @@ class FreeRunObjective:
         return RUNAWAY * self.segments.count * float(np.sum((self.weight * self.deviation) ** 2))
 
 
-def errors_of(dynamics: Dynamics, numbers: Numbers, states: Any, segments: Segments) -> Float[np.ndarray, "k T ny m"]:
-    """Errors of every segment from its state, in the outputs' units; 0 where they are not scored."""
+def errors_of(
+    dynamics: Dynamics, numbers: Numbers, states: Any, segments: Segments
+) -> Float[np.ndarray, "k T ny m"]:
+    """Errors of every segment from its state, in the outputs' units.
+
+    0 where they are not scored.
+    """
     run = np.asarray(respond(dynamics, numbers, segments, states))
     with np.errstate(all="ignore"):
-        return np.where(np.asarray(segments.scored)[:, :, None], np.asarray(segments.target) - run, 0.0)
+        return np.where(
+            np.asarray(segments.scored)[:, :, None], np.asarray(segments.target) - run, 0.0
+        )

@@ -35,9 +35,13 @@ from orthaug.physics.problem import Problem
 from orthaug.physics.streamed import StreamedProblem
 
 MANY_ROWS, FEW_ROWS = 1_000_000, 200_000
-"""From how many rows on runs begin where runs over few of them ended; the table is in docs/design.md."""
+"""From how many rows on runs begin where runs over few of them ended; the table is in
+docs/design.md.
+"""
 OUTPUT_UNIT = 10.0
-"""The learner's output unit in standard deviations of the baseline's residual: the table is in docs/design.md."""
+"""The learner's output unit in standard deviations of the baseline's residual: the table is in
+docs/design.md.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +64,11 @@ class OneStepTask(TrainingRows):
         engine: Engine = InMemory(),  # noqa: B008  (frozen)
     ) -> OneStepTask:
         """Scale features to [-1, 1] and the learner's output to the baseline's residual, unless both are given."""
-        bound = None if learner is None else Bound(learner, len(problem.features.entries), len(problem.outputs))
+        bound = (
+            None
+            if learner is None
+            else Bound(learner, len(problem.features.entries), len(problem.outputs))
+        )
         if isinstance(problem, StreamedProblem):
             z = problem.feature_range if bound else np.zeros((2, 0))
         else:
@@ -72,9 +80,13 @@ class OneStepTask(TrainingRows):
         gain = problem.weight.matrix * unit / rms
         if isinstance(problem, StreamedProblem):
             row_builder = problem.row_builder(scaling.centre, scaling.halfwidth, rms, gain)
-            return cls(problem, bound, scaling, unit, rms, engine, engine.draw(problem.source, row_builder))
+            return cls(
+                problem, bound, scaling, unit, rms, engine, engine.draw(problem.source, row_builder)
+            )
         e = problem.unexplained / rms
-        rows = engine.build_rows(scaling(z), problem.projection.q, e, np.broadcast_to(gain, (*e.shape, e.shape[1])))
+        rows = engine.build_rows(
+            scaling(z), problem.projection.q, e, np.broadcast_to(gain, (*e.shape, e.shape[1]))
+        )
         return cls(problem, bound, scaling, unit, rms, engine, rows)
 
     @property
@@ -101,8 +113,13 @@ class OneStepTask(TrainingRows):
     @property
     def alone(self) -> OneStepTask:
         """The same rows without a learner."""
-        problem, scaling = replace(self.problem, features=Features(())), Scaling(np.zeros(0), np.ones(0))
-        return replace(self, problem=problem, bound=None, scaling=scaling, unit=np.zeros_like(self.unit))
+        problem, scaling = (
+            replace(self.problem, features=Features(())),
+            Scaling(np.zeros(0), np.ones(0)),
+        )
+        return replace(
+            self, problem=problem, bound=None, scaling=scaling, unit=np.zeros_like(self.unit)
+        )
 
     def physics_alone(self) -> tuple[OneStepTask, TrainedLearner]:
         """Return the rows without a learner, and least squares on them."""
@@ -110,10 +127,17 @@ class OneStepTask(TrainingRows):
 
     def on(self, record: Record) -> OneStepTask:
         """The same problem on another record."""
-        return OneStepTask.of(self.problem.on(record), self.bound and self.bound.learner, engine=self.engine)
+        return OneStepTask.of(
+            self.problem.on(record), self.bound and self.bound.learner, engine=self.engine
+        )
 
-    def prepared(self, solver: Any, structure: Structure, progress: RunProgress = quiet) -> OneStepTask:
-        """The same with the loss of physics alone under the structure's rows and bounds; it is solved (F1)."""
+    def prepared(
+        self, solver: Any, structure: Structure, progress: RunProgress = quiet
+    ) -> OneStepTask:
+        """The same with the loss of physics alone under the structure's rows and bounds.
+
+        It is solved (F1).
+        """
         problem, elimination = self.problem, eliminate(structure, self.problem)
         nothing = np.zeros_like(problem.target_coordinates)
         theta = elimination.theta(nothing, elimination.active(nothing))
@@ -124,12 +148,21 @@ class OneStepTask(TrainingRows):
         return replace(self, physics_loss=loss, few=few and few.prepared(solver, structure))
 
     def _few(self) -> OneStepTask | None:
-        """On a witness of the rows, the weights in the same units; None where it lacks what the physics needs."""
+        """On a witness of the rows, the weights in the same units.
+
+        None where it lacks what the physics needs.
+        """
         assert self.bound is not None
         problem = self.problem
-        source = problem.source if isinstance(problem, StreamedProblem) else RecordSource(problem.record, 0)
+        source = (
+            problem.source
+            if isinstance(problem, StreamedProblem)
+            else RecordSource(problem.record, 0)
+        )
         with suppress(InputError):
-            return OneStepTask.of(problem.on(witness(source, FEW_ROWS)), self.bound.learner, self.scaling, self.unit)
+            return OneStepTask.of(
+                problem.on(witness(source, FEW_ROWS)), self.bound.learner, self.scaling, self.unit
+            )
         return None
 
     def run(
@@ -140,13 +173,18 @@ class OneStepTask(TrainingRows):
         regularization: str | float = "none",
         progress: RunProgress = quiet,
     ) -> compiled.TrainingRun:
-        """Return one run from the weights `w`; the arguments as in `estimate`, `structure` None for no penalty.
+        """Return one run from the weights `w`.
 
-        Over very many rows its iterations are those over all of them, its seconds those over the few as well.
+        The arguments as in `estimate`, `structure` None for no penalty.
+
+        Over very many rows its iterations are those over all of them, its seconds those over the
+        few as well.
         """
         structure = Orthogonal() if structure is None else structure
         if self.few is not None:
-            first = self.few.run(solver, w, structure, regularization, lambda iteration, loss: progress(0, loss))
+            first = self.few.run(
+                solver, w, structure, regularization, lambda iteration, loss: progress(0, loss)
+            )
             w = first.w if first.ending.usable else w
             own = replace(self, few=None).run(solver, w, structure, regularization, progress)
             return own._replace(seconds=first.seconds + own.seconds)
@@ -155,11 +193,17 @@ class OneStepTask(TrainingRows):
         plain = not (structure.from_initial or len(elimination.rows.target))
         if not (plain and solver.gauss_newton and solver.iterations and self._above(run)):
             return run
-        silent = self.bound.silent(np.asarray(w)) if self.bound else None  # its runs end below physics alone
+        silent = (
+            self.bound.silent(np.asarray(w)) if self.bound else None
+        )  # its runs end below physics alone
         w = w if silent is None else jnp.asarray(silent)
         run = self._run_inside(solver, w, structure, elimination, regularization, progress)
-        if elimination.bounded and silent is not None and self._above(run):  # the bounds of another active set
-            return self._run_inside(solver.at_most(0), w, structure, elimination, regularization, progress)
+        if (
+            elimination.bounded and silent is not None and self._above(run)
+        ):  # the bounds of another active set
+            return self._run_inside(
+                solver.at_most(0), w, structure, elimination, regularization, progress
+            )
         return run
 
     def _above(self, run: compiled.TrainingRun) -> bool:
@@ -177,8 +221,8 @@ class OneStepTask(TrainingRows):
     ) -> compiled.TrainingRun:
         """Return one run with θ inside its bounds, which an active set meets (they reach into training, F1).
 
-        Entries at a bound are known terms: they are held there from the first step on, as if they were `fixed`. Where
-        others stand there at the end, the run is made again.
+        Entries at a bound are known terms: they are held there from the first step on, as if they
+        were `fixed`. Where others stand there at the end, the run is made again.
         """
 
         def tell(iteration: int, loss: float) -> None:
@@ -188,7 +232,9 @@ class OneStepTask(TrainingRows):
 
         def share(fixed: Fixed) -> Vector | None:
             """QᵀF at the end of a run with these held; None where nothing follows from it."""
-            runs.append(self._run_held(solver, w, structure, elimination, fixed, regularization, tell))
+            runs.append(
+                self._run_held(solver, w, structure, elimination, fixed, regularization, tell)
+            )
             reach = elimination.bounded and not elimination.decoupled
             return self.coordinates(runs[-1]) if reach and runs[-1].ending.usable else None
 
@@ -217,14 +263,20 @@ class OneStepTask(TrainingRows):
         ridge, evidence = ridge_of(regularization)
         if solver.gauss_newton and not structure.from_initial:
             options: dict[str, Any] = {"ridge": ridge, "evidence": evidence, "progress": progress}
-            options["noticeable"] = noticeable_fall(structure, elimination.decoupled, self.problem.samples)
+            options["noticeable"] = noticeable_fall(
+                structure, elimination.decoupled, self.problem.samples
+            )
             if regularization == "ard":
                 options["groups"] = self.bound.groups()
             if self.checkpoints is not None:
-                options["kept"] = self.checkpoints.of_run(np.asarray(w), regularization, structure.name, *hold)
+                options["kept"] = self.checkpoints.of_run(
+                    np.asarray(w), regularization, structure.name, *hold
+                )
             return self._least_squares(solver, w, hold, options)
         check_joint(solver, ridge, evidence, resident=self.engine.resident)
-        physics = Physics.of(self.problem, elimination, fixed, ridge, self.rms, solved=structure.projects)
+        physics = Physics.of(
+            self.problem, elimination, fixed, ridge, self.rms, solved=structure.projects
+        )
         if solver.gauss_newton:
             end = self._joint_least_squares(solver, w, physics, progress)
         else:
@@ -232,13 +284,17 @@ class OneStepTask(TrainingRows):
             end = solver.minimise(joint, w, self.rows, physics, progress=progress)
         normal = linearise(OneStep(self.bound), end.w, (self.rows, hold), self._nothing)
         coordinates = np.asarray(physics.start + physics.basis @ end.v) * self.rms
-        coefficients = None if structure.projects else self.problem.projection.from_coordinates(coordinates)
+        coefficients = (
+            None if structure.projects else self.problem.projection.from_coordinates(coordinates)
+        )
         effective = float(compiled.effective_weights(normal, ridge))
         return compiled.TrainingRun(
             end.w, normal, ridge, effective, end.iterations, end.ending, end.seconds, coefficients
         )
 
-    def _joint_least_squares(self, solver: Any, w: Any, physics: Physics, progress: RunProgress) -> GradientRun:
+    def _joint_least_squares(
+        self, solver: Any, w: Any, physics: Physics, progress: RunProgress
+    ) -> GradientRun:
         """Levenberg-Marquardt over θ, from θ⁰, and the weights together."""
         assert self.bound is not None
         nt = len(physics.outputs)
@@ -246,16 +302,22 @@ class OneStepTask(TrainingRows):
         unknowns = np.concatenate([np.zeros(nt), w])
         options: dict[str, Any] = {"samples": self.problem.samples, "progress": progress}
         options["noticeable"] = noticeable_in(self.problem.samples)
-        end = solver.minimise(JointOneStep(self.bound), unknowns, (self.rows, physics), nothing, **options)
+        end = solver.minimise(
+            JointOneStep(self.bound), unknowns, (self.rows, physics), nothing, **options
+        )
         return GradientRun(end.w[:nt], end.w[nt:], end.iterations, end.ending, end.seconds)
 
-    def _least_squares(self, solver: Any, w: Any, hold: Hold, options: dict[str, Any]) -> compiled.TrainingRun:
+    def _least_squares(
+        self, solver: Any, w: Any, hold: Hold, options: dict[str, Any]
+    ) -> compiled.TrainingRun:
         """Levenberg-Marquardt: compiled whole where the rows are in memory, otherwise driven by the host."""
         assert self.bound is not None
         samples = self.problem.samples - len(self.problem.baseline.names)
         if self.engine.resident:
             criterion, arguments = OneStep(self.bound), (self.rows, hold)
-            return solver.minimise(criterion, w, arguments, self._nothing, samples=samples, **options)
+            return solver.minimise(
+                criterion, w, arguments, self._nothing, samples=samples, **options
+            )
         summed = SummedOneStep(self.engine, self.bound, self.rows, hold)
         return solver.drive(summed, jnp.asarray(w), self._nothing, samples=samples, **options)
 
@@ -298,11 +360,13 @@ class OneStepTask(TrainingRows):
     def median(self, members: list[TrainedLearner], best: int) -> TrainedLearner:
         """Return the median of several: `g = φ c̄ + median_i(f_i + φ (c_i − c̄))`, each with its own c_i (F2).
 
-        The median is one function of the regressor again, and split like any other. It lacks some statistics: those
-        are taken from the `best` member.
+        The median is one function of the regressor again, and split like any other. It lacks some
+        statistics: those are taken from the `best` member.
         """
         coefficients = [
-            split_theta(Additive(), self.problem, self.share(member).coordinates, fixed=member.fixed or {}).theta
+            split_theta(
+                Additive(), self.problem, self.share(member).coordinates, fixed=member.fixed or {}
+            ).theta
             if member.coefficients is None
             else member.coefficients
             for member in members
@@ -319,13 +383,18 @@ class OneStepTask(TrainingRows):
         )
 
     def gram(self, run: compiled.TrainingRun) -> Matrix:
-        """Gram matrix of `[Φ J]` in whitened outputs, from the run's last pass; of a held run without the hold."""
+        """Gram matrix of `[Φ J]` in whitened outputs, from the run's last pass.
+
+        Of a held run without the hold.
+        """
         normal = run.normal
         if run.held:
             nt = len(normal.overlap.values)
             free = Hold(np.zeros((nt, nt)), np.zeros(nt))
             assert self.bound is not None
-            normal = SummedOneStep(self.engine, self.bound, self.rows, free)(np.asarray(run.w), normal.overlap)
+            normal = SummedOneStep(self.engine, self.bound, self.rows, free)(
+                np.asarray(run.w), normal.overlap
+            )
         overlap = np.asarray(normal.overlap.jacobian) * self.rms
         to_phi = self.problem.projection.to_coordinates
         inner = np.asarray(normal.hessian) * self.rms**2 + overlap.T @ overlap

@@ -31,14 +31,26 @@ class Physics(NamedTuple):
 
     @classmethod
     def of(
-        cls, problem: Problem, elimination: Elimination, fixed: Fixed, ridge: float, rms: float, *, solved: bool
+        cls,
+        problem: Problem,
+        elimination: Elimination,
+        fixed: Fixed,
+        ridge: float,
+        rms: float,
+        *,
+        solved: bool,
     ) -> Physics:
-        """θ that starts at θ⁰. A free entry has a column, scaled to the size of a row; a fixed one has none.
+        """θ that starts at θ⁰. A free entry has a column, scaled to the size of a row.
 
-        Where θ is `solved` (F1), it stands at its end and has no columns: the learner's path does not depend on it.
+        A fixed one has none.
+
+        Where θ is `solved` (F1), it stands at its end and has no columns: the learner's path does
+        not depend on it.
         """
         to_rows = elimination.to_coordinates / rms
-        initial = np.array([fixed.get(i, value) for i, value in enumerate(problem.baseline.initial)])
+        initial = np.array(
+            [fixed.get(i, value) for i, value in enumerate(problem.baseline.initial)]
+        )
         free = np.array([float(i not in fixed) for i in range(len(initial))])
         nt = len(initial)
         scale = free * np.sqrt(problem.count) / np.linalg.norm(to_rows, axis=0) if nt else free
@@ -72,7 +84,10 @@ class PaperCriterion:
     orthogonal: bool
 
     def __call__(
-        self, unknowns: tuple[Float[Array, "nt"], Float[Array, "nw"]], chunks: Chunk, physics: Physics
+        self,
+        unknowns: tuple[Float[Array, "nt"], Float[Array, "nw"]],
+        chunks: Chunk,
+        physics: Physics,
     ) -> Float[Array, ""]:
         v, w = unknowns
         miss = physics.outputs - physics.start - physics.basis @ v  # QᵀY − Rθ
@@ -82,7 +97,9 @@ class PaperCriterion:
         total = total + (miss @ miss if self.orthogonal else jnp.sum((miss - share) ** 2))
         return (total + physics.ridge * (w @ w)) / physics.samples
 
-    def _sums(self, w: Float[Array, "nw"], chunk: Chunk) -> tuple[Float[Array, ""], Float[Array, "nt"]]:
+    def _sums(
+        self, w: Float[Array, "nw"], chunk: Chunk
+    ) -> tuple[Float[Array, ""], Float[Array, "nt"]]:
         """‖P⊥Y − F‖² and QᵀF of one chunk."""
         row_values = jax.vmap(self.bound.values, in_axes=(None, -1), out_axes=-1)
         values = jnp.sum(chunk.gain * row_values(w, chunk.z), axis=1)
@@ -95,12 +112,18 @@ class JointOneStep:
 
     bound: Bound
 
-    def __call__(self, p: Float[Array, "n"], rows: Chunk, physics: Physics, before: Overlap) -> Normal:
+    def __call__(
+        self, p: Float[Array, "n"], rows: Chunk, physics: Physics, before: Overlap
+    ) -> Normal:
         nt = len(physics.outputs)
         v, w = p[:nt], p[nt:]
-        known = Overlap(before.jacobian[:, nt:], before.values)  # of QᵀJ and QᵀF, subtracted from the rows
+        known = Overlap(
+            before.jacobian[:, nt:], before.values
+        )  # of QᵀJ and QᵀF, subtracted from the rows
         blocks, free = Blocks(self.bound), Hold(jnp.zeros((nt, nt)), jnp.zeros(nt))
-        rest = collect(row_sum(lambda chunk: blocks(chunk, w, known), rows), free, known)  # what is orthogonal to Q
+        rest = collect(
+            row_sum(lambda chunk: blocks(chunk, w, known), rows), free, known
+        )  # what is orthogonal to Q
         share = rest.overlap
         miss = physics.outputs - physics.start - physics.basis @ v - share.values  # Qᵀ(Y − Φθ − F)
         slope = jnp.concatenate([physics.basis, share.jacobian], axis=1)  # Qᵀ of all columns

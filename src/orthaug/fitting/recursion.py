@@ -1,8 +1,9 @@
 """Weighted least squares row by row: a triangular factor that each row updates by QR, with exponential forgetting.
 
-With weights `w_i = λ^(k−i)` and `e₀ = y − φθ₀` the factor has `[R z]ᵀ[R z] = Σ w [φ e₀]ᵀ[φ e₀]`, so `θ = θ₀ + R⁻¹z`:
-`ΦᵀΦ` is never formed, and rounding adds up against the change of θ only. The covariance needs the squared weights too:
-`Cov θ = s² I⁻¹ M I⁻¹`, `I = RᵀR`, `M = Σ w² φᵀφ`. `EstimateHistory` keeps what it is made of, row by row, within bounds.
+With weights `w_i = λ^(k−i)` and `e₀ = y − φθ₀` the factor has `[R z]ᵀ[R z] = Σ w [φ e₀]ᵀ[φ e₀]`, so
+`θ = θ₀ + R⁻¹z`: `ΦᵀΦ` is never formed, and rounding adds up against the change of θ only. The
+covariance needs the squared weights too: `Cov θ = s² I⁻¹ M I⁻¹`, `I = RᵀR`, `M = Σ w² φᵀφ`.
+`EstimateHistory` keeps what it is made of, row by row, within bounds.
 """
 
 from __future__ import annotations
@@ -19,7 +20,9 @@ from orthaug.inference.covariance import interval
 
 _DETERMINED = 1e-12  # smallest singular value of R with unit columns that tells all of θ
 _KEPT = 0.1
-"""Share of the information of a whole memory of training rows that forgetting leaves in every direction of θ."""
+"""Share of the information of a whole memory of training rows that forgetting leaves in every
+direction of θ.
+"""
 MOST = 10_000
 """Rows that a course keeps; of more every second one, every fourth, and so on."""
 
@@ -28,10 +31,10 @@ MOST = 10_000
 class Recursion:
     """The state of recursive least squares; `update` changes it.
 
-    `factor` (nθ+1, nθ+1) is `[R z]` above a row that is not used; `squared` is M. `level` is s², the mean square of
-    whitened errors, `_errors / _freedom`. `rows` and `rows_squared` are Σw and Σw². Where `floor` is given, directions
-    whose information has come down to `floorᵀ floor` are not forgotten further, so that rows without excitation do not
-    wind the covariance up.
+    `factor` (nθ+1, nθ+1) is `[R z]` above a row that is not used; `squared` is M. `level` is s²,
+    the mean square of whitened errors, `_errors / _freedom`. `rows` and `rows_squared` are Σw and
+    Σw². Where `floor` is given, directions whose information has come down to `floorᵀ floor` are
+    not forgotten further, so that rows without excitation do not wind the covariance up.
     """
 
     factor: Matrix
@@ -108,7 +111,9 @@ class Recursion:
         scaled = r / np.where(norms > 0, norms, 1.0)
         size = np.linalg.svd(scaled, compute_uv=False)
         self.determined = bool(size[-1] > _DETERMINED * size[0])
-        change = np.linalg.lstsq(scaled, z, rcond=_DETERMINED)[0]  # the least that explains the rows
+        change = np.linalg.lstsq(scaled, z, rcond=_DETERMINED)[
+            0
+        ]  # the least that explains the rows
         return self.start + change / np.where(norms > 0, norms, 1.0)
 
     def _forget(self) -> None:
@@ -168,7 +173,9 @@ def started(
         empty: begin without them; they still say what the floor is.
     """
     count, ny, nt = phi.shape
-    whole = np.linalg.qr(np.column_stack([phi.reshape(-1, nt), (target - phi @ theta).ravel()]), mode="r")
+    whole = np.linalg.qr(
+        np.column_stack([phi.reshape(-1, nt), (target - phi @ theta).ravel()]), mode="r"
+    )
     factor = np.zeros((nt + 1, nt + 1))
     factor[: len(whole)] = whole
     memory = 1 / (1 - forgetting) if forgetting < 1 else np.inf
@@ -192,15 +199,17 @@ def started(
 
 def squares(phi: Float[np.ndarray, "N ny nt"], shape: Matrix) -> Matrix:
     """M of rows of equal weight (nθ, nθ)."""
-    return phi[:, 0].T @ phi[:, 0] if len(shape) == 1 else np.einsum("kit,ij,kjs->ts", phi, shape, phi)
+    return (
+        phi[:, 0].T @ phi[:, 0] if len(shape) == 1 else np.einsum("kit,ij,kjs->ts", phi, shape, phi)
+    )
 
 
 @dataclass(eq=False)
 class EstimateHistory:
     """A row of numbers for each row of data that was used.
 
-    Columns: the row's number, the level of the alarm (above 1 it stands), s², degrees of freedom, whether θ is told,
-    the residuals (ny), θ (nθ), R and M (nθ² each).
+    Columns: the row's number, the level of the alarm (above 1 it stands), s², degrees of freedom,
+    whether θ is told, the residuals (ny), θ (nθ), R and M (nθ² each).
     """
 
     ny: int
@@ -213,7 +222,9 @@ class EstimateHistory:
         """All that is kept (k, columns)."""
         return np.reshape(self._lines, (-1, 5 + self.ny + self.nt + 2 * self.nt**2))
 
-    def line(self, row: int, level: float, freedom: float, residual: Vector, recursion: Recursion) -> Vector:
+    def line(
+        self, row: int, level: float, freedom: float, residual: Vector, recursion: Recursion
+    ) -> Vector:
         """Return what is kept of a row."""
         line = np.empty(5 + self.ny + self.nt + 2 * self.nt**2)
         first, second = 5 + self.ny, 5 + self.ny + self.nt
@@ -249,7 +260,9 @@ class EstimateHistory:
     def covariances(self, inflation: Matrix | None) -> Float[np.ndarray, "k nt nt"]:
         """Cov θ of every row; NaN where there is none."""
         squares = self.rows[:, 5 + self.ny + self.nt :].reshape(-1, 2, self.nt, self.nt)
-        return covariances(squares[:, 0], squares[:, 1], self.rows[:, 2], self.rows[:, 4] > 0, inflation)
+        return covariances(
+            squares[:, 0], squares[:, 1], self.rows[:, 2], self.rows[:, 4] > 0, inflation
+        )
 
     def intervals(self, inflation: Matrix | None) -> Float[np.ndarray, "k nt 2"]:
         """95 % intervals of θ."""
@@ -274,10 +287,13 @@ def covariances(
     return result
 
 
-def inflation_of(r: Matrix, squared: Matrix, level: float, covariance: Matrix | None) -> Matrix | None:
+def inflation_of(
+    r: Matrix, squared: Matrix, level: float, covariance: Matrix | None
+) -> Matrix | None:
     """G of a fit: its covariance in units of `s² I⁻¹ M I⁻¹`; None where it has none.
 
-    It holds what else makes θ uncertain: the learner beside it, or the colour of the errors (`fit.robust()`).
+    It holds what else makes θ uncertain: the learner beside it, or the colour of the errors
+    (`fit.robust()`).
     """
     if covariance is None or not np.isfinite(covariance).all() or not level > 0:
         return None
@@ -285,10 +301,14 @@ def inflation_of(r: Matrix, squared: Matrix, level: float, covariance: Matrix | 
     return np.linalg.solve(half, np.linalg.solve(half, covariance).T) / level
 
 
-def _half(r: Float[np.ndarray, "k nt nt"], squared: Float[np.ndarray, "k nt nt"]) -> Float[np.ndarray, "k nt nt"]:
+def _half(
+    r: Float[np.ndarray, "k nt nt"], squared: Float[np.ndarray, "k nt nt"]
+) -> Float[np.ndarray, "k nt nt"]:
     """`S = R⁻¹ (R⁻ᵀ M R⁻¹)^½` of factors that are made unique by a positive diagonal."""
     r = upright(r)
     unit = np.linalg.norm(r, axis=1, keepdims=True)  # of the columns
     inverse = np.swapaxes(unit, 1, 2) ** -1 * np.linalg.inv(r / unit)
     values, vectors = np.linalg.eigh(np.swapaxes(inverse, 1, 2) @ squared @ inverse)
-    return inverse @ ((vectors * np.sqrt(np.maximum(values, 0.0))[:, None]) @ np.swapaxes(vectors, 1, 2))
+    return inverse @ (
+        (vectors * np.sqrt(np.maximum(values, 0.0))[:, None]) @ np.swapaxes(vectors, 1, 2)
+    )

@@ -1,8 +1,8 @@
 """θ followed online: recursive least squares with the learner fixed, intervals, and an alarm.
 
-With f and θ_aux fixed, the fitted model is linear in θ: `y − known − (f − φθ_aux) = φθ + e`. Over the training rows its
-least-squares solution is the fit's θ, whatever the structure's split: `Φ⁺(Y − F) + θ_aux = c + θ_aux` (F1, F2). New
-rows go on from there.
+With f and θ_aux fixed, the fitted model is linear in θ: `y − known − (f − φθ_aux) = φθ + e`. Over
+the training rows its least-squares solution is the fit's θ, whatever the structure's split: `Φ⁺(Y −
+F) + θ_aux = c + θ_aux` (F1, F2). New rows go on from there.
 """
 
 from __future__ import annotations
@@ -15,7 +15,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from orthaug._base.checks import Matrix, Vector, check_choice, check_count, check_number, check_type, is_number
+from orthaug._base.checks import (
+    Matrix,
+    Vector,
+    check_choice,
+    check_count,
+    check_number,
+    check_type,
+    is_number,
+)
 from orthaug._base.errors import InputError, shown
 from orthaug._base.jax import jax
 from orthaug._base.lines import percent
@@ -23,7 +31,14 @@ from orthaug.data.record import Record
 from orthaug.fitting import recursive_storage
 from orthaug.fitting.estimates import Estimate, order_of, parameter_frame, parameter_lines
 from orthaug.fitting.recursion import EstimateHistory, covariances
-from orthaug.fitting.recursive_rows import RegressorStream, WhitenedRows, begin, joined_rows, trained, whitened_rows
+from orthaug.fitting.recursive_rows import (
+    RegressorStream,
+    WhitenedRows,
+    begin,
+    joined_rows,
+    trained,
+    whitened_rows,
+)
 from orthaug.fitting.residual_band import ResidualMonitor
 from orthaug.inference.covariance import interval
 from orthaug.inference.physical import PhysicalEstimate, solve
@@ -54,16 +69,15 @@ class Alarm(NamedTuple):
 class Recursive:
     """A fitted model whose θ follows new rows, the learner fixed.
 
-    Args:
-        fit: of `estimate`, one step ahead, or a saved model.
-        training: the record that a saved model was trained on; an `Estimate` knows it.
-        forgetting: λ in (0, 1], the weight of a row against the next one; 1 (default) forgets nothing.
-        memory: the same in seconds, `λ = exp(−Ts / memory)`.
-        start: "fit" begins with the training rows, at most as many as one memory holds; "empty" without them.
-        quiet: rows between false alarms, at least on average, while nothing changes.
+    Args: fit: of `estimate`, one step ahead, or a saved model. training: the record that a saved
+        model was trained on; an `Estimate` knows it. forgetting: λ in (0, 1], the weight of a row
+        against the next one; 1 (default) forgets nothing. memory: the same in seconds, `λ = exp(−Ts
+        / memory)`. start: "fit" begins with the training rows, at most as many as one memory holds;
+        "empty" without them. quiet: rows between false alarms, at least on average, while nothing
+        changes.
 
-    Raises:
-        InputError: a motion, a fit of the free run, a θ that is not the least squares of its rows (a bound, a penalty).
+    Raises: InputError: a motion, a fit of the free run, a θ that is not the least squares of its
+        rows (a bound, a penalty).
 
     Examples:
         >>> import numpy as np
@@ -96,7 +110,14 @@ class Recursive:
         recursion, reference, inflation = begin(began, factor, quiet, empty=start == "empty")
         self._set(began.model, recursion, ResidualMonitor(reference), inflation, began.used)
 
-    def _set(self, model: Model, recursion: Any, watch: ResidualMonitor, inflation: Matrix | None, used: float) -> None:
+    def _set(
+        self,
+        model: Model,
+        recursion: Any,
+        watch: ResidualMonitor,
+        inflation: Matrix | None,
+        used: float,
+    ) -> None:
         self._fitted, self._recursion, self._watch = model, recursion, watch
         self._inflation, self._used = inflation, used
         self._numbers = jax.device_put(model.numbers)
@@ -107,7 +128,9 @@ class Recursive:
         self.alarms: tuple[Alarm, ...] = ()
 
     @classmethod
-    def load(cls, folder: str | Path, *, baseline: Baseline | None = None, learner: Learner | None = None) -> Recursive:
+    def load(
+        cls, folder: str | Path, *, baseline: Baseline | None = None, learner: Learner | None = None
+    ) -> Recursive:
         """Go on from where `save` was called.
 
         Args:
@@ -138,7 +161,15 @@ class Recursive:
 
     def _kept(self) -> recursive_storage.RecursiveState:
         alarms = np.array([alarm.row for alarm in self.alarms], dtype=float)
-        state = (self._fitted, self._recursion, self._watch, self._inflation, self._used, self._tail, self._rows_kept)
+        state = (
+            self._fitted,
+            self._recursion,
+            self._watch,
+            self._inflation,
+            self._used,
+            self._tail,
+            self._rows_kept,
+        )
         return recursive_storage.RecursiveState(*state, self.rows, self.outside, alarms)
 
     def update(
@@ -146,17 +177,18 @@ class Recursive:
     ) -> Sequence[Alarm]:
         """Follow new rows, one or many; they follow on the last ones.
 
-        Args:
-            record: with the model's channels. Every experiment after the first begins after a gap.
-            u, y: instead of a record inputs and outputs, one row or many; NaN is a missing sample. Rows that read one
+        Args: record: with the model's channels. Every experiment after the first begins after a
+            gap. u, y: instead of a record inputs and outputs, one row or many; NaN is a missing
+            sample. Rows that read one
                 are left out.
-            gap: whether these rows do not follow on the last ones: then the first lags are history only.
+            gap: whether these rows do not follow on the last ones: then the first lags are history
+                only.
 
         Returns:
             The alarms that these rows raised.
 
-        Raises:
-            InputError: other channels or sampling time, values that are infinite; nothing is changed then.
+        Raises: InputError: other channels or sampling time, values that are infinite; nothing is
+            changed then.
         """
         check_type(gap, bool, "gap", "true or false")
         begins: list[bool] = []
@@ -164,7 +196,9 @@ class Recursive:
         tail = self._tail
         for i, rows in enumerate(self._parts(record, u, y)):
             begins.append(gap or i > 0)
-            x, complete, tail = self._lagging.regressors(self._lagging.nothing if begins[-1] else tail, rows)
+            x, complete, tail = self._lagging.regressors(
+                self._lagging.nothing if begins[-1] else tail, rows
+            )
             prepared.append(self._whitened(x, complete, rows))
         told = []
         for begun, (used, whitened, count) in zip(begins, prepared, strict=True):
@@ -186,7 +220,9 @@ class Recursive:
         record = model.fitting(record, need_outputs=True)
         return [np.concatenate([e.outputs, e.inputs], axis=1) for e in record.experiments]
 
-    def _whitened(self, x: Matrix, complete: Any, rows: Matrix) -> tuple[Any, WhitenedRows | None, int]:
+    def _whitened(
+        self, x: Matrix, complete: Any, rows: Matrix
+    ) -> tuple[Any, WhitenedRows | None, int]:
         """Which rows are used, and what θ is least squares of in them."""
         used = np.flatnonzero(complete)
         if not len(used):
@@ -218,7 +254,9 @@ class Recursive:
         """Degrees of freedom of s²: effective rows less what parameters and, as long as its rows count, learner use."""
         recursion = self._recursion
         used = self._used * recursion.oldest
-        return max(recursion.effective_rows * len(self._fitted.outputs) - len(self.theta) - used, 1.0)
+        return max(
+            recursion.effective_rows * len(self._fitted.outputs) - len(self.theta) - used, 1.0
+        )
 
     @property
     def theta(self) -> Vector:
@@ -227,12 +265,17 @@ class Recursive:
 
     @property
     def covariance(self) -> Matrix | None:
-        """Cov θ now (nθ, nθ): of noise, the learner fixed; None where the fit has none or the rows do not tell θ."""
+        """Cov θ now (nθ, nθ): of noise, the learner fixed.
+
+        None where the fit has none or the rows do not tell θ.
+        """
         recursion = self._recursion
         if self._inflation is None or not recursion.determined:
             return None
         level, told = np.array([recursion.level]), np.array([True])
-        return covariances(recursion.factor_now[None], recursion.squared[None], level, told, self._inflation)[0]
+        return covariances(
+            recursion.factor_now[None], recursion.squared[None], level, told, self._inflation
+        )[0]
 
     @property
     def std(self) -> Vector | None:
@@ -273,21 +316,26 @@ class Recursive:
 
     @property
     def model(self) -> Model:
-        """The fitted model with θ of now, to simulate and predict with; its statistics were those of training."""
+        """The fitted model with θ of now, to simulate and predict with.
+
+        Its statistics were those of training.
+        """
         numbers = self._fitted.numbers._replace(theta=self.theta)
         return replace(self._fitted, numbers=numbers, statistics=Statistics())
 
     @property
     def parameters(self) -> pd.DataFrame:
         """Table with a row per parameter: unit, initial, value now, std, and the 95 % interval."""
-        return parameter_frame(self._fitted.form.baseline.parameters, self.theta, self.std, self.interval)
+        return parameter_frame(
+            self._fitted.form.baseline.parameters, self.theta, self.std, self.interval
+        )
 
     @property
     def history(self) -> pd.DataFrame:
         """A row per row that was used: time [s], residual of each output, each θ with its interval, alarm level.
 
-        `alarm` is the largest sum over its limit: above 1 the residual is out of its band. Of more than 10 000 rows
-        every second one is kept, every fourth, and so on.
+        `alarm` is the largest sum over its limit: above 1 the residual is out of its band. Of more
+        than 10 000 rows every second one is kept, every fourth, and so on.
         """
         import pandas as pd
 
@@ -298,7 +346,11 @@ class Recursive:
         columns: dict[str, Any] = {"time": rows[:, 0] * model.sampling_time}
         columns |= {f"residual_{c.name}": residual[:, i] for i, c in enumerate(model.outputs)}
         for i, name in enumerate(model.form.baseline.names):
-            columns |= {name: kept_rows.theta[:, i], f"{name}_low": ci[:, i, 0], f"{name}_high": ci[:, i, 1]}
+            columns |= {
+                name: kept_rows.theta[:, i],
+                f"{name}_low": ci[:, i, 0],
+                f"{name}_high": ci[:, i, 1],
+            }
         columns["alarm"] = kept_rows.alarm
         return pd.DataFrame(columns, index=pd.Index(rows[:, 0].astype(int), name="row"))
 
@@ -318,8 +370,16 @@ class Recursive:
         import pandas as pd
 
         order, kept_rows = self._in_order_of(physics), self._rows_kept
-        rows, theta, spread = kept_rows.rows, kept_rows.theta, kept_rows.covariances(self._inflation)
-        places = np.linspace(len(rows) - 1, 0, check_count(points, "points")) if len(rows) else np.zeros(0)
+        rows, theta, spread = (
+            kept_rows.rows,
+            kept_rows.theta,
+            kept_rows.covariances(self._inflation),
+        )
+        places = (
+            np.linspace(len(rows) - 1, 0, check_count(points, "points"))
+            if len(rows)
+            else np.zeros(0)
+        )
         chosen = np.unique(places.round().astype(int))
         lines = []
         for k in chosen:
@@ -339,29 +399,43 @@ class Recursive:
     def __repr__(self) -> str:
         names = self._fitted.form.baseline.names
         values = ", ".join(f"{n} = {v:.6g}" for n, v in zip(names, self.theta, strict=True))
-        return f"Recursive({self.rows} rows, forgetting {self.forgetting:g}, {len(self.alarms)} alarms, {values})"
+        return (
+            f"Recursive({self.rows} rows, forgetting {self.forgetting:g}, {len(self.alarms)} "
+            f"alarms, {values})"
+        )
 
     def summary(self) -> str:
         """Return a page of text: rows, memory, parameters, alarms."""
         step = self._fitted.sampling_time
-        memory = "everything" if self.forgetting == 1 else f"{-step / math.log(self.forgetting):.4g} s"
+        memory = (
+            "everything" if self.forgetting == 1 else f"{-step / math.log(self.forgetting):.4g} s"
+        )
         lines = [
             f"rows        {self.rows}, {self.rows * step:g} s",
-            f"memory      {memory} (forgetting {self.forgetting:.8g}), worth {self.effective_rows:.0f} rows",
-            f"alarms      {'; '.join(map(str, self.alarms)) or 'none'}{' (it stands)' if self.alarmed else ''}",
+            f"memory      {memory} (forgetting {self.forgetting:.8g}), worth "
+            f"{self.effective_rows:.0f} rows",
+            "alarms      "
+            f"{'; '.join(map(str, self.alarms)) or 'none'}{' (it stands)' if self.alarmed else ''}",
         ]
         if self.outside:
             lines.append(f"outside     {outside_text(self.outside, self.rows)}")
         if self.std is None:
-            lines.append("intervals   none: the fit has no standard errors, or the rows do not tell θ yet")
-        rows = parameter_lines(self._fitted.form.baseline.parameters, self.theta, self.std, self.interval)
+            lines.append(
+                "intervals   none: the fit has no standard errors, or the rows do not tell θ yet"
+            )
+        rows = parameter_lines(
+            self._fitted.form.baseline.parameters, self.theta, self.std, self.interval
+        )
         return "\n".join([*lines, "", *rows])
 
 
 def outside_text(outside: int, rows: int) -> str:
     """Return how many rows the learner extrapolates on."""
     share = f"{percent(outside / rows)} of the rows"
-    return f"the learner's inputs leave those of training on {share}: it extrapolates there, which raises no alarm"
+    return (
+        f"the learner's inputs leave those of training on {share}: it extrapolates there, "
+        "which raises no alarm"
+    )
 
 
 def forgetting_factor(forgetting: Any, memory: Any, sampling_time: float) -> float:
@@ -375,10 +449,15 @@ def forgetting_factor(forgetting: Any, memory: Any, sampling_time: float) -> flo
     if memory is not None:
         seconds = check_number(memory, "memory", positive=True)
         if seconds < sampling_time:
-            raise InputError(f"`memory` must be at least one sampling time, {sampling_time:g} s; got {shown(memory)}.")
+            raise InputError(
+                f"`memory` must be at least one sampling time, {sampling_time:g} s; got "
+                f"{shown(memory)}."
+            )
         return math.exp(-sampling_time / seconds)
     if forgetting is None:
         return 1.0
     if not is_number(forgetting) or not _LEAST_FACTOR <= forgetting <= 1:
-        raise InputError(f"`forgetting` must lie between {_LEAST_FACTOR:g} and 1; got {shown(forgetting)}.")
+        raise InputError(
+            f"`forgetting` must lie between {_LEAST_FACTOR:g} and 1; got {shown(forgetting)}."
+        )
     return float(forgetting)

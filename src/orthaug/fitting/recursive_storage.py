@@ -69,7 +69,9 @@ def _arrays(kept: RecursiveState) -> dict[str, Any]:
         "totals": np.array(watch.totals),
         "tail": kept.tail,
         "course": kept_rows.rows,
-        "counted": np.array([kept.used, kept.rows, kept.outside, kept_rows.stride, watch.level, watch.armed]),
+        "counted": np.array(
+            [kept.used, kept.rows, kept.outside, kept_rows.stride, watch.level, watch.armed]
+        ),
         "alarms": kept.alarms,
         **{name: value for name, value in optional.items() if value is not None},
     }
@@ -90,12 +92,18 @@ def load(folder: Any, baseline: Baseline | None, learner: Learner | None) -> Rec
     except ValueError:  # a NUL byte in the name
         there = False
     if not there:
-        raise InputError(f"{folder}: no saved recursive estimate there; expected {_DECLARATION} and {_ARRAYS}.")
+        raise InputError(
+            f"{folder}: no saved recursive estimate there; expected {_DECLARATION} and {_ARRAYS}."
+        )
     path = folder / _DECLARATION
-    declared, arrays = read_packed(path, folder / _ARRAYS, FORMAT, "recursive estimate", "copy it again")
+    declared, arrays = read_packed(
+        path, folder / _ARRAYS, FORMAT, "recursive estimate", "copy it again"
+    )
     model = storage.load(folder / _MODEL, baseline=baseline, learner=learner)
     if not isinstance(model, Model) or declared.get("model") != storage.digest(model):
-        raise InputError(f"{folder}: its model is not the one that was followed; copy the folder again.")
+        raise InputError(
+            f"{folder}: its model is not the one that was followed; copy the folder again."
+        )
     try:
         return _rebuilt(model, arrays)
     except (KeyError, ValueError, IndexError) as error:
@@ -113,8 +121,19 @@ def _rebuilt(model: Model, arrays: dict[str, np.ndarray]) -> RecursiveState:
     watch.counts, watch.totals = [int(n) for n in arrays["counts"]], arrays["totals"].tolist()
     used, rows, outside, stride, watch.level, armed = arrays["counted"].tolist()
     watch.armed = bool(armed)
-    kept_rows = EstimateHistory(len(model.outputs), len(model.theta), int(stride), list(arrays["course"]))
+    kept_rows = EstimateHistory(
+        len(model.outputs), len(model.theta), int(stride), list(arrays["course"])
+    )
     tail, alarms = arrays["tail"].copy(), arrays["alarms"]
     return RecursiveState(
-        model, recursion, watch, arrays.get("inflation"), used, tail, kept_rows, int(rows), int(outside), alarms
+        model,
+        recursion,
+        watch,
+        arrays.get("inflation"),
+        used,
+        tail,
+        kept_rows,
+        int(rows),
+        int(outside),
+        alarms,
     )

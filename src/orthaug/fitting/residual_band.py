@@ -1,13 +1,14 @@
 """An alarm when residuals leave their band: cumulative sums of the likelihood of a doubled variance, at several scales.
 
-Residuals are whitened by their covariance and colour over the training rows, then summed over blocks of 1, 4, 16 and 64
-rows, since what a changed system adds is slow beside noise. Of each block's square `y²` the sum
+Residuals are whitened by their covariance and colour over the training rows, then summed over
+blocks of 1, 4, 16 and 64 rows, since what a changed system adds is slow beside noise. Of each
+block's square `y²` the sum
 
     g ← max(0, g + ½ (y²/2 − ln 2))
 
-is the log-likelihood ratio of twice the variance (CUSUM, Page 1954). For independent normal blocks it exceeds h once in
-`e^h` blocks or less often (Lorden 1971). Where training residuals have heavier tails, h is larger by the exponent κ for
-which `exp(κ x)` has mean one over their increments x.
+is the log-likelihood ratio of twice the variance (CUSUM, Page 1954). For independent normal blocks
+it exceeds h once in `e^h` blocks or less often (Lorden 1971). Where training residuals have heavier
+tails, h is larger by the exponent κ for which `exp(κ x)` has mean one over their increments x.
 """
 
 from __future__ import annotations
@@ -22,7 +23,9 @@ from orthaug._base.checks import Matrix, Vector
 
 SCALES = (1, 4, 16, 64)
 _RATIO = 2.0  # of the variance that is looked for
-_LARGEST = 4.0  # deviations: what is beyond counts as that, so that no single outlier raises an alarm
+_LARGEST = (
+    4.0  # deviations: what is beyond counts as that, so that no single outlier raises an alarm
+)
 _GROSS = 10.0
 _HIGHEST = 1.2  # of the limit: so that an alarm ends soon after its cause
 _ARMED = 0.5
@@ -36,9 +39,9 @@ _LEAST_EXPONENT = 0.1
 class Reference:
     """What residuals were like in training.
 
-    `white` (ny, ny) whitens whitened outputs' errors, `colour` (p, ny) are autoregressive coefficients of each, and
-    `deviation` (ny,) is that of what they leave. Of each scale `variance` is that of block sums over √rows, and `limit`
-    the threshold of g.
+    `white` (ny, ny) whitens whitened outputs' errors, `colour` (p, ny) are autoregressive
+    coefficients of each, and `deviation` (ny,) is that of what they leave. Of each scale `variance`
+    is that of block sums over √rows, and `limit` the threshold of g.
     """
 
     white: Matrix
@@ -52,10 +55,9 @@ class Reference:
     def of(cls, stretches: Sequence[Matrix], white: Matrix, used: float, quiet: float) -> Reference:
         """From training errors.
 
-        Args:
-            stretches: whitened outputs' errors of each experiment, (N, ny).
-            white: their whitening.
-            used: share of the rows' degrees of freedom that parameters and learner have used up: by as much their
+        Args: stretches: whitened outputs' errors of each experiment, (N, ny). white: their
+            whitening. used: share of the rows' degrees of freedom that parameters and learner have
+            used up: by as much their
                 errors move new residuals, and slowly.
             quiet: rows between false alarms.
         """
@@ -65,7 +67,9 @@ class Reference:
         rows = np.concatenate(left)
         deviation = np.sqrt(np.mean(rows**2, axis=0))
         deviation = np.where(deviation > 0, deviation, 1.0)
-        scales = tuple(s for s in SCALES if s == 1 or sum(len(e) // s for e in left) >= _FEWEST_BLOCKS)
+        scales = tuple(
+            s for s in SCALES if s == 1 or sum(len(e) // s for e in left) >= _FEWEST_BLOCKS
+        )
         variances, limits = [], []
         for scale in scales:
             blocks = np.concatenate([_blocks(stretch / deviation, scale) for stretch in left])
@@ -93,7 +97,9 @@ class ResidualMonitor:
     def __post_init__(self) -> None:
         reference = self.reference
         self.totals = [0.0] * len(reference.scales)
-        self._root = [math.sqrt(v * s) for v, s in zip(reference.variance, reference.scales, strict=True)]
+        self._root = [
+            math.sqrt(v * s) for v, s in zip(reference.variance, reference.scales, strict=True)
+        ]
         self._limits = [float(limit) for limit in reference.limit]
         self.gap()
 
@@ -117,7 +123,9 @@ class ResidualMonitor:
         left = (residual - expected) / reference.deviation
         clipped = np.minimum(np.maximum(left, -_LARGEST), _LARGEST)
         known = not math.isnan(left[0])
-        if len(reference.colour):  # no innovation is that large: an outlier is not remembered, so that it counts once
+        if len(
+            reference.colour
+        ):  # no innovation is that large: an outlier is not remembered, so that it counts once
             now = np.where(np.abs(left) > _GROSS, expected, residual) if known else residual
             self.past = np.concatenate([now[None], self.past[:-1]])
         if not known:  # the filter is not filled yet
@@ -130,7 +138,9 @@ class ResidualMonitor:
                 self.totals[i] = min(max(0.0, self.totals[i] + step), _HIGHEST * self._limits[i])
                 self.counts[i] = 0
                 self.sums[i] = 0.0
-        self.level = max(total / limit for total, limit in zip(self.totals, self._limits, strict=True))
+        self.level = max(
+            total / limit for total, limit in zip(self.totals, self._limits, strict=True)
+        )
         raised = self.armed and self.level > 1
         self.armed = not raised and (self.armed or self.level < _ARMED)
         return raised
@@ -170,7 +180,10 @@ def _filtered(stretch: Matrix, colour: Matrix) -> Matrix:
 
 
 def _colour(stretches: Sequence[Matrix]) -> Matrix:
-    """Autoregressive coefficients (p, ny); the order p by Schwarz's criterion, the same for all outputs."""
+    """Autoregressive coefficients (p, ny).
+
+    The order p by Schwarz's criterion, the same for all outputs.
+    """
     rows = sum(max(len(stretch) - _MOST_LAGS, 0) for stretch in stretches)
     ny = stretches[0].shape[1]
     most = min(_MOST_LAGS, rows // _ROWS_PER_LAG)

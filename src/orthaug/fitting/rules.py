@@ -20,7 +20,9 @@ from orthaug.physics.motion import Motion
 LONGEST_FIT = 30 * 86400.0  # s
 _RATE, _STEP = 2e10, 2e-4  # products per second and core; seconds of an iteration at least
 _MOST = 10**18  # weights or runs; more are as impossible, and would overflow
-_COPIES = 32  # of regressors and outputs, in a fit with its scores and findings; measured on 10⁶ rows
+_COPIES = (
+    32  # of regressors and outputs, in a fit with its scores and findings; measured on 10⁶ rows
+)
 _FEWEST = 50  # iterations that are counted on where more are allowed: most runs converge
 
 
@@ -38,7 +40,9 @@ def check_starts(restarts: int, seed: int, *, ensemble: bool) -> None:
         raise KeyedError(f"`seed` must be below 2**63; got {shown(seed)}.", "seed", words)
     if ensemble and restarts < 2:
         words = f": found {shown(restarts)}; expected 2 or more for an ensemble"
-        raise KeyedError("an ensemble needs `restarts` of 2 or more to be the median of.", "restarts", words)
+        raise KeyedError(
+            "an ensemble needs `restarts` of 2 or more to be the median of.", "restarts", words
+        )
 
 
 def check_scored(criterion: Criterion, longest: int) -> None:
@@ -67,7 +71,8 @@ def check_solver(solver: Solver, criterion: Criterion, regularizations: Sequence
         raise KeyedError(
             "ard regularization is for training one step ahead; take evidence on the free run.",
             "regularization",
-            " = ard; expected none, evidence or a number on the free run, or more than one step ahead",
+            " = ard; expected none, evidence or a number on the free run, or more than one "
+            "step ahead",
         )
     if solver.gauss_newton:
         return
@@ -75,7 +80,8 @@ def check_solver(solver: Solver, criterion: Criterion, regularizations: Sequence
     able = " or ".join(kind for kind, known in SOLVERS.items() if known.gauss_newton)
     if not criterion.one_step:
         raise KeyedError(
-            "only `LevenbergMarquardt` trains on a free run or more than one step ahead; take that solver.",
+            "only `LevenbergMarquardt` trains on a free run or more than one step ahead; take "
+            "that solver.",
             "solver",
             f" = {name} trains one step ahead; expected {able} here",
         )
@@ -123,30 +129,38 @@ def tried(
 def ridge_of(regularization: str | float) -> tuple[float, bool]:
     """Return the ridge α that a run starts with, and whether evidence re-estimates it."""
     evidence = regularization in ("evidence", "ard")
-    return (1.0 if evidence else 0.0 if regularization == "none" else float(regularization)), evidence
+    return (
+        1.0 if evidence else 0.0 if regularization == "none" else float(regularization)
+    ), evidence
 
 
 def check_motion_choices(
-    motion: Motion, learner: Learner | None, structure: Structure, criterion: Criterion, solver: Solver
+    motion: Motion,
+    learner: Learner | None,
+    structure: Structure,
+    criterion: Criterion,
+    solver: Solver,
 ) -> None:
     """Raise InputError for choices that a motion cannot be trained with."""
     states, outputs = motion.learned
     if learner is not None and not (states or outputs):
         raise KeyedError(
-            "there is a learner, but no state and no output of the motion is learned; set `learned` where it is added.",
+            "there is a learner, but no state and no output of the motion is learned; set "
+            "`learned` where it is added.",
             "learner",
             ": no state and no output has `learned = true`; expected one, or kind none",
         )
     if criterion.free_run is None or not criterion.simulates:
         raise KeyedError(
-            "a motion is trained on its free run; take `Simulation(…)`: its states are not measured, so there is no "
-            "error one step ahead.",
+            "a motion is trained on its free run; take `Simulation(…)`: its states are not "
+            "measured, so there is no error one step ahead.",
             "focus",
             " = prediction; expected simulation for a motion, whose states are not measured",
         )
     if not structure.projects:
         raise KeyedError(
-            f"a motion has the orthogonal structure: its parameters are the nearest physics; got {structure.name}.",
+            "a motion has the orthogonal structure: its parameters are the nearest physics; "
+            f"got {structure.name}.",
             "kind",
             f" = {structure.name}; expected orthogonal for a motion",
         )
@@ -162,7 +176,9 @@ def check_joint(solver: Any, ridge: float, evidence: bool, *, resident: bool) ->
     """Raise InputError for what needs θ to be solved, or the solver to see normal equations, one step ahead."""
     if solver.gauss_newton and (ridge or not resident):  # evidence starts with a ridge
         what = "regularization" if ridge else "training on rows that are not in memory"
-        raise InputError(f"{what} needs a solved θ; leave out `from_initial`, which trains θ from θ⁰.")
+        raise InputError(
+            f"{what} needs a solved θ; leave out `from_initial`, which trains θ from θ⁰."
+        )
     if evidence or not resident:
         what = "evidence regularization" if evidence else "training on rows that are not in memory"
         raise InputError(f"{what} needs the Gauss-Newton matrix of the levenberg-marquardt solver.")
@@ -181,13 +197,9 @@ def check_cost(
 ) -> None:
     """Raise InputError where the normal equations do not fit into memory, or training takes longer than a month.
 
-    Args:
-        learner: None for physics alone, which costs nothing; one that cannot tell its `weights` is let pass.
-        rows: usable ones.
-        features, outputs: of the learner.
-        iterations: of a run at most.
-        runs: restarts times regularizations.
-        held: rows that are in memory; None for all.
+    Args: learner: None for physics alone, which costs nothing; one that cannot tell its `weights`
+        is let pass. rows: usable ones. features, outputs: of the learner. iterations: of a run at
+        most. runs: restarts times regularizations. held: rows that are in memory; None for all.
         room: of the workers or devices that add up; None where that is this process.
     """
     held = rows if held is None else held
@@ -198,21 +210,30 @@ def check_cost(
     runs = min(runs, _MOST)
     side_by_side = min(runs, cores)
     what = f"training a learner of {weights} weights" + (f" in {runs} runs" if runs > 1 else "")
-    check_memory(8.0 * (3 * side_by_side * weights**2 + runs * weights + held * (features + outputs)), what)
+    check_memory(
+        8.0 * (3 * side_by_side * weights**2 + runs * weights + held * (features + outputs)), what
+    )
     if room is not None and (size := 8.0 * room.matrices * weights**2) > room.size:
         raise InputError(
-            f"{what} takes {in_words(size)} on each worker or device, for {room.matrices} matrices of its weights; "
-            f"{room.place} has {in_words(room.size)}. Take a smaller learner, or larger workers."
+            f"{what} takes {in_words(size)} on each worker or device, for {room.matrices} "
+            f"matrices of its weights; {room.place} has {in_words(room.size)}. Take a smaller "
+            "learner, or larger workers."
         )
     products = rows * outputs * weights**2 + weights**3 / 3
     seconds = runs * min(iterations, _FEWEST) * max(products / _RATE, _STEP) / cores
     if seconds > LONGEST_FIT:
         raise InputError(
-            f"{what} on {rows} rows would take {_days(seconds)} or more; {_days(LONGEST_FIT)} are the limit. Take "
-            "fewer restarts, a smaller learner, or every n-th row."
+            f"{what} on {rows} rows would take {_days(seconds)} or more; {_days(LONGEST_FIT)} "
+            "are the limit. Take fewer restarts, a smaller learner, or every n-th row."
         )
 
 
 def _days(seconds: float) -> str:
     days = seconds / 86400
-    return f"{days:.0f} days" if days < 1000 else f"{days / 365.25:.3g} years" if math.isfinite(days) else "ages"
+    return (
+        f"{days:.0f} days"
+        if days < 1000
+        else f"{days / 365.25:.3g} years"
+        if math.isfinite(days)
+        else "ages"
+    )

@@ -66,7 +66,9 @@ class Augmented(MultiOutputMixin, RegressorMixin, BaseEstimator):
     _one_column: bool
     _ordered: ClassVar[bool]
 
-    def _estimate(self, record: Record, baseline: Baseline, lags: Lags | None, learner: Any, **more: Any) -> None:
+    def _estimate(
+        self, record: Record, baseline: Baseline, lags: Lags | None, learner: Any, **more: Any
+    ) -> None:
         """Fit, and set the attributes.
 
         Raises:
@@ -77,19 +79,31 @@ class Augmented(MultiOutputMixin, RegressorMixin, BaseEstimator):
         seed = self.random_state
         if seed is None or isinstance(seed, np.random.RandomState):
             seed = int(check_random_state(seed).randint(2**31 - 1))
-        options: dict[str, Any] = {"lags": lags, "learner": learner, "regularization": self.regularization, **more}
+        options: dict[str, Any] = {
+            "lags": lags,
+            "learner": learner,
+            "regularization": self.regularization,
+            **more,
+        }
         options |= {"restarts": self.restarts, "output_weights": self.output_weights}
         options["structure"] = Orthogonal() if self.structure is None else self.structure
         options["solver"] = LevenbergMarquardt() if self.solver is None else self.solver
         try:
-            fit = estimate(record, baseline, seed=check_count(seed, "random_state", least=0), **options)
+            fit = estimate(
+                record, baseline, seed=check_count(seed, "random_state", least=0), **options
+            )
         except InputError as error:
             if not any(f"'{name}' is constant (1)" in str(error) for name in input_names(self)):
                 raise
-            hint = "A column of ones is what PolynomialFeatures adds first: give it include_bias=False."
+            hint = (
+                "A column of ones is what PolynomialFeatures adds first: give it "
+                "include_bias=False."
+            )
             raise InputError(f"{error} {hint}") from None
         if fit.model.form.first_row and not self._ordered:
-            raise InputError("the rows of X have no order, so there are no lags of them; use an AugmentedNARX.")
+            raise InputError(
+                "the rows of X have no order, so there are no lags of them; use an AugmentedNARX."
+            )
         if not fit.status.ok:
             raise TrainingError(fit.status.message)
         self.estimate_: Estimate = fit
@@ -103,15 +117,18 @@ class Augmented(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     @property
     def noise_std_(self) -> np.ndarray | None:
-        """Standard deviation of the noise of each output (n_outputs,); None where no degrees of freedom are left."""
+        """Standard deviation of the noise of each output (n_outputs,).
+
+        None where no degrees of freedom are left.
+        """
         noise = self._fitted().model.statistics.noise
         return None if noise is None else np.sqrt(np.diag(noise))
 
     def set_params(self, **params: Any) -> Any:
         """As of scikit-learn.
 
-        Raises:
-            InputError (a ValueError): a field of a declaration, which is exchanged whole: no `learner__hidden`.
+        Raises: InputError (a ValueError): a field of a declaration, which is exchanged whole: no
+            `learner__hidden`.
         """
         for name in params:
             own, field, rest = name.partition("__")
@@ -166,7 +183,9 @@ def check_there(values: np.ndarray) -> None:
     """Raise InputError for a row (n, n_outputs) on which the model has no value."""
     bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
     if bad.size:
-        raise InputError(f"the model has no finite value at row {bad[0]} of X; look at the physics there.")
+        raise InputError(
+            f"the model has no finite value at row {bad[0]} of X; look at the physics there."
+        )
 
 
 def input_names(estimator: Any) -> tuple[str, ...]:
@@ -186,7 +205,9 @@ def output_names(y: Any, columns: int, inputs: Sequence[str]) -> tuple[str, ...]
     """
     given = getattr(y, "columns", [getattr(y, "name", None)])
     named = [str(name) for name in given]
-    if len(set(named)) == columns and all(is_name(n) and n not in (*inputs, *_TAKEN, "None") for n in named):
+    if len(set(named)) == columns and all(
+        is_name(n) and n not in (*inputs, *_TAKEN, "None") for n in named
+    ):
         return tuple(named)
     return tuple(_free("y" if columns == 1 else f"y{j}", inputs) for j in range(columns))
 
@@ -206,7 +227,10 @@ def at_now(text: str, names: Sequence[str]) -> str:
 
 
 def learner_of(given: Any, names: Sequence[str] = ()) -> Any:
-    """Return the learner of a parameter, "auto" for `MLP()`; the columns `names` in its expressions become channels."""
+    """Return the learner of a parameter, "auto" for `MLP()`.
+
+    The columns `names` in its expressions become channels.
+    """
     if isinstance(given, str) and given == "auto":
         return MLP()
     if not is_dataclass(given) or isinstance(given, type):
@@ -219,12 +243,13 @@ def learner_of(given: Any, names: Sequence[str] = ()) -> Any:
     return replace(given, **changed) if changed else given
 
 
-def baseline_of(physics: Any, layout: Layout, outputs: Sequence[str], names: Sequence[str] = ()) -> Baseline:
+def baseline_of(
+    physics: Any, layout: Layout, outputs: Sequence[str], names: Sequence[str] = ()
+) -> Baseline:
     """Return the physics of a parameter.
 
-    Args:
-        physics: "linear", expressions, `Term`s, a mapping of parameters to expressions, a Baseline, or a JAX function.
-        layout: the regressor, for "linear" and for a function.
+    Args: physics: "linear", expressions, `Term`s, a mapping of parameters to expressions, a
+        Baseline, or a JAX function. layout: the regressor, for "linear" and for a function.
         outputs: with several, every expression has a parameter of its own for each, `gain_y0`.
         names: columns that may stand in expressions without an instant.
 
@@ -242,9 +267,15 @@ def baseline_of(physics: Any, layout: Layout, outputs: Sequence[str], names: Seq
             )
         return Baseline.from_function(physics, [f"theta{i + 1}" for i in range(shape[1])])
     if isinstance(physics, str) and physics == "linear":
-        line = {(f"{lag.channel}_{lag.lag}" if lag.lag else lag.channel): str(lag) for lag in layout}
+        line = {
+            (f"{lag.channel}_{lag.lag}" if lag.lag else lag.channel): str(lag) for lag in layout
+        }
         physics = {_free("intercept", [*line]): "1"} | line
-    elif not isinstance(physics, str) and isinstance(physics, Sequence) and all(isinstance(t, str) for t in physics):
+    elif (
+        not isinstance(physics, str)
+        and isinstance(physics, Sequence)
+        and all(isinstance(t, str) for t in physics)
+    ):
         physics = {f"theta{i + 1}": text for i, text in enumerate(physics)}
     if isinstance(physics, Mapping) and all(isinstance(text, str) for text in physics.values()):
         several = len(outputs) > 1
@@ -253,10 +284,15 @@ def baseline_of(physics: Any, layout: Layout, outputs: Sequence[str], names: Seq
             for parameter, text in physics.items()
             for output in outputs
         ]
-    if isinstance(physics, str) or not isinstance(physics, Sequence) or not all(isinstance(t, Term) for t in physics):
+    if (
+        isinstance(physics, str)
+        or not isinstance(physics, Sequence)
+        or not all(isinstance(t, Term) for t in physics)
+    ):
         raise InputError(
-            "`physics` must be 'linear', a list of expressions or Terms, a mapping of parameters to expressions, a "
-            f"Baseline, or a function of a row; got {shown(physics)}."
+            "`physics` must be 'linear', a list of expressions or Terms, a mapping of "
+            "parameters to expressions, a Baseline, or a function of a row; got "
+            f"{shown(physics)}."
         )
     for term in physics:
         _check_columns(term.regressor, names)
@@ -265,10 +301,15 @@ def baseline_of(physics: Any, layout: Layout, outputs: Sequence[str], names: Seq
 
 def _check_columns(text: Any, names: Sequence[str]) -> None:
     """Raise InputError for a name in an expression of columns that is none of them."""
-    found = re.findall(r"(?<![\w.])[A-Za-z_]\w*\b(?!\s*[\[(])", text) if names and isinstance(text, str) else []
+    found = (
+        re.findall(r"(?<![\w.])[A-Za-z_]\w*\b(?!\s*[\[(])", text)
+        if names and isinstance(text, str)
+        else []
+    )
     for name in found:
         if name not in (*names, *RESERVED, SAMPLING_TIME):
             known = ", ".join(names)
             raise InputError(
-                f"physics '{text}': unknown column '{name}'{nearest(name, names)}; the columns are {known}."
+                f"physics '{text}': unknown column '{name}'{nearest(name, names)}; the columns "
+                f"are {known}."
             )

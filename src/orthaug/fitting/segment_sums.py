@@ -1,8 +1,8 @@
 """Free runs over segments that an engine keeps: what training needs of them is a sum over their chunks.
 
-A trial is the sum of the errors' squares, a linearisation that of the normal equations from which the states of each
-segment are eliminated where the segment is. How these states follow (c, w) stays there too: n0 numbers a segment, its
-state, come back.
+A trial is the sum of the errors' squares, a linearisation that of the normal equations from which
+the states of each segment are eliminated where the segment is. How these states follow (c, w) stays
+there too: n0 numbers a segment, its state, come back.
 """
 
 from __future__ import annotations
@@ -43,7 +43,9 @@ class Squares(NamedTuple):
     errors: Any
 
 
-def _errors(dynamics: Dynamics, numbers: Numbers, segments: Segments, states: Any) -> Float[Array, "T ny m"]:
+def _errors(
+    dynamics: Dynamics, numbers: Numbers, segments: Segments, states: Any
+) -> Float[Array, "T ny m"]:
     run = chunk_response(dynamics, dynamics.prepared(numbers), states, segments.inputs)
     return jnp.where(segments.scored[:, None], segments.target - run, 0.0)
 
@@ -71,7 +73,9 @@ class SegmentEquations:
     dynamics: Dynamics
     free: bool
 
-    def __call__(self, chunk: Any, numbers: Numbers, weight: Any, rows: Any) -> tuple[Any, tuple[Any, Any]]:
+    def __call__(
+        self, chunk: Any, numbers: Numbers, weight: Any, rows: Any
+    ) -> tuple[Any, tuple[Any, Any]]:
         segments, states = chunk
         numbers = self.dynamics.prepared(numbers)
         there = (states, segments.inputs, segments.target, segments.scored)
@@ -100,7 +104,9 @@ class Spectra:
 
     def __call__(self, chunk: Any, numbers: Numbers) -> tuple[Any, Any]:
         errors = _errors(self.dynamics, numbers, *chunk)
-        return jnp.sum(jnp.abs(jnp.fft.rfft(errors, self.size, axis=0)) ** 2, axis=-1).T, jnp.sum(errors != 0, (0, 2))
+        return jnp.sum(jnp.abs(jnp.fft.rfft(errors, self.size, axis=0)) ** 2, axis=-1).T, jnp.sum(
+            errors != 0, (0, 2)
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +129,9 @@ class SegmentSums:
             if known is None:
                 while len(self.placed) >= _KEPT:
                     self.placed.pop(next(iter(self.placed)))
-                there = self.engine.place(segments) if isinstance(segments, Segments) else segments.rows
+                there = (
+                    self.engine.place(segments) if isinstance(segments, Segments) else segments.rows
+                )
                 known = self.placed[id(segments)] = (segments, there)
             return known[1]
 
@@ -133,7 +141,13 @@ class SegmentSums:
         return self.engine.beside(rows, self.engine.place(np.asarray(states), rows))
 
     def tried(
-        self, dynamics: Dynamics, numbers: Numbers, segments: Any, start: Start, step: Vector | None, *made: Matrix
+        self,
+        dynamics: Dynamics,
+        numbers: Numbers,
+        segments: Any,
+        start: Start,
+        step: Vector | None,
+        *made: Matrix,
     ) -> tuple[float, Matrix]:
         """`‖r‖²` and Σ e eᵀ from the states of a start, or with `step` from where they moved to.
 
@@ -144,7 +158,10 @@ class SegmentSums:
             rows, step = self.with_states(segments, start.values), np.zeros(0)
             trying = TrialSquares(dynamics, moves=False)
         else:
-            rows, trying = self.engine.beside(self.rows(segments), start.there), TrialSquares(dynamics, moves=True)
+            rows, trying = (
+                self.engine.beside(self.rows(segments), start.there),
+                TrialSquares(dynamics, moves=True),
+            )
         found = self.engine.sum(trying, rows, numbers, *made, step)
         return float(found.misfit), np.asarray(found.errors)
 
@@ -159,11 +176,19 @@ class SegmentSums:
         return np.asarray(self.engine.fetch(self.engine.keep(MovedStates(), start.there, step)[0]))
 
     def linearised(
-        self, dynamics: Dynamics, numbers: Numbers, segments: Any, initial: InitialStates, states: Any, *made: Matrix
+        self,
+        dynamics: Dynamics,
+        numbers: Numbers,
+        segments: Any,
+        initial: InitialStates,
+        states: Any,
+        *made: Matrix,
     ) -> tuple[Matrix, Vector, Any]:
         """Return normal matrix and right-hand side of (c, w) with the states at their best, and `Best` where it stays."""
         rows = self.with_states(segments, states)
-        kept, (hessian, gradient) = self.engine.keep(SegmentEquations(dynamics, initial.free), rows, numbers, *made)
+        kept, (hessian, gradient) = self.engine.keep(
+            SegmentEquations(dynamics, initial.free), rows, numbers, *made
+        )
         return np.asarray(hessian), np.asarray(gradient), kept if initial.free else None
 
     def slope(self, there: Any) -> Float[np.ndarray, "k m n0 n"]:
@@ -174,5 +199,7 @@ class SegmentSums:
         self, dynamics: Dynamics, numbers: Numbers, segments: Any, states: Any, size: int
     ) -> tuple[Matrix, Vector]:
         """`Spectra` over all segments."""
-        found = self.engine.sum(Spectra(dynamics, size), self.with_states(segments, states), numbers)
+        found = self.engine.sum(
+            Spectra(dynamics, size), self.with_states(segments, states), numbers
+        )
         return np.asarray(found[0]), np.asarray(found[1])

@@ -58,7 +58,9 @@ class SegmentedLagged(SegmentedProblem):
     """Entries of an orthogonal θ that are known to stand at a bound beside the learner."""
 
     @classmethod
-    def of(cls, task: OneStepTask, criterion: Criterion, like: SegmentedLagged | None = None) -> SegmentedLagged:
+    def of(
+        cls, task: OneStepTask, criterion: Criterion, like: SegmentedLagged | None = None
+    ) -> SegmentedLagged:
         """Lay the problem's record out as a criterion of several steps declares, in the shapes of a plan that is small.
 
         Raises:
@@ -81,7 +83,9 @@ class SegmentedLagged(SegmentedProblem):
     def alone(self) -> SegmentedLagged:
         """The same rows and segments without a learner."""
         alone, task = self.dynamics.alone, self.task.alone
-        return replace(self, task=task, dynamics=alone, scaling=task.scaling, unit=task.unit, fixed={})
+        return replace(
+            self, task=task, dynamics=alone, scaling=task.scaling, unit=task.unit, fixed={}
+        )
 
     @property
     def lengthens(self) -> bool:
@@ -101,7 +105,9 @@ class SegmentedLagged(SegmentedProblem):
     def objective(self, structure: Structure) -> StructuredObjective:
         """Return the criterion as a function of θ and the weights."""
         start, elimination = np.asarray(self.segments.start), eliminate(structure, self.problem)
-        free = elimination.projects and not elimination.bounded and self.bound is not None  # the unknown is c
+        free = (
+            elimination.projects and not elimination.bounded and self.bound is not None
+        )  # the unknown is c
         bounds = elimination.lower.copy(), elimination.upper.copy()
         for i, value in self.fixed.items():
             bounds[0][i] = bounds[1][i] = value
@@ -127,9 +133,10 @@ class SegmentedLagged(SegmentedProblem):
 class StructuredObjective(FreeRunObjective):
     """`‖r‖²` of the free run and of the structure's rows.
 
-    Without bounds or penalties the unknown θ is `c = θ − θ_aux`, split at the end (F2). Where an orthogonal θ has
-    bounds, it is the unknown itself and `c = θ − θ_aux(w)` follows, so that the split cannot leave them. The entries
-    that are `fixed` at a bound are known terms, to which nothing is split.
+    Without bounds or penalties the unknown θ is `c = θ − θ_aux`, split at the end (F2). Where an
+    orthogonal θ has bounds, it is the unknown itself and `c = θ − θ_aux(w)` follows, so that the
+    split cannot leave them. The entries that are `fixed` at a bound are known terms, to which
+    nothing is split.
     """
 
     task: OneStepTask
@@ -139,7 +146,9 @@ class StructuredObjective(FreeRunObjective):
     @property
     def follows(self) -> bool:
         """Return whether c follows θ, `c = θ − θ_aux(w)`."""
-        return self.elimination.projects and self.elimination.bounded and self.task.bound is not None
+        return (
+            self.elimination.projects and self.elimination.bounded and self.task.bound is not None
+        )
 
     @property
     def apart(self) -> bool:
@@ -176,8 +185,12 @@ class StructuredObjective(FreeRunObjective):
             change = self.change(point.w)
             hessian, gradient = change.T @ hessian @ change, change.T @ gradient
         if len(rows.target):
-            by_rows = np.column_stack([rows.theta, rows.learner @ self.task.share_slope(point.w)]) / rms
-            miss = (rows.target - rows.theta @ point.theta - rows.learner @ self.task.share_of(point.w)) / rms
+            by_rows = (
+                np.column_stack([rows.theta, rows.learner @ self.task.share_slope(point.w)]) / rms
+            )
+            miss = (
+                rows.target - rows.theta @ point.theta - rows.learner @ self.task.share_of(point.w)
+            ) / rms
             hessian, gradient = hessian + by_rows.T @ by_rows, gradient + by_rows.T @ miss
         return linear._replace(hessian=hessian, gradient=gradient)
 
@@ -205,8 +218,8 @@ class StructuredObjective(FreeRunObjective):
     def held(self, end: Descent) -> Fixed:
         """Return what stands at a bound at the end of a run: entries that got there, and the fixed ones that would stay.
 
-        Those that the learner could imitate stay where the nearest θ in the bounds does, the others where descent
-        would leave the bounds.
+        Those that the learner could imitate stay where the nearest θ in the bounds does, the others
+        where descent would leave the bounds.
         """
         point, elimination = end.point, self.elimination
         ends = enumerate(zip(point.theta, elimination.lower, elimination.upper, strict=True))
@@ -215,9 +228,15 @@ class StructuredObjective(FreeRunObjective):
             return at
         f = self.task.share_of(point.w)
         nearest = replace(elimination, outputs=elimination.to_coordinates @ point.c + f).active(f)
-        downhill = np.where(point.theta == elimination.upper, end.linear.gradient[: self.physics], 0.0)
-        downhill = np.where(point.theta == elimination.lower, -end.linear.gradient[: self.physics], downhill)
+        downhill = np.where(
+            point.theta == elimination.upper, end.linear.gradient[: self.physics], 0.0
+        )
+        downhill = np.where(
+            point.theta == elimination.lower, -end.linear.gradient[: self.physics], downhill
+        )
         imitated = [bool(row.any()) for row in elimination.shared.basis]
         return {
-            i: v for i, v in at.items() if i not in self.fixed or (i in nearest if imitated[i] else downhill[i] > 0)
+            i: v
+            for i, v in at.items()
+            if i not in self.fixed or (i in nearest if imitated[i] else downhill[i] > 0)
         }

@@ -39,7 +39,10 @@ class MotionObjective(FreeRunObjective):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SegmentedMotion(SegmentedProblem):
-    """A motion's record laid out in segments. `loose` (nx,) is how far a start may be from its guess."""
+    """A motion's record laid out in segments.
+
+    `loose` (nx,) is how far a start may be from its guess.
+    """
 
     dynamics: MotionDynamics
     problem: MotionProblem
@@ -97,20 +100,28 @@ class SegmentedMotion(SegmentedProblem):
     def over(self, segment: int) -> SegmentedMotion:
         """The same over segments of another length, without washout; 0 for whole experiments."""
         segments = build_segments(self.record, self.dynamics, segment, 0, shares=self.shares)
-        return replace(self, segments=segments, free_run=replace(self.free_run, segment=segment, washout=0))
+        return replace(
+            self, segments=segments, free_run=replace(self.free_run, segment=segment, washout=0)
+        )
 
     def refined(self, substeps: int) -> SegmentedMotion:
         """The same with other substeps of the integrator."""
         dynamics = replace(self.dynamics, substeps=substeps)
         finer = replace(self, dynamics=dynamics)
-        if dynamics.motion.hold != "spline":  # otherwise steps read the input at the points of the substeps
+        if (
+            dynamics.motion.hold != "spline"
+        ):  # otherwise steps read the input at the points of the substeps
             return finer
         layout = Layout.of(self.record, dynamics, self.criterion, self, self.shares)
         segments = (
-            layout.segments if self.free_run == self.criterion.free_run else finer.over(self.free_run.steps).segments
+            layout.segments
+            if self.free_run == self.criterion.free_run
+            else finer.over(self.free_run.steps).segments
         )
         start = np.asarray(self.segments.start)
-        return replace(finer, segments=segments._replace(start=start), whole=layout.whole, colour=layout.colour)
+        return replace(
+            finer, segments=segments._replace(start=start), whole=layout.whole, colour=layout.colour
+        )
 
     def from_states(self, states: Float[np.ndarray, "k n0 m"]) -> SegmentedMotion:
         """The same with segments that start there."""
@@ -138,7 +149,9 @@ class SegmentedMotion(SegmentedProblem):
         """(ny, ny), multiplies errors: they are then in the unit of what physics alone leaves."""
         return self.problem.weight.matrix / self.rms
 
-    def settled(self, c: Vector, w: Any = (), segments: Segments | None = None, iterations: int = 12) -> np.ndarray:
+    def settled(
+        self, c: Vector, w: Any = (), segments: Segments | None = None, iterations: int = 12
+    ) -> np.ndarray:
         """Return the starts (k, n0, m) by which the segments follow the outputs best."""
         segments = self.segments if segments is None else segments
         numbers, states = self.numbers(c, np.asarray(w)), []
@@ -149,7 +162,9 @@ class SegmentedMotion(SegmentedProblem):
         return np.stack(states)
 
     def mean_square(self, c: Vector, w: Any, tilt: Any = None) -> float:
-        """Mean of squared errors over whole experiments, in deviations of the outputs; NaN where it diverges.
+        """Mean of squared errors over whole experiments, in deviations of the outputs.
+
+        NaN where it diverges.
 
         A whole experiment starts where a free run follows its first rows best.
         """
@@ -209,7 +224,9 @@ def sizes(problem: MotionProblem) -> Vector:
 
 
 @partial(jax.jit, static_argnames="form")
-def _states(form: MotionDynamics, numbers: Numbers, segments: Segments, states: Float[Array, "k n0 m"]) -> Any:
+def _states(
+    form: MotionDynamics, numbers: Numbers, segments: Segments, states: Float[Array, "k n0 m"]
+) -> Any:
     """Return the states (k, T, n0, m) of every segment's run."""
     numbers = form.prepared(numbers)
     side_by_side = jax.vmap(lambda state, row: form.step(numbers, state, row)[0], -1, -1)

@@ -72,7 +72,9 @@ class Layout(NamedTuple):
         like: SegmentedProblem | None = None,
         shares: int = 1,
     ) -> Layout:
-        """As a criterion of several steps declares; padded to the shapes of another course where that is larger.
+        """As a criterion of several steps declares.
+
+        Padded to the shapes of another course where that is larger.
 
         Raises:
             InputError: nothing would be scored.
@@ -82,13 +84,17 @@ class Layout(NamedTuple):
         longest = max(len(e) for e in record.experiments) - dynamics.first_row
         check_scored(criterion, longest)
         shapes = (None, None) if like is None else (like.segments, like.whole)
-        segments = build_segments(record, dynamics, free_run.steps, free_run.washout, shapes[0], shares)
+        segments = build_segments(
+            record, dynamics, free_run.steps, free_run.washout, shapes[0], shares
+        )
         if not (criterion.simulates and free_run.steps):
             return cls(segments, segments, None)
         whole, colour = build_segments(record, dynamics, 0, free_run.washout, shapes[1]), None
         if segments.steps < COLOURED_STEPS <= longest:
             first = tuple(e.rows(0, COLOUR_ROWS) for e in record.experiments)
-            colour = build_segments(replace(record, experiments=first), dynamics, 0, free_run.washout)
+            colour = build_segments(
+                replace(record, experiments=first), dynamics, 0, free_run.washout
+            )
         return cls(segments, whole, colour)
 
 
@@ -96,15 +102,17 @@ class Layout(NamedTuple):
 class SegmentedProblem:
     """A record laid out in segments for a criterion.
 
-    `rms` is the unit of the errors. `deviation` (ny,) is that of the outputs, `output_weights` how they are weighed
-    against each other; `scaling` and `unit` are the learner's.
+    `rms` is the unit of the errors. `deviation` (ny,) is that of the outputs, `output_weights` how
+    they are weighed against each other; `scaling` and `unit` are the learner's.
     """
 
     record: Record
     dynamics: Dynamics
     segments: Segments
     whole: Segments
-    """Segments over which runs are compared: whole experiments; for a prediction h steps ahead its own segments."""
+    """Segments over which runs are compared: whole experiments; for a prediction h steps ahead its
+    own segments.
+    """
     colour: Segments | None
     """Segments that show the colour of the errors, where the others are too short for that."""
     criterion: Criterion
@@ -132,7 +140,9 @@ class SegmentedProblem:
     def numbers(self, c: Vector, w: Any, tilt: Any = None) -> Numbers:
         """Return the model's numbers before the split."""
         scaling = self.scaling
-        return Numbers(c, np.zeros_like(c), np.asarray(w), scaling.centre, scaling.halfwidth, self.unit, tilt)
+        return Numbers(
+            c, np.zeros_like(c), np.asarray(w), scaling.centre, scaling.halfwidth, self.unit, tilt
+        )
 
     def descend(
         self,
@@ -143,14 +153,20 @@ class SegmentedProblem:
         states: Any = None,
         **options: Any,
     ) -> FreeRunFit:
-        """From p to the end; several outputs are weighted by their errors' covariance in a second leg.
+        """From p to the end.
+
+        Several outputs are weighted by their errors' covariance in a second leg.
 
         Args:
             states: of the segments' starts at p; None for the measured ones.
             options: of `descent.descend`.
         """
         ny = len(self.dynamics.outputs)
-        options |= {"bounds": objective.bounds, "damping": MARQUARDT, "noticeable": noticeable_in(self.residuals)}
+        options |= {
+            "bounds": objective.bounds,
+            "damping": MARQUARDT,
+            "noticeable": noticeable_in(self.residuals),
+        }
         two_legs = ny > 1 and self.output_weights in ("auto", "covariance")
         first = solver.at_most(solver.iterations // 2) if two_legs else solver
         start = Start(objective.initial.measured if states is None else states)
@@ -159,10 +175,15 @@ class SegmentedProblem:
         noise = self.noise(objective, end) if two_legs and end.ending.usable else None
         white = None if noise is None else whitening(noise)
         if noise is not None and white is not None:
-            size = np.trace(objective.weight @ noise @ objective.weight.T) / ny  # so that the ridge keeps its place
+            size = (
+                np.trace(objective.weight @ noise @ objective.weight.T) / ny
+            )  # so that the ridge keeps its place
             objective = replace(objective, weight=np.sqrt(size) * white)
             done = end.iterations
-            begun, options = Start(end.point.states), options | {"ridge": end.ridge, "ceiling": np.inf}
+            begun, options = (
+                Start(end.point.states),
+                options | {"ridge": end.ridge, "ceiling": np.inf},
+            )
             again = solver.after(done).descend(
                 objective,
                 end.point.p,
@@ -173,7 +194,9 @@ class SegmentedProblem:
             )
             path = (*end.path, *again.path)
             spent = {"iterations": done + again.iterations, "seconds": end.seconds + again.seconds}
-            tail = again.tail and again.tail._replace(done=spent["iterations"], limit=solver.iterations)
+            tail = again.tail and again.tail._replace(
+                done=spent["iterations"], limit=solver.iterations
+            )
             end = again._replace(path=path, tail=tail, **spent)
         mean_square = self.mean_square(end.point.c, end.point.w)
         return FreeRunFit(objective, end, mean_square, end.iterations, end.seconds)
@@ -184,9 +207,18 @@ class SegmentedProblem:
         """Where the pauses of a descent from there are kept."""
         if self.checkpoints is None:
             return None
-        chosen = [options.get(name) for name in ("ridge", "evidence", "evidence_settled", "ceiling")]
-        size = (self.segments.steps, self.segments.count, objective.weight, objective.dynamics.unknowns)
-        return self.checkpoints.of_run("flight", p, np.asarray(start.values), *size, *chosen, form=OF_DESCENT)
+        chosen = [
+            options.get(name) for name in ("ridge", "evidence", "evidence_settled", "ceiling")
+        ]
+        size = (
+            self.segments.steps,
+            self.segments.count,
+            objective.weight,
+            objective.dynamics.unknowns,
+        )
+        return self.checkpoints.of_run(
+            "flight", p, np.asarray(start.values), *size, *chosen, form=OF_DESCENT
+        )
 
     def looked_at(self, objective: FreeRunObjective, end: Descent) -> TrialInMemory:
         """Where a run ended, on segments in memory; its end has a derivative."""
@@ -197,16 +229,25 @@ class SegmentedProblem:
         """Covariance (ny, ny) of the errors, in the outputs' units."""
         squares, ny = objective.squares(end.point), len(objective.weight)
         used = (objective.physics + end.effective) / ny
-        return None if squares is None else noise_covariance(squares, np.full(ny, self.segments.count - used))
+        return (
+            None
+            if squares is None
+            else noise_covariance(squares, np.full(ny, self.segments.count - used))
+        )
 
     def mean_square(self, c: Vector, w: Any, tilt: Any = None) -> float:
-        """Mean of squared errors over whole experiments, in deviations of the outputs; NaN where it diverges."""
+        """Mean of squared errors over whole experiments, in deviations of the outputs.
+
+        NaN where it diverges.
+        """
         with np.errstate(all="ignore"):
             if self.sums is not None and self.whole is self.segments:
                 squares = self.sums.squares(self.dynamics, self.numbers(c, w, tilt), self.segments)
                 total = float(np.sum(np.diag(squares) / self.deviation**2))
             else:
-                errors = errors_of(self.dynamics, self.numbers(c, w, tilt), self.whole.start, self.whole)
+                errors = errors_of(
+                    self.dynamics, self.numbers(c, w, tilt), self.whole.start, self.whole
+                )
                 total = float(np.sum((errors / self.deviation[:, None]) ** 2))
             mean = total / (self.whole.count * len(self.dynamics.outputs))
         return mean if mean < RUNAWAY else np.nan

@@ -1,8 +1,8 @@
 """The course of a lagged model over rows that stay in a source: its segments, and runs along whole experiments.
 
-Segments are those of the same rows in memory, cut anew at every pass, or once where the rows are. A segment belongs to
-the partition in which the first row that it needs is, and is read on from the partitions after it. Where experiments
-begin and end is asked of all partitions first.
+Segments are those of the same rows in memory, cut anew at every pass, or once where the rows are. A
+segment belongs to the partition in which the first row that it needs is, and is read on from the
+partitions after it. Where experiments begin and end is asked of all partitions first.
 """
 
 from __future__ import annotations
@@ -39,7 +39,10 @@ _SETTLING = 4  # Gauss-Newton steps of a witness's states
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SegmentedStreamed(SegmentedLagged):
-    """A source's rows cut into segments where an engine reads or keeps them. `record` is a witness of them."""
+    """A source's rows cut into segments where an engine reads or keeps them.
+
+    `record` is a witness of them.
+    """
 
     source: Source
     found: ExperimentStarts
@@ -49,15 +52,15 @@ class SegmentedStreamed(SegmentedLagged):
     def of(cls, task: OneStepTask, criterion: Criterion) -> SegmentedStreamed:
         """Cut the problem's source as a criterion of several steps declares.
 
-        Raises:
-            InputError: nothing would be scored; whole experiments as segments, which would have to fit into memory.
+        Raises: InputError: nothing would be scored; whole experiments as segments, which would have
+            to fit into memory.
         """
         problem, free_run, sums = task.problem, criterion.free_run, SegmentSums(task.engine)
         assert free_run is not None and isinstance(problem, StreamedProblem)
         if not free_run.steps:
             raise InputError(
-                "`segment` is 0, whole experiments, which need their rows in memory; give a number of steps, such as "
-                "512, or a Record."
+                "`segment` is 0, whole experiments, which need their rows in memory; give a "
+                "number of steps, such as 512, or a Record."
             )
         dynamics = lagged(task)
         empty, source, washout = problem.basis.form.empty, problem.source, free_run.washout
@@ -69,8 +72,12 @@ class SegmentedStreamed(SegmentedLagged):
         whole: Any = segments
         colour: Any = None
         if criterion.simulates:
-            count = sum(max(rows - dynamics.first_row - min(washout, longest - 1), 0) for rows in found.rows)
-            whole = WholeRuns(task.engine, source.partitions, empty, min(washout, longest - 1), count)
+            count = sum(
+                max(rows - dynamics.first_row - min(washout, longest - 1), 0) for rows in found.rows
+            )
+            whole = WholeRuns(
+                task.engine, source.partitions, empty, min(washout, longest - 1), count
+            )
             if segments.steps < COLOURED_STEPS <= longest:
                 colour = SourceSegments.cut(*made, 0, washout, COLOUR_ROWS)
         layout: dict[str, Any] = {"segments": segments, "whole": whole, "colour": colour}
@@ -90,11 +97,16 @@ class SegmentedStreamed(SegmentedLagged):
             return super().mean_square(c, w, tilt)
         with np.errstate(all="ignore"):
             squares = self.whole.squares(self.dynamics, self.numbers(c, w, tilt))
-            mean = float(np.sum(squares / self.deviation**2)) / (self.whole.count * len(self.deviation))
+            mean = float(np.sum(squares / self.deviation**2)) / (
+                self.whole.count * len(self.deviation)
+            )
         return mean if mean < RUNAWAY else np.nan
 
     def looked_at(self, objective: FreeRunObjective, end: Descent) -> TrialInMemory:
-        """Return the segments of the witness; where that is all rows, with the states that were trained."""
+        """Return the segments of the witness.
+
+        Where that is all rows, with the states that were trained.
+        """
         free_run = self.free_run
         segments = build_segments(self.record, self.dynamics, free_run.steps, free_run.washout)
         initial = InitialStates(np.asarray(segments.start), objective.initial.free)
@@ -127,7 +139,10 @@ class RunState(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PartitionRuns:
-    """A partition's part of the runs, which start from what was measured; picklable if the physics is."""
+    """A partition's part of the runs, which start from what was measured.
+
+    Picklable if the physics is.
+    """
 
     dynamics: Dynamics
     numbers: Numbers
@@ -146,16 +161,30 @@ class PartitionRuns:
             rows = len(target)
             length = padded_length(rows)
             scored = (np.arange(length) < rows) & (run.done + np.arange(length) >= self.washout)
-            padded = (np.concatenate([part, np.zeros((length - rows, part.shape[1]))]) for part in (inputs, target))
+            padded = (
+                np.concatenate([part, np.zeros((length - rows, part.shape[1]))])
+                for part in (inputs, target)
+            )
             given = (self.dynamics, self.numbers, run.state, *padded, scored, np.int64(rows))
             state, squares = map(np.asarray, _along(*given))
-            run = RunState(state, run.squares + squares, (piece.source, piece.offset + len(piece)), run.done + rows)
+            run = RunState(
+                state,
+                run.squares + squares,
+                (piece.source, piece.offset + len(piece)),
+                run.done + rows,
+            )
         return run
 
 
 @partial(jax.jit, static_argnames="dynamics")
 def _along(
-    dynamics: Dynamics, numbers: Numbers, state: Any, inputs: Any, target: Any, scored: Any, rows: Any
+    dynamics: Dynamics,
+    numbers: Numbers,
+    state: Any,
+    inputs: Any,
+    target: Any,
+    scored: Any,
+    rows: Any,
 ) -> tuple[Any, Any]:
     """Return the state after so many rows, and the squares (ny,) of the errors on the scored ones."""
     numbers = dynamics.prepared(numbers)
@@ -168,12 +197,17 @@ def _along(
         return (jnp.where(there, following, state), squares), None
 
     there = jnp.arange(len(inputs)) < rows
-    return jax.lax.scan(step, (state, jnp.zeros(target.shape[1])), (inputs, target, scored, there))[0]
+    return jax.lax.scan(step, (state, jnp.zeros(target.shape[1])), (inputs, target, scored, there))[
+        0
+    ]
 
 
 @dataclass(frozen=True, eq=False)
 class WholeRuns:
-    """Whole experiments of a source, over which runs are compared; `count` of their steps are scored."""
+    """Whole experiments of a source, over which runs are compared.
+
+    `count` of their steps are scored.
+    """
 
     engine: Engine
     partitions: Any
@@ -202,7 +236,10 @@ class PieceShape:
 
 def look(partition: Any) -> list[PieceShape]:
     """Return the pieces of a partition."""
-    return [PieceShape(piece.source, piece.first_row, piece.offset, len(piece)) for piece in partition.pieces(0)]
+    return [
+        PieceShape(piece.source, piece.first_row, piece.offset, len(piece))
+        for piece in partition.pieces(0)
+    ]
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,7 +263,9 @@ class ExperimentStarts:
                 begins.append(total)
                 rows.append(piece.rows)
             total, last = total + piece.rows, piece
-        return cls(tuple(begins), tuple(rows), np.cumsum([sum(p.rows for p in pieces) for pieces in seen]))
+        return cls(
+            tuple(begins), tuple(rows), np.cumsum([sum(p.rows for p in pieces) for pieces in seen])
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -261,7 +300,9 @@ class SegmentCutter:
         waiting: list[Segments] = []
         for experiment in _slices(part):
             inputs = self.dynamics.inputs(experiment, self.empty)
-            waiting.append(segment_of(experiment, inputs, 0, self.steps, self.washout, self.dynamics))
+            waiting.append(
+                segment_of(experiment, inputs, 0, self.steps, self.washout, self.dynamics)
+            )
             if len(waiting) == self.width:
                 yield self._chunk(waiting)
                 waiting = []
@@ -286,8 +327,12 @@ def _slices(part: Part) -> Iterator[Experiment]:
         while begin + len(inputs[0]) <= first:
             begin += len(inputs.pop(0))
             outputs.pop(0)
-        inputs, outputs = ([np.concatenate(group)] if len(group) > 1 else group for group in (inputs, outputs))
-        yield Experiment(inputs[0][first - begin : last - begin], outputs[0][first - begin : last - begin])
+        inputs, outputs = (
+            [np.concatenate(group)] if len(group) > 1 else group for group in (inputs, outputs)
+        )
+        yield Experiment(
+            inputs[0][first - begin : last - begin], outputs[0][first - begin : last - begin]
+        )
 
 
 @dataclass(frozen=True)
@@ -300,7 +345,10 @@ class SegmentStarts:
 
 @dataclass(frozen=True, eq=False)
 class SourceSegments:
-    """The segments of a source where an engine reads or keeps them; elsewhere they count as `Segments` do."""
+    """The segments of a source where an engine reads or keeps them.
+
+    Elsewhere they count as `Segments` do.
+    """
 
     rows: Any
     """Of the engine, chunks of `Segments`."""

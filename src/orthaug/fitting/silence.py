@@ -1,9 +1,10 @@
 """Learners that their regularization silenced: the warning, and runs with weaker regularizations beside them.
 
-Evidence starts from a learner that does nothing yet. A learner that first finds a constant, since the physics has no
-offset, lowers the loss by that, and evidence may then find that one weight is all it needs: dry friction is lost so.
-Such a run is made again without regularization, and with the ridge that evidence finds where that ended; held-out rows
-choose. Ard is for training one step ahead, where "auto" has compared it already.
+Evidence starts from a learner that does nothing yet. A learner that first finds a constant, since
+the physics has no offset, lowers the loss by that, and evidence may then find that one weight is
+all it needs: dry friction is lost so. Such a run is made again without regularization, and with the
+ridge that evidence finds where that ended; held-out rows choose. Ard is for training one step
+ahead, where "auto" has compared it already.
 """
 
 from __future__ import annotations
@@ -58,9 +59,15 @@ def add_retries(
 
 
 def tell_retries(
-    planned: int, starts: Sequence[Any], runs: Sequence[Any], held_out: HeldOutErrors | None, best: int
+    planned: int,
+    starts: Sequence[Any],
+    runs: Sequence[Any],
+    held_out: HeldOutErrors | None,
+    best: int,
 ) -> list[Warning]:
-    """Return the warning that evidence silenced the learner and what was tried then; none where nothing was.
+    """Return the warning that evidence silenced the learner and what was tried then.
+
+    None where nothing was.
 
     Args:
         planned: number of the runs before any were added.
@@ -84,9 +91,10 @@ def tell_retries(
     effective = max(run.effective for run in runs[:planned])
     tried = " and ".join(_name(choice) for choice in choices[1:])
     text = (
-        f"evidence left {counted_weights(effective)} of the learner, no more than a constant, so training was tried "
-        f"again with {tried}. Errors in {held_out.where}, in deviations "
-        f"of the output: {found}, physics alone {_error(np.sqrt(mean_square(held_out.alone)))}. Kept is {kept}."
+        f"evidence left {counted_weights(effective)} of the learner, no more than a constant, "
+        f"so training was tried again with {tried}. Errors in {held_out.where}, in deviations "
+        f"of the output: {found}, physics alone "
+        f"{_error(np.sqrt(mean_square(held_out.alone)))}. Kept is {kept}."
     )
     return [Warning("evidence_retried", text)]
 
@@ -99,7 +107,12 @@ def learner_silent(learned: TrainedLearner, values: Matrix | None = None) -> lis
         values: of the learner (N, ny) over the training rows, where they are known.
     """
     bound = learned.bound
-    if bound is None or not learned.ending.usable or learned.ending is Ending.SPANNED or not bound.size:
+    if (
+        bound is None
+        or not learned.ending.usable
+        or learned.ending is Ending.SPANNED
+        or not bound.size
+    ):
         return []
     if learned.effective < _SILENT or (values is not None and not values.any()):
         does = "the learner is silent: the fit is that of physics alone"

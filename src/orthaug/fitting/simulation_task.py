@@ -1,7 +1,7 @@
 """Runs on the free-run criterion that start from physics alone, of any dynamics.
 
-Every run starts where physics alone ended, with a learner that is silent there. Only what lowers the loss is accepted,
-so that no run ends above physics alone.
+Every run starts where physics alone ended, with a learner that is silent there. Only what lowers
+the loss is accepted, so that no run ends above physics alone.
 """
 
 from __future__ import annotations
@@ -46,7 +46,9 @@ def _learned(free_fit: FreeRunFit, first_loss: float) -> bool:
     return bool(free_fit.end.point.loss < LEARNED * first_loss)
 
 
-Task = TypeVar("Task", bound="SimulationTask")  # Self is nothing that run-time checks of annotations can read
+Task = TypeVar(
+    "Task", bound="SimulationTask"
+)  # Self is nothing that run-time checks of annotations can read
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,11 +80,13 @@ class SimulationTask(ABC):
     ) -> list[StartPoint]:
         """Where a run from the weights w may start; arguments as in `estimate`."""
 
-    def prepared(self: Task, solver: LevenbergMarquardt, structure: Structure, progress: RunProgress = quiet) -> Task:
+    def prepared(
+        self: Task, solver: LevenbergMarquardt, structure: Structure, progress: RunProgress = quiet
+    ) -> Task:
         """The same with physics alone trained.
 
-        Its errors are then the unit of the criterion, in which a ridge counts. Where it runs away over whole
-        experiments, runs are compared over segments.
+        Its errors are then the unit of the criterion, in which a ridge counts. Where it runs away
+        over whole experiments, runs are compared over segments.
         """
         own = self.plan
 
@@ -134,8 +138,9 @@ class SimulationTask(ABC):
         if not self.criterion.simulates or not self.plan.free_run.steps:
             return ()
         text = (
-            "the free run of physics alone diverges over whole experiments of the training data, so `loss` counts its "
-            "segments; bound what makes it run away, or trust predictions a segment ahead only."
+            "the free run of physics alone diverges over whole experiments of the training "
+            "data, so `loss` counts its segments; bound what makes it run away, or trust "
+            "predictions a segment ahead only."
         )
         return (Warning("free_run_diverges", text),)
 
@@ -147,10 +152,12 @@ class SimulationTask(ABC):
         regularization: str | float = "none",
         progress: RunProgress = quiet,
     ) -> FreeRunFit:
-        """Return one run from the weights `w`, silenced, and physics alone; the arguments as in `estimate`.
+        """Return one run from the weights `w`, silenced, and physics alone.
 
-        An earlier model is gone on from where it is better than physics alone. A learner that cannot be silenced
-        starts with its weights, from the best θ for them.
+        The arguments as in `estimate`.
+
+        An earlier model is gone on from where it is better than physics alone. A learner that
+        cannot be silenced starts with its weights, from the best θ for them.
         """
         plan, physics = self.plan, self.physics
         if self.bound is None and physics is not None:
@@ -160,19 +167,27 @@ class SimulationTask(ABC):
         places = self.places(objective, solver, w, structure, regularization)
         best = min(places, key=lambda place: place.loss)
         ceiling = min((place.loss for place in places if place.silent), default=np.inf)
-        if evidence and np.isfinite(best.loss):  # one prior deviation of the weights for one of what is left
+        if evidence and np.isfinite(
+            best.loss
+        ):  # one prior deviation of the weights for one of what is left
             ridge = best.loss / plan.residuals
 
         def tell(iteration: int, loss: float) -> None:
             progress(iteration, loss * plan.rms**2 / plan.residuals)
 
         options: dict[str, Any] = {"ridge": ridge, "evidence": evidence, "evidence_settled": True}
-        free_fit = plan.descend(objective, best.p, solver, tell, best.states, ceiling=ceiling, **options)
+        free_fit = plan.descend(
+            objective, best.p, solver, tell, best.states, ceiling=ceiling, **options
+        )
         if evidence and not _learned(free_fit, best.loss):
-            free = plan.descend(objective, best.p, solver.within_limit, tell, best.states, ceiling=ceiling)
+            free = plan.descend(
+                objective, best.p, solver.within_limit, tell, best.states, ceiling=ceiling
+            )
             if _learned(free, best.loss):
                 point, options = free.end.point, options | {"evidence_settled": False}
-                again = plan.descend(objective, point.p, solver, tell, point.states, ceiling=ceiling, **options)
+                again = plan.descend(
+                    objective, point.p, solver, tell, point.states, ceiling=ceiling, **options
+                )
                 free_fit = again if _learned(again, best.loss) else free_fit
                 spent = {
                     "iterations": free.iterations + free_fit.iterations,
@@ -211,7 +226,9 @@ class SimulationTask(ABC):
         def middle(noise: Matrix) -> Matrix:
             """ΣψᵀΣ_eψ of the rows of `gram`. They are white where `weight` made them so."""
             assert gram is not None
-            change = objective.weight @ np.linalg.inv(self.problem.weight.matrix)  # of errors in whitened outputs
+            change = objective.weight @ np.linalg.inv(
+                self.problem.weight.matrix
+            )  # of errors in whitened outputs
             white = change @ noise @ change.T * rms**2
             return gram * float(np.trace(white)) / len(white)
 
@@ -271,4 +288,8 @@ class SimulationTask(ABC):
         assert end.linear is not None
         information = objective.theta_information(end.linear, end.point.w)
         white = objective.weight @ noise @ objective.weight.T
-        return theta_block(information, end.ridge, objective.physics, at_bound) * float(np.trace(white)) / len(white)
+        return (
+            theta_block(information, end.ridge, objective.physics, at_bound)
+            * float(np.trace(white))
+            / len(white)
+        )

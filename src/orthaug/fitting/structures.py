@@ -1,9 +1,9 @@
 """Structures: how the fitted function `g = φc + f` is split between physics and learner (F2).
 
-Every structure spans the same functions. It decides two things only: which rows join the criterion, and
-which part of `c = θ − θ_aux` is called θ afterwards. The rows are linear in θ and in the learner's
-coordinates `QᵀF`, so θ can always be eliminated. Training sees a structure, its penalty and its bounds as
-one small quadratic in `QᵀF` (`fitting.elimination`).
+Every structure spans the same functions. It decides two things only: which rows join the criterion,
+and which part of `c = θ − θ_aux` is called θ afterwards. The rows are linear in θ and in the
+learner's coordinates `QᵀF`, so θ can always be eliminated. Training sees a structure, its penalty
+and its bounds as one small quadratic in `QᵀF` (`fitting.elimination`).
 """
 
 from __future__ import annotations
@@ -49,7 +49,10 @@ class Structure(Protocol):
 
     @property
     def from_initial(self) -> bool:
-        """Return whether one-step training takes θ from θ⁰ beside the weights; otherwise it solves θ for any weights."""
+        """Return whether one-step training takes θ from θ⁰ beside the weights.
+
+        Otherwise it solves θ for any weights.
+        """
         ...
 
     @property
@@ -68,7 +71,10 @@ class Structure(Protocol):
 
 
 class _SolvedTheta:
-    """θ solved for any weights, without rows in the criterion; called what is left beside the learner."""
+    """θ solved for any weights, without rows in the criterion.
+
+    Called what is left beside the learner.
+    """
 
     projects = False
     identifies = True
@@ -85,11 +91,13 @@ class _SolvedTheta:
 class Orthogonal(_SolvedTheta):
     """ŷ = φ(θ − θ_aux) + f with θ_aux = Φ_μ⁺F_μ (eq:orth_param).
 
-    Under the training measure θ̂ = Φ⁺Y for every learner that sees all lags (F1). Under another `measure` training is
-    the same; at the end the fitted function is split over the measure's points (F2).
+    Under the training measure θ̂ = Φ⁺Y for every learner that sees all lags (F1). Under another
+    `measure` training is the same; at the end the fitted function is split over the measure's
+    points (F2).
 
-    A learner that sees less can imitate only some directions of θ. `shared` "auto" projects along these alone,
-    `θ_aux = B(Φ_μB)⁺F_μ`; the others are what the fit determines beside the learner (F8). "all" is the paper.
+    A learner that sees less can imitate only some directions of θ. `shared` "auto" projects along
+    these alone, `θ_aux = B(Φ_μB)⁺F_μ`; the others are what the fit determines beside the learner
+    (F8). "all" is the paper.
 
     Examples:
         >>> from orthaug.inference.measures import Symmetrized
@@ -108,8 +116,8 @@ class Orthogonal(_SolvedTheta):
 class Additive(_SolvedTheta):
     """ŷ = φθ + f (eqs:additive_struct): θ takes what this learner happens to leave, so it is not unique.
 
-    With `from_initial` θ starts at θ⁰ and is trained with the weights, one step ahead; without, it is solved for any
-    weights and never sees θ⁰.
+    With `from_initial` θ starts at θ⁰ and is trained with the weights, one step ahead; without, it
+    is solved for any weights and never sees θ⁰.
     """
 
     from_initial: bool = False
@@ -162,8 +170,13 @@ class BaselinePenalty(_SolvedTheta):
         if zero:
             start = "starts" if len(zero) == 1 else "start"
             raise InputError(
-                f"the baseline penalty is relative to the initial values, but {', '.join(zero)} {start} at 0; "
-                "give it another `initial`, or use the orthogonal structure."
+                "the baseline penalty is relative to the initial values, but "
+                f"{', '.join(zero)} {start} at 0; give it another `initial`, or use the "
+                "orthogonal structure."
             )
         root = np.sqrt(self.weight) * unit
-        return PenaltyRows(root * np.diag(1 / initial), np.zeros((len(names), len(names))), root * np.ones(len(names)))
+        return PenaltyRows(
+            root * np.diag(1 / initial),
+            np.zeros((len(names), len(names))),
+            root * np.ones(len(names)),
+        )

@@ -56,9 +56,11 @@ def planned(bound: Bound | None, seeds: range, choices: Sequence[str | float]) -
 class Choice:
     """How one run is chosen: on `validation`, on held-out `blocks` of the training data, or by the lowest loss.
 
-    With `scored` and without `validation` it is the lowest generalised cross-validation instead, one step ahead.
+    With `scored` and without `validation` it is the lowest generalised cross-validation instead,
+    one step ahead.
 
-    With `fallback` physics alone is handed over where no free run is better there. An `ensemble` takes them all.
+    With `fallback` physics alone is handed over where no free run is better there. An `ensemble`
+    takes them all.
     """
 
     validation: Record | None = None
@@ -67,18 +69,22 @@ class Choice:
     ensemble: bool = False
     scored: bool = False
     retry: bool = False
-    """Whether runs that evidence silenced are made again with weaker regularizations, if held-out rows can choose."""
+    """Whether runs that evidence silenced are made again with weaker regularizations, if held-out
+    rows can choose.
+    """
 
     def compares(self, task: Task, starts: Sequence[PlannedRun]) -> bool:
         """Return whether there is something to choose by held-out errors: runs that fly, or several regularizations."""
         several = len({start.regularization for start in starts}) > 1
-        return task.bound is not None and (task.criterion.free_run is not None or (several and not self.scored))
+        return task.bound is not None and (
+            task.criterion.free_run is not None or (several and not self.scored)
+        )
 
     def ranking(self, task: Task, runs: Sequence[Any], errors: Sequence[float]) -> np.ndarray:
         """Return what is lowest for the best run: its held-out error, its score, or its loss.
 
-        On blocks other runs of its kind were judged: one that ended higher on its own data than they did on what they
-        had not seen failed to train, and its loss counts.
+        On blocks other runs of its kind were judged: one that ended higher on its own data than
+        they did on what they had not seen failed to train, and its loss counts.
         """
         losses = np.array([task.loss(run) for run in runs])
         if np.isfinite(errors).any():
@@ -106,15 +112,22 @@ def train(
     with one_blas_thread():
         task = task.prepared(solver, structure, partial(progress, 0))
     LOG.info("training: %d runs of %s, %s", len(starts), type(solver).__name__, structure.name)
-    planned, (starts, runs) = len(starts), _run_all(task, starts, structure, solver, choice, progress, runner)
+    planned, (starts, runs) = (
+        len(starts),
+        _run_all(task, starts, structure, solver, choice, progress, runner),
+    )
     losses = [task.loss(run) for run in runs]
     concluded = cache(lambda i: _concluded(conclude, task, structure, task.learned(runs[i])))
     stopped = sum(run.ending is Ending.STOPPED for run in runs)
-    untried = bool(stopped and choice.validation is None and choice.blocks and choice.compares(task, starts))
+    untried = bool(
+        stopped and choice.validation is None and choice.blocks and choice.compares(task, starts)
+    )
     if untried:  # who asks to end does not wait for runs on held-out blocks
         choice = replace(choice, blocks=0)
     held_out = _held_out(task, starts, concluded, structure, solver, choice, conclude, runner)
-    errors = [math.nan] * len(runs) if held_out is None else [mean_square(run) for run in held_out.runs]
+    errors = (
+        [math.nan] * len(runs) if held_out is None else [mean_square(run) for run in held_out.runs]
+    )
     ranking = choice.ranking(task, runs, errors)
     usable = np.array([run.ending.usable for run in runs]) & np.isfinite(ranking)
     best = int(np.argmin(np.where(usable, ranking, np.inf)))
@@ -124,7 +137,10 @@ def train(
         runs_freely = task.criterion.free_run is not None and task.start_loss is not None
         if choice.fallback and runs_freely and not held_out.ratio.value < 1:
             told, best = [_fell_back(held_out)], -1
-            LOG.info("no free run is better than physics alone where it was not fitted: physics alone is handed over")
+            LOG.info(
+                "no free run is better than physics alone where it was not fitted: physics "
+                "alone is handed over"
+            )
     LOG.info("run %d is chosen of %d; 0 is physics alone", best + 1, len(runs))
     alike = _members(starts, ranking, best) if choice.scored else _alike(starts, best)
     shown = alike if choice.scored and held_out is None else list(range(len(starts)))
@@ -156,12 +172,17 @@ def train(
 
 
 def _beside(conclude: Concluding, task: Task, structure: Structure) -> Any:
-    """Return the estimate of physics alone that a learner stands beside; None without one, and where it costs a pass."""
+    """Return the estimate of physics alone that a learner stands beside.
+
+    None without one, and where it costs a pass.
+    """
     streamed = hasattr(task.problem, "source")
     return None if task.bound is None or streamed else _kept_physics(conclude, task, structure)
 
 
-def _restart(start: PlannedRun, run: Any, loss: float, error: float, score: float, *, chosen: bool) -> Restart:
+def _restart(
+    start: PlannedRun, run: Any, loss: float, error: float, score: float, *, chosen: bool
+) -> Restart:
     return Restart(
         seed=start.seed,
         loss=finite_or_none(loss),
@@ -175,7 +196,10 @@ def _restart(start: PlannedRun, run: Any, loss: float, error: float, score: floa
 
 
 def _cross_validation(task: Task, run: Any) -> float:
-    """Generalised: `N RSS / (N − nθ − 1.4 γ)²` of a run one step ahead; infinite where it uses up all rows."""
+    """Generalised: `N RSS / (N − nθ − 1.4 γ)²` of a run one step ahead.
+
+    Infinite where it uses up all rows.
+    """
     samples = task.problem.samples
     left = samples - len(task.problem.baseline.names) - _INFLATION * run.effective
     return task.loss(run) * (samples / left) ** 2 if left > 0 else math.inf
@@ -183,7 +207,9 @@ def _cross_validation(task: Task, run: Any) -> float:
 
 def _alike(starts: Sequence[PlannedRun], best: int) -> list[int]:
     """Return the runs with the regularization of the best one."""
-    return [i for i, start in enumerate(starts) if start.regularization == starts[best].regularization]
+    return [
+        i for i, start in enumerate(starts) if start.regularization == starts[best].regularization
+    ]
 
 
 def _members(starts: Sequence[PlannedRun], ranking: np.ndarray, best: int) -> list[int]:
@@ -209,7 +235,9 @@ def _run_all(
         return begun, runs
 
     def again(planned: list[PlannedRun]) -> tuple[list[PlannedRun], list[Any]]:
-        return _run(task, planned, structure, solver, lambda i, *at: progress(len(begun) + i, *at), runner)
+        return _run(
+            task, planned, structure, solver, lambda i, *at: progress(len(begun) + i, *at), runner
+        )
 
     return add_retries(begun, runs, task.bound.ny, again)
 
@@ -229,11 +257,15 @@ def _run(
         told = (i, start.seed, run.ending.code, run.iterations, task.loss(run), run.seconds)
         LOG.info("run %d, seed %d: %s after %d iterations, loss %.4g, %.2f s", *told)
     failed = [start for start, run in zip(made, runs, strict=True) if not run.ending.usable]
-    if task.bound is None or not failed or len(failed) == len(made):  # where all fail the data or the learner are bad
+    if (
+        task.bound is None or not failed or len(failed) == len(made)
+    ):  # where all fail the data or the learner are bad
         return made, runs
     following = max(start.seed for start in made) + 1
     bound = task.bound
-    LOG.debug("%d runs failed and are made again from the seeds after %d", len(failed), following - 1)
+    LOG.debug(
+        "%d runs failed and are made again from the seeds after %d", len(failed), following - 1
+    )
     again = [
         start._replace(seed=seed, weights=bound.init(jax.random.key(seed)))
         for seed, start in enumerate(failed, following)
@@ -242,16 +274,23 @@ def _run(
     return made + again, runs + list(more)
 
 
-def _one_run(given: tuple[Task, Solver, Structure], start: PlannedRun, tell: Callable[..., None]) -> Any:
+def _one_run(
+    given: tuple[Task, Solver, Structure], start: PlannedRun, tell: Callable[..., None]
+) -> Any:
     task, solver, structure = given
     return task.run(solver, start.weights, structure, start.regularization, tell)
 
 
 def _replaced(starts: Sequence[PlannedRun], runs: Sequence[Any]) -> list[Warning]:
-    failed = [str(start.seed) for start, run in zip(starts, runs, strict=True) if not run.ending.usable]
+    failed = [
+        str(start.seed) for start, run in zip(starts, runs, strict=True) if not run.ending.usable
+    ]
     if not failed or len(failed) == len(runs):
         return []
-    text = f"training failed from seed {', '.join(failed)} and was made again from the seeds after the last one."
+    text = (
+        f"training failed from seed {', '.join(failed)} and was made again from the seeds "
+        "after the last one."
+    )
     return [Warning("start_replaced", text)]
 
 
@@ -260,7 +299,11 @@ def _stopped(count: int, runs: int, untried: bool) -> list[Warning]:
         return []
     text = f"training was stopped on request: {count} of {counted(runs, 'run')} had not ended"
     text += ", and none was tried on held-out blocks" if untried else ""
-    return [Warning("stopped", f"{text}; the best so far is kept, which training to the end may better.")]
+    return [
+        Warning(
+            "stopped", f"{text}; the best so far is kept, which training to the end may better."
+        )
+    ]
 
 
 def _held_out(
@@ -282,20 +325,30 @@ def _held_out(
         fits = [concluded(i) for i in range(len(starts))]
         alone = _errors(_alone(conclude, task, structure), record, unit)
         labels = ("the validation part",) * len(record.experiments)
-        return HeldOutErrors("the validation part", labels, alone, tuple(_errors(fit, record, unit) for fit in fits))
+        return HeldOutErrors(
+            "the validation part", labels, alone, tuple(_errors(fit, record, unit) for fit in fits)
+        )
     if not choice.blocks or not choice.compares(task, starts):
         return None
     try:
         folds = blocked(task.problem.record, choice.blocks, task.problem.first_row)
     except InputError:  # too few rows to leave some out
-        LOG.debug("too few rows for %d blocks of cross-validation; the lowest loss chooses", choice.blocks)
+        LOG.debug(
+            "too few rows for %d blocks of cross-validation; the lowest loss chooses", choice.blocks
+        )
         return None
     LOG.info("cross-validation: %d folds of %d runs", len(folds), len(starts))
     given = (task, starts, structure, solver.at_most(FOLD_ITERATIONS), conclude)
     found = runner.map(_on_fold, given, folds)
     pieces = [[p for block in column for p in block] for column in zip(*found, strict=True)]
-    labels = tuple(f"block {i + 1} of {choice.blocks}" for i, (_, held) in enumerate(folds) for _ in held.experiments)
-    return HeldOutErrors(f"blocked cross-validation ({choice.blocks} blocks)", labels, pieces[0], tuple(pieces[1:]))
+    labels = tuple(
+        f"block {i + 1} of {choice.blocks}"
+        for i, (_, held) in enumerate(folds)
+        for _ in held.experiments
+    )
+    return HeldOutErrors(
+        f"blocked cross-validation ({choice.blocks} blocks)", labels, pieces[0], tuple(pieces[1:])
+    )
 
 
 def _on_fold(given: Any, fold: tuple[Record, Record], tell: Callable[..., None]) -> list[Pieces]:
@@ -323,13 +376,15 @@ def _errors(fit: Any, record: Record, unit: Any) -> Pieces:
 
 
 def _fell_back(held_out: HeldOutErrors) -> Warning:
-    model, alone = (math.sqrt(mean_square(p)) for p in (held_out.runs[held_out.chosen], held_out.alone))
+    model, alone = (
+        math.sqrt(mean_square(p)) for p in (held_out.runs[held_out.chosen], held_out.alone)
+    )
     errors = f"its error is {model:.4g} deviations of the output, that of physics alone {alone:.4g}"
     if math.isinf(model):
         errors = "every one of its starts runs away there"
     text = (
-        f"in {held_out.where} the learner is not better than physics alone ({errors}), so the result is "
-        "physics alone; `fallback = false` keeps the learner."
+        f"in {held_out.where} the learner is not better than physics alone ({errors}), so the "
+        "result is physics alone; `fallback = false` keeps the learner."
     )
     return Warning("physics_alone", text)
 
@@ -345,13 +400,22 @@ def _kept_physics(conclude: Concluding, task: Task, structure: Structure) -> Any
     return _alone(conclude, task, Orthogonal() if plain else structure)
 
 
-def _concluded(conclude: Concluding, task: Task, structure: Structure, learned: TrainedLearner) -> Any:
+def _concluded(
+    conclude: Concluding, task: Task, structure: Structure, learned: TrainedLearner
+) -> Any:
     return replace(conclude(task.rows_task, structure, learned), criterion=task.criterion)
 
 
 def _median(task: Task, runs: Sequence[Any], members: Sequence[int], best: int) -> TrainedLearner:
-    """Return the median of the members that have a value everywhere; the best one alone if it has none."""
+    """Return the median of the members that have a value everywhere.
+
+    The best one alone if it has none.
+    """
     rows: OneStepTask = task.rows_task
     learned = {i: task.learned(runs[i]) for i in members}
     sound = [i for i, member in learned.items() if np.isfinite(rows.share(member).square)]
-    return task.median([learned[i] for i in sound], sound.index(best)) if best in sound else learned[best]
+    return (
+        task.median([learned[i] for i in sound], sound.index(best))
+        if best in sound
+        else learned[best]
+    )

@@ -13,7 +13,15 @@ from orthaug.fitting.learned import TrainedLearner
 from orthaug.fitting.normal_equations import Blocks
 from orthaug.inference.covariance import mixing
 from orthaug.models.learners import Bound, Scaling
-from orthaug.models.rows import Engine, LearnerSums, MixedGram, Overlap, ResidualGram, from_chunks, row_values
+from orthaug.models.rows import (
+    Engine,
+    LearnerSums,
+    MixedGram,
+    Overlap,
+    ResidualGram,
+    from_chunks,
+    row_values,
+)
 from orthaug.physics.problem import Problem
 from orthaug.physics.streamed import StreamedProblem
 
@@ -29,8 +37,8 @@ class Share(NamedTuple):
 class TrainingRows:
     """A problem with its learner (None for physics alone), scaled for training.
 
-    `unit` (ny,) is the learner's output unit in the outputs' units. `rms` is the RMS of the baseline's whitened
-    residual, the unit of the criterion's rows. The engine keeps these rows.
+    `unit` (ny,) is the learner's output unit in the outputs' units. `rms` is the RMS of the
+    baseline's whitened residual, the unit of the criterion's rows. The engine keeps these rows.
     """
 
     problem: Problem
@@ -69,7 +77,9 @@ class TrainingRows:
         """Σ r rᵀ (ny, ny) of the residual r = Y − F − Φc, in whitened outputs."""
         problem = self.problem
         physics = problem.target_coordinates - problem.projection.to_coordinates @ c
-        total = self.engine.sum(ResidualGram(learned.bound), self.rows, *self._weights(learned), physics / self.rms)
+        total = self.engine.sum(
+            ResidualGram(learned.bound), self.rows, *self._weights(learned), physics / self.rms
+        )
         return np.asarray(total) * self.rms**2
 
     def _sums(self, learned: TrainedLearner, shift: Vector) -> tuple[Vector, float]:
@@ -81,12 +91,16 @@ class TrainingRows:
         """f at the training rows, in the outputs' units; the rows are in memory."""
         if self.bound is None:
             return np.zeros_like(self.problem.target)
-        return from_chunks(row_values(self.bound, w, self.rows.z), len(self.problem.rows)) * self.unit
+        return (
+            from_chunks(row_values(self.bound, w, self.rows.z), len(self.problem.rows)) * self.unit
+        )
 
     def share_of(self, w: Vector) -> Vector:
         """QᵀF (nθ,) of the learner with the weights w, in whitened outputs."""
         if not self.engine.resident or isinstance(self.problem, StreamedProblem):
-            sums = self.engine.sum(LearnerSums(self.bound), self.rows, w, None, self._nothing.values)
+            sums = self.engine.sum(
+                LearnerSums(self.bound), self.rows, w, None, self._nothing.values
+            )
             return np.asarray(sums[0]) * self.rms
         return self.problem.projection.coordinates(self.problem.weight.rows(self.values(w)))
 
@@ -105,7 +119,10 @@ class TrainingRows:
         return learned.weights, learned.tilt @ self.problem.projection.to_coordinates.T / self.rms
 
     def middle(self, w: Any, noise: Matrix) -> Matrix:
-        """ΣψᵀΣ_eψ of `[Φ J]` for the noise covariance of whitened outputs; one pass over the rows."""
+        """ΣψᵀΣ_eψ of `[Φ J]` for the noise covariance of whitened outputs.
+
+        One pass over the rows.
+        """
         mix = mixing(noise)
         total = np.asarray(self.engine.sum(MixedGram(self.bound), self.rows, w, mix))
         to_phi = self.problem.projection.to_coordinates

@@ -1,8 +1,9 @@
 """Fits whose training ended while the loss still fell noticeably: what they say of it, and no intervals of θ.
 
-Under the training measure the orthogonal structure's `θ̂ = Φ⁺Y` one step ahead is the same after every iteration (F1),
-and its intervals depend on training through the variance of the residual alone. Everywhere else θ moves with the
-weights: split along some directions only, under another measure, or trained on the free run.
+Under the training measure the orthogonal structure's `θ̂ = Φ⁺Y` one step ahead is the same after
+every iteration (F1), and its intervals depend on training through the variance of the residual
+alone. Everywhere else θ moves with the weights: split along some directions only, under another
+measure, or trained on the free run.
 """
 
 from __future__ import annotations
@@ -31,7 +32,9 @@ def noticeable_fall(structure: Structure, decoupled: bool, samples: int) -> floa
         decoupled: whether θ under the training measure does not depend on the learner.
         samples: number of residuals.
     """
-    return _SETTLED_THETA if decoupled and structure.measure == Training() else noticeable_in(samples)
+    return (
+        _SETTLED_THETA if decoupled and structure.measure == Training() else noticeable_in(samples)
+    )
 
 
 def follows_training(structure: Structure, problem: Problem, learned: TrainedLearner) -> bool:
@@ -57,17 +60,26 @@ def not_converged(learned: TrainedLearner) -> Warning:
     """Return the warning that there are no intervals, with cause and remedy."""
     assert learned.tail is not None
     text = (
-        f"no intervals: training ended after {counted(learned.tail.done, 'iteration')} while the loss still fell "
-        f"({_fall(learned.tail)}), so the parameters may still move by more than their standard errors. "
+        f"no intervals: training ended after {counted(learned.tail.done, 'iteration')} while "
+        f"the loss still fell ({_fall(learned.tail)}), so the parameters may still move by "
+        "more than their standard errors. "
     )
     if learned.ending is Ending.STOPPED:
         return Warning(NOT_CONVERGED, f"{text}Train to the end.")
     if learned.bound is None:
-        text += "Give initial values nearer to the data, fix what the data do not determine, or allow more `iterations`"
+        text += (
+            "Give initial values nearer to the data, fix what the data do not determine, or "
+            "allow more `iterations`"
+        )
     else:
-        text += "Take a smaller learner or a stronger regularization, which settle sooner, or allow more `iterations`"
+        text += (
+            "Take a smaller learner or a stronger regularization, which settle sooner, or "
+            "allow more `iterations`"
+        )
     if not learned.tail.prolonged:
-        text += "; without the key training goes on by itself while the loss falls, up to ten times 300"
+        text += (
+            "; without the key training goes on by itself while the loss falls, up to ten times 300"
+        )
     return Warning(NOT_CONVERGED, f"{text}.")
 
 
@@ -82,11 +94,14 @@ def ending_in_words(ending: Ending, tail: Tail | None) -> str:
         words += "more iterations may improve it"
         if not tail.noticeable:
             words = (
-                f"training stopped at its limit of {counted(tail.done, 'iteration')}, and the loss hardly fell any "
-                f"more ({_fall(tail)})"
+                f"training stopped at its limit of {counted(tail.done, 'iteration')}, and the "
+                f"loss hardly fell any more ({_fall(tail)})"
             )
     if tail.prolonged:
-        past = f"training went on past its limit of {counted(tail.limit, 'iteration')}, for the loss still fell"
+        past = (
+            f"training went on past its limit of {counted(tail.limit, 'iteration')}, for the "
+            "loss still fell"
+        )
         words = f"{past}; {words or ending.message}".rstrip("; ")
     return words
 

@@ -1,11 +1,12 @@
 """How much each row moves an estimate: derivatives of the model by rows, influences on θ, leverage, uneven noise.
 
-To first order `p̂ − p = M⁻¹ Σ_k ψ_kᵀe_k` with `M = Σψᵀψ + ridge`, and `θ̂ − θ = Σ_k b_kᵀe_k` with `b_k = ψ_k M⁻¹ Kᵀ`,
-K how θ follows p = (c, w). The plain covariance takes all errors for equally large. Where their size goes with what
-b_k is made of it is wrong, and there alone: White's test (Econometrica 1980) regresses e_k² on the products of the
-entries of b_k, in the form of Koenker (J. Econometrics 1981), whose level does not rest on normal errors. HC3
-(MacKinnon and White 1985), `Σ ψᵀẽẽᵀψ` with `ẽ_k = (I − φ_k(ΦᵀΦ)⁻¹φ_kᵀ)⁻¹e_k`, holds for both, also of few rows. The
-rows are those of one step ahead or of a free run: both have ψ and e.
+To first order `p̂ − p = M⁻¹ Σ_k ψ_kᵀe_k` with `M = Σψᵀψ + ridge`, and `θ̂ − θ = Σ_k b_kᵀe_k` with
+`b_k = ψ_k M⁻¹ Kᵀ`, K how θ follows p = (c, w). The plain covariance takes all errors for equally
+large. Where their size goes with what b_k is made of it is wrong, and there alone: White's test
+(Econometrica 1980) regresses e_k² on the products of the entries of b_k, in the form of Koenker (J.
+Econometrics 1981), whose level does not rest on normal errors. HC3 (MacKinnon and White 1985), `Σ
+ψᵀẽẽᵀψ` with `ẽ_k = (I − φ_k(ΦᵀΦ)⁻¹φ_kᵀ)⁻¹e_k`, holds for both, also of few rows. The rows are those
+of one step ahead or of a free run: both have ψ and e.
 """
 
 from __future__ import annotations
@@ -45,10 +46,14 @@ class Influence:
     physics: Float[np.ndarray, "N ny s"]
     """The same rows of θ alone, in coordinates of their own: their squares are its leverage."""
     inflation: float
-    """What the learner has used up: √(N / (N − effective weights)), for its leverage is no matter of a single row."""
+    """What the learner has used up: √(N / (N − effective weights)), for its leverage is no matter
+    of a single row.
+    """
 
     @classmethod
-    def of(cls, slopes: Slopes, statistics: Statistics, k: Float[np.ndarray, "m n"], nt: int) -> Influence:
+    def of(
+        cls, slopes: Slopes, statistics: Statistics, k: Float[np.ndarray, "m n"], nt: int
+    ) -> Influence:
         """From derivatives ψ (N, ny, n), the statistics that have their Gram matrix and prior, and K.
 
         Args:
@@ -57,7 +62,10 @@ class Influence:
         assert statistics.gram is not None
         root = half_inverse(statistics.gram + np.diag(prior_of(statistics, nt)), nt)
         rows, own = slopes @ root, slopes[..., :nt] @ half_inverse(statistics.gram[:nt, :nt], nt)
-        used, count = max(float(np.sum(rows**2) - np.sum(own**2)), 0.0), rows.shape[0] * rows.shape[1]
+        used, count = (
+            max(float(np.sum(rows**2) - np.sum(own**2)), 0.0),
+            rows.shape[0] * rows.shape[1],
+        )
         return cls(rows, root, k @ root, own, float(np.sqrt(count / max(count - used, 1.0))))
 
     def less_leverage(self, errors: Matrix) -> Matrix:
@@ -67,7 +75,9 @@ class Influence:
         if errors.shape[1] == 1:
             return errors / np.maximum(own[:, :, 0], np.sqrt(np.finfo(float).eps))
         values, vectors = np.linalg.eigh(own)
-        along = np.einsum("kij,ki->kj", vectors, errors) / np.maximum(values, np.sqrt(np.finfo(float).eps))
+        along = np.einsum("kij,ki->kj", vectors, errors) / np.maximum(
+            values, np.sqrt(np.finfo(float).eps)
+        )
         return np.einsum("kij,kj->ki", vectors, along)
 
     def uneven(self, errors: Matrix) -> float:
@@ -109,7 +119,9 @@ def one_step_slopes(problem: Problem, model: Model, x: Matrix | None = None) -> 
     assert gram is not None
     unit, ny = column_units(gram, len(model.theta)), len(problem.outputs)
     chunks = jnp.asarray(in_chunks(x, chunk_shape(len(x)), repeat=True))
-    moved = from_chunks(np.asarray(changes(model.form, model.numbers, chunks, jnp.diag(unit))), len(x))
+    moved = from_chunks(
+        np.asarray(changes(model.form, model.numbers, chunks, jnp.diag(unit))), len(x)
+    )
     slopes = moved.reshape(len(x), len(unit), ny) / unit[:, None]
     return np.einsum("oi,kni->kon", problem.weight.matrix, slopes)
 
@@ -120,7 +132,9 @@ def prior_of(statistics: Statistics, nt: int) -> Vector:
     return np.concatenate([np.zeros(nt), statistics.ridge * np.ones(len(statistics.gram) - nt)])
 
 
-def hc3(statistics: Statistics, slopes: Slopes, errors: Matrix, nt: int, share: float = 1.0) -> Statistics:
+def hc3(
+    statistics: Statistics, slopes: Slopes, errors: Matrix, nt: int, share: float = 1.0
+) -> Statistics:
     """Return statistics whose middle `ΣψᵀΣ_eψ` is made of every row's own error (HC3), not of one noise for all.
 
     Args:

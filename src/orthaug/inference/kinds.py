@@ -1,4 +1,6 @@
-"""The measures that a spec knows by name. A new one is a file with its declaration, and an entry here.
+"""The measures that a spec knows by name.
+
+A new one is a file with its declaration, and an entry here.
 
 Those from files become `Samples` and `Weighted`.
 """
@@ -60,7 +62,9 @@ class SampleFiles:
 
 @dataclass(frozen=True)
 class WeightFiles:
-    """Declares `Weighted`: files with a column `weight`. Together they have a row for each row of the training data.
+    """Declares `Weighted`: files with a column `weight`.
+
+    Together they have a row for each row of the training data.
 
     Rows before the first usable one have weights too, which are not used.
     """
@@ -72,12 +76,14 @@ class WeightFiles:
 
     def resolve(self, place: MeasurePlace) -> Weighted:
         files = [place.folder / file for file in self.files]
-        weights = np.concatenate([read_record(f, outputs=["weight"]).experiments[0].outputs[:, 0] for f in files])
+        weights = np.concatenate(
+            [read_record(f, outputs=["weight"]).experiments[0].outputs[:, 0] for f in files]
+        )
         lengths = [len(experiment) for experiment in place.record.experiments]
         if len(weights) != sum(lengths):
             raise InputError(
-                f"{', '.join(map(str, files))}: {len(weights)} weights for {sum(lengths)} rows of training data; "
-                "give one for each row, in the same order."
+                f"{', '.join(map(str, files))}: {len(weights)} weights for {sum(lengths)} rows "
+                "of training data; give one for each row, in the same order."
             )
         pieces = np.split(weights, np.cumsum(lengths)[:-1])
         return Weighted(np.concatenate([piece[place.start :] for piece in pieces]))

@@ -26,8 +26,8 @@ WRITINGS = ("text", "latex", "python")
 class LearnedTerm:
     """A term of the learner in one output, or in one equation of a motion.
 
-    `largest` is the largest contribution over the training data, in the unit of what it is added to; `std` and `ci95`
-    are None where there are no standard errors.
+    `largest` is the largest contribution over the training data, in the unit of what it is added
+    to; `std` and `ci95` are None where there are no standard errors.
     """
 
     term: str
@@ -40,7 +40,10 @@ class LearnedTerm:
 
 
 def learned_terms(model: Any) -> tuple[LearnedTerm, ...]:
-    """Of a fitted model, the largest contribution first; empty where the learner is no sum of terms."""
+    """Of a fitted model, the largest contribution first.
+
+    Empty where the learner is no sum of terms.
+    """
     form, numbers, statistics = model.form, model.numbers, model.statistics
     if form.bound is None or not isinstance(form.bound.learner, Terms) or numbers.tilt is not None:
         return ()
@@ -64,24 +67,29 @@ def learned_terms(model: Any) -> tuple[LearnedTerm, ...]:
                 known = {"std": float(std[n]), "ci95": (float(ci[n, 0]), float(ci[n, 1]))}
             largest = abs(values[n]) * float(numbers.halfwidth[j])
             own = coefficient_unit(unit, feature, units)
-            found.append(LearnedTerm(str(feature), place, float(values[n]), own, float(largest), **known))
+            found.append(
+                LearnedTerm(str(feature), place, float(values[n]), own, float(largest), **known)
+            )
     return tuple(sorted(found, key=lambda term: -term.largest))
 
 
 def equation(model: Any, writing: str = "text") -> str:
     """Return the whole model as an equation for each output, or for each equation of a motion, with its numbers.
 
-    Args:
-        writing: "text", "latex", or "python": expressions of arrays that Python evaluates, in full precision.
+    Args: writing: "text", "latex", or "python": expressions of arrays that Python evaluates, in
+        full precision.
 
-    Raises:
-        InputError: a learner that is no sum of terms, physics that is a Python function, another writing.
+    Raises: InputError: a learner that is no sum of terms, physics that is a Python function,
+        another writing.
     """
     check_choice(writing, WRITINGS, "`writing`")
     form = model.form
     terms = learned_terms(model)
     if form.bound is not None and not terms:
-        raise InputError("only a learner of terms can be written as an equation; `explain` finds terms for another.")
+        raise InputError(
+            "only a learner of terms can be written as an equation; `explain` finds terms for "
+            "another."
+        )
     written = []
     for left, physics in _physics(model, writing):
         own = [(term.coefficient, term.term) for term in terms if term.added_to == left[0]]
@@ -108,8 +116,14 @@ def _added_to(model: Any) -> list[tuple[str, str]]:
     motion = model.form.motion
     states, outputs = motion.learned
     units = {channel.name: channel.unit for channel in model.outputs}
-    rates = [(motion.states[i].name, f"({motion.states[i].unit})/s" if motion.states[i].unit else "") for i in states]
-    return [*rates, *((motion.outputs[i].name, units.get(motion.outputs[i].name, "")) for i in outputs)]
+    rates = [
+        (motion.states[i].name, f"({motion.states[i].unit})/s" if motion.states[i].unit else "")
+        for i in states
+    ]
+    return [
+        *rates,
+        *((motion.outputs[i].name, units.get(motion.outputs[i].name, "")) for i in outputs),
+    ]
 
 
 def _units(model: Any) -> dict[str, str]:
@@ -125,14 +139,26 @@ def _physics(model: Any, writing: str) -> list[tuple[tuple[str, str], list[str]]
         return _rates(model, writing)
     baseline = model.form.baseline
     if baseline.function is not None:
-        raise InputError("the physics is a Python function, which cannot be written as an equation.")
+        raise InputError(
+            "the physics is a Python function, which cannot be written as an equation."
+        )
     c = dict(zip(baseline.names, model.theta - model.theta_aux, strict=True))
     found = []
     for channel in model.outputs:
         own = [term for term in baseline.terms if term.output in (None, channel.name)]
-        values = [((term.initial or 0.0) if term.fixed else c[term.parameter], term.regressor) for term in own]
-        left = latex(Expression(f"{channel.name}[k]")) if writing == "latex" else f"{channel.name}[k]"
-        found.append(((channel.name, left), [_product(value, text, writing, model) for value, text in values]))
+        values = [
+            ((term.initial or 0.0) if term.fixed else c[term.parameter], term.regressor)
+            for term in own
+        ]
+        left = (
+            latex(Expression(f"{channel.name}[k]")) if writing == "latex" else f"{channel.name}[k]"
+        )
+        found.append(
+            (
+                (channel.name, left),
+                [_product(value, text, writing, model) for value, text in values],
+            )
+        )
     return found
 
 
@@ -162,7 +188,13 @@ def _product(value: float, text: str, writing: str, model: Any) -> str:
     if writing == "latex":
         number = _power_of_ten(number)
         return number if text == "1" else rf"{number}\,{latex(Expression(text))}"
-    return number if text == "1" else f"{number}*({text})" if outside_brackets(text, "+-") else f"{number}*{text}"
+    return (
+        number
+        if text == "1"
+        else f"{number}*({text})"
+        if outside_brackets(text, "+-")
+        else f"{number}*{text}"
+    )
 
 
 def _power_of_ten(number: str) -> str:
@@ -191,16 +223,26 @@ def term_frame(terms: Sequence[LearnedTerm]) -> pd.DataFrame:
 
 
 def term_lines(terms: Sequence[LearnedTerm]) -> list[str]:
-    """Return the terms as a table of text, a heading before them; a dash where there is no interval."""
+    """Return the terms as a table of text, a heading before them.
+
+    A dash where there is no interval.
+    """
     if not terms:
         return []
     width = max(4, *(len(term.term) for term in terms))
     several = len({term.added_to for term in terms}) > 1
-    lines = ["", f"{'term':<{width}}  {'coefficient':>14}  {'std':>11}  {'95 % interval':^29}  {'largest':>11}  unit"]
+    lines = [
+        "",
+        f"{'term':<{width}}  {'coefficient':>14}  {'std':>11}  {'95 % interval':^29}  "
+        f"{'largest':>11}  unit",
+    ]
     for term in terms:
         spread, reach = f"{'–':>11}", f"{'–':^29}"
         if term.std is not None and term.ci95 is not None:
             spread, reach = f"{term.std:11.4g}", f"[{term.ci95[0]:13.7g}, {term.ci95[1]:13.7g}]"
-        row = f"{term.term:<{width}}  {term.coefficient:14.8g}  {spread}  {reach}  {term.largest:11.5g}  "
+        row = (
+            f"{term.term:<{width}}  {term.coefficient:14.8g}  {spread}  {reach}  "
+            f"{term.largest:11.5g}  "
+        )
         lines.append(f"{row}{term.unit or ''}{f'  in {term.added_to}' * several}".rstrip())
     return lines

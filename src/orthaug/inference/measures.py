@@ -1,8 +1,8 @@
 """Measures: the points, with weights, on which physics and learner are made orthogonal (F3), and the physics there.
 
-θ under a measure is `Φ_μ⁺ G_μ`, the least-squares share of the fitted function g in the physics over those points. The
-paper takes the training set. A function that is orthogonal to the physics under one measure need not be so under
-another.
+θ under a measure is `Φ_μ⁺ G_μ`, the least-squares share of the fitted function g in the physics
+over those points. The paper takes the training set. A function that is orthogonal to the physics
+under one measure need not be so under another.
 """
 
 from __future__ import annotations
@@ -64,7 +64,9 @@ class Support:
         """Of a motion's states (M, nx) and inputs (M, nu) at the training rows."""
         layout, points = layout_of(motion), np.concatenate([x, u], axis=1)
         channels = tuple(Channel(f"c{i}") for i in range(len(layout)))
-        return cls(Record((), channels, 1.0, (Experiment(points[:, :0], points),)), layout, layout, points)
+        return cls(
+            Record((), channels, 1.0, (Experiment(points[:, :0], points),)), layout, layout, points
+        )
 
     @cached_property
     def x(self) -> Matrix:
@@ -74,8 +76,9 @@ class Support:
     def share(self, points: Points) -> float:
         """Return the measure's weight within reach of the training data.
 
-        A point is within reach if its nearest training point is closer than a limit: twice the distance from a training
-        point to its nearest neighbour, at the 99 % quantile. Each used lag counts in units of the range of its data.
+        A point is within reach if its nearest training point is closer than a limit: twice the
+        distance from a training point to its nearest neighbour, at the 99 % quantile. Each used lag
+        counts in units of the range of its data.
         """
         columns = [j for j, lag in enumerate(self.layout) if lag in self.used]
         x = self.x[:, columns]
@@ -112,7 +115,10 @@ def _even(x: Matrix) -> Points:
 
 @dataclass(frozen=True)
 class Training:
-    """The training rows with equal weights: the paper's measure. `rows` (start, stop) of each experiment."""
+    """The training rows with equal weights: the paper's measure.
+
+    `rows` (start, stop) of each experiment.
+    """
 
     rows: tuple[int, int] | None = field(default=None, metadata=LIBRARY_ONLY)
     name: str = field(default="training", metadata=LIBRARY_ONLY)
@@ -128,7 +134,9 @@ class Training:
             kept.append(rows[max(start - first, 0) : max(stop - first, 0)])
         x = np.concatenate(kept)
         if not len(x):
-            raise InputError(f"rows {start}:{stop} hold no usable row; the first is at row {first}.")
+            raise InputError(
+                f"rows {start}:{stop} hold no usable row; the first is at row {first}."
+            )
         return _even(x)
 
 
@@ -185,13 +193,21 @@ class Samples:
         missing = [str(lag) for lag in support.used if lag not in values]
         if missing:
             what = _entries(support)
-            raise InputError(f"the samples lack {', '.join(missing)}; give a column for every {what} that is used.")
+            raise InputError(
+                f"the samples lack {', '.join(missing)}; give a column for every {what} that "
+                "is used."
+            )
         lengths = {str(lag): v.shape for lag, v in values.items()}
         if len(set(lengths.values())) > 1 or any(len(shape) != 1 for shape in lengths.values()):
-            raise InputError(f"the samples' columns differ in shape: {lengths}; give one vector of a length for each.")
+            raise InputError(
+                f"the samples' columns differ in shape: {lengths}; give one vector of a length "
+                "for each."
+            )
         count = next(iter(values.values())).shape[0]
         if not count:
-            raise InputError("the samples have no rows; give at least as many as there are parameters.")
+            raise InputError(
+                "the samples have no rows; give at least as many as there are parameters."
+            )
         bad = [str(lag) for lag, v in values.items() if not np.isfinite(v).all()]
         if bad:
             raise InputError(f"the samples' column {bad[0]} holds a value that is not finite.")
@@ -206,17 +222,20 @@ class Samples:
 class Uniform:
     """Uniform over a box of raw lags, integrated by a deterministic rule that is symmetric about the box's centre.
 
-    Composite Gauss-Legendre in up to three coordinates, Sobol points with their mirror images in more.
+    Composite Gauss-Legendre in up to three coordinates, Sobol points with their mirror images in
+    more.
 
-    Args:
-        box: limits of raw lags, `{"force[k-1]": (-200, 200)}`; lags that are not named take the data's own range.
+    Args: box: limits of raw lags, `{"force[k-1]": (-200, 200)}`; lags that are not named take the
+        data's own range.
 
     Examples:
         >>> Uniform(box={"u[k-1]": (-2, 2)}).name  # fit.split(Uniform(…)) gives θ under it
         'uniform'
     """
 
-    box: Annotated[Mapping[str, Annotated[Sequence[float], Len(2, 2)]], Option("box")] = field(default_factory=dict)
+    box: Annotated[Mapping[str, Annotated[Sequence[float], Len(2, 2)]], Option("box")] = field(
+        default_factory=dict
+    )
     name: str = field(default="uniform", metadata=LIBRARY_ONLY)
 
     def points(self, support: Support) -> Points:
@@ -241,7 +260,9 @@ class Uniform:
             try:
                 start, stop = (float(limit) for limit in limits)
             except (TypeError, ValueError):
-                raise InputError(f"the box of {text} must be two numbers, lower and upper; got {limits!r}.") from None
+                raise InputError(
+                    f"the box of {text} must be two numbers, lower and upper; got {limits!r}."
+                ) from None
             if not (math.isfinite(start) and math.isfinite(stop) and start < stop):
                 raise InputError(f"the box of {text} is empty or reversed: {start:g} to {stop:g}.")
             j = support.layout.index(lag)
@@ -269,8 +290,8 @@ def _lag_of(text: str, support: Support) -> Lag:
         plain = plain[:-3] + "]"
     if plain not in known:
         raise InputError(
-            f"'{text}' is no {_entries(support)} that this model reads{nearest(plain, known) or '.'} "
-            f"It reads {', '.join(known)}."
+            f"'{text}' is no {_entries(support)} that this model "
+            f"reads{nearest(plain, known) or '.'} It reads {', '.join(known)}."
         )
     return known[plain]
 
@@ -292,7 +313,10 @@ def _rule(coordinates: int) -> Points:
         share = np.tile(weight / (2 * panels), panels)
         grid = np.meshgrid(*[line] * coordinates, indexing="ij")
         shares = np.meshgrid(*[share] * coordinates, indexing="ij")
-        return Points(np.stack([g.ravel() for g in grid], axis=-1), np.prod([s.ravel() for s in shares], axis=0))
+        return Points(
+            np.stack([g.ravel() for g in grid], axis=-1),
+            np.prod([s.ravel() for s in shares], axis=0),
+        )
     import scipy.stats.qmc  # slow to import, and few boxes have so many coordinates
 
     quasi = 2 * scipy.stats.qmc.Sobol(coordinates, scramble=True, rng=0).random(_QUASI_RANDOM) - 1
@@ -321,31 +345,44 @@ def weigh(
     Args:
         weight: the matrix of the output weights, (ny, ny).
 
-    Raises:
-        InputError: a measure that does not fit the data, or on whose points the physics is not finite.
+    Raises: InputError: a measure that does not fit the data, or on whose points the physics is not
+        finite.
     """
     points = measure.points(support)
     with np.errstate(all="ignore"):
         phi = np.asarray(baseline.phi(points.x, support.layout, outputs, np))
     if not np.isfinite(phi).all():
         point, _, column = np.argwhere(~np.isfinite(phi))[0]
-        at = ", ".join(f"{lag} = {value:.4g}" for lag, value in zip(support.layout, points.x[point], strict=True))
+        at = ", ".join(
+            f"{lag} = {value:.4g}"
+            for lag, value in zip(support.layout, points.x[point], strict=True)
+        )
         raise InputError(
-            f"the physics is not finite on all points of the {measure.name} measure: what {baseline.names[column]} "
-            f"multiplies is not at {at}. Take the training measure, or a uniform one over a box where it is."
+            f"the physics is not finite on all points of the {measure.name} measure: what "
+            f"{baseline.names[column]} multiplies is not at {at}. Take the training measure, "
+            "or a uniform one over a box where it is."
         )
     unit = np.sqrt(points.weight)[:, None, None] * weight
     projection = Projection.factor(times(unit, phi))
-    return WeighedPhysics(measure, points, unit, projection, excitation(projection.r, baseline.names))
+    return WeighedPhysics(
+        measure, points, unit, projection, excitation(projection.r, baseline.names)
+    )
 
 
 def weigh_problem(measure: Measure, problem: Problem) -> WeighedPhysics:
-    """The same for a posed problem. Under the training measure it takes the factor that the problem has."""
+    """The same for a posed problem.
+
+    Under the training measure it takes the factor that the problem has.
+    """
     if measure != Training():
-        return weigh(measure, Support.of(problem), problem.baseline, problem.outputs, problem.weight.matrix)
+        return weigh(
+            measure, Support.of(problem), problem.baseline, problem.outputs, problem.weight.matrix
+        )
     rows, own = len(problem.rows), problem.projection
     even = np.full(rows, 1 / rows)
     size = np.sqrt(even[0])
     projection = replace(own, r=own.r * size, phi=own.phi * size)
     unit = np.sqrt(even)[:, None, None] * problem.weight.matrix
-    return WeighedPhysics(measure, Points(problem.rows.x, even), unit, projection, problem.excitation)
+    return WeighedPhysics(
+        measure, Points(problem.rows.x, even), unit, projection, problem.excitation
+    )

@@ -1,11 +1,15 @@
-"""The nearest physics of a fitted motion, p̂ = argmin_p Σ_μ ‖G − f(·; p)‖², along what a learner could imitate.
+"""The nearest physics of a fitted motion, p̂ = argmin_p Σ_μ ‖G − f(·.
 
-G = f(·; c) + g is the fitted field over points of states and inputs; only learned equations and outputs count. p̂
-depends on G and the measure alone, not on how G was put together. For f linear in p it is `θ = c + B (Φ_μ B)⁺ F_μ`.
+P)‖², along what a learner could imitate.
 
-Intervals come from the stationarity of p̂ by the implicit function theorem: with φ the sum and q the coordinates of p,
-`B'φ_qq B ds = −B'(φ_qc + φ_qq) dc − B'φ_qw dw − B' Σ φ_qx dx`. The last term counts that the points themselves are
-those of the fitted run. p̂ is unique near by only if B'φ_qq B is positive definite.
+G = f(·; c) + g is the fitted field over points of states and inputs; only learned equations and
+outputs count. p̂ depends on G and the measure alone, not on how G was put together. For f linear in
+p it is `θ = c + B (Φ_μ B)⁺ F_μ`.
+
+Intervals come from the stationarity of p̂ by the implicit function theorem: with φ the sum and q
+the coordinates of p, `B'φ_qq B ds = −B'(φ_qc + φ_qq) dc − B'φ_qw dw − B' Σ φ_qx dx`. The last term
+counts that the points themselves are those of the fitted run. p̂ is unique near by only if B'φ_qq B
+is positive definite.
 """
 
 from __future__ import annotations
@@ -47,7 +51,10 @@ class Field(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class MotionSplit:
-    """q̂ (np,) of p̂ and how it follows (c, w): `slope` (np, np + nw); None where p̂ is not unique."""
+    """q̂ (np,) of p̂ and how it follows (c, w): `slope` (np, np + nw).
+
+    None where p̂ is not unique.
+    """
 
     name: str
     q: Vector
@@ -58,14 +65,21 @@ class MotionSplit:
     share: float | None
     """‖learner‖ / ‖field‖ of the learned equations over the measure, after the split."""
     curvature: float
-    """Smallest eigenvalue of the second derivative of the distance, over that of a rest that is zero."""
+    """Smallest eigenvalue of the second derivative of the distance, over that of a rest that is
+    zero.
+    """
     field: Field
     support: float = 1.0
 
     @classmethod
     def none(cls, name: str, form: MotionField, c: Vector) -> MotionSplit:
         """Before any split: c itself, nothing shared, over no points."""
-        nothing = Field(np.zeros((0, form.states)), np.zeros((0, len(form.motion.inputs))), np.zeros(0), np.zeros(0))
+        nothing = Field(
+            np.zeros((0, form.states)),
+            np.zeros((0, len(form.motion.inputs))),
+            np.zeros(0),
+            np.zeros(0),
+        )
         shared = Shared(form.motion.names, np.zeros((len(c), 0)))
         return cls(name, c, shared, None, None, None, 1.0, nothing)
 
@@ -73,8 +87,8 @@ class MotionSplit:
 def shared_of_motion(form: MotionDynamics, q: Vector, x: Matrix, u: Matrix) -> Shared:
     """Return the directions of q that a learner on the form's features could imitate, at q.
 
-    A direction is shared if it moves no equation and no output without a learner, and moves those with one by a
-    function of the features alone.
+    A direction is shared if it moves no equation and no output without a learner, and moves those
+    with one by a function of the features alone.
     """
     names, motion = form.motion.names, form.motion
     if not learned_places(motion):
@@ -86,20 +100,31 @@ def shared_of_motion(form: MotionDynamics, q: Vector, x: Matrix, u: Matrix) -> S
     points = points[np.isfinite(points).all(axis=1)]
     pairs = moves(lambda rows: np.asarray(form.seen(rows[:, :nx].T, rows[:, nx:].T, np)).T, points)
     some = points[:: max(1, len(points) // _POINTS)]
-    for start, end in (pairs, (some, some)):  # where hardly any move is not seen, the learner sees everything
-        slopes = [np.asarray(slopes_at(form, q, rows[:, :nx], rows[:, nx:])) for rows in (start, end)]
+    for start, end in (
+        pairs,
+        (some, some),
+    ):  # where hardly any move is not seen, the learner sees everything
+        slopes = [
+            np.asarray(slopes_at(form, q, rows[:, :nx], rows[:, nx:])) for rows in (start, end)
+        ]
         kept = np.isfinite(slopes[0]).all(axis=(1, 2)) & np.isfinite(slopes[1]).all(axis=(1, 2))
         if kept.sum() >= _FEWEST * len(names):
             break
     before, after = (part[kept] for part in slopes)  # (M, nx + ny, np)
-    after = np.where(_has_learner(motion)[:, None], after, 0.0)  # what has no learner must not move at all
+    after = np.where(
+        _has_learner(motion)[:, None], after, 0.0
+    )  # what has no learner must not move at all
     size = np.sqrt(np.mean(before**2, axis=(0, 2), keepdims=True))
     size = np.where(size > 0, size, 1.0)
-    before, after = (np.concatenate(list(np.moveaxis(part / size, 1, 0))) for part in (before, after))
+    before, after = (
+        np.concatenate(list(np.moveaxis(part / size, 1, 0))) for part in (before, after)
+    )
     return Shared(names, agreeing(before, after)).beside(_left_over(form, q, points, nx))
 
 
-def _left_over(form: MotionDynamics, q: Vector, points: Matrix, nx: int) -> UnexplainedPhysics | None:
+def _left_over(
+    form: MotionDynamics, q: Vector, points: Matrix, nx: int
+) -> UnexplainedPhysics | None:
     """Return what functions of the features leave of the slopes at the points."""
     some = points[:: max(1, -(-len(points) // _ROWS))]
     slopes = np.asarray(slopes_at(form, q, some[:, :nx], some[:, nx:]))
@@ -158,7 +183,9 @@ def nearest(
     damping, value = 1e-6, _distance(form, numbers, q, field)
     for _ in range(_ITERATIONS):
         shared = directions(q)
-        gradient, gauss = (np.asarray(part) for part in _summed(_gauss_newton, form, numbers, q, field))
+        gradient, gauss = (
+            np.asarray(part) for part in _summed(_gauss_newton, form, numbers, q, field)
+        )
         b = _unit(shared.basis, gauss)
         inner, downhill = b.T @ gauss @ b, -b.T @ gradient
         along = np.linalg.lstsq(inner + damping * np.eye(len(inner)), downhill, rcond=None)[0]
@@ -195,11 +222,9 @@ def split_motion(
 ) -> MotionSplit:
     """p̂ of a fitted motion under a measure.
 
-    Args:
-        name: of the measure.
-        start: coordinates of physics alone.
-        everything: whether all directions count as shared (the paper's projection).
-        wobble: (np, np + nw) from (q̂): `Σ φ_qx dx/d(c, w)` of points that are the fitted run's; None where they
+    Args: name: of the measure. start: coordinates of physics alone. everything: whether all
+        directions count as shared (the paper's projection). wobble: (np, np + nw) from (q̂): `Σ
+        φ_qx dx/d(c, w)` of points that are the fitted run's; None where they
             are fixed.
     """
     count = len(form.motion.parameters)
@@ -225,7 +250,9 @@ def split_motion(
     curvature = lowest / max(float(np.linalg.eigvalsh(flat).min()), 1e-300)
     slope = None
     if lowest > _FLAT:
-        cross = np.concatenate([to_c + second, to_w], axis=1) + (0.0 if wobble is None else wobble(q))
+        cross = np.concatenate([to_c + second, to_w], axis=1) + (
+            0.0 if wobble is None else wobble(q)
+        )
         slope = whole - b @ np.linalg.solve(inner, b.T @ cross)
     return MotionSplit(name, q, shared, slope, defect, share, curvature, field)
 
@@ -235,19 +262,27 @@ def _learned_rows(form: MotionDynamics, q: Any, x: Any, u: Any) -> Any:
     return form.learned_rows(form.motion.coordinates.physical(q, jnp), x, u)
 
 
-def rest_of(form: MotionDynamics, numbers: Numbers, q: Any, c: Any, w: Any, x: Any, u: Any, size: Any) -> Any:
+def rest_of(
+    form: MotionDynamics, numbers: Numbers, q: Any, c: Any, w: Any, x: Any, u: Any, size: Any
+) -> Any:
     """(G − f(q)) / size (nl,) at one point."""
     own = numbers._replace(weights=w)
-    return (_learned_rows(form, c, x, u) + form.learned(own, x, u) - _learned_rows(form, q, x, u)) / size
+    return (
+        _learned_rows(form, c, x, u) + form.learned(own, x, u) - _learned_rows(form, q, x, u)
+    ) / size
 
 
 @partial(jax.jit, static_argnames="form")
-def slopes_at(form: MotionDynamics, q: Any, x: Float[Array, "m nx"], u: Float[Array, "m nu"]) -> Float[Array, "m r np"]:
+def slopes_at(
+    form: MotionDynamics, q: Any, x: Float[Array, "m nx"], u: Float[Array, "m nu"]
+) -> Float[Array, "m r np"]:
     """∂(f, h)/∂q at points."""
 
     def both(q: Any, x: Any, u: Any) -> Any:
         p = form.motion.coordinates.physical(q, jnp)
-        return jnp.concatenate([form.motion.rates(x, u, p, jnp), form.motion.observed(x, u, p, jnp)])
+        return jnp.concatenate(
+            [form.motion.rates(x, u, p, jnp), form.motion.observed(x, u, p, jnp)]
+        )
 
     return jax.vmap(lambda x, u: jax.jacfwd(both)(q, x, u))(x, u)
 
@@ -264,7 +299,9 @@ def _summed(function: Any, form: MotionDynamics, numbers: Numbers, q: Vector, fi
         x, u, weight = (part[begin : begin + _BATCH] for part in field[:3])
         padding = min(_BATCH, 1 << (len(field.x) - 1).bit_length()) - len(x)
         if padding > 0:
-            x, u = (np.concatenate([part, np.repeat(part[-1:], padding, axis=0)]) for part in (x, u))
+            x, u = (
+                np.concatenate([part, np.repeat(part[-1:], padding, axis=0)]) for part in (x, u)
+            )
             weight = np.concatenate([weight, np.zeros(padding)])
         part = function(form, numbers, q, x, u, weight, field.size)
         total = part if total is None else jax.tree.map(jnp.add, total, part)
@@ -272,14 +309,18 @@ def _summed(function: Any, form: MotionDynamics, numbers: Numbers, q: Vector, fi
 
 
 @partial(jax.jit, static_argnames="form")
-def _square(form: MotionDynamics, numbers: Numbers, q: Any, x: Any, u: Any, weight: Any, size: Any) -> Any:
+def _square(
+    form: MotionDynamics, numbers: Numbers, q: Any, x: Any, u: Any, weight: Any, size: Any
+) -> Any:
     c, w = numbers.theta - numbers.theta_aux, numbers.weights
     rest = jax.vmap(lambda x, u: rest_of(form, numbers, q, c, w, x, u, size))(x, u)
     return jnp.sum(jnp.where(weight[:, None] > 0, weight[:, None] * rest**2, 0.0)) / 2
 
 
 @partial(jax.jit, static_argnames="form")
-def _gauss_newton(form: MotionDynamics, numbers: Numbers, q: Any, x: Any, u: Any, weight: Any, size: Any) -> Any:
+def _gauss_newton(
+    form: MotionDynamics, numbers: Numbers, q: Any, x: Any, u: Any, weight: Any, size: Any
+) -> Any:
     c, w = numbers.theta - numbers.theta_aux, numbers.weights
 
     def one(x: Any, u: Any) -> Any:
@@ -295,8 +336,13 @@ def _gauss_newton(form: MotionDynamics, numbers: Numbers, q: Any, x: Any, u: Any
 
 
 @partial(jax.jit, static_argnames="form")
-def _second(form: MotionDynamics, numbers: Numbers, q: Any, x: Any, u: Any, weight: Any, size: Any) -> Any:
-    """Second derivatives of half the distance: in q, in q and c, in q and w; and what the rest is made of."""
+def _second(
+    form: MotionDynamics, numbers: Numbers, q: Any, x: Any, u: Any, weight: Any, size: Any
+) -> Any:
+    """Second derivatives of half the distance: in q, in q and c, in q and w.
+
+    And what the rest is made of.
+    """
     c, w = numbers.theta - numbers.theta_aux, numbers.weights
 
     def one(x: Any, u: Any) -> Any:
@@ -313,4 +359,7 @@ def _second(form: MotionDynamics, numbers: Numbers, q: Any, x: Any, u: Any, weig
         return second, to_c, to_w, slope.T @ slope, downhill(q, c, w), learner, rest, whole
 
     found = jax.vmap(one)(x, u)
-    return tuple(jnp.einsum("m,m...->...", weight, jnp.where(jnp.isfinite(part), part, 0.0)) for part in found)
+    return tuple(
+        jnp.einsum("m,m...->...", weight, jnp.where(jnp.isfinite(part), part, 0.0))
+        for part in found
+    )

@@ -1,7 +1,10 @@
-"""The engine of a Dask cluster: partitions stay on the workers, which sum over them; n_w² numbers come back.
+"""The engine of a Dask cluster: partitions stay on the workers, which sum over them.
 
-Each partition is laid out once, on the worker that keeps it. A pass is a task for each, and a tree of sums in the order
-of the partitions: whoever computes them, and however often after a worker was lost, the sum has the same bits.
+N_w² numbers come back.
+
+Each partition is laid out once, on the worker that keeps it. A pass is a task for each, and a tree
+of sums in the order of the partitions: whoever computes them, and however often after a worker was
+lost, the sum has the same bits.
 """
 
 from __future__ import annotations
@@ -40,7 +43,10 @@ _PATIENCE = "20 s"  # to reach a scheduler
 
 @dataclass(frozen=True, eq=False)
 class ClusterChunks:
-    """Futures of groups of chunks, or tuples of those whose chunks stand beside each other; how many each group has."""
+    """Futures of groups of chunks, or tuples of those whose chunks stand beside each other.
+
+    How many each group has.
+    """
 
     futures: list[Any]
     counts: tuple[int, ...]
@@ -60,7 +66,9 @@ class Dask(Threads):
     limit: int = CHUNK_ROWS
     resident: bool = False
 
-    def build_rows(self, z: Matrix, q: Any, e: Matrix, gain: Float[np.ndarray, "N ny ny"]) -> list[Any]:
+    def build_rows(
+        self, z: Matrix, q: Any, e: Matrix, gain: Float[np.ndarray, "N ny ny"]
+    ) -> list[Any]:
         """Rows that are in memory here, sent to the workers."""
         workers = self.shares
         shape = chunk_shape(len(z), min(self.limit, -(-len(z) // workers)))
@@ -81,7 +89,12 @@ class Dask(Threads):
     def sum(self, function: Callable[..., Any], rows: Sequence[Any], *arguments: Any) -> Any:
         given = jax.tree.map(np.asarray, arguments)
         with told():
-            return self._added([self.client.submit(_partial_sum, function, part, given, pure=False) for part in rows])
+            return self._added(
+                [
+                    self.client.submit(_partial_sum, function, part, given, pure=False)
+                    for part in rows
+                ]
+            )
 
     def _added(self, parts: list[Any]) -> Any:
         """Return the sum of partial sums, in their order."""
@@ -98,19 +111,30 @@ class Dask(Threads):
         pieces = apart(chunks)
         each = -(-len(pieces) // min(self.shares, len(pieces)))
         whole, rest = divmod(len(pieces), each)
-        counts = like.counts if isinstance(like, ClusterChunks) else (*[each] * whole, *([rest] if rest else []))
+        counts = (
+            like.counts
+            if isinstance(like, ClusterChunks)
+            else (*[each] * whole, *([rest] if rest else []))
+        )
         ends = np.cumsum(counts).tolist()
         with told():
             groups = [pieces[end - count : end] for end, count in zip(ends, counts, strict=True)]
-            return ClusterChunks([self.client.submit(kept, group, pure=False) for group in groups], tuple(counts))
-
-    def read(self, function: Callable[[Any], Any], partitions: Sequence[Any], counts: Sequence[int]) -> ClusterChunks:
-        with told():
             return ClusterChunks(
-                [self._on(partial(_listed, function), partition) for partition in partitions], tuple(counts)
+                [self.client.submit(kept, group, pure=False) for group in groups], tuple(counts)
             )
 
-    def along(self, function: Callable[[Any, Any], Any], partitions: Sequence[Any], carry: Any) -> Any:
+    def read(
+        self, function: Callable[[Any], Any], partitions: Sequence[Any], counts: Sequence[int]
+    ) -> ClusterChunks:
+        with told():
+            return ClusterChunks(
+                [self._on(partial(_listed, function), partition) for partition in partitions],
+                tuple(counts),
+            )
+
+    def along(
+        self, function: Callable[[Any, Any], Any], partitions: Sequence[Any], carry: Any
+    ) -> Any:
         with told():
             for partition in partitions:
                 held = getattr(partition, "held", ())
@@ -121,11 +145,15 @@ class Dask(Threads):
     def beside(self, *rows: ClusterChunks) -> ClusterChunks:
         return ClusterChunks(list(zip(*rows, strict=True)), rows[0].counts)
 
-    def keep(self, function: Callable[..., Any], rows: ClusterChunks, *arguments: Any) -> tuple[ClusterChunks, Any]:
+    def keep(
+        self, function: Callable[..., Any], rows: ClusterChunks, *arguments: Any
+    ) -> tuple[ClusterChunks, Any]:
         given = jax.tree.map(np.asarray, arguments)
         with told():
             both = [self.client.submit(_folded, function, part, given, pure=False) for part in rows]
-            kept, parts = ([self.client.submit(itemgetter(i), one, pure=False) for one in both] for i in (0, 1))
+            kept, parts = (
+                [self.client.submit(itemgetter(i), one, pure=False) for one in both] for i in (0, 1)
+            )
             return ClusterChunks(kept, rows.counts), self._added(parts)
 
     def fetch(self, rows: ClusterChunks) -> Any:
@@ -146,10 +174,14 @@ class Dask(Threads):
         held = getattr(partition, "held", ())
         if not held:
             return self.client.submit(function, partition, pure=False)
-        return self.client.submit(_where_held, function, replace(partition, held=()), *held, pure=False)
+        return self.client.submit(
+            _where_held, function, replace(partition, held=()), *held, pure=False
+        )
 
 
-def _build_chunks(partition: Any, row_builder: Callable[[Any], Iterator[RowArrays]], size: int) -> list[Chunk]:
+def _build_chunks(
+    partition: Any, row_builder: Callable[[Any], Iterator[RowArrays]], size: int
+) -> list[Chunk]:
     """Return the chunks of a partition."""
     return list(chunks_of(row_builder(partition), chunk_shape(partition.rows, size)[1]))
 
@@ -167,7 +199,10 @@ def _carried(function: Callable[[Any, Any], Any], partition: Any, carry: Any, *h
 
 
 def kept(value: Any) -> Any:
-    """Return what a worker keeps; made again from what the scheduler knows where that worker is lost."""
+    """Return what a worker keeps.
+
+    Made again from what the scheduler knows where that worker is lost.
+    """
     return value
 
 
@@ -176,12 +211,16 @@ def _paired(groups: Any) -> list[Any]:
     return list(zip(*map(_paired, groups), strict=True)) if isinstance(groups, tuple) else groups
 
 
-def _folded(function: Callable[..., Any], chunks: Sequence[Any], arguments: tuple[Any, ...]) -> tuple[list[Any], Any]:
+def _folded(
+    function: Callable[..., Any], chunks: Sequence[Any], arguments: tuple[Any, ...]
+) -> tuple[list[Any], Any]:
     """Return what one partition keeps, and its share of a sum."""
     return folded(function, _paired(chunks), arguments)
 
 
-def _partial_sum(function: Callable[..., Any], chunks: Sequence[Chunk], arguments: tuple[Any, ...]) -> Any:
+def _partial_sum(
+    function: Callable[..., Any], chunks: Sequence[Chunk], arguments: tuple[Any, ...]
+) -> Any:
     """Return one partition's share of a sum, as NumPy arrays."""
     return jax.tree.map(np.asarray, summed(function, _paired(chunks), arguments))
 
@@ -197,7 +236,9 @@ def smallest_worker(client: Any, matrices: int) -> Room:
     """Return the worker with the least memory; without a limit it is infinite."""
     with told():
         workers = client.scheduler_info(n_workers=-1)["workers"]
-    limits = {address: float(worker["memory_limit"] or math.inf) for address, worker in workers.items()}
+    limits = {
+        address: float(worker["memory_limit"] or math.inf) for address, worker in workers.items()
+    }
     smallest = min(limits, key=lambda address: limits[address], default="")
     return Room(limits.get(smallest, math.inf), f"the worker {smallest}", matrices)
 
@@ -212,11 +253,14 @@ def told() -> Iterator[None]:
         yield
     except KilledWorker as error:
         raise InputError(
-            f"the cluster gave up on a partition: its workers died {error.allowed_failures + 1} times, most often for "
-            "want of memory. Take smaller partitions (engine.partition_rows) or larger workers."
+            "the cluster gave up on a partition: its workers died "
+            f"{error.allowed_failures + 1} times, most often for want of memory. Take smaller "
+            "partitions (engine.partition_rows) or larger workers."
         ) from None
     except (CancelledError, CommClosedError, OSError, TimeoutError) as error:
-        told = f"the cluster is lost ({type(error).__name__}); start it again, and fit with --resume."
+        told = (
+            f"the cluster is lost ({type(error).__name__}); start it again, and fit with --resume."
+        )
         raise InputError(told) from None
 
 
@@ -235,15 +279,25 @@ def connected(scheduler: str | None, workers: int | None) -> Any:
     if scheduler is None:
         count = workers or os.cpu_count() or 1
         own = f"{os.environ.get('XLA_FLAGS', '')} {_SINGLE_THREADED['XLA_FLAGS']}".strip()
-        with config.set({"distributed.nanny.pre-spawn-environ": _SINGLE_THREADED | {"XLA_FLAGS": own}}):
-            options: dict[str, Any] = {"n_workers": count, "threads_per_worker": 1, "dashboard_address": ":0"}
+        with config.set(
+            {"distributed.nanny.pre-spawn-environ": _SINGLE_THREADED | {"XLA_FLAGS": own}}
+        ):
+            options: dict[str, Any] = {
+                "n_workers": count,
+                "threads_per_worker": 1,
+                "dashboard_address": ":0",
+            }
             client = Client(LocalCluster(**options))
     else:
         try:
             client = Client(scheduler, timeout=_PATIENCE)
         except (OSError, TimeoutError, ValueError) as error:
-            raise InputError(f"no Dask scheduler answers at {scheduler} ({type(error).__name__}).") from None
-    atexit.register(_closed, client, own=scheduler is None)  # before distributed's own, which tells of what it cancels
+            raise InputError(
+                f"no Dask scheduler answers at {scheduler} ({type(error).__name__})."
+            ) from None
+    atexit.register(
+        _closed, client, own=scheduler is None
+    )  # before distributed's own, which tells of what it cancels
     check_versions(client)
     return client
 
@@ -259,12 +313,21 @@ def check_versions(client: Any) -> None:
     """Raise InputError for workers with another orthaug or JAX: sums would not be the same."""
     own = versions()
     for worker, found in client.run(versions, on_error="return").items():
-        if isinstance(found, OSError):  # it died while it was asked; its scheduler lays out its rows elsewhere
+        if isinstance(
+            found, OSError
+        ):  # it died while it was asked; its scheduler lays out its rows elsewhere
             continue
         if found != own:
-            others = ", ".join(f"{name} {found.get(name)}" for name in own) if isinstance(found, dict) else found
+            others = (
+                ", ".join(f"{name} {found.get(name)}" for name in own)
+                if isinstance(found, dict)
+                else found
+            )
             here = ", ".join(f"{name} {version}" for name, version in own.items())
-            raise InputError(f"the worker {worker} has {others}; here is {here}. Install the same versions on both.")
+            raise InputError(
+                f"the worker {worker} has {others}; here is {here}. Install the same versions "
+                "on both."
+            )
 
 
 def versions() -> dict[str, str]:

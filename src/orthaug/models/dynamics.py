@@ -1,7 +1,7 @@
 """A model as a state and a step: `x_{k+1}, ŷ_k = step(numbers, x_k, u_k)`.
 
-A free run, its training and its stability need no more. The lagged form (`models.lagged`) is the case whose state is
-the past outputs.
+A free run, its training and its stability need no more. The lagged form (`models.lagged`) is the
+case whose state is the past outputs.
 """
 
 from __future__ import annotations
@@ -31,13 +31,19 @@ class Numbers(NamedTuple):
     gain: Float[AnyArray, "ny"]
     """Unit of the learner's output, in the outputs' units."""
     tilt: Any = None
-    """(members, nθ) of an ensemble: the physics that each member adds. `weights` has a row for each; None otherwise."""
+    """(members, nθ) of an ensemble: the physics that each member adds. `weights` has a row for
+    each; None otherwise.
+    """
     scheme: Any = None
     """What `Dynamics.prepared` makes of them for all steps of a run."""
     limits: Any = None
-    """(2, nz), the range of the features over the training rows; None for a learner that goes on as it is beyond it."""
+    """(2, nz), the range of the features over the training rows; None for a learner that goes on as
+    it is beyond it.
+    """
     pull: Any = None
-    """(n, nz), by which the regressor, or states and inputs, follow the features onto that range (`models.beyond`)."""
+    """(n, nz), by which the regressor, or states and inputs, follow the features onto that range
+    (`models.beyond`).
+    """
 
     @property
     def free(self) -> Numbers:
@@ -47,7 +53,9 @@ class Numbers(NamedTuple):
     @property
     def alone(self) -> Numbers:
         """Those of the physics, in the shapes of a fit without a learner, whose programs then serve."""
-        return Numbers(self.theta, np.zeros_like(self.theta), *[np.zeros(0)] * 3, gain=np.ones_like(self.gain))
+        return Numbers(
+            self.theta, np.zeros_like(self.theta), *[np.zeros(0)] * 3, gain=np.ones_like(self.gain)
+        )
 
 
 class Parts(NamedTuple):
@@ -67,7 +75,8 @@ class Parts(NamedTuple):
 class Dynamics(Protocol):
     """A model without its numbers; hashable, so that compiled programs are reused.
 
-    The state is one vector (n0,), the parameters are θ and the learner's weights, `unknowns` numbers together.
+    The state is one vector (n0,), the parameters are θ and the learner's weights, `unknowns`
+    numbers together.
     """
 
     @property
@@ -118,19 +127,23 @@ class Dynamics(Protocol):
         """Return what the steps of an experiment read, (T, nu), from its first row with an output on; affine in its inputs."""
         ...
 
-    def states_at(self, numbers: Numbers, outputs: Matrix, inputs: Matrix, rows: Any) -> Float[np.ndarray, "r n0"]:
+    def states_at(
+        self, numbers: Numbers, outputs: Matrix, inputs: Matrix, rows: Any
+    ) -> Float[np.ndarray, "r n0"]:
         """Return the states of a free run at some rows of an experiment.
 
-        `outputs` (N, ny) are those of the run, before its first row the measured ones; `inputs` (T, nu) as its steps
-        read them, up to the last of the rows at least.
+        `outputs` (N, ny) are those of the run, before its first row the measured ones; `inputs` (T,
+        nu) as its steps read them, up to the last of the rows at least.
         """
         ...
 
-    def scaled_features(self, numbers: Numbers, start: Vector, outputs: Matrix, inputs: Matrix) -> Matrix | None:
+    def scaled_features(
+        self, numbers: Numbers, start: Vector, outputs: Matrix, inputs: Matrix
+    ) -> Matrix | None:
         """Return the learner's features (T, nz) along a free run, in [-1, 1] over the training data; None if not known.
 
-        `start` (n0,) is its first state, `outputs` (T, ny) are those of the run, `inputs` (T, nu) as its steps read
-        them.
+        `start` (n0,) is its first state, `outputs` (T, ny) are those of the run, `inputs` (T, nu)
+        as its steps read them.
         """
         ...
 
@@ -150,10 +163,13 @@ class Dynamics(Protocol):
         """∂state/∂(state at the start, c, w) at the start of `width` runs: the identity and zeros, in any layout."""
         ...
 
-    def tangents(self, numbers: Numbers, state: Any, slopes: Any, inputs: Any) -> tuple[Any, Any, Any, Any]:
+    def tangents(
+        self, numbers: Numbers, state: Any, slopes: Any, inputs: Any
+    ) -> tuple[Any, Any, Any, Any]:
         """Return a step of m runs side by side with its derivatives: (state, slopes, ŷ, ∂ŷ/∂(start, c, w)).
 
-        Shapes: `state` (n0, m), `inputs` (nu, m), ŷ (ny, m), ∂ŷ (ny, n0 + n, m); `slopes` as in `first_slopes`.
+        Shapes: `state` (n0, m), `inputs` (nu, m), ŷ (ny, m), ∂ŷ (ny, n0 + n, m); `slopes` as in
+        `first_slopes`.
         """
         ...
 
@@ -168,7 +184,10 @@ class Local(NamedTuple):
     """(n0 + ny, n, r)."""
 
     def along(self, slopes: Any, fused: bool = False) -> tuple[Any, Any, Any, Any]:
-        """As `Dynamics.tangents`, of states with the `slopes`. What is cheap to compute twice is better `fused`."""
+        """As `Dynamics.tangents`, of states with the `slopes`.
+
+        What is cheap to compute twice is better `fused`.
+        """
         n0 = len(slopes)
         if fused:
             through = sum(self.to_state[:, i, None] * slopes[None, i] for i in range(n0))
@@ -189,20 +208,30 @@ class AutodiffDynamics:
     def prepared(self, numbers: Numbers) -> Numbers:
         return numbers
 
-    def scaled_features(self, numbers: Numbers, start: Vector, outputs: Matrix, inputs: Matrix) -> Matrix | None:
+    def scaled_features(
+        self, numbers: Numbers, start: Vector, outputs: Matrix, inputs: Matrix
+    ) -> Matrix | None:
         return None
 
     def states_at(
-        self: Dynamics, numbers: Numbers, outputs: Matrix, inputs: Matrix, rows: Int[np.ndarray, "r"]
+        self: Dynamics,
+        numbers: Numbers,
+        outputs: Matrix,
+        inputs: Matrix,
+        rows: Int[np.ndarray, "r"],
     ) -> Float[np.ndarray, "r n0"]:
         padded = np.zeros((padded_length(len(inputs)), inputs.shape[1]))
         padded[: len(inputs)] = inputs
         start = self.start(outputs, [self.first_row])[0]
-        return np.asarray(_states(self, numbers, start, padded))[np.asarray(rows, dtype=int) - self.first_row]
+        return np.asarray(_states(self, numbers, start, padded))[
+            np.asarray(rows, dtype=int) - self.first_row
+        ]
 
     def first_slopes(self: Dynamics, width: int) -> Any:
         n0 = self.states
-        return jnp.broadcast_to(jnp.eye(n0, n0 + self.unknowns)[..., None], (n0, n0 + self.unknowns, width))
+        return jnp.broadcast_to(
+            jnp.eye(n0, n0 + self.unknowns)[..., None], (n0, n0 + self.unknowns, width)
+        )
 
     def local(self: Dynamics, numbers: Numbers, states: Any, inputs: Any) -> Local:
         """Return steps from r states (n0, r) and inputs (nu, r), each by itself."""
@@ -219,7 +248,9 @@ class AutodiffDynamics:
         # a kink without a derivative, such as sqrt(max(y, 0)) at 0, counts as flat
         return Local(value, *(jnp.where(jnp.isfinite(d), d, 0.0) for d in slopes))
 
-    def tangents(self: Any, numbers: Numbers, state: Any, slopes: Any, inputs: Any) -> tuple[Any, Any, Any, Any]:
+    def tangents(
+        self: Any, numbers: Numbers, state: Any, slopes: Any, inputs: Any
+    ) -> tuple[Any, Any, Any, Any]:
         """`S⁺ = A S + [0 B]` with A = ∂x⁺/∂x and B = ∂x⁺/∂(c, w), and the same for the output."""
         return self.local(numbers, state, inputs).along(slopes)
 
@@ -229,4 +260,6 @@ def _states(
     form: Dynamics, numbers: Numbers, state: Float[Array, "n0"], inputs: Float[Array, "T nu"]
 ) -> Float[Array, "T n0"]:
     """Return the state at every row of a free run."""
-    return jax.lax.scan(lambda state, row: (form.step(numbers, state, row)[0], state), state, inputs)[1]
+    return jax.lax.scan(
+        lambda state, row: (form.step(numbers, state, row)[0], state), state, inputs
+    )[1]

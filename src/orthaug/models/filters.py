@@ -12,7 +12,15 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug._base.jax import jax, jnp
 from orthaug.data.record import Experiment, Record
 from orthaug.models.dynamics import Numbers, Parts
-from orthaug.models.kalman import Filter, FilterRow, Noise, StateEstimate, corrected, slope, without_gaps
+from orthaug.models.kalman import (
+    Filter,
+    FilterRow,
+    Noise,
+    StateEstimate,
+    corrected,
+    slope,
+    without_gaps,
+)
 from orthaug.models.lagged import Lagged
 from orthaug.models.moving import MotionDynamics
 from orthaug.models.stepping import Memory
@@ -20,10 +28,13 @@ from orthaug.models.stepping import Memory
 
 @dataclass(frozen=True)
 class LaggedFilter:
-    """A lagged model without its numbers as a filter: `Filter`. Its state is what its regressor remembers.
+    """A lagged model without its numbers as a filter: `Filter`.
 
-    `y_k = g(x_k) + e_k` with Cov e = Q goes on in the lags, and `y_k + v_k` with Cov v = R is measured. With R = 0 the
-    estimate of a measured output is what was measured, and the prediction that of `predict`.
+    Its state is what its regressor remembers.
+
+    `y_k = g(x_k) + e_k` with Cov e = Q goes on in the lags, and `y_k + v_k` with Cov v = R is
+    measured. With R = 0 the estimate of a measured output is what was measured, and the prediction
+    that of `predict`.
     """
 
     form: Lagged
@@ -46,7 +57,9 @@ class LaggedFilter:
     def inputs(self, experiment: Experiment, record: Record) -> Matrix:
         return experiment.inputs[self.first_row :]
 
-    def start(self, experiment: Experiment, record: Record, row: int, noise: Noise, size: Vector) -> StateEstimate:
+    def start(
+        self, experiment: Experiment, record: Record, row: int, noise: Noise, size: Vector
+    ) -> StateEstimate:
         """Return the lags before a row: outputs with the sensors' noise, or unknown by their `size` (ny,) where missing."""
         outputs, lags = list(self.form.outputs), self.memory.lags
         before = Experiment(experiment.inputs[:row], without_gaps(experiment.outputs[:row]))
@@ -61,8 +74,12 @@ class LaggedFilter:
                 continue
             for j, other in enumerate(lags):
                 if other.lag == lag.lag and other.channel in outputs:
-                    there = np.isfinite(experiment.outputs[row - lag.lag, outputs.index(other.channel)])
-                    variance[i, j] = noise.output[own, outputs.index(other.channel)] if there else 0.0
+                    there = np.isfinite(
+                        experiment.outputs[row - lag.lag, outputs.index(other.channel)]
+                    )
+                    variance[i, j] = (
+                        noise.output[own, outputs.index(other.channel)] if there else 0.0
+                    )
         return StateEstimate(mean, variance)
 
     def step(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
@@ -76,8 +93,12 @@ class LaggedFilter:
         value, derivative = slope(_both(self, numbers, inputs), belief.state)
         enters = jnp.concatenate([jnp.asarray(self._newest), jnp.eye(ny)])
         covariance = derivative @ belief.covariance @ derivative.T + enters @ noise.state @ enters.T
-        mean, after, spread, square, likelihood = corrected(value, covariance, noise.output, measured)
-        told = FilterRow(value[n:], spread, mean[n:], after[n:, n:], mean[:n], after[:n, :n], square, likelihood)
+        mean, after, spread, square, likelihood = corrected(
+            value, covariance, noise.output, measured
+        )
+        told = FilterRow(
+            value[n:], spread, mean[n:], after[n:, n:], mean[:n], after[:n, :n], square, likelihood
+        )
         return StateEstimate(told.state, told.state_covariance), told
 
     @property
@@ -124,9 +145,13 @@ class MotionFilter:
     def inputs(self, experiment: Experiment, record: Record) -> Matrix:
         return self.form.inputs(experiment, record)
 
-    def start(self, experiment: Experiment, record: Record, row: int, noise: Noise, size: Vector) -> StateEstimate:
+    def start(
+        self, experiment: Experiment, record: Record, row: int, noise: Noise, size: Vector
+    ) -> StateEstimate:
         """Return the state as it is guessed from what is measured about a row, unknown by the `size` (nx,) of all."""
-        return StateEstimate(self.form.start(without_gaps(experiment.outputs), [row])[0], np.diag(size**2))
+        return StateEstimate(
+            self.form.start(without_gaps(experiment.outputs), [row])[0], np.diag(size**2)
+        )
 
     def step(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
         return self.form.step(numbers, state, inputs)
@@ -139,23 +164,37 @@ class MotionFilter:
         both = jnp.concatenate([jnp.eye(n), seen])
         covariance = both @ belief.covariance @ both.T
         mean = jnp.concatenate([belief.state, value])
-        mean, after, spread, square, likelihood = corrected(mean, covariance, noise.output, measured)
+        mean, after, spread, square, likelihood = corrected(
+            mean, covariance, noise.output, measured
+        )
         following, moved = slope(lambda x: self.step(numbers, x, inputs)[0], mean[:n])
         own = after[:n, :n]
         told = FilterRow(value, spread, mean[n:], after[n:, n:], mean[:n], own, square, likelihood)
         return StateEstimate(following, moved @ own @ moved.T + noise.state), told
 
     def unit(self, noise: Matrix, size: Vector) -> Matrix:
-        """Return a disturbance (nx, nx) as large as the states; none where a rate is another state: that is exact."""
-        known = [state.derivative in self.names and not state.learned for state in self.form.motion.states]
+        """Return a disturbance (nx, nx) as large as the states.
+
+        None where a rate is another state: that is exact.
+        """
+        known = [
+            state.derivative in self.names and not state.learned
+            for state in self.form.motion.states
+        ]
         return np.diag(np.where(known, 0.0, size**2))
 
     def linearised(self, numbers: Numbers) -> tuple[Matrix, Matrix, Matrix, Matrix]:
         """Return a (nx, nx), C (ny, nx) at the origin, and how a disturbance enters state (nx, nx) and outputs (ny, nx)."""
         n = self.form.states
-        nothing = Experiment(np.zeros((4, len(self.form.motion.inputs))), np.zeros((4, len(self.form.outputs))))
+        nothing = Experiment(
+            np.zeros((4, len(self.form.motion.inputs))), np.zeros((4, len(self.form.outputs)))
+        )
         inputs = np.zeros(self.form.inputs(nothing, None).shape[1])  # type: ignore[arg-type]
-        return *_at_origin(self, numbers, inputs, n), np.eye(n), np.zeros((len(self.form.outputs), n))
+        return (
+            *_at_origin(self, numbers, inputs, n),
+            np.eye(n),
+            np.zeros((len(self.form.outputs), n)),
+        )
 
 
 def _both(form: Filter, numbers: Numbers, inputs: Any) -> Callable[[Any], Any]:

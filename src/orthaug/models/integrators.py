@@ -1,8 +1,9 @@
 """One sample of a motion: from x(t) to x(t + Ts), with the input held as declared between samples.
 
-`rk4` is the classical Runge-Kutta method. `exact` is exponential time differencing (Cox and Matthews 2002, ETDRK4): the
-part of the motion that is linear at the origin goes by its matrix exponential, so a linear motion has no error under a
-zero-order or first-order hold. Both take several substeps in a sample.
+`rk4` is the classical Runge-Kutta method. `exact` is exponential time differencing (Cox and
+Matthews 2002, ETDRK4): the part of the motion that is linear at the origin goes by its matrix
+exponential, so a linear motion has no error under a zero-order or first-order hold. Both take
+several substeps in a sample.
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ Field = Callable[[Any, Any], Any]
 def held(inputs: Matrix, hold: str, substeps: int) -> Matrix:
     """Return what the steps of a run read of its inputs (N, nu): the input at points of each sample, (N, points nu).
 
-    One point under a zero-order hold, both ends under a first-order hold, and under a spline hold the ends and middles
-    of all substeps, on a cubic spline through the record.
+    One point under a zero-order hold, both ends under a first-order hold, and under a spline hold
+    the ends and middles of all substeps, on a cubic spline through the record.
     """
     rows, nu = inputs.shape
     if hold == "zero-order" or not nu:
@@ -36,7 +37,9 @@ def held(inputs: Matrix, hold: str, substeps: int) -> Matrix:
     from scipy.interpolate import CubicSpline  # slow to import, and few runs need it
 
     spline, k = CubicSpline(np.arange(rows), inputs), np.arange(rows)
-    return _stacked(*(spline(np.minimum(k + i / (2 * substeps), rows - 1)) for i in range(2 * substeps + 1)))
+    return _stacked(
+        *(spline(np.minimum(k + i / (2 * substeps), rows - 1)) for i in range(2 * substeps + 1))
+    )
 
 
 def _stacked(*points: Matrix) -> Matrix:
@@ -72,7 +75,16 @@ class Exponentials(NamedTuple):
         return cls(linear, whole, phi1, phi2, phi3, half, half1 * h / 2)
 
 
-def advance(field: Field, scheme: Any, x: Any, row: Any, nu: int, step: float, substeps: int, integrator: str) -> Any:
+def advance(
+    field: Field,
+    scheme: Any,
+    x: Any,
+    row: Any,
+    nu: int,
+    step: float,
+    substeps: int,
+    integrator: str,
+) -> Any:
     """x one sample later.
 
     Args:
@@ -136,7 +148,8 @@ def _phi(a: Any, order: int) -> list[Any]:
 def _exponential_less_one(a: Any) -> Any:
     """e^A − I by scaling and squaring: `E ← 2E + E²` keeps the digits that squaring e^A would lose.
 
-    The number of squarings is fixed, so that it compiles to a few products; it is right for ‖A‖ up to some thousand.
+    The number of squarings is fixed, so that it compiles to a few products; it is right for ‖A‖ up
+    to some thousand.
     """
     a = a / 2**_SQUARINGS
     term = total = a

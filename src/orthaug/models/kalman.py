@@ -1,8 +1,9 @@
 """An extended Kalman filter over the rows of a record: where a model stands, told by what is measured.
 
-`x_{k+1} = f(x_k, u_k) + w_k`, `y_k = h(x_k, u_k) + v_k` with Cov w = Q and Cov v = R (Anderson and Moore 1979). A
-lagged model has its disturbance in the equation of its newest output, a motion in the rates of its states
-(`models.filters`). Outputs that are NaN are missing: they tell nothing, and the estimate runs free.
+`x_{k+1} = f(x_k, u_k) + w_k`, `y_k = h(x_k, u_k) + v_k` with Cov w = Q and Cov v = R (Anderson and
+Moore 1979). A lagged model has its disturbance in the equation of its newest output, a motion in
+the rates of its states (`models.filters`). Outputs that are NaN are missing: they tell nothing, and
+the estimate runs free.
 """
 
 from __future__ import annotations
@@ -98,7 +99,9 @@ def slope(function: Any, at: Any) -> tuple[Any, Any]:
     return value, jnp.where(jnp.isfinite(derivative), derivative, 0.0)
 
 
-def corrected(mean: Any, covariance: Any, noise: Any, measured: Any) -> tuple[Any, Any, Any, Any, Any]:
+def corrected(
+    mean: Any, covariance: Any, noise: Any, measured: Any
+) -> tuple[Any, Any, Any, Any, Any]:
     """Mean (n + ny,) and covariance of (state, outputs) once the outputs are measured with `noise` (ny, ny).
 
     By Joseph's form, which stays positive where R is zero. Also S, `νᵀS⁻¹ν` and the log likelihood.
@@ -132,7 +135,9 @@ def _all_rows(
 ) -> tuple[StateEstimate, FilterRow]:
     """Return what is believed before the rows, and what they tell."""
 
-    def row(belief: StateEstimate, given: tuple[Any, Any]) -> tuple[StateEstimate, tuple[StateEstimate, FilterRow]]:
+    def row(
+        belief: StateEstimate, given: tuple[Any, Any]
+    ) -> tuple[StateEstimate, tuple[StateEstimate, FilterRow]]:
         following, told = form.row(numbers, noise, belief, *given)
         return following, (belief, told)
 
@@ -140,8 +145,12 @@ def _all_rows(
 
 
 @partial(jax.jit, static_argnames="form")
-def _likelihood(form: Filter, numbers: Numbers, noise: Noise, belief: StateEstimate, inputs: Any, measured: Any) -> Any:
-    def row(carry: tuple[StateEstimate, Any], given: tuple[Any, Any]) -> tuple[tuple[StateEstimate, Any], None]:
+def _likelihood(
+    form: Filter, numbers: Numbers, noise: Noise, belief: StateEstimate, inputs: Any, measured: Any
+) -> Any:
+    def row(
+        carry: tuple[StateEstimate, Any], given: tuple[Any, Any]
+    ) -> tuple[tuple[StateEstimate, Any], None]:
         following, told = form.row(numbers, noise, carry[0], *given)
         return (following, carry[1] + told.log_likelihood), None
 
@@ -149,7 +158,12 @@ def _likelihood(form: Filter, numbers: Numbers, noise: Noise, belief: StateEstim
 
 
 def filtered(
-    form: Filter, numbers: Numbers, noise: Noise, belief: StateEstimate, inputs: Matrix, measured: Matrix
+    form: Filter,
+    numbers: Numbers,
+    noise: Noise,
+    belief: StateEstimate,
+    inputs: Matrix,
+    measured: Matrix,
 ) -> tuple[StateEstimate, FilterRow]:
     """Return a filter over all rows (T): what is believed before them, and what they tell."""
     rows = len(inputs)
@@ -159,7 +173,12 @@ def filtered(
 
 
 def log_likelihood(
-    form: Filter, numbers: Numbers, noise: Noise, belief: StateEstimate, inputs: Matrix, measured: Matrix
+    form: Filter,
+    numbers: Numbers,
+    noise: Noise,
+    belief: StateEstimate,
+    inputs: Matrix,
+    measured: Matrix,
 ) -> float:
     """Of the innovations (Schweppe 1965)."""
     return float(_likelihood(form, numbers, noise, belief, *_padded(inputs, measured)))
@@ -169,7 +188,9 @@ def _padded(inputs: Matrix, measured: Matrix) -> tuple[Matrix, Matrix]:
     """Rows behind the last are copies of it with nothing measured: they add nothing."""
     more = padded_length(len(inputs)) - len(inputs)
     behind = np.full((more, measured.shape[1]), np.nan)
-    return np.concatenate([inputs, np.repeat(inputs[-1:], more, axis=0)]), np.concatenate([measured, behind])
+    return np.concatenate([inputs, np.repeat(inputs[-1:], more, axis=0)]), np.concatenate(
+        [measured, behind]
+    )
 
 
 @partial(jax.jit, static_argnames="form")
@@ -191,7 +212,12 @@ def _ahead(
 
 
 def ahead(
-    form: Filter, numbers: Numbers, noise: Noise, beliefs: StateEstimate, inputs: Matrix, horizon: int
+    form: Filter,
+    numbers: Numbers,
+    noise: Noise,
+    beliefs: StateEstimate,
+    inputs: Matrix,
+    horizon: int,
 ) -> tuple[Parts, Matrix]:
     """Return the outputs `horizon` steps on from what is believed before the rows (T), and their deviations; (T − h + 1, ny).
 
@@ -203,19 +229,31 @@ def ahead(
         rows = slice(begin, min(begin + _SIDE_BY_SIDE, len(windows)))
         count = len(windows[rows])
         more = _SIDE_BY_SIDE - count
-        chosen = [np.concatenate([a[rows], np.repeat(a[rows][-1:], more, axis=0)]) for a in (*beliefs, windows)]
+        chosen = [
+            np.concatenate([a[rows], np.repeat(a[rows][-1:], more, axis=0)])
+            for a in (*beliefs, windows)
+        ]
         parts, spread = _ahead(form, numbers, noise, StateEstimate(*chosen[:2]), chosen[2], horizon)
         pieces.append([np.asarray(part)[:count] for part in parts])
         deviations.append(spread_of(np.asarray(spread)[:count]))
-    return Parts(*(np.concatenate(piece) for piece in zip(*pieces, strict=True))), np.concatenate(deviations)
+    return Parts(*(np.concatenate(piece) for piece in zip(*pieces, strict=True))), np.concatenate(
+        deviations
+    )
 
 
 def without_gaps(outputs: Matrix) -> Matrix:
-    """Return outputs with missing samples by straight lines between those that are there; zero where there are none."""
+    """Return outputs with missing samples by straight lines between those that are there.
+
+    Zero where there are none.
+    """
     filled = outputs.copy()
     for column in filled.T:
         there = np.isfinite(column)
-        column[~there] = np.interp(np.flatnonzero(~there), np.flatnonzero(there), column[there]) if there.any() else 0.0
+        column[~there] = (
+            np.interp(np.flatnonzero(~there), np.flatnonzero(there), column[there])
+            if there.any()
+            else 0.0
+        )
     return filled
 
 

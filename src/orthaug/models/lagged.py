@@ -1,6 +1,7 @@
 """The lagged form: ŷ_k = φ(x_k)θ + f(x_k) − φ(x_k)θ_aux of a regressor x of past outputs and inputs (eq:orth_param).
 
-As dynamics its state is the past outputs, newest first, and a step puts its own output in front of them.
+As dynamics its state is the past outputs, newest first, and a step puts its own output in front of
+them.
 """
 
 from __future__ import annotations
@@ -67,7 +68,11 @@ class Lagged:
     @property
     def fed_back(self) -> tuple[tuple[int, int], ...]:
         """(lag, number of the output) of every past output in the regressor, in its order."""
-        return tuple((lag.lag, self.outputs.index(lag.channel)) for lag in self.layout if lag.channel in self.outputs)
+        return tuple(
+            (lag.lag, self.outputs.index(lag.channel))
+            for lag in self.layout
+            if lag.channel in self.outputs
+        )
 
     @property
     def memory(self) -> int:
@@ -78,14 +83,18 @@ class Lagged:
     def used(self) -> tuple[Lag, ...]:
         """The raw lags that the physics or the learner reads."""
         read = {*self.baseline.lags, *self.features.lags}
-        return tuple(lag for lag in self.layout if lag in read or self.baseline.function is not None)
+        return tuple(
+            lag for lag in self.layout if lag in read or self.baseline.function is not None
+        )
 
     @property
     def input_layout(self) -> Layout:
         """The lagged inputs of the regressor, in its order."""
         return tuple(lag for lag in self.layout if lag.channel not in self.outputs)
 
-    def start(self, outputs: Matrix, rows: Sequence[int] | Int[np.ndarray, "r"]) -> Float[np.ndarray, "r n0"]:
+    def start(
+        self, outputs: Matrix, rows: Sequence[int] | Int[np.ndarray, "r"]
+    ) -> Float[np.ndarray, "r n0"]:
         before = np.asarray(rows)[:, None] - 1 - np.arange(self.memory)
         return outputs[before].reshape(len(before), self.states)
 
@@ -97,7 +106,11 @@ class Lagged:
         return lag_matrix(experiment, self.input_layout, record, self.first_row)
 
     def states_at(
-        self, numbers: Numbers, outputs: Matrix, inputs: Matrix, rows: Sequence[int] | Int[np.ndarray, "r"]
+        self,
+        numbers: Numbers,
+        outputs: Matrix,
+        inputs: Matrix,
+        rows: Sequence[int] | Int[np.ndarray, "r"],
     ) -> Float[np.ndarray, "r n0"]:
         """Return the run's own past outputs: nothing needs to run again."""
         return self.start(outputs, rows)
@@ -107,14 +120,19 @@ class Lagged:
     ) -> Float[np.ndarray, "T nz"] | None:
         """Return the learner's features along a free run, in [-1, 1] over the training data.
 
-        None without a learner, and of a function from another toolbox, whose features are not scaled.
+        None without a learner, and of a function from another toolbox, whose features are not
+        scaled.
         """
         if self.bound is None or not self.bound.differentiable:
             return None
         before = start.reshape(self.memory, len(self.outputs))[::-1]
-        states = self.start(np.concatenate([before, outputs]), self.memory + np.arange(len(outputs)))
+        states = self.start(
+            np.concatenate([before, outputs]), self.memory + np.arange(len(outputs))
+        )
         x = self.regressor(states.T, inputs.T, np).T
-        return (np.asarray(self.features.evaluate(x, self.layout, np)) - numbers.centre) / numbers.halfwidth
+        return (
+            np.asarray(self.features.evaluate(x, self.layout, np)) - numbers.centre
+        ) / numbers.halfwidth
 
     def describe(self, state: Vector, inputs: Vector) -> dict[str, float]:
         """Return the entries of the regressor."""
@@ -166,9 +184,13 @@ class Lagged:
         blocks = jnp.eye(n0, n0 + n).reshape(self.memory, ny, n0 + n, 1)
         return tuple(jnp.broadcast_to(blocks, (self.memory, ny, n0 + n, width)))
 
-    def tangents(self, numbers: Numbers, state: Any, slopes: Any, inputs: Any) -> tuple[Any, Any, Any, Any]:
+    def tangents(
+        self, numbers: Numbers, state: Any, slopes: Any, inputs: Any
+    ) -> tuple[Any, Any, Any, Any]:
         """`S_k = G_k + Σ_i A_{k,i} S_{k−i}` with G_k = ∂g/∂(c, w) and A_{k,i} = ∂g/∂ŷ_{k−i}."""
-        value, slope, feedback = jax.vmap(partial(self._derivatives, numbers), in_axes=-1, out_axes=-1)(state, inputs)
+        value, slope, feedback = jax.vmap(
+            partial(self._derivatives, numbers), in_axes=-1, out_axes=-1
+        )(state, inputs)
         slope = jnp.pad(slope, ((0, 0), (self.states, 0), (0, 0)))
         for i, (lag, output) in enumerate(self.fed_back):
             slope = slope + feedback[:, i, None] * slopes[lag - 1][output]
@@ -181,16 +203,24 @@ class Lagged:
         past = state.reshape(self.memory, len(self.outputs))
 
         def predict(c: Any, leaves: list[Any], past: Any) -> Any:
-            return self.step(numbers._replace(theta=c, weights=leaves), past.reshape(-1), inputs)[1].total
+            return self.step(numbers._replace(theta=c, weights=leaves), past.reshape(-1), inputs)[
+                1
+            ].total
 
         value, pullback = jax.vjp(predict, numbers.theta, leaves, past)
         slopes, feedback = [], []
         for seed in jnp.eye(len(self.outputs)):
             to_c, to_leaves, to_past = pullback(seed)
             slopes.append(jnp.concatenate([to_c, *(jnp.ravel(leaf) for leaf in to_leaves)]))
-            feedback.append(jnp.stack([to_past[lag - 1, output] for lag, output in self.fed_back] or [jnp.zeros(())]))
+            feedback.append(
+                jnp.stack(
+                    [to_past[lag - 1, output] for lag, output in self.fed_back] or [jnp.zeros(())]
+                )
+            )
         # a kink without a derivative, such as sqrt(max(y, 0)) at 0, counts as flat
-        slope, back = (jnp.where(jnp.isfinite(d), d, 0.0) for d in (jnp.stack(slopes), jnp.stack(feedback)))
+        slope, back = (
+            jnp.where(jnp.isfinite(d), d, 0.0) for d in (jnp.stack(slopes), jnp.stack(feedback))
+        )
         return value, slope, back
 
 
@@ -198,5 +228,7 @@ def _learned(bound: Bound, numbers: Numbers, z: Any, phi: Any) -> Any:
     """f (ny,) at scaled features z; of an ensemble the median of `f_i + φ tilt_i`."""
     if numbers.tilt is None:
         return numbers.gain * bound.values(numbers.weights, z)
-    each = jax.vmap(lambda w, tilt: numbers.gain * bound.values(w, z) + phi @ tilt)(numbers.weights, numbers.tilt)
+    each = jax.vmap(lambda w, tilt: numbers.gain * bound.values(w, z) + phi @ tilt)(
+        numbers.weights, numbers.tilt
+    )
     return jnp.median(each, axis=0)

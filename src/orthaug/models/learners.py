@@ -1,8 +1,8 @@
 """Learners: the trainable correction f(z; w) of scaled features z (nz,), giving (ny,) values.
 
 A learner is a frozen declaration with `init` and `apply` on a pytree of weights. `Bound` fixes the
-numbers of features and outputs. From there on the weights are one flat vector w; only the methods of
-`Bound` know the tree.
+numbers of features and outputs. From there on the weights are one flat vector w; only the methods
+of `Bound` know the tree.
 """
 
 from __future__ import annotations
@@ -66,14 +66,15 @@ class Learner(Protocol):
 class MLP:
     """Fully connected feedforward network with a linear output layer.
 
-    Initialised as in Sect. 5.1 (Xavier): weights uniform on (-a, a), `a = gain √(6 / (fan_in + fan_out))`, biases 0.
+    Initialised as in Sect. 5.1 (Xavier): weights uniform on (-a, a), `a = gain √(6 / (fan_in +
+    fan_out))`, biases 0.
 
-    Args:
-        hidden: neurons of each hidden layer; () is a linear learner.
-        activation: one of tanh, relu, gelu, sigmoid, silu, elu, softplus, identity.
-        inputs: what it sees, as expressions or raw lags; None for all lags.
-        beyond: what the correction does beyond the range of its training: "hold", "fade" within a quarter of the
-            half-range, or "free"; "auto" holds it beside lagged physics and lets it fade in a motion.
+    Args: hidden: neurons of each hidden layer; () is a linear learner. activation: one of tanh,
+        relu, gelu, sigmoid, silu, elu, softplus, identity. inputs: what it sees, as expressions or
+        raw lags; None for all lags. beyond: what the correction does beyond the range of its
+        training: "hold", "fade" within a quarter of the
+            half-range, or "free"; "auto" holds it beside lagged physics and lets it fade in a
+            motion.
 
     Examples:
         >>> MLP(hidden=(8, 8), inputs=("v[k-1]", "x[k-1] - x[k-2]"))
@@ -87,16 +88,28 @@ class MLP:
 
     def __post_init__(self) -> None:
         if not isinstance(self.hidden, tuple | list):
-            raise InputError(f"`hidden` must be a tuple of neurons per layer, such as (16,); got {shown(self.hidden)}.")
+            raise InputError(
+                "`hidden` must be a tuple of neurons per layer, such as (16,); got "
+                f"{shown(self.hidden)}."
+            )
         if isinstance(self.inputs, str):
-            raise InputError(f"`inputs` must be a tuple of expressions, such as ('{self.inputs}',); got one text.")
-        if not isinstance(self.inputs, list | tuple | None) or any(not isinstance(i, str) for i in self.inputs or ()):
+            raise InputError(
+                f"`inputs` must be a tuple of expressions, such as ('{self.inputs}',); got one "
+                "text."
+            )
+        if not isinstance(self.inputs, list | tuple | None) or any(
+            not isinstance(i, str) for i in self.inputs or ()
+        ):
             got = shown(self.inputs)
-            raise InputError(f"`inputs` must be a tuple of expressions, or None for all lags; got {got}.")
+            raise InputError(
+                f"`inputs` must be a tuple of expressions, or None for all lags; got {got}."
+            )
         object.__setattr__(self, "hidden", tuple(self.hidden))
         object.__setattr__(self, "inputs", None if self.inputs is None else tuple(self.inputs))
         if any(isinstance(n, bool) or not isinstance(n, int) or n < 1 for n in self.hidden):
-            raise InputError(f"`hidden` must be whole numbers of neurons, 1 or more; got {shown(self.hidden)}.")
+            raise InputError(
+                f"`hidden` must be whole numbers of neurons, 1 or more; got {shown(self.hidden)}."
+            )
         if len(self.hidden) > MOST_LAYERS:
             has = f"`hidden` has {len(self.hidden)} layers"
             raise InputError(f"{has}; at most {MOST_LAYERS} are taken: more compile for minutes.")
@@ -109,7 +122,8 @@ class MLP:
     def groups(self, tree: Tree) -> Tree:
         """Of every weight the neuron that it belongs to: hidden ones by what comes in, the last also by what goes out.
 
-        So a neuron that is not needed can be silenced as one. The output's biases are a group of their own.
+        So a neuron that is not needed can be silenced as one. The output's biases are a group of
+        their own.
         """
         labels, first = [], 0
         for weight, bias in tree[:-1]:
@@ -123,13 +137,17 @@ class MLP:
     def weights(self, nz: int, ny: int) -> int:
         """Return how many weights it has for `nz` features and `ny` outputs."""
         sizes = (nz, *self.hidden, ny)
-        return sum((fan_in + 1) * fan_out for fan_in, fan_out in zip(sizes, sizes[1:], strict=False))
+        return sum(
+            (fan_in + 1) * fan_out for fan_in, fan_out in zip(sizes, sizes[1:], strict=False)
+        )
 
     def init(self, key: Array, nz: int, ny: int) -> Tree:
         sizes = (nz, *self.hidden, ny)
         shapes = list(zip(sizes[1:], sizes[:-1], strict=True))
         gains = [_GAIN.get(self.activation, 1.0)] * len(self.hidden) + [1.0]
-        reach = np.array([gain * math.sqrt(6.0 / sum(shape)) for gain, shape in zip(gains, shapes, strict=True)])
+        reach = np.array(
+            [gain * math.sqrt(6.0 / sum(shape)) for gain, shape in zip(gains, shapes, strict=True)]
+        )
         drawn = _uniform(key, reach, max(map(math.prod, shapes)))
         return [
             (values[: math.prod(shape)].reshape(shape), np.zeros(shape[0]))
@@ -150,8 +168,8 @@ class MLP:
 def _uniform(key: Array, reach: Vector, count: int) -> Any:
     """Rows of `count` numbers or more, uniform on [−a, a] for each a of `reach`.
 
-    They are drawn in multiples of 1024: one compiled program for layers of all sizes. JAX makes each number from its
-    place alone, so they are those that would be drawn at the layer's own size.
+    They are drawn in multiples of 1024: one compiled program for layers of all sizes. JAX makes
+    each number from its place alone, so they are those that would be drawn at the layer's own size.
     """
     drawn = _drawn(key, reach, -(-count // 1024) * 1024)
     return drawn if is_traced(drawn) else np.asarray(drawn)
@@ -160,7 +178,9 @@ def _uniform(key: Array, reach: Vector, count: int) -> Any:
 @partial(jax.jit, static_argnames="count")
 def _drawn(key: Array, reach: Float[Array, "r"], count: int) -> Float[Array, "r count"]:
     one = partial(jax.random.uniform, shape=(count,), dtype=float)
-    return jax.vmap(lambda key, a: one(key, minval=-a, maxval=a))(jax.random.split(key, len(reach)), reach)
+    return jax.vmap(lambda key, a: one(key, minval=-a, maxval=a))(
+        jax.random.split(key, len(reach)), reach
+    )
 
 
 @dataclass(frozen=True)
@@ -235,7 +255,8 @@ class EquinoxModule:
 class External:
     """A model trained elsewhere: `function(x)` on NumPy rows (N, nx) → (N, ny), with nothing left to train.
 
-    It is called back from compiled code, so it may come from any toolbox. `inputs` as of `MLP`, `ny` outputs.
+    It is called back from compiled code, so it may come from any toolbox. `inputs` as of `MLP`,
+    `ny` outputs.
     """
 
     differentiable = False
@@ -260,7 +281,9 @@ class External:
         """
         z = np.asarray(z)
         every = z.reshape(-1, z.shape[-1])
-        finite = np.isfinite(every).all(axis=1)  # a run that diverged ends as NaN, not in the toolbox's own error
+        finite = np.isfinite(every).all(
+            axis=1
+        )  # a run that diverged ends as NaN, not in the toolbox's own error
         result = np.full((len(every), self.ny), np.nan)
         if finite.any():
             result[finite] = self._evaluate(every[finite])
@@ -269,7 +292,10 @@ class External:
     def _evaluate(self, rows: np.ndarray) -> np.ndarray:
         values = np.asarray(self.function(rows), dtype=float)
         if values.shape != (len(rows), self.ny) and (values.shape, self.ny) != ((len(rows),), 1):
-            raise InputError(f"the external model returned shape {values.shape}; expected ({len(rows)}, {self.ny}).")
+            raise InputError(
+                f"the external model returned shape {values.shape}; expected ({len(rows)}, "
+                f"{self.ny})."
+            )
         return values.reshape(len(rows), self.ny)
 
 
@@ -293,7 +319,10 @@ class Scaling:
 
 @dataclass(frozen=True)
 class Bound:
-    """A learner with its numbers of features and outputs; hashable, so compiled programs are reused."""
+    """A learner with its numbers of features and outputs.
+
+    Hashable, so compiled programs are reused.
+    """
 
     learner: Learner
     nz: int
@@ -313,8 +342,8 @@ class Bound:
         out = jax.eval_shape(self.learner.apply, tree, jax.ShapeDtypeStruct((self.nz,), float))
         if getattr(out, "shape", None) != (self.ny,):
             raise InputError(
-                f"the learner returned shape {getattr(out, 'shape', type(out).__name__)} for one row; "
-                f"expected (ny,) = ({self.ny},)."
+                f"the learner returned shape {getattr(out, 'shape', type(out).__name__)} for "
+                f"one row; expected (ny,) = ({self.ny},)."
             )
 
     @property
@@ -334,15 +363,17 @@ class Bound:
     def silent(self, w: Float[Array | np.ndarray, "nw"]) -> np.ndarray | None:
         """The same weights with the output silenced, so that f = 0 everywhere and training can go on from there.
 
-        A learner says how by a method `silent(tree)`; of others the last arrays are set to zero, as few as it takes.
-        None where that does not silence it.
+        A learner says how by a method `silent(tree)`; of others the last arrays are set to zero, as
+        few as it takes. None where that does not silence it.
         """
         leaves = self.leaves(np.asarray(w))
         declared = getattr(self.learner, "silent", None)
         if declared is not None:
             return np.asarray(self.ravel(jax.tree.leaves(declared(self.tree(leaves)))))
         for count in range(1, len(leaves) + 1):
-            tried = np.asarray(self.ravel([*leaves[:-count], *(jnp.zeros_like(leaf) for leaf in leaves[-count:])]))
+            tried = np.asarray(
+                self.ravel([*leaves[:-count], *(jnp.zeros_like(leaf) for leaf in leaves[-count:])])
+            )
             values, slopes = _probed(self, tried)
             if not np.any(values) and np.any(slopes) and np.isfinite(slopes).all():
                 return tried
@@ -359,7 +390,9 @@ class Bound:
             leaves = jax.tree.leaves(declared(self.tree(leaves)))
         else:
             leaves = [np.full(np.shape(leaf), i) for i, leaf in enumerate(leaves)]
-        labels = np.concatenate([np.zeros(0, int), *(np.ravel(np.asarray(leaf)) for leaf in leaves)])
+        labels = np.concatenate(
+            [np.zeros(0, int), *(np.ravel(np.asarray(leaf)) for leaf in leaves)]
+        )
         return np.unique(labels, return_inverse=True)[1]
 
     @staticmethod
@@ -378,7 +411,9 @@ class Bound:
             offset += size
         return pieces
 
-    def values(self, w: Float[Array | np.ndarray, "nw"] | list[Any], z: Float[Array, "nz"]) -> Float[Array, "ny"]:
+    def values(
+        self, w: Float[Array | np.ndarray, "nw"] | list[Any], z: Float[Array, "nz"]
+    ) -> Float[Array, "ny"]:
         """f(z; w) for one row, of the weights as one vector or as leaves."""
         return self.from_leaves(w if isinstance(w, list) else self.leaves(w), z)
 
@@ -395,8 +430,8 @@ class Bound:
     ) -> tuple[Float[Array, "ny m"], Float[Array, "nw ny m"]]:
         """`G f` and `G ∂f/∂w` for a batch of rows, G the `gain` of each.
 
-        Reverse mode per row, one pass per output. The batch is the *last* axis: every entry of the Jacobian is
-        then contiguous over rows, which is 2.5 times faster here than rows first.
+        Reverse mode per row, one pass per output. The batch is the *last* axis: every entry of the
+        Jacobian is then contiguous over rows, which is 2.5 times faster here than rows first.
         """
 
         def one_row(leaves: list[Any], z_row: Any, gain_row: Any) -> tuple[Any, list[Any]]:
@@ -404,15 +439,23 @@ class Bound:
             scaled = sum(gain_row[:, i] * value[i] for i in range(self.ny))
             return scaled, [pullback(gain_row[i])[0] for i in range(self.ny)]
 
-        values, per_output = jax.vmap(one_row, in_axes=(None, -1, -1), out_axes=-1)(self.leaves(w), z, gain)
+        values, per_output = jax.vmap(one_row, in_axes=(None, -1, -1), out_axes=-1)(
+            self.leaves(w), z, gain
+        )
         batch = z.shape[-1]
         none = jnp.zeros((0, batch))  # a learner may have no weights
-        columns = [jnp.concatenate([none, *(g.reshape(-1, batch) for g in grads)]) for grads in per_output]
+        columns = [
+            jnp.concatenate([none, *(g.reshape(-1, batch) for g in grads)]) for grads in per_output
+        ]
         return values, jnp.stack(columns, axis=1) if len(columns) > 1 else columns[0][:, None, :]
 
 
 @partial(jax.jit, static_argnames="bound")
-def _probed(bound: Bound, w: Float[Array, "nw"]) -> tuple[Float[Array, "ny m"], Float[Array, "nw ny m"]]:
+def _probed(
+    bound: Bound, w: Float[Array, "nw"]
+) -> tuple[Float[Array, "ny m"], Float[Array, "nw ny m"]]:
     """f and ∂f/∂w at some points of the scaled box."""
     z = jnp.asarray(np.random.default_rng(0).uniform(-1, 1, (bound.nz, _PROBES)))
-    return bound.jacobian(w, z, jnp.broadcast_to(jnp.eye(bound.ny)[..., None], (bound.ny, bound.ny, _PROBES)))
+    return bound.jacobian(
+        w, z, jnp.broadcast_to(jnp.eye(bound.ny)[..., None], (bound.ny, bound.ny, _PROBES))
+    )

@@ -29,7 +29,12 @@ class RunPiece(NamedTuple):
 def pieces_of(model: Model, source: Source) -> Iterator[Experiment]:
     """Return the pieces of a source that have rows behind the history that the model needs."""
     first = model.form.first_row
-    return (piece for partition in source.partitions for piece in partition.pieces(first) if len(piece) > first)
+    return (
+        piece
+        for partition in source.partitions
+        for piece in partition.pieces(first)
+        if len(piece) > first
+    )
 
 
 def run_pieces(model: Model, source: Source) -> Iterator[RunPiece]:
@@ -47,7 +52,10 @@ def run_pieces(model: Model, source: Source) -> Iterator[RunPiece]:
 
 
 def responses(model: Model, source: Source, *, free: bool) -> Iterator[tuple[Experiment, Response]]:
-    """Yield one-step predictions or free runs of a source, piece by piece; a run that left all bounds has no more values."""
+    """Yield one-step predictions or free runs of a source, piece by piece.
+
+    A run that left all bounds has no more values.
+    """
     record = as_record(source, (_nothing(source),))
     if not free:
         for piece in pieces_of(model, source):
@@ -58,7 +66,9 @@ def responses(model: Model, source: Source, *, free: bool) -> Iterator[tuple[Exp
         told = model.as_trajectory(state, run, piece, record)
         before = lost == (piece.source, piece.offset + model.form.first_row)
         if before:
-            told = replace(told, baseline=told.baseline * np.nan, learner=told.learner * np.nan, diverged=None)
+            told = replace(
+                told, baseline=told.baseline * np.nan, learner=told.learner * np.nan, diverged=None
+            )
         lost = (piece.source, piece.offset + len(piece)) if before or told.diverged else None
         yield piece, Response((told,), None, model.outputs, source.sampling_time)
 
@@ -99,7 +109,9 @@ class RunningScores:
 
 
 Watch = Callable[[Experiment, int, Matrix], None]
-"""Is shown a piece, its first row with a prediction, and the one-step residual from there on (m, ny)."""
+"""Is shown a piece, its first row with a prediction, and the one-step residual from there on (m,
+ny).
+"""
 
 
 class LongScores(NamedTuple):
@@ -110,7 +122,9 @@ class LongScores(NamedTuple):
     diverged: tuple[str, int, str] | None
 
 
-def scores_along(model: Model, source: Source, skip: int = 0, watch: Watch | None = None) -> LongScores:
+def scores_along(
+    model: Model, source: Source, skip: int = 0, watch: Watch | None = None
+) -> LongScores:
     """Scores of the one-step prediction and the free run, without the first `skip` rows of each recording."""
     record, first = as_record(source, (_nothing(source),)), model.form.first_row
     one_step, free, diverged = RunningScores(), RunningScores(), None
@@ -126,7 +140,9 @@ def scores_along(model: Model, source: Source, skip: int = 0, watch: Watch | Non
     return LongScores(one_step.scores(), free.scores(), diverged)
 
 
-def _runaway(model: Model, piece: Experiment, first: int, run: Matrix) -> tuple[str, int, str] | None:
+def _runaway(
+    model: Model, piece: Experiment, first: int, run: Matrix
+) -> tuple[str, int, str] | None:
     with np.errstate(all="ignore"):
         wild = ~(np.abs(run) <= RUNAWAY * model.largest_output)
     if not wild.any():

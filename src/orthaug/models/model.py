@@ -38,13 +38,20 @@ def _predict_rows(form: Lagged, numbers: Numbers, x: Float[Array, "m nx"]) -> Pa
 def _free_run(
     form: Dynamics, numbers: Numbers, state: Float[Array, "n0"], inputs: Float[Array, "T nu"]
 ) -> tuple[Float[Array, "n0"], Parts]:
-    """Return one scan over the rows, from the state at the first one; with the state after the last."""
+    """Return one scan over the rows, from the state at the first one.
+
+    With the state after the last.
+    """
     return jax.lax.scan(lambda state, row: form.step(numbers, state, row), state, inputs)
 
 
 @partial(jax.jit, static_argnames="form")
 def _ahead(
-    form: Dynamics, numbers: Numbers, states: Float[Array, "m n0"], inputs: Float[Array, "m T nu"], horizon: Any
+    form: Dynamics,
+    numbers: Numbers,
+    states: Float[Array, "m n0"],
+    inputs: Float[Array, "m T nu"],
+    horizon: Any,
 ) -> Parts:
     """Return the last of `horizon` free-run steps from each of m starts."""
     side_by_side = jax.vmap(lambda state, row: form.step(numbers, state, row))
@@ -60,8 +67,9 @@ def _ahead(
 class Model(RecordModel, NotebookView):
     """A fitted model; `estimate` makes it, `orthaug.save` and `orthaug.load` keep it.
 
-    `weight` (ny, ny) is the inner product of criterion and measure: rows multiplied by it are whitened. `deviation`
-    (ny,) is that of the training outputs. From the `statistics` every function of the model has an interval.
+    `weight` (ny, ny) is the inner product of criterion and measure: rows multiplied by it are
+    whitened. `deviation` (ny,) is that of the training outputs. From the `statistics` every
+    function of the model has an interval.
 
     Examples:
         >>> import orthaug as oa
@@ -95,7 +103,10 @@ class Model(RecordModel, NotebookView):
 
     def __repr__(self) -> str:
         learner = self.form.bound.learner if self.form.bound else "none"
-        return f"Model({self.structure}, θ: {', '.join(self.form.baseline.names) or 'none'}, learner: {learner})"
+        return (
+            f"Model({self.structure}, θ: {', '.join(self.form.baseline.names) or 'none'}, "
+            f"learner: {learner})"
+        )
 
     @property
     def theta(self) -> Vector:
@@ -115,10 +126,14 @@ class Model(RecordModel, NotebookView):
     def learner_at(self, x: Float[np.ndarray, "M nx"]) -> Float[np.ndarray, "M ny"]:
         """f, before any split, at regressors of the form's layout; in the outputs' units.
 
-        It is the learner itself, also beyond the range of its training, where the model holds the correction.
+        It is the learner itself, also beyond the range of its training, where the model holds the
+        correction.
         """
         limits = self.numbers.limits
-        if limits is not None and outside(limits, self.form.features.evaluate(x, self.form.layout, np)).any():
+        if (
+            limits is not None
+            and outside(limits, self.form.features.evaluate(x, self.form.layout, np)).any()
+        ):
             return replace(self, numbers=self.numbers.free).parts_at(x).raw
         return self.parts_at(x).raw
 
@@ -157,9 +172,8 @@ class Model(RecordModel, NotebookView):
     def simulate(self, record: Record, initial: str | Any = "measured") -> Response:
         """Free run: the outputs' past is the model's own, from the first usable row on.
 
-        Args:
-            record: inputs, and outputs where they are measured.
-            initial: the outputs on the rows before the first usable one: "measured" (from the record),
+        Args: record: inputs, and outputs where they are measured. initial: the outputs on the rows
+            before the first usable one: "measured" (from the record),
                 "zero", or an array (rows, ny) that holds them.
 
         Raises:
@@ -175,15 +189,22 @@ class Model(RecordModel, NotebookView):
             trajectories.append(self.as_trajectory(start, parts, experiment, record))
         return Response(tuple(trajectories), None, self.outputs, record.sampling_time)
 
-    def as_trajectory(self, start: Vector, parts: Parts, experiment: Experiment, record: Record) -> Trajectory:
+    def as_trajectory(
+        self, start: Vector, parts: Parts, experiment: Experiment, record: Record
+    ) -> Trajectory:
         """Return a free run from a state, cut where it left all bounds."""
         outside = self._outside(start, parts, experiment, record)
-        return replace(self.bounded(parts, experiment, experiment.outputs if record.outputs else None), outside=outside)
+        return replace(
+            self.bounded(parts, experiment, experiment.outputs if record.outputs else None),
+            outside=outside,
+        )
 
     @cached_property
     def memory(self) -> Memory:
         """Return what a step remembers."""
-        return Memory.of(self.form.layout, self.form.outputs, [channel.name for channel in self.inputs])
+        return Memory.of(
+            self.form.layout, self.form.outputs, [channel.name for channel in self.inputs]
+        )
 
     @property
     def state_names(self) -> tuple[str, ...]:
@@ -203,13 +224,15 @@ class Model(RecordModel, NotebookView):
         """
         record = self.fitting(record, need_outputs=False)
         experiment = one_experiment(record)
-        return self.memory.at(experiment, record, checked_row(row, self.form.first_row, len(experiment)))
+        return self.memory.at(
+            experiment, record, checked_row(row, self.form.first_row, len(experiment))
+        )
 
     def step(self, state: Any, inputs: Any) -> tuple[Array, Array]:
         """Return one sample of a free run: the next state (n,) and the outputs (ny,), from a state and the inputs (nu,).
 
-        A pure function of JAX arrays, so that `jax.jit`, `jax.vmap` and `jax.grad` take it; to go on from a measured
-        output, put that in the place of the model's own.
+        A pure function of JAX arrays, so that `jax.jit`, `jax.vmap` and `jax.grad` take it; to go
+        on from a measured output, put that in the place of the model's own.
         """
         return step_lagged(self.form, self.numbers, self.memory, state, inputs)
 
@@ -228,10 +251,13 @@ class Model(RecordModel, NotebookView):
             raise InputError(f"`initial` must be 'measured', 'zero' or an array; got '{initial}'.")
         rows, ny = as_signal(initial, "initial"), len(self.outputs)
         if rows.shape[1] != ny:
-            raise InputError(f"`initial` has {rows.shape[1]} columns; expected one per output, {ny}.")
+            raise InputError(
+                f"`initial` has {rows.shape[1]} columns; expected one per output, {ny}."
+            )
         if len(rows) < self.form.memory:
             raise InputError(
-                f"`initial` has {len(rows)} rows; expected the first {self.form.first_row} outputs of the record."
+                f"`initial` has {len(rows)} rows; expected the first {self.form.first_row} "
+                "outputs of the record."
             )
         return rows
 
@@ -257,8 +283,12 @@ class Model(RecordModel, NotebookView):
         inputs = self.form.inputs(experiment, record)
         windows = np.lib.stride_tricks.sliding_window_view(inputs, horizon, axis=0).swapaxes(1, 2)
         states = self.form.start(experiment.outputs, np.arange(first, first + len(windows)))
-        largest = max(1, _WINDOW_CELLS // max(1, windows[0].size))  # windows overlap: they are copied batch by batch
-        return _in_batches(lambda s, u: _ahead(self.form, self.numbers, s, u, horizon), (states, windows), largest)
+        largest = max(
+            1, _WINDOW_CELLS // max(1, windows[0].size)
+        )  # windows overlap: they are copied batch by batch
+        return _in_batches(
+            lambda s, u: _ahead(self.form, self.numbers, s, u, horizon), (states, windows), largest
+        )
 
     def first_state(self, experiment: Experiment, record: Record) -> Vector:
         """Return the state at the first row of the free run that starts from the measured outputs."""
@@ -271,7 +301,8 @@ class Model(RecordModel, NotebookView):
         if isinstance(initial, str) and initial == "measured":
             if measured is None:
                 raise InputError(
-                    "the record has no measured outputs to start from; use initial='zero' or give the values."
+                    "the record has no measured outputs to start from; use initial='zero' or "
+                    "give the values."
                 )
             rows = measured[: self.form.first_row]
         else:
@@ -289,14 +320,18 @@ class Model(RecordModel, NotebookView):
         return np.concatenate([np.zeros(self.form.first_row, dtype=bool), beyond])
 
 
-def _in_batches(function: Callable[..., Parts], rows: tuple[np.ndarray, ...], largest: int = _BATCH) -> Parts:
+def _in_batches(
+    function: Callable[..., Parts], rows: tuple[np.ndarray, ...], largest: int = _BATCH
+) -> Parts:
     """`function` over batches of rows, padded to one shape, its results concatenated."""
     count = len(rows[0])
     size, pieces = min(_BATCH, largest), []
     for begin in range(0, count, size):
         batch = [array[begin : begin + size] for array in rows]
         padding = size - len(batch[0])
-        padded = [np.concatenate([b, np.repeat(b[-1:], padding, axis=0)]) if padding else b for b in batch]
+        padded = [
+            np.concatenate([b, np.repeat(b[-1:], padding, axis=0)]) if padding else b for b in batch
+        ]
         parts = function(*padded)
         pieces.append([np.asarray(part)[: size - padding] for part in parts])
     return Parts(*(np.concatenate(piece) for piece in zip(*pieces, strict=True)))

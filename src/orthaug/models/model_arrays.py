@@ -24,12 +24,19 @@ _SAID = ("structure", "measure", "sampling_time", "time_column")
 
 def said_of(model: Any) -> dict[str, Any]:
     """Return what a file says of every model, whatever its physics."""
-    channels = {kind: [asdict(channel) for channel in getattr(model, kind)] for kind in ("outputs", "inputs")}
+    channels = {
+        kind: [asdict(channel) for channel in getattr(model, kind)]
+        for kind in ("outputs", "inputs")
+    }
     kept = model.statistics
     said = (
-        {name: getattr(model, name) for name in _SAID} | channels | {"flown": kept.simulated, "verdict": kept.verdict}
+        {name: getattr(model, name) for name in _SAID}
+        | channels
+        | {"flown": kept.simulated, "verdict": kept.verdict}
     )
-    return said | ({"prepared": [asdict(step) for step in model.prepared]} if model.prepared else {})
+    return said | (
+        {"prepared": [asdict(step) for step in model.prepared]} if model.prepared else {}
+    )
 
 
 def fields_from(declared: dict[str, Any], arrays: dict[str, np.ndarray]) -> dict[str, Any]:
@@ -100,22 +107,28 @@ def rebuilt_learner(kept: dict[str, Any], given: Learner | None, path: Path) -> 
     kind = kept["kind"]
     if kind in LEARNERS:
         learner = LEARNERS[kind]
-        return learner(**{name: frozen(kept[name]) for name in _field_names(learner) if name in kept})
+        return learner(
+            **{name: frozen(kept[name]) for name in _field_names(learner) if name in kept}
+        )
     if given is not None:
         return given
     if kind != "callable":
         raise InputError(
-            f"{path}: its learner is of the kind '{kind}', which is not registered here; register it, or give the "
-            "learner, load(…, learner=…)."
+            f"{path}: its learner is of the kind '{kind}', which is not registered here; "
+            "register it, or give the learner, load(…, learner=…)."
         )
-    raise InputError(f"{path}: the learner was a Python callable; give it again, load(…, learner=…).")
+    raise InputError(
+        f"{path}: the learner was a Python callable; give it again, load(…, learner=…)."
+    )
 
 
 def _field_names(learner: type) -> list[str]:
     return [field.name for field in fields(learner) if field.init]
 
 
-def bound_of(kept: dict[str, Any] | None, weights: np.ndarray, given: Learner | None, path: Path) -> Bound | None:
+def bound_of(
+    kept: dict[str, Any] | None, weights: np.ndarray, given: Learner | None, path: Path
+) -> Bound | None:
     """Return the learner that a file declares with its sizes; None for physics alone.
 
     Raises:
@@ -126,5 +139,8 @@ def bound_of(kept: dict[str, Any] | None, weights: np.ndarray, given: Learner | 
     bound = Bound(rebuilt_learner(kept, given, path), kept["nz"], kept["ny"])
     saved = weights.shape[-1]
     if bound.size != saved:
-        raise InputError(f"{path}: the learner has {bound.size} weights, the saved one {saved}; give the same one.")
+        raise InputError(
+            f"{path}: the learner has {bound.size} weights, the saved one {saved}; give the "
+            "same one."
+        )
     return bound

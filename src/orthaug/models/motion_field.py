@@ -1,8 +1,8 @@
 """The field of a motion with a learner: ẋ = f(x, u; c) + E g(z; w), y = h(x, u; c) + g(z; w).
 
-g is the learner on features z of states and inputs. Its values go to the learned equations first, then to the learned
-outputs. The unknowns are the coordinates c of the physical parameters, and the weights. `parts_at` tells what physics
-and learner add at many points.
+g is the learner on features z of states and inputs. Its values go to the learned equations first,
+then to the learned outputs. The unknowns are the coordinates c of the physical parameters, and the
+weights. `parts_at` tells what physics and learner add at many points.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ from orthaug.physics.motion import Motion
 class MotionField:
     """What a motion with a learner computes at a point, without its numbers.
 
-    `features` are expressions of states and inputs; `substeps` the integrator's in a sample of `sampling_time` s.
+    `features` are expressions of states and inputs; `substeps` the integrator's in a sample of
+    `sampling_time` s.
     """
 
     motion: Motion
@@ -61,7 +62,9 @@ class MotionField:
 
     def _values(self, numbers: Numbers, z: Any) -> Any:
         assert self.bound is not None
-        return numbers.gain * self.bound.values(numbers.weights, (z - numbers.centre) / numbers.halfwidth)
+        return numbers.gain * self.bound.values(
+            numbers.weights, (z - numbers.centre) / numbers.halfwidth
+        )
 
     @property
     def beyond(self) -> str:
@@ -71,8 +74,8 @@ class MotionField:
     def added(self, numbers: Numbers, x: Any, u: Any) -> Any:
         """Return what is added to the physics at c, learned equations and outputs first, at one point.
 
-        Within the range of training it is g. Beyond it the physics at p̂ goes on, and what it left there at x̄ is held
-        or fades: `f(x; p̂) − f(x; c) + a (f(x̄; c) − f(x̄; p̂) + g(z̄))`.
+        Within the range of training it is g. Beyond it the physics at p̂ goes on, and what it left
+        there at x̄ is held or fades: `f(x; p̂) − f(x; c) + a (f(x̄; c) − f(x̄; p̂) + g(z̄))`.
         """
         if numbers.limits is None:
             return self.learned(numbers, x, u)
@@ -82,9 +85,14 @@ class MotionField:
         share = remaining(self.beyond, numbers.limits, z)
         x_in, u_in = x + moved[: len(x)], u + moved[len(x) :]
         split, own = (
-            self.motion.coordinates.physical(q, jnp) for q in (numbers.theta, numbers.theta - numbers.theta_aux)
+            self.motion.coordinates.physical(q, jnp)
+            for q in (numbers.theta, numbers.theta - numbers.theta_aux)
         )
-        held = self.learned_rows(own, x_in, u_in) - self.learned_rows(split, x_in, u_in) + self._values(numbers, inside)
+        held = (
+            self.learned_rows(own, x_in, u_in)
+            - self.learned_rows(split, x_in, u_in)
+            + self._values(numbers, inside)
+        )
         beyond = self.learned_rows(split, x, u) - self.learned_rows(own, x, u) + share * held
         return jnp.where(jnp.all(inside == z), self._values(numbers, inside), beyond)
 
@@ -123,13 +131,17 @@ class MotionField:
 
 
 def parts_at(form: MotionField, numbers: Numbers, x: Matrix, u: Matrix) -> tuple[Matrix, Matrix]:
-    """Physics f(x, u; p̂) and what is learned beside it, each (M, nl): learned equations, then learned outputs.
+    """Physics f(x, u.
+
+    P̂) and what is learned beside it, each (M, nl): learned equations, then learned outputs.
 
     Args:
         x: states (M, nx); `u` inputs (M, nu) at the same instants.
     """
     count = len(x)
-    x, u = (np.pad(part, ((0, padded_length(count) - count), (0, 0)), mode="edge") for part in (x, u))
+    x, u = (
+        np.pad(part, ((0, padded_length(count) - count), (0, 0)), mode="edge") for part in (x, u)
+    )
     physics, learner = _parts(form, numbers, x, u)
     return np.asarray(physics)[:count], np.asarray(learner)[:count]
 

@@ -1,7 +1,10 @@
-"""The fitted motion ẋ = f(x, u; p) + learner, y = h(x, u; p): free runs, predictions, and what acts in it.
+"""The fitted motion ẋ = f(x, u.
 
-A run starts from a state that was not measured. It is estimated from the first rows of the record or, for a prediction,
-from a window of rows before it: the state from which a free run over the window follows the measured outputs best.
+P) + learner, y = h(x, u; p): free runs, predictions, and what acts in it.
+
+A run starts from a state that was not measured. It is estimated from the first rows of the record
+or, for a prediction, from a window of rows before it: the state from which a free run over the
+window follows the measured outputs best.
 """
 
 from __future__ import annotations
@@ -28,7 +31,13 @@ from orthaug.models.on_records import RUNAWAY, RecordModel, trajectory
 from orthaug.models.response import Response, Trajectory
 from orthaug.models.settling import LOOSE, Windows, padded_steps, settle
 from orthaug.models.statistics import Statistics
-from orthaug.models.stepping import checked_row, one_experiment, step_arguments, step_inputs, with_scheme
+from orthaug.models.stepping import (
+    checked_row,
+    one_experiment,
+    step_arguments,
+    step_inputs,
+    with_scheme,
+)
 from orthaug.physics.parameters import PhysicalParameter
 
 if TYPE_CHECKING:
@@ -55,20 +64,27 @@ def _run(
 
 @partial(jax.jit, static_argnames="form")
 def _last(
-    form: MotionDynamics, numbers: Numbers, states: Float[Array, "n0 m"], inputs: Float[Array, "T nu m"], steps: Any
+    form: MotionDynamics,
+    numbers: Numbers,
+    states: Float[Array, "n0 m"],
+    inputs: Float[Array, "T nu m"],
+    steps: Any,
 ) -> Float[Array, "ny m"]:
     """Return the last output of `steps` of runs side by side."""
     numbers = form.prepared(numbers)
     side_by_side = jax.vmap(lambda state, row: form.step(numbers, state, row), -1, -1)
-    states = jax.lax.fori_loop(0, steps - 1, lambda i, states: side_by_side(states, inputs[i])[0], states)
+    states = jax.lax.fori_loop(
+        0, steps - 1, lambda i, states: side_by_side(states, inputs[i])[0], states
+    )
     return side_by_side(states, inputs[steps - 1])[1].total
 
 
 class TrainedSegments(NamedTuple):
     """What a later split under a measure needs beside the training data: how segments lay, and where they started.
 
-    `rows` counts the rows that were scored, `alone` (np,) are the coordinates of physics alone; `slope` (k, m, nx, n)
-    is how the starts `states` (k, nx, m) follow the unknowns, less its sign; None where that is not known.
+    `rows` counts the rows that were scored, `alone` (np,) are the coordinates of physics alone;
+    `slope` (k, m, nx, n) is how the starts `states` (k, nx, m) follow the unknowns, less its sign;
+    None where that is not known.
     """
 
     segment: int
@@ -83,8 +99,9 @@ class TrainedSegments(NamedTuple):
 class MotionModel(RecordModel, NotebookView):
     """A fitted motion; `estimate` makes it, `orthaug.save` and `orthaug.load` keep it.
 
-    `window` rows tell a state from which to predict. `weight` (ny, ny) is the inner product of the outputs; `loose`
-    (nx,) how far a state may be from its guess. `deviation` (ny,) is that of the training outputs.
+    `window` rows tell a state from which to predict. `weight` (ny, ny) is the inner product of the
+    outputs; `loose` (nx,) how far a state may be from its guess. `deviation` (ny,) is that of the
+    training outputs.
     """
 
     form: MotionDynamics
@@ -103,14 +120,18 @@ class MotionModel(RecordModel, NotebookView):
     time_column: str | None = None
     trained: TrainedSegments | None = field(default=None, repr=False)
     seen: Matrix | None = field(default=None, kw_only=True, repr=False)
-    """Least and largest (2, nz) of the learner's features over the fitted run of the training data."""
+    """Least and largest (2, nz) of the learner's features over the fitted run of the training data.
+    """
     statistics: Statistics = Statistics()  # noqa: RUF009  (frozen)
     prepared: tuple[Prepared, ...] = field(default=(), kw_only=True, repr=False)
     """What the training data went through before."""
 
     def __repr__(self) -> str:
         learner = self.form.bound.learner if self.form.bound else "none"
-        return f"MotionModel({', '.join(f'{k} = {v:.5g}' for k, v in self.parameters.items())}, learner: {learner})"
+        return (
+            f"MotionModel({', '.join(f'{k} = {v:.5g}' for k, v in self.parameters.items())}, "
+            f"learner: {learner})"
+        )
 
     @property
     def theta(self) -> Vector:
@@ -121,7 +142,9 @@ class MotionModel(RecordModel, NotebookView):
     def parameters(self) -> dict[str, float]:
         """The physical parameters by name."""
         values = self.form.motion.coordinates.physical(self.theta)
-        return {name: float(value) for name, value in zip(self.form.motion.names, values, strict=True)}
+        return {
+            name: float(value) for name, value in zip(self.form.motion.names, values, strict=True)
+        }
 
     @property
     def estimated(self) -> tuple[Sequence[PhysicalParameter], Vector]:
@@ -132,23 +155,26 @@ class MotionModel(RecordModel, NotebookView):
     @property
     def alone(self) -> MotionModel:
         """Its physics without the learner."""
-        return replace(self, form=self.form.alone, numbers=self.numbers.alone._replace(gain=np.ones(0)))
+        return replace(
+            self, form=self.form.alone, numbers=self.numbers.alone._replace(gain=np.ones(0))
+        )
 
     def simulate(self, record: Record, initial: str | Any = "measured") -> Response:
         """Free run from the first row on.
 
         `baseline` is the output of the physics alone from the same start, `learner` the difference.
 
-        Args:
-            record: inputs, and outputs where they are measured.
-            initial: "measured" (the state by which a free run follows the first rows of the record best), "zero", or an
+        Args: record: inputs, and outputs where they are measured. initial: "measured" (the state by
+            which a free run follows the first rows of the record best), "zero", or an
                 array (rows, ny) of outputs to follow instead.
 
         Raises:
             InputError: other channels, no rows, or initial values that are not there.
         """
         record = self.fitting(record, need_outputs=False)
-        trajectories = [self._free_run(experiment, record, initial) for experiment in record.experiments]
+        trajectories = [
+            self._free_run(experiment, record, initial) for experiment in record.experiments
+        ]
         return Response(tuple(trajectories), None, self.outputs, record.sampling_time)
 
     def predict(self, record: Record, horizon: int = 1) -> Response:
@@ -161,7 +187,9 @@ class MotionModel(RecordModel, NotebookView):
         """
         horizon = check_count(horizon, "horizon", of="steps")
         record = self.fitting(record, need_outputs=True)
-        trajectories = [self._ahead(experiment, record, horizon) for experiment in record.experiments]
+        trajectories = [
+            self._ahead(experiment, record, horizon) for experiment in record.experiments
+        ]
         return Response(tuple(trajectories), horizon, self.outputs, record.sampling_time)
 
     def components(self, record: Record) -> Response:
@@ -169,7 +197,9 @@ class MotionModel(RecordModel, NotebookView):
         return self.simulate(record)
 
     def states(self, record: Record, initial: str | Any = "measured") -> pd.DataFrame:
-        """Return the states of a free run; of each learned equation its rate by the physics, and what is learned beside it.
+        """Return the states of a free run.
+
+        Of each learned equation its rate by the physics, and what is learned beside it.
 
         Of a learned output likewise.
         """
@@ -183,7 +213,9 @@ class MotionModel(RecordModel, NotebookView):
             states, _ = self._follow(self.form, self.numbers, start, inputs)
             physics, learner = parts_at(self.form, self.numbers, states, experiment.inputs)
             time = experiment.start_time + np.arange(len(states)) * self.sampling_time
-            columns = {"time": time} | {name: states[:, i] for i, name in enumerate(motion.names_of_states)}
+            columns = {"time": time} | {
+                name: states[:, i] for i, name in enumerate(motion.names_of_states)
+            }
             learned = [motion.names_of_states[i] for i in motion.learned[0]]
             learned += [motion.outputs[i].name for i in motion.learned[1]]
             for i, name in enumerate(learned):
@@ -217,7 +249,9 @@ class MotionModel(RecordModel, NotebookView):
         state = self._start(experiment, "measured", record)
         if not row:
             return state
-        return self._follow(self.form, self.numbers, state, self.form.inputs(experiment, record))[0][row]
+        return self._follow(self.form, self.numbers, state, self.form.inputs(experiment, record))[
+            0
+        ][row]
 
     def step(self, state: Any, inputs: Any) -> tuple[Array, Array]:
         """Return one sample: the next state (nx,) and the outputs (ny,) at this one, from a state and `step_inputs`.
@@ -238,7 +272,10 @@ class MotionModel(RecordModel, NotebookView):
 
     @property
     def reached(self) -> Scaling:
-        """Return what training reached of the learner's features; of a model saved without it, what physics alone did."""
+        """Return what training reached of the learner's features.
+
+        Of a model saved without it, what physics alone did.
+        """
         return super().reached if self.seen is None else Scaling.fit(self.seen)
 
     def reach(self, record: Record) -> Matrix:
@@ -258,7 +295,10 @@ class MotionModel(RecordModel, NotebookView):
             raise InputError(f"`initial` must be 'measured', 'zero' or an array; got '{initial}'.")
         rows = as_signal(initial, "initial")
         if rows.shape[1] != len(self.outputs):
-            raise InputError(f"`initial` has {rows.shape[1]} columns; expected one per output, {len(self.outputs)}.")
+            raise InputError(
+                f"`initial` has {rows.shape[1]} columns; expected one per output, "
+                f"{len(self.outputs)}."
+            )
         return rows
 
     def _free_run(self, experiment: Experiment, record: Record, initial: str | Any) -> Trajectory:
@@ -271,20 +311,37 @@ class MotionModel(RecordModel, NotebookView):
         if self.form.bound is None:
             return bounded
         alone = self.alone
-        told = self._with_physics(bounded, self._follow(alone.form, alone.numbers, start, inputs)[1])
-        return told if told.diverged else replace(told, outside=self._outside(states, self.form.now(inputs)))
+        told = self._with_physics(
+            bounded, self._follow(alone.form, alone.numbers, start, inputs)[1]
+        )
+        return (
+            told
+            if told.diverged
+            else replace(told, outside=self._outside(states, self.form.now(inputs)))
+        )
 
     def _with_physics(self, run: Trajectory, physics: Matrix) -> Trajectory:
-        """Return a run of the whole model with the output of the physics alone; no value from where that left all bounds."""
+        """Return a run of the whole model with the output of the physics alone.
+
+        No value from where that left all bounds.
+        """
         with np.errstate(all="ignore"):
             wild = ~(np.abs(physics) <= RUNAWAY * self.largest_output).all(axis=1)
-        known = np.where(np.logical_or.accumulate(wild)[:, None] | np.isnan(run.model), np.nan, physics)
+        known = np.where(
+            np.logical_or.accumulate(wild)[:, None] | np.isnan(run.model), np.nan, physics
+        )
         learner = run.model - known
-        return replace(run, baseline=known, learner=learner, learner_before=learner, whole=run.model)
+        return replace(
+            run, baseline=known, learner=learner, learner_before=learner, whole=run.model
+        )
 
-    def _follow(self, form: MotionDynamics, numbers: Numbers, start: Vector, inputs: Matrix) -> tuple[Matrix, Matrix]:
+    def _follow(
+        self, form: MotionDynamics, numbers: Numbers, start: Vector, inputs: Matrix
+    ) -> tuple[Matrix, Matrix]:
         rows = len(inputs)
-        padded = np.concatenate([inputs, np.repeat(inputs[-1:], padded_length(rows) - rows, axis=0)])
+        padded = np.concatenate(
+            [inputs, np.repeat(inputs[-1:], padded_length(rows) - rows, axis=0)]
+        )
         states, outputs = _run(form, numbers, start, padded)
         return np.asarray(states)[:rows], np.asarray(outputs)[:rows]
 
@@ -306,7 +363,8 @@ class MotionModel(RecordModel, NotebookView):
         if isinstance(initial, str) and initial == "measured":
             if not record.outputs:
                 raise InputError(
-                    "the record has no measured outputs to start from; use initial='zero' or give the values."
+                    "the record has no measured outputs to start from; use initial='zero' or "
+                    "give the values."
                 )
             rows = experiment.outputs
         else:
@@ -315,14 +373,20 @@ class MotionModel(RecordModel, NotebookView):
         inputs = self.form.inputs(experiment, record)[: len(rows)]
         rows = rows[: len(inputs)]
         size = max(FIRST_ROWS, self.window)
-        windows = Windows(_padded(inputs, size), _padded(rows, size), (np.arange(size) < len(rows))[:, None])
+        windows = Windows(
+            _padded(inputs, size), _padded(rows, size), (np.arange(size) < len(rows))[:, None]
+        )
         guess = self.form.start(rows, [0]).T
-        settled = settle(self.form, self.numbers, guess, windows, self.weight, self.loose, _GUESS_ITERATIONS)[0]
+        settled = settle(
+            self.form, self.numbers, guess, windows, self.weight, self.loose, _GUESS_ITERATIONS
+        )[0]
         return settled[:, 0]
 
     def _ahead(self, experiment: Experiment, record: Record, horizon: int) -> Trajectory:
         self.check_rows(experiment, horizon)
-        window = min(self.window, len(experiment) - horizon)  # short recordings have at least one prediction
+        window = min(
+            self.window, len(experiment) - horizon
+        )  # short recordings have at least one prediction
         first = window + horizon - 1
         outputs, physics = self._predicted(experiment, record, horizon, window)
         nothing = np.zeros_like(outputs)
@@ -330,7 +394,9 @@ class MotionModel(RecordModel, NotebookView):
         known = np.full(experiment.outputs.shape, np.nan)
         known[first:] = np.where(np.isfinite(physics), physics, np.nan)
         learner = ahead.model - known
-        return replace(ahead, baseline=known, learner=learner, learner_before=learner, whole=ahead.model)
+        return replace(
+            ahead, baseline=known, learner=learner, learner_before=learner, whole=ahead.model
+        )
 
     def _predicted(
         self, experiment: Experiment, record: Record, horizon: int, window: int
@@ -338,7 +404,9 @@ class MotionModel(RecordModel, NotebookView):
         """Return the outputs from row `window + horizon - 1` on, each `horizon` steps after a window; and by physics alone."""
         steps = window + horizon
         inputs = self.form.inputs(experiment, record)
-        run = self._follow(self.form, self.numbers, self._start(experiment, "measured", record), inputs)[0]
+        run = self._follow(
+            self.form, self.numbers, self._start(experiment, "measured", record), inputs
+        )[0]
         begins = np.arange(len(inputs) - steps + 1)
         states = self.form.start(experiment.outputs, begins)
         hidden = [i for i, state in enumerate(self.form.motion.states) if state.from_output is None]
@@ -352,13 +420,26 @@ class MotionModel(RecordModel, NotebookView):
             rows = np.minimum(padded[None, :] + np.arange(length)[:, None], len(inputs) - 1)
             following = np.moveaxis(inputs[rows], -1, 1)
             target = np.moveaxis(experiment.outputs[rows[:window]], -1, 1)
-            windows = Windows(following[:window], target, np.ones((window, len(padded)), dtype=bool))
+            windows = Windows(
+                following[:window], target, np.ones((window, len(padded)), dtype=bool)
+            )
             settled = settle(
-                self.form, self.numbers, states[padded].T, windows, self.weight, self.loose, _WINDOW_ITERATIONS
+                self.form,
+                self.numbers,
+                states[padded].T,
+                windows,
+                self.weight,
+                self.loose,
+                _WINDOW_ITERATIONS,
             )[0]
             ends = [(self.form, self.numbers)]
             ends += [(self.alone.form, self.alone.numbers)] if self.form.bound is not None else []
-            pieces.append([np.asarray(_last(*end, settled, following, steps)).T[: len(chosen)] for end in ends])
+            pieces.append(
+                [
+                    np.asarray(_last(*end, settled, following, steps)).T[: len(chosen)]
+                    for end in ends
+                ]
+            )
         outputs, physics = (np.concatenate([piece[i] for piece in pieces]) for i in (0, -1))
         return outputs, physics
 

@@ -47,7 +47,9 @@ def sample_slopes(form: MotionField, numbers: Numbers, state: Any, row: Any) -> 
         psi3 = h / 3 * identity + h * psi4 @ fourth.to_x
         psi2 = h / 3 * identity + h / 2 * psi3 @ third.to_x
         psi1 = h / 6 * identity + h / 2 * psi2 @ second.to_x
-        through.append(list(zip((psi1, psi2, psi3, psi4), (first, second, third, fourth), strict=True)))
+        through.append(
+            list(zip((psi1, psi2, psi3, psi4), (first, second, third, fourth), strict=True))
+        )
     to_x, to_c, to_w = identity, 0.0, 0.0
     learned = np.array(form.motion.learned[0], dtype=int)
     for stages in reversed(through):  # `to_x` is what follows this substep
@@ -88,10 +90,14 @@ def learner_slopes(form: MotionField, numbers: Numbers, x: Any, u: Any) -> Slope
         return (form.seen(x, u) - numbers.centre) / numbers.halfwidth
 
     z, to_z = features(x), _finite(jax.jacfwd(features)(x))
-    value, pull = jax.vjp(lambda leaves, z: bound.from_leaves(leaves, z), bound.leaves(numbers.weights), z)
+    value, pull = jax.vjp(
+        lambda leaves, z: bound.from_leaves(leaves, z), bound.leaves(numbers.weights), z
+    )
     gain = jnp.broadcast_to(jnp.asarray(numbers.gain), (bound.ny,))
     pulled = [pull(row) for row in jnp.diag(gain)]
-    to_w = jnp.stack([jnp.concatenate([jnp.ravel(leaf) for leaf in leaves]) for leaves, _ in pulled])
+    to_w = jnp.stack(
+        [jnp.concatenate([jnp.ravel(leaf) for leaf in leaves]) for leaves, _ in pulled]
+    )
     to_x = jnp.stack([of_z @ to_z for _, of_z in pulled])
     return Slopes(gain * value, _finite(to_x), jnp.zeros((bound.ny, 0)), _finite(to_w))
 
@@ -115,7 +121,10 @@ def output_slopes(form: MotionField, numbers: Numbers, x: Any, u: Any) -> Slopes
 
 
 def _differentiated(function: Any, x: Any, c: Any) -> tuple[Any, Any, Any]:
-    """Value and slopes by x and c; of few entries one at a time, which leaves out what an entry does not touch."""
+    """Value and slopes by x and c.
+
+    Of few entries one at a time, which leaves out what an entry does not touch.
+    """
     entries, n0 = [*x, *c], len(x)
     if len(entries) > _FEW:
         return function(x, c), *jax.jacfwd(function, (0, 1))(x, c)
@@ -162,7 +171,9 @@ class MotionDynamics(MotionField, AutodiffDynamics):
         """The same motion without a learner."""
         return replace(self, features=(), bound=None)
 
-    def start(self, outputs: Matrix, rows: Sequence[int] | Int[np.ndarray, "r"]) -> Float[np.ndarray, "r n0"]:
+    def start(
+        self, outputs: Matrix, rows: Sequence[int] | Int[np.ndarray, "r"]
+    ) -> Float[np.ndarray, "r n0"]:
         """States as they are declared to start, by local polynomials through the measured outputs about the rows."""
         return guess(self.motion, outputs, rows, self.sampling_time)
 
@@ -175,7 +186,11 @@ class MotionDynamics(MotionField, AutodiffDynamics):
 
     def describe(self, state: Vector, inputs: Vector) -> dict[str, float]:
         """States and inputs by name."""
-        named = zip((*self.motion.names_of_states, *self.motion.inputs), (*state, *self.now(inputs)), strict=True)
+        named = zip(
+            (*self.motion.names_of_states, *self.motion.inputs),
+            (*state, *self.now(inputs)),
+            strict=True,
+        )
         return {name: float(value) for name, value in named}
 
     def step(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
@@ -220,20 +235,29 @@ class MotionDynamics(MotionField, AutodiffDynamics):
     def _by_stages(self) -> bool:
         return self.motion.integrator == "rk4" and self.substeps <= UNROLLED and self.differentiable
 
-    def tangents(self, numbers: Numbers, state: Any, slopes: Any, inputs: Any) -> tuple[Any, Any, Any, Any]:
+    def tangents(
+        self, numbers: Numbers, state: Any, slopes: Any, inputs: Any
+    ) -> tuple[Any, Any, Any, Any]:
         return self.local(numbers, state, inputs).along(slopes, fused=self._by_stages)
 
     def local(self, numbers: Numbers, states: Any, inputs: Any) -> Local:
-        """Of a few Runge-Kutta substeps by the adjoint of their stages; otherwise by automatic differentiation."""
+        """Of a few Runge-Kutta substeps by the adjoint of their stages.
+
+        Otherwise by automatic differentiation.
+        """
         if numbers.scheme is not None:
             value, to_state, to_unknowns = super().local(numbers, states, inputs)
             return Local(value, to_state, to_unknowns + self._by_scheme(numbers, states, inputs))
         if not self._by_stages or numbers.limits is not None:
             return super().local(numbers, states, inputs)
         following = jax.vmap(partial(sample_slopes, self, numbers), -1, -1)(states, inputs)
-        output = jax.vmap(lambda x, row: output_slopes(self, numbers, x, self.now(row)), -1, -1)(states, inputs)
+        output = jax.vmap(lambda x, row: output_slopes(self, numbers, x, self.now(row)), -1, -1)(
+            states, inputs
+        )
         known = 4 if self.bound is not None else 3  # there are no weights otherwise
-        value, to_x, *own = (jnp.concatenate(both) for both in zip(following[:known], output[:known], strict=True))
+        value, to_x, *own = (
+            jnp.concatenate(both) for both in zip(following[:known], output[:known], strict=True)
+        )
         return Local(value, to_x, jnp.concatenate(own, axis=1))
 
     def _by_scheme(self, numbers: Numbers, state: Any, inputs: Any) -> Any:
@@ -244,9 +268,11 @@ class MotionDynamics(MotionField, AutodiffDynamics):
             return self.step(numbers._replace(scheme=(scheme, None)), state, row)[0]
 
         def along(moved: Any) -> Any:
-            return jax.vmap(lambda x, row: jax.jvp(lambda s: following(s, x, row), (scheme,), (moved,))[1], -1, -1)(
-                state, inputs
-            )
+            return jax.vmap(
+                lambda x, row: jax.jvp(lambda s: following(s, x, row), (scheme,), (moved,))[1],
+                -1,
+                -1,
+            )(state, inputs)
 
         moved = jax.vmap(along, -1, 1)(by_theta)  # a tangent for each parameter: (nx, np, m)
         after = self.unknowns - moved.shape[1]

@@ -1,8 +1,10 @@
-"""Sums over rows, and the engine that makes them. Training and its statistics need no more of the data (F4).
+"""Sums over rows, and the engine that makes them.
 
-Chunks hold the rows, with the row index last, padded with zero weights to one shape. So one compiled program serves any
-number of rows, and nothing of size N × nw ever exists. What is summed is a function of one chunk. The function does not
-know where the rows are.
+Training and its statistics need no more of the data (F4).
+
+Chunks hold the rows, with the row index last, padded with zero weights to one shape. So one
+compiled program serves any number of rows, and nothing of size N × nw ever exists. What is summed
+is a function of one chunk. The function does not know where the rows are.
 """
 
 from __future__ import annotations
@@ -23,11 +25,17 @@ from orthaug.models.lagged import Lagged
 from orthaug.models.learners import Bound
 
 CHUNK_ROWS = 5000  # fastest of 500 … 10000 at 10⁴×81 and 10⁵×257, see benchmarks/
-_FEW, _SHARED = 1024, 256  # rows: so few take less time than to compile for their number, or for that of a fold
+_FEW, _SHARED = (
+    1024,
+    256,
+)  # rows: so few take less time than to compile for their number, or for that of a fold
 
 
 class Chunk(NamedTuple):
-    """Some rows (…, m), or in memory all of them (k, …, m); zero gain and zero entries are padding."""
+    """Some rows (…, m), or in memory all of them (k, …, m).
+
+    Zero gain and zero entries are padding.
+    """
 
     z: Float[Array, "*k nz m"]
     """Scaled learner features."""
@@ -81,7 +89,10 @@ class Engine(Protocol):
         ...
 
     def sum(self, function: Callable[..., Any], rows: Any, *arguments: Any) -> Any:
-        """Σ function(chunk, *arguments) over all chunks; `function` is hashable, its result any pytree of arrays."""
+        """Σ function(chunk, *arguments) over all chunks.
+
+        `function` is hashable, its result any pytree of arrays.
+        """
         ...
 
     @property
@@ -90,14 +101,21 @@ class Engine(Protocol):
         ...
 
     def place(self, chunks: Any, like: Any = None) -> Any:
-        """Chunks of any pytree, (k, …) each, as rows; where those of `like` are, which are as many."""
+        """Chunks of any pytree, (k, …) each, as rows.
+
+        Where those of `like` are, which are as many.
+        """
         ...
 
-    def read(self, function: Callable[[Any], Any], partitions: Sequence[Any], counts: Sequence[int]) -> Any:
+    def read(
+        self, function: Callable[[Any], Any], partitions: Sequence[Any], counts: Sequence[int]
+    ) -> Any:
         """Rows of the chunks, `counts` of each, that `function(partition)` gives one by one."""
         ...
 
-    def along(self, function: Callable[[Any, Any], Any], partitions: Sequence[Any], carry: Any) -> Any:
+    def along(
+        self, function: Callable[[Any, Any], Any], partitions: Sequence[Any], carry: Any
+    ) -> Any:
         """`carry = function(partition, carry)` over all partitions in their order."""
         ...
 
@@ -113,7 +131,9 @@ class Engine(Protocol):
         """Return what was placed or kept, (k, …) each, in NumPy."""
         ...
 
-    def map(self, function: Any, given: Any, items: Sequence[Any], heard: Heard = nobody) -> Iterator[Any]:
+    def map(
+        self, function: Any, given: Any, items: Sequence[Any], heard: Heard = nobody
+    ) -> Iterator[Any]:
         """Independent runs, `function(given, item, tell)` each; as `Threads.map`."""
         ...
 
@@ -128,7 +148,9 @@ class LocalEngine(Threads):
     def passes(self, function: Callable[[Any], Any], partitions: Sequence[Any]) -> list[Any]:
         return in_threads(function, partitions)
 
-    def along(self, function: Callable[[Any, Any], Any], partitions: Sequence[Any], carry: Any) -> Any:
+    def along(
+        self, function: Callable[[Any, Any], Any], partitions: Sequence[Any], carry: Any
+    ) -> Any:
         return reduce(lambda carry, partition: function(partition, carry), partitions, carry)
 
     def beside(self, *rows: Any) -> Any:
@@ -161,7 +183,9 @@ class InMemory(LocalEngine):
     def place(self, chunks: Any, like: Any = None) -> Any:
         return jax.tree.map(jax.device_put, chunks)
 
-    def read(self, function: Callable[[Any], Any], partitions: Sequence[Any], counts: Sequence[int]) -> Any:
+    def read(
+        self, function: Callable[[Any], Any], partitions: Sequence[Any], counts: Sequence[int]
+    ) -> Any:
         return self.place(all_chunks(function, partitions))
 
     def keep(self, function: Callable[..., Any], rows: Any, *arguments: Any) -> tuple[Any, Any]:
@@ -172,7 +196,9 @@ class InMemory(LocalEngine):
 
 
 @partial(jax.jit, static_argnames="function")
-def _compiled_fold(function: Callable[..., Any], rows: Any, arguments: tuple[Any, ...]) -> tuple[Any, Any]:
+def _compiled_fold(
+    function: Callable[..., Any], rows: Any, arguments: tuple[Any, ...]
+) -> tuple[Any, Any]:
     return row_fold(lambda chunk: function(chunk, *arguments), rows)
 
 
@@ -198,7 +224,10 @@ def brought(source: Any, row_builder: Callable[[Any], Any]) -> tuple[np.ndarray,
 
 
 def row_sum(function: Callable[[Any], Any], rows: Any) -> Any:
-    """Σ function(chunk) over the leading axis of every array in `rows`; any pytree in, any pytree out."""
+    """Σ function(chunk) over the leading axis of every array in `rows`.
+
+    Any pytree in, any pytree out.
+    """
     return row_fold(lambda chunk: (None, function(chunk)), rows)[1]
 
 
@@ -217,7 +246,10 @@ def row_fold(function: Callable[[Any], tuple[Any, Any]], rows: Any) -> tuple[Any
 
 
 def chunk_shape(rows: int, limit: int = CHUNK_ROWS) -> tuple[int, int]:
-    """(number of chunks, rows in each) for `rows` rows in equal chunks of about `limit`; few rows in few sizes."""
+    """(number of chunks, rows in each) for `rows` rows in equal chunks of about `limit`.
+
+    Few rows in few sizes.
+    """
     count = max(1, -(-rows // limit))
     size = -(-rows // count)
     unit = _SHARED if rows <= _FEW <= limit else 8
@@ -256,10 +288,16 @@ def gram(columns: Float[Array, "n rows"]) -> Float[Array, "n n"]:
     return columns @ columns.T
 
 
-def learner_rows(engine: Engine, form: Lagged, numbers: Numbers, x: Matrix, q: Any, weight: Any) -> Any:
+def learner_rows(
+    engine: Engine, form: Lagged, numbers: Numbers, x: Matrix, q: Any, weight: Any
+) -> Any:
     """Regressors x (N, nx) as rows of the engine, their outputs multiplied by `weight`, (ny, ny) or (N, ny, ny)."""
     z = np.asarray(form.features.evaluate(x, form.layout, np))
-    scaled = (z - np.asarray(numbers.centre)) / np.asarray(numbers.halfwidth) if form.bound else np.zeros((len(x), 0))
+    scaled = (
+        (z - np.asarray(numbers.centre)) / np.asarray(numbers.halfwidth)
+        if form.bound
+        else np.zeros((len(x), 0))
+    )
     gain = np.broadcast_to(weight * np.asarray(numbers.gain), (len(x), *2 * (len(form.outputs),)))
     return engine.build_rows(scaled, q, np.zeros(gain.shape[:2]), gain)
 
@@ -272,14 +310,17 @@ class Overlaps:
 
     def __call__(self, chunk: Chunk, w: Any) -> Overlap:
         values, jacobian = self.bound.jacobian(w, chunk.z, chunk.gain)
-        return Overlap(jnp.einsum("otm,wom->tw", chunk.q, jacobian), jnp.einsum("otm,om->t", chunk.q, values))
+        return Overlap(
+            jnp.einsum("otm,wom->tw", chunk.q, jacobian), jnp.einsum("otm,om->t", chunk.q, values)
+        )
 
 
 @dataclass(frozen=True)
 class MixedGram:
     """Gram matrix of `[Q J]` with the outputs of every row multiplied by `mix`: `ΣψᵀΣ_eψ` for `Σ_e = mixᵀ mix`.
 
-    J is taken without its `overlaps` with Q, if any are given. Without a learner the matrix is that of Q.
+    J is taken without its `overlaps` with Q, if any are given. Without a learner the matrix is that
+    of Q.
     """
 
     bound: Bound | None
@@ -299,17 +340,24 @@ class _LeftOver:
         return jnp.einsum("tom,wom->tw", *_columns(self.bound, chunk, w, overlaps))
 
 
-def _columns(bound: Bound | None, chunk: Chunk, w: Any, overlaps: tuple[Any, ...]) -> tuple[Any, Any]:
+def _columns(
+    bound: Bound | None, chunk: Chunk, w: Any, overlaps: tuple[Any, ...]
+) -> tuple[Any, Any]:
     """Q (nt, ny, m) and J (nw, ny, m) of a chunk, J less its overlaps with Q."""
     q = jnp.moveaxis(chunk.q, 1, 0)
-    jacobian = jnp.zeros((0, *q.shape[1:])) if bound is None else bound.jacobian(w, chunk.z, chunk.gain)[1]
+    jacobian = (
+        jnp.zeros((0, *q.shape[1:])) if bound is None else bound.jacobian(w, chunk.z, chunk.gain)[1]
+    )
     for overlap in overlaps:
         jacobian = jacobian - jnp.einsum("tw,tom->wom", overlap, q)
     return q, jacobian
 
 
 def projected_gram(engine: Engine, bound: Bound | None, w: Any, rows: Any, mix: Any) -> Matrix:
-    """Gram matrix of `[Q P⊥J]`, outputs multiplied by `mix`; J is projected twice, so that Q and it are orthogonal."""
+    """Gram matrix of `[Q P⊥J]`, outputs multiplied by `mix`.
+
+    J is projected twice, so that Q and it are orthogonal.
+    """
     overlaps: tuple[Any, ...] = ()
     for _ in range(2):
         overlaps = (*overlaps, engine.sum(_LeftOver(bound), rows, w, overlaps))
@@ -317,14 +365,19 @@ def projected_gram(engine: Engine, bound: Bound | None, w: Any, rows: Any, mix: 
 
 
 @partial(jax.jit, static_argnames="bound")
-def row_values(bound: Bound, w: Float[Array, "nw"], z: Float[Array, "k nz m"]) -> Float[Array, "k ny m"]:
+def row_values(
+    bound: Bound, w: Float[Array, "nw"], z: Float[Array, "k nz m"]
+) -> Float[Array, "k ny m"]:
     """f at every row, in the learner's unit."""
     one_chunk = jax.vmap(lambda row: bound.values(w, row), in_axes=-1, out_axes=-1)
     return jax.lax.map(one_chunk, z)
 
 
 def _values(bound: Bound | None, chunk: Chunk, w: Any, tilt: Any) -> Float[Array, "ny m"]:
-    """F of one chunk; of an ensemble the median of its members, each with the physics that it adds."""
+    """F of one chunk.
+
+    Of an ensemble the median of its members, each with the physics that it adds.
+    """
     if bound is None:
         return jnp.zeros_like(chunk.e)
 
@@ -356,5 +409,9 @@ class ResidualGram:
     bound: Bound | None
 
     def __call__(self, chunk: Chunk, w: Any, tilt: Any, physics: Any) -> Any:
-        residual = chunk.e - _values(self.bound, chunk, w, tilt) + jnp.einsum("otm,t->om", chunk.q, physics)
+        residual = (
+            chunk.e
+            - _values(self.bound, chunk, w, tilt)
+            + jnp.einsum("otm,t->om", chunk.q, physics)
+        )
         return residual @ residual.T

@@ -1,6 +1,7 @@
 """States by which runs follow what was measured: least squares on the starts alone, of many windows side by side.
 
-A damped Gauss-Newton iteration on every start by itself. Starts that a window does not show stay near the guess.
+A damped Gauss-Newton iteration on every start by itself. Starts that a window does not show stay
+near the guess.
 """
 
 from __future__ import annotations
@@ -22,7 +23,10 @@ _SETTLED = 1e-10  # relative decrease that is not worth a step
 
 
 class Windows(NamedTuple):
-    """Stretches of measured rows side by side; the last axis counts them. Only rows that are scored count."""
+    """Stretches of measured rows side by side; the last axis counts them.
+
+    Only rows that are scored count.
+    """
 
     inputs: Float[Any, "T nu m"]
     target: Float[Any, "T ny m"]
@@ -35,7 +39,9 @@ class Windows(NamedTuple):
         more = padded_steps(steps) - steps, -count % _LANES
 
         def repeated(part: Any) -> Any:
-            return np.pad(part, ((0, more[0]), *((0, 0),) * (part.ndim - 2), (0, more[1])), mode="edge")
+            return np.pad(
+                part, ((0, more[0]), *((0, 0),) * (part.ndim - 2), (0, more[1])), mode="edge"
+            )
 
         return Windows(*(jax.device_put(repeated(np.asarray(part))) for part in self)), steps
 
@@ -56,7 +62,8 @@ def settle(
 ) -> tuple[Float[np.ndarray, "n0 m"], Vector]:
     """Return the states at the windows' first rows that lower `‖weight e‖²` most, and its value (m,).
 
-    A window ends where a step promises to lower it by less than a 10⁻¹⁰th part: that is a 10⁻⁵th of its own noise.
+    A window ends where a step promises to lower it by less than a 10⁻¹⁰th part: that is a 10⁻⁵th of
+    its own noise.
 
     Args:
         states: where to begin.
@@ -95,12 +102,20 @@ def _steps(
     right = np.where(sound[:, None], right, 0.0)
     try:
         return np.linalg.solve(damped, right[..., None])[..., 0].T
-    except np.linalg.LinAlgError:  # states beyond what double precision tells apart: there is no step to take
+    except (
+        np.linalg.LinAlgError
+    ):  # states beyond what double precision tells apart: there is no step to take
         return np.zeros_like(right).T
 
 
 def _linearised(
-    form: Dynamics, numbers: Numbers, states: Matrix, layout: Any, weight: Matrix, begun: Matrix, prior: Vector
+    form: Dynamics,
+    numbers: Numbers,
+    states: Matrix,
+    layout: Any,
+    weight: Matrix,
+    begun: Matrix,
+    prior: Vector,
 ) -> tuple[Any, Any, Any]:
     """Return normal matrix (m, n0, n0), right-hand side (m, n0) and misfit (m,), infinite where a run is not finite."""
     gram, square = (np.asarray(part) for part in _gram(form, numbers, states, *layout, weight))
@@ -135,7 +150,9 @@ def _gram(
 
     def sloped(state: Any, row: Any) -> tuple[Any, Any]:
         """Return a step and its slopes (n0 + ny, n0)."""
-        along = jax.vmap(lambda moved: jax.jvp(lambda x: both(x, row), (state,), (moved,)), out_axes=(None, -1))
+        along = jax.vmap(
+            lambda moved: jax.jvp(lambda x: both(x, row), (state,), (moved,)), out_axes=(None, -1)
+        )
         return along(directions)
 
     def step(i: Any, carry: tuple[Any, ...]) -> tuple[Any, ...]:

@@ -9,11 +9,16 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
 
-_ROUNDING = 1e-13  # of the largest eigenvalue of a Gram matrix with unit columns: what is below is rounding
+_ROUNDING = (
+    1e-13  # of the largest eigenvalue of a Gram matrix with unit columns: what is below is rounding
+)
 
 
 def column_units(gram: Matrix, nt: int) -> Vector:
-    """Return one over the norm of each column, θ first. Learner columns that are rounding beside the largest stay small."""
+    """Return one over the norm of each column, θ first.
+
+    Learner columns that are rounding beside the largest stay small.
+    """
     size = np.sqrt(np.maximum(np.diag(gram), 0.0))
     size[nt:] = np.maximum(size[nt:], np.sqrt(np.finfo(float).eps) * size[nt:].max(initial=0.0))
     return 1 / np.where(size > 1e-150, size, 1.0)
@@ -22,7 +27,8 @@ def column_units(gram: Matrix, nt: int) -> Vector:
 def half_inverse(gram: Matrix, nt: int) -> Float[np.ndarray, "n r"]:
     """H with `H Hᵀ` the inverse of the Gram matrix of `[S_c S_w]` on the directions that the data see.
 
-    Products with the inverse are formed from H on both sides: the inverse itself has entries up to 1e13.
+    Products with the inverse are formed from H on both sides: the inverse itself has entries up to
+    1e13.
     """
     unit = column_units(gram, nt)
     values, vectors = np.linalg.eigh(gram * np.outer(unit, unit))
@@ -34,8 +40,8 @@ def half_inverse(gram: Matrix, nt: int) -> Float[np.ndarray, "n r"]:
 class JointCovariance:
     """Cov of all that training estimated, p = (c, w): `σ² M⁻¹` with `M = G + ridge` on the weights.
 
-    G is the Gram matrix of ∂ŷ/∂p in whitened outputs. Only functions of the fitted model have a variance. A direction
-    of p that changes no prediction on the training rows counts as absent.
+    G is the Gram matrix of ∂ŷ/∂p in whitened outputs. Only functions of the fitted model have a
+    variance. A direction of p that changes no prediction on the training rows counts as absent.
     """
 
     gram: Matrix
@@ -67,9 +73,10 @@ class JointCovariance:
 class Statistics:
     """What training leaves behind; None where it left nothing.
 
-    `gram` (nθ + nw)² is the Gram matrix of ∂ŷ/∂(c, w) over the training rows in whitened outputs, `[Φ J]` one step
-    ahead; `ridge` the weights' prior precision beside it, of all or of each (nw,); `middle` = ΣψᵀΣ_eψ; `noise` (ny, ny)
-    the noise covariance in the outputs' units; `freedom` its degrees of freedom.
+    `gram` (nθ + nw)² is the Gram matrix of ∂ŷ/∂(c, w) over the training rows in whitened outputs,
+    `[Φ J]` one step ahead; `ridge` the weights' prior precision beside it, of all or of each (nw,);
+    `middle` = ΣψᵀΣ_eψ; `noise` (ny, ny) the noise covariance in the outputs' units; `freedom` its
+    degrees of freedom.
     """
 
     gram: Matrix | None = None
@@ -82,7 +89,9 @@ class Statistics:
     verdict: str = ""
     """What the residual says of the noise (`analysis.Diagnosis`); empty where nobody asked."""
     disturbance: Matrix | None = None
-    """Q of an observer by the likelihood of the training data, and with it R, `sensor`; where nobody tuned it."""
+    """Q of an observer by the likelihood of the training data, and with it R, `sensor`; where
+    nobody tuned it.
+    """
     sensor: Matrix | None = None
 
     def joint(self, nt: int) -> JointCovariance | None:

@@ -1,7 +1,7 @@
 """A fitted model one sample at a time: `state, outputs = model.step(state, inputs)`, a state with names.
 
-The state of a lagged model is what its regressor remembers of outputs and inputs, so that a step takes the inputs of
-its own sample alone; that of a motion is its state.
+The state of a lagged model is what its regressor remembers of outputs and inputs, so that a step
+takes the inputs of its own sample alone; that of a motion is its state.
 """
 
 from __future__ import annotations
@@ -43,7 +43,10 @@ class Memory:
     def of(cls, layout: Layout, outputs: Sequence[str], inputs: Sequence[str]) -> Memory:
         """Of a regressor's layout."""
         names = dict.fromkeys((*outputs, *inputs))
-        deepest = ((name, max((lag.lag for lag in layout if lag.channel == name), default=0)) for name in names)
+        deepest = (
+            (name, max((lag.lag for lag in layout if lag.channel == name), default=0))
+            for name in names
+        )
         return cls(tuple(deepest), layout, tuple(inputs))
 
     @cached_property
@@ -59,7 +62,9 @@ class Memory:
     @cached_property
     def read(self) -> Int[np.ndarray, "nx"]:
         """Where the regressor's entries are among state and inputs."""
-        place = {lag: i for i, lag in enumerate((*self.lags, *(Lag(name, 0) for name in self.inputs)))}
+        place = {
+            lag: i for i, lag in enumerate((*self.lags, *(Lag(name, 0) for name in self.inputs)))
+        }
         return np.array([place[lag] for lag in self.layout], dtype=int)
 
     @cached_property
@@ -85,16 +90,20 @@ def step_arguments(state: Any, inputs: Any, states: int, count: int) -> tuple[An
     try:
         state, inputs = jnp.asarray(state, dtype=float), jnp.asarray(inputs, dtype=float)
     except (TypeError, ValueError):
-        raise InputError(f"a step takes two vectors of numbers; got {shown(state)} and {shown(inputs)}.") from None
+        raise InputError(
+            f"a step takes two vectors of numbers; got {shown(state)} and {shown(inputs)}."
+        ) from None
     if state.shape != (states,) or inputs.shape != (count,):
         raise InputError(
-            f"a step takes a state of {states} and inputs of {count} numbers; got the shapes {state.shape} and "
-            f"{inputs.shape}."
+            f"a step takes a state of {states} and inputs of {count} numbers; got the shapes "
+            f"{state.shape} and {inputs.shape}."
         )
     return state, inputs
 
 
-def step_lagged(form: Lagged, numbers: Numbers, memory: Memory, state: Any, inputs: Any) -> tuple[Any, Any]:
+def step_lagged(
+    form: Lagged, numbers: Numbers, memory: Memory, state: Any, inputs: Any
+) -> tuple[Any, Any]:
     """Return the next state and the outputs (ny,) of one sample."""
     state, inputs = step_arguments(state, inputs, len(memory.lags), len(memory.inputs))
     y = form.at(numbers, jnp.concatenate([state, inputs])[memory.read]).total
@@ -110,8 +119,8 @@ def step_inputs(form: MotionDynamics) -> tuple[str, ...]:
     motion = form.motion
     if motion.hold == "spline" and motion.inputs:
         raise InputError(
-            "a step knows no spline through the whole record; fit the motion with hold = 'zero-order' or "
-            "'first-order' to step or export it."
+            "a step knows no spline through the whole record; fit the motion with hold = "
+            "'zero-order' or 'first-order' to step or export it."
         )
     after = tuple(f"{name}[k+1]" for name in motion.inputs) if motion.hold == "first-order" else ()
     return (*motion.inputs, *after)
@@ -133,7 +142,9 @@ def checked_row(row: Any, first: int, rows: int) -> int:
     if row is None:
         row = first
     if isinstance(row, bool) or not isinstance(row, int | np.integer) or not first <= row <= rows:
-        raise InputError(f"`row` must be a whole number from {first} to {rows} in this record; got {shown(row)}.")
+        raise InputError(
+            f"`row` must be a whole number from {first} to {rows} in this record; got {shown(row)}."
+        )
     return int(row)
 
 
@@ -145,11 +156,12 @@ def one_experiment(record: Record) -> Experiment:
     """
     if len(record.experiments) != 1:
         raise InputError(
-            f"the record has {len(record.experiments)} experiments; a state starts in one: give a record of one."
+            f"the record has {len(record.experiments)} experiments; a state starts in one: "
+            "give a record of one."
         )
     if not record.outputs:
         raise InputError(
-            "the record has no measured outputs to start from; give some, or a state of your own: one number for "
-            "each of `state_names`."
+            "the record has no measured outputs to start from; give some, or a state of your "
+            "own: one number for each of `state_names`."
         )
     return record.experiments[0]

@@ -1,4 +1,6 @@
-"""Models on disk: `model.json` for what a model is, `arrays.safetensors` for its numbers; nothing executable.
+"""Models on disk: `model.json` for what a model is, `arrays.safetensors` for its numbers.
+
+Nothing executable.
 
 The JSON carries checksums of itself and of the arrays. A file that was cut or altered is refused.
 `pack` writes other content the same way.
@@ -41,27 +43,42 @@ def check_loaded(model: Any, path: Path) -> None:
         InputError: the first part that does not fit.
     """
     if not is_number(model.sampling_time) or model.sampling_time <= 0:
-        raise InputError(f"{path}: its sampling time is {shown(model.sampling_time)}; expected a positive number.")
+        raise InputError(
+            f"{path}: its sampling time is {shown(model.sampling_time)}; expected a positive "
+            "number."
+        )
     for name in ("structure", "measure", "time_column"):
         if not isinstance(getattr(model, name), str | None):
-            raise InputError(f"{path}: its {name} is {shown(getattr(model, name))}; expected a word.")
+            raise InputError(
+                f"{path}: its {name} is {shown(getattr(model, name))}; expected a word."
+            )
     for name, value, shape in _expected(model):
         if value is None:
             raise InputError(f"{path}: the model has no {name}; it was not written by orthaug.")
         array = np.asarray(value)
         if shape is not None and array.shape != shape:
-            raise InputError(f"{path}: {name} has the shape {array.shape}; the model's form needs {shape}.")
+            raise InputError(
+                f"{path}: {name} has the shape {array.shape}; the model's form needs {shape}."
+            )
         if not np.isfinite(array).all():
-            raise InputError(f"{path}: {name} holds a number that is not finite; fit again, or copy the model again.")
+            raise InputError(
+                f"{path}: {name} holds a number that is not finite; fit again, or copy the "
+                "model again."
+            )
     for name, value in (("deviation", model.deviation), ("halfwidth", model.numbers.halfwidth)):
         if (np.asarray(value) < 0).any():
             raise InputError(f"{path}: {name} is negative; it was not written by orthaug.")
     for entry in getattr(model.form.features, "entries", model.form.features):
         if not isinstance(entry.text, str):
-            raise InputError(f"{path}: a learner's input is {shown(entry.text)}; expected an expression.")
+            raise InputError(
+                f"{path}: a learner's input is {shown(entry.text)}; expected an expression."
+            )
     for lag in getattr(model.form, "layout", ()):
         if type(lag.lag) is not int or not 0 <= lag.lag <= _LONGEST_LAG:
-            raise InputError(f"{path}: its layout has a lag of {shown(lag.lag)}; expected 0 to {_LONGEST_LAG} rows.")
+            raise InputError(
+                f"{path}: its layout has a lag of {shown(lag.lag)}; expected 0 to "
+                f"{_LONGEST_LAG} rows."
+            )
     if model.form.differentiable:
         _check_step(model, path)
 
@@ -72,11 +89,16 @@ def _check_step(model: Any, path: Path) -> None:
     following, outputs = jax.eval_shape(model.step, state, row)
     shapes = tuple(following.shape), tuple(outputs.shape)
     if shapes != (state.shape, (len(model.outputs),)):
-        raise InputError(f"{path}: a step of the model makes {shapes}; its state and outputs need other shapes.")
+        raise InputError(
+            f"{path}: a step of the model makes {shapes}; its state and outputs need other shapes."
+        )
 
 
 def _expected(model: Any) -> Iterator[tuple[str, Any, tuple[int, ...] | None]]:
-    """Names, values and shapes of what a model computes with; None for a shape that something else has checked."""
+    """Names, values and shapes of what a model computes with.
+
+    None for a shape that something else has checked.
+    """
     form, numbers, kept = model.form, model.numbers, model.statistics
     outputs, parameters = len(model.outputs), len(model.estimated[0])
     yield "theta", numbers.theta, (parameters,)
@@ -110,10 +132,12 @@ _KINDS: dict[type, ModuleType] = {Model: lagged_storage, MotionModel: motion_sto
 
 
 def save(model: Model | MotionModel, folder: str | Path, *, force: bool = False) -> None:
-    """Write a model to a folder of its own, whole or not at all. A model that `save` wrote there before is replaced.
+    """Write a model to a folder of its own, whole or not at all.
 
-    A baseline, motion or learner that is a Python callable cannot be written. Its numbers can; `load` asks for the
-    callable.
+    A model that `save` wrote there before is replaced.
+
+    A baseline, motion or learner that is a Python callable cannot be written. Its numbers can;
+    `load` asks for the callable.
 
     Args:
         model: what to write.
@@ -160,9 +184,9 @@ def load(
 ) -> Model | MotionModel:
     """Read a model that `save` or `orthaug fit` wrote.
 
-    Args:
-        folder: the model's folder, or the result folder that holds it as `model/`.
-        baseline, learner: the Python callables again, where the saved model had such; a motion counts as a baseline.
+    Args: folder: the model's folder, or the result folder that holds it as `model/`. baseline,
+        learner: the Python callables again, where the saved model had such; a motion counts as a
+        baseline.
 
     Raises:
         InputError: no model there; a file that is cut, altered, or from a newer version.
@@ -190,13 +214,21 @@ def load(
         return model
     except InputError:
         raise
-    except Exception as error:  # the checksum holds, so someone made it: there is no list of what that can hold
-        raise InputError(f"{path}: not a model of this version (missing or misplaced: {error}).") from None
+    except (
+        Exception
+    ) as error:  # the checksum holds, so someone made it: there is no list of what that can hold
+        raise InputError(
+            f"{path}: not a model of this version (missing or misplaced: {error})."
+        ) from None
 
 
-def pack(number: int, declared: Mapping[str, Any], arrays: Mapping[str, Any]) -> tuple[dict[str, Any], bytes]:
+def pack(
+    number: int, declared: Mapping[str, Any], arrays: Mapping[str, Any]
+) -> tuple[dict[str, Any], bytes]:
     """Return what the two files hold, in the format of this `number`."""
-    packed = save_arrays({name: np.ascontiguousarray(value, dtype=np.float64) for name, value in arrays.items()})
+    packed = save_arrays(
+        {name: np.ascontiguousarray(value, dtype=np.float64) for name, value in arrays.items()}
+    )
     declaration = {"format": number, "orthaug": __version__, **declared} | {
         "arrays_sha256": hashlib.sha256(packed).hexdigest()
     }
@@ -230,17 +262,24 @@ def read_packed(
         raise InputError(f"{path.parent}: cannot be read ({error.strerror}).") from None
     except (ValueError, RecursionError):
         raise InputError(f"{path}: the file is cut or altered (no JSON); {again}.") from None
-    if not isinstance(declared, dict) or type(declared.get("format")) is not int or declared["format"] < 1:
+    if (
+        not isinstance(declared, dict)
+        or type(declared.get("format")) is not int
+        or declared["format"] < 1
+    ):
         raise InputError(f"{path}: not a {what} of orthaug.")
     if declared["format"] > number:
         raise InputError(
-            f"{path}: written by orthaug {declared.get('orthaug')} in format {declared['format']}; this version "
-            f"({__version__}) reads up to {number}. Update orthaug."
+            f"{path}: written by orthaug {declared.get('orthaug')} in format "
+            f"{declared['format']}; this version ({__version__}) reads up to {number}. Update "
+            "orthaug."
         )
     if given != checksum:
         raise InputError(f"{path}: the file was altered (its checksum differs); {again}.")
     if hashlib.sha256(packed).hexdigest() != declared.get("arrays_sha256"):
-        raise InputError(f"{arrays}: the file is cut or altered (its checksum differs); copy it again.")
+        raise InputError(
+            f"{arrays}: the file is cut or altered (its checksum differs); copy it again."
+        )
     try:
         return declared, load_arrays(packed)
     except SafetensorError as error:

@@ -1,6 +1,7 @@
 """The engine of rows that do not fit into memory: they are read, laid out and summed chunk by chunk, at every pass.
 
-A thread reads ahead while the chunk before it is summed. All chunks have one shape, so one compiled program serves.
+A thread reads ahead while the chunk before it is summed. All chunks have one shape, so one compiled
+program serves.
 """
 
 from __future__ import annotations
@@ -36,7 +37,12 @@ class SourceRows:
 
     def __iter__(self) -> Iterator[Chunk]:
         return chunks_of(
-            (arrays for partition in self.source.partitions for arrays in self.row_builder(partition)), self.size
+            (
+                arrays
+                for partition in self.source.partitions
+                for arrays in self.row_builder(partition)
+            ),
+            self.size,
         )
 
 
@@ -47,7 +53,9 @@ class Stream(LocalEngine):
     limit: int = CHUNK_ROWS
     resident: bool = False
 
-    def build_rows(self, z: Matrix, q: Any, e: Matrix, gain: Float[np.ndarray, "N ny ny"]) -> list[Chunk]:
+    def build_rows(
+        self, z: Matrix, q: Any, e: Matrix, gain: Float[np.ndarray, "N ny ny"]
+    ) -> list[Chunk]:
         """Rows that are in memory, in chunks."""
         return apart(build_chunk(z, q, e, gain, chunk_shape(len(z), self.limit)))
 
@@ -64,13 +72,17 @@ class Stream(LocalEngine):
     def place(self, chunks: Any, like: Any = None) -> list[Any]:
         return apart(chunks)
 
-    def read(self, function: Callable[[Any], Any], partitions: Sequence[Any], counts: Sequence[int]) -> PartitionChunks:
+    def read(
+        self, function: Callable[[Any], Any], partitions: Sequence[Any], counts: Sequence[int]
+    ) -> PartitionChunks:
         return PartitionChunks(function, partitions)
 
     def beside(self, *rows: Iterable[Any]) -> PairedChunks:
         return PairedChunks(rows)
 
-    def keep(self, function: Callable[..., Any], rows: Iterable[Any], *arguments: Any) -> tuple[list[Any], Any]:
+    def keep(
+        self, function: Callable[..., Any], rows: Iterable[Any], *arguments: Any
+    ) -> tuple[list[Any], Any]:
         return folded(function, rows, arguments)
 
     def fetch(self, rows: Iterable[Any]) -> Any:
@@ -107,7 +119,9 @@ def apart(chunks: Any) -> list[Any]:
     return [jax.tree.unflatten(form, parts) for parts in zip(*leaves, strict=True)]
 
 
-def folded(function: Callable[..., Any], rows: Iterable[Any], arguments: tuple[Any, ...]) -> tuple[list[Any], Any]:
+def folded(
+    function: Callable[..., Any], rows: Iterable[Any], arguments: tuple[Any, ...]
+) -> tuple[list[Any], Any]:
     """Of function(chunk, *arguments), a pair: the first ones on the host, and Σ of the second."""
     arguments = jax.tree.map(jax.numpy.asarray, arguments)
     first, _ = _compiled(function)
@@ -141,7 +155,10 @@ def _compiled(function: Callable[..., Any]) -> tuple[Any, Any]:
 
 
 def chunks_of(pieces: Iterable[RowArrays], size: int) -> Iterator[Chunk]:
-    """Rows in chunks of one size, the row index last; the last one is padded with rows that count for nothing."""
+    """Rows in chunks of one size, the row index last.
+
+    The last one is padded with rows that count for nothing.
+    """
     parts: list[Any] = []
     held = 0
     for piece in pieces:
@@ -156,12 +173,17 @@ def chunks_of(pieces: Iterable[RowArrays], size: int) -> Iterator[Chunk]:
                 yield Chunk(*parts)
                 parts, held = [], 0
     if parts:
-        parts[0][..., held:] = parts[0][..., held - 1 : held]  # zeros may be where the learner has no value
+        parts[0][..., held:] = parts[0][
+            ..., held - 1 : held
+        ]  # zeros may be where the learner has no value
         yield Chunk(*parts)
 
 
 def read_ahead(items: Iterable[Any], ahead: int = _AHEAD) -> Iterator[Any]:
-    """Yield the items in order, made by a thread of their own while the caller works; its errors are raised here."""
+    """Yield the items in order, made by a thread of their own while the caller works.
+
+    Its errors are raised here.
+    """
     ready: queue.Queue[tuple[bool, Any]] = queue.Queue(ahead)
     given_up = threading.Event()
 

@@ -1,7 +1,7 @@
 """Independent runs as tasks of a Dask cluster: restarts, held-out blocks, candidates of a selection, cases of a study.
 
-What all runs share is sent once and goes from worker to worker; each run is whole at one place. A task that a lost
-worker had is made again elsewhere, so results do not depend on who made them.
+What all runs share is sent once and goes from worker to worker; each run is whole at one place. A
+task that a lost worker had is made again elsewhere, so results do not depend on who made them.
 """
 
 from __future__ import annotations
@@ -21,7 +21,9 @@ from orthaug.models.rows import InMemory, Room
 
 _MATRICES = 3  # of a run in memory
 _WAIT = 0.5  # s between two looks at whether a run is still wanted, and two tellings of a run
-_ANY_SIZE = {"distributed.admin.large-graph-warning-threshold": "1 PB"}  # rows are sent on purpose, and once
+_ANY_SIZE = {
+    "distributed.admin.large-graph-warning-threshold": "1 PB"
+}  # rows are sent on purpose, and once
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,10 @@ class Tasks(InMemory):
         items: Sequence[Any],
         heard: Heard = nobody,
     ) -> Iterator[Any]:
-        """As `Threads.map`; the function, its arguments and results are pickled, `given` once while it is the same."""
+        """As `Threads.map`.
+
+        The function, its arguments and results are pickled, `given` once while it is the same.
+        """
         shared = self._shared(given)
         with _heard_on(self.client) as (topic, said):
 
@@ -56,7 +61,9 @@ class Tasks(InMemory):
                     while said[i]:
                         heard(i, *said[i].popleft())
 
-                return ask(self.client, look, _made, shared, DoublePrecision((function, item)), topic, i)
+                return ask(
+                    self.client, look, _made, shared, DoublePrecision((function, item)), topic, i
+                )
 
             yield from each(one, list(enumerate(items)), places(self.client))
 
@@ -71,7 +78,10 @@ class Tasks(InMemory):
         if id(given) not in self._sent:
             self._sent.clear()
             with told(), config.set(_ANY_SIZE):
-                self._sent[id(given)] = given, self.client.submit(kept, DoublePrecision(given), pure=False)
+                self._sent[id(given)] = (
+                    given,
+                    self.client.submit(kept, DoublePrecision(given), pure=False),
+                )
         return self._sent[id(given)][1]
 
 
@@ -85,8 +95,13 @@ def places(client: Any) -> int:
     return max(sum(client.nthreads().values()), 1)
 
 
-def ask(client: Any, check: Callable[[], None], function: Callable[..., Any], *args: Any, **named: Any) -> Any:
-    """Return the result of a function that a worker computes; `check` is called now and then, and may raise to give it up."""
+def ask(
+    client: Any, check: Callable[[], None], function: Callable[..., Any], *args: Any, **named: Any
+) -> Any:
+    """Return the result of a function that a worker computes.
+
+    `check` is called now and then, and may raise to give it up.
+    """
     from distributed import wait
 
     with told():

@@ -30,16 +30,16 @@ Names = tuple[str, ...]
 class Terms:
     """`f = Σ w_j t_j`: linear in its weights, so that its training, its intervals and the split are exact.
 
-    Terms given by hand are what it sees. A `degree` adds all products of so many of its inputs, and `functions` of
-    them, when the lags or the states are known (`over`).
+    Terms given by hand are what it sees. A `degree` adds all products of so many of its inputs, and
+    `functions` of them, when the lags or the states are known (`over`).
 
-    Args:
-        terms: expressions such as `v[k-1]**3`, of a motion of states and inputs.
-        degree: of the products, the constant included; 0 for none.
-        functions: abs, sign, sqrt (of the size), tanh, sin, cos, exp; one in a product, times up to `degree − 1`
+    Args: terms: expressions such as `v[k-1]**3`, of a motion of states and inputs. degree: of the
+        products, the constant included; 0 for none. functions: abs, sign, sqrt (of the size), tanh,
+        sin, cos, exp; one in a product, times up to `degree − 1`
             signals.
         exclude: terms of the library to leave out.
-        inputs: the signals that the library is made of; None for all lags, or all states and inputs of a motion.
+        inputs: the signals that the library is made of; None for all lags, or all states and inputs
+            of a motion.
         beyond: as of `MLP`; "auto" is "free", for terms are an equation that goes on as it is.
 
     Examples:
@@ -61,12 +61,21 @@ class Terms:
             given = getattr(self, name)
             if given is None and name == "inputs":
                 continue
-            if isinstance(given, str) or not isinstance(given, Sequence) or any(not isinstance(t, str) for t in given):
-                raise InputError(f"`{name}` must be a tuple of texts, such as ('v[k-1]**3',); got {shown(given)}.")
+            if (
+                isinstance(given, str)
+                or not isinstance(given, Sequence)
+                or any(not isinstance(t, str) for t in given)
+            ):
+                raise InputError(
+                    f"`{name}` must be a tuple of texts, such as ('v[k-1]**3',); got "
+                    f"{shown(given)}."
+                )
             object.__setattr__(self, name, tuple(given))
         check_fields(self)
         if self.functions and not self.degree:
-            raise InputError("`functions` are factors of products, so they need a `degree` of 1 or more.")
+            raise InputError(
+                "`functions` are factors of products, so they need a `degree` of 1 or more."
+            )
         if not self.degree:
             if not self.terms:
                 raise InputError("a learner of terms needs `terms`, or a `degree` of 1 or more.")
@@ -77,7 +86,9 @@ class Terms:
         TermLibrary.of((), 0, self.functions)  # refuses unknown functions before there are signals
 
     def __str__(self) -> str:
-        named = ", ".join(self.terms[:_NAMED]) + (f" and {len(self.terms) - _NAMED} more" * (len(self.terms) > _NAMED))
+        named = ", ".join(self.terms[:_NAMED]) + (
+            f" and {len(self.terms) - _NAMED} more" * (len(self.terms) > _NAMED)
+        )
         return f"terms {named}" if not self.degree else f"all terms to the degree {self.degree}"
 
     linear = True
@@ -129,19 +140,33 @@ class Terms:
 
 
 def _written(library: TermLibrary) -> dict[str, Any]:
-    return {"terms": library.texts, "degree": 0, "functions": (), "exclude": (), "inputs": library.texts}
+    return {
+        "terms": library.texts,
+        "degree": 0,
+        "functions": (),
+        "exclude": (),
+        "inputs": library.texts,
+    }
 
 
-def over_lags(learner: Any, baseline: Baseline, lags: Lags | None, outputs: Names, inputs: Names) -> Any:
+def over_lags(
+    learner: Any, baseline: Baseline, lags: Lags | None, outputs: Names, inputs: Names
+) -> Any:
     """Return a learner whose library waits for the lags, written out; any other as it is."""
     if not hasattr(learner, "over"):
         return learner
-    return learner.over([str(lag) for lag in regressor_of(baseline, lags, None, outputs, inputs)[0]])
+    return learner.over(
+        [str(lag) for lag in regressor_of(baseline, lags, None, outputs, inputs)[0]]
+    )
 
 
 def over_states(learner: Any, motion: Motion) -> Any:
     """The same for a motion, with its states and inputs."""
-    return learner.over([*motion.names_of_states, *motion.inputs]) if hasattr(learner, "over") else learner
+    return (
+        learner.over([*motion.names_of_states, *motion.inputs])
+        if hasattr(learner, "over")
+        else learner
+    )
 
 
 def scaling_of(learner: Any, features: Matrix) -> Scaling:

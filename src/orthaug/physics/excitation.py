@@ -1,7 +1,8 @@
 """Excitation and identifiability: do the data, and could any data, determine θ?
 
-Identifiability is the rank of φ at random regressor points, a property of the physics alone; excitation
-is the rank of φ on the measured rows (assumption `assum:phi_full_rank`). The first can hold without the second.
+Identifiability is the rank of φ at random regressor points, a property of the physics alone;
+excitation is the rank of φ on the measured rows (assumption `assum:phi_full_rank`). The first can
+hold without the second.
 """
 
 from __future__ import annotations
@@ -42,8 +43,9 @@ GRAM_TOLERANCE = 3e-6
 def excitation(r: Matrix, names: Sequence[str], tolerance: float = RANK_TOLERANCE) -> Excitation:
     """Rank and condition of a matrix from its R factor (or itself), columns scaled to unit norm.
 
-    The condition number is σmax/σmin of the scaled columns, None where it is infinite. A group holds the columns that
-    a null direction ties: nothing in the data can tell their parameters apart.
+    The condition number is σmax/σmin of the scaled columns, None where it is infinite. A group
+    holds the columns that a null direction ties: nothing in the data can tell their parameters
+    apart.
     """
     columns = len(names)
     if columns == 0:
@@ -62,7 +64,9 @@ def of_gram(gram: Matrix, names: Sequence[str]) -> Excitation:
     norms = np.sqrt(np.maximum(np.diag(gram), 0.0))
     unit = np.where(norms > 0, norms, 1.0)
     values, vectors = np.linalg.eigh(gram / np.outer(unit, unit))
-    return excitation(np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T * unit, names, GRAM_TOLERANCE)
+    return excitation(
+        np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T * unit, names, GRAM_TOLERANCE
+    )
 
 
 def _groups(null_space: Matrix, names: Sequence[str]) -> tuple[tuple[str, ...], ...]:
@@ -86,7 +90,8 @@ def require_rank(excited: Excitation, rows: int) -> None:
     """Raise RankError where θ is not determined, naming the parameters that cannot be told apart."""
     if rows < excited.columns:
         raise RankError(
-            f"{rows} usable rows for {excited.columns} parameters; give at least as many rows as parameters."
+            f"{rows} usable rows for {excited.columns} parameters; give at least as many rows "
+            "as parameters."
         )
     if excited.full_rank:
         return
@@ -97,12 +102,15 @@ def require_rank(excited: Excitation, rows: int) -> None:
         for group in excited.collinear
     )
     raise RankError(
-        f"the physics is rank-deficient on the data (rank {excited.rank} of {excited.columns}): {groups}. "
-        "Remove or fix one of them, or use data that excite them separately."
+        f"the physics is rank-deficient on the data (rank {excited.rank} of "
+        f"{excited.columns}): {groups}. Remove or fix one of them, or use data that excite "
+        "them separately."
     )
 
 
-def identifiability(baseline: Baseline, layout: Layout, outputs: Sequence[str], x: Matrix) -> Excitation:
+def identifiability(
+    baseline: Baseline, layout: Layout, outputs: Sequence[str], x: Matrix
+) -> Excitation:
     """Rank of φ at random points of a box twice as wide as the data's (width 1 where the data do not move).
 
     Args:
@@ -123,7 +131,9 @@ def identifiability(baseline: Baseline, layout: Layout, outputs: Sequence[str], 
         return excitation(np.zeros((0, 0)), ())
     low, high = x.min(axis=0), x.max(axis=0)
     halfwidth = np.where(high > low, high - low, 1.0)
-    points = (low + high) / 2 + halfwidth * np.random.default_rng(0).uniform(-1, 1, (50 * nt + 200, len(layout)))
+    points = (low + high) / 2 + halfwidth * np.random.default_rng(0).uniform(
+        -1, 1, (50 * nt + 200, len(layout))
+    )
     with np.errstate(all="ignore"):
         phi = np.asarray(baseline.phi(points, layout, outputs, np))
     finite = np.isfinite(phi).all(axis=(1, 2))  # a logarithm or a root has no value at some of them

@@ -1,7 +1,8 @@
 """The estimation problem of a motion: its record, what the learner sees, and what can be said before any training.
 
-Where it may start: states as they are declared, from what is measured about a row. An output and its derivative are
-those of a local polynomial (Savitzky and Golay 1964), what nothing is said of starts at zero. Training and simulation
+Where it may start: states as they are declared, from what is measured about a row. An output and
+its derivative are those of a local polynomial (Savitzky and Golay 1964), what nothing is said of
+starts at zero. Training and simulation
 go on from there: a start is an unknown.
 """
 
@@ -23,14 +24,19 @@ from orthaug.physics.motion import MOST_SUBSTEPS, Motion
 from orthaug.physics.output_weights import OutputWeights, check_output_weights, weigh_outputs
 
 _LOOKED_AT = 200  # rows at which the equations are looked at
-_ANGLE = 0.35  # of the fastest mode in a substep [rad]: Runge-Kutta errs by about 1e-3 of it in a period
+_ANGLE = (
+    0.35  # of the fastest mode in a substep [rad]: Runge-Kutta errs by about 1e-3 of it in a period
+)
 _STEP = 1e-6  # relative, of differences
 _ROWS, _DEGREE = 9, 2  # of a local polynomial
 
 
 @dataclass(frozen=True, eq=False)
 class MotionProblem:
-    """A record with its motion. `features` are what a learner sees; `deviation` (ny,) is that of the outputs."""
+    """A record with its motion.
+
+    `features` are what a learner sees; `deviation` (ny,) is that of the outputs.
+    """
 
     record: Record
     motion: Motion
@@ -42,7 +48,10 @@ class MotionProblem:
 
     def __repr__(self) -> str:
         motion = self.motion
-        return f"MotionProblem({len(self.record)} rows of {', '.join(self.outputs)}, states {motion.names_of_states})"
+        return (
+            f"MotionProblem({len(self.record)} rows of {', '.join(self.outputs)}, states "
+            f"{motion.names_of_states})"
+        )
 
     @property
     def outputs(self) -> tuple[str, ...]:
@@ -81,16 +90,24 @@ class MotionProblem:
             (self.outputs, outputs, "the output", len(rates)),
         ):
             if values.shape != (len(names), x.shape[1]):
-                raise InputError(f"the motion's functions return shape {values.shape}; expected ({len(names)}, …).")
+                raise InputError(
+                    f"the motion's functions return shape {values.shape}; expected "
+                    f"({len(names)}, …)."
+                )
             for i, name in enumerate(names):
                 lost = ~np.isfinite(values[i])
                 if over(lost):
                     k = int(np.argmax(lost))
-                    at = zip((*motion.names_of_states, *motion.inputs), (*x[:, k], *u[:, k]), strict=True)
+                    at = zip(
+                        (*motion.names_of_states, *motion.inputs), (*x[:, k], *u[:, k]), strict=True
+                    )
                     where = ", ".join(f"{n} = {v:.4g}" for n, v in at)
                     term = motion.term_without_value(first + i, x[:, k], u[:, k])
                     told = f": {term}" if term else ""
-                    return f"{what} '{name}' is not finite at the start ({where}, initial parameters){told}"
+                    return (
+                        f"{what} '{name}' is not finite at the start ({where}, initial "
+                        f"parameters){told}"
+                    )
         return ""
 
     @cached_property
@@ -103,7 +120,10 @@ class MotionProblem:
             for i, h in enumerate(_STEP * size):
                 moved = np.zeros_like(x)
                 moved[i] = h
-                ends = (np.asarray(self.motion.rates(x + s * moved, u, self.motion.initial, np)) for s in (1, -1))
+                ends = (
+                    np.asarray(self.motion.rates(x + s * moved, u, self.motion.initial, np))
+                    for s in (1, -1)
+                )
                 columns.append((next(ends) - next(ends)) / (2 * h))
         slopes = np.moveaxis(np.stack(columns, axis=1), -1, 0)
         slopes = slopes[np.isfinite(slopes).all(axis=(1, 2))]
@@ -130,11 +150,11 @@ def pose_motion(
 ) -> MotionProblem:
     """Check record and motion against each other.
 
-    Args:
-        learner_inputs: expressions of states and inputs that the learner sees; None for all of them.
+    Args: learner_inputs: expressions of states and inputs that the learner sees; None for all of
+        them.
 
-    Raises:
-        InputError: other channels, outputs that do not move, learner inputs that cannot be, equations that have no
+    Raises: InputError: other channels, outputs that do not move, learner inputs that cannot be,
+        equations that have no
             value at the start, a sampling time too long for the fastest mode.
     """
     inputs, outputs = (tuple(c.name for c in group) for group in (record.inputs, record.outputs))
@@ -148,11 +168,18 @@ def pose_motion(
             == max(np.ptp(e.outputs[:, i]) for e in record.experiments)
             == 0.0
         ):
-            raise InputError(f"channel '{name}' is constant over all training data; nothing can be learned from it.")
+            raise InputError(
+                f"channel '{name}' is constant over all training data; nothing can be learned "
+                "from it."
+            )
     deviation = np.concatenate([e.outputs for e in record.experiments]).std(axis=0)
     deviation = np.where(deviation > 0, deviation, 1.0)
     problem = MotionProblem(
-        record, motion, _features(motion, learner_inputs), deviation, weigh_outputs(output_weights, deviation)
+        record,
+        motion,
+        _features(motion, learner_inputs),
+        deviation,
+        weigh_outputs(output_weights, deviation),
     )
     _check_start(problem)
     return problem
@@ -160,16 +187,23 @@ def pose_motion(
 
 def _features(motion: Motion, texts: Sequence[str] | None) -> tuple[Expression, ...]:
     known = {name: value for name, value in motion.known.items() if name not in motion.names}
-    reach = {name for name, expression in motion.definitions if set(expression.names) & set(motion.names)}
+    reach = {
+        name for name, expression in motion.definitions if set(expression.names) & set(motion.names)
+    }
     texts = (*motion.names_of_states, *motion.inputs) if texts is None else tuple(texts)
     if not texts:
-        raise InputError("the learner sees nothing; give `inputs` such as a state's name, or leave it out for all.")
+        raise InputError(
+            "the learner sees nothing; give `inputs` such as a state's name, or leave it out "
+            "for all."
+        )
     found = []
     for text in texts:
         expression = parse_named(text, known, "learner input")
         hidden = [name for name in expression.names if name in reach]
         if hidden:
-            raise InputError(f"learner input = {text}: '{hidden[0]}' contains parameters; use states and inputs.")
+            raise InputError(
+                f"learner input = {text}: '{hidden[0]}' contains parameters; use states and inputs."
+            )
         found.append(expression)
     return tuple(found)
 
@@ -188,7 +222,10 @@ def _check_start(problem: MotionProblem) -> None:
 
 
 def guess(
-    motion: Motion, outputs: Matrix, rows: Sequence[int] | Int[np.ndarray, "r"], sampling_time: float
+    motion: Motion,
+    outputs: Matrix,
+    rows: Sequence[int] | Int[np.ndarray, "r"],
+    sampling_time: float,
 ) -> Float[np.ndarray, "r n0"]:
     """Return the states at some rows, made of the outputs (N, ny) that were measured about them."""
     rows = np.asarray(rows, dtype=int)

@@ -1,7 +1,7 @@
 """How several outputs are weighed against each other: the inner product of criterion and measure alike.
 
-Errors e (ny,) count as `‖W e‖²`. The rows of Φ, of the learner and of Y are multiplied by the same W, so that θ is
-solved exactly (F1).
+Errors e (ny,) count as `‖W e‖²`. The rows of Φ, of the learner and of Y are multiplied by the same
+W, so that θ is solved exactly (F1).
 """
 
 from __future__ import annotations
@@ -17,15 +17,19 @@ from orthaug._base.checks import Matrix, Vector, check_choice
 from orthaug._base.errors import InputError, shown
 
 CHOICES = ("auto", "none", "std", "covariance")
-_SMALLEST, _LARGEST = 1e-12, 1e12  # of one weight against another: beyond, an output does not count at all
+_SMALLEST, _LARGEST = (
+    1e-12,
+    1e12,
+)  # of one weight against another: beyond, an output does not count at all
 
 
 @dataclass(frozen=True, eq=False)
 class OutputWeights:
     """W, and how it came about.
 
-    `matrix` (ny, ny) is W, scaled so that whitened outputs have a mean square of one; `unit` is that scale, against
-    which penalties count. `kind` is "none", "std", "covariance" or "given"; `choice` is what was asked for.
+    `matrix` (ny, ny) is W, scaled so that whitened outputs have a mean square of one; `unit` is
+    that scale, against which penalties count. `kind` is "none", "std", "covariance" or "given";
+    `choice` is what was asked for.
     """
 
     kind: str
@@ -69,7 +73,9 @@ class OutputWeights:
         return inverse @ whitened @ inverse.T
 
 
-def times(matrix: np.ndarray, values: Float[np.ndarray, "N ny ..."]) -> Float[np.ndarray, "N ny ..."]:
+def times(
+    matrix: np.ndarray, values: Float[np.ndarray, "N ny ..."]
+) -> Float[np.ndarray, "N ny ..."]:
     """Return every row's outputs multiplied by one matrix (ny, ny), or by one of its own (N, ny, ny)."""
     if matrix.shape[-1] == 1:  # one output: the same number without a sum
         return values * matrix.reshape(-1, *([1] * (values.ndim - 1)))
@@ -81,7 +87,9 @@ def check_output_weights(choice: Any, ny: int) -> None:
     if isinstance(choice, str):
         check_choice(choice, CHOICES, "`output_weights`")
         return
-    expected = f"expected one of {', '.join(CHOICES)}, or {ny} positive weights, one for each output"
+    expected = (
+        f"expected one of {', '.join(CHOICES)}, or {ny} positive weights, one for each output"
+    )
     listed = isinstance(choice, Sequence) or (isinstance(choice, np.ndarray) and choice.ndim > 0)
     if not listed or any(isinstance(w, bool | str) for w in choice):
         raise InputError(f"`output_weights` is {shown(choice)}; {expected}.")
@@ -93,26 +101,31 @@ def check_output_weights(choice: Any, ny: int) -> None:
         raise InputError(f"`output_weights` is {shown(choice)}; {expected}.")
     if values.min() < _SMALLEST * values.max():
         raise InputError(
-            f"`output_weights` {shown(choice)} differ by more than {_LARGEST:g}; leave the output out instead."
+            f"`output_weights` {shown(choice)} differ by more than {_LARGEST:g}; leave the "
+            "output out instead."
         )
 
 
 def weigh_outputs(choice: str | Sequence[float], deviation: Vector) -> OutputWeights:
     """W for outputs of these standard deviations (ny,).
 
-    Args:
-        choice: "none" for the plain sum of squares, "std" for each output in its standard deviation, numbers for the
+    Args: choice: "none" for the plain sum of squares, "std" for each output in its standard
+        deviation, numbers for the
             weights of the squared errors. "auto" and "covariance" begin with "std".
     """
     if len(deviation) == 1:  # one output: the weight changes nothing, penalties count in its unit
         scale = float(1 / deviation[0])
-        return OutputWeights("none" if choice == "none" else "std", np.array([[scale]]), scale, "std")
+        return OutputWeights(
+            "none" if choice == "none" else "std", np.array([[scale]]), scale, "std"
+        )
     if choice in ("auto", "std", "covariance"):
         return OutputWeights("std", np.diag(1 / deviation), 1.0, str(choice))
     given = choice if isinstance(choice, str) else tuple(float(w) for w in choice)
     root = np.ones(len(deviation)) if isinstance(given, str) else np.sqrt(given)
     scale = float(1 / np.sqrt(np.mean((root * deviation) ** 2)))
-    return OutputWeights("none" if isinstance(given, str) else "given", np.diag(scale * root), scale, given)
+    return OutputWeights(
+        "none" if isinstance(given, str) else "given", np.diag(scale * root), scale, given
+    )
 
 
 def by_covariance(white: Matrix, outputs: Matrix) -> OutputWeights:

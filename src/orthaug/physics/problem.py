@@ -18,14 +18,24 @@ from orthaug._base.errors import InputError
 from orthaug._base.parallel import one_blas_thread
 from orthaug.data.expressions import Lag, parse
 from orthaug.data.record import Record
-from orthaug.data.regressors import Features, Lags, Layout, UsableRows, in_order, lag_matrix, stack_rows
+from orthaug.data.regressors import (
+    Features,
+    Lags,
+    Layout,
+    UsableRows,
+    in_order,
+    lag_matrix,
+    stack_rows,
+)
 from orthaug.physics.baseline import Baseline
 from orthaug.physics.excitation import Excitation, excitation, require_rank
 from orthaug.physics.output_weights import OutputWeights, check_output_weights, weigh_outputs
 from orthaug.physics.projection import Projection
 from orthaug.physics.shared import Shared, shared_directions
 
-_LARGEST = 1e120  # size of outputs and regressors whose squares still add up; 1 / _LARGEST is the smallest
+_LARGEST = (
+    1e120  # size of outputs and regressors whose squares still add up; 1 / _LARGEST is the smallest
+)
 
 _SMALLEST_RESIDUAL = 1e-10  # of an output's deviation: the physics leaves at least rounding
 
@@ -62,7 +72,11 @@ class Moments(NamedTuple):
         if not count:
             return self
         apart = other.mean - self.mean
-        scatter = self.scatter + other.scatter + np.outer(apart, apart) * (self.count * other.count / count)
+        scatter = (
+            self.scatter
+            + other.scatter
+            + np.outer(apart, apart) * (self.count * other.count / count)
+        )
         return Moments(count, self.mean + apart * (other.count / count), scatter)
 
     @property
@@ -79,9 +93,9 @@ class Moments(NamedTuple):
 class Problem:
     """Usable rows of a record with everything that does not depend on the learner's weights.
 
-    `weight` weighs the outputs, for criterion and measure alike: so F1 holds for several outputs too. Rows multiplied
-    by it are called whitened. `target` is the outputs without the fixed terms, `deviation` (ny,) the standard
-    deviation of the outputs themselves.
+    `weight` weighs the outputs, for criterion and measure alike: so F1 holds for several outputs
+    too. Rows multiplied by it are called whitened. `target` is the outputs without the fixed terms,
+    `deviation` (ny,) the standard deviation of the outputs themselves.
     """
 
     record: Record
@@ -97,7 +111,10 @@ class Problem:
 
     def __repr__(self) -> str:
         lags = ", ".join(str(lag) for lag in self.layout)
-        return f"Problem({len(self.rows)} rows of {', '.join(self.outputs)}, x: {lags}, {self.baseline!r})"
+        return (
+            f"Problem({len(self.rows)} rows of {', '.join(self.outputs)}, x: {lags}, "
+            f"{self.baseline!r})"
+        )
 
     @property
     def outputs(self) -> tuple[str, ...]:
@@ -170,7 +187,9 @@ class Problem:
     @cached_property
     def shared(self) -> Shared:
         """The directions of θ that a learner on these features could imitate."""
-        return shared_directions(self.baseline, self.features, self.layout, self.outputs, self.rows.x)
+        return shared_directions(
+            self.baseline, self.features, self.layout, self.outputs, self.rows.x
+        )
 
     @cached_property
     def freedom_used(self) -> Vector:
@@ -179,12 +198,22 @@ class Problem:
 
     def seen_linearly(self) -> Problem:
         """The same for a learner that is a linear combination of its features."""
-        return self if self.features.linear else replace(self, features=replace(self.features, linear=True))
+        return (
+            self
+            if self.features.linear
+            else replace(self, features=replace(self.features, linear=True))
+        )
 
     def physics_alone(self) -> Problem:
-        """Return the problem without a learner. It is posed anew where the learner's lags took rows from the physics."""
+        """Return the problem without a learner.
+
+        It is posed anew where the learner's lags took rows from the physics.
+        """
         outputs, inputs = self.outputs, tuple(channel.name for channel in self.record.inputs)
-        if self.baseline.function is not None or in_order(self.baseline.lags, outputs, inputs) == self.layout:
+        if (
+            self.baseline.function is not None
+            or in_order(self.baseline.lags, outputs, inputs) == self.layout
+        ):
             return replace(self, features=Features(()))
         return pose(self.record, self.baseline, output_weights=self.weight.choice)
 
@@ -233,10 +262,10 @@ def pose(
         output_weights: as in `estimate`; "covariance" and "auto" begin with standard deviations.
         require_full_rank: raise where the data do not determine θ; `check` reports it instead.
 
-    Raises:
-        InputError: unknown channels, outputs at lag 0, constant channels, values that are not finite,
-            too few rows, initial values beyond their bounds, a constant `Ts` that is not the sampling time;
-            RankError for linearly dependent physics.
+    Raises: InputError: unknown channels, outputs at lag 0, constant channels, values that are not
+        finite,
+            too few rows, initial values beyond their bounds, a constant `Ts` that is not the
+            sampling time; RankError for linearly dependent physics.
     """
     outputs, inputs = (tuple(c.name for c in group) for group in (record.outputs, record.inputs))
     if not outputs:
@@ -248,7 +277,9 @@ def pose(
     baseline.check_channels(outputs, inputs)
     layout, features = regressor_of(baseline, lags, learner_inputs, outputs, inputs)
     features = features.sampled(record.sampling_time)
-    return _posed(record, baseline, layout, features, output_weights, require_full_rank=require_full_rank)
+    return _posed(
+        record, baseline, layout, features, output_weights, require_full_rank=require_full_rank
+    )
 
 
 def _posed(
@@ -277,7 +308,9 @@ def _posed(
     excited = excitation(projection.r, baseline.names)
     if require_full_rank:
         require_rank(excited, rows.y.size)
-    return Problem(record, baseline, features, layout, rows, target, deviation, weight, projection, excited)
+    return Problem(
+        record, baseline, features, layout, rows, target, deviation, weight, projection, excited
+    )
 
 
 def check_defined(problem: Problem, record: Record) -> None:
@@ -285,7 +318,9 @@ def check_defined(problem: Problem, record: Record) -> None:
     layout, outputs, start = problem.layout, problem.outputs, problem.rows.start
     for experiment in record.experiments:
         alone = replace(record, experiments=(experiment,))
-        rows = UsableRows(lag_matrix(experiment, layout, record, start), experiment.outputs[start:], layout, start)
+        rows = UsableRows(
+            lag_matrix(experiment, layout, record, start), experiment.outputs[start:], layout, start
+        )
         phi, known = problem.baseline.on(rows.x, layout, outputs)
         check_physics(phi, known, problem.baseline, rows, alone)
         feature_rows(problem.features, rows, layout, alone)
@@ -312,7 +347,9 @@ def regressor_of(
     Raises:
         InputError: unknown channels, outputs at lag 0, learner inputs that cannot be read.
     """
-    chosen = in_order(baseline.lags, outputs, inputs) if lags is None else lags.layout(outputs, inputs)
+    chosen = (
+        in_order(baseline.lags, outputs, inputs) if lags is None else lags.layout(outputs, inputs)
+    )
     features = Features.of(chosen)
     if learner_inputs is not None:
         constants = dict(baseline.constants)
@@ -325,16 +362,25 @@ def regressor_of(
         features = Features(tuple(expressions))
     if baseline.function is not None:  # it takes the regressor exactly as `lags` lays it out
         if lags is None:
-            raise InputError("a baseline function needs `lags`: they define the regressor x that it is called with.")
+            raise InputError(
+                "a baseline function needs `lags`: they define the regressor x that it is "
+                "called with."
+            )
         missing = set(features.lags) - set(chosen)
         if missing:
-            raise InputError(f"the learner inputs use {', '.join(map(str, missing))}, which `lags` does not contain.")
+            raise InputError(
+                f"the learner inputs use {', '.join(map(str, missing))}, which `lags` does not "
+                "contain."
+            )
         return chosen, features
     return in_order((*chosen, *features.lags, *baseline.lags), outputs, inputs), features
 
 
 def check_moving(extent: Extent, record: Record, layout: Layout) -> None:
-    """Raise InputError for a channel of the model that is constant; `extent` is that of outputs, then inputs."""
+    """Raise InputError for a channel of the model that is constant.
+
+    `extent` is that of outputs, then inputs.
+    """
     used = {lag.channel for lag in layout} | {channel.name for channel in record.outputs}
     for channel, low, high in zip(record.channels, *extent, strict=True):
         if channel.name in used and low == high:
@@ -347,23 +393,30 @@ def check_moving(extent: Extent, record: Record, layout: Layout) -> None:
 def check_sizes(deviation: Vector, moved: Vector) -> None:
     """Raise InputError for outputs of such a deviation (ny,) that move by `moved`, if their squares do not add up."""
     moves = moved > 0
-    if not np.all(np.isfinite(deviation)) or np.any(moves & ((deviation > _LARGEST) | (deviation < 1 / _LARGEST))):
+    if not np.all(np.isfinite(deviation)) or np.any(
+        moves & ((deviation > _LARGEST) | (deviation < 1 / _LARGEST))
+    ):
         raise InputError(
             f"the outputs move by {np.max(moved):.3g}, too large or too small for double precision "
             "arithmetic; scale them (`scale` of the channel)."
         )
 
 
-def check_physics(phi: np.ndarray, known: np.ndarray, baseline: Baseline, rows: UsableRows, record: Record) -> None:
+def check_physics(
+    phi: np.ndarray, known: np.ndarray, baseline: Baseline, rows: UsableRows, record: Record
+) -> None:
     """Raise InputError where Φ (N, ny, nθ) or the fixed terms (N, ny) are not finite, or their squares not."""
     for j, name in enumerate(baseline.names):
-        texts = ", ".join(t.regressor for t in baseline.terms if t.parameter == name) or "the baseline function"
+        texts = (
+            ", ".join(t.regressor for t in baseline.terms if t.parameter == name)
+            or "the baseline function"
+        )
         _check_finite(phi[:, :, j], f"the regressor of {name} ({texts})", rows, record)
         size = np.abs(phi[:, :, j]).max()
         if size > _LARGEST or 0 < size < 1 / _LARGEST:
             raise InputError(
-                f"the regressor of {name} ({texts}) is of size {size:.3g}, beyond double precision arithmetic; "
-                "scale its channels (`scale`)."
+                f"the regressor of {name} ({texts}) is of size {size:.3g}, beyond double "
+                "precision arithmetic; scale its channels (`scale`)."
             )
     _check_finite(known, "the sum of the fixed terms", rows, record)
 

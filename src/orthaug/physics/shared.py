@@ -1,11 +1,13 @@
 """Which directions of θ could the learner imitate? Only along these does it have to be made orthogonal to the physics.
 
-A direction a of θ is shared if φ(x)a is a function of the learner's features z(x) alone. A change of θ along it can be
-undone by the learner, so there θ is arbitrary until it is split off. Every other direction is determined by the fit
-itself, as in a partially linear regression. A learner that sees all lags shares everything: that is the paper.
+A direction a of θ is shared if φ(x)a is a function of the learner's features z(x) alone. A change
+of θ along it can be undone by the learner, so there θ is arbitrary until it is split off. Every
+other direction is determined by the fit itself, as in a partially linear regression. A learner that
+sees all lags shares everything: that is the paper.
 
-Found by moves: pairs of regressors x, x′ with z(x) = z(x′) that differ otherwise. A direction is shared where φ(x)a and
-φ(x′)a agree on all of them. Finite moves, not derivatives, so that a jump such as sign(v) counts too.
+Found by moves: pairs of regressors x, x′ with z(x) = z(x′) that differ otherwise. A direction is
+shared where φ(x)a and φ(x′)a agree on all of them. Finite moves, not derivatives, so that a jump
+such as sign(v) counts too.
 """
 
 from __future__ import annotations
@@ -38,15 +40,20 @@ NEARLY = 0.5
 class Shared:
     """The shared directions of θ.
 
-    `basis` (nθ, s) spans them, in reduced form: each column has an entry of one that is zero in all others.
+    `basis` (nθ, s) spans them, in reduced form: each column has an entry of one that is zero in all
+    others.
     """
 
     names: tuple[str, ...]
     basis: Matrix
     on_data: tuple[str, ...] = ()
-    """Parameters that only the rows show to be shared: their regressors read what the learner does not see."""
+    """Parameters that only the rows show to be shared: their regressors read what the learner does
+    not see.
+    """
     rest: UnexplainedPhysics | None = None
-    """What functions of the features leave of the physics on the rows; None where that was not asked."""
+    """What functions of the features leave of the physics on the rows; None where that was not
+    asked.
+    """
 
     @property
     def nearly(self) -> dict[str, float]:
@@ -54,7 +61,9 @@ class Shared:
         if self.rest is None:
             return {}
         shares = zip(self.names, self.basis, self.rest.share, strict=True)
-        return {name: float(share) for name, row, share in shares if not row.any() and share < NEARLY}
+        return {
+            name: float(share) for name, row, share in shares if not row.any() and share < NEARLY
+        }
 
     def beside(self, rest: UnexplainedPhysics | None) -> Shared:
         """Return these directions and those that the rows do not tell from functions of the features."""
@@ -64,7 +73,9 @@ class Shared:
         if not more.shape[1]:
             return replace(self, rest=rest)
         moved = [
-            name for name, row, own in zip(self.names, more, self.basis, strict=True) if row.any() and not own.any()
+            name
+            for name, row, own in zip(self.names, more, self.basis, strict=True)
+            if row.any() and not own.any()
         ]
         size = np.sqrt(np.maximum(np.diag(rest.whole), 1e-300))[:, None]
         basis = _reduced(np.column_stack([self.basis, more]) * size, 1 / size[:, 0]) / size
@@ -78,7 +89,9 @@ class Shared:
     @property
     def untouched(self) -> tuple[str, ...]:
         """Parameters that no shared direction moves: the fit determines them beside any learner."""
-        return tuple(name for name, row in zip(self.names, self.basis, strict=True) if not row.any())
+        return tuple(
+            name for name, row in zip(self.names, self.basis, strict=True) if not row.any()
+        )
 
     @property
     def directions(self) -> tuple[dict[str, float], ...]:
@@ -86,11 +99,20 @@ class Shared:
         told = []
         for column in self.basis.T:
             first = column[np.flatnonzero(column)[0]]
-            told.append({name: float(f"{a / first:.12g}") for name, a in zip(self.names, column, strict=True) if a})
+            told.append(
+                {
+                    name: float(f"{a / first:.12g}")
+                    for name, a in zip(self.names, column, strict=True)
+                    if a
+                }
+            )
         return tuple(told)
 
     def leaving(self, held: Iterable[int]) -> Shared:
-        """Return the shared directions that leave some entries of θ where they are; in reduced form too."""
+        """Return the shared directions that leave some entries of θ where they are.
+
+        In reduced form too.
+        """
         basis = self.basis
         for i in held:
             if not basis[i].any():
@@ -104,7 +126,11 @@ class Shared:
 
 
 def shared_directions(
-    baseline: Baseline, features: Features, layout: Layout, outputs: Sequence[str], x: Float[np.ndarray, "N nx"]
+    baseline: Baseline,
+    features: Features,
+    layout: Layout,
+    outputs: Sequence[str],
+    x: Float[np.ndarray, "N nx"],
 ) -> Shared:
     """Return the directions of θ that a learner on these features could imitate.
 
@@ -124,12 +150,16 @@ def shared_directions(
     with np.errstate(all="ignore"):
         phi = [np.asarray(baseline.phi(rows, layout, tuple(outputs), np)) for rows in (start, end)]
     kept = np.isfinite(phi[0]).all(axis=(1, 2)) & np.isfinite(phi[1]).all(axis=(1, 2))
-    if np.sum(kept) < _FEWEST * len(names):  # nothing is known: the paper's projection is right for any learner
+    if np.sum(kept) < _FEWEST * len(
+        names
+    ):  # nothing is known: the paper's projection is right for any learner
         return everything
     before, after = (part[kept].reshape(-1, len(names)) for part in phi)
     with np.errstate(all="ignore"):
         own = np.asarray(baseline.phi(x, layout, tuple(outputs), np))
-        return Shared(names, agreeing(before, after)).beside(left_over(own, _values(features, layout)(x)))
+        return Shared(names, agreeing(before, after)).beside(
+            left_over(own, _values(features, layout)(x))
+        )
 
 
 def spanned(
@@ -178,7 +208,9 @@ def seen(
     return still & (np.sum(there, axis=0) >= _FEWEST)
 
 
-def _combined(values: Float[np.ndarray, "N k"], features: Float[np.ndarray, "N nz"]) -> Bool[np.ndarray, "k"]:
+def _combined(
+    values: Float[np.ndarray, "N k"], features: Float[np.ndarray, "N nz"]
+) -> Bool[np.ndarray, "k"]:
     """Which columns are linear combinations of features on the same points."""
     kept = np.isfinite(values).all(axis=1) & np.isfinite(features).all(axis=1)
     values, q = values[kept], _basis(features[kept])
@@ -235,8 +267,9 @@ def moves(
 ) -> tuple[Float[np.ndarray, "M nx"], Float[np.ndarray, "M nx"]]:
     """Pairs of points with equal features, of the size of the data's spread.
 
-    A step towards another row, or in any direction, is led back to the features' values by Newton's method; every other
-    one along the null space of ∂z/∂x first. The free ones find other branches: −u beside u where the learner sees u².
+    A step towards another row, or in any direction, is led back to the features' values by Newton's
+    method; every other one along the null space of ∂z/∂x first. The free ones find other branches:
+    −u beside u where the learner sees u².
 
     Args:
         seen: the features (M, nz) of points (M, nx).
@@ -258,7 +291,9 @@ def moves(
         for j in range(rows.shape[1]):
             small = np.zeros(rows.shape[1])
             small[j] = 1e-6 * spread[j]
-            columns.append((values(rows + small) - values(rows - small)) / 2e-6)  # in units of the spread
+            columns.append(
+                (values(rows + small) - values(rows - small)) / 2e-6
+            )  # in units of the spread
         return np.nan_to_num(np.stack(columns, axis=-1))
 
     target, size = values(start), np.maximum(np.nanstd(values(x), axis=0), 1e-300)

@@ -1,8 +1,9 @@
 """A problem whose rows stay in a source: what training needs of them comes from passes over its partitions.
 
-Three passes: a survey of sizes and ranges, a tree QR of `[Φ Y]`, and a second QR of the rows that the first one gives.
-The second makes Q orthonormal to rounding however ill-conditioned Φ is, as Householder's does in memory. A `witness` of
-the rows stays in memory for everything that only looks at the data.
+Three passes: a survey of sizes and ranges, a tree QR of `[Φ Y]`, and a second QR of the rows that
+the first one gives. The second makes Q orthonormal to rounding however ill-conditioned Φ is, as
+Householder's does in memory. A `witness` of the rows stays in memory for everything that only looks
+at the data.
 """
 
 from __future__ import annotations
@@ -59,7 +60,9 @@ class Form:
         """Rows of history that a row needs."""
         return largest_lag(self.layout)
 
-    def posed(self, partition: Partition) -> Iterator[tuple[Experiment, UsableRows, np.ndarray, np.ndarray]]:
+    def posed(
+        self, partition: Partition
+    ) -> Iterator[tuple[Experiment, UsableRows, np.ndarray, np.ndarray]]:
         """Pieces with their rows, Φ (m, ny, nθ) and the sum of the fixed terms (m, ny)."""
         for piece in partition.pieces(self.lead):
             if len(piece) <= self.lead:
@@ -68,7 +71,9 @@ class Form:
             rows = UsableRows(x, piece.outputs[self.lead :], self.layout, self.lead)
             yield piece, rows, *self.baseline.on(x, self.layout, self.outputs)
 
-    def checked(self, piece: Experiment, rows: UsableRows, phi: np.ndarray, known: np.ndarray) -> Matrix:
+    def checked(
+        self, piece: Experiment, rows: UsableRows, phi: np.ndarray, known: np.ndarray
+    ) -> Matrix:
         """Return the learner's features (m, nz), after everything was found to be finite."""
         alone = replace(self.empty, experiments=(piece,))
         check_physics(phi, known, self.baseline, rows, alone)
@@ -185,7 +190,9 @@ class PartitionQR:
 
 
 def _both(one: SecondQR, other: SecondQR) -> SecondQR:
-    return SecondQR(_triangle([one.r, other.r]), one.errors | other.errors, one.freedom + other.freedom)
+    return SecondQR(
+        _triangle([one.r, other.r]), one.errors | other.errors, one.freedom + other.freedom
+    )
 
 
 def _triangle(blocks: Sequence[Matrix]) -> Matrix:
@@ -198,7 +205,10 @@ def _merged(parts: Sequence[Any], merge: Callable[[Any, Any], Any]) -> Any:
     """Neighbours two by two, and so on: an order that does not depend on who was ready first."""
     parts = [part for part in parts if part is not None]
     while len(parts) > 1:
-        parts = [merge(*parts[i : i + 2]) if i + 1 < len(parts) else parts[i] for i in range(0, len(parts), 2)]
+        parts = [
+            merge(*parts[i : i + 2]) if i + 1 < len(parts) else parts[i]
+            for i in range(0, len(parts), 2)
+        ]
     return parts[0] if parts else None
 
 
@@ -213,20 +223,34 @@ class RowBuilder:
     rms: float
     gain: Matrix
 
-    def __call__(self, partition: Partition) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
+    def __call__(
+        self, partition: Partition
+    ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
         form = self.basis.form
         for _, rows, phi, known in form.posed(partition):
             q = self.basis.rows(phi)
             e = self.basis.left(rows.y - known, q, self.coordinates) / self.rms
-            z = np.asarray(form.features.evaluate(rows.x, form.layout, np)) if len(self.centre) else rows.x[:, :0]
-            yield (z - self.centre) / self.halfwidth, q, e, np.broadcast_to(self.gain, (*e.shape, e.shape[1]))
+            z = (
+                np.asarray(form.features.evaluate(rows.x, form.layout, np))
+                if len(self.centre)
+                else rows.x[:, :0]
+            )
+            yield (
+                (z - self.centre) / self.halfwidth,
+                q,
+                e,
+                np.broadcast_to(self.gain, (*e.shape, e.shape[1])),
+            )
 
 
 @dataclass(frozen=True, eq=False)
 class StreamedProblem(Problem):
-    """A problem of a source. `record`, `rows` and the rows of `projection` are those of its witness.
+    """A problem of a source.
 
-    `passes` makes passes over the source. `moments` are those of what the physics leaves, in whitened outputs.
+    `record`, `rows` and the rows of `projection` are those of its witness.
+
+    `passes` makes passes over the source. `moments` are those of what the physics leaves, in
+    whitened outputs.
     """
 
     source: Source
@@ -278,27 +302,35 @@ class StreamedProblem(Problem):
             extent = _survey(form, self.source, self.passes).features
         return np.stack(extent)
 
-    def row_builder(self, centre: Vector, halfwidth: Vector, rms: float, gain: Matrix) -> RowBuilder:
+    def row_builder(
+        self, centre: Vector, halfwidth: Vector, rms: float, gain: Matrix
+    ) -> RowBuilder:
         """Return how its rows are laid out for training."""
         basis = replace(self.basis, form=replace(self.basis.form, features=self.features))
         return RowBuilder(basis, self.target_coordinates, centre, halfwidth, rms, gain)
 
     def physics_alone(self) -> Problem:
         alone = super().physics_alone()
-        return alone if isinstance(alone, StreamedProblem) else streamed(alone, self.source, self.passes)
+        return (
+            alone
+            if isinstance(alone, StreamedProblem)
+            else streamed(alone, self.source, self.passes)
+        )
 
     def weighed(self, weight: OutputWeights) -> Problem:
         if weight is self.weight:
             return self
-        return _factored(replace(self, weight=weight), self.source, self.passes, self.survey, self.basis.form)
+        return _factored(
+            replace(self, weight=weight), self.source, self.passes, self.survey, self.basis.form
+        )
 
 
 def _survey(form: Form, source: Source, passes: Passes) -> Survey:
     found = _merged(passes(PartitionSurvey(form), source.partitions), Survey.__or__)
     if found is None:
         raise InputError(
-            f"no experiment has enough rows for a single prediction: the largest lag is {form.lead}, so at least "
-            f"{form.lead + 1} are needed."
+            "no experiment has enough rows for a single prediction: the largest lag is "
+            f"{form.lead}, so at least {form.lead + 1} are needed."
         )
     return found
 
@@ -306,7 +338,9 @@ def _survey(form: Form, source: Source, passes: Passes) -> Survey:
 def pose_streamed(
     source: Source, record: Record, passes: Passes, baseline: Baseline, *args: Any, **options: Any
 ) -> Problem:
-    """`pose` for a source, with a witness `record` of it in memory; the arguments are those of `pose`.
+    """`pose` for a source, with a witness `record` of it in memory.
+
+    The arguments are those of `pose`.
 
     Raises:
         InputError: as `pose`, wherever in the source it is; RankError.
@@ -331,14 +365,20 @@ def streamed(seen: Problem, source: Source, passes: Passes) -> StreamedProblem:
     weight = seen.weight
     if weight.kind != "covariance":
         weight = weigh_outputs("none" if weight.kind == "none" else weight.choice, deviation)
-    return _factored(replace(seen, deviation=deviation, weight=weight), source, passes, survey, form)
+    return _factored(
+        replace(seen, deviation=deviation, weight=weight), source, passes, survey, form
+    )
 
 
-def _factored(seen: Problem, source: Source, passes: Passes, survey: Survey, form: Form) -> StreamedProblem:
+def _factored(
+    seen: Problem, source: Source, passes: Passes, survey: Survey, form: Form
+) -> StreamedProblem:
     """Return two passes: R of `[Φ Y]`, and again of what it gives."""
     weight, nt = seen.weight, len(seen.baseline.names)
     scale = powers_of_two(survey.columns * np.abs(weight.matrix).max())
-    first = _merged(passes(Factoring(form, weight, scale), source.partitions), lambda a, b: _triangle([a, b]))
+    first = _merged(
+        passes(Factoring(form, weight, scale), source.partitions), lambda a, b: _triangle([a, b])
+    )
     r, coordinates = first[:nt, :nt], first[:nt, nt]
     excited = excitation(r, seen.baseline.names)
     ready = excited.full_rank and len(r) == nt
@@ -353,7 +393,10 @@ def _factored(seen: Problem, source: Source, passes: Passes, survey: Survey, for
     theta = inverse @ (coordinates + back @ rest)
     phi, _ = seen.baseline.on(seen.rows.x, seen.layout, seen.outputs)
     fields = {name: getattr(seen, name) for name in Problem.__dataclass_fields__}
-    fields |= {"projection": Projection(turn @ r, scale, weight.rows(phi), basis.rows(phi)), "excitation": excited}
+    fields |= {
+        "projection": Projection(turn @ r, scale, weight.rows(phi), basis.rows(phi)),
+        "excitation": excited,
+    }
     return StreamedProblem(
         **fields,
         source=source,

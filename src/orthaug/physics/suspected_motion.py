@@ -12,7 +12,10 @@ from orthaug.physics.parameters import PhysicalParameter
 
 
 class SuspectedTerm(NamedTuple):
-    """A term of an equation, counted from 0 with the outputs after the states; `name` is that of its coefficient."""
+    """A term of an equation, counted from 0 with the outputs after the states.
+
+    `name` is that of its coefficient.
+    """
 
     name: str
     place: int
@@ -30,7 +33,10 @@ class SuspectedMotion(Motion):
     def of(cls, physics: Motion, added: Sequence[SuspectedTerm]) -> SuspectedMotion:
         """Return the terms read what the equations do."""
         own = {field.name: getattr(physics, field.name) for field in fields(Motion)}
-        own["parameters"] = (*physics.parameters, *(PhysicalParameter(term.name, 0.0) for term in added))
+        own["parameters"] = (
+            *physics.parameters,
+            *(PhysicalParameter(term.name, 0.0) for term in added),
+        )
         return cls(**own, physics=physics, added=tuple(added))
 
     def values(self, x: Any, u: Any, p: Any, xp: Any) -> dict[str, Any]:
@@ -61,5 +67,11 @@ class SuspectedMotion(Motion):
         for term, coefficient in zip(self.added, p[self._count :], strict=True):
             if first <= term.place < first + len(found):
                 values = self.values(x, u, p, xp) if values is None else values
-                found[term.place - first] = found[term.place - first] + coefficient * term.expression.value(values, xp)
-        return rows if values is None else xp.stack([xp.broadcast_to(row, x.shape[1:]) for row in found])
+                found[term.place - first] = found[
+                    term.place - first
+                ] + coefficient * term.expression.value(values, xp)
+        return (
+            rows
+            if values is None
+            else xp.stack([xp.broadcast_to(row, x.shape[1:]) for row in found])
+        )

@@ -1,4 +1,7 @@
-"""Parameters by what biases them; which biases by suspected terms a heat map shows, and how its cells are written."""
+"""Parameters by what biases them.
+
+Which biases by suspected terms a heat map shows, and how its cells are written.
+"""
 
 from __future__ import annotations
 
@@ -22,8 +25,8 @@ _ZERO = 1e-7
 class BiasMap:
     """The part of a bias table that is drawn, with a number in every cell.
 
-    `shares` (suspects, parameters) are in per cent, NaN where there is none; `colours` are their signed logarithms,
-    so that biases of 0.1 % and of 100 % both show, and lie within ± `reach`.
+    `shares` (suspects, parameters) are in per cent, NaN where there is none; `colours` are their
+    signed logarithms, so that biases of 0.1 % and of 100 % both show, and lie within ± `reach`.
     """
 
     parameters: tuple[str, ...]
@@ -60,16 +63,27 @@ def biased_by(rows: Sequence[ParameterResult]) -> dict[tuple[str, float], list[P
 def bias_map(suspects: Sequence[SuspectResult]) -> BiasMap:
     """Return all biases, or those of the suspects and parameters with the largest ones, in the order of the result."""
     names = list(suspects[0].percent)
-    shares = np.array([[suspect.percent[name] for name in names] for suspect in suspects], dtype=float)
+    shares = np.array(
+        [[suspect.percent[name] for name in names] for suspect in suspects], dtype=float
+    )
     shares = np.where(np.abs(shares) < _ZERO, 0.0, shares)
     size = np.nan_to_num(np.abs(shares))
     columns = _largest(size.max(axis=0), _MOST_COLUMNS)
     rows = _largest(size[:, columns].max(axis=1, initial=0.0), _MOST_CELLS // max(len(columns), 1))
     shown = [suspects[i].name for i in rows]
-    parts = [(len(rows), counted(len(suspects), "suspect")), (len(columns), counted(len(names), "parameter"))]
-    fewer = " and ".join(f"{count} of {whole}" for count, whole in parts if count < int(whole.partition(" ")[0]))
-    told = f"Shown are those with the largest biases, {fewer}; result.json has all." if fewer else ""
-    return BiasMap(tuple(names[j] for j in columns), tuple(shown), shares[np.ix_(rows, columns)], told)
+    parts = [
+        (len(rows), counted(len(suspects), "suspect")),
+        (len(columns), counted(len(names), "parameter")),
+    ]
+    fewer = " and ".join(
+        f"{count} of {whole}" for count, whole in parts if count < int(whole.partition(" ")[0])
+    )
+    told = (
+        f"Shown are those with the largest biases, {fewer}; result.json has all." if fewer else ""
+    )
+    return BiasMap(
+        tuple(names[j] for j in columns), tuple(shown), shares[np.ix_(rows, columns)], told
+    )
 
 
 def _largest(size: np.ndarray, most: int) -> list[int]:

@@ -22,7 +22,9 @@ try:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 except UnicodeDecodeError:
-    raise InputError("matplotlibrc: found letters that are not UTF-8; mend that file, or remove it.") from None
+    raise InputError(
+        "matplotlibrc: found letters that are not UTF-8; mend that file, or remove it."
+    ) from None
 
 # Okabe-Ito: told apart by every reader
 BLACK, GREY, BLUE, ORANGE, GREEN = "#000000", "#B8B8B8", "#0072B2", "#E69F00", "#009E73"
@@ -38,8 +40,13 @@ Drawn = ParamSpec("Drawn")
 
 
 def _own_style() -> AbstractContextManager[None]:
-    """Figures look the same whatever the user's own settings of matplotlib are; a `$` in a unit begins no formula."""
-    own: dict[Any, Any] = {key: value for key, value in rcParamsDefault.items() if not key.startswith("backend")}
+    """Figures look the same whatever the user's own settings of matplotlib are.
+
+    A `$` in a unit begins no formula.
+    """
+    own: dict[Any, Any] = {
+        key: value for key, value in rcParamsDefault.items() if not key.startswith("backend")
+    }
     own |= {"text.parse_math": False}
     return rc_context({key: value for key, value in own.items() if rcParams[key] != value})
 
@@ -99,14 +106,21 @@ def grid(
     bottom: float = BOTTOM,
     **options: Any,
 ) -> np.ndarray:
-    """Panels (rows, columns) at fixed places; a layout found from the sizes of all texts takes longer than drawing.
+    """Panels (rows, columns) at fixed places.
+
+    A layout found from the sizes of all texts takes longer than drawing.
 
     Args:
         gap: inches between rows and columns; `left` and `bottom` those beside and below them.
     """
     width, height = figure.get_size_inches()
     high, wide = height - TOP - bottom, width - left - RIGHT
-    place = {"left": left / width, "right": 1 - RIGHT / width, "bottom": bottom / height, "top": 1 - TOP / height}
+    place = {
+        "left": left / width,
+        "right": 1 - RIGHT / width,
+        "bottom": bottom / height,
+        "top": 1 - TOP / height,
+    }
     place["hspace"] = gap[0] * rows / max(high - gap[0] * (rows - 1), 0.1)
     place["wspace"] = gap[1] * columns / max(wide - gap[1] * (columns - 1), 0.1)
     axes = figure.subplots(rows, columns, squeeze=False, gridspec_kw=place, **options)
@@ -120,7 +134,9 @@ def headline(figure: Figure, title: str) -> None:
     figure.suptitle(title, fontsize=10, y=1 - _TITLE / figure.get_size_inches()[1], va="top")
 
 
-def label(axis: Axes, *, x: str | None = None, y: str | None = None, title: str | None = None) -> None:
+def label(
+    axis: Axes, *, x: str | None = None, y: str | None = None, title: str | None = None
+) -> None:
     """Labels at a fixed distance from the panel."""
     figure = axis.get_figure(root=True)
     assert figure is not None
@@ -148,7 +164,11 @@ def extent(response: Response, rows: slice) -> str:
     """Which samples of the record are drawn, in words."""
     whole = len(response.trajectories[0].model)
     text = f"samples {rows.start} to {rows.stop - 1} of {whole}"
-    return text + (f", first of {len(response.trajectories)} experiments" if len(response.trajectories) > 1 else "")
+    return text + (
+        f", first of {len(response.trajectories)} experiments"
+        if len(response.trajectories) > 1
+        else ""
+    )
 
 
 def window(response: Response) -> tuple[np.ndarray, slice]:
@@ -161,7 +181,13 @@ def window(response: Response) -> tuple[np.ndarray, slice]:
 def legend(axis: Axes, *shown: Any) -> None:
     """What the lines are, above the panel: its own, or the handles and labels that are `shown`."""
     axis.legend(
-        *shown, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.2, fontsize=8, frameon=False, ncols=3
+        *shown,
+        loc="lower right",
+        bbox_to_anchor=(1.0, 1.0),
+        borderaxespad=0.2,
+        fontsize=8,
+        frameon=False,
+        ncols=3,
     )
 
 
@@ -171,6 +197,8 @@ def save(figure: Figure, path: Path, kind: str = "png") -> None:
         warnings.simplefilter("ignore")  # such as a unit in letters that the font lacks
         figure.set_dpi(_SHARPNESS)
         if kind == "png":
-            FigureCanvasAgg(figure).print_png(path, pil_kwargs={"compress_level": 2})  # `savefig` would draw it twice
+            FigureCanvasAgg(figure).print_png(
+                path, pil_kwargs={"compress_level": 2}
+            )  # `savefig` would draw it twice
         else:
             figure.savefig(path, format=kind)

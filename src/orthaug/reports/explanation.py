@@ -66,7 +66,10 @@ def explain_text(result: ExplainResult) -> str:
     """Return what the learner has found, the terms alone, θ with them in the physics, and what to write into the spec."""
     blocks = [[_capital(result.text)]]
     if result.noise is not None:
-        blocks[0] += [f"Of what it adds, {percent(result.noise)} are its own errors, as far as training tells."]
+        blocks[0] += [
+            f"Of what it adds, {percent(result.noise)} are its own errors, as far as training "
+            "tells."
+        ]
     if result.terms:
         blocks += [_term_lines(result), _parameter_lines(result)]
     if result.singles:
@@ -82,7 +85,9 @@ def explain_text(result: ExplainResult) -> str:
     elif result.terms:
         blocks.append(["The physics is a Python function: add the terms there, and fit again."])
     blocks.append([f"warning: {warning.text}" for warning in result.warnings])
-    blocks = [lines if "" in lines else fold(lines) for lines in blocks]  # what is to be copied stays as it is
+    blocks = [
+        lines if "" in lines else fold(lines) for lines in blocks
+    ]  # what is to be copied stays as it is
     return "\n\n".join("\n".join(lines) for lines in blocks if lines)
 
 
@@ -90,7 +95,13 @@ def _term_lines(result: ExplainResult) -> list[str]:
     rows = [["term", "coefficient", "std", "unit", "share", "alone", "added to"]]
     for term in result.terms:
         std = "–" if term.std is None else f"{term.std:.2g}"
-        numbers = (f"{term.coefficient:.6g}", std, term.unit or "–", _percent(term.share), _percent(term.alone))
+        numbers = (
+            f"{term.coefficient:.6g}",
+            std,
+            term.unit or "–",
+            _percent(term.share),
+            _percent(term.alone),
+        )
         rows.append([term.expression, *numbers, term.added_to])
     lines = table(rows)
     for term in result.terms:

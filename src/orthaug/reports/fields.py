@@ -47,7 +47,11 @@ class Content(BaseModel):
 
     @model_serializer(mode="wrap")
     def _without_absent(self, handler: SerializerFunctionWrapHandler):
-        return {key: value for key, value in handler(self).items() if value is not None or key not in self.absent}
+        return {
+            key: value
+            for key, value in handler(self).items()
+            if value is not None or key not in self.absent
+        }
 
     def content(self) -> dict[str, Any]:
         """Dictionaries, lists, text, numbers and None."""

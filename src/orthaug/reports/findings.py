@@ -128,15 +128,22 @@ class SuspectResult(Content):
     def percent(self) -> dict[str, float | None]:
         """The bias of every θ and physical parameter, in per cent of its value.
 
-        With a guess it is the bias by the guessed coefficient. Without one the term counts as 1 % of the outputs'
-        deviation over the measure.
+        With a guess it is the bias by the guessed coefficient. Without one the term counts as 1 %
+        of the outputs' deviation over the measure.
         """
         coefficient = self.coefficient
         if coefficient is None:
             coefficient = 0.01 / self.size if self.size else None
         relative = {**(self.relative_bias or {}), **(self.relative_physical_bias or {})}
-        shares = {k: None if v is None or coefficient is None else 100 * v * coefficient for k, v in relative.items()}
-        exact = {k: 100 * e.relative for k, e in (self.expected_physical_bias or {}).items() if e.relative}
+        shares = {
+            k: None if v is None or coefficient is None else 100 * v * coefficient
+            for k, v in relative.items()
+        }
+        exact = {
+            k: 100 * e.relative
+            for k, e in (self.expected_physical_bias or {}).items()
+            if e.relative
+        }
         return shares | exact
 
 
@@ -340,8 +347,8 @@ class HoldResult(Content):
 class AdviceResult(Content):
     """A change of the spec that was tried and bettered the free run where nothing was fitted.
 
-    `change` has the new values by their keys, `before` and `after` the RMS errors in standard deviations of the
-    training output; `before` is None where the model as it is diverges.
+    `change` has the new values by their keys, `before` and `after` the RMS errors in standard
+    deviations of the training output; `before` is None where the model as it is diverges.
     """
 
     change: dict[str, Any]

@@ -63,10 +63,14 @@ class Card:
 
 def html_of(shown: Any) -> str:
     """Return the object, or a card, as HTML, escaped."""
-    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
+    environment = jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True
+    )
     card = shown if isinstance(shown, Card) else card_of(shown)
     tables = [Table(t.columns, _shortened(t)) for t in card.tables]
-    return environment.from_string(_TEMPLATE).render(card=Card(card.title, card.facts, tables, card.notes))
+    return environment.from_string(_TEMPLATE).render(
+        card=Card(card.title, card.facts, tables, card.notes)
+    )
 
 
 def _shortened(table: Table) -> Sequence[Sequence[str]]:
@@ -92,11 +96,25 @@ def _record(record: Record) -> Card:
     rows = []
     for role, channels in (("input", record.inputs), ("output", record.outputs)):
         for i, channel in enumerate(channels):
-            values = np.concatenate([np.asarray(getattr(e, role + "s"))[:, i] for e in record.experiments])
+            values = np.concatenate(
+                [np.asarray(getattr(e, role + "s"))[:, i] for e in record.experiments]
+            )
             there = values[np.isfinite(values)]
-            numbers = (there.min(), there.max(), there.mean(), there.std()) if len(there) else (np.nan,) * 4
+            numbers = (
+                (there.min(), there.max(), there.mean(), there.std())
+                if len(there)
+                else (np.nan,) * 4
+            )
             missing = len(values) - len(there)
-            rows.append([channel.name, role, channel.unit or "–", *map(_number, numbers), str(missing or "–")])
+            rows.append(
+                [
+                    channel.name,
+                    role,
+                    channel.unit or "–",
+                    *map(_number, numbers),
+                    str(missing or "–"),
+                ]
+            )
     columns = ["channel", "role", "unit", "least", "largest", "mean", "deviation", "missing"]
     return Card("Record", facts, [Table(columns, rows)])
 
@@ -106,7 +124,9 @@ def _baseline(baseline: Baseline) -> Card:
     facts = {"constants": ", ".join(f"{k} = {v:g}" for k, v in dict(baseline.constants).items())}
     if baseline.function is not None:
         facts["terms"] = "a function of the regressor"
-    rows = [[f"{t.parameter} (fixed)" if t.fixed else t.parameter, t.regressor] for t in baseline.terms]
+    rows = [
+        [f"{t.parameter} (fixed)" if t.fixed else t.parameter, t.regressor] for t in baseline.terms
+    ]
     columns = ["parameter", "regressor"]
     if any(t.output for t in baseline.terms):  # else there is only one
         columns = ["output", *columns]
@@ -123,11 +143,20 @@ def _motion(motion: Motion) -> Card:
     }
     if motion.functions is not None:
         facts["equations"] = "functions of states, inputs and parameters"
-    rows = [[f"d/dt {s.name}", s.derivative or "–", s.unit or "–", "yes" if s.learned else "–"] for s in motion.states]
-    rows += [[o.name, o.expression or "–", "–", "yes" if o.learned else "–"] for o in motion.outputs]
+    rows = [
+        [f"d/dt {s.name}", s.derivative or "–", s.unit or "–", "yes" if s.learned else "–"]
+        for s in motion.states
+    ]
+    rows += [
+        [o.name, o.expression or "–", "–", "yes" if o.learned else "–"] for o in motion.outputs
+    ]
     defined = [[name, str(expression)] for name, expression in motion.definitions]
     equations = Table(["", "equation", "unit of the state", "learned beside it"], rows)
-    return Card("Motion", _told(facts), [equations, Table(["defined", "as"], defined), _declared(motion.parameters)])
+    return Card(
+        "Motion",
+        _told(facts),
+        [equations, Table(["defined", "as"], defined), _declared(motion.parameters)],
+    )
 
 
 @card_of.register(Estimate)
@@ -138,7 +167,8 @@ def _fit(fit: Estimate | MotionEstimate) -> Card:
         "structure": fit.model.structure,
         "learner": "none" if bound is None else f"{bound.learner}, {bound.size} weights",
         "data": repr(fit.problem.record),
-        "status": f"{status.code}, {status.iterations} iterations, {status.seconds:.2f} s, loss {status.loss:.6g}",
+        "status": f"{status.code}, {status.iterations} iterations, {status.seconds:.2f} s, loss "
+        f"{status.loss:.6g}",
         "": status.message or "",
     }
     rows = [
@@ -152,14 +182,19 @@ def _fit(fit: Estimate | MotionEstimate) -> Card:
         for name, row in fit.parameters.to_dict("index").items()
     ]
     parameters = Table(["parameter", "value", "std", "95 % interval", "unit"], rows)
-    return Card(type(fit).__name__, _told(facts), [parameters], [warning.text for warning in fit.warnings])
+    return Card(
+        type(fit).__name__, _told(facts), [parameters], [warning.text for warning in fit.warnings]
+    )
 
 
 def card_of_result(fit: Estimate | MotionEstimate, result: FitResult) -> Card:
     """Return a fit with what its result tells of every parameter, and all of the result's warnings."""
     parameters = [*result.parameters, *(result.physical_parameters or ())]
     columns = ["parameter", "value", "std", "95 % interval", "unit"]
-    rows = [[row.name, _number(row.value), _number(row.std, 3), _ends(row.ci95), row.shown_unit] for row in parameters]
+    rows = [
+        [row.name, _number(row.value), _number(row.std, 3), _ends(row.ci95), row.shown_unit]
+        for row in parameters
+    ]
     if any(row.bias for row in parameters):
         columns += ["bias", "95 % interval with it"]
         for cells, row in zip(rows, parameters, strict=True):
@@ -182,7 +217,9 @@ def _model(model: Model | MotionModel) -> Card:
         "sampling time": f"{model.sampling_time:g} s",
     }
     parameters, values = model.estimated
-    rows = [[p.name, _number(value), p.unit or "–"] for p, value in zip(parameters, values, strict=True)]
+    rows = [
+        [p.name, _number(value), p.unit or "–"] for p, value in zip(parameters, values, strict=True)
+    ]
     return Card(type(model).__name__, _told(facts), [Table(["parameter", "value", "unit"], rows)])
 
 

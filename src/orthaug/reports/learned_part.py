@@ -30,7 +30,9 @@ _FINER = 2  # times as many in which the learned part is drawn
 _IN_A_CELL = 3  # points of the data on average, where their means are drawn
 _TIED = 0.95  # correlation with another feature from which others at their medians are no state of the system
 Reach = Callable[[Matrix], Matrix | None]
-"""Half the length of 95 % intervals of the learned part (M, nl) at points (M, n); None where there are none."""
+"""Half the length of 95 % intervals of the learned part (M, nl) at points (M, n); None where there
+are none.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +49,10 @@ class Curve:
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """The learned part over two variables, all others at their medians; NaN where no data are near."""
+    """The learned part over two variables, all others at their medians.
+
+    NaN where no data are near.
+    """
 
     across: Vector
     along: Vector
@@ -58,8 +63,8 @@ class Surface:
 class LearnedPart:
     """The learned part of a model on training data: points (M, n) of the `variables`, and `at` any other of them.
 
-    `seen` (M, nz) are the learner's `features` at the points, `values` (M, nl) the learned part, named `names` with
-    their units.
+    `seen` (M, nz) are the learner's `features` at the points, `values` (M, nl) the learned part,
+    named `names` with their units.
     """
 
     names: tuple[str, ...]
@@ -74,7 +79,9 @@ class LearnedPart:
     reach: Reach | None = None
 
     @classmethod
-    def of_motion(cls, model: MotionModel, record: Record, reach: Reach | None = None) -> LearnedPart:
+    def of_motion(
+        cls, model: MotionModel, record: Record, reach: Reach | None = None
+    ) -> LearnedPart:
         """Of a motion, along the free run of the first experiment."""
         states, inputs = trajectory_of(model, record)
         chosen = spread(len(states))
@@ -83,7 +90,10 @@ class LearnedPart:
         def at(x: Matrix) -> Matrix:
             padded = x[np.minimum(np.arange(-(-len(x) // _BATCH) * _BATCH), len(x) - 1)]
             batches = np.split(padded, len(padded) // _BATCH)
-            found = [parts_at(model.form, model.numbers, *np.split(b, [size], axis=1))[1] for b in batches]
+            found = [
+                parts_at(model.form, model.numbers, *np.split(b, [size], axis=1))[1]
+                for b in batches
+            ]
             return np.concatenate(found)[: len(x)]
 
         with np.errstate(all="ignore"):
@@ -106,7 +116,9 @@ class LearnedPart:
     def of_lagged(cls, model: Model, record: Record) -> LearnedPart:
         """Of a lagged model, at the measured regressors of all experiments: `f − φ θ_aux`."""
         form, record = model.form, model.fitting(record, need_outputs=True)
-        rows = np.concatenate([form.regressors(experiment, record) for experiment in record.experiments])
+        rows = np.concatenate(
+            [form.regressors(experiment, record) for experiment in record.experiments]
+        )
         points = rows[spread(len(rows))]
         of_channel = {channel.name: channel.unit for channel in (*model.outputs, *model.inputs)}
         units = {str(lag): of_channel.get(lag.channel, "") for lag in form.layout}
@@ -142,7 +154,10 @@ class LearnedPart:
         return Curve(along, (along >= low) & (along <= high), self.at(rows), half)
 
     def telling_pair(self) -> tuple[str, str]:
-        """Return the most telling feature, and of those that do not move along with it the next; of at least two features."""
+        """Return the most telling feature, and of those that do not move along with it the next.
+
+        Of at least two features.
+        """
         first, *others = self.ranked()
         own = self.seen[:, self.features.index(first)]
         for name in others:
@@ -153,10 +168,16 @@ class LearnedPart:
 
     def tied(self, feature: str, but: str = "") -> bool:
         """Return whether the data move another feature along with it, `but` one: then they hold nothing with that at rest."""
-        moving = [name for name, spread in zip(self.features, self.seen.std(axis=0), strict=True) if spread > 0]
+        moving = [
+            name
+            for name, spread in zip(self.features, self.seen.std(axis=0), strict=True)
+            if spread > 0
+        ]
         own = self.seen[:, self.features.index(feature)]
         others = [self.seen[:, self.features.index(n)] for n in moving if n not in (feature, but)]
-        return feature in moving and any(abs(np.corrcoef(own, other)[0, 1]) > _TIED for other in others)
+        return feature in moving and any(
+            abs(np.corrcoef(own, other)[0, 1]) > _TIED for other in others
+        )
 
     def alone(self, across: str, along: str) -> bool:
         """Return whether two features are variables that can be moved with all else at rest."""
@@ -181,12 +202,17 @@ class LearnedPart:
         return [self.features[j] for j in order]
 
     def surface(self, across: str, along: str) -> Surface:
-        """Over two features where data are near; of such that do not move alone the mean of the data in each cell."""
+        """Over two features where data are near.
+
+        Of such that do not move alone the mean of the data in each cell.
+        """
         pair = self.seen[:, [self.features.index(across), self.features.index(along)]]
         low, high = pair.min(axis=0), pair.max(axis=0)
         width = np.maximum(high - low, 1e-300)
         alone = self.alone(across, along)
-        count = _CELLS if alone else min(max(int(np.sqrt(len(pair) / _IN_A_CELL)), _CELLS // 4), _CELLS)
+        count = (
+            _CELLS if alone else min(max(int(np.sqrt(len(pair) / _IN_A_CELL)), _CELLS // 4), _CELLS)
+        )
         cells = np.minimum((count * (pair - low) / width).astype(int), count - 1)
         size = _FINER * count if alone else count
         first, second = (low[k] + width[k] * (np.arange(size) + 0.5) / size for k in (0, 1))
@@ -205,7 +231,10 @@ class LearnedPart:
 
 
 def learned_of(fit: Estimate | MotionEstimate, record: Record) -> LearnedPart | None:
-    """Return what a fit learned along a record, with intervals where it has some; None where nothing was learned."""
+    """Return what a fit learned along a record, with intervals where it has some.
+
+    None where nothing was learned.
+    """
     if fit.model.form.bound is None:
         return None
     if isinstance(fit, Estimate):
@@ -258,7 +287,9 @@ def labels_with_units(model: MotionModel) -> list[str]:
 
 def units_of(model: MotionModel) -> dict[str, str]:
     """Of states and inputs by name."""
-    return {s.name: s.unit for s in model.form.motion.states} | {c.name: c.unit for c in model.inputs}
+    return {s.name: s.unit for s in model.form.motion.states} | {
+        c.name: c.unit for c in model.inputs
+    }
 
 
 def curve_limits(curve: Curve, k: int, cloud: Vector) -> tuple[float, float]:

@@ -37,7 +37,9 @@ class PoleResult(Content):
         """Of a view's pole."""
         s = pole.s
         own = {name: getattr(pole, name) for name in cls.model_fields if hasattr(pole, name)}
-        own = {name: list(value) if isinstance(value, tuple) else value for name, value in own.items()}
+        own = {
+            name: list(value) if isinstance(value, tuple) else value for name, value in own.items()
+        }
         parts = {"real": pole.z.real, "imaginary": pole.z.imag}
         parts |= {
             "continuous_real": None if s is None else s.real,
@@ -186,7 +188,9 @@ def _point(view: LinearView, found: Linearization) -> dict[str, Any]:
         "static_gain": [_gain(view, i, j) for i, j in np.ndindex(*view.d.shape)],
         "continuous": _continuous(view),
         "frequency": [] if view.bode is None else view.bode.frequency,
-        "response": [] if view.bode is None else [_response(view, i, j) for i, j in np.ndindex(*view.d.shape)],
+        "response": []
+        if view.bode is None
+        else [_response(view, i, j) for i, j in np.ndindex(*view.d.shape)],
         "median_difference_db": None if agreement is None else agreement.decibel,
         "median_difference_deg": None if agreement is None else agreement.degrees,
         "warnings": list(view.warnings),
@@ -198,7 +202,9 @@ def _matrices(view: LinearView) -> dict[str, Any]:
     parts = {"a": np.s_[:n, :n], "b": np.s_[:n, n:], "c": np.s_[n:, :n], "d": np.s_[n:, n:]}
     for name, part in parts.items():
         found[name] = view.system.matrix[part].tolist()
-        found[f"{name}_ci95"] = None if view.matrix_ci95 is None else view.matrix_ci95[part].tolist()
+        found[f"{name}_ci95"] = (
+            None if view.matrix_ci95 is None else view.matrix_ci95[part].tolist()
+        )
     return found
 
 

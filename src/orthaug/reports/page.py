@@ -30,7 +30,9 @@ def fit_page(page: FitPage) -> str:
     """Return the page of a fit."""
     result = page.result
     title = _title("Model", page.outputs, result.spec, page.origin)
-    kind = f"{result.structure} structure" + (f", {result.measure} measure" if result.measure else "")
+    kind = f"{result.structure} structure" + (
+        f", {result.measure} measure" if result.measure else ""
+    )
     warnings = [w for w in result.warnings if w.code not in _TOLD_ELSEWHERE]
     return _page(
         title,
@@ -45,9 +47,13 @@ def fit_page(page: FitPage) -> str:
 
 def compare_page(page: ComparePage) -> str:
     """Return the page of a comparison."""
-    title = _title(f"{len(page.result.comparison)} models", page.outputs, page.result.spec, page.origin)
+    title = _title(
+        f"{len(page.result.comparison)} models", page.outputs, page.result.spec, page.origin
+    )
     verdict = compare_verdict(page.result)
-    return _page(title, "comparison", verdict, page.result.warnings, compare_sections(page), page.origin, "")
+    return _page(
+        title, "comparison", verdict, page.result.warnings, compare_sections(page), page.origin, ""
+    )
 
 
 def _title(what: str, outputs: Sequence[str], spec: Mapping[str, Any], origin: Origin) -> str:
@@ -134,7 +140,10 @@ def _template(name: str) -> str:
 
 @cache
 def _plotly() -> str:
-    """Plotly's script of its package, compressed, for the page to unpack; the package itself is not imported."""
+    """Plotly's script of its package, compressed, for the page to unpack.
+
+    The package itself is not imported.
+    """
     found = importlib.util.find_spec("plotly")
     assert found is not None and found.submodule_search_locations
     script = Path(found.submodule_search_locations[0]) / "package_data" / "plotly.min.js"

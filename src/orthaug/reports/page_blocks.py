@@ -1,4 +1,7 @@
-"""What a page is made of: sections of paragraphs, tables and plots; and how numbers are written in cells."""
+"""What a page is made of: sections of paragraphs, tables and plots.
+
+And how numbers are written in cells.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +39,10 @@ def number(value: float | None, digits: int = 5, scale: float | None = None) -> 
 
 
 def interval(ends: Sequence[float | None] | None, digits: int = 5) -> str:
-    """Return the two ends of an interval, of so many digits at least that they are told apart; a dash where there is none."""
+    """Return the two ends of an interval, of so many digits at least that they are told apart.
+
+    A dash where there is none.
+    """
     if ends is None:
         return "–"
     known = [end for end in ends if end is not None]
@@ -45,7 +51,9 @@ def interval(ends: Sequence[float | None] | None, digits: int = 5) -> str:
     decimals = None if not scale else digits - 1 - math.floor(math.log10(scale))
     if decimals is None or not 0 < decimals <= _MOST_DIGITS or None in ends:
         return " … ".join(number(end, digits, scale) for end in ends)
-    texts = [f"{0.0 if abs(end) <= _ROUNDING * (scale or 0.0) else end:.{decimals}f}" for end in known]
+    texts = [
+        f"{0.0 if abs(end) <= _ROUNDING * (scale or 0.0) else end:.{decimals}f}" for end in known
+    ]
     while all(text.endswith("0") for text in texts) and "." in texts[0]:
         texts = [text[:-1].removesuffix(".") for text in texts]
     return " … ".join(texts).replace("-", "−")
@@ -71,7 +79,9 @@ def percent(share: float | None, digits: int = 2, *, signed: bool = False) -> st
     if shown and abs(shown) < 10**-3:
         return "< 0.001 %"
     told = (
-        lines.percent(shown / 100, digits, sign="+") if signed and shown else lines.percent(shown / 100, max(digits, 3))
+        lines.percent(shown / 100, digits, sign="+")
+        if signed and shown
+        else lines.percent(shown / 100, max(digits, 3))
     )
     mantissa, power, rest = told.partition("e")
     if power:
@@ -127,7 +137,10 @@ def rounded(values: Any, digits: int = 6) -> list[Any]:
     """Numbers, or rows of them, that are drawn only; None for what is not finite."""
     if np.ndim(values) > 1:
         return [rounded(row, digits) for row in values]
-    return [float(f"{v:.{digits}g}") if math.isfinite(v) else None for v in np.asarray(values, dtype=float).tolist()]
+    return [
+        float(f"{v:.{digits}g}") if math.isfinite(v) else None
+        for v in np.asarray(values, dtype=float).tolist()
+    ]
 
 
 @dataclass(frozen=True)
@@ -158,7 +171,10 @@ class Code:
 
 @dataclass(frozen=True)
 class Plot:
-    """A Plotly figure that the page draws; `label` is read aloud in its place, `caption` stands below."""
+    """A Plotly figure that the page draws.
+
+    `label` is read aloud in its place, `caption` stands below.
+    """
 
     label: str
     caption: str

@@ -20,7 +20,11 @@ from orthaug.reports.page_fit import (
 from orthaug.reports.page_runs import compared_plots
 from orthaug.reports.result import CompareResult
 
-_WORDS = {"helps": "the learner helps", "no_help": "the learner does not help", "hurts": "the learner hurts"}
+_WORDS = {
+    "helps": "the learner helps",
+    "no_help": "the learner does not help",
+    "hurts": "the learner hurts",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +55,11 @@ def compare_sections(page: ComparePage) -> list[Section]:
         Section(
             "residuals",
             "Residual tests",
-            [Text(f"{row.name}: {row.residuals.text}") for row in result.comparison if row.residuals is not None],
+            [
+                Text(f"{row.name}: {row.residuals.text}")
+                for row in result.comparison
+                if row.residuals is not None
+            ],
         ),
         Section(
             "warnings",
@@ -72,8 +80,14 @@ def _models(result: CompareResult) -> list[Any]:
     rows = []
     for row in result.comparison:
         defect = row.orthogonality_defect
-        shown = "–" if defect is None else "0 up to rounding" if defect < 1e-10 else number(defect, 2)
-        verdict = "–" if row.validation is None else _WORDS.get(row.validation.verdict, row.validation.verdict)
+        shown = (
+            "–" if defect is None else "0 up to rounding" if defect < 1e-10 else number(defect, 2)
+        )
+        verdict = (
+            "–"
+            if row.validation is None
+            else _WORDS.get(row.validation.verdict, row.validation.verdict)
+        )
         chosen = " (chosen)" if row.name == result.chosen else ""
         rows.append(
             [
@@ -86,13 +100,28 @@ def _models(result: CompareResult) -> list[Any]:
                 verdict,
             ]
         )
-    head = ["model", "ended", "weights", "learner over physics", "overlap ‖QᵀF̃‖/‖F‖", "time [s]", "verdict"]
+    head = [
+        "model",
+        "ended",
+        "weights",
+        "learner over physics",
+        "overlap ‖QᵀF̃‖/‖F‖",
+        "time [s]",
+        "verdict",
+    ]
     caption = "Physics alone and every structure on the same data and seeds."
     if result.chosen:
-        caption += " The chosen one has the lowest error on the validation part, unless its learner does not help."
+        caption += (
+            " The chosen one has the lowest error on the validation part, unless its learner "
+            "does not help."
+        )
     blocks: list[Any] = [Table(caption, head, rows)]
-    blocks += [Text(f"{row.name}: {row.validation.text}") for row in result.comparison if row.validation]
-    return blocks + [Text(f"Left out: {kind}: {why}", "note") for kind, why in result.left_out.items()]
+    blocks += [
+        Text(f"{row.name}: {row.validation.text}") for row in result.comparison if row.validation
+    ]
+    return blocks + [
+        Text(f"Left out: {kind}: {why}", "note") for kind, why in result.left_out.items()
+    ]
 
 
 def _parameters(result: CompareResult) -> list[Any]:
@@ -112,6 +141,14 @@ def _parameters(result: CompareResult) -> list[Any]:
         ]
         for name, p in told
     ]
-    head = ["model", "parameter", "value", "unit", "standard error", "95 % interval", *(["bias"] if biased else [])]
+    head = [
+        "model",
+        "parameter",
+        "value",
+        "unit",
+        "standard error",
+        "95 % interval",
+        *(["bias"] if biased else []),
+    ]
     caption = f"What each model estimates.{BIAS_TOLD if biased else ''}"
     return [Grid(parameter_comparison(result.comparison)), Table(caption, head, rows)]

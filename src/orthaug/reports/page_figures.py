@@ -42,7 +42,11 @@ def interval_plot(rows: Sequence[ParameterResult]) -> Plot | None:
     told = any(row.ci95_with_bias for row in drawn)
     for i, row in enumerate(drawn):
         number = str(i + 1) if i else ""
-        first = {"95 % interval": i == 0, "estimate": i == 0, "initial value": i == _first(drawn, _near)}
+        first = {
+            "95 % interval": i == 0,
+            "estimate": i == 0,
+            "initial value": i == _first(drawn, _near),
+        }
         first["95 % interval less the bias"] = i == _first(drawn, lambda r: bool(r.ci95_with_bias))
         for trace in _interval_traces(row):
             own = {"xaxis": f"x{number}", "yaxis": f"y{number}", "legendgroup": trace["name"]}
@@ -58,17 +62,28 @@ def interval_plot(rows: Sequence[ParameterResult]) -> Plot | None:
             "showgrid": False,
             "zeroline": False,
         }
-        layout[f"xaxis{number}"] = {"anchor": f"y{number}", "nticks": 6, "zeroline": False, "range": _reach(row)}
+        layout[f"xaxis{number}"] = {
+            "anchor": f"y{number}",
+            "nticks": 6,
+            "zeroline": False,
+            "range": _reach(row),
+        }
     caption = (
-        "Every parameter on an axis of its own: the circle is the estimate, the thick bar its 95 % interval"
+        "Every parameter on an axis of its own: the circle is the estimate, the thick bar its "
+        "95 % interval"
         + (
-            "; the thin bar is its 95 % interval once the bias is taken out, which need not hold the estimate."
+            "; the thin bar is its 95 % interval once the bias is taken out, which need not "
+            "hold the estimate."
             if told
             else "."
         )
         + " A diamond is the initial value, where it is near enough to be shown."
     )
-    label = "Intervals of " + ", ".join(row.name for row in drawn) + "; the table above has their numbers."
+    label = (
+        "Intervals of "
+        + ", ".join(row.name for row in drawn)
+        + "; the table above has their numbers."
+    )
     return Plot(label, caption, traces, layout, height=70 + _ROW * len(drawn))
 
 
@@ -78,14 +93,30 @@ def _interval_traces(row: ParameterResult) -> list[dict[str, Any]]:
     if row.ci95_with_bias and None not in row.ci95_with_bias:
         bars = {"95 % interval less the bias": (row.ci95_with_bias, "@bias", 3), **bars}
     found: list[dict[str, Any]] = [
-        {"name": name, "x": ends, "y": [0, 0], "mode": "lines", "line": {"color": color, "width": width}}
+        {
+            "name": name,
+            "x": ends,
+            "y": [0, 0],
+            "mode": "lines",
+            "line": {"color": color, "width": width},
+        }
         for name, (ends, color, width) in bars.items()
     ]
     circle = {"color": "@paper", "size": 9, "line": {"color": "@ink", "width": 2}}
-    found.append({"name": "estimate", "x": [row.value], "y": [0], "mode": "markers", "marker": circle})
+    found.append(
+        {"name": "estimate", "x": [row.value], "y": [0], "mode": "markers", "marker": circle}
+    )
     if _near(row):
         diamond = {"color": "@measured", "size": 9, "symbol": "diamond"}
-        found.append({"name": "initial value", "x": [row.initial], "y": [0], "mode": "markers", "marker": diamond})
+        found.append(
+            {
+                "name": "initial value",
+                "x": [row.initial],
+                "y": [0],
+                "mode": "markers",
+                "marker": diamond,
+            }
+        )
     return found
 
 
@@ -97,13 +128,22 @@ def _first(rows: Sequence[ParameterResult], holds: Callable[[ParameterResult], b
 def _tick(row: ParameterResult) -> str:
     """Return the name of a parameter, and half its interval in per cent of it."""
     low, high = row.ci95 or (None, None)
-    half = None if low is None or high is None or not row.value else abs((high - low) / (2 * row.value))
+    half = (
+        None
+        if low is None or high is None or not row.value
+        else abs((high - low) / (2 * row.value))
+    )
     return f"<b>{parameter_label(row)}</b>" + ("" if half is None else f"<br>± {percent(half)}")
 
 
 def _reach(row: ParameterResult) -> list[float]:
     """Return what the axis of a parameter shows: its intervals with a margin, and the initial value where it is near."""
-    ends = [row.value, *(row.ci95 or ()), *(row.ci95_with_bias or ()), row.initial if _near(row) else None]
+    ends = [
+        row.value,
+        *(row.ci95 or ()),
+        *(row.ci95_with_bias or ()),
+        row.initial if _near(row) else None,
+    ]
     known = [end for end in ends if end is not None]
     margin = 0.35 * max(max(known) - min(known), 1e-300)
     return [min(known) - margin, max(known) + margin]
@@ -116,8 +156,12 @@ def _near(row: ParameterResult) -> bool:
     return abs(row.initial - row.value) <= _FAR * max(high - low, 1e-300)
 
 
-def score_plot(scores: Mapping[str, Mapping[str, PartScores]], outputs: Sequence[str]) -> Plot | None:
-    """NRMSE of every part, or of every way of modelling; logarithmic where some are bad or far apart.
+def score_plot(
+    scores: Mapping[str, Mapping[str, PartScores]], outputs: Sequence[str]
+) -> Plot | None:
+    """NRMSE of every part, or of every way of modelling.
+
+    Logarithmic where some are bad or far apart.
 
     Args:
         scores: by the name of a row, by the name of a part.
@@ -139,15 +183,27 @@ def score_plot(scores: Mapping[str, Mapping[str, PartScores]], outputs: Sequence
         values += x
         symbol = "circle" if kind == "simulation" else "diamond"
         traces.append(
-            {"x": x, "y": y, "mode": "markers", "name": name, "marker": {"color": color, "size": 11, "symbol": symbol}}
+            {
+                "x": x,
+                "y": y,
+                "mode": "markers",
+                "name": name,
+                "marker": {"color": color, "size": 11, "symbol": symbol},
+            }
         )
     if not values:
         return None
     logarithmic = max(values) > _BAD or max(values) > _DECADES * min(values)
-    caption = "NRMSE of every part, the error over the output's deviation: 0 is perfect, 1 as bad as the mean"
+    caption = (
+        "NRMSE of every part, the error over the output's deviation: 0 is perfect, 1 as bad as "
+        "the mean"
+    )
     caption += "; the axis is logarithmic." if logarithmic else "."
     if lost:
-        caption += f" There is none of {', '.join(dict.fromkeys(lost))}: the run diverged, or the output does not move."
+        caption += (
+            f" There is none of {', '.join(dict.fromkeys(lost))}: the run diverged, or the "
+            "output does not move."
+        )
     count = len({place for trace in traces for place in trace["y"]})
     axis: dict[str, Any] = (
         {"title": {"text": "NRMSE"}, "type": "log"}
@@ -180,21 +236,48 @@ def score_plot(scores: Mapping[str, Mapping[str, PartScores]], outputs: Sequence
         "yaxis": CATEGORIES,
         "shapes": shapes,
     }
-    return Plot("NRMSE of every part; the table has the numbers.", caption, traces, layout, height=110 + 30 * count)
+    return Plot(
+        "NRMSE of every part; the table has the numbers.",
+        caption,
+        traces,
+        layout,
+        height=110 + 30 * count,
+    )
 
 
 def residual_plots(test: ResidualTestResult, what: str, units: Mapping[str, str]) -> list[Plot]:
-    """Autocorrelation, correlation with the inputs, and means over the most telling regressor; units by channel."""
+    """Autocorrelation, correlation with the inputs, and means over the most telling regressor.
+
+    Units by channel.
+    """
     plots = []
     if test.acf is not None and test.acf_band is not None:
         lags = list(range(1, len(test.acf)))
-        bars = {"type": "bar", "x": lags, "y": test.acf[1:], "name": "autocorrelation", "marker": {"color": "@model"}}
+        bars = {
+            "type": "bar",
+            "x": lags,
+            "y": test.acf[1:],
+            "name": "autocorrelation",
+            "marker": {"color": "@model"},
+        }
         told = (
-            f"Autocorrelation of the {what} of {test.name}; the band holds 99 % of the values that noise gives."
-            f" The largest in size is {number(test.strongest_acf, 2)}."
+            f"Autocorrelation of the {what} of {test.name}; the band holds 99 % of the values "
+            f"that noise gives. The largest in size is {number(test.strongest_acf, 2)}."
         )
-        layout = titled("lag [samples]", "autocorrelation") | {"shapes": [_band(test.acf_band)], "showlegend": True}
-        plots.append(Plot(f"Autocorrelation of the {what} of {test.name}.", told, [bars], layout, 280, small=True))
+        layout = titled("lag [samples]", "autocorrelation") | {
+            "shapes": [_band(test.acf_band)],
+            "showlegend": True,
+        }
+        plots.append(
+            Plot(
+                f"Autocorrelation of the {what} of {test.name}.",
+                told,
+                [bars],
+                layout,
+                280,
+                small=True,
+            )
+        )
     if test.crossed:
         traces = []
         for (name, cross), color in zip(
@@ -211,12 +294,19 @@ def residual_plots(test: ResidualTestResult, what: str, units: Mapping[str, str]
                     "marker": {"color": color, "size": 4},
                 }
             )
-        told = f"Correlation of the {what} of {test.name} with the inputs; beyond the band it is more than noise."
-        layout = titled("lag behind the input [samples]", "correlation") | {"shapes": [_band(test.cross_band)]}
+        told = (
+            f"Correlation of the {what} of {test.name} with the inputs; beyond the band it is "
+            "more than noise."
+        )
+        layout = titled("lag behind the input [samples]", "correlation") | {
+            "shapes": [_band(test.cross_band)]
+        }
         layout["showlegend"] = True
         label = f"Correlation of the {what} of {test.name} with the inputs."
         plots.append(Plot(label, told, traces, layout, 280, small=True))
-    return plots + [_means_plot(test, name, curve, what, units) for name, curve in test.most_telling.items()]
+    return plots + [
+        _means_plot(test, name, curve, what, units) for name, curve in test.most_telling.items()
+    ]
 
 
 def _means_plot(
@@ -234,12 +324,15 @@ def _means_plot(
     }
     surely = chance(curve.p)
     told = (
-        f"Mean of the {what} of {test.name}, less that of all rows, over {name} with 99 % intervals, both with its "
-        f"autocorrelation taken into account as in the test: that it is flat has p "
-        f"{'' if surely.startswith('<') else '= '}{surely}. Plain means explain {percent(curve.share)} of its variance."
+        f"Mean of the {what} of {test.name}, less that of all rows, over {name} with 99 % "
+        "intervals, both with its autocorrelation taken into account as in the test: that it "
+        f"is flat has p {'' if surely.startswith('<') else '= '}{surely}. Plain means explain "
+        f"{percent(curve.share)} of its variance."
     )
     label = f"Mean of the {what} of {test.name} over {name}."
-    layout = titled(regressor_label(name, units), with_unit(f"residual of {test.name}", units.get(test.name)))
+    layout = titled(
+        regressor_label(name, units), with_unit(f"residual of {test.name}", units.get(test.name))
+    )
     return Plot(label, told, [dots], layout, 280, small=True)
 
 
@@ -266,8 +359,9 @@ def bias_plot(suspects: Sequence[SuspectResult]) -> Plot:
         "showlegend": False,
     }
     caption = (
-        "Bias of each parameter (columns) by each term that may be missing from the physics (rows), in per cent of "
-        "its value; a term without a guessed size counts as 1 % of the output. Colours are logarithmic."
+        "Bias of each parameter (columns) by each term that may be missing from the physics "
+        "(rows), in per cent of its value; a term without a guessed size counts as 1 % of the "
+        "output. Colours are logarithmic."
     )
     caption += f" {shown.left_out}" if shown.left_out else ""
     height = 90 + 28 * len(shown.suspects)
@@ -312,8 +406,17 @@ def parameter_comparison(rows: Sequence[RowResult]) -> list[Plot]:
             if entry is not None and entry.value is not None:
                 x.append(entry.value)
                 y.append(row.name)
-                ends = entry.ci95 if entry.ci95 and None not in entry.ci95 else (entry.value, entry.value)
-                arms.append((max((ends[1] or 0.0) - entry.value, 0.0), max(entry.value - (ends[0] or 0.0), 0.0)))
+                ends = (
+                    entry.ci95
+                    if entry.ci95 and None not in entry.ci95
+                    else (entry.value, entry.value)
+                )
+                arms.append(
+                    (
+                        max((ends[1] or 0.0) - entry.value, 0.0),
+                        max(entry.value - (ends[0] or 0.0), 0.0),
+                    )
+                )
         dots = {
             "x": x,
             "y": y,
@@ -334,7 +437,9 @@ def parameter_comparison(rows: Sequence[RowResult]) -> list[Plot]:
             "yaxis": CATEGORIES,
             "showlegend": False,
         }
-        told = f"{parameter.name} by every way of modelling, with its 95 % interval where it has one."
+        told = (
+            f"{parameter.name} by every way of modelling, with its 95 % interval where it has one."
+        )
         plots.append(Plot(told, told, [dots], layout, 120 + 30 * len(rows), small=True))
     return plots
 

@@ -20,19 +20,34 @@ def residuals_blocks(result: FitResult, units: Mapping[str, str]) -> list[Any]:
         blocks += [Text(told)] if told else []
     else:
         blocks.append(Text(found.text))
-        tests = [("one-step residual", found.one_step), ("error of the free run", found.free_run or [])]
+        tests = [
+            ("one-step residual", found.one_step),
+            ("error of the free run", found.free_run or []),
+        ]
         rows = [_test_cells(what, test, units) for what, group in tests for test in group]
-        head = ["residual", "RMS", "mean", "white", "Ljung-Box p", "largest autocorrelation", "follows", "curved over"]
+        head = [
+            "residual",
+            "RMS",
+            "mean",
+            "white",
+            "Ljung-Box p",
+            "largest autocorrelation",
+            "follows",
+            "curved over",
+        ]
         blocks.append(
             Table(
-                "Tests of the residuals on the training data, at the levels that the result tells; RMS and mean are in "
-                "the output's unit.",
+                "Tests of the residuals on the training data, at the levels that the result "
+                "tells; RMS and mean are in the output's unit.",
                 head,
                 rows,
             )
         )
         blocks += [
-            Grid(plots) for what, group in tests for test in group if (plots := residual_plots(test, what, units))
+            Grid(plots)
+            for what, group in tests
+            for test in group
+            if (plots := residual_plots(test, what, units))
         ]
     blocks += [Text(result.missing_lags.text)] if result.missing_lags else []
     return blocks
@@ -79,13 +94,27 @@ def stability_blocks(result: FitResult) -> list[Any]:
         told += [
             ["rightmost eigenvalue, real part [1/s]", number(m.rightmost, 4, m.fastest)],
             modes,
-            *([["integrators, which are not among these", str(m.integrators)]] if m.integrators else []),
+            *(
+                [["integrators, which are not among these", str(m.integrators)]]
+                if m.integrators
+                else []
+            ),
             ["points with a growing mode", percent(m.growing)],
         ]
     if found.diverges_at is not None or found.searched is not None:
         at = "none found" if found.diverges_at is None else number(found.diverges_at, 4)
-        told.append([f"factor on the inputs at which the run diverges (searched to {number(found.searched, 4)})", at])
-    return [*blocks, Table("Evidence on the free run's stability.", ["measure", "value"], told)] if told else blocks
+        told.append(
+            [
+                "factor on the inputs at which the run diverges (searched to "
+                f"{number(found.searched, 4)})",
+                at,
+            ]
+        )
+    return (
+        [*blocks, Table("Evidence on the free run's stability.", ["measure", "value"], told)]
+        if told
+        else blocks
+    )
 
 
 def excitation_blocks(result: FitResult) -> list[Any]:
@@ -103,19 +132,32 @@ def excitation_blocks(result: FitResult) -> list[Any]:
         blocks.append(
             Text(
                 f"θ was split under the {detail.kind} measure, {detail.points} points"
-                + ("." if detail.support is None else f", {percent(detail.support)} within reach of the data.")
+                + (
+                    "."
+                    if detail.support is None
+                    else f", {percent(detail.support)} within reach of the data."
+                )
             )
         )
     if result.bias:
         head = ["suspect", "expression", "explains of the learner", "cosine with the physics"]
-        rows = [[s.name, s.expression, percent(s.explained), number(s.cosine, 3, 1.0)] for s in result.bias]
+        rows = [
+            [s.name, s.expression, percent(s.explained), number(s.cosine, 3, 1.0)]
+            for s in result.bias
+        ]
         caption = "Terms that may be missing from the physics."
         if any(s.removed_by for s in result.bias):
-            caption = "Terms that may be missing from the physics, and what takes their bias from the parameters."
+            caption = (
+                "Terms that may be missing from the physics, and what takes their bias from "
+                "the parameters."
+            )
             head = [*head, "removed by"]
             rows = [[*row, s.removed_by or "–"] for row, s in zip(rows, result.bias, strict=True)]
         else:
-            caption += " Whether a measure takes their bias from the parameters is told by `orthaug check`."
+            caption += (
+                " Whether a measure takes their bias from the parameters is told by `orthaug "
+                "check`."
+            )
         blocks.append(Table(caption, head, rows))
         if result.bias[0].percent:
             blocks.append(bias_plot(result.bias))
@@ -127,7 +169,8 @@ def _sentence(text: str) -> str:
 
 
 _CHOOSES = {
-    "score": "score, generalised cross-validation: the loss, raised by how many weights a run uses for it",
+    "score": "score, generalised cross-validation: the loss, raised by how many weights a run uses "
+    "for it",
     "validation": "error on data that were not fitted",
 }
 
@@ -136,17 +179,25 @@ def restarts_blocks(result: FitResult) -> list[Any]:
     """Return how training ended, from every start."""
     status = result.status
     told = (
-        f"Training ended with “{status.code.replace('_', ' ')}” after {status.iterations} iterations and "
-        f"{number(status.seconds, 3)} s. {_sentence(status.message)}"
+        f"Training ended with “{status.code.replace('_', ' ')}” after {status.iterations} "
+        f"iterations and {number(status.seconds, 3)} s. {_sentence(status.message)}"
     )
-    fall = f" The loss is {number(status.loss, 4)}; that of physics alone was {number(status.start_loss, 4)}."
+    fall = (
+        f" The loss is {number(status.loss, 4)}; that of physics alone was "
+        f"{number(status.start_loss, 4)}."
+    )
     runs, caption = result.restarts, "Every run from its own initial weights."
     by = [name for name in _CHOOSES if any(getattr(r, name) is not None for r in runs)]
     if by and sum(r.chosen for r in runs) == 1 < len(runs):
         caption += f" The chosen one has the lowest {_CHOOSES[by[0]]}."
     head = ["seed", "regularization", "loss", *by, "iterations", "ended", "chosen"]
     rows = [
-        [str(r.seed), str(r.regularization), number(r.loss), *(number(getattr(r, name)) for name in by)]
+        [
+            str(r.seed),
+            str(r.regularization),
+            number(r.loss),
+            *(number(getattr(r, name)) for name in by),
+        ]
         + [str(r.iterations), r.code.replace("_", " "), "yes" if r.chosen else "no"]
         for r in runs
     ]

@@ -26,12 +26,20 @@ from orthaug.reports.page_blocks import (
     with_unit,
 )
 from orthaug.reports.page_figures import interval_plot, score_plot
-from orthaug.reports.page_findings import excitation_blocks, residuals_blocks, restarts_blocks, stability_blocks
+from orthaug.reports.page_findings import (
+    excitation_blocks,
+    residuals_blocks,
+    restarts_blocks,
+    stability_blocks,
+)
 from orthaug.reports.page_learned import learned_blocks
 from orthaug.reports.page_runs import Run, error_band, run_plots
 from orthaug.reports.result import CompareResult, DataResult, FitResult, ParameterResult, PartScores
 
-BIAS_TOLD = " The bias is estimate less truth, as far as one suspected term explains what the learner found."
+BIAS_TOLD = (
+    " The bias is estimate less truth, as far as one suspected term explains what the learner "
+    "found."
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +70,9 @@ class FitPage:
     @property
     def outputs(self) -> tuple[str, ...]:
         """Their names."""
-        return tuple(channel.name for _, free in self.responses.values() for channel in free.outputs)[: self._count]
+        return tuple(
+            channel.name for _, free in self.responses.values() for channel in free.outputs
+        )[: self._count]
 
     @property
     def units(self) -> dict[str, str]:
@@ -120,22 +130,36 @@ def _parameters(result: FitResult) -> list[Any]:
     if result.standard_errors_by is not None:
         caption = f"What was estimated. Standard errors: {STD_KINDS[result.standard_errors_by]}."
     if result.noise_only:
-        caption += " Intervals count noise only: the model leaves more than noise, which may have moved the parameters."
+        caption += (
+            " Intervals count noise only: the model leaves more than noise, which may have "
+            "moved the parameters."
+        )
     if result.standard_errors is not None:
-        caption += " Intervals hold for the inputs that were applied; under others the bias is another one."
+        caption += (
+            " Intervals hold for the inputs that were applied; under others the bias is "
+            "another one."
+        )
     if any(row.derived_unit for row in rows):
         caption += " A unit in brackets is not the spec's: the channels' units ask for it."
     if biased:
         caption += f"{BIAS_TOLD[:-1]};"
         caption += " the interval with it is the hull over all causes that noise cannot tell apart."
-    blocks: list[Any] = [Table(caption, columns, [_parameter_cells(row, biased, shared) for row in rows])]
+    blocks: list[Any] = [
+        Table(caption, columns, [_parameter_cells(row, biased, shared) for row in rows])
+    ]
     plot = interval_plot(rows)
     blocks += [plot] if plot else []
     causes = [f"{percent(share)} is {cause}" for cause, share in biased_by(rows)]
     if causes:
-        told, more = f"{' in one equation' if len(causes) > 1 else ''} {', in another '.join(causes)}", ""
+        told, more = (
+            f"{' in one equation' if len(causes) > 1 else ''} {', in another '.join(causes)}",
+            "",
+        )
         if result.learns:
-            more = ", once what the physics can imitate is taken out of both; drawn over one input it may tell less"
+            more = (
+                ", once what the physics can imitate is taken out of both; drawn over one "
+                "input it may tell less"
+            )
         what = "what the learner found" if result.learns else "the squares that the free run leaves"
         blocks.append(Text(f"The bias budget: of {what}{told}{more}."))
     if result.physical_consistency:
@@ -162,7 +186,10 @@ def _parameter_cells(row: ParameterResult, biased: bool, shared: bool) -> list[s
     ]
     if biased:
         known = row.bias is None or row.bias.determined
-        cells += [bias_cell(row), interval(row.ci95_with_bias) if known else "not determined by these data"]
+        cells += [
+            bias_cell(row),
+            interval(row.ci95_with_bias) if known else "not determined by these data",
+        ]
     return cells + ([{True: "yes", False: "no", None: "–"}[row.shared]] if shared else [])
 
 
@@ -183,11 +210,21 @@ def _equations(result: FitResult) -> list[Any]:
         ]
         told = result.motion
         caption = (
-            f"The equations of motion, {told.integrator} with {told.substeps} substep{'s' * (told.substeps > 1)} in "
-            f"a sample and a {told.hold} hold; a prediction starts from a state estimated over {told.window} rows."
+            f"The equations of motion, {told.integrator} with {told.substeps} "
+            f"substep{'s' * (told.substeps > 1)} in a sample and a {told.hold} hold; a "
+            f"prediction starts from a state estimated over {told.window} rows."
         )
         blocks.append(
-            Table(caption, ["state", "unit", "next value" if next_value else "derivative", "learner beside it"], rows)
+            Table(
+                caption,
+                [
+                    "state",
+                    "unit",
+                    "next value" if next_value else "derivative",
+                    "learner beside it",
+                ],
+                rows,
+            )
         )
     if result.terms:
         rows = [
@@ -202,7 +239,15 @@ def _equations(result: FitResult) -> list[Any]:
             ]
             for t in result.terms
         ]
-        head = ["term", "added to", "coefficient", "unit", "standard error", "95 % interval", "largest contribution"]
+        head = [
+            "term",
+            "added to",
+            "coefficient",
+            "unit",
+            "standard error",
+            "95 % interval",
+            "largest contribution",
+        ]
         blocks.append(Table("The learned terms, the largest first.", head, rows))
     if result.equation:
         blocks.append(Code(result.equation.text, "The fitted equations"))
@@ -212,16 +257,30 @@ def _equations(result: FitResult) -> list[Any]:
 def _runs(page: FitPage) -> list[Any]:
     runs = [Run(part, free, page.alone.get(part)) for part, (_, free) in page.responses.items()]
     train = next(iter(page.responses.values()))[1]
-    notes = [Text(w.text, "warning") for w in page.result.warnings if w.code in ("witness", "free_run_diverged")]
+    notes = [
+        Text(w.text, "warning")
+        for w in page.result.warnings
+        if w.code in ("witness", "free_run_diverged")
+    ]
     band, alone = error_band(train), bool(page.alone)
-    told = "A model in free run sees the inputs alone and lives on its own past; the residual is measured less model."
+    told = (
+        "A model in free run sees the inputs alone and lives on its own past; the residual is "
+        "measured less model."
+    )
     if alone:
-        told += " The model without its learner has the same parameters and the learner switched off; it is not the"
+        told += (
+            " The model without its learner has the same parameters and the learner switched "
+            "off; it is not the"
+        )
         told += " physics alone of the verdict, which is fitted by itself."
-    told += " Between the limits of the band lie 95 % of the errors on the training data." if band else ""
+    told += (
+        " Between the limits of the band lie 95 % of the errors on the training data."
+        if band
+        else ""
+    )
     how = Text(
-        "Drag over a stretch to zoom, double-click for the whole record; with the keyboard the arrows move, "
-        "+ and − zoom, 0 shows all.",
+        "Drag over a stretch to zoom, double-click for the whole record; with the keyboard the "
+        "arrows move, + and − zoom, 0 shows all.",
         "hint",
     )
     return [*notes, Text(told), how, *run_plots(runs, band)]
@@ -231,12 +290,19 @@ def _shares(page: FitPage) -> list[Any]:
     """Return how much of the model's output, or of each equation, is physics and how much the learner."""
     result = page.result
     if result.motion is not None:
-        rows = [(part.equation, part.physics, part.learner, part.share, part.unit) for part in result.motion.parts]
+        rows = [
+            (part.equation, part.physics, part.learner, part.share, part.unit)
+            for part in result.motion.parts
+        ]
         what = "each learned equation along the training run"
     else:
         if page.learned is None:
             return []
-        rows = [row for part, (one_step, _) in page.responses.items() for row in _part_shares(part, one_step)]
+        rows = [
+            row
+            for part, (one_step, _) in page.responses.items()
+            for row in _part_shares(part, one_step)
+        ]
         what = "the one-step prediction's deviation from its mean"
     if not rows:
         return []
@@ -245,7 +311,10 @@ def _shares(page: FitPage) -> list[Any]:
         for name, physics, learner, share, unit in rows
     ]
     head = ["part", "physics", "learner", "unit", "share of the learner"]
-    caption = f"RMS of what physics and learner add to {what}. The share is the learner's RMS over that of their sum; "
+    caption = (
+        f"RMS of what physics and learner add to {what}. The share is the learner's RMS over "
+        "that of their sum; "
+    )
     caption += "it need not fit to the two RMS, for the parts may cancel or follow each other."
     bars = {
         "type": "bar",
@@ -259,12 +328,17 @@ def _shares(page: FitPage) -> list[Any]:
     layout = {"xaxis": axis, "yaxis": CATEGORIES, "showlegend": False}
     told = "The learner's RMS over that of physics and learner together."
     if result.structure == "orthogonal":
-        told += " The learner holds only what the physics cannot: its overlap with the physics is split off."
+        told += (
+            " The learner holds only what the physics cannot: its overlap with the physics is "
+            "split off."
+        )
     label = "Share of the learner; the table has the numbers."
     return [Table(caption, head, cells), Plot(label, told, [bars], layout, 90 + 34 * len(rows))]
 
 
-def _part_shares(part: str, response: Response) -> list[tuple[str, float, float, float | None, str]]:
+def _part_shares(
+    part: str, response: Response
+) -> list[tuple[str, float, float, float | None, str]]:
     found = []
     for i, channel in enumerate(response.outputs):
         both = [
@@ -272,7 +346,9 @@ def _part_shares(part: str, response: Response) -> list[tuple[str, float, float,
             for name in ("baseline", "learner")
         ]
         with np.errstate(all="ignore"):
-            physics, learner, total = (float(np.nanstd(values)) for values in (*both, both[0] + both[1]))
+            physics, learner, total = (
+                float(np.nanstd(values)) for values in (*both, both[0] + both[1])
+            )
         name = part if len(response.outputs) == 1 else f"{part}, {channel.name}"
         found.append((name, physics, learner, learner / total if total else None, channel.unit))
     return found
@@ -294,7 +370,10 @@ def score_blocks(
         for part, both in parts.items():
             for kind, score in both.kinds.items():
                 for j, output in enumerate(outputs):
-                    cells = [None if v is None or j >= len(v) else v[j] for v in (score.rmse, score.nrmse, score.fit)]
+                    cells = [
+                        None if v is None or j >= len(v) else v[j]
+                        for v in (score.rmse, score.nrmse, score.fit)
+                    ]
                     horizon = "one step" if kind == "prediction" else "free run"
                     rows.append(
                         [
@@ -310,22 +389,35 @@ def score_blocks(
     head = [*(["model"] if named else []), "part", "horizon", "output", "RMSE", "NRMSE", "FIT %"]
     plot = score_plot(scores, outputs)
     table = Table(
-        "Scores; RMSE is in the output's unit, FIT is 100 (1 − NRMSE), a dash where there is none.", head, rows
+        "Scores; RMSE is in the output's unit, FIT is 100 (1 − NRMSE), a dash where there is none.",
+        head,
+        rows,
     )
     return [*([plot] if plot else []), table]
 
 
 def origin_blocks(origin: Origin, result: FitResult | CompareResult) -> list[Any]:
     """Command, versions, files with their checksums, and the spec as it was written."""
-    rows = [["command", origin.command], ["seed", str(origin.seed)], ["date", origin.date], ["machine", origin.machine]]
+    rows = [
+        ["command", origin.command],
+        ["seed", str(origin.seed)],
+        ["date", origin.date],
+        ["machine", origin.machine],
+    ]
     rows += [[name, version] for name, version in origin.versions.items()]
     return [
-        Table("How this result was made; the same versions, files and seed give the same numbers.", ["what", ""], rows),
+        Table(
+            "How this result was made; the same versions, files and seed give the same numbers.",
+            ["what", ""],
+            rows,
+        ),
         _files(result.data),
         Code(origin.toml, "The spec as it was written", long=True),
     ]
 
 
 def _files(data: DataResult) -> Table:
-    rows = [[part, f.file, str(f.rows), f.sha256] for part, files in data.parts.items() for f in files]
+    rows = [
+        [part, f.file, str(f.rows), f.sha256] for part, files in data.parts.items() for f in files
+    ]
     return Table("The data files and their checksums.", ["part", "file", "rows", "sha256"], rows)

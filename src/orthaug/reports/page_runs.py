@@ -1,6 +1,7 @@
 """Free runs on a page: whole records with the residual below, packed as numbers of four bytes for the page to draw.
 
-The page draws of every curve the least and the largest value in each column of pixels, anew whenever it is zoomed.
+The page draws of every curve the least and the largest value in each column of pixels, anew
+whenever it is zoomed.
 """
 
 from __future__ import annotations
@@ -19,7 +20,10 @@ from orthaug.reports.page_blocks import Plot, area, number, percent
 
 MOST_POINTS = 100_000  # of a curve
 _BUDGET = 560_000  # points of a page: three million letters
-_UPPER, _GAP = 0.64, 0.05  # share of a pair of panels that is the upper one, and what lies between panels
+_UPPER, _GAP = (
+    0.64,
+    0.05,
+)  # share of a pair of panels that is the upper one, and what lies between panels
 _MOST_SHADES = 200  # areas of a plot
 _PANEL = 330  # pixels of a pair of panels
 _DASHES = ("dash", "solid", "dot", "dashdot")
@@ -30,7 +34,10 @@ WITHOUT = "model without its learner"  # its name where it is drawn: the physics
 
 @dataclass(frozen=True)
 class Run:
-    """A free run on a part; `alone` that of the model without its learner, None where nothing was learned."""
+    """A free run on a part.
+
+    `alone` that of the model without its learner, None where nothing was learned.
+    """
 
     part: str
     response: Response
@@ -40,10 +47,15 @@ class Run:
 def run_plots(runs: Sequence[Run], band: Mapping[str, tuple[float, float]]) -> list[Plot]:
     """Return a plot for every part: measured, model, the model without its learner, and the residual.
 
-    Args:
-        band: of each output the two limits between which 95 % of the errors on the training data lie.
+    Args: band: of each output the two limits between which 95 % of the errors on the training data
+        lie.
     """
-    lengths = [_length(run) for run in runs for _ in run.response.outputs for _ in range(2 + (run.alone is not None))]
+    lengths = [
+        _length(run)
+        for run in runs
+        for _ in run.response.outputs
+        for _ in range(2 + (run.alone is not None))
+    ]
     most = _fair(lengths, _BUDGET)
     return [_plot(run, band, most) for run in runs]
 
@@ -51,11 +63,21 @@ def run_plots(runs: Sequence[Run], band: Mapping[str, tuple[float, float]]) -> l
 def compared_plots(responses: Mapping[str, Mapping[str, Response]]) -> list[Plot]:
     """Return a plot for every part: measured, and the free run of every model."""
     parts = list(dict.fromkeys(part for runs in responses.values() for part in runs))
-    count = sum(len(t.model) + 1 for runs in responses.values() for r in runs.values() for t in r.trajectories)
+    count = sum(
+        len(t.model) + 1
+        for runs in responses.values()
+        for r in runs.values()
+        for t in r.trajectories
+    )
     outputs = max((len(r.outputs) for runs in responses.values() for r in runs.values()), default=1)
-    most = min(MOST_POINTS, max(_BUDGET // max(2 * len(parts) * (len(responses) + 1) * outputs, 1), 1000))
+    most = min(
+        MOST_POINTS, max(_BUDGET // max(2 * len(parts) * (len(responses) + 1) * outputs, 1), 1000)
+    )
     most = MOST_POINTS if 2 * count * outputs < _BUDGET else most
-    return [_compared(part, {k: runs[part] for k, runs in responses.items() if part in runs}, most) for part in parts]
+    return [
+        _compared(part, {k: runs[part] for k, runs in responses.items() if part in runs}, most)
+        for part in parts
+    ]
 
 
 def _compared(part: str, runs: Mapping[str, Response], most: int) -> Plot:
@@ -66,7 +88,14 @@ def _compared(part: str, runs: Mapping[str, Response], most: int) -> Plot:
         own = {"yaxis": f"y{2 * i + 1}", "showlegend": i == 0}
         if panels.measured is not None:
             key = panels.keep("measured", i, panels.measured)
-            panels.traces.append({**own, "series": key, "name": "measured", "line": {"color": "@measured", "width": 3}})
+            panels.traces.append(
+                {
+                    **own,
+                    "series": key,
+                    "name": "measured",
+                    "line": {"color": "@measured", "width": 3},
+                }
+            )
         colors = ("@physics", "@model", "@learner", "@bias") * 9
         for (name, model), color, dash in zip(models.items(), colors, _DASHES * 9, strict=False):
             line = {"color": color, "width": 1.3, "dash": dash}
@@ -78,23 +107,32 @@ def _compared(part: str, runs: Mapping[str, Response], most: int) -> Plot:
     lost = [name for name, run in runs.items() if any(t.diverged for t in run.trajectories)]
     samples = sum(len(t.model) for t in first.trajectories)
     caption = (
-        f"The free runs of {', '.join(runs)} on {part}, all {samples} samples, with what each leaves of the measured "
-        "output under them."
+        f"The free runs of {', '.join(runs)} on {part}, all {samples} samples, with what each "
+        "leaves of the measured output under them."
     )
     caption += f" The run of {', '.join(lost)} diverges." if lost else ""
-    return panels.plot(f"Free runs of every model on {part}, with their residuals below.", caption, "time [s]")
+    return panels.plot(
+        f"Free runs of every model on {part}, with their residuals below.", caption, "time [s]"
+    )
 
 
 def error_band(response: Response) -> dict[str, tuple[float, float]]:
-    """Of each output the limits between which 95 % of the errors of a run lie; none of one that diverged."""
+    """Of each output the limits between which 95 % of the errors of a run lie.
+
+    None of one that diverged.
+    """
     found = {}
     if any(t.measured is None or t.diverged for t in response.trajectories):
         return found
     for i, channel in enumerate(response.outputs):
-        errors = np.concatenate([(t.measured - t.model)[t.start :, i] for t in response.trajectories])  # type: ignore
+        errors = np.concatenate(
+            [(t.measured - t.model)[t.start :, i] for t in response.trajectories]
+        )  # type: ignore
         errors = errors[np.isfinite(errors)]
         if len(errors) >= 40:
-            found[channel.name] = tuple(float(limit) for limit in np.quantile(errors, [0.025, 0.975]))
+            found[channel.name] = tuple(
+                float(limit) for limit in np.quantile(errors, [0.025, 0.975])
+            )
     return found
 
 
@@ -114,20 +152,31 @@ def _fair(lengths: Sequence[int], budget: int) -> int:
 
 
 def packed(values: Vector, x0: float, dx: float, most: int = MOST_POINTS) -> dict[str, Any]:
-    """Return a curve at even steps as the page reads it; of a longer one the least and the largest value of each stretch."""
+    """Return a curve at even steps as the page reads it.
+
+    Of a longer one the least and the largest value of each stretch.
+    """
     step = dx
     if len(values) > most:
         stride = -(-len(values) // (most // 2))
         filled = np.full(-(-len(values) // stride) * stride, np.nan)
         filled[: len(values)] = values
         cells = filled.reshape(-1, stride)
-        values = np.stack([np.fmin.reduce(cells, axis=1), np.fmax.reduce(cells, axis=1)], axis=1).ravel()
+        values = np.stack(
+            [np.fmin.reduce(cells, axis=1), np.fmax.reduce(cells, axis=1)], axis=1
+        ).ravel()
         dx = dx * stride / 2
     finite = values[np.isfinite(values)]
     shift = float(finite.mean()) if len(finite) else 0.0
     with np.errstate(over="ignore"):
         bare = (values - shift).astype("<f4")
-    return {"x0": x0, "dx": dx, "step": step, "shift": shift, "f4": base64.b64encode(bare.tobytes()).decode()}
+    return {
+        "x0": x0,
+        "dx": dx,
+        "step": step,
+        "shift": shift,
+        "f4": base64.b64encode(bare.tobytes()).decode(),
+    }
 
 
 def joined(response: Response, values: Sequence[Matrix | None]) -> Matrix:
@@ -140,7 +189,8 @@ def joined(response: Response, values: Sequence[Matrix | None]) -> Matrix:
 class _Panels:
     """A plot of runs as it is drawn: of each output a panel of curves, and the residuals below.
 
-    `measured` (N, ny) are the measured outputs, experiments one after another; None where there are none.
+    `measured` (N, ny) are the measured outputs, experiments one after another; None where there are
+    none.
     """
 
     def __init__(self, response: Response, most: int) -> None:
@@ -166,7 +216,9 @@ class _Panels:
         own: dict[str, Any] = {"minus": [f"measured {i}", f"{name} {i}"]}
         if len(model) > self.most:
             key = f"measured {i} − {name} {i}"
-            self.series[key] = packed(self.measured[:, i] - model[:, i], self.start, self.step, self.most)
+            self.series[key] = packed(
+                self.measured[:, i] - model[:, i], self.start, self.step, self.most
+            )
             own = {"series": key}
         self.traces.append({**own, **drawn, "yaxis": f"y{2 * i + 2}", "showlegend": False})
 
@@ -183,7 +235,10 @@ class _Panels:
         for one in self._left:
             channel = self.outputs[one.output]
             reached = f"{number(one.farthest, 3)} {channel.unit}".strip()
-            caption += f" At {number(one.time, 4)} s {channel.name} of {one.name} leaves the panel, at the triangle;"
+            caption += (
+                f" At {number(one.time, 4)} s {channel.name} of {one.name} leaves the panel, "
+                "at the triangle;"
+            )
             caption += f" it goes to {reached}."
         self.layout["xaxis"] = {
             "title": {"text": time},
@@ -191,7 +246,9 @@ class _Panels:
             "anchor": f"y{2 * len(self.outputs)}",
         }
         traces = [*self.traces, *(one.marker() for one in self._left)]
-        return Plot(label, caption, traces, self.layout, 60 + _PANEL * len(self.outputs), series=self.series)
+        return Plot(
+            label, caption, traces, self.layout, 60 + _PANEL * len(self.outputs), series=self.series
+        )
 
 
 @dataclass(frozen=True)
@@ -216,17 +273,26 @@ class PanelExit:
             "name": f"{self.name} leaves the panel",
             "cliponaxis": False,
             "showlegend": False,
-            "marker": {"color": "@bad", "size": 12, "symbol": "triangle-up" if self.above else "triangle-down"},
+            "marker": {
+                "color": "@bad",
+                "size": 12,
+                "symbol": "triangle-up" if self.above else "triangle-down",
+            },
         }
 
 
 def frame_of(measured: Vector, curves: Iterable[Vector]) -> list[float] | None:
-    """Return what the upper panel shows where a curve leaves what was measured by far; None for all of it."""
+    """Return what the upper panel shows where a curve leaves what was measured by far.
+
+    None for all of it.
+    """
     low, high = float(np.nanmin(measured)), float(np.nanmax(measured))
     width = max(high - low, 1e-300)
     for curve in curves:
         inside = curve[np.isfinite(curve)]
-        if len(inside) and (inside.min() < low - _FAR * width or inside.max() > high + _FAR * width):
+        if len(inside) and (
+            inside.min() < low - _FAR * width or inside.max() > high + _FAR * width
+        ):
             return [low - width, high + width]
     return None
 
@@ -242,14 +308,18 @@ def curves_left(
         if len(outside):
             row, above = int(outside[0]), bool(curve[outside[0]] > limits[1])
             farthest = curve[outside][np.argmax(np.abs(curve[outside] - np.mean(limits)))]
-            found.append(PanelExit(name, output, start + step * row, limits[above], above, float(farthest)))
+            found.append(
+                PanelExit(name, output, start + step * row, limits[above], above, float(farthest))
+            )
     return found
 
 
 def _plot(run: Run, band: Mapping[str, tuple[float, float]], most: int) -> Plot:
     response, panels = run.response, _Panels(run.response, most)
     model = joined(response, [t.model for t in response.trajectories])
-    alone = None if run.alone is None else joined(response, [t.model for t in run.alone.trajectories])
+    alone = (
+        None if run.alone is None else joined(response, [t.model for t in run.alone.trajectories])
+    )
     curves = {"measured": panels.measured, "physics": alone, "model": model}
     drawn = {"the model": model} | ({} if alone is None else {f"the {WITHOUT}": alone})
     for i, channel in enumerate(response.outputs):
@@ -257,7 +327,9 @@ def _plot(run: Run, band: Mapping[str, tuple[float, float]], most: int) -> Plot:
             if curve is not None:
                 panels.keep(name, i, curve)
         limits = band.get(channel.name)
-        panels.traces += _upper([name for name, curve in curves.items() if curve is not None], i, limits)
+        panels.traces += _upper(
+            [name for name, curve in curves.items() if curve is not None], i, limits
+        )
         if panels.measured is not None:
             told = {"name": "measured − model", "line": {"color": "@residual", "width": 1}}
             panels.add_residual("model", i, model, told)
@@ -268,25 +340,38 @@ def _plot(run: Run, band: Mapping[str, tuple[float, float]], most: int) -> Plot:
         panels.finish(i, drawn)
     _mark(panels.layout, run, panels.start, panels.step)
     panels.layout["shapes"] += _shades(response, panels.start, panels.step)
-    time = "time [s]" if len(response.trajectories) == 1 else "time, experiments one after another [s]"
+    time = (
+        "time [s]" if len(response.trajectories) == 1 else "time, experiments one after another [s]"
+    )
     return panels.plot(_label(run), _caption(run, most), time)
 
 
 def _upper(curves: Sequence[str], i: int, limits: tuple[float, float] | None) -> list[dict]:
-    """Measured, band, the model without its learner and with it, of output i; the legend tells of the first."""
+    """Measured, band, the model without its learner and with it, of output i.
+
+    The legend tells of the first.
+    """
     found = []
     if "measured" in curves:
         line = {"color": "@measured", "width": 3}
         found.append({"series": f"measured {i}", "name": "measured", "line": line})
     if limits is not None:
-        edge: dict[str, Any] = {"series": f"model {i}", "line": {"width": 0, "color": "@band"}, "hoverinfo": "skip"}
+        edge: dict[str, Any] = {
+            "series": f"model {i}",
+            "line": {"width": 0, "color": "@band"},
+            "hoverinfo": "skip",
+        }
         fill = {"fill": "tonexty", "fillcolor": "@band"}
-        found.append({**edge, "edge": "min", "plus": limits[0], "name": "lower limit", "showlegend": False})
+        found.append(
+            {**edge, "edge": "min", "plus": limits[0], "name": "lower limit", "showlegend": False}
+        )
         found.append({**edge, **fill, "edge": "max", "plus": limits[1], "name": "95 % band"})
     if "physics" in curves:
         line = {"color": "@physics", "width": 1.3, "dash": "dash"}
         found.append({"series": f"physics {i}", "name": WITHOUT, "line": line})
-    found.append({"series": f"model {i}", "name": "model", "line": {"color": "@model", "width": 1.3}})
+    found.append(
+        {"series": f"model {i}", "name": "model", "line": {"color": "@model", "width": 1.3}}
+    )
     own = {"yaxis": f"y{2 * i + 1}", "showlegend": i == 0}
     return [{**own, "legendgroup": trace["name"], **trace} for trace in found]
 
@@ -362,20 +447,27 @@ def _caption(run: Run, most: int) -> str:
     response = run.response
     rows, count = sum(len(t.model) for t in response.trajectories), len(response.trajectories)
     files = f" of {count} experiments" if count > 1 else ""
-    told = [f"The free run on {run.part}, all {rows} samples{files}, and the residual under it on the same time axis."]
+    told = [
+        f"The free run on {run.part}, all {rows} samples{files}, and the residual under it on "
+        "the same time axis."
+    ]
     if rows > most:
         told.append(
-            f"Of each curve {number(most, 3)} points are kept, the least and the largest value of every stretch."
+            f"Of each curve {number(most, 3)} points are kept, the least and the largest value "
+            "of every stretch."
         )
     for t in response.trajectories:
         if t.diverged:
-            told.append(f"The run leaves all bounds in {t.diverged[1]} at row {t.diverged[0]}, where it is cut off.")
+            told.append(
+                f"The run leaves all bounds in {t.diverged[1]} at row {t.diverged[0]}, where "
+                "it is cut off."
+            )
     outside = [t.outside for t in response.trajectories if t.outside is not None]
     beyond = float(np.concatenate(outside).mean()) if outside else 0.0
     if beyond > 0:
         told.append(
-            f"On {percent(beyond)} of the samples, shaded, the learner is outside what it was trained on; "
-            "`learner.beyond` says what its correction does there."
+            f"On {percent(beyond)} of the samples, shaded, the learner is outside what it was "
+            "trained on; `learner.beyond` says what its correction does there."
         )
     return " ".join(told)
 
@@ -384,15 +476,32 @@ def _shades(response: Response, start: float, step: float) -> list[dict[str, Any
     """Return areas over the stretches on which the learner is outside its training, close ones as one."""
     rows, flags = 0, []
     for t in response.trajectories:
-        flags.append(np.zeros(len(t.model)) if t.outside is None else np.asarray(t.outside, dtype=float))
+        flags.append(
+            np.zeros(len(t.model)) if t.outside is None else np.asarray(t.outside, dtype=float)
+        )
         flags.append(np.zeros(1))  # the gap between experiments
         rows += len(t.model) + 1
     edges = np.diff(np.concatenate([[0.0], *flags, [0.0]]))
     first, after = np.flatnonzero(edges > 0), np.flatnonzero(edges < 0)
     apart = np.flatnonzero(first[1:] - after[:-1] > rows // _MOST_SHADES)
-    first, after = first[np.concatenate([[0], apart + 1])[: len(first)]], after[np.append(apart, -1)[: len(after)]]
-    place = {"yref": "paper", "y0": 0, "y1": 1, "name": "outside of training", "legendgroup": "outside"}
+    first, after = (
+        first[np.concatenate([[0], apart + 1])[: len(first)]],
+        after[np.append(apart, -1)[: len(after)]],
+    )
+    place = {
+        "yref": "paper",
+        "y0": 0,
+        "y1": 1,
+        "name": "outside of training",
+        "legendgroup": "outside",
+    }
     return [
-        area("@reach", **place, x0=start + step * (a - 0.5), x1=start + step * (b - 0.5), showlegend=not i)
+        area(
+            "@reach",
+            **place,
+            x0=start + step * (a - 0.5),
+            x1=start + step * (b - 0.5),
+            showlegend=not i,
+        )
         for i, (a, b) in enumerate(zip(first.tolist(), after.tolist(), strict=True))
     ]

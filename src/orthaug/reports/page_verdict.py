@@ -30,11 +30,17 @@ _MOST_DOUBTS = 3  # that are told in the first sentence
 _WORSE = 1.5  # times the error on the training data: a Gaussian error then leaves the 95 % band on a fifth of the rows
 _STOPPED = ("iteration_limit", "no_descent", "stopped")
 _RAN_AWAY = "free_run_diverged"
-_TIED = ("orthogonal", "physics alone")  # of models that are as good as each other these are taken first
+_TIED = (
+    "orthogonal",
+    "physics alone",
+)  # of models that are as good as each other these are taken first
 
 
 class PageVerdict(NamedTuple):
-    """`level` is good, care or bad; the sentences say whether to trust the model, for what, and what to do next."""
+    """`level` is good, care or bad.
+
+    The sentences say whether to trust the model, for what, and what to do next.
+    """
 
     level: str
     trust: str
@@ -51,7 +57,11 @@ def fit_verdict(result: FitResult) -> PageVerdict:
     """Of a fit, from its own findings."""
     doubts = list(_doubts(result, result.data))
     error, part = _worst(result.scores)
-    bad = _warned(result, _RAN_AWAY) or (error is not None and error > _POOR) or _code(result) == "hurts"
+    bad = (
+        _warned(result, _RAN_AWAY)
+        or (error is not None and error > _POOR)
+        or _code(result) == "hurts"
+    )
     level = "bad" if bad else "care" if doubts else "good"
     opening = {
         "good": "The model is to be trusted",
@@ -59,10 +69,14 @@ def fit_verdict(result: FitResult) -> PageVerdict:
         "bad": "Do not trust the model as it is",
     }[level]
     shown = "" if error is None else f": {_told_error(error, part)}"
-    because = f"{', but ' if level == 'care' else '; '}{_joined(doubts[:_MOST_DOUBTS])}" if doubts else ""
+    because = (
+        f"{', but ' if level == 'care' else '; '}{_joined(doubts[:_MOST_DOUBTS])}" if doubts else ""
+    )
     first = next((f"{w.text.split(':')[0][0].upper()}{w.text.split(':')[0][1:]}. " for w in result.warnings
                   if w.code == "one_step_only"), "")  # fmt: skip
-    return PageVerdict(level, f"{first}{opening}{shown}{because}.", _use(result, level), _then(result))
+    return PageVerdict(
+        level, f"{first}{opening}{shown}{because}.", _use(result, level), _then(result)
+    )
 
 
 def compare_verdict(result: CompareResult) -> PageVerdict:
@@ -80,7 +94,13 @@ def compare_verdict(result: CompareResult) -> PageVerdict:
     row = next(row for row in result.comparison if row.name == best)
     error, part = _worst(row.scores)
     doubts = list(_doubts(row, result.data))
-    level = "good" if error is not None and error <= _GOOD else "care" if error is None or error <= _POOR else "bad"
+    level = (
+        "good"
+        if error is not None and error <= _GOOD
+        else "care"
+        if error is None or error <= _POOR
+        else "bad"
+    )
     level = "care" if level == "good" and doubts else level
     near = [name for name in errors if name != best and errors[name] <= _ALIKE * (error or 0.0)]
     same = [name for name in near if percent(errors[name]) == percent(errors[best])]
@@ -97,15 +117,23 @@ def compare_verdict(result: CompareResult) -> PageVerdict:
     use = "It is the physics alone: no learner earns its place beside it."
     if best != "physics alone" and alone is not None and error is not None:
         learns = error / alone if alone else 1.0
-        use = f"Its error on {part} is {number(learns, 2)} of that of physics alone ({percent(alone)})"
+        use = (
+            f"Its error on {part} is {number(learns, 2)} of that of physics alone "
+            f"({percent(alone)})"
+        )
         use += f", and its learner {_word(row)}." if row.validation else "."
     return PageVerdict(level, trust, use, _after_comparison(result, row))
 
 
 def _taken(rows: Sequence[RowResult], errors: Mapping[str, float]) -> str:
-    """Return the model of the lowest error; of such that are as good, one whose θ means something."""
+    """Return the model of the lowest error.
+
+    Of such that are as good, one whose θ means something.
+    """
     best = min(errors, key=errors.__getitem__)
-    earns = [row.name for row in rows if row.validation is None or row.validation.verdict == "helps"]
+    earns = [
+        row.name for row in rows if row.validation is None or row.validation.verdict == "helps"
+    ]
     tied = [name for name in _TIED if name in earns and errors[name] <= _ALIKE * errors[best]]
     return next(iter(tied), best)
 
@@ -116,13 +144,21 @@ def _after_comparison(result: CompareResult, row: RowResult) -> str:
     if not result.data.tests and not result.data.validation:
         return "Hold out a test part, on which the models can be judged."
     if not result.data.validation:
-        return "Hold out a validation part (`[data.validation]`), so that the choice is not made on what judges it."
-    return f"Fit it alone with `orthaug fit` and structure “{row.name}”, whose report has its residuals and bias."
+        return (
+            "Hold out a validation part (`[data.validation]`), so that the choice is not made "
+            "on what judges it."
+        )
+    return (
+        f"Fit it alone with `orthaug fit` and structure “{row.name}”, whose report has its "
+        "residuals and bias."
+    )
 
 
 def _word(row: RowResult) -> str:
     assert row.validation is not None
-    return {"helps": "helps", "no_help": "does not help", "hurts": "hurts"}.get(row.validation.verdict, "–")
+    return {"helps": "helps", "no_help": "does not help", "hurts": "hurts"}.get(
+        row.validation.verdict, "–"
+    )
 
 
 def _told_error(error: float, part: str) -> str:
@@ -147,7 +183,9 @@ def _worse(scores: dict[str, PartScores]) -> tuple[float, str] | None:
 
 
 def _worst(scores: dict[str, PartScores], kind: str = "simulation") -> tuple[float | None, str]:
-    """NRMSE of the free run on the held-out part where it is largest, RMS over outputs; of training if none is.
+    """NRMSE of the free run on the held-out part where it is largest, RMS over outputs.
+
+    Of training if none is.
 
     Args:
         kind: `prediction` for that of one step ahead.
@@ -163,8 +201,15 @@ def _worst(scores: dict[str, PartScores], kind: str = "simulation") -> tuple[flo
 
 
 def _code(result: FitResult | RowResult) -> str | None:
-    """Return the verdict on the learner; None without one, and where the model is the physics alone that was taken for it."""
-    return None if result.validation is None or _warned(result, "physics_alone") else result.validation.verdict
+    """Return the verdict on the learner.
+
+    None without one, and where the model is the physics alone that was taken for it.
+    """
+    return (
+        None
+        if result.validation is None or _warned(result, "physics_alone")
+        else result.validation.verdict
+    )
 
 
 def _warned(result: FitResult | RowResult, code: str) -> bool:
@@ -178,18 +223,31 @@ def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
         yield f"its free run diverges on {_joined(runaway)}"
     if _code(result) == "hurts":
         yield "its learner makes the free run worse than physics alone"
-    if not data.tests and not data.validation and not (result.validation and result.validation.trials):
+    if (
+        not data.tests
+        and not data.validation
+        and not (result.validation and result.validation.trials)
+    ):
         yield "it was never tried on data that it was not fitted to"
     if (result.status if isinstance(result, RowResult) else result.status.code) in _STOPPED:
         yield "training stopped before it converged"
     if _warned(result, "spectral_radius_above_one"):
-        yield "it is not proved stable, for its local spectral radius is above 1 on a part of its free run"
+        yield (
+            "it is not proved stable, for its local spectral radius is above 1 on a part of "
+            "its free run"
+        )
     biased = [row.name for row in _rows(result) if _biased(row)]
     if biased:
         one = len(biased) == 1
         carry = _size_of_bias([row for row in _rows(result) if _biased(row)])
-        guessed = any(row.bias and (row.bias.share or 0.0) < SURE_SHARE for row in _rows(result) if _biased(row))
-        carry = f"probably {carry}" if guessed and getattr(result, "motion", None) is None else carry
+        guessed = any(
+            row.bias and (row.bias.share or 0.0) < SURE_SHARE
+            for row in _rows(result)
+            if _biased(row)
+        )
+        carry = (
+            f"probably {carry}" if guessed and getattr(result, "motion", None) is None else carry
+        )
         yield f"the estimate{'' if one else 's'} of {_joined(biased)} {carry}"
     if result.residuals is not None and result.residuals.verdict in ("unmodelled", "sensor_noise"):
         coarse = list(result.residuals.steps or {})
@@ -204,19 +262,36 @@ def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
     worse = _worse(result.scores)
     if worse is not None:
         times = number(worse[0], 2)
-        yield f"its error on {worse[1]} is {times} times that on the training data, so the band is too narrow"
+        yield (
+            f"its error on {worse[1]} is {times} times that on the training data, so the band "
+            "is too narrow"
+        )
     if result.validation is not None and result.validation.extrapolation:
         left = dict.fromkeys(entry.part for entry in result.validation.extrapolation)
-        yield f"{_joined(list(left))} {'leaves' if len(left) == 1 else 'leave'} the range of the training data"
+        yield (
+            f"{_joined(list(left))} {'leaves' if len(left) == 1 else 'leave'} the range of the "
+            "training data"
+        )
 
 
 def _size_of_bias(rows: Sequence[ParameterResult]) -> str:
-    """Return how large the biases are; in figures where one is far larger than its standard error."""
+    """Return how large the biases are.
+
+    In figures where one is far larger than its standard error.
+    """
     one = len(rows) == 1
     worst = max(rows, key=_errors_of)
     if _errors_of(worst) < _FAR or worst.bias is None:
-        return "carries a bias larger than its standard error" if one else "carry biases larger than their errors"
-    share = "" if not worst.value else f", {percent(abs((worst.bias.value or 0.0) / worst.value))} of its value"
+        return (
+            "carries a bias larger than its standard error"
+            if one
+            else "carry biases larger than their errors"
+        )
+    share = (
+        ""
+        if not worst.value
+        else f", {percent(abs((worst.bias.value or 0.0) / worst.value))} of its value"
+    )
     size = f"{plain_number(_errors_of(worst))} standard errors{share}"
     return f"carries a bias of {size}" if one else f"carry biases, that of {worst.name} of {size}"
 
@@ -245,8 +320,9 @@ def _use(result: FitResult, level: str) -> str:
     predicts = ahead is not None and ahead <= (_GOOD if level == "bad" else _POOR)
     if level == "bad" and ahead is not None and ahead > _POOR:
         return (
-            "Use it for nothing but to look for what is missing: not even its prediction of the next sample holds, "
-            f"which leaves {percent(ahead)} of the output's deviation {_on(part)}."
+            "Use it for nothing but to look for what is missing: not even its prediction of "
+            f"the next sample holds, which leaves {percent(ahead)} of the output's deviation "
+            f"{_on(part)}."
         )
     if level == "bad" and not (known and predicts):
         return "Use it for nothing but to look for what is missing."
@@ -257,17 +333,28 @@ def _use(result: FitResult, level: str) -> str:
     told += f" and to read {_joined(known)} as physics" if known else ""
     if sure and not known:
         cover = "interval does" if len(sure) == 1 else "intervals do"
-        told += f", but do not read {_joined(sure)} as physics yet: the {cover} not cover what the residual still holds"
-    told += f"; {_joined(others)} {_is(others)} too uncertain or biased to be read so" if others else ""
+        told += (
+            f", but do not read {_joined(sure)} as physics yet: the {cover} not cover what the "
+            "residual still holds"
+        )
+    told += (
+        f"; {_joined(others)} {_is(others)} too uncertain or biased to be read so" if others else ""
+    )
     if shared:
-        told += f"; {_joined(shared)} {_is(shared)} what the physics nearest to the data has, for the learner could"
+        told += (
+            f"; {_joined(shared)} {_is(shared)} what the physics nearest to the data has, for "
+            "the learner could"
+        )
         told += f" imitate {'it' if len(shared) == 1 else 'them'}"
     return f"Use it to {told}."
 
 
 def _noise_alone(result: FitResult) -> bool:
     """Return whether the residual shows nothing that would bias the parameters."""
-    return result.residuals is None or result.residuals.verdict not in ("unmodelled", "sensor_noise")
+    return result.residuals is None or result.residuals.verdict not in (
+        "unmodelled",
+        "sensor_noise",
+    )
 
 
 def _known(row: ParameterResult) -> bool:
@@ -285,22 +372,33 @@ def _is(names: list[str]) -> str:
 
 
 def _then(result: FitResult) -> str:
-    """Return the first thing to do: a change that bettered the free run in a trial; else an option, named as one."""
+    """Return the first thing to do: a change that bettered the free run in a trial.
+
+    Else an option, named as one.
+    """
     if result.advice:
         return result.advice[0].text
     option = _option(result)
     if option is not None:
         return f"An option, not tried here: {option}."
     if result.advice_trials is not None and result.advice_trials.tried:
-        text = "None of the changes that were tried betters the free run; export it (`orthaug export`), or design the"
+        text = (
+            "None of the changes that were tried betters the free run; export it (`orthaug "
+            "export`), or design the"
+        )
         return f"{text} next experiment."
-    return "Nothing further is predicted to help; export it (`orthaug export`) or design the next experiment."
+    return (
+        "Nothing further is predicted to help; export it (`orthaug export`) or design the next "
+        "experiment."
+    )
 
 
 def _option(result: FitResult) -> str | None:
     """Return what may help and was not tried, as the middle of a sentence."""
     if _code(result) == "hurts":
-        return 'physics alone (`learner.kind = "none"`), or a learner of other inputs or fewer neurons'
+        return (
+            'physics alone (`learner.kind = "none"`), or a learner of other inputs or fewer neurons'
+        )
     predicted = None if result.advice_trials is not None else _predicted(result)
     if predicted is not None:
         return predicted
@@ -313,33 +411,57 @@ def _option(result: FitResult) -> str | None:
     if result.validation is not None and result.validation.extrapolation:
         entry = result.validation.extrapolation[0]
         low, high = entry.found
-        return f"training data that reach {entry.regressor} from {number(low, 3)} to {number(high, 3)}"
+        return (
+            f"training data that reach {entry.regressor} from {number(low, 3)} to {number(high, 3)}"
+        )
     if _warned(result, _RAN_AWAY):
         return "data over the range that the free run leaves"
     if _warned(result, "closed_loop"):
-        return "data with the reference recorded, to model the whole loop, with more of its motion, or in open loop"
+        return (
+            "data with the reference recorded, to model the whole loop, with more of its "
+            "motion, or in open loop"
+        )
     if _undecided(result):
-        return "the learner (`training.fallback = false`), for cross-validation leaves undecided if it helps"
+        return (
+            "the learner (`training.fallback = false`), for cross-validation leaves undecided "
+            "if it helps"
+        )
     if result.residuals is not None and result.residuals.steps:
         steps = _joined(list(result.residuals.steps))
-        return f"fewer samples, or a finer measurement, for the steps of {steps} are as large as the one-step residual"
+        return (
+            f"fewer samples, or a finer measurement, for the steps of {steps} are as large as "
+            "the one-step residual"
+        )
     if not _noise_alone(result):
-        return "physics of your own for what the residual still follows (residual tests; `[[suspects]]` tests a form)"
+        return (
+            "physics of your own for what the residual still follows (residual tests; "
+            "`[[suspects]]` tests a form)"
+        )
     worse = _worse(result.scores)
-    return None if worse is None else f"more training data of the kind of {worse[1]}, on which the error is larger"
+    return (
+        None
+        if worse is None
+        else f"more training data of the kind of {worse[1]}, on which the error is larger"
+    )
 
 
 def _predicted(result: FitResult) -> str | None:
     """Return the change with the largest gain that findings predict, where none was tried."""
     causes = [row.bias for row in _rows(result) if _biased(row) and row.bias]
     cause = max(causes, key=lambda bias: bias.share or 0.0, default=None)
-    missing = result.residuals.missing.terms if result.residuals and result.residuals.missing else []
+    missing = (
+        result.residuals.missing.terms if result.residuals and result.residuals.missing else []
+    )
     if missing and result.residuals is not None and result.residuals.verdict == "unmodelled":
         return f"the term {missing[0].expression} in the equation of {missing[0].equation}"
     if cause is not None and (cause.share or 0.0) > _NAMED:
         return _cause_option(cause, result.learns)
     tried = result.validation is not None and _code(result) != "helps"
-    changes = [c for c in result.residuals.changes if c.kind != "learner" or not tried] if result.residuals else []
+    changes = (
+        [c for c in result.residuals.changes if c.kind != "learner" or not tried]
+        if result.residuals
+        else []
+    )
     if changes:
         return _change(changes[0])
     return None if cause is None else _cause_option(cause, result.learns)
@@ -355,7 +477,11 @@ def _cause_option(cause: BiasResult, learned: bool) -> str:
 def _undecided(result: FitResult) -> bool:
     """Return whether physics alone was handed over although the learner may help."""
     ratio = None if result.validation is None else result.validation.ratio
-    return _warned(result, "physics_alone") and ratio is not None and (ratio.value or 1.0) < 1 < (ratio.high or 0.0)
+    return (
+        _warned(result, "physics_alone")
+        and ratio is not None
+        and (ratio.value or 1.0) < 1 < (ratio.high or 0.0)
+    )
 
 
 def _change(change: object) -> str:

@@ -91,7 +91,9 @@ class ResidualTestResult(Content):
     @property
     def strongest_acf(self) -> float | None:
         """The autocorrelation that is the largest in size, with its sign."""
-        return max((value for value in (self.acf or [])[1:] if value is not None), key=abs, default=None)
+        return max(
+            (value for value in (self.acf or [])[1:] if value is not None), key=abs, default=None
+        )
 
 
 class RunningTestResult(Content):

@@ -40,7 +40,9 @@ SCHEMA = 2
 class ResultHeader(Content):
     """What every result begins with."""
 
-    schema_number: Literal[2] = Field(SCHEMA, validation_alias="schema", serialization_alias="schema")
+    schema_number: Literal[2] = Field(
+        SCHEMA, validation_alias="schema", serialization_alias="schema"
+    )
     orthaug: str = __version__
 
 
@@ -107,7 +109,9 @@ class RestartResult(Content):
 class ParameterResult(Content):
     """A parameter with its interval."""
 
-    absent: ClassVar = frozenset({"derived_unit", "one_step", "profile95", "plain_std", "shared", "ci95_counts"})
+    absent: ClassVar = frozenset(
+        {"derived_unit", "one_step", "profile95", "plain_std", "shared", "ci95_counts"}
+    )
 
     name: str
     unit: str
@@ -245,7 +249,10 @@ class EquationResult(Content):
 
 
 class FocusCandidateResult(Content):
-    """A model whose free run was compared where nothing was fitted; `error` in standard deviations of the output."""
+    """A model whose free run was compared where nothing was fitted.
+
+    `error` in standard deviations of the output.
+    """
 
     focus: str
     learner: Flag
@@ -269,7 +276,9 @@ class PhysicsAloneResult(Content):
 class FitResult(ResultHeader):
     """What `orthaug fit` leaves."""
 
-    absent: ClassVar = frozenset({"motion", "terms", "equation", "unexplained", "standard_errors_by"})
+    absent: ClassVar = frozenset(
+        {"motion", "terms", "equation", "unexplained", "standard_errors_by"}
+    )
 
     spec: dict[str, Any]
     data: DataResult
@@ -278,7 +287,9 @@ class FitResult(ResultHeader):
     parameters: list[ParameterResult]
     standard_errors: str | None
     standard_errors_by: str | None = None
-    """How they were made, a key of `fitting.estimates.STD_KINDS`; None for those of white and even errors."""
+    """How they were made, a key of `fitting.estimates.STD_KINDS`; None for those of white and even
+    errors.
+    """
     physical_parameters: list[ParameterResult] | None
     physical_consistency: ConsistencyResult | None
     sensitivities: dict[str, ByName] | None
@@ -312,7 +323,10 @@ class FitResult(ResultHeader):
 
     @property
     def learns(self) -> bool:
-        """Return whether biases are of what a learner found; of a motion without one they are of what the free run leaves."""
+        """Return whether biases are of what a learner found.
+
+        Of a motion without one they are of what the free run leaves.
+        """
         return self.motion is None or self.shared is not None
 
 
@@ -396,7 +410,10 @@ class DesignResult(Content):
     @classmethod
     def of(cls, design: Design) -> DesignResult:
         """Return the content of a design, without its signal."""
-        by_name = {key: dict(zip(design.names, getattr(design, key), strict=True)) for key in ("bias", "std")}
+        by_name = {
+            key: dict(zip(design.names, getattr(design, key), strict=True))
+            for key in ("bias", "std")
+        }
         return cls.model_validate({**vars(design), **by_name, "samples": len(design.signal)})
 
 
@@ -430,7 +447,17 @@ def physical_rows(
     estimate: PhysicalEstimate, profiles: dict[str, tuple[float, float]] | None = None
 ) -> list[ParameterResult]:
     """Return the physical parameters as results list them, with the profile intervals that were made."""
-    columns = (estimate.names, estimate.units, estimate.initial, estimate.value, estimate.std, estimate.ci95)
+    columns = (
+        estimate.names,
+        estimate.units,
+        estimate.initial,
+        estimate.value,
+        estimate.std,
+        estimate.ci95,
+    )
     keys = ("name", "unit", "initial", "value", "std", "ci95")
     rows = [dict(zip(keys, row, strict=True)) for row in zip(*columns, strict=True)]
-    return [ParameterResult.model_validate(row | {"profile95": (profiles or {}).get(row["name"])}) for row in rows]
+    return [
+        ParameterResult.model_validate(row | {"profile95": (profiles or {}).get(row["name"])})
+        for row in rows
+    ]

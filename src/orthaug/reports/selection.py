@@ -96,15 +96,23 @@ def selection_text(result: SelectResult) -> str:
     orders = Orders(result.orders.na, tuple(result.orders.nb), tuple(result.orders.nk))
     lines = [f"orders       {orders}"]
     lines += [
-        f"delay        {Delay(delay.input, delay.correlation, delay.fitted, delay.square)}" for delay in result.delays
+        f"delay        {Delay(delay.input, delay.correlation, delay.fitted, delay.square)}"
+        for delay in result.delays
     ]
     if result.nonlinearity is not None:
         lines.append(f"nonlinear    {result.nonlinearity.text}")
     lines.append(f"learner      {_learner(result)}")
     if result.terms:
         width = max(len(term.term) for term in result.terms)
-        lines += ["", f"{'term':<{width}}  chosen over random halves of the data, left beside physics and other terms"]
-        lines += [f"{t.term:<{width}}  {_percent(t.chosen):>5}  {_percent(t.left):>6}" for t in result.terms]
+        lines += [
+            "",
+            f"{'term':<{width}}  chosen over random halves of the data, left beside physics "
+            "and other terms",
+        ]
+        lines += [
+            f"{t.term:<{width}}  {_percent(t.chosen):>5}  {_percent(t.left):>6}"
+            for t in result.terms
+        ]
         lines += _physics(result)
     for stage in dict.fromkeys(row.stage for row in result.models):
         lines += ["", *_table(stage, [row for row in result.models if row.stage == stage])]
@@ -122,11 +130,20 @@ def _physics(result: SelectResult) -> list[str]:
     if not result.physics:
         return []
     width = max(9, *(len(shift.parameter) for shift in result.physics))
-    lines = ["", f"{'parameter':<{width}}  {'physics alone':>22}  {'with the terms':>22}  {'left':>6}"]
+    lines = [
+        "",
+        f"{'parameter':<{width}}  {'physics alone':>22}  {'with the terms':>22}  {'left':>6}",
+    ]
     for shift in result.physics:
-        before, after = _figure(shift.before, shift.before_std), _figure(shift.after, shift.after_std)
+        before, after = (
+            _figure(shift.before, shift.before_std),
+            _figure(shift.after, shift.after_std),
+        )
         mark = "  moves by more than its standard errors allow" if shift.moved else ""
-        lines.append(f"{shift.parameter:<{width}}  {before:>22}  {after:>22}  {_percent(shift.left):>6}{mark}")
+        lines.append(
+            f"{shift.parameter:<{width}}  {before:>22}  {after:>22}  "
+            f"{_percent(shift.left):>6}{mark}"
+        )
     condition = "infinite" if result.condition is None else f"{result.condition:.3g}"
     return [*lines, f"condition number of physics and terms together: {condition}"]
 
@@ -157,5 +174,8 @@ def _table(stage: str, rows: list[SelectionRowResult]) -> list[str]:
         score = "runs away" if row.score is None else f"{row.score:.5g}"
         error = "–" if row.standard_error is None else f"{row.standard_error:.2g}"
         mark = "→" if row.chosen else " "
-        lines.append(f"{mark:<8} {row.size:5d}  {score:>11}  {error:>10}  {row.seconds or 0:6.1f}   {row.model}")
+        lines.append(
+            f"{mark:<8} {row.size:5d}  {score:>11}  {error:>10}  {row.seconds or 0:6.1f}   "
+            f"{row.model}"
+        )
     return lines

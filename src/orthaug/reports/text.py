@@ -67,7 +67,10 @@ def _as_doubted(line: str, result: FitResult) -> str:
 
 def _advice_lines(result: FitResult) -> list[str]:
     """Changes of the spec that bettered the free run in a trial, and an account of all trials."""
-    lines = [f"{'Next: ' if i == 0 else 'Or: '}{advice.text}" for i, advice in enumerate(result.advice[:ADVISED])]
+    lines = [
+        f"{'Next: ' if i == 0 else 'Or: '}{advice.text}"
+        for i, advice in enumerate(result.advice[:ADVISED])
+    ]
     return lines + ([result.advice_trials.text] if result.advice_trials is not None else [])
 
 
@@ -84,7 +87,11 @@ def check_text(result: CheckResult) -> str:
         f"usable rows      {result.rows}",
         f"excitation       rank {data.rank} of {data.columns} on the data, condition {condition}",
         f"identifiability  rank {physics.rank} of {physics.columns} {where}: "
-        + ("the parameters can be told apart" if physics.identifiable else "no data can tell the parameters apart"),
+        + (
+            "the parameters can be told apart"
+            if physics.identifiable
+            else "no data can tell the parameters apart"
+        ),
     ]
     for group in physics.inseparable:
         lines.append(f"  inseparable by any data: {', '.join(group)}")
@@ -98,9 +105,10 @@ def check_text(result: CheckResult) -> str:
     if result.bias:
         lines += [
             "",
-            "Bias of each parameter if a term is missing from the physics. Size: its share of the output's deviation, "
-            "1 % where no coefficient is given. Removed by: a measure, if some weighting of these points leaves none; "
-            "the learner, if it sees the term, from what it could not imitate.",
+            "Bias of each parameter if a term is missing from the physics. Size: its share of "
+            "the output's deviation, 1 % where no coefficient is given. Removed by: a measure, "
+            "if some weighting of these points leaves none; the learner, if it sees the term, "
+            "from what it could not imitate.",
             *_suspect_lines(result.bias),
         ]
     return "\n".join(fold([*lines, *warning_lines(result.warnings)]))
@@ -112,7 +120,11 @@ def _shared_lines(shared: SharedResult) -> list[str]:
     if shared.alternatives:
         head = ["with learner.inputs", "shared directions", "determined beside it"]
         rows = [
-            [", ".join(other.inputs), str(other.shared), ", ".join([*other.determined, *(other.physical or [])]) or "–"]
+            [
+                ", ".join(other.inputs),
+                str(other.shared),
+                ", ".join([*other.determined, *(other.physical or [])]) or "–",
+            ]
             for other in shared.alternatives
         ]
         lines += [f"  {line}" for line in table([head, *rows])]
@@ -120,11 +132,18 @@ def _shared_lines(shared: SharedResult) -> list[str]:
 
 
 def compare_text(result: CompareResult, verdicts: Mapping[str, Verdict]) -> str:
-    """Return two tables, parameters with standard errors and scores on every part; then the verdicts on each row."""
+    """Return two tables, parameters with standard errors and scores on every part.
+
+    Then the verdicts on each row.
+    """
     lines = [*table(_parameter_cells(result)), "", *table(_score_cells(result.comparison))]
     if result.chosen:
         lines += ["", "* chosen on the validation part"]
-    told = [f"{row.name}: {row.residuals.text}" for row in result.comparison if row.residuals is not None]
+    told = [
+        f"{row.name}: {row.residuals.text}"
+        for row in result.comparison
+        if row.residuals is not None
+    ]
     lines += ["", *told] if told else []
     told = [f"{kind}: {verdict.summary}" for kind, verdict in verdicts.items()]
     beyond = dict.fromkeys(f"{e}." for verdict in verdicts.values() for e in verdict.extrapolation)
@@ -133,7 +152,9 @@ def compare_text(result: CompareResult, verdicts: Mapping[str, Verdict]) -> str:
     lines += [f"left out: {kind}: {why}" for kind, why in result.left_out.items()]
     lines += warning_lines(result.warnings)
     for row in result.comparison:
-        lines += [f"warning: {row.name}: {w.text}" for w in row.warnings if w not in result.warnings]
+        lines += [
+            f"warning: {row.name}: {w.text}" for w in row.warnings if w not in result.warnings
+        ]
     return "\n".join(fold(lines)).rstrip()
 
 
@@ -142,7 +163,8 @@ def split_text(result: SplitResult) -> str:
     detail = result.measure_detail
     support = "–" if detail.support is None else f"{100 * detail.support:.0f} %"
     lines = [
-        f"measure     {result.measure}, {detail.points} points, {support} of it within reach of the data",
+        f"measure     {result.measure}, {detail.points} points, {support} of it within reach "
+        "of the data",
         *parameter_table("parameter", result.parameters),
     ]
     return "\n".join(fold([*lines, *warning_lines(result.warnings)]))
@@ -162,7 +184,9 @@ def design_text(result: DesignResult) -> str:
     rows = [["signal", "error", "bias", "std", "condition"]]
     for signal in result.candidates[:SHOWN]:
         error = None if signal.cost is None else float(np.sqrt(signal.cost))
-        rows.append([signal.name, *map(_or_infinite, (error, signal.bias, signal.std, signal.condition))])
+        rows.append(
+            [signal.name, *map(_or_infinite, (error, signal.bias, signal.std, signal.condition))]
+        )
     lines = [
         f"input       {result.kind}",
         f"predicted   relative error of θ {_or_infinite(result.relative_error)}, "
@@ -195,9 +219,16 @@ def _suspect_lines(suspects: Sequence[SuspectResult]) -> list[str]:
     for suspect in suspects:
         guess = suspect.coefficient
         cosine = "–" if suspect.cosine is None else f"{suspect.cosine:.3f}"
-        size = "1 %" if guess is None else "–" if suspect.size is None else percent(abs(guess) * suspect.size)
+        size = (
+            "1 %"
+            if guess is None
+            else "–"
+            if suspect.size is None
+            else percent(abs(guess) * suspect.size)
+        )
         biases = (
-            "–" if share is None else percent(_rounded(share) / 100, sign="+") for share in suspect.percent.values()
+            "–" if share is None else percent(_rounded(share) / 100, sign="+")
+            for share in suspect.percent.values()
         )
         rows.append([suspect.name, size, *biases, cosine, suspect.removed_by or "–"])
     return table(rows)
@@ -207,13 +238,23 @@ def _bias_lines(result: FitResult) -> list[str]:
     """Return the bias of every parameter by what the learner found, and the interval that covers it."""
     rows = [*result.parameters, *(result.physical_parameters or ())]
     lines, width, causes = [], _width([row for row in rows if row.bias]), biased_by(rows)
-    what = ("learner found" if result.learns else "free run leaves") + (" in one equation" if len(causes) > 1 else "")
+    what = ("learner found" if result.learns else "free run leaves") + (
+        " in one equation" if len(causes) > 1 else ""
+    )
     for (cause, share), own in causes.items():
         if result.learns and share < SURE_SHARE:
-            lines.append(f"What the {what} looks most like {cause}: {percent(share)} of it. The bias if it is that:")
+            lines.append(
+                f"What the {what} looks most like {cause}: {percent(share)} of it. The bias if "
+                "it is that:"
+            )
         else:
-            lines.append(f"{100 * share:.0f} % of what the {what} is {cause}. The bias that implies:")
-        head = f"{'parameter':<{width}}  {'bias':>11}  {'of std':>7}  {'of value':>9}  {'95 % interval with it':^29}"
+            lines.append(
+                f"{100 * share:.0f} % of what the {what} is {cause}. The bias that implies:"
+            )
+        head = (
+            f"{'parameter':<{width}}  {'bias':>11}  {'of std':>7}  {'of value':>9}  "
+            f"{'95 % interval with it':^29}"
+        )
         lines += [head, *(_bias_line(row, width) for row in own if row.value is not None)]
     return lines
 
@@ -237,7 +278,9 @@ def _physical_lines(result: FitResult) -> list[str]:
     rows = result.physical_parameters or []
     width = _width(rows)
     between = "95 %, noise only" if result.noise_only else "95 % interval"
-    lines = [f"{'physical':<{width}}  {'value':>14}  {'std':>11}  {between:^29}  {'initial':>11}  unit"]
+    lines = [
+        f"{'physical':<{width}}  {'value':>14}  {'std':>11}  {between:^29}  {'initial':>11}  unit"
+    ]
     for row in rows:
         cells = _value_cells(row, row.profile95 or row.ci95, width)
         lines.append(f"{cells}  {row.initial:11.5g}  {row.unit}".rstrip())
@@ -253,7 +296,9 @@ def _width(rows: Sequence[ParameterResult]) -> int:
 def _value_cells(row: ParameterResult, interval: Sequence[float | None] | None, width: int) -> str:
     """Name, value, standard error and interval."""
     spread = f"{row.std:11.4g}" if row.std is not None else f"{'–':>11}"
-    reach = f"[{_limit(interval[0])}, {_limit(interval[1])}]" if interval is not None else f"{'–':^29}"
+    reach = (
+        f"[{_limit(interval[0])}, {_limit(interval[1])}]" if interval is not None else f"{'–':^29}"
+    )
     return f"{row.name:<{width}}  {row.value:14.8g}  {spread}  {reach}"
 
 
@@ -267,9 +312,14 @@ def _score_lines(fit: Estimate | MotionEstimate, result: FitResult) -> list[str]
     for part, scores in result.scores.items():
         for kind, score in scores.kinds.items():
             for i, channel in enumerate(fit.model.outputs):
-                cells = (None if values is None else values[i] for values in (score.rmse, score.nrmse, score.fit))
+                cells = (
+                    None if values is None else values[i]
+                    for values in (score.rmse, score.nrmse, score.fit)
+                )
                 rmse, nrmse, percent = ("–" if c is None else f"{c:.6g}" for c in cells)
-                rows.append([part, kind, channel.name, f"{rmse} {channel.unit}".strip(), nrmse, percent])
+                rows.append(
+                    [part, kind, channel.name, f"{rmse} {channel.unit}".strip(), nrmse, percent]
+                )
     return [*table(rows), *_residual_lines(result)] if len(rows) > 1 else []
 
 
@@ -285,12 +335,18 @@ def _residual_lines(result: FitResult) -> list[str]:
             largest += [(f"{name} by {cross.values[len(acf) - 1 + cross.lag]:.2g} at lag {cross.lag}", cross.band)
                         for name, cross in found]  # fmt: skip
             told = ", ".join(f"{words} (band {band:.1g})" for words, band in largest)
-            lines.append(f"{part}: over all {test.n} rows the one-step residual of {test.name} follows {told}.")
+            lines.append(
+                f"{part}: over all {test.n} rows the one-step residual of {test.name} follows "
+                f"{told}."
+            )
     return lines
 
 
 def response_text(response: Response) -> str:
-    """Scores of a response where its outputs were measured and it has a value on every row; otherwise nothing."""
+    """Scores of a response where its outputs were measured and it has a value on every row.
+
+    Otherwise nothing.
+    """
     if any(t.measured is None or t.diverged for t in response.trajectories):
         return ""
     return scores_text(response.scores(), response.outputs, response.horizon)
@@ -307,7 +363,9 @@ def scores_text(scored: Scores, outputs: Sequence[Channel], horizon: int | None)
 
 
 def _parameter_cells(result: CompareResult) -> list[list[str]]:
-    names = list(dict.fromkeys(parameter.name for row in result.comparison for parameter in row.parameters))
+    names = list(
+        dict.fromkeys(parameter.name for row in result.comparison for parameter in row.parameters)
+    )
     rows = [["structure", *names, "‖QᵀF̃‖/‖F‖", "‖F̃‖/‖Φθ̂‖", "weights", "time [s]"]]
     for row in result.comparison:
         defect, share = row.orthogonality_defect, row.learner_to_physics

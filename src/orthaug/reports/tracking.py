@@ -39,9 +39,13 @@ def track_text(result: TrackResult) -> str:
     memory = "everything" if result.memory is None else f"{result.memory:.4g} s"
     lines = [
         f"rows        {result.rows}, {result.time:g} s",
-        f"memory      {memory} (forgetting {result.forgetting:.8g}), worth {result.effective_rows:.0f} rows",
+        f"memory      {memory} (forgetting {result.forgetting:.8g}), worth "
+        f"{result.effective_rows:.0f} rows",
     ]
-    told = [f"the residual has left its band at {alarm.time:g} s (row {alarm.row})" for alarm in result.alarms]
+    told = [
+        f"the residual has left its band at {alarm.time:g} s (row {alarm.row})"
+        for alarm in result.alarms
+    ]
     lines += [f"alarm       {sentence}" for sentence in told] or ["alarm       none"]
     if told:
         stands = "is still out of it" if result.alarmed else "has come back"

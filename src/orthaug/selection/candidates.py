@@ -36,8 +36,9 @@ class Candidates:
 def candidates(problem: Problem, library: TermLibrary) -> Candidates:
     """Return the terms that the physics does not express already, of more than `SHORTLIST` the most promising.
 
-    A term is promising by what it lowers the error one step ahead, beside the physics and beside those that are picked
-    between rounds of looking through all (iterated screening). Nothing of the size rows × terms is kept.
+    A term is promising by what it lowers the error one step ahead, beside the physics and beside
+    those that are picked between rounds of looking through all (iterated screening). Nothing of the
+    size rows × terms is kept.
 
     Raises:
         InputError: no term is left.
@@ -49,11 +50,17 @@ def candidates(problem: Problem, library: TermLibrary) -> Candidates:
     own = finite & (left > DEPENDENT * norms) & (norms > 0)
     notes = _notes(library, finite, own)
     if not own.any():
-        raise InputError("the physics expresses all candidate terms already; give other functions, or a higher degree.")
+        raise InputError(
+            "the physics expresses all candidate terms already; give other functions, or a "
+            "higher degree."
+        )
     kept = np.flatnonzero(own)
     if len(kept) > SHORTLIST:
         kept = _promising(runs, known, kept)
-        text = f"of {own.sum()} terms the {len(kept)} that promise most one step ahead were looked at on the free run."
+        text = (
+            f"of {own.sum()} terms the {len(kept)} that promise most one step ahead were "
+            "looked at on the free run."
+        )
         notes.append(Warning("terms_shortlisted", text))
     return Candidates(library.picked(kept), tuple(notes))
 
@@ -68,9 +75,13 @@ class _ModelColumns:
     @classmethod
     def of(cls, runs: TermRuns) -> _ModelColumns:
         """Of the physics alone."""
-        every = (runs.physics(*runs.rows(experiment)) for experiment in runs.problem.record.experiments)
+        every = (
+            runs.physics(*runs.rows(experiment)) for experiment in runs.problem.record.experiments
+        )
         phi, target = zip(*every, strict=True)
-        return cls(np.zeros((sum(map(len, target)), 0)), np.concatenate(target)).beside(np.concatenate(phi))
+        return cls(np.zeros((sum(map(len, target)), 0)), np.concatenate(target)).beside(
+            np.concatenate(phi)
+        )
 
     def beside(self, columns: Float[np.ndarray, "N m"]) -> _ModelColumns:
         """With further columns."""
@@ -82,7 +93,9 @@ class _ModelColumns:
         u = u[:, sigma > 1e-10]
         return _ModelColumns(np.column_stack([self.q, u]), self.left - u @ (u.T @ self.left))
 
-    def weigh(self, runs: TermRuns, chosen: Sequence[int] | np.ndarray | None = None) -> tuple[Vector, Vector, Vector]:
+    def weigh(
+        self, runs: TermRuns, chosen: Sequence[int] | np.ndarray | None = None
+    ) -> tuple[Vector, Vector, Vector]:
         """Of each term its squared norm, what of that the model leaves, and its product with the error."""
         every = np.arange(len(runs.library)) if chosen is None else np.asarray(chosen)
         norms, left, right = (np.zeros(len(every)) for _ in range(3))
@@ -98,7 +111,9 @@ class _ModelColumns:
         return norms, left, right
 
 
-def _chunks(runs: TermRuns, chosen: Sequence[int] | np.ndarray) -> Iterator[tuple[slice, Float[np.ndarray, "K m"]]]:
+def _chunks(
+    runs: TermRuns, chosen: Sequence[int] | np.ndarray
+) -> Iterator[tuple[slice, Float[np.ndarray, "K m"]]]:
     numbers, begin = runs.library.numbers[np.asarray(chosen, dtype=int)], 0
     for experiment in runs.problem.record.experiments:
         factors = runs.factors(experiment)
@@ -121,7 +136,9 @@ def _promising(runs: TermRuns, known: _ModelColumns, among: np.ndarray) -> np.nd
         columns = np.concatenate([terms for _, terms in _chunks(runs, new)], axis=1).T
         rest = columns - known.q @ (known.q.T @ columns)
         square = float(known.left @ known.left)
-        picks = forward(Equations(rest.T @ rest, rest.T @ known.left, square, len(rest)), (), _PICKED)
+        picks = forward(
+            Equations(rest.T @ rest, rest.T @ known.left, square, len(rest)), (), _PICKED
+        )
         known = known.beside(columns[:, [pick.column for pick in picks]])
     return np.array(sorted(found))
 
@@ -140,4 +157,6 @@ def _notes(library: TermLibrary, finite: np.ndarray, own: np.ndarray) -> list[Wa
 
 
 def _named(texts: list[str]) -> str:
-    return ", ".join(texts[:_NAMED]) + (f" and {len(texts) - _NAMED} more" if len(texts) > _NAMED else "")
+    return ", ".join(texts[:_NAMED]) + (
+        f" and {len(texts) - _NAMED} more" if len(texts) > _NAMED else ""
+    )

@@ -1,8 +1,9 @@
 """What has a learner found? Its output over data, regressed on suspected terms and on products of what it sees.
 
-Forward orthogonal regression: the physics is projected out first where the learner shares directions with it, then the
-term that explains most beside those that are in comes next, or a pair that explains more than it and one that is in
-(replacement). Widths, of a Stribeck curve say, are refined with all others in.
+Forward orthogonal regression: the physics is projected out first where the learner shares
+directions with it, then the term that explains most beside those that are in comes next, or a pair
+that explains more than it and one that is in (replacement). Widths, of a Stribeck curve say, are
+refined with all others in.
 """
 
 from __future__ import annotations
@@ -30,8 +31,9 @@ _ROUNDING = 1e-8  # of the largest variance
 class LearnerTarget:
     """How a learner shows what is missing: `target` (r,) is what it shows, `covariance` (r, r) that of its errors.
 
-    `view` (P, r) takes whitened values over all points to that; None where the learner tells no tangent space: then
-    they are taken as they are, less the physics. `size` is the norm of the learner with all that physics expresses.
+    `view` (P, r) takes whitened values over all points to that; None where the learner tells no
+    tangent space: then they are taken as they are, less the physics. `size` is the norm of the
+    learner with all that physics expresses.
     """
 
     linearization: LearnedLinearization
@@ -60,19 +62,31 @@ class LearnerTarget:
         covariance = None
         if tangent.joint is not None:
             k = sigma[:, None] * (inner @ (sigma[:, None] ** 2 * v.T + v.T * ridge))
-            covariance = tangent.joint.of(np.concatenate([np.zeros((len(k), tangent.joint.nt)), k], axis=1))
+            covariance = tangent.joint.of(
+                np.concatenate([np.zeros((len(k), tangent.joint.nt)), k], axis=1)
+            )
         view = u @ smooth.T
         view = view if linearization.response is None else linearization.response.adjoint(view)
         return cls(linearization, q, view, target, covariance, size)
 
     @property
     def noise(self) -> float:
-        """The variance of the learner's errors in a direction, on average; 0 where it is not known."""
-        return 0.0 if self.covariance is None else float(np.trace(self.covariance)) / max(len(self.target), 1)
+        """The variance of the learner's errors in a direction, on average.
+
+        0 where it is not known.
+        """
+        return (
+            0.0
+            if self.covariance is None
+            else float(np.trace(self.covariance)) / max(len(self.target), 1)
+        )
 
     @property
     def p(self) -> float | None:
-        """Of the learner being nothing but its own errors, beside the physics (Wald's test); None if not known."""
+        """Of the learner being nothing but its own errors, beside the physics (Wald's test).
+
+        None if not known.
+        """
         if self.covariance is None:
             return None
         values, vectors = np.linalg.eigh(self.covariance)
@@ -119,14 +133,28 @@ MOST_CANDIDATES = 3000
 TERM = "term"
 """The kind of a product of what the learner sees."""
 _PLAIN = ("coulomb", "quadratic_drag", "cubic", "square_root")
-_WIDE = tuple(kind for kind in ("stribeck", "stribeck_gauss", "dead_zone", "saturation") if kind in WIDTHS)
-_WIDTHS = tuple(2.0 ** (i / 2) for i in range(-8, 3))  # times the median size of what a term acts on
+_WIDE = tuple(
+    kind for kind in ("stribeck", "stribeck_gauss", "dead_zone", "saturation") if kind in WIDTHS
+)
+_WIDTHS = tuple(
+    2.0 ** (i / 2) for i in range(-8, 3)
+)  # times the median size of what a term acts on
 _REFINED = 2.0  # how far, as a factor, a width is moved from where it was found
-_COMPLEXITY = dict.fromkeys(_PLAIN, 1) | {"stribeck": 3, "stribeck_gauss": 3, "dead_zone": 4, "saturation": 4}
+_COMPLEXITY = dict.fromkeys(_PLAIN, 1) | {
+    "stribeck": 3,
+    "stribeck_gauss": 3,
+    "dead_zone": 4,
+    "saturation": 4,
+}
 _OWN = 1e-4  # of a candidate's squared norm: what physics, learner and other terms must leave of it
-_TIE, _TIE_UNKNOWN = 2e-4, 2e-3  # share of the learner: within this of the best the simpler term is taken
+_TIE, _TIE_UNKNOWN = (
+    2e-4,
+    2e-3,
+)  # share of the learner: within this of the best the simpler term is taken
 _PART = 0.1  # of what even the best leaves: less tells no two terms apart either
-_DRAWS = 10.0  # variances of the noise in one direction: what two terms with widths differ by at random
+_DRAWS = (
+    10.0  # variances of the noise in one direction: what two terms with widths differ by at random
+)
 _ROUGH, _FINE = 0.03, 1e-3  # of its logarithm
 _TRIED = 10  # kinds of terms, or pairs of kinds, that are refined before the choice
 _BLOCK, _LOOKED = 256, 200  # candidates whose pairs are looked at together, and pairs of them
@@ -155,7 +183,10 @@ class Candidate:
 
     @property
     def complexity(self) -> int:
-        """Of terms that explain as much the simplest is taken. A learner is smooth: clipping imitates jumps last."""
+        """Of terms that explain as much the simplest is taken.
+
+        A learner is smooth: clipping imitates jumps last.
+        """
         return _COMPLEXITY.get(self.kind, 2 + self.text.replace("**", "").count("*"))
 
     @property
@@ -173,8 +204,8 @@ class Candidate:
 class Space:
     """Candidates as the learner would show them, beside the physics: `columns` (K, r), and the learner, `target` (r,).
 
-    The target has norm 1, so that squares are shares of what the learner adds; `norm` is what it had. `tie` is the
-    share by which two terms cannot be told apart.
+    The target has norm 1, so that squares are shares of what the learner adds; `norm` is what it
+    had. `tie` is the share by which two terms cannot be told apart.
     """
 
     linearization: LearnedLinearization
@@ -192,7 +223,9 @@ class Space:
         norm = float(np.linalg.norm(shown.target))
         kept, columns = [], []
         for candidate in candidates:
-            column = shown.unit(linearization.column(linearization.parse(candidate.text), candidate.place))
+            column = shown.unit(
+                linearization.column(linearization.parse(candidate.text), candidate.place)
+            )
             if np.isfinite(column).all() and column @ column > _OWN:
                 kept.append(candidate)
                 columns.append(column)
@@ -209,7 +242,9 @@ class Space:
 
     def column(self, candidate: Candidate) -> Vector:
         """Return a candidate as the learner would show it, (r,)."""
-        return self.shown.unit(self.linearization.column(self.linearization.parse(candidate.text), candidate.place))
+        return self.shown.unit(
+            self.linearization.column(self.linearization.parse(candidate.text), candidate.place)
+        )
 
     def gains(self, chosen: Sequence[Vector]) -> Vector:
         """Share of the learner that each candidate would explain beside those that are chosen (K,)."""
@@ -218,7 +253,9 @@ class Space:
         if basis.size:
             left = left - np.sum((self.columns @ basis) ** 2, axis=1)
         able = left > _OWN
-        return np.where(able, (self.columns @ without(self.target, basis)) ** 2 / np.where(able, left, 1.0), 0.0)
+        return np.where(
+            able, (self.columns @ without(self.target, basis)) ** 2 / np.where(able, left, 1.0), 0.0
+        )
 
     def explained(self, chosen: Sequence[Vector]) -> float:
         """Share of the learner that chosen columns explain together."""
@@ -226,7 +263,10 @@ class Space:
 
 
 def candidates_of(
-    linearization: LearnedLinearization, degree: int, functions: Sequence[str], suspects: Sequence[tuple[str, int]]
+    linearization: LearnedLinearization,
+    degree: int,
+    functions: Sequence[str],
+    suspects: Sequence[tuple[str, int]],
 ) -> tuple[Candidate, ...]:
     """Return what could explain the learner, simple terms first.
 
@@ -238,24 +278,37 @@ def candidates_of(
         InputError: more than can be kept in memory.
     """
     library = TermLibrary.of(linearization.signals[: linearization.seen], degree, functions)
-    plain = [(kind, on) for kind in _PLAIN for on in linearization.signals if _likely(linearization, kind, on)]
+    plain = [
+        (kind, on)
+        for kind in _PLAIN
+        for on in linearization.signals
+        if _likely(linearization, kind, on)
+    ]
     known = {_written(kind, on) for kind, on in plain}
     texts = [text for text in library.texts if text != CONSTANT and text not in known]
-    wide = [(kind, on) for kind in _WIDE for on in linearization.signals if _likely(linearization, kind, on)]
+    wide = [
+        (kind, on)
+        for kind in _WIDE
+        for on in linearization.signals
+        if _likely(linearization, kind, on)
+    ]
     wide = [(kind, on, width) for kind, on in wide for width in _grid(linearization, on)]
     places = range(len(linearization.places))
     count = (len(texts) + len(wide)) * len(places)
     if count > MOST_CANDIDATES:
         raise InputError(
-            f"{linearization.seen} signals to the degree {degree} make {count} candidate terms; at most {MOST_CANDIDATES} are "
-            "looked at. Lower the degree, or give fewer functions."
+            f"{linearization.seen} signals to the degree {degree} make {count} candidate "
+            f"terms; at most {MOST_CANDIDATES} are looked at. Lower the degree, or give fewer "
+            "functions."
         )
     found = [Candidate(TERM, None, None, place, text) for text, place in suspects]
     for place in places:
         found += [Candidate(kind, on, None, place, _written(kind, on)) for kind, on in plain]
         found += [Candidate(TERM, None, None, place, CONSTANT)]
         found += [Candidate(TERM, None, None, place, text) for text in texts]
-        found += [Candidate(kind, on, width, place, _written(kind, on, width)) for kind, on, width in wide]
+        found += [
+            Candidate(kind, on, width, place, _written(kind, on, width)) for kind, on, width in wide
+        ]
     return tuple(found)
 
 
@@ -264,7 +317,9 @@ def _likely(linearization: LearnedLinearization, kind: str, on: str) -> bool:
     if kind not in (*ODD_JUMPS, "square_root"):
         return True
     values = _values(linearization, on)
-    return bool(np.isfinite(values).all()) and (is_level if kind == "square_root" else changes_sign)(values)
+    return bool(np.isfinite(values).all()) and (
+        is_level if kind == "square_root" else changes_sign
+    )(values)
 
 
 def _values(linearization: LearnedLinearization, on: str) -> Vector:
@@ -306,10 +361,13 @@ def _share(space: Space, chosen: Sequence[Candidate]) -> float:
 
 
 def _grown(space: Space, chosen: list[Candidate]) -> list[Candidate]:
-    """Return one term more: beside all that are in, or a pair beside all but one; widths refined, the simplest of the best.
+    """Return one term more: beside all that are in, or a pair beside all but one.
 
-    Friction has the sum of a jump and of a peak, neither of which is the best term alone. Two peaks on one variable, or
-    two widths of another kind, are the difference of nearly the same, and no law.
+    Widths refined, the simplest of the best.
+
+    Friction has the sum of a jump and of a peak, neither of which is the best term alone. Two peaks
+    on one variable, or two widths of another kind, are the difference of nearly the same, and no
+    law.
     """
     trials = [[*chosen, one] for one in _best_single(space, chosen)]
     for i in range(len(chosen)):
@@ -321,7 +379,9 @@ def _grown(space: Space, chosen: list[Candidate]) -> list[Candidate]:
     best = max(shares, default=0.0)
     tie = max(space.tie, _PART * (1 - best))
     able = [i for i, share in enumerate(shares) if share >= best - tie]
-    taken = min(able, key=lambda i: (sum(one.complexity for one in trials[i]), -shares[i]), default=None)
+    taken = min(
+        able, key=lambda i: (sum(one.complexity for one in trials[i]), -shares[i]), default=None
+    )
     return [] if taken is None else _refined(space, trials[taken])
 
 
@@ -349,8 +409,14 @@ def _best_pairs(space: Space, others: Sequence[Candidate]) -> list[tuple[Candida
         rows = slice(begin, begin + _BLOCK)
         across = x[rows] @ x.T
         left = np.outer(size[rows], size) - across**2
-        gain = along[rows, None] ** 2 * size + along**2 * size[rows, None] - 2 * np.outer(along[rows], along) * across
-        gain = np.where(left > _OWN * np.outer(size[rows], size), gain / np.where(left > 0, left, 1.0), 0.0)
+        gain = (
+            along[rows, None] ** 2 * size
+            + along**2 * size[rows, None]
+            - 2 * np.outer(along[rows], along) * across
+        )
+        gain = np.where(
+            left > _OWN * np.outer(size[rows], size), gain / np.where(left > 0, left, 1.0), 0.0
+        )
         gain = np.where(np.arange(len(able)) > begin + np.arange(len(gain))[:, None], gain, 0.0)
         best = np.argpartition(-gain, min(_LOOKED, gain.size - 1), axis=None)[:_LOOKED]
         for flat in best[np.argsort(-gain.ravel()[best], kind="stable")]:
@@ -369,13 +435,17 @@ def _refined(space: Space, chosen: list[Candidate], within: float = _FINE) -> li
             continue
         others = [space.column(one) for one in chosen[:i] + chosen[i + 1 :]]
 
-        def missed(log: float, candidate: Candidate = candidate, others: list[Vector] = others) -> float:
+        def missed(
+            log: float, candidate: Candidate = candidate, others: list[Vector] = others
+        ) -> float:
             return -space.explained([*others, space.column(candidate.wide(float(np.exp(log))))])
 
         centre = float(np.log(candidate.width))
         around = (centre - np.log(_REFINED), centre + np.log(_REFINED))
         options: Any = {"xatol": within}
-        best = scipy.optimize.minimize_scalar(missed, bounds=around, method="bounded", options=options)
+        best = scipy.optimize.minimize_scalar(
+            missed, bounds=around, method="bounded", options=options
+        )
         if best.fun < missed(centre) - 1e-6:
             chosen = [*chosen[:i], candidate.wide(float(np.exp(best.x))), *chosen[i + 1 :]]
     return chosen
@@ -386,7 +456,9 @@ def _pruned(space: Space, chosen: list[Candidate], least: float) -> list[Candida
     while len(chosen) > 1:
         columns = [space.column(one) for one in chosen]
         whole = space.explained(columns)
-        losses = [whole - space.explained(columns[:i] + columns[i + 1 :]) for i in range(len(columns))]
+        losses = [
+            whole - space.explained(columns[:i] + columns[i + 1 :]) for i in range(len(columns))
+        ]
         weakest = int(np.argmin(losses))
         if losses[weakest] >= least:
             break
@@ -422,21 +494,33 @@ class Fit:
 
 
 def fit_terms(space: Space, chosen: Sequence[Candidate]) -> Fit:
-    """Least squares of the learner on the terms as it would show them; the physics takes what they do not express."""
+    """Least squares of the learner on the terms as it would show them.
+
+    The physics takes what they do not express.
+    """
     linearization, shown = space.linearization, space.shown
     raw = [linearization.column(linearization.parse(one.text), one.place) for one in chosen]
     size = np.array([np.linalg.norm(column) for column in raw])
     inverse = np.zeros((0, len(shown.target)))
     if chosen:
-        inverse = np.linalg.pinv(np.column_stack([shown.unit(column) for column in raw])) / size[:, None]
+        inverse = (
+            np.linalg.pinv(np.column_stack([shown.unit(column) for column in raw])) / size[:, None]
+        )
     coefficients = inverse @ shown.target
     rest = linearization.learner - sum((b * c for b, c in zip(coefficients, raw, strict=True)), 0.0)
     covariance = None if shown.covariance is None else inverse @ shown.covariance @ inverse.T
-    return Fit(least_squares(linearization.physics_moves, linearization.fitted(rest)), coefficients, covariance)
+    return Fit(
+        least_squares(linearization.physics_moves, linearization.fitted(rest)),
+        coefficients,
+        covariance,
+    )
 
 
 def settled(space: Space, chosen: list[Candidate]) -> tuple[list[Candidate], Fit, bool]:
-    """Return the terms whose coefficients stand out from the learner's own errors; and whether any other was dropped."""
+    """Return the terms whose coefficients stand out from the learner's own errors.
+
+    And whether any other was dropped.
+    """
     fit, dropped = fit_terms(space, chosen), False
     while (weak := fit.doubtful()) is not None:
         chosen, dropped = chosen[:weak] + chosen[weak + 1 :], True
@@ -444,7 +528,9 @@ def settled(space: Space, chosen: list[Candidate]) -> tuple[list[Candidate], Fit
     return chosen, fit, dropped
 
 
-def rivals(space: Space, chosen: Sequence[Candidate], number: int, most: int = 3) -> tuple[str, ...]:
+def rivals(
+    space: Space, chosen: Sequence[Candidate], number: int, most: int = 3
+) -> tuple[str, ...]:
     """Other terms that could stand in the place of one and explain nearly as much."""
     columns = [space.column(one) for one in chosen]
     others = columns[:number] + columns[number + 1 :]

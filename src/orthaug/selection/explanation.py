@@ -44,8 +44,8 @@ _DIVIDED = re.compile(r"\((?P<inner>.+)\)\s*/\s*(?P<by>[A-Za-z_]\w*)")
 class NewTerm:
     """A term to be added: its parameter's `name`, the `text` with its `width` as a number, and where it goes.
 
-    `scale` is the expression whose unit the term has; None for one by which no unit is told. `template` has `{width}`
-    where the width stands, None without one.
+    `scale` is the expression whose unit the term has; None for one by which no unit is told.
+    `template` has `{width}` where the width stands, None without one.
     """
 
     name: str
@@ -72,15 +72,29 @@ def names_for(kinds: Sequence[str], taken: Sequence[str]) -> list[str]:
     return names
 
 
-def added_to_baseline(baseline: Baseline, values: Vector, added: Sequence[NewTerm], several: bool) -> Baseline | None:
-    """Return a baseline with terms, starting from these parameter values; None if it is a function."""
+def added_to_baseline(
+    baseline: Baseline, values: Vector, added: Sequence[NewTerm], several: bool
+) -> Baseline | None:
+    """Return a baseline with terms, starting from these parameter values.
+
+    None if it is a function.
+    """
     if baseline.function is not None:
         return None
     low, high = baseline.bounds
     start = dict(zip(baseline.names, np.clip(values, low, high), strict=True))
-    old = [term if term.fixed else replace(term, initial=float(start[term.parameter])) for term in baseline.terms]
+    old = [
+        term if term.fixed else replace(term, initial=float(start[term.parameter]))
+        for term in baseline.terms
+    ]
     new = [
-        Term(one.name, one.text, initial=one.coefficient, unit=one.unit or "", output=one.added_to if several else None)
+        Term(
+            one.name,
+            one.text,
+            initial=one.coefficient,
+            unit=one.unit or "",
+            output=one.added_to if several else None,
+        )
         for one in added
     ]
     return Baseline.from_terms([*old, *new], dict(baseline.constants))
@@ -93,7 +107,14 @@ def baseline_lines(added: Sequence[NewTerm], several: bool) -> str:
         entries = {"parameter": one.name, "regressor": one.text, "initial": _short(one.coefficient)}
         entries |= {"unit": one.unit} if one.unit else {}
         entries |= {"output": one.added_to} if several else {}
-        blocks.append("\n".join(["[[baseline.terms]]", *(f"{key} = {_toml(value)}" for key, value in entries.items())]))
+        blocks.append(
+            "\n".join(
+                [
+                    "[[baseline.terms]]",
+                    *(f"{key} = {_toml(value)}" for key, value in entries.items()),
+                ]
+            )
+        )
     return "\n\n".join(blocks)
 
 
@@ -112,14 +133,22 @@ class ChangedMotion:
         for one in self.parameters:
             entries = {"initial": _short(one.initial)} | ({"unit": one.unit} if one.unit else {})
             entries |= {"min": one.min} if np.isfinite(one.min) else {}
-            rows.append(f"{one.name} = {{ {', '.join(f'{key} = {_toml(value)}' for key, value in entries.items())} }}")
+            rows.append(
+                f"{one.name} = {{ "
+                f"{', '.join(f'{key} = {_toml(value)}' for key, value in entries.items())} }}"
+            )
         return "\n\n".join([*blocks, "\n".join(["[motion.parameters]", *rows])])
 
 
-def added_to_motion(motion: Motion, values: Vector, added: Sequence[NewTerm], units: dict[str, str]) -> Any:
-    """Return a `ChangedMotion` that starts from these parameter values; None if the equations are functions.
+def added_to_motion(
+    motion: Motion, values: Vector, added: Sequence[NewTerm], units: dict[str, str]
+) -> Any:
+    """Return a `ChangedMotion` that starts from these parameter values.
 
-    A term of an equation `(…)/m` goes inside, so that its coefficient is a force. A width becomes a parameter.
+    None if the equations are functions.
+
+    A term of an equation `(…)/m` goes inside, so that its coefficient is a force. A width becomes a
+    parameter.
     """
     if motion.functions is not None:
         return None
@@ -137,7 +166,10 @@ def added_to_motion(motion: Motion, values: Vector, added: Sequence[NewTerm], un
             product = one.template.format(width=width)
         inside = _DIVIDED.fullmatch(text.strip())
         if inside and _balanced(inside["inner"]) and inside["by"] in start:
-            coefficient, unit = coefficient * start[inside["by"]], _unit_inside(inside["inner"], one, units)
+            coefficient, unit = (
+                coefficient * start[inside["by"]],
+                _unit_inside(inside["inner"], one, units),
+            )
         sign, factor = ("-", -1.0) if coefficient < 0 else ("+", 1.0)
         summand = f" {sign} {one.name}" + ("" if product == "1" else f"*{_closed(product)}")
         if inside and _balanced(inside["inner"]) and inside["by"] in start:
@@ -169,7 +201,10 @@ def added_to_motion(motion: Motion, values: Vector, added: Sequence[NewTerm], un
 
 
 def _unit_inside(inner: str, added: NewTerm, units: dict[str, str]) -> str:
-    """Return the unit of a term's coefficient within a sum; none where the sum's or the term's is not told."""
+    """Return the unit of a term's coefficient within a sum.
+
+    None where the sum's or the term's is not told.
+    """
     unit = _unit_of_first(inner, units)
     if not unit or added.scale is None:
         return unit
@@ -216,19 +251,24 @@ _ENDED = ("converged", "exact")
 _SHOWN = 8  # terms, each as the only one
 _OUTSIDE = 0.05  # share of rows beyond the training data that is told of
 _CONDITIONAL = (
-    "the terms were chosen on these data: intervals of a fit with them to the same data are conditional on the choice; "
-    "a fit to other data has intervals that are not."
+    "the terms were chosen on these data: intervals of a fit with them to the same data are "
+    "conditional on the choice; a fit to other data has intervals that are not."
 )
-_NAMES = {"coulomb": "coulomb", "quadratic_drag": "drag", "stribeck_gauss": "stribeck", TERM: "term"}
+_NAMES = {
+    "coulomb": "coulomb",
+    "quadratic_drag": "drag",
+    "stribeck_gauss": "stribeck",
+    TERM: "term",
+}
 
 
 @dataclass(frozen=True)
 class ExplainingTerm:
     """A term to add to the physics.
 
-    `coefficient` is in `unit`, None where that is not told; `std` is its standard error by the learner's, None if not
-    known. `share` is what it adds to the terms before it, `alone` what it explains as the only one. `rivals` would
-    explain nearly as much in its place.
+    `coefficient` is in `unit`, None where that is not told; `std` is its standard error by the
+    learner's, None if not known. `share` is what it adds to the terms before it, `alone` what it
+    explains as the only one. `rivals` would explain nearly as much in its place.
     """
 
     parameter: str
@@ -269,10 +309,11 @@ class MovedParameter:
 class Explanation:
     """What a learner has found.
 
-    `share` is what the `terms` explain together of the mean square that the learner adds beside the physics, `noise`
-    the share that is its own error as far as training tells, `p` that of the learner being nothing else; None if not
-    known. `physics` is the baseline or motion with the terms added, None where there are none or it is a function;
-    `spec` the same as lines of a spec file.
+    `share` is what the `terms` explain together of the mean square that the learner adds beside the
+    physics, `noise` the share that is its own error as far as training tells, `p` that of the
+    learner being nothing else; None if not known. `physics` is the baseline or motion with the
+    terms added, None where there are none or it is a function; `spec` the same as lines of a spec
+    file.
     """
 
     terms: tuple[ExplainingTerm, ...]
@@ -308,12 +349,12 @@ def explain(
 ) -> Explanation:
     """Which terms a learner has found: its output over a record, regressed on suspects and on products.
 
-    Friction, drag, hardening, dead zones and saturations of everything that the learner sees are tried, and products of
-    it. Each is taken as the learner would show it, for a smooth one shows no jumps (`selection.as_shown`).
+    Friction, drag, hardening, dead zones and saturations of everything that the learner sees are
+    tried, and products of it. Each is taken as the learner would show it, for a smooth one shows no
+    jumps (`selection.as_shown`).
 
-    Args:
-        model: a model with a learner, or what `estimate` returned.
-        record: best the one that it was trained on; may be left out for an estimate. Outputs are needed but for a
+    Args: model: a model with a learner, or what `estimate` returned. record: best the one that it
+        was trained on; may be left out for an estimate. Outputs are needed but for a
             motion, whose free run then starts from 0.
         suspects: further terms to try.
         degree, functions: of the products, as in `Terms`.
@@ -327,35 +368,58 @@ def explain(
     if not isinstance(model, Model | MotionModel):
         model = getattr(fit, "model", None)
         if not isinstance(model, Model | MotionModel):
-            raise InputError(f"`model` must be a model or what `estimate` returns; got {shown(fit)}.")
-        record = getattr(getattr(fit, "problem", None), "record", None) if record is None else record
+            raise InputError(
+                f"`model` must be a model or what `estimate` returns; got {shown(fit)}."
+            )
+        record = (
+            getattr(getattr(fit, "problem", None), "record", None) if record is None else record
+        )
     check_type(record, Record, "record", "the Record that the model was trained on")
     assert record is not None
-    degree, most = check_count(degree, "degree", of="factors"), check_count(most, "most", of="terms")
+    degree, most = (
+        check_count(degree, "degree", of="factors"),
+        check_count(most, "most", of="terms"),
+    )
     if not is_number(least) or not 0 < least < 1:
         raise InputError(f"`least` must be a share between 0 and 1; got {shown(least)}.")
     if isinstance(functions, str) or any(not isinstance(name, str) for name in functions):
-        raise InputError(f"`functions` must be a list of names, such as ['abs']; got {shown(functions)}.")
+        raise InputError(
+            f"`functions` must be a list of names, such as ['abs']; got {shown(functions)}."
+        )
     linearization = linearization_of(model, record)
-    space = Space.of(linearization, candidates_of(linearization, degree, functions, _declared(suspects, linearization)))
+    space = Space.of(
+        linearization,
+        candidates_of(linearization, degree, functions, _declared(suspects, linearization)),
+    )
     chosen, fitted, dropped = settled(space, select(space, most, least))
     told = _told(space, chosen, fitted, dropped)
     code = getattr(getattr(fit, "status", None), "code", "converged")
     if code not in _ENDED:
-        text = "training did not end at a minimum: the learner may show terms otherwise than they are; train longer."
+        text = (
+            "training did not end at a minimum: the learner may show terms otherwise than they "
+            "are; train longer."
+        )
         told = replace(told, warnings=(*told.warnings, Warning("not_converged", text)))
     return told
 
 
-def _declared(suspects: Sequence[Any], linearization: LearnedLinearization) -> list[tuple[str, int]]:
+def _declared(
+    suspects: Sequence[Any], linearization: LearnedLinearization
+) -> list[tuple[str, int]]:
     """Expressions of suspects with the number of their output or equation."""
     names, found = [name for name, _ in linearization.places], []
     for suspect in suspects:
-        check_type(suspect, Suspect | MotionSuspect, "suspects", "a list of Suspects, or of MotionSuspects of a motion")
+        check_type(
+            suspect,
+            Suspect | MotionSuspect,
+            "suspects",
+            "a list of Suspects, or of MotionSuspects of a motion",
+        )
         where = suspect.equation if isinstance(suspect, MotionSuspect) else suspect.output
         if where is not None and where not in names:
             raise InputError(
-                f"suspect '{suspect.name}': the learner adds nothing to '{where}', but to {', '.join(names)}."
+                f"suspect '{suspect.name}': the learner adds nothing to '{where}', but to "
+                f"{', '.join(names)}."
             )
         linearization.evaluate(linearization.parse(suspect.expression))
         found.append((suspect.expression, 0 if where is None else names.index(where)))
@@ -367,7 +431,8 @@ def _told(space: Space, chosen: list[Candidate], fitted: Fit, dropped: bool) -> 
     if space.shown.covariance is not None and space.norm > 0:
         noise = min(float(np.trace(space.shown.covariance)) / space.norm**2, 1.0)
     singles = tuple(
-        SingleTerm(one.name, one.text, linearization.places[one.place][0], share) for one, share in alone(space, _SHOWN)
+        SingleTerm(one.name, one.text, linearization.places[one.place][0], share)
+        for one, share in alone(space, _SHOWN)
     )
     share = space.explained([space.column(one) for one in chosen])
     real = p is None or p < _LEVEL
@@ -388,27 +453,43 @@ def _told(space: Space, chosen: list[Candidate], fitted: Fit, dropped: bool) -> 
         text = f"{what} {verb} {percent(share, 3)} of what the learner adds beside the physics."
     told = []
     if linearization.outside > _OUTSIDE:
-        reach = f"{100 * linearization.outside:.0f} % of the rows lie beyond what the learner saw in training"
+        reach = (
+            f"{100 * linearization.outside:.0f} % of the rows lie beyond what the learner saw "
+            "in training"
+        )
         told.append(Warning("beyond_training", f"{reach}: there it shows how it extrapolates."))
     if terms:
         told.append(Warning("conditional_on_selection", _CONDITIONAL))
     points = len(linearization.target)
-    return Explanation(terms, share, noise, p, singles, parameters, physics, spec, points, text, tuple(told))
+    return Explanation(
+        terms, share, noise, p, singles, parameters, physics, spec, points, text, tuple(told)
+    )
 
 
-def _why_nothing(space: Space, real: bool, dropped: bool, share: float, singles: Sequence[SingleTerm]) -> str:
+def _why_nothing(
+    space: Space, real: bool, dropped: bool, share: float, singles: Sequence[SingleTerm]
+) -> str:
     if not space.target.any():
         return (
-            "the learner adds nothing over these data that the physics could not express; there is nothing to explain."
+            "the learner adds nothing over these data that the physics could not express; "
+            "there is nothing to explain."
         )
     if not space.candidates:
         return "nothing explains the learner: the physics expresses all candidate terms already."
     if not real:
-        return "what the learner adds does not stand out from its own errors; there is nothing to explain."
-    best = f"the best single term, {singles[0].expression}, explains {percent(singles[0].share)} of it"
+        return (
+            "what the learner adds does not stand out from its own errors; there is nothing to "
+            "explain."
+        )
+    best = (
+        f"the best single term, {singles[0].expression}, explains {percent(singles[0].share)} of it"
+    )
     if dropped and share < _HALF:
         return f"no term stands out from the learner's own errors; {best}. Keep the learner."
-    return f"no few terms explain half of what the learner adds; {best}. Keep the learner, or try other suspects."
+    return (
+        f"no few terms explain half of what the learner adds; {best}. Keep the learner, or try "
+        "other suspects."
+    )
 
 
 def _terms(space: Space, chosen: Sequence[Candidate], fitted: Fit) -> tuple[ExplainingTerm, ...]:
@@ -422,7 +503,9 @@ def _terms(space: Space, chosen: Sequence[Candidate], fitted: Fit) -> tuple[Expl
         ]
     names = names_for([_base_name(one) for one in chosen], taken)
     columns = [space.column(one) for one in chosen]
-    std = None if fitted.covariance is None else np.sqrt(np.maximum(np.diag(fitted.covariance), 0.0))
+    std = (
+        None if fitted.covariance is None else np.sqrt(np.maximum(np.diag(fitted.covariance), 0.0))
+    )
     for i, one in enumerate(chosen):
         place, unit = linearization.places[one.place]
         whole = space.explained(columns[: i + 1])

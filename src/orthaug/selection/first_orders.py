@@ -34,19 +34,22 @@ class FirstModel:
     offset: bool
     """Whether the signals have a level, so that the physics needs a constant."""
     delays: tuple[int | None, ...]
-    """First lag of each input that is significant beside the output's own past; None where none is."""
+    """First lag of each input that is significant beside the output's own past; None where none is.
+    """
     persistence: tuple[int, ...]
     """Up to which order each input excites; `PERSISTENCE` stands for that or more."""
     free_run: tuple[float, ...]
-    """Error of the free run on rows held out over the output's standard deviation, for each output."""
+    """Error of the free run on rows held out over the output's standard deviation, for each output.
+    """
 
 
 def first_model(record: Record) -> FirstModel | None:
     """Delays, excitation and orders for a record; None where it has too few rows for any model.
 
-    The orders are the smallest whose free run is within 5 % of the best of up to 4 lags a channel. The first lags are
-    the significant ones, unless from 1 or 0 on the best free run is clearly better. Every model that is tried has a
-    constant: without one, lags that are not there stand in for the level of the signals.
+    The orders are the smallest whose free run is within 5 % of the best of up to 4 lags a channel.
+    The first lags are the significant ones, unless from 1 or 0 on the best free run is clearly
+    better. Every model that is tried has a constant: without one, lags that are not there stand in
+    for the level of the signals.
     """
     record = _spread(record)
     signals = np.concatenate([np.hstack([e.outputs, e.inputs]) for e in record.experiments])
@@ -55,7 +58,9 @@ def first_model(record: Record) -> FirstModel | None:
     excited = tuple(_persistence(record, i) for i in range(len(record.inputs)))
     usual = [tuple(late if delay is None else delay for delay in delays) for late in (1, 0)]
     chosen: tuple[float, Orders, tuple[float, ...]] | None = None
-    for nk in dict.fromkeys([*usual, *((late,) * len(delays) for late in (1, 0))]):  # a test may miss the first lags
+    for nk in dict.fromkeys(
+        [*usual, *((late,) * len(delays) for late in (1, 0))]
+    ):  # a test may miss the first lags
         found = _smallest(record, excited, nk)
         if found is not None and (chosen is None or found[0] * _BETTER < chosen[0]):
             chosen = found
@@ -92,8 +97,8 @@ def _spread(record: Record) -> Record:
 def _delay(record: Record, number: int) -> int | None:
     """Return the first lag at which an input acts on any output, beside the output's past and all other lags of the inputs.
 
-    Where rows or excitation do not allow that, by the cross-correlation with the input made white; where none is
-    significant, by that of the input's square.
+    Where rows or excitation do not allow that, by the cross-correlation with the input made white;
+    where none is significant, by that of the input's square.
     """
     found = []
     long = tuple(e for e in record.experiments if len(e) > 2 * _DELAY)
@@ -109,7 +114,10 @@ def _delay(record: Record, number: int) -> int | None:
 
 
 def _tested_delay(record: Record, number: int) -> int | None:
-    """By t-tests, at 5 % for all lags together; None where none is significant or the lags cannot be told apart."""
+    """By t-tests, at 5 % for all lags together.
+
+    None where none is significant or the lags cannot be told apart.
+    """
     orders = Orders(_MOST, (_DELAY + 1,) * len(record.inputs), (0,) * len(record.inputs))
     phi = np.concatenate([_rows(e, 0, orders, _DELAY) for e in record.experiments])
     y = np.concatenate([e.outputs[_DELAY:, 0] for e in record.experiments])
@@ -137,7 +145,10 @@ def _persistence(record: Record, number: int) -> int:
 
 
 def _errors(record: Record, orders: Orders) -> tuple[float, ...] | None:
-    """Error of the free run on the last rows for each output; None where it cannot be fitted, or runs away."""
+    """Error of the free run on the last rows for each output.
+
+    None where it cannot be fitted, or runs away.
+    """
     first = max([orders.na, *(nb + nk - 1 for nb, nk in zip(orders.nb, orders.nk, strict=True))])
     usable = [e for e in record.experiments if len(e) > first + 1]
     rows = sum(len(e) - first for e in usable)
@@ -181,5 +192,7 @@ def _free_run(e: Experiment, j: int, theta: np.ndarray, orders: Orders, first: i
     driven = _rows(e, j, orders, first)[:, orders.na :] @ theta[orders.na :]
     taps = np.concatenate([[1.0], -theta[: orders.na]])
     with np.errstate(all="ignore"):
-        start = lfiltic([1.0], taps, e.outputs[first - 1 :: -1, j][: orders.na] if first else np.empty(0))
+        start = lfiltic(
+            [1.0], taps, e.outputs[first - 1 :: -1, j][: orders.na] if first else np.empty(0)
+        )
         return lfilter([1.0], taps, driven, zi=start)[0]

@@ -1,7 +1,8 @@
 """Forward orthogonal least squares on normal equations: which column lowers the error most, beside those that are in.
 
-Chen, Billings and Luo (1989), on Gram matrices: each pick is projected out of all others, so what a column would lower
-the squared error by is its right-hand side squared over what is left of its norm (the error-reduction ratio).
+Chen, Billings and Luo (1989), on Gram matrices: each pick is projected out of all others, so what a
+column would lower the squared error by is its right-hand side squared over what is left of its norm
+(the error-reduction ratio).
 """
 
 from __future__ import annotations
@@ -14,16 +15,20 @@ import numpy as np
 from orthaug._base.checks import Matrix, Vector
 
 DEPENDENT = 1e-9
-"""Share of a column's squared norm: where less of it is left beside the others, it is a combination of them."""
+"""Share of a column's squared norm: where less of it is left beside the others, it is a combination
+of them.
+"""
 
 
 COLLINEAR = 0.05
-"""Share of a column's deviation: where less is left beside the others, it lies within their span, near enough.
+"""Share of a column's deviation: where less is left beside the others, it lies within their span,
+near enough.
 
-One column widens the standard error of another by at most one over what is left of it, here twenty times. On records of
-a slow plant with a persistent input (`benchmarks/selection.py collinear`) terms widened a standard error up to 46 times
-without a limit, 28 with this one and 11 with twice as much, at 0.78, 0.79 and 0.80 of the error of physics alone on the
-blocks; but with twice as much the free run on Silverbox's arrow errs by a sixth more.
+One column widens the standard error of another by at most one over what is left of it, here twenty
+times. On records of a slow plant with a persistent input (`benchmarks/selection.py collinear`)
+terms widened a standard error up to 46 times without a limit, 28 with this one and 11 with twice as
+much, at 0.78, 0.79 and 0.80 of the error of physics alone on the blocks; but with twice as much the
+free run on Silverbox's arrow errs by a sixth more.
 """
 
 
@@ -48,7 +53,11 @@ class Equations(NamedTuple):
 
     def among(self, columns: Sequence[int], count: int) -> Equations:
         """As these of `count` columns, of which the others are zero."""
-        picked, hessian, right = np.asarray(columns, dtype=int), np.zeros((count, count)), np.zeros(count)
+        picked, hessian, right = (
+            np.asarray(columns, dtype=int),
+            np.zeros((count, count)),
+            np.zeros(count),
+        )
         hessian[np.ix_(picked, picked)], right[picked] = self.hessian, self.right
         return self._replace(hessian=hessian, right=right)
 
@@ -62,7 +71,12 @@ class Equations(NamedTuple):
         """p, the shortest where columns depend on each other."""
         size = np.sqrt(np.maximum(np.diag(self.hessian), 0.0))
         unit = 1 / np.where(size > 0, size, 1.0)
-        return unit * np.linalg.lstsq(self.hessian * np.outer(unit, unit), unit * self.right, rcond=1e-14)[0]
+        return (
+            unit
+            * np.linalg.lstsq(self.hessian * np.outer(unit, unit), unit * self.right, rcond=1e-14)[
+                0
+            ]
+        )
 
     def miss(self, p: Vector) -> float:
         """`‖y − S p‖²`."""
@@ -87,10 +101,10 @@ def forward(
 ) -> list[ForwardStep]:
     """Pick up to `most` columns, one after another, beside those that are `known`.
 
-    Args:
-        least: share of the squared error left that a column must take away.
-        within: share of a column's deviation; one of which less is left lies within the span of those that are in.
-        constant: the column of a constant, beside which a column's deviation is what is left; None for its norm.
+    Args: least: share of the squared error left that a column must take away. within: share of a
+        column's deviation; one of which less is left lies within the span of those that are in.
+        constant: the column of a constant, beside which a column's deviation is what is left; None
+        for its norm.
     """
     gram, right, square, _ = equations.scaled()
     gram, right, square = gram.copy(), right.copy(), float(square)
@@ -134,11 +148,15 @@ def _deviations(gram: Matrix, constant: int | None) -> Vector:
     return beside
 
 
-def spanned(equations: Equations, known: Sequence[int], within: float, constant: int | None) -> list[int]:
+def spanned(
+    equations: Equations, known: Sequence[int], within: float, constant: int | None
+) -> list[int]:
     """Return the columns of which less than `within` of the deviation is left beside the `known` ones."""
     gram = equations.scaled().hessian
     size, known = np.diag(gram), list(known)
     across = gram[known]
-    left = size - np.einsum("ij,ij->j", across, np.linalg.pinv(gram[np.ix_(known, known)], hermitian=True) @ across)
+    left = size - np.einsum(
+        "ij,ij->j", across, np.linalg.pinv(gram[np.ix_(known, known)], hermitian=True) @ across
+    )
     inside = (left < within**2 * _deviations(gram, constant)) & (size > 0)
     return [i for i in np.flatnonzero(inside).tolist() if i not in set(known)]

@@ -1,8 +1,9 @@
 """Whether the chosen terms leave the physics its parameters: θ of physics alone beside θ with the terms.
 
-A term within the span of the physics takes over a part of it: the sum predicts as before, and θ means nothing any more.
-So each parameter is compared before and after, in units of what the two standard errors allow, and of each column the
-share is given that the others leave: one over it is the factor by which they widen its standard error.
+A term within the span of the physics takes over a part of it: the sum predicts as before, and θ
+means nothing any more. So each parameter is compared before and after, in units of what the two
+standard errors allow, and of each column the share is given that the others leave: one over it is
+the factor by which they widen its standard error.
 """
 
 from __future__ import annotations
@@ -24,8 +25,9 @@ _SURE = 1.96  # standard errors
 class Shift:
     """A parameter of physics alone, and with the chosen terms.
 
-    Standard errors are those of the search's criterion, `None` where the data do not determine the parameter. `left` is
-    the share of the parameter's regressor, of its norm, that the other columns of the model leave.
+    Standard errors are those of the search's criterion, `None` where the data do not determine the
+    parameter. `left` is the share of the parameter's regressor, of its norm, that the other columns
+    of the model leave.
     """
 
     parameter: str
@@ -76,29 +78,37 @@ class PhysicsComparison:
         if moved and self.left:
             times = max((shift.times for shift in moved if shift.times is not None), default=None)
             allowed = (
-                "more" if times is None else f"up to {times:.2g} times" if len(moved) > 1 else f"{times:.2g} times"
+                "more"
+                if times is None
+                else f"up to {times:.2g} times"
+                if len(moved) > 1
+                else f"{times:.2g} times"
             )
             least = min(moved, key=lambda shift: shift.left)
             text = (
-                f"the chosen terms move {'; '.join(map(str, moved))}: {allowed} what the standard errors allow. Beside "
-                f"the terms {100 * least.left:.2g} % of the regressor of {least.parameter} is left. Either physics "
-                "alone was biased by what the terms now explain, or the terms took over a part of the physics: compare "
-                "both values with what is known of the parameters, and where the first is right, put the missing "
-                "effect into the physics or `exclude` the terms that stand in for it."
+                f"the chosen terms move {'; '.join(map(str, moved))}: {allowed} what the "
+                f"standard errors allow. Beside the terms {100 * least.left:.2g} % of the "
+                f"regressor of {least.parameter} is left. Either physics alone was biased by "
+                "what the terms now explain, or the terms took over a part of the physics: "
+                "compare both values with what is known of the parameters, and where the first "
+                "is right, put the missing effect into the physics or `exclude` the terms that "
+                "stand in for it."
             )
             notes.append(Warning(MOVED, text))
         if self.excluded:
             beside = "physics and the chosen terms" if self.left else "the physics"
             text = (
-                f"{self.excluded} of {self.candidates} candidate terms lie within the span of {beside} and were not "
-                f"taken: less than {100 * self.collinear:g} % of each is left beside these, whose condition number is "
-                f"{self.condition:.3g}."
+                f"{self.excluded} of {self.candidates} candidate terms lie within the span of "
+                f"{beside} and were not taken: less than {100 * self.collinear:g} % of each is "
+                f"left beside these, whose condition number is {self.condition:.3g}."
             )
             notes.append(Warning(SPANNED, text))
         return notes
 
 
-def kept_physics(runs: TermRuns, alone: Point, chosen: Point, able: Able = None) -> PhysicsComparison:
+def kept_physics(
+    runs: TermRuns, alone: Point, chosen: Point, able: Able = None
+) -> PhysicsComparison:
     """Compare θ of physics alone with θ beside the chosen terms, both trained on the criterion.
 
     Args:
@@ -110,7 +120,15 @@ def kept_physics(runs: TermRuns, alone: Point, chosen: Point, able: Able = None)
     before_std, _, _ = _statistics(runs, alone, runs.equations(alone, ()).of(range(nt)))
     after_std, left, condition = _statistics(runs, chosen, every.of(columns))
     shifts = tuple(
-        Shift(p.name, p.unit, float(alone.c[i]), before_std[i], float(chosen.c[i]), after_std[i], float(left[i]))
+        Shift(
+            p.name,
+            p.unit,
+            float(alone.c[i]),
+            before_std[i],
+            float(chosen.c[i]),
+            after_std[i],
+            float(left[i]),
+        )
         for i, p in enumerate(physics.parameters)
     )
     within = spanned(every, columns, runs.collinear, runs.constant) if columns else []
@@ -118,7 +136,9 @@ def kept_physics(runs: TermRuns, alone: Point, chosen: Point, able: Able = None)
     return PhysicsComparison(shifts, terms, condition, len(within), len(texts), runs.collinear)
 
 
-def _statistics(runs: TermRuns, point: Point, own: Equations) -> tuple[list[float | None], Vector, float]:
+def _statistics(
+    runs: TermRuns, point: Point, own: Equations
+) -> tuple[list[float | None], Vector, float]:
     """Return standard errors of all columns, what the others leave of each, and the condition of their Gram matrix."""
     size = np.sqrt(np.maximum(np.diag(own.hessian), 1e-300))
     gram: Matrix = own.hessian / np.outer(size, size)
@@ -126,10 +146,18 @@ def _statistics(runs: TermRuns, point: Point, own: Equations) -> tuple[list[floa
     inverse = np.linalg.pinv(gram, rcond=1e-14, hermitian=True)
     left = 1 / np.sqrt(np.maximum(np.diag(inverse), 1.0))
     determined = bool(values[0] > 1e-14 * values[-1])
-    variance = max(own.miss(own.solve()), 0.0) / max(own.rows - len(gram), 1) / runs.independent_share(point)
+    variance = (
+        max(own.miss(own.solve()), 0.0)
+        / max(own.rows - len(gram), 1)
+        / runs.independent_share(point)
+    )
     stds = np.sqrt(variance * np.diag(inverse)) / size
     condition = float(np.sqrt(values[-1] / values[0])) if determined else np.inf
-    return [float(std) if determined and np.isfinite(std) else None for std in stds], left, condition
+    return (
+        [float(std) if determined and np.isfinite(std) else None for std in stds],
+        left,
+        condition,
+    )
 
 
 def _figure(value: float, std: float | None) -> str:

@@ -1,7 +1,7 @@
 """What is to be explained: a learner's output over data, beside what the parameters of the physics could do.
 
-Of a lagged model over the rows of a record, of a motion over the states and inputs of its free run there, by what it
-does to the outputs.
+Of a lagged model over the rows of a record, of a motion over the states and inputs of its free run
+there, by what it does to the outputs.
 """
 
 from __future__ import annotations
@@ -32,7 +32,9 @@ from orthaug.physics.motion import Motion
 from orthaug.physics.parameters import PhysicalParameter
 
 MOST_CELLS = 10_000
-"""Values of the learner that are looked at: a smooth function needs no more, and candidates are kept beside them."""
+"""Values of the learner that are looked at: a smooth function needs no more, and candidates are
+kept beside them.
+"""
 FEWEST = 20  # of them
 MOST_WEIGHTS = 2000  # of a learner whose tangent is looked at
 
@@ -50,9 +52,9 @@ class Tangent(NamedTuple):
 class LearnedLinearization:
     """The learner over M points in nl outputs or equations (`places`: name and unit).
 
-    `target` is the learner in their units, `physics_moves` what the parameters, and starts of runs, do to what is
-    fitted. `weight` (nl, nl) whitens a row of a lagged model. `outside` is the share of the points beyond the training
-    data.
+    `target` is the learner in their units, `physics_moves` what the parameters, and starts of runs,
+    do to what is fitted. `weight` (nl, nl) whitens a row of a lagged model. `outside` is the share
+    of the points beyond the training data.
     """
 
     target: Float[np.ndarray, "M nl"]
@@ -80,7 +82,9 @@ class LearnedLinearization:
     def column(self, expression: Expression, place: int) -> Vector:
         """Return a term with coefficient 1, whitened, all points and places below each other (M·nl,)."""
         with np.errstate(all="ignore"):
-            values = np.broadcast_to(np.asarray(self.evaluate(expression), dtype=float), (len(self.target),))
+            values = np.broadcast_to(
+                np.asarray(self.evaluate(expression), dtype=float), (len(self.target),)
+            )
         return (values[:, None] * self.weight[:, place]).ravel()
 
     def fitted(self, columns: Float[np.ndarray, "P *k"]) -> np.ndarray:
@@ -101,10 +105,13 @@ def linearization_of(model: Model | MotionModel, record: Record) -> LearnedLinea
     """
     if model.form.bound is None:
         raise InputError("the model is physics alone: it has no learner that could be explained.")
-    linearization = _of_motion(model, record) if isinstance(model, MotionModel) else _of_lagged(model, record)
+    linearization = (
+        _of_motion(model, record) if isinstance(model, MotionModel) else _of_lagged(model, record)
+    )
     if len(linearization.target) < FEWEST:
         raise InputError(
-            f"the learner has a value at {len(linearization.target)} rows of the data; at least {FEWEST} are needed."
+            f"the learner has a value at {len(linearization.target)} rows of the data; at "
+            f"least {FEWEST} are needed."
         )
     return linearization
 
@@ -118,14 +125,20 @@ def _of_lagged(model: Model, record: Record) -> LearnedLinearization:
     x = (
         stack_rows(record, form.layout).x
         if record.outputs
-        else np.concatenate([lag_matrix(e, form.layout, record, form.first_row) for e in record.experiments])
+        else np.concatenate(
+            [lag_matrix(e, form.layout, record, form.first_row) for e in record.experiments]
+        )
     )
     x = x[:: max(1, -(-len(x) * len(form.outputs) // MOST_CELLS))]
     with np.errstate(all="ignore"):
         target = model.learner_at(x) if len(x) else np.zeros((0, len(form.outputs)))
         phi = np.asarray(form.baseline.phi(x, form.layout, form.outputs, np))
         z = np.asarray(form.features.evaluate(x, form.layout, np))
-    finite = np.isfinite(target).all(axis=1) & np.isfinite(phi).all(axis=(1, 2)) & np.isfinite(z).all(axis=1)
+    finite = (
+        np.isfinite(target).all(axis=1)
+        & np.isfinite(phi).all(axis=(1, 2))
+        & np.isfinite(z).all(axis=1)
+    )
     x, target, phi, z = x[finite], target[finite], phi[finite], z[finite]
     constants = {SAMPLING_TIME: model.sampling_time} | dict(form.baseline.constants)
     for entry in form.features.entries:
@@ -141,7 +154,8 @@ def _of_lagged(model: Model, record: Record) -> LearnedLinearization:
         places=tuple((channel.name, channel.unit) for channel in model.outputs),
         signals=(*own, *_rates_of_change(form.outputs, own)),
         seen=len(own),
-        units={channel.name: channel.unit for channel in (*model.outputs, *model.inputs)} | {SAMPLING_TIME: "s"},
+        units={channel.name: channel.unit for channel in (*model.outputs, *model.inputs)}
+        | {SAMPLING_TIME: "s"},
         parse=lambda text: parse(text, constants),
         evaluate=lambda expression: expression.evaluate(columns, np),
         moved=lambda along: c + along,
@@ -193,9 +207,10 @@ def _of_motion(model: MotionModel, record: Record) -> LearnedLinearization:
 class MotionResponse:
     """The tangent system along a free run: from terms at M points in all equations and outputs to whitened outputs.
 
-    `s_{k+1} = A_k s_k + h/2 (A_k t_k + t_{k+1})`, `y_k = C_k s_k + o_k` for terms t in the equations and o in the
-    outputs, h the sampling time; A, `steps`, and C, `outputs`, are derivatives of the fitted motion. A segment of
-    training starts anew, from a state that was estimated beside everything else: `begins` (M,) tells where.
+    `s_{k+1} = A_k s_k + h/2 (A_k t_k + t_{k+1})`, `y_k = C_k s_k + o_k` for terms t in the
+    equations and o in the outputs, h the sampling time; A, `steps`, and C, `outputs`, are
+    derivatives of the fitted motion. A segment of training starts anew, from a state that was
+    estimated beside everything else: `begins` (M,) tells where.
     """
 
     steps: Float[np.ndarray, "M nx nx"]
@@ -207,7 +222,14 @@ class MotionResponse:
 
     @classmethod
     def of(
-        cls, form: MotionDynamics, numbers: Numbers, x: Matrix, u: Matrix, rows: Matrix, begins: Any, weight: Matrix
+        cls,
+        form: MotionDynamics,
+        numbers: Numbers,
+        x: Matrix,
+        u: Matrix,
+        rows: Matrix,
+        begins: Any,
+        weight: Matrix,
     ) -> MotionResponse:
         """Along states x (M, nx) and inputs u (M, nu), with the rows that steps read."""
         steps, outputs = (np.asarray(part) for part in _derivatives(form, numbers, x, u, rows))
@@ -261,7 +283,9 @@ class MotionResponse:
 
 
 @partial(jax.jit, static_argnames="form")
-def _derivatives(form: MotionDynamics, numbers: Numbers, x: Any, u: Any, rows: Any) -> tuple[Any, Any]:
+def _derivatives(
+    form: MotionDynamics, numbers: Numbers, x: Any, u: Any, rows: Any
+) -> tuple[Any, Any]:
     """∂(next state)/∂x and ∂y/∂x at points."""
     numbers = form.prepared(numbers)
     steps = jax.vmap(lambda x, row: jax.jacfwd(lambda s: form.step(numbers, s, row)[0])(x))(x, rows)
@@ -291,7 +315,10 @@ class Response:
 
 
 class _Run(NamedTuple):
-    """States, inputs, and the rows that steps read, along free runs where they have values; where segments begin."""
+    """States, inputs, and the rows that steps read, along free runs where they have values.
+
+    Where segments begin.
+    """
 
     x: Matrix
     u: Matrix
@@ -327,7 +354,9 @@ def _places(model: MotionModel) -> tuple[tuple[str, str], ...]:
     motion = model.form.motion
     states, outputs = motion.learned
     names = [motion.states[i].name for i in states] + [motion.outputs[i].name for i in outputs]
-    units = [unit for _, unit in labels_of(model.form)][: len(states)] + [model.outputs[i].unit for i in outputs]
+    units = [unit for _, unit in labels_of(model.form)][: len(states)] + [
+        model.outputs[i].unit for i in outputs
+    ]
     return tuple(zip(names, units, strict=True))
 
 

@@ -1,11 +1,12 @@
 """Is anything nonlinear missing, before a learner is trained? A test of what linear lags leave one step ahead.
 
-Squares, cubes and sizes of each regressor, less what physics and linear lags express of them, are multiplied by what
-these leave of the output. Their sums over blocks of rows change sign at random if nothing is missing, so the
-statistic is compared with itself under random signs, a wild bootstrap by blocks (Liu 1988, Shao 2010): its level does
-not rest on white or normal errors. A block is three times as long as the products remember each other, and a
-twentieth of the rows at least. What physics and linear lags leave of a block is too small, for the block has helped
-to fit them: it is divided by what it did not use, `(I − H_bb)⁻¹e_b` with H their projector (Bell and McCaffrey 2002),
+Squares, cubes and sizes of each regressor, less what physics and linear lags express of them, are
+multiplied by what these leave of the output. Their sums over blocks of rows change sign at random
+if nothing is missing, so the statistic is compared with itself under random signs, a wild bootstrap
+by blocks (Liu 1988, Shao 2010): its level does not rest on white or normal errors. A block is three
+times as long as the products remember each other, and a twentieth of the rows at least. What
+physics and linear lags leave of a block is too small, for the block has helped to fit them: it is
+divided by what it did not use, `(I − H_bb)⁻¹e_b` with H their projector (Bell and McCaffrey 2002),
 as HC3 does for a row.
 """
 
@@ -38,7 +39,8 @@ _SEED = 20_261_123
 class Nonlinearity:
     """Whether functions of the regressors explain what linear lags leave; `p` is the p-value.
 
-    `regressors` are the p-values of the functions of each regressor alone, multiplied by their number (Bonferroni).
+    `regressors` are the p-values of the functions of each regressor alone, multiplied by their
+    number (Bonferroni).
     """
 
     p: float
@@ -56,7 +58,10 @@ class Nonlinearity:
 
     def __str__(self) -> str:
         if not self.found:
-            return f"nothing nonlinear is missing beside physics and linear lags, as far as is seen (p = {self.p:.2g})."
+            return (
+                "nothing nonlinear is missing beside physics and linear lags, as far as is "
+                f"seen (p = {self.p:.2g})."
+            )
         named = ", ".join(self.matter)
         where = f" in {named}" if named else "; no single regressor shows it"
         return f"something nonlinear is missing (p = {self.p:.2g}){where}."
@@ -68,7 +73,9 @@ def nonlinearity(problem: Problem, lags: Sequence[str], draws: int = _DRAWS) -> 
     Args:
         draws: of random signs.
     """
-    squares = [f"{lag}**{power}" for lag in lags for power in (2, 3)] + [f"abs({lag})" for lag in lags]
+    squares = [f"{lag}**{power}" for lag in lags for power in (2, 3)] + [
+        f"abs({lag})" for lag in lags
+    ]
     library = TermLibrary.of((), 0, (), [*lags, *squares])
     runs = TermRuns.of(problem, library, Prediction())
     known, functions, target = _rows(runs, len(lags))
@@ -79,7 +86,9 @@ def nonlinearity(problem: Problem, lags: Sequence[str], draws: int = _DRAWS) -> 
     size = np.linalg.norm(functions, axis=0)
     functions = functions / np.where(size > 0, size, 1.0)
     functions = functions - q @ (q.T @ functions)
-    own = np.flatnonzero(np.isfinite(functions).all(axis=0) & (np.sum(functions**2, axis=0) > DEPENDENT))
+    own = np.flatnonzero(
+        np.isfinite(functions).all(axis=0) & (np.sum(functions**2, axis=0) > DEPENDENT)
+    )
     if not len(own):
         return None
     count = _blocks(_basis(functions[:, own]) * error[:, None])
@@ -95,10 +104,14 @@ def nonlinearity(problem: Problem, lags: Sequence[str], draws: int = _DRAWS) -> 
         statistic = float(np.sum((basis.T @ error) ** 2))
         return float((1 + np.sum(np.sum((signs @ sums) ** 2, axis=1) >= statistic)) / (1 + draws))
 
-    names = {i: lags[i // 2] for i in range(2 * len(lags))} | {2 * len(lags) + i: lag for i, lag in enumerate(lags)}
+    names = {i: lags[i // 2] for i in range(2 * len(lags))} | {
+        2 * len(lags) + i: lag for i, lag in enumerate(lags)
+    }
     single = {lag: np.array([i for i in own if names[int(i)] == lag], dtype=int) for lag in lags}
     single = {lag: columns for lag, columns in single.items() if len(columns)}
-    return Nonlinearity(p_value(own), {lag: min(1.0, p_value(c) * len(single)) for lag, c in single.items()})
+    return Nonlinearity(
+        p_value(own), {lag: min(1.0, p_value(c) * len(single)) for lag, c in single.items()}
+    )
 
 
 def _blocks(products: Matrix) -> int:

@@ -1,11 +1,12 @@
 """How many terms, and which: a path of models, judged by free runs on blocks that were held out.
 
-Forward the terms come by what they lower the error by: of the lags that the physics reads alone, of those of the orders
-that were chosen, and of all, for a term of a slow signal looks like that of its neighbours. About the best model as
-many are picked anew, and from it on backward they go, the least missed first. The choice is the smallest model that is
-within one standard error of the best (Breiman et al. 1984), block by block in pairs, or worse by less than is worth a
-term; of as many terms those of fewer lags. Blocks that had a say in the terms judge them too well: so the path is gone
-anew without each block, and no term is chosen where physics alone is as good there.
+Forward the terms come by what they lower the error by: of the lags that the physics reads alone, of
+those of the orders that were chosen, and of all, for a term of a slow signal looks like that of its
+neighbours. About the best model as many are picked anew, and from it on backward they go, the least
+missed first. The choice is the smallest model that is within one standard error of the best
+(Breiman et al. 1984), block by block in pairs, or worse by less than is worth a term; of as many
+terms those of fewer lags. Blocks that had a say in the terms judge them too well: so the path is
+gone anew without each block, and no term is chosen where physics alone is as good there.
 """
 
 from __future__ import annotations
@@ -28,11 +29,16 @@ from orthaug.selection.term_runs import Able, Point, TermRuns
 
 _ONE_BY_ONE = 8  # terms are added singly up to here, later an eighth at a time
 _LEAST = 1e-6  # share of the squared error left below which nothing is worth adding
-_PATIENCE = 5  # additions that did not improve the score by `_BETTER` each, after which the path ends
+_PATIENCE = (
+    5  # additions that did not improve the score by `_BETTER` each, after which the path ends
+)
 _BETTER = 0.005
 _FOLD_ITERATIONS = 10
 _ANEW = 5  # times that the terms are picked anew about the choice
-_SURE, _HALF = 3.0, 0.5  # standard errors, and of the error of physics alone: what is better by both is confirmed
+_SURE, _HALF = (
+    3.0,
+    0.5,
+)  # standard errors, and of the error of physics alone: what is better by both is confirmed
 _HALVES = 50  # random halves of the data over which terms are chosen again
 _PARTS = 10  # of the training data, that halves are made of
 _SEED = 20_261_122
@@ -75,19 +81,30 @@ class RankedModel:
 
 
 def judge_all(rungs: Sequence[PathModel], terms: bool = True) -> tuple[RankedModel, ...]:
-    """Return every model beside the best, block by block in pairs; the choice is the smallest that is as good.
+    """Return every model beside the best, block by block in pairs.
+
+    The choice is the smallest that is as good.
 
     Args:
         terms: whether a model that has any may be chosen.
     """
-    best, found = min((rung for rung in rungs if terms or not rung.size), key=lambda rung: rung.score), []
+    best, found = (
+        min((rung for rung in rungs if terms or not rung.size), key=lambda rung: rung.score),
+        [],
+    )
     for rung in rungs:
         count = len(rung.held)
         finite = bool(np.isfinite(rung.held).all()) and (terms or not rung.size)
         worse = rung.held - best.held if finite else np.full(count, np.inf)
         tolerated = worse.std(ddof=1) / np.sqrt(count) if finite else 0.0
-        within = finite and (float(worse.mean()) <= tolerated or rung.score <= (1 + WORTH) * best.score)
-        spread_of = rung.held.std(ddof=1) / np.sqrt(count) / (2 * rung.score) if finite and rung.score else np.inf
+        within = finite and (
+            float(worse.mean()) <= tolerated or rung.score <= (1 + WORTH) * best.score
+        )
+        spread_of = (
+            rung.held.std(ddof=1) / np.sqrt(count) / (2 * rung.score)
+            if finite and rung.score
+            else np.inf
+        )
         found.append(RankedModel(rung, float(spread_of), within, False))
     able = [i for i, one in enumerate(found) if one.within]
     chosen = min(able, key=lambda i: (rungs[i].size, rungs[i].lags, rungs[i].score), default=0)
@@ -125,15 +142,25 @@ class Blocks:
             self.folds.append((runs.on(kept), layout))
         self.given = runs, self.folds
 
-    def along(self, points: Sequence[Point | None], count: int, able: Able) -> tuple[list[Point], Vector]:
-        """Return the path anew without each block, by as many terms; and the mean squared errors on the blocks."""
+    def along(
+        self, points: Sequence[Point | None], count: int, able: Able
+    ) -> tuple[list[Point], Vector]:
+        """Return the path anew without each block, by as many terms.
+
+        And the mean squared errors on the blocks.
+        """
         items = [(i, point, count, able) for i, point in enumerate(points)]
         points, errors = zip(*self.runner.map(_along, self.given, items), strict=True)
         return list(points), np.array(errors)
 
     def judge(self, points: Sequence[Point]) -> Iterator[tuple[Vector, float]]:
-        """Mean squared errors of free runs on each block of the same terms, fitted without it; and what it took [s]."""
-        items = [(point._replace(states=None), i) for point in points for i in range(len(self.folds))]
+        """Mean squared errors of free runs on each block of the same terms, fitted without it.
+
+        And what it took [s].
+        """
+        items = [
+            (point._replace(states=None), i) for point in points for i in range(len(self.folds))
+        ]
         found = self.runner.map(_on_fold, self.given, items)
         for _ in points:
             errors, seconds = zip(*islice(found, len(self.folds)), strict=True)
@@ -151,10 +178,15 @@ _Given = tuple[TermRuns, list[tuple[TermRuns, Segments]]]
 
 
 def _on_all(given: _Given, chosen: Sequence[int], tell: Callable[..., None]) -> tuple[Point, float]:
-    """Chosen terms beside the physics, fitted from physics alone and from one step ahead; and what it took [s]."""
+    """Chosen terms beside the physics, fitted from physics alone and from one step ahead.
+
+    And what it took [s].
+    """
     runs, began = given[0], time.monotonic()
     point = runs.fit(runs.start(), chosen)
-    if runs.layout is not None and chosen:  # from physics alone a free run may end in a local minimum
+    if (
+        runs.layout is not None and chosen
+    ):  # from physics alone a free run may end in a local minimum
         nt = len(point.c)
         p = runs.step_equations.of([*range(nt), *(nt + i for i in chosen)]).solve()
         other = runs.fit(runs.start()._replace(chosen=tuple(chosen), c=p[:nt], w=p[nt:]), chosen)
@@ -162,16 +194,28 @@ def _on_all(given: _Given, chosen: Sequence[int], tell: Callable[..., None]) -> 
     return point, time.monotonic() - began
 
 
-def _on_fold(given: _Given, item: tuple[Point, int], tell: Callable[..., None]) -> tuple[float, float]:
-    """Return the mean squared error on a block of a model that is fitted without it; and what it took [s]."""
+def _on_fold(
+    given: _Given, item: tuple[Point, int], tell: Callable[..., None]
+) -> tuple[float, float]:
+    """Return the mean squared error on a block of a model that is fitted without it.
+
+    And what it took [s].
+    """
     began, (point, number) = time.monotonic(), item
     runs, held = given[1][number]
     own = point._replace(states=None if runs.layout is None else np.asarray(runs.layout.start))
-    return runs.errors(runs.fit(own, point.chosen, _FOLD_ITERATIONS), held), time.monotonic() - began
+    return runs.errors(
+        runs.fit(own, point.chosen, _FOLD_ITERATIONS), held
+    ), time.monotonic() - began
 
 
-def _along(given: _Given, item: tuple[int, Point | None, int, Able], tell: Callable[..., None]) -> tuple[Point, float]:
-    """Physics alone, or some terms more, picked without a block; and the mean squared error on the block."""
+def _along(
+    given: _Given, item: tuple[int, Point | None, int, Able], tell: Callable[..., None]
+) -> tuple[Point, float]:
+    """Physics alone, or some terms more, picked without a block.
+
+    And the mean squared error on the block.
+    """
     number, point, count, able = item
     runs, held = given[1][number]
     if point is None:
@@ -233,9 +277,9 @@ def climb(
 ) -> TermPath:
     """Return the path of up to `most` terms forward, and from the best model on backward.
 
-    Args:
-        near: lags whose terms have a way forward of their own, before the one that has all.
-        linear: terms that the last of these ways begins with, the linear lags that the choice of orders has beside the
+    Args: near: lags whose terms have a way forward of their own, before the one that has all.
+        linear: terms that the last of these ways begins with, the linear lags that the choice of
+        orders has beside the
             physics.
 
     Raises:
@@ -246,12 +290,16 @@ def climb(
         confirmed = True
 
         def judged(point: Point, change: Sequence[str], began: float) -> PathModel:
-            known = (rung.held for rung in rungs if rung.point.chosen == point.chosen)  # ways that begin alike
+            known = (
+                rung.held for rung in rungs if rung.point.chosen == point.chosen
+            )  # ways that begin alike
             held = next(known, None)
             if held is None:
                 held, _ = next(folds.judge([point]))
             lags = frozenset[Lag]().union(*(runs.lags[i] for i in point.chosen))
-            rung = PathModel(point, tuple(change), held, time.monotonic() - began, len(point.chosen), len(lags))
+            rung = PathModel(
+                point, tuple(change), held, time.monotonic() - began, len(point.chosen), len(lags)
+            )
             rungs.append(rung)
             told(rung)
             return rung
@@ -265,10 +313,18 @@ def climb(
             given = _given(runs, alone.point, linear[:most])
             for able in (*ways, None):
                 begin = alone
-                if given and (able is None or able == ways[-1]) and set(given) <= set(able or given):
+                if (
+                    given
+                    and (able is None or able == ways[-1])
+                    and set(given) <= set(able or given)
+                ):
                     began, given_now, given = time.monotonic(), given, ()
                     point = runs.fit(alone.point, given_now)
-                    begin = judged(point, ["physics alone", *(f"+ {runs.library.texts[i]}" for i in given_now)], began)
+                    begin = judged(
+                        point,
+                        ["physics alone", *(f"+ {runs.library.texts[i]}" for i in given_now)],
+                        began,
+                    )
                 _forward(runs, begin, most, able, judged, again=len(rungs) > 1)
             _anew(path, judged)
             confirmed = _confirmed(folds, path().chosen.size, path().way)
@@ -281,7 +337,11 @@ def climb(
 
 def _ways(runs: TermRuns, near: Sequence[Collection[Lag]]) -> tuple[tuple[int, ...], ...]:
     """Return the terms of some lags by number, where these are some and not all, nor those of the lags before."""
-    own = [tuple(i for i, lags in enumerate(runs.lags) if lags <= frozenset(given)) for given in near if given]
+    own = [
+        tuple(i for i, lags in enumerate(runs.lags) if lags <= frozenset(given))
+        for given in near
+        if given
+    ]
     return tuple(able for able in dict.fromkeys(own) if 0 < len(able) < len(runs.library))
 
 
@@ -305,7 +365,9 @@ def _added_to(size: int) -> int:
     return 1 if size < _ONE_BY_ONE else max(1, size // 8)
 
 
-def _forward(runs: TermRuns, begin: PathModel, most: int, able: Able, judged: Any, *, again: bool) -> None:
+def _forward(
+    runs: TermRuns, begin: PathModel, most: int, able: Able, judged: Any, *, again: bool
+) -> None:
     texts, point, best, waited = runs.library.texts, begin.point, begin.score, 0
     while len(point.chosen) < most and waited < _PATIENCE and np.isfinite(point.loss):
         began = time.monotonic()
@@ -332,7 +394,9 @@ def _picked(
     """Return up to `count` further terms by number, each of them outside the span of physics and terms before it."""
     nt = equations.hessian.shape[0] - len(runs.library)
     known = [*range(nt), *(nt + i for i in chosen)]
-    picks = forward(equations, known, count, least=least, within=runs.collinear, constant=runs.constant)
+    picks = forward(
+        equations, known, count, least=least, within=runs.collinear, constant=runs.constant
+    )
     return [pick.column - nt for pick in picks]
 
 
@@ -347,7 +411,9 @@ def _anew(path: Callable[[], TermPath], judged: Any) -> None:
         new = tuple(_picked(runs, equations, (), rung.size))
         if any({*new} == set(other.point.chosen) for other in path().rungs):
             return
-        change = [f"+ {texts[i]}" for i in new if i not in before] + [f"− {texts[i]}" for i in sorted(before - {*new})]
+        change = [f"+ {texts[i]}" for i in new if i not in before] + [
+            f"− {texts[i]}" for i in sorted(before - {*new})
+        ]
         judged(_refitted(runs, rung.point, equations, new), change, began)
 
 

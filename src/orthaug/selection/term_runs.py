@@ -1,7 +1,8 @@
 """Models of chosen terms: fitted one step ahead or on the free run, linearised for all terms, and flown where held out.
 
-One compiled program serves every choice (`Menu`). On the free run a term is weighed by what it does to the run,
-not to one step: noise in measured lags does not count as structure, and what pays only one step ahead is not picked.
+One compiled program serves every choice (`Menu`). On the free run a term is weighed by what it does
+to the run, not to one step: noise in measured lags does not count as structure, and what pays only
+one step ahead is not picked.
 """
 
 from __future__ import annotations
@@ -22,7 +23,13 @@ from orthaug.data.regressors import Features, in_order
 from orthaug.data.terms import CONSTANT, TermLibrary, products_of
 from orthaug.fitting.criteria import Criterion, Simulation
 from orthaug.fitting.initial_states import InitialStates, Start
-from orthaug.fitting.objective import RUNAWAY, FreeRunObjective, LinearisedFreeRun, TrialPoint, errors_of
+from orthaug.fitting.objective import (
+    RUNAWAY,
+    FreeRunObjective,
+    LinearisedFreeRun,
+    TrialPoint,
+    errors_of,
+)
 from orthaug.fitting.segments import Segments, build_segments
 from orthaug.fitting.solvers.descent import MARQUARDT
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
@@ -43,10 +50,10 @@ _TOLERANCE = 1e-4  # relative change of the loss: models are compared, not publi
 class Menu(Lagged):
     """A lagged form, its `features` the factors, with places for `width` terms of up to `order` factors.
 
-    `ŷ_k = φ(x_k)θ + Σ_j w_j t_j(x_k)`, the t_j products of few factors whose numbers come with the weights. So every
-    choice of `width` terms runs by the same compiled programs.
-    Of `Numbers`, `weights` are a pair: the factors' numbers (width, order) of each term, and its coefficient (width,).
-    `halfwidth` are the factors' sizes. It has one output.
+    `ŷ_k = φ(x_k)θ + Σ_j w_j t_j(x_k)`, the t_j products of few factors whose numbers come with the
+    weights. So every choice of `width` terms runs by the same compiled programs. Of `Numbers`,
+    `weights` are a pair: the factors' numbers (width, order) of each term, and its coefficient
+    (width,). `halfwidth` are the factors' sizes. It has one output.
     """
 
     width: int = 0
@@ -59,7 +66,9 @@ class Menu(Lagged):
     def numbers(self, theta: Any, products: Any, weights: Any, sizes: Any) -> Numbers:
         """Return the model's numbers, of coefficients (width,) of terms of the factors divided by their `sizes`."""
         pair = (np.asarray(products), np.asarray(weights, dtype=float))
-        return Numbers(np.asarray(theta), np.zeros(len(theta)), pair, np.zeros(len(sizes)), sizes, np.ones(1))
+        return Numbers(
+            np.asarray(theta), np.zeros(len(theta)), pair, np.zeros(len(sizes)), sizes, np.ones(1)
+        )
 
     def terms(self, numbers: Numbers, x: Any) -> Any:
         """t (width,) at one regressor x (nx,)."""
@@ -75,7 +84,9 @@ class Menu(Lagged):
         known = self.baseline.known(x, self.layout, self.outputs, jnp)
         terms = self.terms(numbers, x)[None, :]
         learned = terms @ numbers.weights[1]
-        return Parts(known + phi @ numbers.theta, learned, learned), jnp.concatenate([phi, terms], axis=1)
+        return Parts(known + phi @ numbers.theta, learned, learned), jnp.concatenate(
+            [phi, terms], axis=1
+        )
 
     def _derivatives(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Any, Any]:
         def predict(state: Any) -> tuple[Any, Any]:
@@ -83,7 +94,9 @@ class Menu(Lagged):
             return parts.total[0], (parts.total, slope)
 
         to_state, (value, slope) = jax.grad(predict, has_aux=True)(state)
-        back = jnp.stack([to_state[lag - 1] for lag, _ in self.fed_back] or [jnp.zeros(())])[None, :]
+        back = jnp.stack([to_state[lag - 1] for lag, _ in self.fed_back] or [jnp.zeros(())])[
+            None, :
+        ]
         # a kink without a derivative counts as flat
         slope, feedback = (jnp.where(jnp.isfinite(d), d, 0.0) for d in (slope, back))
         return value, slope, feedback
@@ -119,7 +132,9 @@ class TermRuns:
     sizes: Vector
     layout: Segments | None
     collinear: float = COLLINEAR
-    """Share of a term's deviation that physics and the terms before it must leave, so that it is taken."""
+    """Share of a term's deviation that physics and the terms before it must leave, so that it is
+    taken.
+    """
 
     @classmethod
     def of(
@@ -131,25 +146,40 @@ class TermRuns:
         collinear: float = COLLINEAR,
     ) -> TermRuns:
         """Lay a problem out; its segments padded to the shapes of another's."""
-        factors = Features(tuple(parse(text) for text in library.factors)).sampled(problem.record.sampling_time)
-        names = tuple(c.name for c in problem.record.outputs), tuple(c.name for c in problem.record.inputs)
+        factors = Features(tuple(parse(text) for text in library.factors)).sampled(
+            problem.record.sampling_time
+        )
+        names = (
+            tuple(c.name for c in problem.record.outputs),
+            tuple(c.name for c in problem.record.inputs),
+        )
         layout = in_order((*problem.baseline.lags, *factors.lags), *names)
-        menu = Menu(problem.baseline, factors, layout, names[0], None, width=_PLACES, order=max(library.order, 1))
+        menu = Menu(
+            problem.baseline,
+            factors,
+            layout,
+            names[0],
+            None,
+            width=_PLACES,
+            order=max(library.order, 1),
+        )
         sizes = like.sizes if like is not None else None
         first = np.ones(len(library.factors)) if sizes is None else sizes
         runs = cls(problem, library, criterion, menu, first, None, collinear)
         if sizes is None:
             with np.errstate(all="ignore"):
-                largest = np.abs(np.concatenate([runs.factors(e) for e in problem.record.experiments], axis=1)).max(
-                    axis=1
-                )
+                largest = np.abs(
+                    np.concatenate([runs.factors(e) for e in problem.record.experiments], axis=1)
+                ).max(axis=1)
             runs = replace(runs, sizes=np.where(np.isfinite(largest) & (largest > 0), largest, 1.0))
         if criterion.one_step:
             return runs
         trial = criterion.free_run
         assert trial is not None
         shape = None if like is None else like.layout
-        return replace(runs, layout=build_segments(problem.record, menu, trial.steps, trial.washout, shape))
+        return replace(
+            runs, layout=build_segments(problem.record, menu, trial.steps, trial.washout, shape)
+        )
 
     @property
     def free_run(self) -> Simulation:
@@ -159,7 +189,9 @@ class TermRuns:
     @cached_property
     def rms(self) -> float:
         """Of what least squares leaves one step ahead, in the output's unit."""
-        return max(float(np.sqrt(np.mean(self.problem.unexplained**2))), 1e-10) * float(self.problem.deviation[0])
+        return max(float(np.sqrt(np.mean(self.problem.unexplained**2))), 1e-10) * float(
+            self.problem.deviation[0]
+        )
 
     def places(self, count: int) -> int:
         """Return the number of places of the compiled program that so many terms run in."""
@@ -170,11 +202,16 @@ class TermRuns:
         """Return the factors along an experiment, over their sizes."""
         x = self.menu.regressors(experiment, self.problem.record)
         with np.errstate(all="ignore"):
-            return np.asarray(self.menu.features.evaluate(x, self.menu.layout, np)).T / self.sizes[:, None]
+            return (
+                np.asarray(self.menu.features.evaluate(x, self.menu.layout, np)).T
+                / self.sizes[:, None]
+            )
 
     def rows(self, experiment: Any) -> tuple[Float[np.ndarray, "T nx"], Float[np.ndarray, "T 1"]]:
         """Regressors and outputs along an experiment."""
-        return self.menu.regressors(experiment, self.problem.record), experiment.outputs[self.menu.first_row :]
+        return self.menu.regressors(experiment, self.problem.record), experiment.outputs[
+            self.menu.first_row :
+        ]
 
     def physics(self, x: Matrix, y: Matrix) -> tuple[Float[np.ndarray, "T nt"], Vector]:
         """Φ along some of these rows, and what the fixed terms leave of the output."""
@@ -183,13 +220,17 @@ class TermRuns:
 
     def on(self, record: Record) -> TermRuns:
         """The same on another record."""
-        return TermRuns.of(self.problem.on(record), self.library, self.criterion, self, self.collinear)
+        return TermRuns.of(
+            self.problem.on(record), self.library, self.criterion, self, self.collinear
+        )
 
     @cached_property
     def lags(self) -> tuple[frozenset[Lag], ...]:
         """Those that each term reads."""
         own = [parse(text).lags for text in self.library.factors]
-        return tuple(frozenset(lag for i in product for lag in own[i]) for product in self.library.products)
+        return tuple(
+            frozenset(lag for i in product for lag in own[i]) for product in self.library.products
+        )
 
     @cached_property
     def constant(self) -> int | None:
@@ -204,7 +245,10 @@ class TermRuns:
     def start(self) -> Point:
         """Physics alone, one step ahead."""
         return Point(
-            (), self.problem.least_squares, np.zeros(0), None if self.layout is None else np.asarray(self.layout.start)
+            (),
+            self.problem.least_squares,
+            np.zeros(0),
+            None if self.layout is None else np.asarray(self.layout.start),
         )
 
     def fit(self, point: Point, chosen: Sequence[int], iterations: int = 30) -> Point:
@@ -217,14 +261,21 @@ class TermRuns:
             p = own.solve()
             return Point(chosen, p[:nt], p[nt:], None, max(own.miss(p), 0.0) / own.rows)
         objective = _TermSubset.of(self, chosen)
-        p = np.concatenate([point.c, w, np.zeros(objective.dynamics.unknowns - len(point.c) - len(w))])
+        p = np.concatenate(
+            [point.c, w, np.zeros(objective.dynamics.unknowns - len(point.c) - len(w))]
+        )
         states = point.states if point.states is not None else np.asarray(self.layout.start)
         trial = _descended(objective, p, Start(states), iterations)
-        loss = trial.misfit * self.rms**2 / self.layout.count if np.isfinite(trial.misfit) else np.inf
+        loss = (
+            trial.misfit * self.rms**2 / self.layout.count if np.isfinite(trial.misfit) else np.inf
+        )
         return Point(chosen, trial.c, trial.w[: len(chosen)], trial.states, loss)
 
     def independent_share(self, point: Point) -> float:
-        """Return the share of a model's errors that is independent; one step ahead all of them count."""
+        """Return the share of a model's errors that is independent.
+
+        One step ahead all of them count.
+        """
         if self.layout is None:
             return 1.0
         objective = _TermSubset.of(self, point.chosen)
@@ -235,15 +286,19 @@ class TermRuns:
     def equations(self, point: Point, able: Able = None, scored: Any = None) -> Equations:
         """Return the normal equations of physics and all terms about a point, for p itself: its chosen terms are in the error.
 
-        Args:
-            able: terms that may be chosen, beside those that are; the columns of others are zero.
-            scored: which steps of the segments count, or chunks of rows one step ahead; None for all.
+        Args: able: terms that may be chosen, beside those that are; the columns of others are zero.
+            scored: which steps of the segments count, or chunks of rows one step ahead; None for
+            all.
         """
         nt, terms = len(point.c), len(self.library)
         taken = range(terms) if able is None else sorted({*able, *point.chosen})
         columns = [*range(nt), *(nt + i for i in taken)]
         if self.layout is None:
-            own = self.step_equations if scored is None else Equations.sum_of(self.step_blocks[scored])
+            own = (
+                self.step_equations
+                if scored is None
+                else Equations.sum_of(self.step_blocks[scored])
+            )
             return own if able is None else own.of(columns).among(columns, nt + terms)
         objective = _TermSubset.of(self, tuple(taken), exactly=True)
         if scored is not None:
@@ -264,9 +319,14 @@ class TermRuns:
         if self.layout is None:
             chunks = len(self.step_blocks)
             edges = np.linspace(0, chunks, min(count, chunks) + 1).astype(int)
-            return [self.equations(point, able, slice(a, b)) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+            return [
+                self.equations(point, able, slice(a, b))
+                for a, b in zip(edges[:-1], edges[1:], strict=True)
+            ]
         scored = np.asarray(self.layout.scored)
-        order = np.cumsum(np.moveaxis(scored, 1, -1).reshape(-1)).reshape(*scored.shape[::2], scored.shape[1])
+        order = np.cumsum(np.moveaxis(scored, 1, -1).reshape(-1)).reshape(
+            *scored.shape[::2], scored.shape[1]
+        )
         place = np.moveaxis((order - 1) * count // max(int(scored.sum()), 1), -1, 1)
         return [self.equations(point, able, scored & (place == part)) for part in range(count)]
 
@@ -282,7 +342,11 @@ class TermRuns:
                 with np.errstate(all="ignore"):
                     terms = products_of(factors[:, rows], self.library.numbers, np)
                 columns = np.concatenate([phi.T, terms])
-                found.append(Equations(columns @ columns.T, columns @ target, float(target @ target), len(target)))
+                found.append(
+                    Equations(
+                        columns @ columns.T, columns @ target, float(target @ target), len(target)
+                    )
+                )
         return tuple(found)
 
     @cached_property
@@ -290,7 +354,10 @@ class TermRuns:
         return Equations.sum_of(self.step_blocks)
 
     def errors(self, point: Point, held: Segments) -> float:
-        """Mean of squared errors of free runs over held-out segments from measured starts; infinite if one diverges."""
+        """Mean of squared errors of free runs over held-out segments from measured starts.
+
+        Infinite if one diverges.
+        """
         objective = _TermSubset.of(self, point.chosen)
         w = np.zeros(objective.dynamics.unknowns - objective.physics)
         w[: len(point.w)] = point.w
@@ -304,16 +371,19 @@ class TermRuns:
 def _descended(objective: FreeRunObjective, p: Vector, start: Start, iterations: int) -> TrialPoint:
     """Minimise the misfit by Gauss-Newton steps, and by Levenberg-Marquardt from where one of them does not descend.
 
-    About a fitted model the misfit is nearly quadratic. A small step that lowers it by what was expected leaves nothing
-    to gain, so no trial is linearised only to confirm that: a linearisation costs ten to thirty trials. After a large
-    step the sensitivities are others: those of past outputs are zero where the model does nothing yet.
+    About a fitted model the misfit is nearly quadratic. A small step that lowers it by what was
+    expected leaves nothing to gain, so no trial is linearised only to confirm that: a linearisation
+    costs ten to thirty trials. After a large step the sensitivities are others: those of past
+    outputs are zero where the model does nothing yet.
     """
     trial = objective.evaluate(p, start)
     for done in range(iterations if np.isfinite(trial.misfit) else 0):
         linear = objective.linearise(trial)
         if not np.isfinite(linear.hessian).all():
             break
-        step = Equations(linear.hessian, linear.gradient, trial.misfit, objective.segments.count).solve()
+        step = Equations(
+            linear.hessian, linear.gradient, trial.misfit, objective.segments.count
+        ).solve()
         expected = float(2 * step @ linear.gradient - step @ linear.hessian @ step)
         if expected <= _TOLERANCE**2 * trial.misfit:
             break
@@ -323,7 +393,10 @@ def _descended(objective: FreeRunObjective, p: Vector, start: Start, iterations:
             solver, start = LevenbergMarquardt(iterations - done, _TOLERANCE), Start(trial.states)
             return solver.descend(objective, trial.p, start, damping=MARQUARDT).point
         before, trial = trial, tried
-        if gained <= _SETTLED * before.misfit and abs(expected - gained) <= _TOLERANCE * before.misfit:
+        if (
+            gained <= _SETTLED * before.misfit
+            and abs(expected - gained) <= _TOLERANCE * before.misfit
+        ):
             break
     return trial
 
@@ -347,7 +420,9 @@ class _TermSubset(FreeRunObjective):
             dynamics=menu,
             numbers=lambda c, w: menu.numbers(c, products, w, runs.sizes),
             segments=segments,
-            initial=InitialStates(start, start is not None and start.size > 0 and runs.free_run.estimates_pasts),  # type: ignore[arg-type]
+            initial=InitialStates(
+                start, start is not None and start.size > 0 and runs.free_run.estimates_pasts
+            ),  # type: ignore[arg-type]
             weight=np.eye(1) / runs.rms,
             rms=runs.rms,
             deviation=runs.problem.deviation,

@@ -57,7 +57,10 @@ LABELS = {
 }
 ORTHOGONAL = Orthogonal()
 STRUCTURES = {"orthogonal": ORTHOGONAL, "additive": Additive()}
-PIPELINES = {"static": (500, 1000), "mass_spring_damper": (2500, 500)}  # the paper's Adam and L-BFGS iterations
+PIPELINES = {
+    "static": (500, 1000),
+    "mass_spring_damper": (2500, 500),
+}  # the paper's Adam and L-BFGS iterations
 LARGEST_TRAINED = {
     "ours": 65_536,
     "paper": 16_384,
@@ -65,7 +68,9 @@ LARGEST_TRAINED = {
 }  # samples up to which a learner is trained: the run is to end
 _NODES = np.polynomial.legendre.leggauss(64)
 UNIFORM = Samples({"u[k]": 0.6 * _NODES[0]}, weights=_NODES[1], name="uniform")
-"""Uniform on [−0.6, 0.6]: `measures.Uniform` with fewer nodes, which changes no digit shown and is quicker."""
+"""Uniform on [−0.6, 0.6]: `measures.Uniform` with fewer nodes, which changes no digit shown and is
+quicker.
+"""
 
 
 class Finding(NamedTuple):
@@ -89,7 +94,10 @@ class Finding(NamedTuple):
 
 
 class Counts(NamedTuple):
-    """Comparisons that are met, and all of them, apart by what ours is compared with; rows beyond the paper."""
+    """Comparisons that are met, and all of them, apart by what ours is compared with.
+
+    Rows beyond the paper.
+    """
 
     published_met: int
     published: int
@@ -102,7 +110,9 @@ class Counts(NamedTuple):
         rows = list(findings)
         paper = [row.as_published for row in rows if row.as_published is not None]
         scripts = [row.as_scripts for row in rows if row.as_scripts is not None]
-        return cls(sum(paper), len(paper), sum(scripts), len(scripts), sum(row.beyond for row in rows))
+        return cls(
+            sum(paper), len(paper), sum(scripts), len(scripts), sum(row.beyond for row in rows)
+        )
 
 
 class Drawing(NamedTuple):
@@ -117,8 +127,9 @@ class Drawing(NamedTuple):
 class Reproduction:
     """One entry of `orthaug reproduce`.
 
-    `study(pipeline, small)` declares the runs: `pipeline` is one of `reproduction.PIPELINES`; `small` for the reduced
-    size of the tests. `figures(table)` draws, by file name; `findings(table)` compares. `text` says what is run.
+    `study(pipeline, small)` declares the runs: `pipeline` is one of `reproduction.PIPELINES`;
+    `small` for the reduced size of the tests. `figures(table)` draws, by file name;
+    `findings(table)` compares. `text` says what is run.
     """
 
     name: str
@@ -141,26 +152,43 @@ def trained(
 ) -> Estimate:
     """Return one fit of an example by a pipeline; `which` names the paper's iterations.
 
-    Args:
-        pipeline: "ours", Levenberg-Marquardt with `iterations` and `regularization`; "paper", Adam and L-BFGS on
+    Args: pipeline: "ours", Levenberg-Marquardt with `iterations` and `regularization`; "paper",
+        Adam and L-BFGS on
             normalised data; "scripts", the published scripts' own.
     """
     if pipeline == "scripts":
         return published.train(example, structure, PIPELINES[which], seed)
-    solver = AdamLBFGS(*PIPELINES[which]) if pipeline == "paper" else LevenbergMarquardt(iterations, longest=iterations)
-    options: dict[str, Any] = {"structure": structure, "solver": solver, "regularization": regularization}
+    solver = (
+        AdamLBFGS(*PIPELINES[which])
+        if pipeline == "paper"
+        else LevenbergMarquardt(iterations, longest=iterations)
+    )
+    options: dict[str, Any] = {
+        "structure": structure,
+        "solver": solver,
+        "regularization": regularization,
+    }
     return estimate(example.train, example.baseline, seed=seed, **options)
 
 
 def drawn(data_set: int, *, samples: int = 1024, draw: int = 0, noise: bool = False) -> Example:
-    """Return the static example's training record drawn anew; `draw` 0 is the paper's own, as `synthetic.static` has it."""
+    """Return the static example's training record drawn anew.
+
+    `draw` 0 is the paper's own, as `synthetic.static` has it.
+    """
     example = static(data_set, noise=noise, samples=samples)
     if not draw:
         return example
     rng = np.random.default_rng([10, draw])
     half = 0.3 * rng.standard_normal(samples // 2 if data_set == 1 else samples)
     u = np.concatenate([half, -half]) if data_set == 1 else half - (0.01 if data_set == 3 else 0.0)
-    y = 0.01 + u - 0.5 * u**2 + 0.1 * u**3 + (rng.normal(0.0, NOISE_30_DB, len(u)) if noise else 0.0)
+    y = (
+        0.01
+        + u
+        - 0.5 * u**2
+        + 0.1 * u**3
+        + (rng.normal(0.0, NOISE_30_DB, len(u)) if noise else 0.0)
+    )
     return Example(Record.from_arrays(u, y), example.test, example.baseline, example.theta)
 
 
@@ -178,7 +206,11 @@ def mean_errors(rows: pd.DataFrame) -> pd.DataFrame:
 
 def slope(samples: Any, errors: Any) -> float:
     """Return the exponent p of errors ∝ Nᵖ, by least squares over logarithms."""
-    return float(np.polyfit(np.log(np.asarray(samples, dtype=float)), np.log(np.asarray(errors, dtype=float)), 1)[0])
+    return float(
+        np.polyfit(
+            np.log(np.asarray(samples, dtype=float)), np.log(np.asarray(errors, dtype=float)), 1
+        )[0]
+    )
 
 
 def panels(
@@ -208,7 +240,14 @@ def legend(figure: Figure, axes: Axes | Iterable[Axes], ncols: int = 4) -> None:
         handles, labels = axis.get_legend_handles_labels()
         unique.update(dict(zip(labels, handles, strict=True)))
     ncols = min(ncols, len(unique))
-    figure.legend(unique.values(), unique.keys(), loc="outside upper center", ncols=ncols, frameon=False, fontsize=8)
+    figure.legend(
+        unique.values(),
+        unique.keys(),
+        loc="outside upper center",
+        ncols=ncols,
+        frameon=False,
+        fontsize=8,
+    )
 
 
 def against_samples(axis: Axes, title: str) -> None:
@@ -224,7 +263,9 @@ def extremes(rows: pd.DataFrame, by: str, column: str) -> pd.DataFrame:
     return rows.groupby(by)[column].agg(["median", "min", "max"]).reset_index()
 
 
-def whiskers(axis: Axes, x: Any, of: pd.DataFrame, name: str, *, label: str = "", **style: Any) -> None:
+def whiskers(
+    axis: Axes, x: Any, of: pd.DataFrame, name: str, *, label: str = "", **style: Any
+) -> None:
     """Medians with bars from the smallest to the largest value, which a logarithmic axis shows whole."""
     reach = np.stack([of["median"] - of["min"], of["max"] - of["median"]])
     style = {
@@ -239,10 +280,20 @@ def whiskers(axis: Axes, x: Any, of: pd.DataFrame, name: str, *, label: str = ""
 
 def scripts_bars(axis: Axes, x: Any, spreads: Sequence[Spread], name: str, **style: Any) -> None:
     """What the scripts gave: a cross at each mean with a bar from the smallest to the largest run."""
-    low, mean, high = (np.array([getattr(spread, part) for spread in spreads]) for part in ("low", "mean", "high"))
-    style = {"marker": "x", "markersize": 5.0, "linewidth": 0.0, "elinewidth": 0.8, "capsize": 2.5} | style
+    low, mean, high = (
+        np.array([getattr(spread, part) for spread in spreads]) for part in ("low", "mean", "high")
+    )
+    style = {
+        "marker": "x",
+        "markersize": 5.0,
+        "linewidth": 0.0,
+        "elinewidth": 0.8,
+        "capsize": 2.5,
+    } | style
     style["label"] = f"scripts, {LABELS[name]}"
-    axis.errorbar(x, mean, np.stack([mean - low, high - mean]), color=COLOURS[name], alpha=0.6, **style)
+    axis.errorbar(
+        x, mean, np.stack([mean - low, high - mean]), color=COLOURS[name], alpha=0.6, **style
+    )
 
 
 def signed(exponent: float) -> str:

@@ -1,4 +1,7 @@
-"""Sect. 5.1: the asymptotic covariance matrix of θ and the learner's weights, zeros in black (thm:zero_cov)."""
+"""Sect.
+
+5.1: the asymptotic covariance matrix of θ and the learner's weights, zeros in black (thm:zero_cov).
+"""
 
 from __future__ import annotations
 
@@ -18,7 +21,10 @@ ZERO = 1e-6  # what is shown in black; in the paper in absolute value
 
 
 def one(seed: int, pipeline: str) -> dict[str, Any]:
-    """P̂ of eq:cov_approx for one start, as it stands and as correlations; θ's standard errors in both conventions."""
+    """P̂ of eq:cov_approx for one start, as it stands and as correlations.
+
+    Θ's standard errors in both conventions.
+    """
     fit = trained(static(1, noise=True), "static", pipeline, seed=seed)
     matrix = fit.joint_covariance("paper") * len(fit.problem.rows)
     nt, deviation = len(fit.theta), np.sqrt(np.maximum(np.diag(matrix), 0.0))
@@ -60,8 +66,9 @@ def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
     return {
         "covariance": Drawing(
             figure,
-            "The asymptotic covariance matrix of θ and the weights for the first initial weights, each entry over the "
-            "geometric mean of its two diagonal entries (left) and in absolute value as in the paper (right).",
+            "The asymptotic covariance matrix of θ and the weights for the first initial "
+            "weights, each entry over the geometric mean of its two diagonal entries (left) "
+            "and in absolute value as in the paper (right).",
             "Entries below 10⁻⁶ are black. The first two rows and columns are θ.",
         )
     }
@@ -73,9 +80,14 @@ def findings(table: pd.DataFrame) -> list[Finding]:
     for deviation, matrix in zip(table["std"], table.correlation, strict=True):
         nt = len(deviation)
         across.append(np.array(matrix, dtype=float)[:nt, nt:])
-    relative, absolute = 100 * float(np.mean(np.array(across) < ZERO)), 100 * float(table.zeros_across.mean())
+    relative, absolute = (
+        100 * float(np.mean(np.array(across) < ZERO)),
+        100 * float(table.zeros_across.mean()),
+    )
     largest = table.largest_across
-    ratio = np.array([np.array(p) / np.array(c) for p, c in zip(table.std_paper, table["std"], strict=True)])
+    ratio = np.array(
+        [np.array(p) / np.array(c) for p, c in zip(table.std_paper, table["std"], strict=True)]
+    )
     between = "P̂ between θ and the weights: share of entries below 10⁻⁶"
     return [
         Finding(
@@ -88,8 +100,9 @@ def findings(table: pd.DataFrame) -> list[Finding]:
         Finding(
             f"{between} in absolute value",
             f"{absolute:.4g} %",
-            f"the largest entry is {largest.median():.1e} in the median over {len(table)} starts, {largest.max():.1e} "
-            f"in the worst; the variances of the weights reach {_largest_variance(table):.1e}",
+            f"the largest entry is {largest.median():.1e} in the median over {len(table)} "
+            f"starts, {largest.max():.1e} in the worst; the variances of the weights reach "
+            f"{_largest_variance(table):.1e}",
             "all, in a figure",
             as_published=bool(absolute == 100),
         ),
@@ -102,14 +115,16 @@ def findings(table: pd.DataFrame) -> list[Finding]:
 
 
 def _largest_variance(table: pd.DataFrame) -> float:
-    return max(float(np.max(np.diagonal(np.array(matrix, dtype=float)))) for matrix in table.covariance)
+    return max(
+        float(np.max(np.diagonal(np.array(matrix, dtype=float)))) for matrix in table.covariance
+    )
 
 
 REPRODUCTION = Reproduction(
     "covariance",
     "The asymptotic covariance matrix",
-    "eq:cov_approx of the orthogonal structure on data set 1 with 30 dB of noise, for 2 + 49 parameters. The first two "
-    "rows and columns are θ.",
+    "eq:cov_approx of the orthogonal structure on data set 1 with 30 dB of noise, for 2 + 49 "
+    "parameters. The first two rows and columns are θ.",
     study,
     figures,
     findings,

@@ -1,4 +1,7 @@
-"""Sect. 5.1, panel (b) of the last static figure: error of θ against the number of samples, without noise."""
+"""Sect.
+
+5.1, panel (b) of the last static figure: error of θ against the number of samples, without noise.
+"""
 
 from __future__ import annotations
 
@@ -78,7 +81,9 @@ def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
     figure, axes = panels(2, sharey=True, height=3.3)
     for axis, data_set in zip(axes, (2, 3), strict=True):
         for measure, name in (("training", "orthogonal"), ("uniform", "uniform")):
-            errors = extremes(rows_of(table, data_set=data_set, measure=measure), "samples", "theta_error")
+            errors = extremes(
+                rows_of(table, data_set=data_set, measure=measure), "samples", "theta_error"
+            )
             label = "orthogonal, training measure" if measure == "training" else ""
             whiskers(axis, errors.samples, errors, name, label=label)
         own = rows_of(table, data_set=data_set, measure="training")
@@ -86,50 +91,78 @@ def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
         style = {"color": COLOURS["orthogonal"], "linewidth": 1.0, "label": "the paper's record"}
         axis.plot(own.samples, own.theta_error, ":", **style)
         if data_set == 3:
-            axis.axhline(limit(3), linestyle="--", linewidth=0.9, color=COLOURS["truth"], label="limit, N → ∞")
+            axis.axhline(
+                limit(3),
+                linestyle="--",
+                linewidth=0.9,
+                color=COLOURS["truth"],
+                label="limit, N → ∞",
+            )
         against_samples(axis, f"data set {data_set}, no noise")
     axes[0].set_ylabel("‖θ* − θ̂‖")
     legend(figure, axes)
     return {
         "theta_error": Drawing(
             figure,
-            "Error of θ against the number of samples without noise, data set 2 (left) and 3 (right), under the "
-            "training and under the uniform measure.",
+            "Error of θ against the number of samples without noise, data set 2 (left) and 3 "
+            "(right), under the training and under the uniform measure.",
             "Marks are medians over records, bars go from the smallest to the largest of them.",
         )
     }
 
 
 def findings(table: pd.DataFrame) -> list[Finding]:
-    """Return the two trends, and what the uniform measure makes of them. The paper's own record is in `static_errors`."""
+    """Return the two trends, and what the uniform measure makes of them.
+
+    The paper's own record is in `static_errors`.
+    """
     compared = []
-    two, three = (mean_errors(rows_of(table, data_set=data_set, measure="training")) for data_set in (2, 3))
+    two, three = (
+        mean_errors(rows_of(table, data_set=data_set, measure="training")) for data_set in (2, 3)
+    )
     rate = slope(two.samples, two.theta_error)
     first, last = (float(two.theta_error.iloc[i]) for i in (0, -1))
-    why = f"the mean falls from {first:.2g} to {last:.2g} between N = {two.samples.iloc[0]} and {two.samples.iloc[-1]}"
+    why = (
+        f"the mean falls from {first:.2g} to {last:.2g} between N = {two.samples.iloc[0]} and "
+        f"{two.samples.iloc[-1]}"
+    )
     quantity, met = "set 2, no noise: exponent of ‖θ* − θ̂‖ in N", bool(-0.7 < rate < -0.3)
-    compared.append(Finding(quantity, signed(rate), f"{why}; 1/√N is −0.5", "converges to 0", as_published=met))
+    compared.append(
+        Finding(quantity, signed(rate), f"{why}; 1/√N is −0.5", "converges to 0", as_published=met)
+    )
     last = float(three.theta_error.iloc[-1])
     away = last / limit(3) - 1
     quantity = f"set 3, no noise: ‖θ* − θ̂‖ at N = {int(three.samples.iloc[-1])}"
-    why = f"{percent(abs(away))} from the limit that quadrature over the inputs' distribution gives, {limit(3):.4g}"
+    why = (
+        f"{percent(abs(away))} from the limit that quadrature over the inputs' distribution "
+        f"gives, {limit(3):.4g}"
+    )
     text, met = f"{last:.4g}", bool(abs(away) < 0.25)
     compared.append(Finding(quantity, text, why, "converges to a fixed number", as_published=met))
     for data_set in (2, 3):
         worst = float(rows_of(table, data_set=data_set, measure="uniform").theta_error.max())
-        ratio = worst / float(rows_of(table, data_set=data_set, measure="training").theta_error.max())
+        ratio = worst / float(
+            rows_of(table, data_set=data_set, measure="training").theta_error.max()
+        )
         quantity = f"set {data_set}, no noise, uniform measure: largest ‖θ* − θ̂‖ over all N"
-        compared.append(Finding(quantity, f"{worst:.2g}", f"{ratio:.1g} times the largest under the training measure"))
+        compared.append(
+            Finding(
+                quantity,
+                f"{worst:.2g}",
+                f"{ratio:.1g} times the largest under the training measure",
+            )
+        )
     return compared
 
 
 REPRODUCTION = Reproduction(
     "data_length",
     "Error of θ against N, without noise",
-    "Ten records for each N; the paper shows one, dotted in the figure. θ under the "
-    "training measure is least squares whatever the learner does, so those runs have no learner; only the uniform "
-    f"measure needs training, on {TRAINED_DRAWS} records of up to {LARGEST_TRAINED['ours']} samples "
-    f"({LARGEST_TRAINED['paper']} by the paper's pipeline, {LARGEST_TRAINED['scripts']} by the scripts').",
+    "Ten records for each N; the paper shows one, dotted in the figure. θ under the training "
+    "measure is least squares whatever the learner does, so those runs have no learner; only "
+    f"the uniform measure needs training, on {TRAINED_DRAWS} records of up to "
+    f"{LARGEST_TRAINED['ours']} samples ({LARGEST_TRAINED['paper']} by the paper's pipeline, "
+    f"{LARGEST_TRAINED['scripts']} by the scripts').",
     study,
     figures,
     findings,

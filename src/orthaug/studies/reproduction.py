@@ -86,7 +86,9 @@ def chosen(name: str | None) -> list[Reproduction]:
     if name is None:
         return list(known.values())
     if name not in known:
-        raise InputError(f"there is no study '{name}'{nearest(name, known) or '.'} There are {', '.join(known)}.")
+        raise InputError(
+            f"there is no study '{name}'{nearest(name, known) or '.'} There are {', '.join(known)}."
+        )
     return [known[name]]
 
 
@@ -101,8 +103,8 @@ def reproduce(
 ) -> list[StudyOutcome]:
     """Run the studies; what a store holds already is not run again.
 
-    Args:
-        pipeline: "ours", "paper" for Adam and L-BFGS with the published iterations on normalised data, or "scripts"
+    Args: pipeline: "ours", "paper" for Adam and L-BFGS with the published iterations on normalised
+        data, or "scripts"
             for what the published scripts do, un-normalised and from θ⁰.
         small: at the reduced size of the tests.
         store: where results are kept as they are made; None for the user's cache folder.
@@ -112,10 +114,18 @@ def reproduce(
     store = Path(platformdirs.user_cache_dir("orthaug")) / "studies" if store is None else store
     reproduced = []
     for entry in entries:
-        tell = None if progress is None else lambda done, total, e=entry: progress(e.title, done, total)
+        tell = (
+            None
+            if progress is None
+            else lambda done, total, e=entry: progress(e.title, done, total)
+        )
         done = runs(entry.study(pipeline, small), store=store, progress=tell, client=client)
         table = as_table(done)
-        reproduced.append(StudyOutcome(entry, done, table, dict(entry.figures(table)), entry.findings(table), small))
+        reproduced.append(
+            StudyOutcome(
+                entry, done, table, dict(entry.figures(table)), entry.findings(table), small
+            )
+        )
     return reproduced
 
 
@@ -124,8 +134,13 @@ def check_output(folder: Path, *, force: bool = False) -> None:
     check_replaceable(folder, force=force)
 
 
-def write(reproduced: Sequence[StudyOutcome], folder: Path, pipeline: str, *, force: bool = False) -> None:
-    """index.html, and for each study its figures as PNG and its runs as CSV; whole or not at all."""
+def write(
+    reproduced: Sequence[StudyOutcome], folder: Path, pipeline: str, *, force: bool = False
+) -> None:
+    """index.html, and for each study its figures as PNG and its runs as CSV.
+
+    Whole or not at all.
+    """
     with whole_folder(folder, force=force) as partial:
         for study in reproduced:
             place = partial / study.entry.name
@@ -140,13 +155,19 @@ def write(reproduced: Sequence[StudyOutcome], folder: Path, pipeline: str, *, fo
             "findings": as_rows(reproduced),
             "runs": {study.entry.name: when(study.runs) for study in reproduced},
         }
-        (partial / MARK).write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        (partial / MARK).write_text(
+            json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8"
+        )
         (partial / "index.html").write_text(_page(reproduced, pipeline), encoding="utf-8")
 
 
 def as_rows(reproduced: Sequence[StudyOutcome]) -> list[dict[str, Any]]:
     """Return the findings as plain rows, each with its study."""
-    return [{"study": study.entry.name, **finding._asdict()} for study in reproduced for finding in study.findings]
+    return [
+        {"study": study.entry.name, **finding._asdict()}
+        for study in reproduced
+        for finding in study.findings
+    ]
 
 
 def _counts(reproduced: Sequence[StudyOutcome]) -> Counts:
@@ -162,7 +183,9 @@ def when(done: Sequence[Run]) -> str:
             days = sorted({run.made[:10] for run in some})
             dates = days[0] if len(days) == 1 else f"{days[0]} to {days[-1]}"
             origin = "read from the store, made on" if stored else "made now, on"
-            parts.append(f"{len(some)} {origin} {dates} in {sum(run.seconds for run in some):.3g} s")
+            parts.append(
+                f"{len(some)} {origin} {dates} in {sum(run.seconds for run in some):.3g} s"
+            )
     return f"{len(done)} run{'s' * (len(done) != 1)}: {'; '.join(parts)}, summed over runs"
 
 
@@ -175,11 +198,26 @@ def text(reproduced: Sequence[StudyOutcome]) -> str:
     buffer = io.StringIO()
     console = Console(file=buffer, width=WIDTH, color_system=None, legacy_windows=False)
     for study in reproduced:
-        table = Table(title=study.entry.title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1), expand=True)
-        for name, ratio in (("quantity", 24), ("published", 14), ("scripts", 18), ("ours", 18), ("verdict", 26)):
+        table = Table(
+            title=study.entry.title,
+            title_justify="left",
+            box=box.SIMPLE_HEAD,
+            padding=(0, 1),
+            expand=True,
+        )
+        for name, ratio in (
+            ("quantity", 24),
+            ("published", 14),
+            ("scripts", 18),
+            ("ours", 18),
+            ("verdict", 26),
+        ):
             table.add_column(name, ratio=ratio, overflow="fold")
         for row in study.findings:
-            marked = (_marked(row.published, row.as_published), _marked(row.scripts, row.as_scripts))
+            marked = (
+                _marked(row.published, row.as_published),
+                _marked(row.scripts, row.as_scripts),
+            )
             table.add_row(row.quantity, *marked, row.ours, row.verdict)
         console.print(table, markup=False, highlight=False)
     counts = _counts(reproduced)
@@ -200,8 +238,12 @@ def _marked(reference: str, met: bool | None) -> str:
 
 
 def _page(reproduced: Sequence[StudyOutcome], pipeline: str) -> str:
-    source = files("orthaug.studies").joinpath("templates/reproduction.html").read_text(encoding="utf-8")
-    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
+    source = (
+        files("orthaug.studies").joinpath("templates/reproduction.html").read_text(encoding="utf-8")
+    )
+    environment = jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True
+    )
     environment.filters["whole"] = lambda words: words.replace("e-", f"e{HYPHEN}")
     studies = [
         {

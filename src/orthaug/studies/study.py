@@ -1,4 +1,6 @@
-"""Studies: one function over a grid of arguments and seeds, its results in a table. An interrupted study goes on.
+"""Studies: one function over a grid of arguments and seeds, its results in a table.
+
+An interrupted study goes on.
 
 A study is a declaration, so anyone's Monte Carlo is a function and a grid:
 
@@ -38,13 +40,12 @@ CasesProgress = Callable[[int, int], None]
 class Study:
     """A function and the grid that it runs over.
 
-    Args:
-        name: of its folder in a store.
-        one: takes one value of each axis as keyword arguments, gives a mapping of plain values: numbers, texts, lists.
-        grid: axes by name, each with its values; all combinations run, the last axis fastest. Slow cases go first.
-        version: raise it when `one` computes something else, so that stored results no longer count.
-        where: of all combinations, those that run; takes what `one` takes. None for all.
-        workers: cases at a time; 1 for a study that measures time, None for the machine's cores.
+    Args: name: of its folder in a store. one: takes one value of each axis as keyword arguments,
+        gives a mapping of plain values: numbers, texts, lists. grid: axes by name, each with its
+        values; all combinations run, the last axis fastest. Slow cases go first. version: raise it
+        when `one` computes something else, so that stored results no longer count. where: of all
+        combinations, those that run; takes what `one` takes. None for all. workers: cases at a
+        time; 1 for a study that measures time, None for the machine's cores.
     """
 
     name: str
@@ -56,13 +57,20 @@ class Study:
 
     def cases(self) -> list[Case]:
         """Return every combination that runs, as keyword arguments of plain values."""
-        axes = [[_value(self, axis, value) for value in values] for axis, values in self.grid.items()]
+        axes = [
+            [_value(self, axis, value) for value in values] for axis, values in self.grid.items()
+        ]
         combinations = (dict(zip(self.grid, values, strict=True)) for values in product(*axes))
         return [case for case in combinations if self.where is None or self.where(**case)]
 
     def key(self, case: Case) -> str:
         """Return the key of a stored result: a hash of study, version, arguments, function and this package's code."""
-        declared = {"study": self.name, "version": self.version, "case": case, "code": _text(self.one)}
+        declared = {
+            "study": self.name,
+            "version": self.version,
+            "case": case,
+            "code": _text(self.one),
+        }
         declared["orthaug"] = _sources()
         return hashlib.sha256(json.dumps(declared, sort_keys=True).encode()).hexdigest()[:24]
 
@@ -110,10 +118,9 @@ def run(
 ) -> pd.DataFrame:
     """Run what the store does not hold yet, several cases at a time; a row per case, axes first.
 
-    Args:
-        store: a folder that keeps each result as it is made; None to keep nothing.
-        workers: cases at a time; by default the study's own number, or the machine's cores.
-        client: a `distributed.Client`; its workers make the cases of a study that does not measure time.
+    Args: store: a folder that keeps each result as it is made; None to keep nothing. workers: cases
+        at a time; by default the study's own number, or the machine's cores. client: a
+        `distributed.Client`; its workers make the cases of a study that does not measure time.
 
     Raises:
         InputError: a result that is not plain values; a store that cannot be written.
@@ -144,7 +151,10 @@ def runs(
     if progress is not None:
         progress(done, len(cases))
 
-    wanted, elsewhere = study.workers if workers is None else workers, client is not None and study.workers != 1
+    wanted, elsewhere = (
+        study.workers if workers is None else workers,
+        client is not None and study.workers != 1,
+    )
     if elsewhere:
         wanted = places(client)
 
@@ -179,7 +189,13 @@ def _read(store: Path | None, study: Study, case: Case) -> Run | None:
         content = json.loads(_path(store, study, case).read_text(encoding="utf-8"))
         if content.pop("sha256") != _checksum(study, case, content):
             return None
-        return Run(case, dict(content["result"]), str(content["made"]), float(content["seconds"]), stored=True)
+        return Run(
+            case,
+            dict(content["result"]),
+            str(content["made"]),
+            float(content["seconds"]),
+            stored=True,
+        )
     except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
         return None
 
@@ -218,4 +234,7 @@ def _value(study: Study, key: str, value: Any) -> Any:
         return finite_or_none(value)
     if value is None or isinstance(value, bool | int | str):
         return value
-    raise InputError(f"study '{study.name}': '{key}' is a {type(value).__name__}; expected numbers, texts or lists.")
+    raise InputError(
+        f"study '{study.name}': '{key}' is a {type(value).__name__}; expected numbers, texts "
+        "or lists."
+    )

@@ -47,9 +47,14 @@ def static(data_set: int = 1, *, noise: bool = False, samples: int = 1024) -> Ex
     y = _static_map(u)
     if noise:
         y = y + rng.normal(0.0, NOISE_30_DB, y.shape)
-    baseline = Baseline.from_terms([Term("theta1", "u[k]", initial=0.8), Term("theta3", "u[k]**3", initial=0.03)])
+    baseline = Baseline.from_terms(
+        [Term("theta1", "u[k]", initial=0.8), Term("theta3", "u[k]**3", initial=0.03)]
+    )
     return Example(
-        Record.from_arrays(u, y), Record.from_arrays(u_test, _static_map(u_test)), baseline, np.array([1.0, 0.1])
+        Record.from_arrays(u, y),
+        Record.from_arrays(u_test, _static_map(u_test)),
+        baseline,
+        np.array([1.0, 0.1]),
     )
 
 
@@ -59,7 +64,11 @@ def _static_map(u: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class MassSpringDamper:
-    """Sect. 5.2: mass [kg], damping [Ns/m], stiffness [N/m], Stribeck friction [N, N, m/s], sampling time [s]."""
+    """Sect.
+
+    5.2: mass [kg], damping [Ns/m], stiffness [N/m], Stribeck friction [N, N, m/s], sampling time
+    [s].
+    """
 
     m: float = 1.0
     cd: float = 100.0
@@ -70,7 +79,10 @@ class MassSpringDamper:
     sampling_time: float = 0.01
 
     def paper_theta(self) -> Vector:
-        """θ as printed in the paper and its scripts; backward Euler has `2m + cd Ts` in the first entry."""
+        """θ as printed in the paper and its scripts.
+
+        Backward Euler has `2m + cd Ts` in the first entry.
+        """
         ts = self.sampling_time
         gamma = self.m + self.cd * ts + self.ks * ts**2
         return np.array([2 * self.m - self.cd * ts, -self.m, ts**2]) / gamma
@@ -87,7 +99,10 @@ class MassSpringDamper:
         for k in range(2, len(force)):
             velocity = (y[k - 1] - y[k - 2]) / self.sampling_time
             y[k] = (
-                theta[0] * y[k - 1] + theta[1] * y[k - 2] + theta[2] * (force[k - 1] - self.friction(velocity)) + e[k]
+                theta[0] * y[k - 1]
+                + theta[1] * y[k - 2]
+                + theta[2] * (force[k - 1] - self.friction(velocity))
+                + e[k]
             )
         return y
 
@@ -101,7 +116,11 @@ def mass_spring_damper() -> Example:
     force = np.concatenate([half, -half])
     position = system.simulate(force, theta, rng.normal(scale=0.00018, size=len(force) - 2))
     force_test = rng.uniform(-100.0, 100.0, 1000)
-    names = {"inputs": [Channel("force", "N")], "outputs": [Channel("position", "m")], "sampling_time": 0.01}
+    names = {
+        "inputs": [Channel("force", "N")],
+        "outputs": [Channel("position", "m")],
+        "sampling_time": 0.01,
+    }
     baseline = Baseline.from_terms(
         [
             Term("theta1", "position[k-1]", initial=0.61),

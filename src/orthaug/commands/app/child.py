@@ -1,8 +1,8 @@
 """The command line as a child of the page: it ends with whoever started it, however that ended.
 
-Whoever started it holds its standard input open. Where that is closed, the child is interrupted as by Ctrl-C, which
-keeps or removes what is partial; that is also how the page stops it. A line `enough` on it ends training with what
-it has reached.
+Whoever started it holds its standard input open. Where that is closed, the child is interrupted as
+by Ctrl-C, which keeps or removes what is partial; that is also how the page stops it. A line
+`enough` on it ends training with what it has reached.
 """
 
 from __future__ import annotations

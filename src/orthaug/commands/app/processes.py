@@ -69,7 +69,9 @@ class Command:
     def complaint(self) -> str:
         """Return what it said last where it failed."""
         told = [line for line in self.lines if line.strip()]
-        known = [line for line in told if line.startswith(("error:", "training failed:", "interrupted"))]
+        known = [
+            line for line in told if line.startswith(("error:", "training failed:", "interrupted"))
+        ]
         last = (known or ["it ended without a word; is there enough memory?"])[-1]
         return last.removeprefix("error:").strip()
 
@@ -216,7 +218,9 @@ async def _started() -> asyncio.subprocess.Process:
     )
 
 
-async def _answered(process: asyncio.subprocess.Process, question: dict[str, Any]) -> dict[str, Any]:
+async def _answered(
+    process: asyncio.subprocess.Process, question: dict[str, Any]
+) -> dict[str, Any]:
     assert process.stdin is not None and process.stdout is not None
     try:
         process.stdin.write(json.dumps(question, default=str).encode() + b"\n")
@@ -224,7 +228,9 @@ async def _answered(process: asyncio.subprocess.Process, question: dict[str, Any
         line = await process.stdout.readline()
         return json.loads(line)
     except (OSError, ValueError):
-        raise InputError("the data could not be looked at: the process ended early. Is there enough memory?") from None
+        raise InputError(
+            "the data could not be looked at: the process ended early. Is there enough memory?"
+        ) from None
 
 
 def _kill(process: asyncio.subprocess.Process) -> None:

@@ -29,13 +29,17 @@ from orthaug.commands.app.view_training import TrainingView
 from orthaug.commands.app.widgets import sentence, text
 
 LARGEST = 2 * 2**30  # bytes of a file that is dropped: it lies once more in a temporary folder
-_TOO_LARGE = "the file is larger than {}, the most that this page takes in; name its path instead, and it stays there."
+_TOO_LARGE = (
+    "the file is larger than {}, the most that this page takes in; name its path instead, and "
+    "it stays there."
+)
 _OFTEN = 0.25  # s between looks at what has changed
 _PARTS = ("Data", "Model", "Training", "Report", "Export")
 MARK = (
-    "<svg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 32 32'><rect width='32' height='32' rx='7' fill='#0550ae'/>"
-    "<path d='M9 7v16h16' stroke='#fff' stroke-width='3.4' fill='none' stroke-linecap='round'/>"
-    "<path d='M9 17h6v6' stroke='#9cc8ff' stroke-width='2.2' fill='none'/></svg>"
+    "<svg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 32 32'><rect width='32' height='32' "
+    "rx='7' fill='#0550ae'/><path d='M9 7v16h16' stroke='#fff' stroke-width='3.4' fill='none' "
+    "stroke-linecap='round'/><path d='M9 17h6v6' stroke='#9cc8ff' stroke-width='2.2' "
+    "fill='none'/></svg>"
 )
 """The mark of the program, as a picture."""
 
@@ -46,7 +50,11 @@ class Page:
     def __init__(self, session: Session) -> None:
         self.session = session
         self.data, self.model = DataView(session), ModelView(session)
-        self.training, self.report, self.export = TrainingView(session), ReportView(session), ExportView(session)
+        self.training, self.report, self.export = (
+            TrainingView(session),
+            ReportView(session),
+            ExportView(session),
+        )
         self.seen = dict(session.versions)
 
     def draw(self) -> None:
@@ -58,7 +66,11 @@ class Page:
             ui.html(MARK, sanitize=False, tag="span").classes("logo").props("aria-hidden=true")
             text("orthaug", "h1")
             self.title = text("", "p", "hint")
-        with ui.tabs().props("no-caps align=left active-color=tab indicator-color=tab dense").classes("tabs") as tabs:
+        with (
+            ui.tabs()
+            .props("no-caps align=left active-color=tab indicator-color=tab dense")
+            .classes("tabs") as tabs
+        ):
             for name in _PARTS:
                 ui.tab(name)
         start = "Training" if self.session.commands else "Data"
@@ -84,7 +96,9 @@ class Page:
 
         ui.on("part", go)
         ui.on("reopened", reopen)
-        tabs.on_value_change(lambda event: ui.run_javascript(f"shown({json.dumps(str(event.value))}, false)"))
+        tabs.on_value_change(
+            lambda event: ui.run_javascript(f"shown({json.dumps(str(event.value))}, false)")
+        )
         opened = "location.hash ? emitEvent('reopened', location.hash.slice(1)) : shown({}, true)"
         ui.timer(_OFTEN, lambda: ui.run_javascript(opened.format(json.dumps(start))), once=True)
 
@@ -102,7 +116,10 @@ class Page:
         if moved("spec"):
             authors = set(self.session.authors[seen.get("spec", 0) :])
             author = authors.pop() if len(authors) == 1 else ""
-            looks += [partial(self.data.follow_spec, author), partial(self.model.follow_spec, author)]
+            looks += [
+                partial(self.data.follow_spec, author),
+                partial(self.model.follow_spec, author),
+            ]
         if moved("check"):
             looks += [self.data.follow_check, self.model.follow_check]
         if moved("work") or moved("spec") or moved("data") or self.session.running is not None:
@@ -124,7 +141,11 @@ class Page:
         self.title.set_content(escape(self.session.title or "from data to a model"))
 
     def _complain(self, error: Exception) -> None:
-        told = str(error) if isinstance(error, InputError) else f"this did not work ({type(error).__name__})."
+        told = (
+            str(error)
+            if isinstance(error, InputError)
+            else f"this did not work ({type(error).__name__})."
+        )
         ui.notify(sentence(told), type="negative")
 
 
@@ -161,7 +182,10 @@ def application(sessions: Sessions, spec: Path | None) -> FastAPI:
     def work(key: str) -> Response | None:
         session = sessions.find(key)
         if session is None:
-            return _told("This work is not open any more. Its spec is offered where something new begins.", 404)
+            return _told(
+                "This work is not open any more. Its spec is offered where something new begins.",
+                404,
+            )
         Page(session).draw()
 
     pages.on_exception(lambda error: None)  # each page tells of its own
@@ -216,4 +240,6 @@ def _refused(text: str, code: int) -> Response:
 
 
 def _told(text: str, code: int) -> Response:
-    return HTMLResponse(f"{PLAIN}<p>{escape(text)}</p><p><a href='/'>Begin anew</a></p></body></html>", code)
+    return HTMLResponse(
+        f"{PLAIN}<p>{escape(text)}</p><p><a href='/'>Begin anew</a></p></body></html>", code
+    )

@@ -38,7 +38,9 @@ def free_port(wanted: int | None) -> socket.socket:
     except (OSError, OverflowError) as error:
         listening.close()
         why = getattr(error, "strerror", None) or error
-        raise InputError(f"--port: cannot listen on port {wanted} ({why}); leave it out for a free one.") from None
+        raise InputError(
+            f"--port: cannot listen on port {wanted} ({why}); leave it out for a free one."
+        ) from None
     return listening
 
 
@@ -48,13 +50,17 @@ def check_installed() -> None:
         import nicegui  # noqa: F401
     except ImportError:
         raise InputError(
-            "the page is drawn by NiceGUI, which is not installed; pip install 'orthaug[app]', or pip install nicegui."
+            "the page is drawn by NiceGUI, which is not installed; pip install 'orthaug[app]', "
+            "or pip install nicegui."
         ) from None
 
 
 @contextlib.contextmanager
 def private_folder() -> Iterator[Path]:
-    """A folder that only this user may read, gone with the program; what a killed one left goes with the next."""
+    """A folder that only this user may read, gone with the program.
+
+    What a killed one left goes with the next.
+    """
     before = os.umask(0o077)
     folder = PARTIALS.folder(Path(tempfile.gettempdir()))
     try:
@@ -72,7 +78,9 @@ def serve(spec: Path | None, *, port: int | None = None, browser: bool = True) -
     """
     listening = free_port(port)
     with listening, private_folder() as folder:
-        os.environ["NICEGUI_STORAGE_PATH"] = str(folder / "storage")  # else it would keep one in the working folder
+        os.environ["NICEGUI_STORAGE_PATH"] = str(
+            folder / "storage"
+        )  # else it would keep one in the working folder
         check_installed()
         from orthaug.commands.app.spec_text import in_file
 
@@ -97,14 +105,22 @@ def _asked_to_end() -> Iterator[threading.Event]:
 
 
 async def _serve(
-    sessions: Sessions, listening: socket.socket, spec: Path | None, asked: threading.Event, browser: bool
+    sessions: Sessions,
+    listening: socket.socket,
+    spec: Path | None,
+    asked: threading.Event,
+    browser: bool,
 ) -> None:
     import uvicorn
 
     from orthaug.commands.app.routes import application
 
     gate = Gate(application(sessions, spec), listening.getsockname()[1])
-    options: dict[str, Any] = {"log_level": "critical", "access_log": False, "timeout_graceful_shutdown": 1}
+    options: dict[str, Any] = {
+        "log_level": "critical",
+        "access_log": False,
+        "timeout_graceful_shutdown": 1,
+    }
     server = uvicorn.Server(uvicorn.Config(gate, lifespan="on", ws_max_size=2**26, **options))
     server.capture_signals = contextlib.nullcontext  # type: ignore[method-assign]  # the program has its own way
     sessions.desk.prepare()

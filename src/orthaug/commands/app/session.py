@@ -1,4 +1,7 @@
-"""Work on the page: file, spec, check, training, results. It lives on the server; a page only shows it."""
+"""Work on the page: file, spec, check, training, results.
+
+It lives on the server; a page only shows it.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,16 @@ from orthaug._base.errors import InputError
 from orthaug._base.folders import file_digest
 from orthaug._base.progress import LOG
 from orthaug.commands.app.processes import Command, WorkerPool
-from orthaug.commands.app.spec_text import absolute, files, in_file, keep, kept_title, plain, section, with_value
+from orthaug.commands.app.spec_text import (
+    absolute,
+    files,
+    in_file,
+    keep,
+    kept_title,
+    plain,
+    section,
+    with_value,
+)
 from orthaug.data.tables import KNOWN
 
 _SESSIONS = 50  # that are kept at once
@@ -29,7 +41,10 @@ KINDS = ("fit", "compare")
 
 
 class Session:
-    """State and actions. `versions` counts the changes of `data`, `spec`, `check` and `work`, for pages to follow."""
+    """State and actions.
+
+    `versions` counts the changes of `data`, `spec`, `check` and `work`, for pages to follow.
+    """
 
     def __init__(self, key: str, folder: Path, desk: WorkerPool) -> None:
         self.key, self.folder, self.desk = key, folder, desk
@@ -47,7 +62,9 @@ class Session:
         """Why the chosen channels make no spec."""
         self.spec = ""
         self.kept_as = ""
-        """The title under which its spec is kept when the server ends; empty until there is something to keep."""
+        """The title under which its spec is kept when the server ends; empty until there is
+        something to keep.
+        """
         self.authors: list[str] = []
         """Who made each change of the spec: a part of a page, which need not be told of its own."""
         self.checked: dict[str, Any] | None = None
@@ -95,7 +112,11 @@ class Session:
     @property
     def first_step(self) -> str:
         """Return what begins the work, where there is no spec yet."""
-        return "It begins with a data file." if self.found is None else "Choose the channels in Data first."
+        return (
+            "It begins with a data file."
+            if self.found is None
+            else "Choose the channels in Data first."
+        )
 
     # Data
 
@@ -108,11 +129,15 @@ class Session:
         plain_name = _as_name(re.split(r"[/\\]", name)[-1])
         ending = Path(plain_name).suffix.lower()
         if ending not in KNOWN or not Path(plain_name).stem:
-            raise InputError(f"'{plain_name}': no data file that is known; known are {', '.join(KNOWN)}.")
+            raise InputError(
+                f"'{plain_name}': no data file that is known; known are {', '.join(KNOWN)}."
+            )
         return self.folder / plain_name
 
     def begin_file(self, name: str) -> Path:
-        """Return a file to write what is dropped under that name into; `keep_file` gives it its place.
+        """Return a file to write what is dropped under that name into.
+
+        `keep_file` gives it its place.
 
         Raises:
             InputError: an ending of no data file.
@@ -131,7 +156,12 @@ class Session:
             number += 1
             place = first.with_name(f"{first.stem}-{number}{first.suffix}")
         os.replace(partial, place)
-        return place, f"another file called {first.name} is here, so this one is {place.name}" if number > 1 else ""
+        return (
+            place,
+            f"another file called {first.name} is here, so this one is {place.name}"
+            if number > 1
+            else "",
+        )
 
     def open_file(self, path: Path) -> None:
         """Look at a data file, and begin a spec for it where its columns tell what they are."""
@@ -156,7 +186,9 @@ class Session:
         self.changed("data")
         place = self.folder / "spec.toml"
         try:
-            found = await self.desk.ask("look", path=self.data, out=place, inputs=inputs, outputs=outputs, step=step)
+            found = await self.desk.ask(
+                "look", path=self.data, out=place, inputs=inputs, outputs=outputs, step=step
+            )
             if self.found is not None and found["spec"] is None:
                 self.unfit = found["open"]
             else:
@@ -208,12 +240,18 @@ class Session:
         self.changed("data")
 
     def open_spec(self, path: Path, *, kept: bool = False) -> None:
-        """Take a spec that stands somewhere, or one of earlier work that was kept; it is read, and never written.
+        """Take a spec that stands somewhere, or one of earlier work that was kept.
+
+        It is read, and never written.
 
         Raises:
             InputError: a file that cannot be read, or broken TOML.
         """
-        text = path.read_text(encoding="utf-8") if kept else absolute(in_file(path), path.absolute().parent)
+        text = (
+            path.read_text(encoding="utf-8")
+            if kept
+            else absolute(in_file(path), path.absolute().parent)
+        )
         self.title = kept_title(path) if kept else path.name
         self.write(text, "file")
         self.changed("data")
@@ -265,7 +303,10 @@ class Session:
 
     @property
     def units(self) -> dict[str, str]:
-        """Return what the channels ask for as units of parameters, of the spec as it is; nothing until it is checked."""
+        """Return what the channels ask for as units of parameters, of the spec as it is.
+
+        Nothing until it is checked.
+        """
         if self.checked is None or self.checking or self.stale:
             return {}
         return {name: asked or "1" for name, _, asked in self.checked["units"] if asked is not None}
@@ -279,7 +320,11 @@ class Session:
 
     def worded(self, text: Any) -> str:
         """Return a message without the session's own folder and file names."""
-        text = str(text).removeprefix(f"{self.folder / 'check.toml'}: ").removeprefix(f"{self.folder / 'spec.toml'}: ")
+        text = (
+            str(text)
+            .removeprefix(f"{self.folder / 'check.toml'}: ")
+            .removeprefix(f"{self.folder / 'spec.toml'}: ")
+        )
         return text.replace(f"{self.folder}/", "").replace(f"{self.folder}\\", "")
 
     # Training
@@ -287,7 +332,10 @@ class Session:
     @property
     def running(self) -> Command | None:
         """The training that goes on."""
-        return next((command for kind in KINDS if (command := self.commands.get(kind)) and command.running), None)
+        return next(
+            (command for kind in KINDS if (command := self.commands.get(kind)) and command.running),
+            None,
+        )
 
     def train(self, kind: str) -> None:
         """Run `orthaug fit` or `orthaug compare` on the spec."""
@@ -336,7 +384,14 @@ class Session:
         self.start(self._exported(target, name))
 
     async def _exported(self, target: str, name: str) -> None:
-        arguments = ("export", str(self.folder / "fit"), "--to", target, "--out", str(self.folder / "export" / target))
+        arguments = (
+            "export",
+            str(self.folder / "fit"),
+            "--to",
+            target,
+            "--out",
+            str(self.folder / "export" / target),
+        )
         (self.folder / "export").mkdir(exist_ok=True)
         command = Command((*arguments, "--name", name, "--force"), lambda: None)
         self.exports[target] = "…"
@@ -359,7 +414,9 @@ class Session:
         single = {"report.html": "fit/report.html", "result.json": "fit/result.json"}
         single["comparison.html"] = "compare/report.html"
         folders = {"model.zip": "fit/model", "result.zip": "fit", "comparison.zip": "compare"}
-        folders |= {f"{target}.zip": f"export/{target}" for target, why in self.exports.items() if not why}
+        folders |= {
+            f"{target}.zip": f"export/{target}" for target, why in self.exports.items() if not why
+        }
         if what in single and (self.folder / single[what]).is_file():
             return self.folder / single[what]
         if what in folders and (self.folder / folders[what]).is_dir():
@@ -391,7 +448,9 @@ class Sessions:
         if len(self._open) >= _SESSIONS and untouched:
             del self._open[untouched[0].key]
         if len(self._open) >= _SESSIONS:
-            raise InputError(f"{_SESSIONS} pieces of work are open; end orthaug app, and start it again.")
+            raise InputError(
+                f"{_SESSIONS} pieces of work are open; end orthaug app, and start it again."
+            )
         key = secrets.token_urlsafe(12)
         self._made += 1
         folder = self.folder / f"work-{self._made}"
@@ -405,7 +464,9 @@ class Sessions:
         return self._open.get(key)
 
     async def close(self) -> None:
-        await asyncio.gather(self.desk.close(), *(session.close() for session in self._open.values()))
+        await asyncio.gather(
+            self.desk.close(), *(session.close() for session in self._open.values())
+        )
 
 
 def _as_name(text: str) -> str:

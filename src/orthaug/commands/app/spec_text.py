@@ -1,4 +1,7 @@
-"""A spec as text that forms change, one key or table at a time, comments and order kept; and where it stands."""
+"""A spec as text that forms change, one key or table at a time, comments and order kept.
+
+And where it stands.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,13 @@ from tomlkit.items import AoT
 from orthaug._base.errors import InputError
 from orthaug.data.tables import check_readable
 
-_WORDS = ("parameter", "regressor", "output", "unit", "channel")  # keys whose values are text, digits or not
+_WORDS = (
+    "parameter",
+    "regressor",
+    "output",
+    "unit",
+    "channel",
+)  # keys whose values are text, digits or not
 _KEPT = 20  # specs of earlier work
 _MARK = 7  # letters behind the title in the name of one
 
@@ -53,7 +62,10 @@ def in_file(path: Path) -> str:
 
 
 def keep(title: str, key: str, spec: str) -> None:
-    """Write the spec of a piece of work anew, whole or not at all; nothing where the folder cannot be written."""
+    """Write the spec of a piece of work anew, whole or not at all.
+
+    Nothing where the folder cannot be written.
+    """
     place = _folder() / f"{title}-{key[: _MARK - 1]}.toml"
     with suppress(OSError):
         place.parent.mkdir(parents=True, exist_ok=True)
@@ -67,7 +79,9 @@ def keep(title: str, key: str, spec: str) -> None:
 def earlier() -> list[Path]:
     """Return the specs that are kept, the latest first."""
     with suppress(OSError):
-        return sorted(_folder().glob("*.toml"), key=lambda place: place.stat().st_mtime, reverse=True)
+        return sorted(
+            _folder().glob("*.toml"), key=lambda place: place.stat().st_mtime, reverse=True
+        )
     return []
 
 
@@ -103,18 +117,26 @@ def _with_files(document: Mapping[str, Any]) -> Iterator[Any]:
 
 def files(content: Mapping[str, Any]) -> list[str]:
     """Return every data file that a spec names, the training data first, each once."""
-    return list(dict.fromkeys(file for entry in _with_files(content) for file in names(entry, "files")))
+    return list(
+        dict.fromkeys(file for entry in _with_files(content) for file in names(entry, "files"))
+    )
 
 
 def columns(content: Mapping[str, Any]) -> dict[str, str]:
     """Of the columns of a file that hold the channels: whether each is an `input` or an `output`."""
     data = section(content, "data")
     kinds = {name: kind for kind in ("input", "output") for name in names(data, f"{kind}s")}
-    return {str(section(data, "channels", name).get("column") or name): kind for name, kind in kinds.items()}
+    return {
+        str(section(data, "channels", name).get("column") or name): kind
+        for name, kind in kinds.items()
+    }
 
 
 def section(content: Mapping[str, Any], *path: str) -> Mapping[str, Any]:
-    """Return the table at the end of the path; an empty one where there is none, or something else in its place."""
+    """Return the table at the end of the path.
+
+    An empty one where there is none, or something else in its place.
+    """
     for key in path:
         found = content.get(key)
         content = found if isinstance(found, Mapping) else {}
@@ -129,11 +151,20 @@ def names(table: Mapping[str, Any], key: str) -> list[str]:
 
 def shown(value: Any) -> str:
     """Return a value as a field shows it."""
-    return "" if value is None else ", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
+    return (
+        ""
+        if value is None
+        else ", ".join(map(str, value))
+        if isinstance(value, list | tuple)
+        else str(value)
+    )
 
 
 def read(key: str, value: str) -> Any:
-    """Return what a field says: a number, names, or text; None for nothing. The spec's own check says what is wrong."""
+    """Return what a field says: a number, names, or text; None for nothing.
+
+    The spec's own check says what is wrong.
+    """
     value = value.strip()
     if not value:
         return None
@@ -175,18 +206,25 @@ def changed(text: str, change: Callable[[Any], None]) -> str:
     change(document)
     written = tomlkit.dumps(document)
     if plain(written) != document.unwrap():
-        raise InputError("a form cannot write this change into the spec as it is laid out; make it in the text.")
+        raise InputError(
+            "a form cannot write this change into the spec as it is laid out; make it in the text."
+        )
     return written
 
 
 def with_value(text: str, path: Sequence[str], value: Any) -> str:
-    """With a key of a table set, or without it where the value is None; tables on the way are made."""
+    """With a key of a table set, or without it where the value is None.
+
+    Tables on the way are made.
+    """
 
     def change(document: Any) -> None:
         table = _made(document, path[:-1])
         if value is None:
             table.pop(path[-1], None)
-        elif isinstance(value, Mapping):  # inline: a table of its own would land elsewhere beside dotted keys
+        elif isinstance(
+            value, Mapping
+        ):  # inline: a table of its own would land elsewhere beside dotted keys
             table[path[-1]] = tomlkit.inline_table()
             table[path[-1]].update(value)
         else:
@@ -196,9 +234,14 @@ def with_value(text: str, path: Sequence[str], value: Any) -> str:
 
 
 def rows_of(text: str, path: Sequence[str]) -> list[dict[str, Any]]:
-    """Return the tables of a list of tables, such as `data.prepare`; none where there is no such list."""
+    """Return the tables of a list of tables, such as `data.prepare`.
+
+    None where there is no such list.
+    """
     found = section(plain(text), *path[:-1]).get(path[-1])
-    return [dict(row) for row in found if isinstance(row, Mapping)] if isinstance(found, list) else []
+    return (
+        [dict(row) for row in found if isinstance(row, Mapping)] if isinstance(found, list) else []
+    )
 
 
 def with_row(text: str, path: Sequence[str], row: Mapping[str, Any]) -> str:
@@ -250,7 +293,11 @@ def _at(document: Any, path: Sequence[str]) -> Any:
     return document
 
 
-_OF_TERMS = ("linear difference equations", "sees the lags that the physics reads", 'focus = "simulation"')
+_OF_TERMS = (
+    "linear difference equations",
+    "sees the lags that the physics reads",
+    'focus = "simulation"',
+)
 """What comments of `orthaug init` that equations of motion make untrue have in them."""
 MOTION = """
 [motion]
@@ -269,25 +316,35 @@ k = {{ initial = 1.0{k}, min = 0 }}
 def as_motion(text: str) -> str:
     """With the equations of a mass, a spring and a damper in place of the baseline, for a person to change.
 
-    Comments about the baseline go with it; the parameters get units where force and output have theirs.
+    Comments about the baseline go with it; the parameters get units where force and output have
+    theirs.
     """
     data = section(plain(text), "data")
     inputs, outputs = names(data, "inputs") or ["0"], names(data, "outputs") or ["y"]
-    force, output = (section(data, "channels", name).get("unit") for name in (inputs[0], outputs[0]))
-    units = _motion_units(force, output) if isinstance(force, str) and isinstance(output, str) else {}
+    force, output = (
+        section(data, "channels", name).get("unit") for name in (inputs[0], outputs[0])
+    )
+    units = (
+        _motion_units(force, output) if isinstance(force, str) and isinstance(output, str) else {}
+    )
     given = {name: f', unit = "{units[name]}"' if name in units else "" for name in "xvmck"}
 
     def change(document: Any) -> None:
         for key in ("baseline", "lags", "physics", "motion", "suspects"):
             document.pop(key, None)
-        document["motion"] = tomlkit.parse(MOTION.format(output=outputs[0], force=inputs[0], **given))["motion"]
+        document["motion"] = tomlkit.parse(
+            MOTION.format(output=outputs[0], force=inputs[0], **given)
+        )["motion"]
         _made(document, ["learner"])["inputs"] = ["v"]
 
     return changed(_without_comments(text, _OF_TERMS), change)
 
 
 def _without_comments(text: str, told: Sequence[str]) -> str:
-    """Without the comments that have one of these in them; a line that holds nothing else goes too."""
+    """Without the comments that have one of these in them.
+
+    A line that holds nothing else goes too.
+    """
     kept = []
     for line in text.splitlines(keepends=True):
         before, mark, comment = line.partition("# ")

@@ -34,7 +34,10 @@ from orthaug.data.record import check_step
 
 _STEPS = ("data", "prepare")
 _LISTED = 40  # columns
-_COLUMNS = ("input ", "output ")  # begins of lines of an account that tell of columns, which stand by themselves
+_COLUMNS = (
+    "input ",
+    "output ",
+)  # begins of lines of an account that tell of columns, which stand by themselves
 _DRAFT = ("first physics", "test:")  # of lines that tell of a spec for the file
 _OFFERED = 5  # specs of earlier work
 _USES = {"": "leave out", "input": "input", "output": "output"}
@@ -49,7 +52,12 @@ _SUMMARIES = {
     "shift": "shift an input in time",
 }
 _FIRST = {"factor": 2, "samples": 1}  # what a step begins with where it has no default
-_LABELS = {"cutoff": "cutoff in Hz", "sampling_time": "step in s", "most": "rows at most", "window": "rows each side"}
+_LABELS = {
+    "cutoff": "cutoff in Hz",
+    "sampling_time": "step in s",
+    "most": "rows at most",
+    "window": "rows each side",
+}
 _CUTOFF = 0.1  # the first cutoff, as a share of the sampling frequency
 _KNOWN = "CSV, TSV, TXT, DAT, Parquet, Excel, MATLAB, NumPy or HDF5; it stays on this machine"
 _DROP = """
@@ -82,12 +90,18 @@ class DataView:
                 with card("Data file"):
                     ui.html(_DROP.format(endings=",".join(KNOWN), told=_KNOWN), sanitize=False)
                     with ui.element("div").classes("fields"):
-                        self.path = ui.input("or its path on this machine").props("outlined dense stack-label")
+                        self.path = ui.input("or its path on this machine").props(
+                            "outlined dense stack-label"
+                        )
                         self.path.classes("grow").on("keydown.enter", self.name_file)
                         button("Open", self.name_file)
                     self.status = ui.element("div")
-                self.columns = card("Channels", "Say what each column is; the spec begins with that.")
-                self.cleaning = card("Preparation", "Every part of the data goes through these steps, in this order.")
+                self.columns = card(
+                    "Channels", "Say what each column is; the spec begins with that."
+                )
+                self.cleaning = card(
+                    "Preparation", "Every part of the data goes through these steps, in this order."
+                )
                 with self.columns:
                     self.column_rows = ui.element("div")
                     self.unfit = ui.element("div")
@@ -128,10 +142,16 @@ class DataView:
             elif session.trouble:
                 note(session.trouble, "bad")
             elif found is not None and session.data is not None:
-                lines = found["account"].splitlines() or [f"{session.data.name}: {found['rows']} rows"]
+                lines = found["account"].splitlines() or [
+                    f"{session.data.name}: {found['rows']} rows"
+                ]
                 text(lines[0], "p", "strong")
                 with ui.element("ul").classes("account"):
-                    untold = _COLUMNS if session.data in self._trained() or not session.spec else (*_COLUMNS, *_DRAFT)
+                    untold = (
+                        _COLUMNS
+                        if session.data in self._trained() or not session.spec
+                        else (*_COLUMNS, *_DRAFT)
+                    )
                     for line in [one for one in lines[1:] if not one.startswith(untold)]:
                         text(line, "li")
                 if self._apart:
@@ -162,10 +182,15 @@ class DataView:
     def _lacking(self, found: Mapping[str, Any]) -> list[str]:
         """Return the columns that the spec reads and the file does not have."""
         heads = {column["header"] for column in found["columns"]}
-        return [column for column in spec_text.columns(self.session.content()) if column not in heads]
+        return [
+            column for column in spec_text.columns(self.session.content()) if column not in heads
+        ]
 
     def _of_spec(self, found: Mapping[str, Any]) -> dict[str, str]:
-        """Return the use of each column in the spec; empty where there is none, or where the file lacks one of them."""
+        """Return the use of each column in the spec.
+
+        Empty where there is none, or where the file lacks one of them.
+        """
         return {} if self._lacking(found) else spec_text.columns(self.session.content())
 
     def _take_uses(self, found: Mapping[str, Any]) -> None:
@@ -176,11 +201,15 @@ class DataView:
         if data is not self.session.data:
             self.step = ""
         inputs, outputs = found.get("inputs"), found.get("outputs")
-        self.uses = {column["header"]: column["kind"] for column in found["columns"] if column["usable"]}
+        self.uses = {
+            column["header"]: column["kind"] for column in found["columns"] if column["usable"]
+        }
         if of_spec := self._of_spec(found):
             self.uses = {h: of_spec.get(h, "") for h in self.uses}
         elif inputs is not None and outputs is not None:
-            self.uses = {h: "input" if h in inputs else "output" if h in outputs else "" for h in self.uses}
+            self.uses = {
+                h: "input" if h in inputs else "output" if h in outputs else "" for h in self.uses
+            }
 
     def _draw_columns(self, found: Mapping[str, Any]) -> None:
         usable = [column for column in found["columns"] if column["usable"]]
@@ -191,30 +220,55 @@ class DataView:
                         text(column["header"], "p", "strong")
                         text(column["told"], "p", "hint")
                     head = column["header"]
-                    choice(f"use of {head}", _USES, self.uses[head], partial(self.uses.__setitem__, head), "bare")
+                    choice(
+                        f"use of {head}",
+                        _USES,
+                        self.uses[head],
+                        partial(self.uses.__setitem__, head),
+                        "bare",
+                    )
             if found["timed"]:
                 text(found["timed"], "p", "hint")
             left = [c for c in found["columns"] if not c["usable"] and not c["timed"]]
             if left:
-                text("Not usable: " + ", ".join(f"{c['header']} ({c['told']})" for c in left[:_LISTED]), "p", "hint")
+                text(
+                    "Not usable: "
+                    + ", ".join(f"{c['header']} ({c['told']})" for c in left[:_LISTED]),
+                    "p",
+                    "hint",
+                )
             if not usable:
-                note("No column of this file is a signal that changes: there is nothing to fit.", "bad")
+                note(
+                    "No column of this file is a signal that changes: there is nothing to fit.",
+                    "bad",
+                )
                 return
             if found["spec"] is None and not self._of_spec(found):
-                names = "The names of the columns do not say which are inputs and outputs: choose them here."
+                names = (
+                    "The names of the columns do not say which are inputs and outputs: choose "
+                    "them here."
+                )
                 note(found["open"] or names, "care")
             with ui.element("div").classes("fields"):
                 step = "" if found["step"] is None else f"{found['step']:g}"
                 label = "sampling time in s"
                 self.step_field = field(
-                    label, self.step, partial(setattr, self, "step"), classes="medium", hint=step or "1"
+                    label,
+                    self.step,
+                    partial(setattr, self, "step"),
+                    classes="medium",
+                    hint=step or "1",
                 )
                 first = found["spec"] is None and not self.session.spec
-                begin = button(f"Begin {'' if first else 'anew '}with these channels", self.choose, main=first)
+                begin = button(
+                    f"Begin {'' if first else 'anew '}with these channels", self.choose, main=first
+                )
                 begin.props("data-place=begin")
 
     def choose(self) -> None:
-        chosen = {kind: [h for h, use in self.uses.items() if use == kind] for kind in ("input", "output")}
+        chosen = {
+            kind: [h for h, use in self.uses.items() if use == kind] for kind in ("input", "output")
+        }
         try:
             step = _seconds(self.step)
         except InputError as error:
@@ -249,7 +303,9 @@ class DataView:
 
     def _draw_step(self, index: int, step: Mapping[str, Any]) -> None:
         kind = str(step.get("step"))
-        with named(ui.element("div").classes("entry step").props("role=group"), f"step {index + 1}"):
+        with named(
+            ui.element("div").classes("entry step").props("role=group"), f"step {index + 1}"
+        ):
             with ui.element("div").classes("grow"):
                 text(f"{index + 1}. {_SUMMARIES.get(kind, kind)}", "p", "strong")
                 with ui.element("div").classes("fields"):
@@ -258,7 +314,14 @@ class DataView:
                         field(
                             _LABELS.get(own.name, own.name),
                             spec_text.shown(step.get(own.name)),
-                            partial(self.session.edit, "steps", spec_text.with_told, _STEPS, index, own.name),
+                            partial(
+                                self.session.edit,
+                                "steps",
+                                spec_text.with_told,
+                                _STEPS,
+                                index,
+                                own.name,
+                            ),
                             classes="short",
                             hint="" if own.default is MISSING else usual,
                         )
@@ -289,7 +352,10 @@ class DataView:
         return ("", {}) if place is None else (place.name, session.raw.get(place, {}))
 
     def follow_check(self) -> None:
-        """Curves of the file, and of the training data after preparation; why they cannot be drawn."""
+        """Curves of the file, and of the training data after preparation.
+
+        Why they cannot be drawn.
+        """
         session, checked = self.session, self.session.checked
         with redrawn(self.refusal):
             if session.stale:
@@ -300,7 +366,9 @@ class DataView:
         rows = []
         shown = [curve["column"] for curve in prepared.values()] or list(raw)
         for name in shown:
-            drawn = [{**raw[name], "name": "as measured", "raw": bool(prepared)}] if name in raw else []
+            drawn = (
+                [{**raw[name], "name": "as measured", "raw": bool(prepared)}] if name in raw else []
+            )
             unit = ""
             for channel, curve in prepared.items():
                 if curve["column"] == name:
@@ -309,8 +377,17 @@ class DataView:
                     unit, name = curve["unit"], channel
             if drawn:
                 rows.append((f"{name} [{unit}]" if unit else name, drawn))
-        other = f"; {session.data.name} is no part of them" if session.apart and session.data else ""
-        state = (rows, cleaned, whole, other, checked and checked["prepared"], checked and checked["rows"])
+        other = (
+            f"; {session.data.name} is no part of them" if session.apart and session.data else ""
+        )
+        state = (
+            rows,
+            cleaned,
+            whole,
+            other,
+            checked and checked["prepared"],
+            checked and checked["rows"],
+        )
         if state == self._curves:
             return
         self._curves = state
@@ -318,7 +395,9 @@ class DataView:
             if not rows:
                 text("The curves of a file are drawn here, once there is one.", "p", "hint")
                 return
-            plot(curves_figure(rows), f"Curves of {', '.join(label for label, _ in rows)} over time.")
+            plot(
+                curves_figure(rows), f"Curves of {', '.join(label for label, _ in rows)} over time."
+            )
             told = f"All of {whole}"
             if prepared:
                 grey = f", in grey all of {whole}" * bool(raw)

@@ -51,11 +51,21 @@ class ModelView:
                     self.physics = ui.element("div")
                 with card("Learner and training"):
                     self.learner = ui.element("div")
-                hint = "What the forms write; forms and text change each other. Every key: orthaug schema keys."
+                hint = (
+                    "What the forms write; forms and text change each other. Every key: "
+                    "orthaug schema keys."
+                )
                 with card("Spec", hint):
-                    self.editor = ui.textarea("spec in TOML", value=self.session.spec).classes("editor")
-                    self.editor.props("outlined stack-label spellcheck=false autocapitalize=off autogrow debounce=250")
-                    self.editor.on_value_change(lambda event: self.session.write(event.value or "", "editor"))
+                    self.editor = ui.textarea("spec in TOML", value=self.session.spec).classes(
+                        "editor"
+                    )
+                    self.editor.props(
+                        "outlined stack-label spellcheck=false autocapitalize=off autogrow "
+                        "debounce=250"
+                    )
+                    self.editor.on_value_change(
+                        lambda event: self.session.write(event.value or "", "editor")
+                    )
             with card("Check", classes="sticky"):
                 self.check = ui.element("div")
         self.follow_spec("")
@@ -86,7 +96,11 @@ class ModelView:
                 self._draw_motion(content)
                 return
             outputs = spec_text.names(spec_text.section(content, "data"), "outputs")
-            text(" and ".join(f"{name}[k] = Σ parameter · regressor" for name in outputs), "p", "hint formula")
+            text(
+                " and ".join(f"{name}[k] = Σ parameter · regressor" for name in outputs),
+                "p",
+                "hint formula",
+            )
             for i, term in enumerate(spec_text.rows_of(self.session.spec, _TERMS)):
                 self._draw_term(i, term, several=len(outputs) > 1)
             with ui.element("div").classes("fields"):
@@ -95,17 +109,23 @@ class ModelView:
 
     def _draw_term(self, index: int, term: Mapping[str, Any], *, several: bool) -> None:
         keys = ("parameter", "regressor", *(("output",) if several else ()), "initial", "unit")
-        with named(ui.element("div").classes("entry term").props("role=group"), f"term {index + 1}"):
+        with named(
+            ui.element("div").classes("entry term").props("role=group"), f"term {index + 1}"
+        ):
             with ui.element("div").classes("fields grow"):
                 for key in keys:
                     wide = "" if key in ("parameter", "regressor") else "short"
-                    change = partial(self.session.edit, "form", spec_text.with_told, _TERMS, index, key)
+                    change = partial(
+                        self.session.edit, "form", spec_text.with_told, _TERMS, index, key
+                    )
                     field(key, term.get(key), change, classes=f"{wide} {key}")
             remove = partial(self.session.edit, "more terms", spec_text.without_row, _TERMS, index)
             named(button("Remove", remove), f"Remove term {index + 1}")
 
     def _add(self) -> None:
-        taken = {str(term.get("parameter")) for term in spec_text.rows_of(self.session.spec, _TERMS)}
+        taken = {
+            str(term.get("parameter")) for term in spec_text.rows_of(self.session.spec, _TERMS)
+        }
         name = next(name for i in range(1, 1000) if (name := f"p{i}") not in taken)
         data = spec_text.section(self.session.content(), "data")
         inputs, outputs = spec_text.names(data, "inputs"), spec_text.names(data, "outputs")
@@ -126,18 +146,30 @@ class ModelView:
             text(f"d{name}/dt = {equation}{learned}", "p", "formula")
         for name, row in spec_text.section(motion, "parameters").items():
             if isinstance(row, Mapping):
-                with named(ui.element("div").classes("entry term").props("role=group"), f"parameter {name}"):
+                with named(
+                    ui.element("div").classes("entry term").props("role=group"), f"parameter {name}"
+                ):
                     text(name, "p", "strong name")
                     with ui.element("div").classes("fields grow"):
                         for key in ("initial", "unit", "min", "max"):
-                            field(key, row.get(key), self._value("motion", "parameters", name, key), classes="short")
+                            field(
+                                key,
+                                row.get(key),
+                                self._value("motion", "parameters", name, key),
+                                classes="short",
+                            )
 
     def _value(self, *path: str) -> Callable[[str], None]:
         """Takes what a field says as the value of a key."""
-        return lambda told: self.session.edit("form", spec_text.with_value, path, spec_text.read(path[-1], told))
+        return lambda told: self.session.edit(
+            "form", spec_text.with_value, path, spec_text.read(path[-1], told)
+        )
 
     def _draw_learner(self, content: Mapping[str, Any]) -> None:
-        learner, training = spec_text.section(content, "learner"), spec_text.section(content, "training")
+        learner, training = (
+            spec_text.section(content, "learner"),
+            spec_text.section(content, "training"),
+        )
         moves = "motion" in content
         with redrawn(self.learner):
             if not content:
@@ -150,17 +182,33 @@ class ModelView:
                     hidden = learner.get("hidden", [16])
                     field("neurons", spec_text.shown(hidden), self._set_hidden, classes="short")
                 if kind == "terms":
-                    field("highest degree", learner.get("degree"), self._value("learner", "degree"), classes="short")
+                    field(
+                        "highest degree",
+                        learner.get("degree"),
+                        self._value("learner", "degree"),
+                        classes="short",
+                    )
                 seen = learner.get("inputs")
                 change = self._value("learner", "inputs")
-                field("what it sees", spec_text.shown(seen), change, hint="all that the physics reads")
+                field(
+                    "what it sees", spec_text.shown(seen), change, hint="all that the physics reads"
+                )
             with ui.element("div").classes("fields"):
                 structure = str(spec_text.section(content, "structure").get("kind", "orthogonal"))
                 choice("structure", _STRUCTURES, structure, self._value("structure", "kind"))
                 focus = str(training.get("focus", "simulation" if moves else "prediction"))
                 choice("trained on", _FOCUS, focus, self._value("training", "focus"))
-                for label, key, hint in (("starts", "restarts", "1"), ("iterations", "iterations", "")):
-                    field(label, training.get(key), self._value("training", key), classes="short", hint=hint)
+                for label, key, hint in (
+                    ("starts", "restarts", "1"),
+                    ("iterations", "iterations", ""),
+                ):
+                    field(
+                        label,
+                        training.get(key),
+                        self._value("training", key),
+                        classes="short",
+                        hint=hint,
+                    )
 
     def _set_kind(self, kind: str) -> None:
         spec = spec_text.with_value(self.session.spec, ("learner", "kind"), kind)
@@ -173,7 +221,9 @@ class ModelView:
         try:
             hidden = [int(part) for part in value.replace(";", ",").split(",") if part.strip()]
         except ValueError:
-            ui.notify("Neurons are whole numbers, such as 16, or 8, 8 for two layers.", type="warning")
+            ui.notify(
+                "Neurons are whole numbers, such as 16, or 8, 8 for two layers.", type="warning"
+            )
             return
         self.session.edit("form", spec_text.with_value, ("learner", "hidden"), hidden or None)
 
@@ -182,7 +232,12 @@ class ModelView:
         session = self.session
         with redrawn(self.check):
             if not session.spec.strip():
-                text("Rank, units, what the learner could take from the physics, and what would bias it.", "p", "hint")
+                text(
+                    "Rank, units, what the learner could take from the physics, and what would "
+                    "bias it.",
+                    "p",
+                    "hint",
+                )
                 return
             if session.checking:
                 note("Checking …", "busy")
@@ -199,7 +254,11 @@ class ModelView:
                     _units((session.checked or {})["units"], moves=bool(told.get("motion")))
                     _findings(told, (session.checked or {})["bias"])
             elif session.checking and session.checked is not None:
-                text("The equations are run to see what they determine; that takes a while.", "p", "hint")
+                text(
+                    "The equations are run to see what they determine; that takes a while.",
+                    "p",
+                    "hint",
+                )
 
 
 def _findings(told: Mapping[str, Any], bias: Sequence[Mapping[str, Any]]) -> None:
@@ -230,7 +289,10 @@ def _findings(told: Mapping[str, Any], bias: Sequence[Mapping[str, Any]]) -> Non
             table(("if it sees only", "shared", "determined"), rows)
     if bias:
         text("What would bias the parameters", "h3")
-        hint = "If such a term is missing from the physics; its size 1 % of the output's, or as the spec says."
+        hint = (
+            "If such a term is missing from the physics; its size 1 % of the output's, or as "
+            "the spec says."
+        )
         text(hint, "p", "hint")
         rows = [(one["name"], _biases(one["percent"]), one["removed_by"] or "–") for one in bias]
         table(("missing term", "change of each parameter", "removed by"), rows)
@@ -239,16 +301,30 @@ def _findings(told: Mapping[str, Any], bias: Sequence[Mapping[str, Any]]) -> Non
 
 
 def _units(units: Sequence[tuple[str, str, str | None]], *, moves: bool) -> None:
-    """What the spec says of units, where it is not what the regressors ask for; both are written in one way here."""
+    """What the spec says of units, where it is not what the regressors ask for.
+
+    Both are written in one way here.
+    """
     for name, given, asked in units:
         if asked is not None and given not in (asked, ""):
-            note(f"Unit of {name}: the spec says {given}, output and regressor ask for {asked}.", "care")
-    wanted = [f"{name} in {asked}" for name, given, asked in units if asked not in (None, "1") and not given]
+            note(
+                f"Unit of {name}: the spec says {given}, output and regressor ask for {asked}.",
+                "care",
+            )
+    wanted = [
+        f"{name} in {asked}"
+        for name, given, asked in units
+        if asked not in (None, "1") and not given
+    ]
     if wanted:
         text(f"Units, from those of the channels: {', '.join(wanted)}.", "p", "hint")
     bare = [name for name, given, _ in units if moves and not given]
     if bare:
-        text(f"No unit is given for {', '.join(bare)}, and none can be told from the channels.", "p", "hint")
+        text(
+            f"No unit is given for {', '.join(bare)}, and none can be told from the channels.",
+            "p",
+            "hint",
+        )
 
 
 def _biases(percents: Mapping[str, float | None]) -> str:
@@ -257,7 +333,10 @@ def _biases(percents: Mapping[str, float | None]) -> str:
 
 
 def _percent(value: float | None) -> str:
-    """Return a change in per cent; of a parameter near zero no number says more than that it is a multiple."""
+    """Return a change in per cent.
+
+    Of a parameter near zero no number says more than that it is a multiple.
+    """
     if value is None:
         return "–"
     if abs(value) >= _MULTIPLE:

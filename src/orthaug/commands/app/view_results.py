@@ -10,7 +10,17 @@ from nicegui import ui
 
 from orthaug.commands.app.session import Session
 from orthaug.commands.app.spec_text import files
-from orthaug.commands.app.widgets import button, card, choice, field, link, named, note, redrawn, text
+from orthaug.commands.app.widgets import (
+    button,
+    card,
+    choice,
+    field,
+    link,
+    named,
+    note,
+    redrawn,
+    text,
+)
 
 _REPORTS = {"report.html": "of the fit", "comparison.html": "of the comparison"}
 _FILES = (
@@ -47,7 +57,11 @@ class ReportView:
         """The report of the last result."""
         session = self.session
         kinds = {"fit": "report.html", "compare": "comparison.html"}
-        marks = {name: session.commands[kind].began for kind, name in kinds.items() if kind in session.results}
+        marks = {
+            name: session.commands[kind].began
+            for kind, name in kinds.items()
+            if kind in session.results
+        }
         there = list(marks)
         if marks == self._state:
             return
@@ -55,15 +69,31 @@ class ReportView:
         with redrawn(self.place):
             if not there:
                 with card("Report"):
-                    text("The report of a fit or of a comparison is read here, once there is one.", "p", "hint")
+                    text(
+                        "The report of a fit or of a comparison is read here, once there is one.",
+                        "p",
+                        "hint",
+                    )
                 return
             self.shown = self.shown if self.shown in there else there[0]
             with ui.element("div").classes("fields report-line"):
                 if len(there) > 1:
-                    choice("report", {name: _REPORTS[name] for name in there}, self.shown, self._show, "bare")
+                    choice(
+                        "report",
+                        {name: _REPORTS[name] for name in there},
+                        self.shown,
+                        self._show,
+                        "bare",
+                    )
                 link("Download", f"/session/{session.key}/get/{self.shown}")
-            frame = ui.element("iframe").classes("report").props('sandbox="allow-scripts" title="report"')
-            place = f"/session/{session.key}/get/{self.shown}?show=true&n={session.versions['work']}"
+            frame = (
+                ui.element("iframe")
+                .classes("report")
+                .props('sandbox="allow-scripts" title="report"')
+            )
+            place = (
+                f"/session/{session.key}/get/{self.shown}?show=true&n={session.versions['work']}"
+            )
             frame.props(f'data-src="{place}"')  # page.js loads it once the frame has its width
 
     def _show(self, name: str) -> None:
@@ -82,13 +112,20 @@ class ExportView:
         with ui.element("div").classes("columns"):
             with card("Files"):
                 self.files = ui.element("div")
-            with card("Model as code", "Needs no orthaug; each folder has a README and test vectors."):
+            with card(
+                "Model as code", "Needs no orthaug; each folder has a README and test vectors."
+            ):
                 self.code = ui.element("div")
         self.follow_work()
 
     def follow_work(self) -> None:
         session = self.session
-        state = (bool(session.spec), tuple(session.results), tuple(session.exports.items()), self._beside())
+        state = (
+            bool(session.spec),
+            tuple(session.results),
+            tuple(session.exports.items()),
+            self._beside(),
+        )
         if state == self._state:
             return
         self._state = state
@@ -138,7 +175,10 @@ class ExportView:
                 if why == "":
                     made = link(f"{target}.zip", f"/session/{session.key}/get/{target}.zip")
                 else:
-                    made = named(button("Write", partial(session.export, target, self.name)), f"Write {target}")
+                    made = named(
+                        button("Write", partial(session.export, target, self.name)),
+                        f"Write {target}",
+                    )
                     made.props("loading" if why == "…" else "")
                 made.props(f"data-place={target}")
 
@@ -148,4 +188,7 @@ class ExportView:
             self.session.exports.clear()
             self.session.changed("work")
         else:
-            ui.notify("A name has letters, digits and underscores, and begins with a letter.", type="warning")
+            ui.notify(
+                "A name has letters, digits and underscores, and begins with a letter.",
+                type="warning",
+            )

@@ -40,20 +40,29 @@ class TrainingView:
         self._state: Any = None
 
     def draw(self) -> None:
-        with card("Train", "Runs orthaug fit on the spec, or orthaug compare: physics alone and every structure."):
+        with card(
+            "Train",
+            "Runs orthaug fit on the spec, or orthaug compare: physics alone and every structure.",
+        ):
             with ui.element("div").classes("fields"):
                 self.begin = button("Train", lambda: self.session.train("fit"), main=True)
                 self.compare = button("Compare structures", lambda: self.session.train("compare"))
                 self.finish = button("Stop and keep the best so far", self.session.finish)
                 self.end = button("Stop", self.session.stop, classes="stop")
             self.state = ui.element("div")
-            self.bar = ui.element("progress").props('max=1 value=0 aria-label="progress of training"')
+            self.bar = ui.element("progress").props(
+                'max=1 value=0 aria-label="progress of training"'
+            )
             self.losses = ui.element("div")
         self.results = ui.element("div")
         self.follow_work()
 
     def follow_check(self) -> None:
-        able = bool(self.session.spec.strip()) and self.session.running is None and not self.session.refused
+        able = (
+            bool(self.session.spec.strip())
+            and self.session.running is None
+            and not self.session.refused
+        )
         for made in (self.begin, self.compare):
             made.set_enabled(able)
 
@@ -63,15 +72,23 @@ class TrainingView:
         self.follow_check()
         self.end.set_visibility(running is not None)
         self.end.set_enabled(running is not None and not running.stopping)
-        able = running is not None and running.arguments[0] == "fit"  # half a comparison compares nothing
+        able = (
+            running is not None and running.arguments[0] == "fit"
+        )  # half a comparison compares nothing
         self.finish.set_visibility(able)
         self.finish.set_enabled(
-            running is not None and bool(running.progress) and not (running.stopping or running.ending)
+            running is not None
+            and bool(running.progress)
+            and not (running.stopping or running.ending)
         )
         shown = running or max(session.commands.values(), key=lambda c: c.began, default=None)
         with redrawn(self.state):
             if shown is None:
-                text("Nothing has been trained yet." if session.spec else session.first_step, "p", "hint")
+                text(
+                    "Nothing has been trained yet." if session.spec else session.first_step,
+                    "p",
+                    "hint",
+                )
             else:
                 self._tell(shown)
         self.bar.set_visibility(running is not None)
@@ -124,7 +141,10 @@ class TrainingView:
     def _draw_results(self) -> None:
         session = self.session
         with redrawn(self.results):
-            kinds = (("fit", "Result", "trained", _fit), ("compare", "Comparison", "compared", _compare))
+            kinds = (
+                ("fit", "Result", "trained", _fit),
+                ("compare", "Comparison", "compared", _compare),
+            )
             for kind, title, done, draw in kinds:
                 if (result := session.results.get(kind)) is None:
                     continue
@@ -132,7 +152,9 @@ class TrainingView:
                     same = session.trained[kind] == session.spec
                     if not same:
                         note(f"The spec has changed since this was {done}.", "care")
-                    if (verdict := session.verdicts.get(kind)) is not None:  # that the report begins with
+                    if (
+                        verdict := session.verdicts.get(kind)
+                    ) is not None:  # that the report begins with
                         note(" ".join(verdict["sentences"]), verdict["level"])
                     draw(result, session.units if same else {})
 
@@ -163,7 +185,9 @@ def _fit(result: Mapping[str, Any], units: Mapping[str, str]) -> None:
 
 
 def _parameters(
-    caption: str, models: Sequence[tuple[str, Sequence[Mapping[str, Any]]]], units: Mapping[str, str]
+    caption: str,
+    models: Sequence[tuple[str, Sequence[Mapping[str, Any]]]],
+    units: Mapping[str, str],
 ) -> None:
     """Of one model, or of several that are named; `units` are those that the channels ask for."""
     named, cells = any(name for name, _ in models), []
@@ -174,14 +198,23 @@ def _parameters(
             own = (number(row["value"], 6), number(row["std"], 3), reach)
             unit = row["unit"] or units.get(row["name"]) or "–"
             cells.append((*([name] if named else []), row["name"], *own, unit))
-    head = (*(["model"] if named else []), "parameter", "value", "standard error", "95 % interval", "unit")
+    head = (
+        *(["model"] if named else []),
+        "parameter",
+        "value",
+        "standard error",
+        "95 % interval",
+        "unit",
+    )
     table(head, cells, caption)
 
 
 def _output_units(result: Mapping[str, Any]) -> str:
     """Return the units of the outputs behind `RMSE`, in brackets; nothing where none has one."""
     data = section(result["spec"], "data")
-    units = [str(section(data, "channels", name).get("unit") or "–") for name in names(data, "outputs")]
+    units = [
+        str(section(data, "channels", name).get("unit") or "–") for name in names(data, "outputs")
+    ]
     return f" [{', '.join(units)}]" if set(units) - {"–"} else ""
 
 
@@ -190,7 +223,12 @@ def _scores(models: Sequence[tuple[str, Mapping[str, Any]]], unit: str) -> None:
     for name, scores in models:
         for part, kinds in scores.items():
             one, free = kinds["prediction"], kinds["simulation"]
-            own = [_numbers(one["nrmse"]), _numbers(free["nrmse"]), _numbers(free["rmse"]), _numbers(free["fit"], 4)]
+            own = [
+                _numbers(one["nrmse"]),
+                _numbers(free["nrmse"]),
+                _numbers(free["rmse"]),
+                _numbers(free["fit"], 4),
+            ]
             rows.append((name or part, *([part] if name else []), *own))
     head = (*(("model", "part") if models and models[0][0] else ("part",)), "NRMSE, one step")
     table((*head, "NRMSE, free run", f"RMSE, free run{unit}", "FIT %, free run"), rows, "Scores")

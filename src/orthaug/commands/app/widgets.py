@@ -1,4 +1,7 @@
-"""Building blocks of the page: headings, fields, tables, curves; plain HTML where that is all it takes."""
+"""Building blocks of the page: headings, fields, tables, curves.
+
+Plain HTML where that is all it takes.
+"""
 
 from __future__ import annotations
 
@@ -59,10 +62,14 @@ def redrawn(place: ui.element) -> Any:
         yield
 
 
-def field(label: str, value: Any, changed: Callable[[str], None], *, classes: str = "", hint: str = "") -> ui.input:
+def field(
+    label: str, value: Any, changed: Callable[[str], None], *, classes: str = "", hint: str = ""
+) -> ui.input:
     """Return a line of text; told when it is left, or by Enter."""
     made = (
-        ui.input(label, value="" if value is None else str(value)).props("outlined dense stack-label").classes(classes)
+        ui.input(label, value="" if value is None else str(value))
+        .props("outlined dense stack-label")
+        .classes(classes)
     )
     if hint:
         made.props["placeholder"] = hint
@@ -77,7 +84,11 @@ def refuse(made: ui.input, why: str) -> None:
 
 
 def choice(
-    label: str, options: Mapping[str, str], value: str, changed: Callable[[str], None], classes: str = ""
+    label: str,
+    options: Mapping[str, str],
+    value: str,
+    changed: Callable[[str], None],
+    classes: str = "",
 ) -> ui.element:
     """Return a list to choose from, as every phone knows it; the label is above."""
     with ui.element("label").classes(f"choice {classes}"):
@@ -99,15 +110,22 @@ def choice(
 
 def table(head: Sequence[str], rows: Sequence[Sequence[Any]], caption: str = "") -> None:
     """A table; on a phone each row of more than two cells is a block with the heads beside them."""
-    kinds = ["w" if any(str(row[i])[:1].isalpha() for row in rows) else "" for i in range(len(head))]  # words, numbers
+    kinds = [
+        "w" if any(str(row[i])[:1].isalpha() for row in rows) else "" for i in range(len(head))
+    ]  # words, numbers
     lines = ["<table>", f"<caption>{escape(caption)}</caption>" if caption else "", "<thead><tr>"]
-    lines += [f"<th scope='col' class='{kind}'>{escape(name)}</th>" for name, kind in zip(head, kinds, strict=True)]
+    lines += [
+        f"<th scope='col' class='{kind}'>{escape(name)}</th>"
+        for name, kind in zip(head, kinds, strict=True)
+    ]
     lines.append("</tr></thead><tbody>")
     for row in rows:
         lines.append(f"<tr><th scope='row'>{_whole(row[0])}</th>")
         for name, value, kind in zip(head[1:], map(str, row[1:]), kinds[1:], strict=True):
             kind += " n" if len(value) <= _SHORT else ""
-            lines.append(f"<td class='{kind}' data-label='{escape(name, True)}'>{_whole(value)}</td>")
+            lines.append(
+                f"<td class='{kind}' data-label='{escape(name, True)}'>{_whole(value)}</td>"
+            )
         lines.append("</tr>")
     made = ui.html("".join([*lines, "</tbody></table>"]), sanitize=False).classes("table")
     made.classes("cards" if len(head) > 2 else "")
@@ -120,9 +138,13 @@ def number(value: Any, digits: int = 5) -> str:
     return "–" if value is None else f"{value:.{digits}g}"
 
 
-def button(label: str, clicked: Callable[[], Any], *, main: bool = False, classes: str = "") -> ui.button:
+def button(
+    label: str, clicked: Callable[[], Any], *, main: bool = False, classes: str = ""
+) -> ui.button:
     """Return a button; the main one of its place is filled."""
-    made = ui.button(label, on_click=clicked, color=None).props("no-caps unelevated" if main else "no-caps outline")
+    made = ui.button(label, on_click=clicked, color=None).props(
+        "no-caps unelevated" if main else "no-caps outline"
+    )
     return made.classes(("main " if main else "plain ") + classes)
 
 
@@ -143,7 +165,9 @@ _ENTRY = 19  # px of one
 _COLORS = ("#3b82d0", "#d9730d", "#159a7c", "#9a5fd6", "#c2498a", "#8a7a12")
 
 
-def curves_figure(rows: Sequence[tuple[str, Sequence[Mapping[str, Any]]]], unit: str = "time in s") -> dict[str, Any]:
+def curves_figure(
+    rows: Sequence[tuple[str, Sequence[Mapping[str, Any]]]], unit: str = "time in s"
+) -> dict[str, Any]:
     """Curves below one another on one axis of time: of each row a label, and traces `x`, `y`, `name`, `raw`."""
     traces: list[dict[str, Any]] = []
     layout = _layout(70 + 130 * len(rows))
@@ -152,14 +176,33 @@ def curves_figure(rows: Sequence[tuple[str, Sequence[Mapping[str, Any]]]], unit:
     for i, (label, drawn) in enumerate(rows):
         axis, top = (f"y{i + 1}" if i else "y"), 1 - i / len(rows)
         layout[f"yaxis{i + 1 if i else ''}"] = {
-            **{"domain": [max(0.0, top - 1 / len(rows) + gap), top - gap / 2], "zeroline": False, "automargin": True},
+            **{
+                "domain": [max(0.0, top - 1 / len(rows) + gap), top - gap / 2],
+                "zeroline": False,
+                "automargin": True,
+            },
             **{"title": _small(label), "nticks": 5, "anchor": "x"},
         }
         for curve in drawn:
             raw = curve.get("raw", False)
             line = {"width": 1.2, "color": "#8b949e" if raw else _COLORS[i % len(_COLORS)]}
-            own = {"name": curve["name"], "x": curve["x"], "y": curve["y"], "line": line, "opacity": 0.6 if raw else 1}
-            traces.append({**own, "type": "scatter", "mode": "lines", "xaxis": "x", "yaxis": axis, "showlegend": False})
+            own = {
+                "name": curve["name"],
+                "x": curve["x"],
+                "y": curve["y"],
+                "line": line,
+                "opacity": 0.6 if raw else 1,
+            }
+            traces.append(
+                {
+                    **own,
+                    "type": "scatter",
+                    "mode": "lines",
+                    "xaxis": "x",
+                    "yaxis": axis,
+                    "showlegend": False,
+                }
+            )
     return {"data": traces, "layout": layout, "config": _CONFIG}
 
 
@@ -197,15 +240,34 @@ def loss_figure(losses: Sequence[tuple[Run, int, float | None]]) -> dict[str, An
         "legend": {"yref": "container", "y": 0, "yanchor": "bottom", "x": 0, "tracegroupgap": 0},
     }
     layout["margin"]["b"] += _ENTRY * len(entries) * shown
-    layout["yaxis"] = {"type": "log", "title": _small("loss"), "automargin": True, "exponentformat": "e", "nticks": 5}
+    layout["yaxis"] = {
+        "type": "log",
+        "title": _small("loss"),
+        "automargin": True,
+        "exponentformat": "e",
+        "nticks": 5,
+    }
     own = {"type": "scatter", "mode": "lines+markers", "marker": {"size": 4}}
     traces, named = [], set[str]()
     for run, (x, y) in sorted(runs.items()):
         group = groups[run]
         color = _COLORS[entries.index(group) % len(_COLORS)]
         hover = f"{escape(names[run])}<br>iteration %{{x}}, loss %{{y:.4g}}<extra></extra>"
-        told = {"name": escape(group), "legendgroup": group, "showlegend": shown and group not in named}
-        traces.append({**own, **told, "x": x, "y": y, "hovertemplate": hover, "line": {"width": 1.5, "color": color}})
+        told = {
+            "name": escape(group),
+            "legendgroup": group,
+            "showlegend": shown and group not in named,
+        }
+        traces.append(
+            {
+                **own,
+                **told,
+                "x": x,
+                "y": y,
+                "hovertemplate": hover,
+                "line": {"width": 1.5, "color": color},
+            }
+        )
         named.add(group)
     return {"data": traces, "layout": layout, "config": _CONFIG}
 
@@ -218,9 +280,20 @@ def _small(title: str) -> dict[str, Any]:
 
 
 def _layout(height: int) -> dict[str, Any]:
-    plain: dict[str, Any] = {"paper_bgcolor": "rgba(0,0,0,0)", "plot_bgcolor": "rgba(0,0,0,0)", "height": height}
-    plain |= {"margin": {"l": 56, "r": 12, "t": 8, "b": 40}, "font": {"size": 12}, "hovermode": "x unified"}
-    return plain | {"xaxis": {"zeroline": False, "automargin": True}, "legend": {"orientation": "h", "y": 1.12}}
+    plain: dict[str, Any] = {
+        "paper_bgcolor": "rgba(0,0,0,0)",
+        "plot_bgcolor": "rgba(0,0,0,0)",
+        "height": height,
+    }
+    plain |= {
+        "margin": {"l": 56, "r": 12, "t": 8, "b": 40},
+        "font": {"size": 12},
+        "hovermode": "x unified",
+    }
+    return plain | {
+        "xaxis": {"zeroline": False, "automargin": True},
+        "legend": {"orientation": "h", "y": 1.12},
+    }
 
 
 def plot(figure: dict[str, Any], label: str) -> ui.plotly:

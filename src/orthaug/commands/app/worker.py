@@ -1,7 +1,7 @@
 """A process that answers questions of the page: what is in a file, which spec to start with, what a spec is worth.
 
-A question is a line of JSON on standard input, its answer one on standard output: `refused` where there is none, and
-`last` where the process ends with it.
+A question is a line of JSON on standard input, its answer one on standard output: `refused` where
+there is none, and `last` where the process ends with it.
 """
 
 from __future__ import annotations
@@ -34,7 +34,10 @@ _DRAWN = 12  # columns of a file whose curves are
 
 
 def main() -> None:
-    """Answer questions until nobody asks any more; end where a question took much memory, which would be kept."""
+    """Answer questions until nobody asks any more.
+
+    End where a question took much memory, which would be kept.
+    """
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # what a library prints is no answer
     asked: queue.Queue[str] = queue.Queue()
@@ -61,11 +64,19 @@ def _answer(given: dict[str, Any]) -> dict[str, Any]:
     except InputError as error:
         return {"refused": str(error)}
     except MemoryError:
-        return {"refused": "there is not enough memory to look at these data; take fewer rows, or every n-th."}
+        return {
+            "refused": "there is not enough memory to look at these data; take fewer rows, or every "
+            "n-th."
+        }
     except OSError as error:
-        return {"refused": f"{error.filename or 'a file'}: cannot be read ({error.strerror or error})."}
+        return {
+            "refused": f"{error.filename or 'a file'}: cannot be read ({error.strerror or error})."
+        }
     except Exception as error:  # a page shows no traceback
-        return {"refused": f"this cannot be told: {type(error).__name__}: {' '.join(str(error).split())[:300]}"}
+        return {
+            "refused": f"this cannot be told: {type(error).__name__}: "
+            f"{' '.join(str(error).split())[:300]}"
+        }
 
 
 def peak() -> float:
@@ -78,7 +89,9 @@ def peak() -> float:
     return float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss) * unit
 
 
-def look(path: str, out: str, inputs: str | None, outputs: str | None, step: float | None) -> dict[str, Any]:
+def look(
+    path: str, out: str, inputs: str | None, outputs: str | None, step: float | None
+) -> dict[str, Any]:
     """Return the columns of a file, their curves, and the first spec for it where its channels are known.
 
     Args:
@@ -101,7 +114,10 @@ def look(path: str, out: str, inputs: str | None, outputs: str | None, step: flo
         roles = starting.assign(found, inputs, outputs, None if step is None else check_step(step))
         if roles is not None:
             draft = starting.draft(found, roles, Path(out))
-            names = {"inputs": [c.header for c in roles.inputs], "outputs": [c.header for c in roles.outputs]}
+            names = {
+                "inputs": [c.header for c in roles.inputs],
+                "outputs": [c.header for c in roles.outputs],
+            }
             answer |= {"spec": draft.spec, "account": draft.account, **names}
     except InputError as error:
         answer["open"] = str(error).removeprefix(f"{path}: ")
@@ -115,14 +131,24 @@ def _timed(found: Survey) -> str:
         return ""
     if not clock.instants:
         return f"{clock.column.header} gives the sampling time, {clock.step:g} s."
-    return f"{clock.column.header} gives the instants, {'every' if clock.even else 'mostly every'} {clock.step:g} s."
+    return (
+        f"{clock.column.header} gives the instants, "
+        f"{'every' if clock.even else 'mostly every'} {clock.step:g} s."
+    )
 
 
 def _column(found: Survey, column: Column) -> dict[str, Any]:
     usable = column in found.signals
-    told = starting.as_seen(column, spikes=column.kind != "input") if usable else found.why_not(column)
+    told = (
+        starting.as_seen(column, spikes=column.kind != "input") if usable else found.why_not(column)
+    )
     head = column.name + (f" = column '{column.header}'" if column.header != column.name else "")
-    own = {"header": column.header, "kind": column.kind, "usable": usable, "timed": column is found.clock.column}
+    own = {
+        "header": column.header,
+        "kind": column.kind,
+        "usable": usable,
+        "timed": column is found.clock.column,
+    }
     return own | {"told": told.removeprefix(f"{head}: ")}
 
 
@@ -141,8 +167,8 @@ def _curves(found: Survey) -> dict[str, Any]:
 def examine(path: str, whole: bool) -> dict[str, Any]:
     """Return what `orthaug check` tells of a spec, and its training data as they are after preparation.
 
-    Args:
-        whole: run equations of motion too; without, `check` is None for them, since that takes its time.
+    Args: whole: run equations of motion too; without, `check` is None for them, since that takes
+        its time.
     """
     job = open_job(Path(path), require_full_rank=False)
     moves = job.spec.motion is not None
@@ -154,7 +180,10 @@ def examine(path: str, whole: bool) -> dict[str, Any]:
             use_compilation_cache()
         result = kind_of(job).checked(job)
         refused = kind_of(job).refused(job, result)
-        bias = [{"name": one.name, "removed_by": one.removed_by, "percent": one.percent} for one in result.bias or ()]
+        bias = [
+            {"name": one.name, "removed_by": one.removed_by, "percent": one.percent}
+            for one in result.bias or ()
+        ]
         told = {"check": json.loads(result.to_json()), "bias": bias}
         told["refusal"] = None if refused is None else str(refused)
     return told | {
@@ -187,7 +216,9 @@ def verdict(path: str, kind: str) -> dict[str, Any]:
 def _units(job: Job) -> list[tuple[str, str, str | None]]:
     """Of each parameter: its name, the unit that the spec gives, and what its regressor asks for if it has one."""
     if job.spec.motion is not None:
-        return [(name, entry.unit or "", None) for name, entry in job.spec.motion.parameters.items()]
+        return [
+            (name, entry.unit or "", None) for name, entry in job.spec.motion.parameters.items()
+        ]
     if job.spec.baseline is None:
         return []
     record, baseline = job.train.record, job.problem.baseline
@@ -210,7 +241,12 @@ def _prepared_curves(job: Job) -> dict[str, Any]:
             share = max(8, MOST * len(e) // max(len(record), 1))
             curve = thinned(e.start_time + record.sampling_time * np.arange(len(e)), values, share)
             x, y = [*x, *curve["x"], None], [*y, *curve["y"], None]
-        curves[channel.name] = {"x": x[:-1], "y": y[:-1], "unit": channel.unit, "column": channel.file_column}
+        curves[channel.name] = {
+            "x": x[:-1],
+            "y": y[:-1],
+            "unit": channel.unit,
+            "column": channel.file_column,
+        }
     return curves
 
 
@@ -228,7 +264,11 @@ def thinned(time: Vector, values: Vector, most: int = MOST) -> dict[str, list[fl
         for a, b in zip(edges[:-1], edges[1:], strict=True):
             piece = there[a:b]
             known = np.isfinite(piece).any()
-            kept += sorted({a + int(np.nanargmin(piece)), a + int(np.nanargmax(piece))}) if known else [a]
+            kept += (
+                sorted({a + int(np.nanargmin(piece)), a + int(np.nanargmax(piece))})
+                if known
+                else [a]
+            )
         time, values = time[kept], values[kept]
     return {"x": _plain(time), "y": _plain(values)}
 
@@ -237,7 +277,11 @@ def _plain(values: Vector) -> list[float | None]:
     return [float(f"{v:.7g}") if np.isfinite(v) else None for v in values]
 
 
-QUESTIONS: dict[str, Callable[..., dict[str, Any]]] = {"look": look, "examine": examine, "verdict": verdict}
+QUESTIONS: dict[str, Callable[..., dict[str, Any]]] = {
+    "look": look,
+    "examine": examine,
+    "verdict": verdict,
+}
 
 if __name__ == "__main__":
     main()

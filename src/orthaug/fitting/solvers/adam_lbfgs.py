@@ -1,7 +1,8 @@
 """The paper's pipeline: Adam, then L-BFGS, over θ and the learner's weights together, compiled whole.
 
-θ starts at θ⁰ in units of its columns, the weights where the caller says. L-BFGS is optax's, in one compiled
-loop. SciPy's L-BFGS-B, called back from Python, took 3 to 6 times longer on both of the paper's examples.
+θ starts at θ⁰ in units of its columns, the weights where the caller says. L-BFGS is optax's, in one
+compiled loop. SciPy's L-BFGS-B, called back from Python, took 3 to 6 times longer on both of the
+paper's examples.
 """
 
 from __future__ import annotations
@@ -80,7 +81,10 @@ class AdamLBFGS:
         *,
         progress: RunProgress = quiet,
     ) -> GradientRun:
-        """Minimise the joint criterion from θ⁰ and `w`; the loss told to `progress` is a mean square."""
+        """Minimise the joint criterion from θ⁰ and `w`.
+
+        The loss told to `progress` is a mean square.
+        """
         import optax
 
         began = training_clock()
@@ -100,16 +104,26 @@ class AdamLBFGS:
                 tick = training_clock()
                 stop = jnp.asarray(min(int(state.iteration) + burst, limit))
                 advance = _lbfgs if second else _adam
-                state = jax.block_until_ready(advance(criterion, state, chunks, physics, self.learning_rate, stop))
+                state = jax.block_until_ready(
+                    advance(criterion, state, chunks, physics, self.learning_rate, stop)
+                )
                 burst = burst_length(burst, training_clock() - tick)
                 try:
-                    progress(done + int(state.iteration), float(state.loss) * float(physics.samples))
+                    progress(
+                        done + int(state.iteration), float(state.loss) * float(physics.samples)
+                    )
                 except StopTraining:
                     enough = True
             done += int(state.iteration)
         finite = bool(jnp.isfinite(state.loss))
         still = Ending.STOPPED if enough else Ending.RUNNING
-        ending = Ending.NON_FINITE if not finite else Ending.CONVERGED if int(state.small) >= 5 else still
+        ending = (
+            Ending.NON_FINITE
+            if not finite
+            else Ending.CONVERGED
+            if int(state.small) >= 5
+            else still
+        )
         v, w = state.unknowns
         return GradientRun(v, w, done, ending, training_clock() - began)
 
@@ -126,7 +140,12 @@ def _value(criterion: PaperCriterion, unknowns: Any, chunks: Chunk, physics: Phy
 
 @partial(jax.jit, static_argnames="criterion")
 def _adam(
-    criterion: PaperCriterion, state: _GradientState, chunks: Chunk, physics: Physics, rate: Any, stop: Any
+    criterion: PaperCriterion,
+    state: _GradientState,
+    chunks: Chunk,
+    physics: Physics,
+    rate: Any,
+    stop: Any,
 ) -> _GradientState:
     import optax
 
@@ -143,7 +162,12 @@ def _adam(
 
 @partial(jax.jit, static_argnames="criterion")
 def _lbfgs(
-    criterion: PaperCriterion, state: _GradientState, chunks: Chunk, physics: Physics, rate: Any, stop: Any
+    criterion: PaperCriterion,
+    state: _GradientState,
+    chunks: Chunk,
+    physics: Physics,
+    rate: Any,
+    stop: Any,
 ) -> _GradientState:
     import optax
 
@@ -156,7 +180,9 @@ def _lbfgs(
 
     def step(s: _GradientState) -> _GradientState:
         loss, gradient = value_and_grad(s.unknowns, state=s.optimizer)
-        update, inner = optimizer.update(gradient, s.optimizer, s.unknowns, value=loss, grad=gradient, value_fn=value)
+        update, inner = optimizer.update(
+            gradient, s.optimizer, s.unknowns, value=loss, grad=gradient, value_fn=value
+        )
         unknowns: Any = optax.apply_updates(s.unknowns, update)
         reached = optax.tree.get(inner, "value")
         small = jnp.where(loss - reached <= _SMALL * loss, s.small + 1, 0)

@@ -1,8 +1,8 @@
 """The Levenberg-Marquardt loop compiled whole, for a criterion whose rows are in memory: the fast path of the solver.
 
-The step solves `(H + (α + μ) I) d = g − α w`. Damping with the identity and Nielsen's update (Madsen, Nielsen and
-Tingleff 2004, algorithm 3.16) converges from Xavier starts on normalised data. A trial costs one pass over the rows,
-and this pass is also the linearisation for the next step.
+The step solves `(H + (α + μ) I) d = g − α w`. Damping with the identity and Nielsen's update
+(Madsen, Nielsen and Tingleff 2004, algorithm 3.16) converges from Xavier starts on normalised data.
+A trial costs one pass over the rows, and this pass is also the linearisation for the next step.
 """
 
 from __future__ import annotations
@@ -116,18 +116,28 @@ class Settings:
     def prepared(self, w: Any) -> tuple[Options, Any, State | None]:
         """Return the numbers of the compiled program, the ridge it starts with, and the state to go on from."""
         groups = self.groups
-        if groups is None and not self.evidence:  # the program of groups serves a fixed ridge as well
+        if (
+            groups is None and not self.evidence
+        ):  # the program of groups serves a fixed ridge as well
             groups = np.zeros(len(w), dtype=int)
-        numbers = np.asarray(self.tolerance), np.asarray(self.evidence), np.asarray(float(self.samples))
+        numbers = (
+            np.asarray(self.tolerance),
+            np.asarray(self.evidence),
+            np.asarray(float(self.samples)),
+        )
         options = Options(numbers[0], numbers[1], numbers[2], groups)
-        start = np.float64(self.ridge) if groups is None else np.full(len(groups), float(self.ridge))
+        start = (
+            np.float64(self.ridge) if groups is None else np.full(len(groups), float(self.ridge))
+        )
         return options, start, self.kept.state() if self.kept else None
 
     def runs(self, state: State) -> bool:
         """Return whether there is a step to take."""
         if int(state.code) != Ending.RUNNING:
             return False
-        return not self.limit.reached(int(state.iteration), float(state.mark), float(state.normal.loss))
+        return not self.limit.reached(
+            int(state.iteration), float(state.mark), float(state.normal.loss)
+        )
 
     def marked(self, state: State) -> State:
         """Return the state, with its loss noted where a window of the limit begins."""
@@ -155,9 +165,14 @@ class Settings:
         effective = float(effective_weights(state.normal, held))
         ending, done = Ending(int(state.code)), int(state.iteration)
         ending = Ending.STOPPED if enough and ending is Ending.RUNNING else ending
-        losses, converged = (float(state.mark), float(state.normal.loss)), int(state.code) != Ending.RUNNING
+        losses, converged = (
+            (float(state.mark), float(state.normal.loss)),
+            int(state.code) != Ending.RUNNING,
+        )
         tail = Tail.of(self.limit, done, *losses, converged=converged)
-        return TrainingRun(state.w, state.normal, ridge, effective, done, ending, seconds, tail=tail)
+        return TrainingRun(
+            state.w, state.normal, ridge, effective, done, ending, seconds, tail=tail
+        )
 
 
 def minimise(
@@ -174,7 +189,9 @@ def minimise(
         overlap: a first guess of the learner's share in the physics; zeros do.
     """
     options, start, state = settings.prepared(w)
-    state = _begun(w, linearise(criterion, w, arguments, overlap), start) if state is None else state
+    state = (
+        _begun(w, linearise(criterion, w, arguments, overlap), start) if state is None else state
+    )
     if settings.runs(state):  # a run beside this one may be compiling: no time of this one
         jax.block_until_ready(_advance(criterion, state, arguments, options, np.int64(0)))
     began = training_clock()
@@ -182,7 +199,9 @@ def minimise(
     while settings.runs(state) and not enough:
         tick = training_clock()
         stop = min(int(state.iteration) + burst, settings.limit.next_look(int(state.iteration)))
-        state = jax.block_until_ready(_advance(criterion, state, arguments, options, np.int64(stop)))
+        state = jax.block_until_ready(
+            _advance(criterion, state, arguments, options, np.int64(stop))
+        )
         state = settings.marked(state)
         burst = burst_length(burst, training_clock() - tick)
         enough = settings.tell(state)
@@ -204,7 +223,9 @@ def driven(
     first = normal_at(w, overlap) if state is None else None  # compiles: no time of the run
     began = training_clock()
     if first is not None:
-        state = _begun(w, normal_at(w, first.overlap), start)  # less what rounding left of J in the physics
+        state = _begun(
+            w, normal_at(w, first.overlap), start
+        )  # less what rounding left of J in the physics
     assert state is not None
     enough = False
     while settings.runs(state) and not enough:
@@ -233,13 +254,17 @@ def _begun(w: Any, normal: Normal, ridge: Any) -> State:
         iteration=jnp.asarray(0),
         accepted=jnp.asarray(0),
         small=jnp.asarray(0),
-        code=jnp.where(finite, jnp.where(spanned(normal), Ending.SPANNED, Ending.RUNNING), Ending.NON_FINITE),
+        code=jnp.where(
+            finite, jnp.where(spanned(normal), Ending.SPANNED, Ending.RUNNING), Ending.NON_FINITE
+        ),
         mark=normal.loss,
     )
 
 
 @partial(jax.jit, static_argnames="criterion")
-def _advance(criterion: Any, state: State, arguments: tuple[Any, ...], options: Options, stop: Any) -> State:
+def _advance(
+    criterion: Any, state: State, arguments: tuple[Any, ...], options: Options, stop: Any
+) -> State:
     return jax.lax.while_loop(
         lambda s: (s.code == Ending.RUNNING) & (s.iteration < stop),
         lambda s: _trial(criterion, s, arguments, options),
@@ -250,7 +275,9 @@ def _advance(criterion: Any, state: State, arguments: tuple[Any, ...], options: 
 def _trial(criterion: Any, state: State, arguments: tuple[Any, ...], options: Options) -> State:
     """Return one damped step: accept it, or damp more."""
     step = _proposed(state)
-    return _judged(state, step, one_pass(criterion, state.w + step, arguments, state.normal.overlap), options)
+    return _judged(
+        state, step, one_pass(criterion, state.w + step, arguments, state.normal.overlap), options
+    )
 
 
 def _downhill(state: State) -> Any:
@@ -273,15 +300,23 @@ def _judged(state: State, step: Any, trial: Normal, options: Options) -> State:
     gain = (before - after) / (step @ (state.damping * step + downhill))
     ok = jnp.isfinite(after) & (after < before) & jnp.all(jnp.isfinite(trial.hessian))
 
-    small = jnp.where(ok, jnp.where(before - after < options.tolerance * before, state.small + 1, 0), state.small)
+    small = jnp.where(
+        ok, jnp.where(before - after < options.tolerance * before, state.small + 1, 0), state.small
+    )
     accepted = state.accepted + ok
-    damping = jnp.where(ok, state.damping * jnp.maximum(1 / 3, 1 - (2 * gain - 1) ** 3), state.damping * state.growth)
+    damping = jnp.where(
+        ok,
+        state.damping * jnp.maximum(1 / 3, 1 - (2 * gain - 1) ** 3),
+        state.damping * state.growth,
+    )
     stuck = damping > IDENTITY.largest * jnp.max(jnp.diag(normal.hessian), initial=1e-300)
     code = jnp.where(small >= 2, Ending.CONVERGED, Ending.RUNNING)
     arrived = (accepted > 0) | _level(normal, downhill, before)
     code = jnp.where(stuck, jnp.where(arrived, Ending.CONVERGED, Ending.NO_DESCENT), code)
     moved = jax.tree.map(lambda new, old: jnp.where(ok, new, old), (w + step, trial), (w, normal))
-    ridge = jax.lax.cond(ok & options.evidence, lambda: _evidence(moved[0], moved[1], alpha, options), lambda: alpha)
+    ridge = jax.lax.cond(
+        ok & options.evidence, lambda: _evidence(moved[0], moved[1], alpha, options), lambda: alpha
+    )
     return State(
         w=moved[0],
         normal=moved[1],
@@ -317,7 +352,10 @@ def _evidence(w: Any, normal: Normal, alpha: Any, options: Options) -> Any:
         variance = normal.loss / jnp.maximum(options.samples - effective, 1.0)
         return jnp.clip(effective * variance / jnp.maximum(w @ w, 1e-300), 1e-12, 1e12)
     each = _effective(normal, alpha)
-    used, size = (jax.ops.segment_sum(x, options.groups, num_segments=len(w))[options.groups] for x in (each, w**2))
+    used, size = (
+        jax.ops.segment_sum(x, options.groups, num_segments=len(w))[options.groups]
+        for x in (each, w**2)
+    )
     variance = normal.loss / jnp.maximum(options.samples - jnp.sum(each), 1.0)
     return jnp.clip(jnp.maximum(used, _UNUSED) * variance / jnp.maximum(size, 1e-300), 1e-12, 1e12)
 
@@ -352,4 +390,6 @@ def spanned(normal: Normal) -> Any:
 
 def _largest_column(normal: Normal) -> Any:
     """Return the largest ‖J_i‖², before the projection."""
-    return jnp.max(jnp.diag(normal.hessian) + jnp.sum(normal.overlap.jacobian**2, axis=0), initial=0.0)
+    return jnp.max(
+        jnp.diag(normal.hessian) + jnp.sum(normal.overlap.jacobian**2, axis=0), initial=0.0
+    )

@@ -1,11 +1,13 @@
 """The Levenberg-Marquardt loop that the host drives, for any objective that can be tried and linearised.
 
-The step solves `(H + αE + μ D) d = g − αE p` with Nielsen's update of μ (Madsen, Nielsen and Tingleff 2004, algorithm
-3.16). The ridge α acts on the weights alone (E). One step ahead D is the identity, which converges from Xavier starts
-on normalised data; on the free run D is diag H (Marquardt's scaling). A trial costs one evaluation. Only an accepted
-trial is linearised. A trial that is not finite is rejected like one that does not descend.
+The step solves `(H + αE + μ D) d = g − αE p` with Nielsen's update of μ (Madsen, Nielsen and
+Tingleff 2004, algorithm 3.16). The ridge α acts on the weights alone (E). One step ahead D is the
+identity, which converges from Xavier starts on normalised data; on the free run D is diag H
+(Marquardt's scaling). A trial costs one evaluation. Only an accepted trial is linearised. A trial
+that is not finite is rejected like one that does not descend.
 
-Where the rows of a one-step criterion are in memory, the loop is compiled whole instead (`compiled`).
+Where the rows of a one-step criterion are in memory, the loop is compiled whole instead
+(`compiled`).
 """
 
 from __future__ import annotations
@@ -30,14 +32,19 @@ _SMALLEST_CURVATURE = 1e-14  # of the largest: it damps a direction that does no
 
 
 class Damping(NamedTuple):
-    """The first μ and the largest, in units of the largest curvature; with Marquardt's scaling in units of 1."""
+    """The first μ and the largest, in units of the largest curvature.
+
+    With Marquardt's scaling in units of 1.
+    """
 
     first: float
     largest: float
     diagonal: bool
 
 
-IDENTITY = Damping(1e-5, 1e12, diagonal=False)  # docs/design.md has the comparison of first dampings
+IDENTITY = Damping(
+    1e-5, 1e12, diagonal=False
+)  # docs/design.md has the comparison of first dampings
 MARQUARDT = Damping(1e-3, 1e16, diagonal=True)
 
 
@@ -76,7 +83,10 @@ class LinearModel(Protocol):
 
 @runtime_checkable
 class SquaredResiduals(Protocol):
-    """The objective `‖r(p)‖²` of p = (θ, w), θ in front. Its functions are pure: a rejected trial leaves no trace."""
+    """The objective `‖r(p)‖²` of p = (θ, w), θ in front.
+
+    Its functions are pure: a rejected trial leaves no trace.
+    """
 
     @property
     def physics(self) -> int:
@@ -151,7 +161,9 @@ class _Iterate(NamedTuple):
     small: int = 0
     path: tuple[Vector, ...] = ()
     coloured: bool = False
-    """Whether the colour of the errors counts. It does once they no longer fall fast; before, misfit colours them."""
+    """Whether the colour of the errors counts. It does once they no longer fall fast; before,
+    misfit colours them.
+    """
 
     @property
     def settled(self) -> bool:
@@ -177,12 +189,11 @@ def descend(
 ) -> Descent:
     """Minimise `‖r‖² + α‖w‖²` from p.
 
-    Args:
-        start: handed to the first trial.
-        ridge: α; with `evidence` where it starts.
-        evidence_settled: whether α waits until the weights have lowered the loss and the objective falls slowly, or no
-            longer; otherwise until the first accepted step. From weights that do nothing yet, evidence would find that
-            none are needed (w = 0 is its fixed point).
+    Args: start: handed to the first trial. ridge: α; with `evidence` where it starts.
+        evidence_settled: whether α waits until the weights have lowered the loss and the objective
+        falls slowly, or no
+            longer; otherwise until the first accepted step. From weights that do nothing yet,
+            evidence would find that none are needed (w = 0 is its fixed point).
         ceiling: a trial with a larger `‖r‖²` is rejected.
         bounds: of θ, each (physics,); the start is moved inside.
         kept: where pauses are kept; a descent goes on from the last one.
@@ -201,14 +212,19 @@ def descend(
         if linear is None or not np.isfinite(linear.hessian).all():
             return Descent(point, None, ridge, 0.0, 0, Ending.NON_FINITE, training_clock() - began)
         largest = 1.0 if damping.diagonal else float(np.diag(linear.hessian).max(initial=1e-300))
-        iterate, first_loss = _Iterate(point, linear, ridge, damping.first * largest, path=(point.p,)), point.loss
+        iterate, first_loss = (
+            _Iterate(point, linear, ridge, damping.first * largest, path=(point.p,)),
+            point.loss,
+        )
         ending, done, taken, begun, mark = Ending.RUNNING, 0, 1, not evidence_settled, first_loss
     while ending is Ending.RUNNING and not limit.reached(done, mark, iterate.point.loss):
         iterate, ending = _trial(objective, iterate, limits, tolerance, damping, ceiling)
         if evidence and not begun:
             lower = iterate.point.loss < LEARNED * first_loss or iterate.small > 0
             begun = iterate.settled and lower or ending is Ending.CONVERGED
-            if begun and ending is Ending.CONVERGED:  # under the first ridge; not yet under the one that follows
+            if (
+                begun and ending is Ending.CONVERGED
+            ):  # under the first ridge; not yet under the one that follows
                 iterate, ending, taken = iterate._replace(small=0), Ending.RUNNING, 0
         if evidence and begun and len(iterate.path) > taken:
             iterate = iterate._replace(ridge=_next_ridge(objective, iterate))
@@ -222,11 +238,27 @@ def descend(
             break
         if kept is not None:
             counts = _Counts(done, taken, begun, first_loss, mark)
-            kept.keep(partial(_paused, objective, iterate, counts, ending), ended=ending is not Ending.RUNNING)
+            kept.keep(
+                partial(_paused, objective, iterate, counts, ending),
+                ended=ending is not Ending.RUNNING,
+            )
     effective = effective_weights(iterate.linear.hessian, iterate.ridge, objective.physics)
     converged = ending not in (Ending.RUNNING, Ending.STOPPED)
-    tail, seconds = Tail.of(limit, done, mark, iterate.point.loss, converged=converged), training_clock() - began
-    return Descent(iterate.point, iterate.linear, iterate.ridge, effective, done, ending, seconds, iterate.path, tail)
+    tail, seconds = (
+        Tail.of(limit, done, mark, iterate.point.loss, converged=converged),
+        training_clock() - began,
+    )
+    return Descent(
+        iterate.point,
+        iterate.linear,
+        iterate.ridge,
+        effective,
+        done,
+        ending,
+        seconds,
+        iterate.path,
+        tail,
+    )
 
 
 def _paused(objective: Any, iterate: _Iterate, counts: _Counts, ending: Ending) -> Pause:
@@ -239,20 +271,29 @@ def _resumed(objective: Any, paused: Pause) -> tuple[_Iterate, _Counts, Ending]:
     point = objective.again(paused.point)
     ridge, damping, growth = (float(paused[i]) for i in (1, 2, 3))
     path, done = tuple(paused.path), paused.counts.tolist()
-    iterate = _Iterate(point, objective.linearise(point), ridge, damping, growth, int(paused.small), path)
+    iterate = _Iterate(
+        point, objective.linearise(point), ridge, damping, growth, int(paused.small), path
+    )
     counts = _Counts(int(done[0]), int(done[1]), bool(done[2]), done[3], done[4])
     return iterate._replace(coloured=bool(paused.coloured)), counts, Ending(int(paused.ending))
 
 
 def _trial(
-    objective: SquaredResiduals, iterate: _Iterate, limits: Any, tolerance: float, damping: Damping, ceiling: float
+    objective: SquaredResiduals,
+    iterate: _Iterate,
+    limits: Any,
+    tolerance: float,
+    damping: Damping,
+    ceiling: float,
 ) -> tuple[_Iterate, Ending]:
     """Return one damped step: accept it, or damp more."""
     point, linear, ridge = iterate.point, iterate.linear, iterate.ridge
     p = point.p
     penalty = np.concatenate([np.zeros(objective.physics), np.ones(len(p) - objective.physics)])
     downhill = linear.gradient - ridge * penalty * p
-    step, expected = _step(linear.hessian + ridge * np.diag(penalty), downhill, iterate.damping, p, limits, damping)
+    step, expected = _step(
+        linear.hessian + ridge * np.diag(penalty), downhill, iterate.damping, p, limits, damping
+    )
     moves = bool(np.isfinite(step).all() and step.any())
     tried = objective.evaluate(p + step, linear.start) if moves else None
     before = point.loss + ridge * float(penalty @ p**2)
@@ -284,11 +325,13 @@ def _next_ridge(objective: SquaredResiduals, iterate: _Iterate) -> float:
     return evidence_ridge(objective, iterate.point, effective, coloured=iterate.coloured)
 
 
-def evidence_ridge(objective: SquaredResiduals, point: Any, effective: float, *, coloured: bool = True) -> float:
+def evidence_ridge(
+    objective: SquaredResiduals, point: Any, effective: float, *, coloured: bool = True
+) -> float:
     """Return MacKay's fixed point `α = γσ²/(κ‖w‖²)`, κ the share of the residuals that is independent.
 
-    Residuals of a free run are coloured: N of them say as much as κN independent ones. So the data weigh less against
-    the prior.
+    Residuals of a free run are coloured: N of them say as much as κN independent ones. So the data
+    weigh less against the prior.
 
     Args:
         objective: that the weights minimise.
@@ -304,21 +347,30 @@ def evidence_ridge(objective: SquaredResiduals, point: Any, effective: float, *,
 
 
 def _step(
-    hessian: Matrix, downhill: Vector, damping: float, p: Vector, bounds: tuple[Vector, Vector], kind: Damping
+    hessian: Matrix,
+    downhill: Vector,
+    damping: float,
+    p: Vector,
+    bounds: tuple[Vector, Vector],
+    kind: Damping,
 ) -> tuple[Vector, float]:
     """Return the damped step inside the bounds, and the decrease that the quadratic model expects of it."""
     free = np.flatnonzero(~_held(p, downhill, *bounds))
     curvature = np.diag(hessian)[free] if kind.diagonal else np.ones(len(free))
     scale = np.maximum(curvature, _SMALLEST_CURVATURE * curvature.max(initial=0.0))
     scale = np.where(scale > 0, scale, 1.0)
-    unit = 1 / np.sqrt(scale)  # solved with a unit diagonal: columns of very different size keep their digits
+    unit = 1 / np.sqrt(
+        scale
+    )  # solved with a unit diagonal: columns of very different size keep their digits
     matrix = hessian[np.ix_(free, free)] * np.outer(unit, unit) + damping * np.eye(len(free))
     step = np.zeros(len(p))
     if not len(free):
         return step, 0.0
     try:
         factor = scipy.linalg.cho_factor(matrix, check_finite=False)
-        step[free] = unit * scipy.linalg.cho_solve(factor, unit * downhill[free], check_finite=False)
+        step[free] = unit * scipy.linalg.cho_solve(
+            factor, unit * downhill[free], check_finite=False
+        )
     except np.linalg.LinAlgError:  # curvature lost to rounding: more damping mends it
         return np.full(len(p), np.nan), 0.0
     step = np.clip(p + step, *bounds) - p
@@ -330,7 +382,9 @@ def _held(p: Vector, downhill: Vector, lower: Vector, upper: Vector) -> Bool[np.
     return ((p <= lower) & (downhill < 0)) | ((p >= upper) & (downhill > 0))
 
 
-def _level(hessian: Matrix, downhill: Vector, objective: float, held: Bool[np.ndarray, "n"]) -> bool:
+def _level(
+    hessian: Matrix, downhill: Vector, objective: float, held: Bool[np.ndarray, "n"]
+) -> bool:
     """Residual and Jacobian are orthogonal to rounding in every free entry: the start is a minimum."""
     flat = np.abs(downhill) <= 1e-7 * np.sqrt(np.maximum(np.diag(hessian), 0.0) * objective)
     return bool(np.all(flat | held))
@@ -338,7 +392,11 @@ def _level(hessian: Matrix, downhill: Vector, objective: float, held: Bool[np.nd
 
 def weights_hessian(hessian: Matrix, physics: int) -> Matrix:
     """Return the Hessian of the weights with θ eliminated, (nw, nw)."""
-    h_tt, h_tw, h_ww = hessian[:physics, :physics], hessian[:physics, physics:], hessian[physics:, physics:]
+    h_tt, h_tw, h_ww = (
+        hessian[:physics, :physics],
+        hessian[:physics, physics:],
+        hessian[physics:, physics:],
+    )
     size = np.diag(h_tt)
     unit = np.sqrt(np.where(size > 1e-300 * size.max(initial=0.0), size, 1.0))
     inner = np.linalg.lstsq(h_tt / np.outer(unit, unit), h_tw / unit[:, None], rcond=1e-14)[0]

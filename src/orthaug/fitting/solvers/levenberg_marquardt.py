@@ -26,10 +26,11 @@ _ITERATIONS = 300  # the default limit
 class LevenbergMarquardt:
     """Declaration of the solver.
 
-    Args:
-        iterations: trial steps at most. Only the default, 300, is a limit that a run passes where the loss still falls
+    Args: iterations: trial steps at most. Only the default, 300, is a limit that a run passes where
+        the loss still falls
             noticeably (`solvers/limit.py`), up to ten times.
-        tolerance: two successive steps that lower the objective by less than this fraction end the run.
+        tolerance: two successive steps that lower the objective by less than this fraction end the
+            run.
         longest: trial steps at most where the loss still falls; None for what `iterations` says.
     """
 
@@ -77,17 +78,32 @@ class LevenbergMarquardt:
         overlap: Overlap,
         **options: Any,
     ) -> TrainingRun:
-        """`‖r(w)‖² + α‖w‖²` from `w`, compiled whole: the rows are in memory; see `compiled.minimise`."""
+        """`‖r(w)‖² + α‖w‖²` from `w`, compiled whole: the rows are in memory.
+
+        See `compiled.minimise`.
+        """
         return compiled.minimise(criterion, w, arguments, overlap, self._settings(**options))
 
     def drive(
-        self, normal_at: Callable[[Any, Overlap], Normal], w: Float[Array, "nw"], overlap: Overlap, **options: Any
+        self,
+        normal_at: Callable[[Any, Overlap], Normal],
+        w: Float[Array, "nw"],
+        overlap: Overlap,
+        **options: Any,
     ) -> TrainingRun:
         """The same, pass by pass: the rows are elsewhere; see `compiled.driven`."""
         return compiled.driven(normal_at, w, overlap, self._settings(**options))
 
     def descend(
-        self, objective: SquaredResiduals, p: Vector, start: Any, *, noticeable: float = 0.0, **options: Any
+        self,
+        objective: SquaredResiduals,
+        p: Vector,
+        start: Any,
+        *,
+        noticeable: float = 0.0,
+        **options: Any,
     ) -> Descent:
         """`‖r(p)‖² + α‖w‖²` from p, driven by the host; see `descent.descend`."""
-        return descend(objective, p, start, limit=self.limit(noticeable), tolerance=self.tolerance, **options)
+        return descend(
+            objective, p, start, limit=self.limit(noticeable), tolerance=self.tolerance, **options
+        )

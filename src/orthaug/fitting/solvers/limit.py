@@ -1,9 +1,10 @@
 """The limit of a run's iterations, and how far past it a run goes while its loss still falls noticeably.
 
-A run that has not converged at its limit is judged by the last quarter of the limit: did the loss fall there by more
-than the `noticeable` fraction? For residuals of variance σ² the parameters are at most `√(N d)` standard errors from
-the minimum when the loss is the fraction d above it, since `N d` is what χ² has still to fall by. What is still to fall
-is about what fell last, so a fall of `1/(4 N)` means half a standard error: `noticeable_in(N)`.
+A run that has not converged at its limit is judged by the last quarter of the limit: did the loss
+fall there by more than the `noticeable` fraction? For residuals of variance σ² the parameters are
+at most `√(N d)` standard errors from the minimum when the loss is the fraction d above it, since `N
+d` is what χ² has still to fall by. What is still to fall is about what fell last, so a fall of
+`1/(4 N)` means half a standard error: `noticeable_in(N)`.
 """
 
 from __future__ import annotations
@@ -18,10 +19,9 @@ _PROLONGED = 10  # times the limit, at most
 class Limit(NamedTuple):
     """Trial steps that a run may take.
 
-    Args:
-        iterations: the limit.
-        longest: the limit while the loss still falls noticeably; `iterations` for none beyond.
-        noticeable: a relative fall of the loss over the last quarter of the limit that is worth going on for.
+    Args: iterations: the limit. longest: the limit while the loss still falls noticeably;
+        `iterations` for none beyond. noticeable: a relative fall of the loss over the last quarter
+        of the limit that is worth going on for.
     """
 
     iterations: int
@@ -56,7 +56,11 @@ class Limit(NamedTuple):
 
     def begins_window(self, done: int) -> bool:
         """Return whether a window begins after `done` steps."""
-        end = min((done // self.iterations + 1) * self.iterations, self.longest) if self.iterations else 0
+        end = (
+            min((done // self.iterations + 1) * self.iterations, self.longest)
+            if self.iterations
+            else 0
+        )
         return done == end - self.window
 
 
@@ -86,7 +90,9 @@ class Tail(NamedTuple):
     def of(cls, limit: Limit, done: int, before: float, loss: float, *, converged: bool) -> Tail:
         """Return the tail of a run with that limit; `before` and `loss` as in `Limit.reached`."""
         noticeable = not converged and limit.iterations > 0 and limit.falls(before, loss)
-        return cls(done, limit.iterations, min(limit.window, done), relative_fall(before, loss), noticeable)
+        return cls(
+            done, limit.iterations, min(limit.window, done), relative_fall(before, loss), noticeable
+        )
 
     @property
     def prolonged(self) -> bool:
@@ -95,7 +101,10 @@ class Tail(NamedTuple):
 
 
 def longest_of(iterations: int, default: int) -> int:
-    """Return how far a run may go: ten times the default limit; a limit that somebody chose is not passed."""
+    """Return how far a run may go: ten times the default limit.
+
+    A limit that somebody chose is not passed.
+    """
     return _PROLONGED * iterations if iterations == default else iterations
 
 
