@@ -49,7 +49,20 @@ UNSAFE_MODULES = (
     "shelve",
 )
 UNSAFE_CALLS = ("eval", "exec", "read_pickle", "to_pickle")
-MOST_LINES, MOST_FUNCTION_LINES = 600, 60  # of a file; of a function, its docstring aside
+MOST_NAMES = 17  # of a room's face
+ENTRIES = {
+    "studies.": "a study is an entry of `orthaug reproduce`",
+    "export.": "a target is an entry of `orthaug export --to`",
+    "commands.": "a command, or a part of the page, has a file of its own",
+}
+CONCEPTS: dict[str, str] = {
+    "analysis.co....memory": "",
+    "analysis.contraction": "one way to a certificate",
+    "analysis.missing_lags": "a test",
+    "analysis.motion_modes": "eigenvalues of a motion",
+    "models.devices": "an engine, an entry of the registry",
+    "selection.first_orders": "",
+}
 
 
 def module_name(path: Path) -> str:
@@ -275,32 +288,38 @@ def is_false(node: ast.expr) -> bool:
     return isinstance(node, ast.Constant) and node.value is False
 
 
-def lines_of(node: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
-    """Lines of a function, its docstring aside."""
-    first = node.body[0]
-    docstring = (
-        isinstance(first, ast.Expr)
-        and isinstance(first.value, ast.Constant)
-        and isinstance(first.value.value, str)
-    )
-    said = (first.end_lineno or 0) - first.lineno + 1 if docstring else 0
-    return (node.end_lineno or node.lineno) - node.lineno + 1 - said
-
-
-def test_files_and_functions_are_short() -> None:
-    assert in_files(too_long) == {}
-
-
-def too_long(name: str) -> list[str]:
-    lines = len(FILES[name].read_text(encoding="utf-8").splitlines())
-    found = [f"{lines} lines: there are two concepts in it"] if lines > MOST_LINES else []
-    for node in ast.walk(parsed(FILES[name])):
-        if (
-            isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
-            and lines_of(node) > MOST_FUNCTION_LINES
-        ):
-            found.append(f"{node.name} has {lines_of(node)} lines: there are two functions in it")
+def importers() -> dict[str, set[str]]:
+    """Return the files that import each file, by their dotted names; a room's own face does not count."""
+    found: dict[str, set[str]] = {name: set() for name in FILES}
+    for name, path in FILES.items():
+        for _, dotted in imports_of(name, parsed(path), path.name == "__init__.py"):
+            parts = dotted.removeprefix("orthaug.").split(".")
+            for end in range(len(parts), 0, -1):
+                target = ".".join(parts[:end])
+                if target in FILES and target != name:
+                    found[target].add(name)
+                    break
     return found
+
+
+def test_a_file_that_one_file_imports_is_a_concept() -> None:
+    """Cut a file where a concept ends, not where it is long: what only one file uses is part of it."""
+    single = {
+        name
+        for name, others in importers().items()
+        if len(others) == 1 and FILES[name].name != "__init__.py"
+    }
+    entries = {name for name in single if name.startswith(tuple(ENTRIES))}
+    assert single - entries - set(CONCEPTS) == set()
+    assert set(CONCEPTS) - single == set(), (
+        "these are imported elsewhere, too: strike them from the list"
+    )
+
+
+def test_a_face_has_few_names() -> None:
+    for room in ROOMS:
+        face = (SOURCE / room / "__init__.pyi").read_text(encoding="utf-8")
+        assert face.count(" as ") <= MOST_NAMES, room
 
 
 def loaded_by(code: str) -> dict[str, object]:

@@ -142,9 +142,10 @@ def test_of_a_level_a_root_is_tried_and_no_friction_and_of_a_velocity_the_revers
                 0.8 * y[k - 1] + 0.5 * u[k - 1] - 0.1 * np.sign(y[k - 1]) * np.sqrt(abs(y[k - 1]))
             )
         baseline = oa.Baseline.from_terms([oa.Term("a", "y[k-1]"), oa.Term("g", "u[k-1]")])
-        plant = lambda x: (x @ [0.8, 0.5] - 0.1 * np.sign(x[:, 0]) * np.sqrt(np.abs(x[:, 0])))[
-            :, None
-        ]  # noqa: E731
+
+        def plant(x):
+            return (x @ [0.8, 0.5] - 0.1 * np.sign(x[:, 0]) * np.sqrt(np.abs(x[:, 0])))[:, None]
+
         fit = oa.orthogonalize(oa.Record.from_arrays(u, y), baseline, plant)
         tried = candidates_of(linearization_of(fit.model, fit.problem.record), 2, (), ())
         kinds[low] = {one.kind for one in tried if one.on == "y[k-1]"}

@@ -115,9 +115,10 @@ def test_arguments_of_channels_and_records():
 def test_arguments_of_baselines():
     for name in ("parameter", "regressor", "initial", "unit", "output", "fixed", "min", "max"):
         kept = {"parameter": "a", "regressor": "u[k]"}
-        call = lambda value, name=name, kept=kept: oa.Baseline.from_terms(
-            [oa.Term(**{**kept, name: value})]
-        )  # noqa: E731
+
+        def call(value, name=name, kept=kept):
+            return oa.Baseline.from_terms([oa.Term(**{**kept, name: value})])
+
         assert tried(call) >= 14
     assert tried(oa.Baseline.from_terms) == len(WRONG)
     assert tried(lambda value: oa.Baseline.from_terms([oa.Term("a", "u[k]")], value)) >= 14

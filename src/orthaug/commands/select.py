@@ -26,7 +26,7 @@ from orthaug.reports.selection import SelectResult
 
 if TYPE_CHECKING:
     from orthaug.selection.kept_physics import Shift
-    from orthaug.selection.selecting import Selection, Told
+    from orthaug.selection.selecting import OnStage, Selection
 
 _DEGREE = 3  # of the terms that a spec without [learner] is searched with
 
@@ -67,7 +67,7 @@ def open_select(path: Path) -> tuple[LaggedJob, Spec]:
     return open_lagged(path, alone), spec
 
 
-def select_for(job: LaggedJob, spec: Spec, folder: Path, told: Told) -> SelectionReport:
+def select_for(job: LaggedJob, spec: Spec, folder: Path, told: OnStage) -> SelectionReport:
     """Select, and write the choice into the spec.
 
     Args:

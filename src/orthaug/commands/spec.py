@@ -428,9 +428,8 @@ def _spec_model(registered: object) -> type[Spec]:
         "structure": structure,
         "training": with_kinds(TrainingSection),
     }
-    return create_model(
-        "Spec", __base__=Spec, **{name: (section, section()) for name, section in sections.items()}
-    )  # type: ignore[call-overload]
+    fields: dict[str, Any] = {name: (section, section()) for name, section in sections.items()}
+    return create_model("Spec", __base__=Spec, **fields)
 
 
 def load_spec(path: Path) -> Spec:

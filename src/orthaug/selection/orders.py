@@ -17,7 +17,7 @@ from orthaug.data.record import Record
 from orthaug.data.terms import TermLibrary
 from orthaug.fitting.criteria import Criterion
 from orthaug.physics.problem import Problem
-from orthaug.selection.term_path import Blocks, PathModel, Search, Told, judge_all
+from orthaug.selection.term_path import Blocks, OnModel, PathModel, Search, judge_all
 from orthaug.selection.term_runs import TermRuns
 
 _SURE = 1.96  # standard errors of a cross-correlation of white signals
@@ -113,7 +113,7 @@ def search_orders(
     largest: Orders,
     least: Orders,
     blocks: int,
-    told: Told = lambda rung: None,
+    told: OnModel = lambda rung: None,
     runner: Any = Threads(),  # noqa: B008  (it holds nothing)
 ) -> OrderSearch:
     """Judge orders from `largest` down, never below `least`, what the physics reads already.

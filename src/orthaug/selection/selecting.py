@@ -33,7 +33,7 @@ from orthaug.selection.forward import COLLINEAR
 from orthaug.selection.kept_physics import PhysicsComparison, kept_physics
 from orthaug.selection.nonlinearity import Nonlinearity, nonlinearity
 from orthaug.selection.orders import Delay, Orders, OrderSearch, search_orders
-from orthaug.selection.term_path import PathModel, RankedModel, Search, TermPath, Told, climb
+from orthaug.selection.term_path import OnModel, PathModel, RankedModel, Search, TermPath, climb
 from orthaug.selection.term_runs import Point, TermRuns
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ def search_learners(
     widths: Sequence[int],
     criterion: Criterion,
     blocks: int,
-    told: Told,
+    told: OnModel,
     runner: Any,
 ) -> LearnerSearch:
     """Judge every width on all lags, and on those whose functions matter by themselves.
@@ -151,7 +151,7 @@ _CONDITIONAL = (
     "intervals of a fit on these data are conditional on the choice, which was made on them; "
     "with `halves` one half of the data chooses and the other is fitted."
 )
-Told = Callable[[str, Any], None]
+OnStage = Callable[[str, Any], None]
 """Called with the stage and each model that was judged; it may raise KeyboardInterrupt to keep what
 there is.
 """
@@ -296,7 +296,7 @@ def select(
     most: int = MOST,
     blocks: int = 5,
     halves: bool = False,
-    progress: Told = _unheard,
+    progress: OnStage = _unheard,
     engine: Engine | None = None,
     collinear: float = COLLINEAR,
 ) -> Selection:
@@ -411,7 +411,7 @@ def select(
 class _Listener:
     """Hands on what was judged, and remembers whether it was asked to stop."""
 
-    def __init__(self, progress: Told) -> None:
+    def __init__(self, progress: OnStage) -> None:
         self.progress, self.stopped = progress, False
 
     def of(self, stage: str) -> Callable[[Any], None]:

@@ -43,7 +43,7 @@ _HALVES = 50  # random halves of the data over which terms are chosen again
 _PARTS = 10  # of the training data, that halves are made of
 _SEED = 20_261_122
 
-Told = Callable[["PathModel"], None]
+OnModel = Callable[["PathModel"], None]
 """Called with every model that was judged."""
 
 
@@ -270,7 +270,7 @@ def climb(
     runs: TermRuns,
     blocks: int,
     most: int,
-    told: Told = lambda rung: None,
+    told: OnModel = lambda rung: None,
     runner: Any = Threads(),  # noqa: B008  (it holds nothing)
     near: Sequence[Collection[Lag]] = (),
     linear: Sequence[str] = (),

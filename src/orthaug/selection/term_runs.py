@@ -415,14 +415,14 @@ class _TermSubset(FreeRunObjective):
         products[: len(chosen)] = runs.library.numbers[list(chosen)]
         nt = len(runs.problem.baseline.names)
         segments: Any = layout
-        start = None if layout is None else np.asarray(layout.start)
+        start: Any = None if layout is None else np.asarray(layout.start)
         return cls(
             dynamics=menu,
             numbers=lambda c, w: menu.numbers(c, products, w, runs.sizes),
             segments=segments,
             initial=InitialStates(
                 start, start is not None and start.size > 0 and runs.free_run.estimates_pasts
-            ),  # type: ignore[arg-type]
+            ),
             weight=np.eye(1) / runs.rms,
             rms=runs.rms,
             deviation=runs.problem.deviation,
