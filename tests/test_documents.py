@@ -115,7 +115,7 @@ def test_what_functions_return_is_in_the_reference():
         "Budget",
         "Diagnosis",
         "Job",
-        "Fitted",
+        "FitReport",
     } <= returned and "SuspectedBias" in held
     told = re.findall(r"^::: orthaug\.(?:[\w.]+\.)?(\w+)$", REFERENCE, re.MULTILINE)
     assert (returned | held) - set(told) == set()
