@@ -53,8 +53,11 @@ STD_KINDS = {
     "coloured",
     "batch-means-uneven": "robust (batch means), for the errors of the free run are of uneven size",
     "none": "none: the errors of the free run remember each other for too long",
+    "chosen": "none: the terms were chosen on the rows that were fitted",
 }
 """How standard errors were made, in words."""
+WITHHELD = ("none", "chosen")
+"""The kinds of fits that have none."""
 
 
 @dataclass(frozen=True)
@@ -235,9 +238,9 @@ class Estimate(AnyFit):
             model=replace(
                 self.model, numbers=numbers, structure="orthogonal", measure=measure.name
             ),
-            covariance=None if self.std_kind == "none" else under.covariance,
+            covariance=None if self.std_kind in WITHHELD else under.covariance,
             plain_covariance=plain,
-            std_kind=self.std_kind if plain is not None or self.std_kind == "none" else "plain",
+            std_kind=self.std_kind if plain is not None or self.std_kind in WITHHELD else "plain",
             defect=under.defect,
             measure=under,
             warnings=(
@@ -245,6 +248,22 @@ class Estimate(AnyFit):
                 *under.warnings,
                 *unknown,
             ),
+        )
+
+    def withheld(self, kind: str, why: Warning) -> Estimate:
+        """The same without standard errors and intervals, of θ, of terms and of predictions.
+
+        A warning says why.
+        """
+        statistics = replace(self.model.statistics, middle=None)
+        return replace(
+            self,
+            model=replace(self.model, statistics=statistics),
+            covariance=None,
+            plain_covariance=None,
+            plain_statistics=None,
+            std_kind=kind,
+            warnings=(*self.warnings, why),
         )
 
     def joint_covariance(self, convention: str = "calibrated") -> Matrix:

@@ -31,6 +31,8 @@ class Candidates:
 
     library: TermLibrary
     notes: tuple[Warning, ...]
+    considered: int
+    """Number of terms that could have been chosen, those that promise little included."""
 
 
 def candidates(problem: Problem, library: TermLibrary) -> Candidates:
@@ -62,7 +64,7 @@ def candidates(problem: Problem, library: TermLibrary) -> Candidates:
             "looked at on the free run."
         )
         notes.append(Warning("terms_shortlisted", text))
-    return Candidates(library.picked(kept), tuple(notes))
+    return Candidates(library.picked(kept), tuple(notes), int(own.sum()))
 
 
 @dataclass(frozen=True, eq=False)

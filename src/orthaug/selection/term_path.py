@@ -6,7 +6,8 @@ neighbours. About the best model as many are picked anew, and from it on backwar
 missed first. The choice is the smallest model that is within one standard error of the best
 (Breiman et al. 1984), block by block in pairs, or worse by less than is worth a term; of as many
 terms those of fewer lags. Blocks that had a say in the terms judge them too well: so the path is
-gone anew without each block, and no term is chosen where physics alone is as good there.
+gone anew without each block, and no term is chosen where physics alone is as good there. Last,
+terms go that noise among so many candidates would give as well (`selection/false_discoveries.py`).
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from orthaug._base.parallel import Threads, one_blas_thread
 from orthaug.data.expressions import Lag
 from orthaug.fitting.held_out import WORTH, blocked
 from orthaug.fitting.segments import Segments, build_segments
+from orthaug.selection.false_discoveries import Control, p_values
 from orthaug.selection.forward import Equations, forward
 from orthaug.selection.term_runs import Able, Point, TermRuns
 
@@ -182,7 +184,12 @@ def _on_all(given: _Given, chosen: Sequence[int], tell: Callable[..., None]) -> 
 
     And what it took [s].
     """
-    runs, began = given[0], time.monotonic()
+    began = time.monotonic()
+    return from_both_starts(given[0], chosen), time.monotonic() - began
+
+
+def from_both_starts(runs: TermRuns, chosen: Sequence[int]) -> Point:
+    """Return chosen terms beside the physics, fitted from physics alone and from one step ahead."""
     point = runs.fit(runs.start(), chosen)
     if (
         runs.layout is not None and chosen
@@ -191,7 +198,7 @@ def _on_all(given: _Given, chosen: Sequence[int], tell: Callable[..., None]) -> 
         p = runs.step_equations.of([*range(nt), *(nt + i for i in chosen)]).solve()
         other = runs.fit(runs.start()._replace(chosen=tuple(chosen), c=p[:nt], w=p[nt:]), chosen)
         point = min(point, other, key=lambda one: one.loss)
-    return point, time.monotonic() - began
+    return point
 
 
 def _on_fold(
@@ -233,6 +240,10 @@ class TermPath(Search):
     confirmed: bool = True
     ways: tuple[tuple[int, ...], ...] = ()
     """Terms that ways forward kept to, before the one that had all."""
+    control: Control | None = None
+    """What a term must stand beside so many candidates; None for no such rule."""
+    kept: int | None = None
+    """The model that the rule left, where it took terms away; None where it took none."""
 
     @property
     def way(self) -> Able:
@@ -241,7 +252,17 @@ class TermPath(Search):
         return next((able for able in self.ways if chosen <= set(able)), None)
 
     def judged(self) -> tuple[RankedModel, ...]:
-        return judge_all(self.rungs, self.confirmed)
+        found = judge_all(self.rungs, self.confirmed)
+        if self.kept is None:
+            return found
+        return tuple(replace(one, chosen=i == self.kept) for i, one in enumerate(found))
+
+    def rates(self) -> dict[str, float]:
+        """Of every term of the choice, the least rate of false discoveries at which it would have stayed."""
+        point, texts = self.chosen.point, self.runs.library.texts
+        control = self.control or Control(1.0, len(texts))
+        found = control.rates(p_values(self.runs, point)) if point.chosen else ()
+        return {texts[i]: float(rate) for i, rate in zip(point.chosen, found, strict=True)}
 
     @property
     def chosen(self) -> PathModel:
@@ -274,6 +295,7 @@ def climb(
     runner: Any = Threads(),  # noqa: B008  (it holds nothing)
     near: Sequence[Collection[Lag]] = (),
     linear: Sequence[str] = (),
+    control: Control | None = None,
 ) -> TermPath:
     """Return the path of up to `most` terms forward, and from the best model on backward.
 
@@ -281,13 +303,14 @@ def climb(
         linear: terms that the last of these ways begins with, the linear lags that the choice of
         orders has beside the
             physics.
+        control: the rate of false discoveries that is allowed; None for any.
 
     Raises:
         InputError: too few rows for so many blocks.
     """
     with one_blas_thread():
         folds, rungs, ways = Blocks(runs, blocks, runner), [], _ways(runs, near)
-        confirmed = True
+        confirmed, kept = True, None
 
         def judged(point: Point, change: Sequence[str], began: float) -> PathModel:
             known = (
@@ -305,7 +328,7 @@ def climb(
             return rung
 
         def path() -> TermPath:
-            return TermPath(tuple(rungs), runs, confirmed, ways)
+            return TermPath(tuple(rungs), runs, confirmed, ways, control, kept)
 
         try:
             began = time.monotonic()
@@ -329,6 +352,7 @@ def climb(
             _anew(path, judged)
             confirmed = _confirmed(folds, path().chosen.size, path().way)
             _backward(path(), judged)
+            kept = _controlled(path(), judged)
         except KeyboardInterrupt:
             if not rungs:
                 raise
@@ -462,3 +486,28 @@ def _backward(path: TermPath, judged: Any) -> None:
         point = _refitted(runs, point, equations, left)  # the others take over what it did
         rung = judged(point, [f"− {texts[gone]}"], began)
         path = replace(path, rungs=(*path.rungs, rung))
+
+
+def _controlled(path: TermPath, judged: Any) -> int | None:
+    """Return the number of the model whose terms all stand the control.
+
+    None where those of the choice do.
+    """
+    runs, rung, control, place = path.runs, path.chosen, path.control, None
+    rungs = list(path.rungs)
+    while control is not None and rung.size:
+        began, point = time.monotonic(), rung.point
+        p = p_values(runs, point)
+        if p.max() <= control.allowed(rung.size):
+            break
+        gone = point.chosen[int(np.argmax(p))]
+        left = tuple(i for i in point.chosen if i != gone)
+        place = next(
+            (i for i, other in enumerate(rungs) if set(other.point.chosen) == set(left)), None
+        )
+        if place is None:
+            fitted = _refitted(runs, point, runs.equations(point, ()), left)
+            rungs.append(judged(fitted, [f"− {runs.library.texts[gone]}"], began))
+            place = len(rungs) - 1
+        rung = rungs[place]
+    return place

@@ -287,18 +287,14 @@ class TermRuns:
         """Return the normal equations of physics and all terms about a point, for p itself: its chosen terms are in the error.
 
         Args: able: terms that may be chosen, beside those that are; the columns of others are zero.
-            scored: which steps of the segments count, or chunks of rows one step ahead; None for
-            all.
+            scored: which steps of the segments count, or which range of rows one step ahead; None
+            for all.
         """
         nt, terms = len(point.c), len(self.library)
         taken = range(terms) if able is None else sorted({*able, *point.chosen})
         columns = [*range(nt), *(nt + i for i in taken)]
         if self.layout is None:
-            own = (
-                self.step_equations
-                if scored is None
-                else Equations.sum_of(self.step_blocks[scored])
-            )
+            own = self.step_equations if scored is None else self._step_equations_of(scored)
             return own if able is None else own.of(columns).among(columns, nt + terms)
         objective = _TermSubset.of(self, tuple(taken), exactly=True)
         if scored is not None:
@@ -317,8 +313,8 @@ class TermRuns:
     def parts(self, point: Point, count: int, able: Able = None) -> list[Equations]:
         """Return the equations about a point over up to `count` parts of the data, one after another."""
         if self.layout is None:
-            chunks = len(self.step_blocks)
-            edges = np.linspace(0, chunks, min(count, chunks) + 1).astype(int)
+            rows = self.step_equations.rows
+            edges = np.linspace(0, rows, min(count, rows) + 1).astype(int)
             return [
                 self.equations(point, able, slice(a, b))
                 for a, b in zip(edges[:-1], edges[1:], strict=True)
@@ -331,13 +327,19 @@ class TermRuns:
         return [self.equations(point, able, scored & (place == part)) for part in range(count)]
 
     @cached_property
-    def step_blocks(self) -> tuple[Equations, ...]:
-        """The normal equations one step ahead of physics and all terms, by chunks of rows, in the output's unit."""
-        found = []
+    def step_equations(self) -> Equations:
+        """The normal equations one step ahead of physics and all terms, in the output's unit."""
+        return self._step_equations_of(slice(None))
+
+    def _step_equations_of(self, part: slice) -> Equations:
+        """The same over a range of rows, counted over the experiments."""
+        found, before = [], 0
         for experiment in self.problem.record.experiments:
             (x, y), factors = self.rows(experiment), self.factors(experiment)
-            for a in range(0, len(x), _CHUNK):
-                rows = slice(a, a + _CHUNK)
+            first, last = ((0 if e is None else e - before) for e in (part.start, part.stop))
+            last = len(x) if part.stop is None else min(max(last, 0), len(x))
+            for a in range(min(max(first, 0), last), last, _CHUNK):
+                rows = slice(a, min(a + _CHUNK, last))
                 phi, target = self.physics(x[rows], y[rows])
                 with np.errstate(all="ignore"):
                     terms = products_of(factors[:, rows], self.library.numbers, np)
@@ -347,11 +349,8 @@ class TermRuns:
                         columns @ columns.T, columns @ target, float(target @ target), len(target)
                     )
                 )
-        return tuple(found)
-
-    @cached_property
-    def step_equations(self) -> Equations:
-        return Equations.sum_of(self.step_blocks)
+            before += len(x)
+        return Equations.sum_of(found)
 
     def errors(self, point: Point, held: Segments) -> float:
         """Mean of squared errors of free runs over held-out segments from measured starts.
