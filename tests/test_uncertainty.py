@@ -18,6 +18,7 @@ from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.structures import Additive, OrthogonalPenalty
 from orthaug.inference.covariance import (
     interval,
+    joint_covariance,
     newey_west,
     prediction_std,
     robust_split_covariance,
@@ -227,6 +228,23 @@ def test_the_whole_covariance_where_every_weight_is_estimable(convention):
     np.testing.assert_allclose(
         found / np.outer(size, size), expected / np.outer(size, size), rtol=0, atol=1e-8
     )
+
+
+def test_a_pseudo_inverse_in_own_units_leaves_out_what_is_rounding(noisy):
+    """It is the whole where every weight is estimable; elsewhere no variance is so large that rounding shows."""
+    fit = estimable()
+    found = joint_covariance(fit.problem, fit.model, "paper", own_units=True)
+    size = np.sqrt(np.diag(found))
+    np.testing.assert_allclose(
+        (found - fit.joint_covariance("paper")) / np.outer(size, size), 0.0, atol=1e-8
+    )
+    own, unit = (
+        joint_covariance(noisy.problem, noisy.model, "paper", own_units=units)
+        for units in (True, False)
+    )
+    assert np.diag(own).max() < 0.01 * np.diag(unit).max()
+    np.testing.assert_allclose(own[:2, :2], unit[:2, :2], rtol=1e-9)
+    assert np.abs(own[:2, 2:]).max() * len(noisy.problem.rows) < 1e-6
 
 
 def test_the_calibrated_convention_is_the_textbook(noisy):

@@ -71,10 +71,14 @@ class Partials:
         shelter.mkdir()
         return shelter
 
-    def stands(self, partial: Path, place: Path) -> None:
-        """Note that a partial one is in its place."""
+    def stands(self, partial: Path, place: Path, *, result: bool = True) -> None:
+        """Note that a partial one is in its place.
+
+        `placed` has only what is a result of the command.
+        """
         self._open.pop(partial, None)
-        self.placed.append(place)
+        if result:
+            self.placed.append(place)
 
     def discard(self, partial: Path) -> None:
         """Remove a partial one, and the parents that were made for it."""
@@ -285,11 +289,14 @@ def check_new_file(path: Path, *, force: bool = False) -> None:
 
 
 @contextmanager
-def whole_file(path: Path, *, force: bool = False) -> Iterator[Path]:
+def whole_file(path: Path, *, force: bool = False, result: bool = True) -> Iterator[Path]:
     """A file beside `path` that takes its place at the end, and vanishes on any exception.
 
     A link is followed: its target is written. What is no regular file, such as a pipe, is written
     into.
+
+    Args: force: replace whatever is there. result: whether a command that a signal ends names the
+        file among what it wrote; False for a cache.
 
     Raises:
         InputError: the file cannot be written, or exists already and holds something else.
@@ -307,7 +314,7 @@ def whole_file(path: Path, *, force: bool = False) -> Iterator[Path]:
         yield partial
         with PARTIALS.lock:
             _place_file(partial, target, force)
-            PARTIALS.stands(partial, path)
+            PARTIALS.stands(partial, path, result=result)
     except FileExistsError:
         told = (
             f"{path}: exists and holds something else; give another name, or replace it with "

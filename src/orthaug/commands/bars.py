@@ -33,6 +33,8 @@ warning `stopped`.
 """
 ENOUGH_LINE = b"enough\n"
 """What sets it, on the standard input of a child of the page."""
+GO_ON = "The runs that are done are kept: the same command goes on from there"
+"""What an interrupted `reproduce` says last."""
 _OFTEN = 0.02  # s between such lines
 _MANY = 1_000_000  # rows from which the rate is told
 _LONG = 5.0  # s of a search that are told beforehand
@@ -154,18 +156,18 @@ def study_bars() -> Iterator[Callable[[str, int, int], None]]:
     with (
         _deferred_interrupt() as interrupted,
         drawn_bar(MofNCompleteColumn(), TimeElapsedColumn(), transient=False) as bar,
-        WATCH.telling(lambda: reached, bar.stop),
+        WATCH.telling(lambda: reached, bar.stop, GO_ON),
     ):
         tasks: dict[str, Any] = {}
 
         def tell(title: str, done: int, total: int) -> None:
             nonlocal reached
-            reached = f"'{title}', {done} of {total} runs done and kept for the next time"
+            reached = f"'{title}', {done} of {total} runs done"
             if title not in tasks:
                 tasks[title] = bar.add_task(title, total=total)
             bar.update(tasks[title], completed=done)
             if interrupted.is_set():
-                raise KeyboardInterrupt(reached)
+                raise KeyboardInterrupt(reached, GO_ON)
 
         yield tell
 

@@ -125,14 +125,18 @@ def interval(
     return np.stack([value - half, value + half], axis=-1)
 
 
-def joint_covariance(problem: Problem, model: Model, convention: str = "calibrated") -> Matrix:
+def joint_covariance(
+    problem: Problem, model: Model, convention: str = "calibrated", *, own_units: bool = False
+) -> Matrix:
     """Cov of θ̂ and the learner's weights in the orthogonal structure, from the raw `[Φ J̃]`, J̃ = P⊥J; (nθ + nw)².
 
     Under the training measure the blocks between θ and weights are zero (`thm:zero_cov`), if all
     outputs have the same noise or share no θ. One pass over the rows.
 
     Args: convention: "paper" for eq:cov_approx divided by N, factor 2 and `Σ̂ = (1/N) Σ e eᵀ`
-        included.
+        included. own_units: invert the weights' block by a pseudo-inverse in the weights' own
+        units: of directions whose
+            eigenvalue is rounding beside the largest, there is nothing in the result.
 
     Raises:
         InputError: an unknown convention, or a model without a learner's gradient.
@@ -168,9 +172,8 @@ def joint_covariance(problem: Problem, model: Model, convention: str = "calibrat
     change[:nt, :nt] = projection.r / projection.scale
     outer, middle = (change.T @ gram @ change for gram in (outer, middle))
     # block by block, as in the proof: one inverse of both mixes rounding of the weights' singular block into θ's
-    half: Any = scipy.linalg.block_diag(
-        half_inverse(outer[:nt, :nt], nt), half_inverse(outer[nt:, nt:], 0)
-    )
+    weights = half_inverse(outer[nt:, nt:], 0, own_units=own_units)
+    half: Any = scipy.linalg.block_diag(half_inverse(outer[:nt, :nt], nt), weights)
     return (2.0 if convention == "paper" else 1.0) * half @ (half.T @ middle @ half) @ half.T
 
 

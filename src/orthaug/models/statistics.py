@@ -24,13 +24,17 @@ def column_units(gram: Matrix, nt: int) -> Vector:
     return 1 / np.where(size > 1e-150, size, 1.0)
 
 
-def half_inverse(gram: Matrix, nt: int) -> Float[np.ndarray, "n r"]:
+def half_inverse(gram: Matrix, nt: int, *, own_units: bool = False) -> Float[np.ndarray, "n r"]:
     """H with `H Hᵀ` the inverse of the Gram matrix of `[S_c S_w]` on the directions that the data see.
 
     Products with the inverse are formed from H on both sides: the inverse itself has entries up to
     1e13.
+
+    Args: own_units: ask which directions the data see in the units that the columns have, as a
+        pseudo-inverse does;
+            otherwise after each column was divided by its norm, so that units do not matter.
     """
-    unit = column_units(gram, nt)
+    unit = np.ones(len(gram)) if own_units else column_units(gram, nt)
     values, vectors = np.linalg.eigh(gram * np.outer(unit, unit))
     kept = values > _ROUNDING * values.max(initial=0.0)
     return unit[:, None] * vectors[:, kept] / np.sqrt(values[kept])

@@ -214,7 +214,7 @@ def _write(store: Path | None, study: Study, run: Run) -> None:
     path = _path(store, study, run.case)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with whole_file(path, force=True) as partial:
+        with whole_file(path, force=True, result=False) as partial:
             partial.write_text(json.dumps(content, allow_nan=False), encoding="utf-8")
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror}).") from None
