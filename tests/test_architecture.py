@@ -87,6 +87,7 @@ CONCEPTS = {
     "selection.explanation": "the verb `explain`",
     "selection.first_orders": "orders for a first spec",
     "selection.nonlinearity": "a test",
+    "selection.rivals": "candidates that a chosen term may replace",
     "selection.selecting": "the verb `select`",
 }
 
