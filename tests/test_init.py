@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import sys
 import tomllib
 
@@ -11,6 +12,7 @@ import pandas as pd
 import pytest
 import scipy.io
 import scipy.signal
+from helpers import unfolded
 from test_cli import run
 
 from orthaug.commands import cli, kinds
@@ -348,7 +350,24 @@ def test_an_encoding_that_was_guessed_is_told(tmp_path):
         done.code == 0
         and "a.csv: 300 rows, 2 columns; no UTF-8, so read as Windows-1252" in done.out
     )
-    assert run("check", tmp_path / "spec.toml").code == 0
+    warning = "line 1 of a.csv is no UTF-8, so the file is read as Windows-1252; save it as UTF-8."
+    assert warning in unfolded(run("check", tmp_path / "spec.toml").out)
+    done = run("fit", tmp_path / "spec.toml", "--out", tmp_path / "out", "--json")
+    told = [w["text"] for w in json.loads(done.out)["warnings"] if w["code"] == "encoding_guessed"]
+    assert told[0] == f"train: {warning}"
+
+
+def test_a_damaged_byte_in_a_column_that_is_not_used_is_told_with_its_line(tmp_path):
+    """Found by the fuzzer (.tsv, seed 110): the file was read as Windows-1252 without a word."""
+    u, y = plant(300)
+    rows = "".join(f"{a},{b},n{i}\n" for i, (a, b) in enumerate(zip(u, y, strict=True))).encode()
+    (tmp_path / "a.csv").write_bytes(b"u,y,note\n" + rows.replace(b"n7\n", b"n7\x7f\xff\n"))
+    spec = '[data]\nsampling_time = 0.1\ninputs = ["u"]\noutputs = ["y"]\ntrain = { files = ["a.csv"] }\n'
+    (tmp_path / "spec.toml").write_text(
+        spec + '[baseline]\nterms = [{ parameter = "b", regressor = "u[k-1]" }]\n'
+    )
+    done = run("check", tmp_path / "spec.toml")
+    assert done.code == 0 and "line 9 of a.csv is no UTF-8" in unfolded(done.out)
 
 
 def test_on_a_terminal_it_asks_again(tmp_path, monkeypatch):

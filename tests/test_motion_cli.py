@@ -91,6 +91,53 @@ def test_a_channel_of_an_unlikely_size_is_named_where_the_free_run_fails(small, 
         assert "training failed" not in err
 
 
+@pytest.mark.parametrize(
+    ("equation", "words"),
+    [
+        (
+            "(force - c*v - 1e7*k*x)/m",
+            "oscillates with 3.16e+04 rad/s, 50.3 periods in a sample of 0.01 s",
+        ),
+        (
+            "(force - 1e6*c*v - k*x)/m",
+            '1e+06 1/s, also of `integrator = "exact"`: 1e+04 in a substep, at most 4096',
+        ),
+    ],
+    ids=["turns", "decays"],
+)
+def test_modes_beyond_what_samples_show_are_refused_of_an_exact_integrator(small, equation, words):
+    text = small.read_text().replace("(force - c*v - k*x)/m", equation)
+    small.write_text(
+        text.replace("[motion.states]", '[motion]\nintegrator = "exact"\n[motion.states]')
+    )
+    code, _, err = orthaug("fit", small, "--out", "out")
+    assert code == 2 and words in err and "leave the fast mode out" in err
+    small.write_text(small.read_text().replace('"exact"', '"exact"\nsubsteps = 8'))
+    assert orthaug("check", small)[0] == (2 if "1e7" in equation else 0)
+
+
+@pytest.mark.parametrize("substeps", [1, 3])
+def test_a_long_chain_of_definitions_is_what_it_stands_for(small, substeps):
+    """200 operations: such a motion has its stages in a loop; the short one has them one by one."""
+    text = small.read_text().replace(
+        "[motion.states]", f"[motion]\nsubsteps = {substeps}\n[motion.states]"
+    )
+    small.write_text(text)
+    assert orthaug("fit", small, "--out", "short")[0] == 0
+    chain = 'd1 = "x + 1"\n' + "".join(f'd{i} = "d{i - 1} + 1"\n' for i in range(2, 201))
+    text = text.replace("k*x)/m", "k*(d200 - 200))/m").replace(
+        "[motion.parameters]", f"[motion.define]\n{chain}[motion.parameters]"
+    )
+    small.write_text(text)
+    assert orthaug("fit", small, "--out", "long")[0] == 0
+    short, long = (
+        strict(Path(out, "result.json").read_text())["parameters"] for out in ("short", "long")
+    )
+    for one, other in zip(short, long, strict=True):
+        assert other["value"] == pytest.approx(one["value"], rel=1e-6)
+        assert other["std"] == pytest.approx(one["std"], rel=1e-4)
+
+
 def friction(rows: int, seed: int) -> np.ndarray:
     """Force and position of a mass with viscous and Coulomb friction under steps, 40 dB of noise."""
     random = np.random.default_rng(seed)

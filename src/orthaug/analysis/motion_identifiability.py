@@ -14,9 +14,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
+from orthaug._base.errors import Warning
 from orthaug.data.record import Record
 from orthaug.fitting.initial_states import Start
+from orthaug.fitting.motion_task import MotionTask
 from orthaug.fitting.segmented_motion import SegmentedMotion
+from orthaug.physics import ill_conditioned
 from orthaug.physics.excitation import Excitation, of_gram
 
 _DRAWS = 3  # parameters near the initial ones
@@ -106,6 +109,24 @@ def information(segmented: SegmentedMotion, q: Vector) -> Matrix | None:
             return None
         gram = objective.linearise(point).information
     return gram if np.isfinite(gram).all() else None
+
+
+def ill_conditioned_alone(task: MotionTask) -> list[Warning]:
+    """Return the warning `ill_conditioned` of physics alone as a task trained it.
+
+    None where it has no run.
+    """
+    free_fit, segmented = task.physics, task.plan.alone
+    if free_fit is None or not free_fit.ending.usable:
+        return []
+    q = free_fit.end.point.theta
+    gram = information(segmented.from_states(free_fit.end.point.states), q)
+    noise = segmented.noise(free_fit.objective, free_fit.end)
+    if gram is None or noise is None:
+        return []
+    return ill_conditioned.of_motion(
+        segmented.problem, segmented.rms**2 * gram, np.asarray(q), noise
+    )
 
 
 def _near(segmented: SegmentedMotion) -> Iterator[Vector]:

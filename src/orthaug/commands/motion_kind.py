@@ -46,7 +46,7 @@ def checked(job: MotionJob) -> CheckResult:
     from orthaug.analysis.absorbed import Waves
     from orthaug.analysis.imitation import imitation_before
     from orthaug.analysis.input_timing import dead_times, try_holds
-    from orthaug.analysis.motion_identifiability import identified
+    from orthaug.analysis.motion_identifiability import identified, ill_conditioned_alone
     from orthaug.fitting.motion_estimation import without_learner
     from orthaug.fitting.segmented_motion import SegmentedMotion
     from orthaug.inference.motion_split import shared_of_motion
@@ -105,7 +105,13 @@ def checked(job: MotionJob) -> CheckResult:
                 "best_hold": trial.best,
                 "text": text,
             },
-            "warnings": [*job.warnings, *on_rows, *warnings, *closed_loop(job.train.record)],
+            "warnings": [
+                *job.warnings,
+                *(ill_conditioned_alone(trial.task) if told.on_data.full_rank else ()),
+                *on_rows,
+                *warnings,
+                *closed_loop(job.train.record),
+            ],
         }
     )
 

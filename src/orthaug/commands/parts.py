@@ -20,7 +20,7 @@ from orthaug.data.preparation import warnings_of
 from orthaug.data.readers import read_record
 from orthaug.data.record import Record, same_step
 from orthaug.data.sources import Source, witness
-from orthaug.data.tables import KNOWN, PLAIN_TEXT
+from orthaug.data.tables import KNOWN, PLAIN_TEXT, guessed_encoding
 from orthaug.reports.result import FileResult
 
 
@@ -215,6 +215,7 @@ def _load(path: Path, spec: Spec, part: PartSection, name: str, *, stays: bool =
         warnings = (
             Warning("thinned", f"{kept}; content above the new Nyquist frequency folds back."),
         )
+    warnings += _guessed_encoding(path, files, name)
     if spec.data.time is None:
         warnings += _other_step(path, spec, files, name, part.columns)
     if name == "train":
@@ -275,6 +276,19 @@ def _used_columns(spec: Spec, columns: Mapping[str, str]) -> set[str]:
     """Return the columns of a part's files that are channels, or tell experiments apart."""
     channels = [*spec.channels(spec.data.inputs), *spec.channels(spec.data.outputs)]
     return {columns.get(c.name, c.file_column) for c in channels} | {spec.data.experiment or ""}
+
+
+def _guessed_encoding(path: Path, files: Sequence[str], name: str) -> tuple[Warning, ...]:
+    """Return a warning for the first file that is no UTF-8: what looks like an old encoding may be damage."""
+    for file in files:
+        line = guessed_encoding(path.parent / file)
+        if line is not None:
+            text = (
+                f"{name}: line {line} of {file} is no UTF-8, so the file is read as "
+                "Windows-1252; save it as UTF-8."
+            )
+            return (Warning("encoding_guessed", text),)
+    return ()
 
 
 def _other_step(

@@ -99,7 +99,7 @@ def layout(path: Path, columns: Sequence[str] = ()) -> Layout:
         InputError: what is no text, or only blank lines.
     """
     try:
-        encoding = _encoding(path)
+        encoding = encoding_of(path)
         return _layout(path, encoding, columns)
     except (UnicodeError, csv.Error):
         raise InputError(
@@ -107,7 +107,7 @@ def layout(path: Path, columns: Sequence[str] = ()) -> Layout:
         ) from None
 
 
-def _encoding(path: Path) -> str:
+def encoding_of(path: Path) -> str:
     """By the byte-order mark; otherwise UTF-8, or Windows-1252 where it is none.
 
     Raises:
@@ -127,6 +127,22 @@ def _encoding(path: Path) -> str:
             raise
     _check_text(path, _FALLBACK, strict=True)
     return _FALLBACK
+
+
+def guessed_at(path: Path) -> int | None:
+    """Return the first line of a text that is no UTF-8, so that it is read as Windows-1252.
+
+    None where none is.
+    """
+    if encoding_of(path) != _FALLBACK:
+        return None
+    with path.open("rb") as file:
+        for number, line in enumerate(file, start=1):
+            try:
+                line.decode()
+            except UnicodeDecodeError:
+                return number
+    return None
 
 
 def _check_text(path: Path, encoding: str, *, strict: bool = False) -> None:

@@ -130,10 +130,11 @@ def survey(path: Path) -> Survey:
             "Write one."
         )
     headers = list(dict.fromkeys(every))
+    table, refused = {}, None
     try:
         table = read_table(path, headers).columns
-    except InputError:  # one of them cannot be read: each by itself
-        table = {}
+    except InputError as error:  # one of them cannot be read: each by itself
+        refused = error
     for header in headers:
         base, unit = split_header(header)
         try:
@@ -148,6 +149,8 @@ def survey(path: Path) -> Survey:
         name = channel_name(base, [c.name for c in columns])
         columns.append(Column(header, name, unit, values, unusable))
     if all(c.unusable for c in columns):
+        if refused and path.suffix.lower() in ENDINGS:  # of variables, which have no header
+            raise refused
         raise InputError(
             f"{path}: no column holds numbers; expected one for each signal, under a header. "
             f"The names that were found are {shown(', '.join(every))}; a line above the header "

@@ -20,7 +20,15 @@ from orthaug._base.errors import InputError, MissingColumnError
 from orthaug._base.memory import check_memory
 from orthaug._base.progress import LOG
 from orthaug.data.headers import dated, in_seconds
-from orthaug.data.layouts import Layout, as_number, layout, numbers_only, read_sheet, text_number
+from orthaug.data.layouts import (
+    Layout,
+    as_number,
+    guessed_at,
+    layout,
+    numbers_only,
+    read_sheet,
+    text_number,
+)
 from orthaug.data.variables import ENDINGS, foreign, read_variables, short, variable_names
 
 _SMALL = 4_000_000  # bytes of a text file that NumPy reads sooner than pandas is imported
@@ -120,6 +128,14 @@ def column_names(path: Path) -> list[str]:
 def reading_note(path: Path) -> str:
     """Return what to know of how a file is read: an encoding that was guessed; mostly nothing."""
     return layout(path).note if _READERS.get(path.suffix.lower()) is _read_text else ""
+
+
+def guessed_encoding(path: Path) -> int | None:
+    """Return the first line that is no UTF-8 of a text that is read all the same.
+
+    None of any other file.
+    """
+    return guessed_at(path) if _READERS.get(path.suffix.lower()) is _read_text else None
 
 
 def check_readable(path: Path) -> None:

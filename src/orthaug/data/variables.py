@@ -5,6 +5,7 @@ A channel is a vector or a matrix column.
 
 from __future__ import annotations
 
+import io
 import math
 import re
 import warnings
@@ -124,6 +125,7 @@ def _from_npz(path: Path, names: Wanted) -> dict[str, Vector]:
         return _taken(path, names, held)
 
 
+_LONGEST_HEAD = 2**16  # bytes of a member that are unpacked to know what it is
 _LARGE, _DENSEST = (
     2**28,
     300,
@@ -133,13 +135,16 @@ _LARGE, _DENSEST = (
 def _member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> FileVariable:
     """Return an array of an archive by its header; Python objects are never opened."""
     with archive.open(info) as member:
-        version = np.lib.format.read_magic(member)
-        read = {
-            (1, 0): np.lib.format.read_array_header_1_0,
-            (2, 0): np.lib.format.read_array_header_2_0,
-        }[version]
-        shape, _, kind = read(member)
-        begin = member.tell()
+        head = io.BytesIO(
+            member.read(_LONGEST_HEAD)
+        )  # a header may declare a length of its own, in gigabytes
+    version = np.lib.format.read_magic(head)
+    read = {
+        (1, 0): np.lib.format.read_array_header_1_0,
+        (2, 0): np.lib.format.read_array_header_2_0,
+    }[version]
+    shape, _, kind = read(head)
+    begin = head.tell()
     if kind.hasobject:
         return FileVariable("Python objects", None)
     if kind.kind not in "fiubc":
@@ -147,16 +152,15 @@ def _member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> File
     size = math.prod(shape) * kind.itemsize
     if size != info.file_size - begin:
         return FileVariable(f"cut: {in_words(info.file_size - begin)} of {in_words(size)}", None)
-
-    if size > _LARGE and size > _DENSEST * info.compress_size:
-        packed = in_words(info.compress_size)
-        return FileVariable(
-            f"{in_words(size)} in {packed} of the file, denser than measurements; store it "
-            "uncompressed",
-            None,
-        )
+    dense = size > _LARGE and size > _DENSEST * info.compress_size
 
     def load() -> np.ndarray:
+        if dense:  # by its header: nothing of it is unpacked
+            raise InputError(
+                f"{path}: '{info.filename.removesuffix('.npy')}' is {in_words(size)} in "
+                f"{in_words(info.compress_size)} of the file, denser than measurements are. "
+                "Store it uncompressed (`numpy.savez`) if it is true."
+            )
         with archive.open(info) as member:
             return np.lib.format.read_array(member, allow_pickle=False)
 

@@ -114,8 +114,14 @@ class RunCheckpoint:
     form: Any
     written: float = field(default_factory=time.monotonic)
 
-    def state(self) -> Any:
-        """Return the last one that was written whole; None where there is none."""
+    def state(self, *shapes: tuple[int, ...]) -> Any:
+        """Return the last one that was written whole, finite and with first arrays of these shapes.
+
+        None where there is none.
+
+        A checksum tells what was damaged, not what was made: a run does not go on from what it
+        cannot have written.
+        """
         from safetensors import SafetensorError
         from safetensors.numpy import load
 
@@ -130,6 +136,10 @@ class RunCheckpoint:
                 raise ValueError
             held = load(content[_HEAD:])
             leaves = [held[str(i)] for i in range(len(held))]
+            if any(np.shape(leaf) != shape for leaf, shape in zip(leaves, shapes, strict=False)):
+                raise ValueError
+            if not all(np.isfinite(leaf).all() for leaf in leaves):
+                raise ValueError
             state = jax.tree.unflatten(jax.tree.structure(self.form), leaves)
         except (KeyError, ValueError, SafetensorError):
             self.checkpoints.spoilt.append(self.path.name)
@@ -162,9 +172,16 @@ class RunCheckpoint:
             _replace(
                 folder / _ABOUT, json.dumps({"fingerprint": self.checkpoints.fingerprint}).encode()
             )
-        leaves = jax.tree.leaves(state)
+        leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(state)]
+        if not all(
+            np.isfinite(leaf).all() for leaf in leaves
+        ):  # a run that failed: nothing goes on from there
+            return
         content = save(
-            {str(i): np.atleast_1d(leaf).reshape(np.shape(leaf)) for i, leaf in enumerate(leaves)}
+            {
+                str(i): np.ascontiguousarray(leaf).reshape(leaf.shape)
+                for i, leaf in enumerate(leaves)
+            }
         )
         _replace(self.path, _head(content) + content)
 

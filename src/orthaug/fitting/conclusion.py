@@ -39,8 +39,8 @@ from orthaug.models.lagged import Lagged
 from orthaug.models.learners import Bound, External, Function, Scaling
 from orthaug.models.model import Model
 from orthaug.models.statistics import JointCovariance, Statistics
+from orthaug.physics import ill_conditioned
 from orthaug.physics.baseline import Baseline
-from orthaug.physics.excitation import ILL_CONDITIONED
 from orthaug.physics.problem import Problem, pose
 
 _UNDETERMINED = (
@@ -78,6 +78,7 @@ def conclude(task: OneStepTask, structure: Structure, learned: TrainedLearner) -
     identified = structure.projects or (learned.bound is None and structure.identifies)
     known = noise is not None and identified and not learned.elsewhere
     told += [] if learned.elsewhere else learner_silent(learned)
+    told += ill_conditioned.of_physics(problem, theta, errors.covariance if ending.usable else None)
     told += _warnings(problem, structure, learned, identified, noise, fixed)
     if any(warning.code == NOT_CONVERGED for warning in told):
         pass
@@ -275,14 +276,7 @@ def _warnings(
     noise: Matrix | None,
     fixed: Fixed,
 ) -> list[Warning]:
-    told = []
-    condition = problem.excitation.condition
-    if condition is not None and condition > ILL_CONDITIONED:
-        text = (
-            f"the physics is ill-conditioned on the data (condition {condition:.1e} of the "
-            "scaled columns): θ is determined, but small changes of the data move it far."
-        )
-        told.append(Warning("ill_conditioned", text))
+    told: list[Warning] = []
     if learned.ending is Ending.SPANNED:
         text = (
             "the learner lies in the span of the physics (P⊥J = 0): there is nothing for it to "

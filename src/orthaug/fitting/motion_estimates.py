@@ -27,6 +27,7 @@ from orthaug.inference.nearly_shared import grown
 from orthaug.models.dynamics import Numbers
 from orthaug.models.motion_model import MotionModel
 from orthaug.models.statistics import JointCovariance, column_units
+from orthaug.physics import ill_conditioned
 from orthaug.physics.motion_problem import MotionProblem, layout_of
 from orthaug.physics.shared import Shared
 
@@ -259,13 +260,17 @@ def _with_split(
         if q <= low or q >= high
     )
     covariance, unseen = _covariance(fit, split, at_bound)
-    warnings = [*told, *_doubts(split, at_bound, unseen, fit.model.form.bound is not None)]
+    warnings = [
+        *told,
+        *_ill_conditioned(fit, split),
+        *_doubts(split, at_bound, unseen, fit.model.form.bound is not None),
+    ]
     model = replace(
         fit.model,
         numbers=numbers._replace(theta=split.q, theta_aux=split.q - c),
         measure=split.name,
     )
-    own = {"not_unique", "at_a_bound", "not_identified", "measure_beyond_data"}
+    own = {"ill_conditioned", "not_unique", "at_a_bound", "not_identified", "measure_beyond_data"}
     return replace(
         fit,
         model=model,
@@ -277,6 +282,15 @@ def _with_split(
         at_bound=at_bound,
         unidentified=unseen,
         warnings=(*(w for w in fit.warnings if w.code not in own), *warnings),
+    )
+
+
+def _ill_conditioned(fit: MotionEstimate, split: MotionSplit) -> list[Warning]:
+    gram, noise, count = fit.model.statistics.gram, fit.model.statistics.noise, len(split.q)
+    return (
+        []
+        if gram is None or noise is None
+        else ill_conditioned.of_motion(fit.problem, gram[:count, :count], split.q, noise)
     )
 
 

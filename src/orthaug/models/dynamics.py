@@ -237,14 +237,18 @@ class AutodiffDynamics:
         """Return steps from r states (n0, r) and inputs (nu, r), each by itself."""
         nt = len(numbers.theta)
 
-        def both(state: Any, unknowns: Any, inputs: Any) -> Any:
+        def both(state: Any, unknowns: Any, inputs: Any) -> tuple[Any, Any]:
             own = numbers._replace(theta=unknowns[:nt], weights=unknowns[nt:])
             following, parts = self.step(own, state, inputs)
-            return jnp.concatenate([following, parts.total])
+            value = jnp.concatenate([following, parts.total])
+            return (
+                value,
+                value,
+            )  # to differentiate, and as it is: the step stands once in the program
 
         unknowns = jnp.concatenate([jnp.asarray(numbers.theta), jnp.asarray(numbers.weights)])
-        value = jax.vmap(both, (-1, None, -1), -1)(states, unknowns, inputs)
-        slopes = jax.vmap(jax.jacrev(both, (0, 1)), (-1, None, -1), -1)(states, unknowns, inputs)
+        differentiated = jax.jacrev(both, (0, 1), has_aux=True)
+        slopes, value = jax.vmap(differentiated, (-1, None, -1), -1)(states, unknowns, inputs)
         # a kink without a derivative, such as sqrt(max(y, 0)) at 0, counts as flat
         return Local(value, *(jnp.where(jnp.isfinite(d), d, 0.0) for d in slopes))
 

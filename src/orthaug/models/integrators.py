@@ -70,8 +70,10 @@ class Exponentials(NamedTuple):
     @classmethod
     def of(cls, linear: Any, h: float) -> Exponentials:
         """Of A (nx, nx)."""
-        whole, phi1, phi2, phi3 = _phi(linear * h, 3)
-        half, half1 = _phi(linear * h / 2, 1)
+        both = jax.vmap(lambda a: _phi(a, 3))(
+            jnp.stack([linear * h, linear * h / 2])
+        )  # at once: less to compile
+        (whole, half), (phi1, half1), (phi2, _), (phi3, _) = both
         return cls(linear, whole, phi1, phi2, phi3, half, half1 * h / 2)
 
 
@@ -84,18 +86,19 @@ def advance(
     step: float,
     substeps: int,
     integrator: str,
+    *,
+    looped: bool = False,
 ) -> Any:
     """x one sample later.
 
-    Args:
-        field: ẋ = F(x, u).
-        scheme: the `Exponentials` of its linear part; None for `rk4`.
-        row: the input as `held` lays it out.
-        step: the sampling time.
+    Args: field: ẋ = F(x, u). scheme: the `Exponentials` of its linear part; None for `rk4`. row:
+        the input as `held` lays it out. step: the sampling time. looped: write the field once into
+        a program, and not for every stage: of a large one that compiles faster.
     """
     at, halves, h = input_at(row, nu), 2 * substeps, step / substeps
-    one = _exponential(field, scheme, h) if integrator == "exact" else runge_kutta(field, h)
-    if substeps <= UNROLLED:
+    stages = _stages_in_a_loop if looped else runge_kutta
+    one = _exponential(field, scheme, h) if integrator == "exact" else stages(field, h)
+    if substeps <= UNROLLED and not (looped and substeps > 1):
         for j in range(substeps):
             x = one(x, at(2 * j, halves), at(2 * j + 1, halves), at(2 * j + 2, halves))
         return x
@@ -112,6 +115,25 @@ def runge_kutta(field: Field, h: float) -> Callable[..., Any]:
         k3 = field(x + h / 2 * k2, middle)
         k4 = field(x + h * k3, last)
         return x + h / 6 * (k1 + 2 * (k2 + k3) + k4)
+
+    return one
+
+
+def _stages_in_a_loop(field: Field, h: float) -> Callable[..., Any]:
+    """`runge_kutta` of JAX arrays with a loop over the stages."""
+    ahead, share = jnp.array([0.0, 0.5, 0.5, 1.0]), jnp.array([1.0, 2.0, 2.0, 1.0]) / 6
+
+    def one(x: Any, first: Any, middle: Any, last: Any) -> Any:
+        def stage(
+            sums: tuple[Any, Any], given: tuple[Any, Any, Any]
+        ) -> tuple[tuple[Any, Any], None]:
+            (k, total), (a, b, u) = sums, given
+            k = field(x + a * h * k, u)
+            return (k, total + b * k), None
+
+        inputs = jnp.stack([first, middle, middle, last])
+        nothing = jnp.zeros_like(x)
+        return x + h * jax.lax.scan(stage, (nothing, nothing), (ahead, share, inputs))[0][1]
 
     return one
 
@@ -152,8 +174,10 @@ def _exponential_less_one(a: Any) -> Any:
     to some thousand.
     """
     a = a / 2**_SQUARINGS
-    term = total = a
-    for i in range(2, _TERMS + 1):
-        term = term @ a / i
-        total = total + term
+
+    def further(i: Any, sums: tuple[Any, Any]) -> tuple[Any, Any]:
+        term = sums[0] @ a / i
+        return term, sums[1] + term
+
+    _, total = jax.lax.fori_loop(2, _TERMS + 1, further, (a, a))
     return jax.lax.fori_loop(0, _SQUARINGS, lambda _, e: 2 * e + e @ e, total)

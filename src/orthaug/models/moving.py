@@ -145,6 +145,9 @@ def _finite(slope: Any) -> Any:
     return jnp.where(jnp.isfinite(slope), slope, 0.0)
 
 
+_LARGE = 150  # operations in the expressions of a motion: beyond, compiling its stages one by one takes a minute
+
+
 @dataclass(frozen=True)
 class MotionDynamics(MotionField, AutodiffDynamics):
     """A motion with a learner as dynamics, without its numbers: `Dynamics`."""
@@ -211,6 +214,7 @@ class MotionDynamics(MotionField, AutodiffDynamics):
             self.sampling_time,
             self.substeps,
             self.motion.integrator,
+            looped=self._large,
         )
         return following, parts
 
@@ -232,8 +236,13 @@ class MotionDynamics(MotionField, AutodiffDynamics):
         return Exponentials.of(self.linear_part(numbers), self.sampling_time / self.substeps)
 
     @property
+    def _large(self) -> bool:
+        return self.motion.size > _LARGE
+
+    @property
     def _by_stages(self) -> bool:
-        return self.motion.integrator == "rk4" and self.substeps <= UNROLLED and self.differentiable
+        few = self.substeps <= UNROLLED and not self._large
+        return self.motion.integrator == "rk4" and few and self.differentiable
 
     def tangents(
         self, numbers: Numbers, state: Any, slopes: Any, inputs: Any

@@ -19,7 +19,6 @@ from orthaug.physics.baseline import Baseline
 from orthaug.physics.projection import Factor
 
 RANK_TOLERANCE = 1e-13  # σmin/σmax of the unit-norm columns below which Φ counts as rank-deficient
-ILL_CONDITIONED = 1e8  # condition number above which half of the digits of θ are lost: a warning
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +55,12 @@ def excitation(r: Matrix, names: Sequence[str], tolerance: float = RANK_TOLERANC
     sigma = np.concatenate([sigma, np.zeros(columns - len(sigma))])
     rank = int(np.sum(sigma > tolerance * sigma[0])) if sigma[0] > 0 else 0
     condition = float(sigma[0] / sigma[-1]) if rank == columns else None
-    return Excitation(rank, columns, condition, _groups(vt[rank:], names))
+    return Excitation(
+        rank,
+        columns,
+        condition,
+        tuple(tuple(names[i] for i in group) for group in tied_columns(vt[rank:])),
+    )
 
 
 def of_gram(gram: Matrix, names: Sequence[str]) -> Excitation:
@@ -69,11 +73,16 @@ def of_gram(gram: Matrix, names: Sequence[str]) -> Excitation:
     )
 
 
-def _groups(null_space: Matrix, names: Sequence[str]) -> tuple[tuple[str, ...], ...]:
-    """Sets of columns tied by null directions: connected components of the null-space projector."""
-    tied = np.abs(null_space.T @ null_space) > 1e-6
+def tied_columns(directions: Matrix, part: float = 1e-6) -> list[list[int]]:
+    """Return sets of columns tied by some orthonormal directions: connected components of their projector.
+
+    Args:
+        directions: one a row.
+        part: entry of the projector above which columns are tied.
+    """
+    tied = np.abs(directions.T @ directions) > part
     groups, seen = [], set()
-    for start in range(len(names)):
+    for start in range(len(tied)):
         if start in seen or not tied[start, start]:
             continue
         group, frontier = {start}, [start]
@@ -82,8 +91,8 @@ def _groups(null_space: Matrix, names: Sequence[str]) -> tuple[tuple[str, ...], 
             group |= new
             frontier.extend(new)
         seen |= group
-        groups.append(tuple(names[i] for i in sorted(group)))
-    return tuple(groups)
+        groups.append(sorted(group))
+    return groups
 
 
 def require_rank(excited: Excitation, rows: int) -> None:

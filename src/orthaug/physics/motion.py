@@ -8,9 +8,11 @@ time; of a `discrete` motion it is the state one sample later. No JAX.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import ast
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from graphlib import CycleError, TopologicalSorter
 from typing import Any
 
 import numpy as np
@@ -304,13 +306,13 @@ class Motion(NotebookView):
                     f"the parameter '{name}' is in no equation and no output; use or remove it."
                 )
 
-    def _names_in(self, expression: Expression) -> set[str]:
-        """Return the names of an expression, and those of the definitions that it uses."""
-        reach = {name: set(given.names) for name, given in self.definitions}
-        for name, given in self.definitions:  # each after those that it uses
-            for other in given.names:
-                reach[name] |= reach.get(other, set())
-        return set(expression.names).union(*(reach.get(name, set()) for name in expression.names))
+    def _names_in(self, *expressions: Expression) -> set[str]:
+        """Return the names of expressions, and those of the definitions that they use."""
+        found = {name for expression in expressions for name in expression.names}
+        for name, given in reversed(self.definitions):  # each after those that it uses
+            if name in found:
+                found |= set(given.names)
+        return found
 
     def parameters_in(self, state: str) -> tuple[str, ...]:
         """Return the parameters of a state's equation; of a motion that has expressions."""
@@ -373,21 +375,48 @@ class Motion(NotebookView):
             parse_named(o.expression, self.known, f"the output '{o.name}'") for o in self.outputs
         )
 
-    def values(self, x: Any, u: Any, p: Any, xp: Any) -> dict[str, Any]:
-        """Return what every name stands for; x (nx, …), u (nu, …), p (np,)."""
+    @cached_property
+    def size(self) -> int:
+        """Return how many operations its expressions have; 0 of a motion of functions."""
+        if self.functions is not None:
+            return 0
+        every = (
+            *self.equations.values(),
+            *self.observations,
+            *(given for _, given in self.definitions),
+        )
+        return sum(
+            isinstance(node, ast.BinOp | ast.UnaryOp | ast.Call)
+            for e in every
+            for node in ast.walk(e.tree)
+        )
+
+    @cached_property
+    def _read(self) -> tuple[set[str], set[str]]:
+        """Return what the equations need of the names, and what the outputs do."""
+        return self._names_in(*self.equations.values()), self._names_in(*self.observations)
+
+    def values(
+        self, x: Any, u: Any, p: Any, xp: Any, needed: Collection[str] | None = None
+    ) -> dict[str, Any]:
+        """Return what every name stands for; x (nx, …), u (nu, …), p (np,).
+
+        Of the definitions only those that are needed.
+        """
         values = dict(self.constants)
         values |= dict(zip(self.names, p, strict=True))
         values |= dict(zip(self.names_of_states, x, strict=True))
         values |= dict(zip(self.inputs, u, strict=True))
         for name, expression in self.definitions:
-            values[name] = expression.value(values, xp)
+            if needed is None or name in needed:
+                values[name] = expression.value(values, xp)
         return values
 
     def rates(self, x: Any, u: Any, p: Any, xp: Any) -> Any:
         """f(x, u; p) (nx, …) by `xp` (numpy or jax.numpy); of a discrete motion the next state."""
         if self.functions is not None:
             return xp.asarray(self.functions[0](x, u, p))
-        values = self.values(x, u, p, xp)
+        values = self.values(x, u, p, xp, self._read[0])
         rates = [self.equations[state.name].value(values, xp) for state in self.states]
         return xp.stack(
             [xp.broadcast_to(xp.asarray(rate, dtype=float), x.shape[1:]) for rate in rates]
@@ -397,7 +426,7 @@ class Motion(NotebookView):
         """h(x, u; p) (ny, …)."""
         if self.functions is not None:
             return xp.asarray(self.functions[1](x, u, p))
-        values = self.values(x, u, p, xp)
+        values = self.values(x, u, p, xp, self._read[1])
         outputs = [expression.value(values, xp) for expression in self.observations]
         return xp.stack(
             [xp.broadcast_to(xp.asarray(output, dtype=float), x.shape[1:]) for output in outputs]
@@ -455,20 +484,14 @@ def _ordered(definitions: Mapping[str, Expression]) -> list[str]:
     Raises:
         InputError: definitions that need each other.
     """
-    done: list[str] = []
-
-    def visit(name: str, above: tuple[str, ...]) -> None:
-        if name in above:
-            loop = " → ".join((*above[above.index(name) :], name))
-            raise InputError(
-                f"motion.define: an algebraic loop, {loop}; no definition may need itself."
-            )
-        if name not in done:
-            for used in definitions[name].names:
-                if used in definitions:
-                    visit(used, (*above, name))
-            done.append(name)
-
-    for name in definitions:
-        visit(name, ())
-    return done
+    uses = {
+        name: [other for other in given.names if other in definitions]
+        for name, given in definitions.items()
+    }
+    try:
+        return list(TopologicalSorter(uses).static_order())
+    except CycleError as error:
+        loop = " → ".join(reversed(error.args[1]))
+        raise InputError(
+            f"motion.define: an algebraic loop, {loop}; no definition may need itself."
+        ) from None

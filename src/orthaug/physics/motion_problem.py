@@ -14,7 +14,7 @@ from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Complex, Float, Int
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
@@ -27,6 +27,13 @@ _LOOKED_AT = 200  # rows at which the equations are looked at
 _ANGLE = (
     0.35  # of the fastest mode in a substep [rad]: Runge-Kutta errs by about 1e-3 of it in a period
 )
+_TURNED = (
+    100.0  # [rad] in a sample, of a mode that lasts: beyond, every start is in another minimum
+)
+_GONE = (
+    -5.0
+)  # real part times the sampling time: of an oscillation less than 1 % is left at the next sample
+_FASTEST = 4096  # |eigenvalue| times the substep: the exponential of a motion has no digits beyond
 _STEP = 1e-6  # relative, of differences
 _ROWS, _DEGREE = 9, 2  # of a local polynomial
 
@@ -111,8 +118,8 @@ class MotionProblem:
         return ""
 
     @cached_property
-    def fastest(self) -> float:
-        """The largest |eigenvalue| of ∂f/∂x at the initial parameters [1/s], over the guessed states."""
+    def modes(self) -> Complex[np.ndarray, "m nx"]:
+        """The eigenvalues of ∂f/∂x at the initial parameters [1/s], at the guessed states where they are finite."""
         x, u = self.looked_at
         size = np.maximum(np.abs(x).max(axis=1), 1e-6 * np.abs(x).max(initial=1e-6))
         columns = []
@@ -127,7 +134,12 @@ class MotionProblem:
                 columns.append((next(ends) - next(ends)) / (2 * h))
         slopes = np.moveaxis(np.stack(columns, axis=1), -1, 0)
         slopes = slopes[np.isfinite(slopes).all(axis=(1, 2))]
-        return float(np.abs(np.linalg.eigvals(slopes)).max(initial=0.0))
+        return np.linalg.eigvals(slopes).astype(complex)
+
+    @property
+    def fastest(self) -> float:
+        """The largest |eigenvalue| of ∂f/∂x at the initial parameters [1/s], over the guessed states."""
+        return float(np.abs(self.modes).max(initial=0.0))
 
     @property
     def substeps(self) -> int:
@@ -218,6 +230,29 @@ def _check_start(problem: MotionProblem) -> None:
             f"the sampling time of {problem.record.sampling_time:g} s is too long for the fastest mode of the motion, "
             f"{problem.fastest:.3g} 1/s: it would take {problem.substeps} substeps, at most {MOST_SUBSTEPS} are made. "
             'Use `integrator = "exact"`, check units and initial values, or leave the fast mode out.'
+        )
+    if motion.integrator == "exact":
+        _check_exact(problem)
+
+
+def _check_exact(problem: MotionProblem) -> None:
+    """Raise InputError for modes that samples do not show, or whose exponential has no digits."""
+    sampling_time = problem.record.sampling_time
+    lasting = problem.modes[problem.modes.real * sampling_time > _GONE]
+    turned = float(np.abs(lasting.imag).max(initial=0.0)) * sampling_time
+    fast = problem.fastest * sampling_time / problem.substeps
+    if turned > _TURNED:
+        raise InputError(
+            "at the initial parameters a mode of the motion oscillates with "
+            f"{turned / sampling_time:.3g} rad/s, {turned / (2 * np.pi):.3g} periods in a "
+            f"sample of {sampling_time:g} s: the data cannot determine it. Check units and "
+            "initial values, sample faster, or leave the fast mode out."
+        )
+    if fast > _FASTEST:
+        raise InputError(
+            f"the sampling time of {sampling_time:g} s is too long for the fastest mode of the motion, "
+            f'{problem.fastest:.3g} 1/s, also of `integrator = "exact"`: {fast:.3g} in a substep, at most {_FASTEST}. '
+            f"Give `substeps` (at most {MOST_SUBSTEPS}), check units and initial values, or leave the fast mode out."
         )
 
 

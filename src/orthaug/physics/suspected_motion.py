@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, NamedTuple
 
@@ -39,8 +39,10 @@ class SuspectedMotion(Motion):
         )
         return cls(**own, physics=physics, added=tuple(added))
 
-    def values(self, x: Any, u: Any, p: Any, xp: Any) -> dict[str, Any]:
-        return self._known.values(x, u, p[: self._count], xp)
+    def values(
+        self, x: Any, u: Any, p: Any, xp: Any, needed: Collection[str] | None = None
+    ) -> dict[str, Any]:
+        return self._known.values(x, u, p[: self._count], xp, needed)
 
     def rates(self, x: Any, u: Any, p: Any, xp: Any) -> Any:
         rates = self._known.rates(x, u, p[: self._count], xp)

@@ -49,8 +49,8 @@ class State(NamedTuple):
 class CheckpointWriter(Protocol):
     """Where the states of a run are kept."""
 
-    def state(self) -> State | None:
-        """Return the last one; None for none."""
+    def state(self, *shapes: tuple[int, ...]) -> State | None:
+        """Return the last one whose first arrays have these shapes; None for none."""
         ...
 
     def keep(self, state: State, *, ended: bool = False) -> None:
@@ -129,7 +129,7 @@ class Settings:
         start = (
             np.float64(self.ridge) if groups is None else np.full(len(groups), float(self.ridge))
         )
-        return options, start, self.kept.state() if self.kept else None
+        return options, start, self.kept.state(np.shape(w)) if self.kept else None
 
     def runs(self, state: State) -> bool:
         """Return whether there is a step to take."""

@@ -203,7 +203,7 @@ def descend(
     if bounds is not None:
         for whole, side in zip(limits, bounds, strict=True):
             whole[: objective.physics] = side
-    paused = None if kept is None else kept.state()
+    paused = None if kept is None else kept.state(np.shape(p))
     if paused is not None:
         iterate, (done, taken, begun, first_loss, mark), ending = _resumed(objective, paused)
     else:
