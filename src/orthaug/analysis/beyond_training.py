@@ -1,4 +1,6 @@
-"""Is the free run bounded whatever bounded inputs come? A proof where the correction is held or fades.
+"""Proof that the free run stays bounded for any bounded inputs, far beyond the training data.
+
+It applies where the correction is constant far out, or fades.
 
 Far beyond its training the model is `x_{k+1} = A x_k + b(x_k, u_k)`. Where the correction is held,
 or gone, and the physics is linear in the state, A is one matrix and b is bounded: with all
@@ -62,7 +64,7 @@ def radius_beyond(model: Model | MotionModel, states: Matrix, inputs: Matrix) ->
 
 
 def describe_beyond(model: Model | MotionModel, radius: float | None) -> str:
-    """Return what the radius says of the free run, in a sentence; nothing without one."""
+    """Return a sentence on what the radius says of the free run; empty without a radius."""
     if radius is None:
         return ""
     does = "fades" if model.form.beyond == "fade" else "is held"

@@ -1,4 +1,4 @@
-"""What unmodelled terms do to θ: bias per unit of each suspect, and whether any measure can remove it.
+"""Bias of θ by unmodelled terms: per unit of each suspect, and whether a measure can remove it.
 
 With the truth `Y = Φθ* + Δ + E` (`eq:data_gen_sys_reformed_vect`) the estimate under a measure μ
 errs by `θ̂ − θ* = Φ_μ⁺(Δ_μ − ε_μ)` (eq:error_val), ε the misfit of the whole model. Here Φ_μ and
@@ -44,7 +44,7 @@ RemovedBy = Literal["learner", "learner and measure", "learner in part", "measur
 
 @dataclass(frozen=True)
 class Certificate:
-    """Whether a measure on the given points can make φ and δ orthogonal.
+    """Certificate that a measure on the given points can, or cannot, make φ and δ orthogonal.
 
     By Stiemke's lemma exactly one of the two holds: positive weights on all points with `Σ μ_k
     φ_kᵀδ_k = 0` (`removable`), or a direction a with `(φ_kᵀa)δ_k ≥ 0` on all points and `> 0` on
@@ -66,7 +66,7 @@ class Certificate:
 
 @dataclass(frozen=True)
 class SuspectedBias:
-    """What a suspect does to θ if it is there, per unit of its coefficient.
+    """Bias of θ by a suspect, per unit of the suspect's coefficient.
 
     `bias` (nt,) is `Φ_μ⁺Δ_μ`, in the unit of θ per unit of the coefficient; `relative` the same
     divided by θ (None where θ is 0); `physical` the same for physical parameters, to first order;
@@ -93,7 +93,7 @@ class SuspectedBias:
 
     @property
     def removed_by(self) -> RemovedBy | None:
-        """Return what leaves θ unbiased by it; None where that is not known.
+        """Change that removes this bias from θ; None where none is known.
 
         A learner that sees the term removes its bias from all that the learner could not imitate.
         Along the shared directions a measure may remove the rest.
@@ -147,7 +147,7 @@ class SuspectedBias:
         )
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain numbers, text and None, for JSON."""
+        """Return plain numbers, text and None, for JSON."""
         certificate = self.certificate
 
         def by_name(values: tuple[float | None, ...] | None) -> dict[str, float | None] | None:
@@ -194,7 +194,7 @@ def bias_table(
     directions: Matrix | None = None,
     absorbed: Sequence[TermAfterFit] | None = None,
 ) -> tuple[SuspectedBias, ...]:
-    """Return one `SuspectedBias` for each suspect, under the measure that `projection` was made with.
+    """Return one `SuspectedBias` for each suspect, under the measure of `projection`.
 
     Args: projection: of the rows of φ, their outputs multiplied by `gain`. names: the nt
         parameters. suspects: their forms; `deltas` (ns, N, ny) their values, as
@@ -256,7 +256,7 @@ def bias_table(
 def _overlaps(
     projection: Projection, delta: Matrix, tilde: Matrix | None, directions: Matrix | None
 ) -> tuple[float | None, float | None, float | None]:
-    """cos(Δ, span Φ); R² of the learner's P⊥F on P⊥Δ; the coefficient of that fit.
+    """Return cos(Δ, span Φ), R² of the learner's P⊥F on P⊥Δ, and the coefficient of that fit.
 
     Along `directions` only.
     """
@@ -278,7 +278,7 @@ def _overlaps(
 
 
 def orthogonal_part(projection: Projection, values: Matrix, directions: Matrix | None) -> Matrix:
-    """P⊥v, or what is left of v along some directions of θ."""
+    """Return P⊥v, or what is left of v along some directions of θ."""
     if directions is None:
         return projection.orthogonal_part(values)
     return values - projection.phi @ projection.solve_along(values, directions)
@@ -343,7 +343,7 @@ def find_certificate(
 
 
 def _certificate_along(projection: Projection, delta: Matrix, directions: Matrix) -> Certificate:
-    """Return the certificate among some directions, told in all parameters."""
+    """Return the certificate among some directions, as weights of all parameters."""
     directions = projection.told_of(directions)
     if not directions.shape[1]:
         return Certificate("orthogonal")
@@ -381,7 +381,7 @@ def _numbers(values: Vector) -> tuple[float, ...]:
 
 
 def _row_gain(gain: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """`gain`, checked against rows of the shape (N, ny)."""
+    """Return `gain`, checked against rows of the shape (N, ny)."""
     gain, ny = np.asarray(gain, dtype=float), shape[1]
     if gain.shape not in ((ny, ny), (*shape, ny)):
         raise InputError(

@@ -1,4 +1,4 @@
-"""Does the free run stay within bounds where its inputs grow? The factor from which it leaves them."""
+"""Bounds of the free run under growing inputs: the factor from which it leaves them."""
 
 from __future__ import annotations
 
@@ -31,7 +31,9 @@ Diverging = Callable[[list[float]], np.ndarray]
 def divergence_scaling(
     model: Model | MotionModel, record: Record, largest: float = 1024.0
 ) -> float | None:
-    """Factor on the inputs from which the free run leaves all bounds (10⁶ times the largest training output).
+    """Return the factor on the inputs from which the free run leaves all bounds.
+
+    The bounds are 10⁶ times the largest training output.
 
     It scales each input's deviation from its mean over the record; the measured outputs that the
     run starts from stay. Doubled until a run diverges, then bisected to 5 %; what is returned did
@@ -60,7 +62,7 @@ def divergence_scaling(
 
 
 def margin(factor: float | None, searched: float, driven: bool) -> tuple[str, str]:
-    """Such a factor, or that there is none up to `searched`, in a sentence.
+    """Return a sentence on the factor, or that there is none up to `searched`.
 
     With the code of a warning, or nothing.
 
@@ -86,7 +88,7 @@ def margin(factor: float | None, searched: float, driven: bool) -> tuple[str, st
 
 
 def _doubled(largest: float) -> list[float]:
-    """1, 2, 4, …, `largest`."""
+    """Return the factors 1, 2, 4, …, `largest`."""
     factors = [1.0]
     while factors[-1] < largest:
         factors.append(min(2 * factors[-1], largest))
@@ -94,7 +96,11 @@ def _doubled(largest: float) -> list[float]:
 
 
 def _below_one(diverges: Diverging) -> float:
-    """Return the factor where a run with the record's own inputs diverges: below 10⁻⁴ the last one tried, or 0."""
+    """Return the factor below 1 from which the run diverges.
+
+    The run diverges with the record's own inputs. Below 10⁻⁴ the factor is the last one tried, or
+    0.
+    """
     falling = [1.0]
     while falling[-1] >= 1 / _LARGEST_FACTOR:
         falling.append(falling[-1] / 2)
@@ -121,7 +127,10 @@ def _bisected(low: float, high: float, diverges: Diverging) -> float:
 
 
 def _middles(low: float, high: float) -> list[float]:
-    """Return all factors that a bisection between two, at most one double the other, can come to: 15 or fewer."""
+    """Return all factors that a bisection of an interval can reach: 15 or fewer.
+
+    The upper end is at most double the lower one.
+    """
     if not high > _CLOSE * low:
         return []
     middle = _middle(low, high)
@@ -135,7 +144,9 @@ def _middle(low: float, high: float) -> float:
 def _diverging(
     model: Model | MotionModel, record: Record, factors: Sequence[float]
 ) -> Bool[np.ndarray, "f"]:
-    """Return whether the free run diverges with the inputs' deviations from their means times each of up to 16 factors.
+    """Return whether the free run diverges with its inputs scaled by each of up to 16 factors.
+
+    A factor scales the inputs' deviations from their means.
 
     The runs start from the measured outputs of each experiment and go side by side.
 
@@ -181,7 +192,10 @@ def _side_by_side(
     factors: Float[Array, "f"],
     bound: Float[Array, "ny"],
 ) -> Bool[Array, "f"]:
-    """Return whether an output leaves `bound` within `steps` of free runs with `resting + factor (inputs − resting)`."""
+    """Return whether an output leaves `bound` within `steps` of each scaled free run.
+
+    The inputs of a run are `resting + factor (inputs − resting)`.
+    """
     one = jax.vmap(lambda state, row: form.step(numbers, state, row))
 
     def going_on(carry: tuple[Any, Any, Any]) -> Any:

@@ -1,4 +1,4 @@
-"""What the learner found, explained by a cause, and the bias of every parameter that follows from it.
+"""Bias budget: the cause that explains the learner, and the bias of every parameter by it.
 
 With F the learner's values under the measure and Δ a cause's, the coefficient is that of P⊥F on P⊥Δ
 and the bias, estimate less truth, `Φ_μ⁺Δ` times it. One cause is named: the declared suspect that
@@ -52,7 +52,7 @@ _MEASURED_ROWS = 50_000  # above which no other measure is tried
 def remedies(
     linearization: MeasureLinearization, cause: SuspectedBias, biased: Sequence[str]
 ) -> list[str]:
-    """Return sentences on what removes the bias by a cause from the parameters named, the easiest first."""
+    """Return sentences on how to remove the bias of the named parameters, the easiest first."""
     return [*_by_inputs(linearization, cause, biased), *_by_measure(linearization, cause, biased)]
 
 
@@ -121,7 +121,7 @@ def _bias(linearization: MeasureLinearization, suspect: Suspect) -> Vector:
 def _freed(
     linearization: MeasureLinearization, cause: SuspectedBias, left: Vector, biased: Sequence[str]
 ) -> tuple[str, ...]:
-    """Parameters, physical ones by their slopes, whose bias shrinks to a small part."""
+    """Return the parameters, physical ones by their slopes, whose bias shrinks to a small part."""
     names, before = linearization.problem.baseline.names, np.array(cause.bias)
     rows = dict(zip(names, np.eye(len(names)), strict=True)) | (
         linearization.slopes[0] if linearization.slopes else {}
@@ -144,7 +144,7 @@ _TOLD = 4  # parameters that a warning lists at most
 
 @dataclass(frozen=True)
 class ParameterBias:
-    """The bias of a parameter, estimate less truth, and an interval that covers bias and noise together."""
+    """Bias of a parameter, estimate less truth, with an interval that covers bias and noise."""
 
     name: str
     value: float
@@ -163,7 +163,7 @@ class ParameterBias:
 
 @dataclass(frozen=True, eq=False)
 class Budget:
-    """The bias of every parameter by the causes that explain the learner, that of the largest part first."""
+    """Bias of every parameter by the causes that explain the learner, the largest part first."""
 
     causes: tuple[SuspectedBias, ...]
     parameters: tuple[ParameterBias, ...]
@@ -172,12 +172,12 @@ class Budget:
 
     @property
     def cause(self) -> SuspectedBias:
-        """Return what explains most."""
+        """Cause that explains most."""
         return self.causes[0]
 
     @property
     def share(self) -> float:
-        """Return how much of the learner that explains.
+        """Share of the learner that the causes explain.
 
         Where each output has a cause, of what is learned of its own.
         """
@@ -193,7 +193,7 @@ class Budget:
 def linearization_of(
     fit: Estimate, measure: Measure, physics: PhysicsMap | None = None
 ) -> MeasureLinearization:
-    """Return what biases of a fit are computed on; `measure` is the one that θ was split under."""
+    """Return the linearization of a fit for biases, under the measure that θ was split under."""
     weighed = weigh_problem(measure, fit.problem)
     learns = fit.model.form.bound is not None
     learned = fit.model.learner_at(weighed.points.x) if learns else None
@@ -222,7 +222,7 @@ def lagged_budget(
 def budget_on(
     linearization: MeasureLinearization, fit: Estimate, suspects: Sequence[Suspect]
 ) -> Budget | None:
-    """The same on a ground that is there already."""
+    """Return the budget of a fit on a given linearization."""
     if (
         not linearization.problem.baseline.names
         or linearization.learned is None
@@ -274,7 +274,10 @@ def _norm(rows: Sequence[Vector]) -> Vector | float:
 
 
 def noise_share(linearization: MeasureLinearization, fit: Estimate) -> float:
-    """ν: how much of what the learner holds beside the physics is noise, of which it takes σ² a weight that it uses."""
+    """Return ν, the share of noise in what the learner holds beside the physics.
+
+    Noise takes σ² for each weight that the learner uses.
+    """
     noise = fit.model.statistics.noise
     if noise is None:
         return 0.0
@@ -301,7 +304,7 @@ def _candidates(
     suspects: Sequence[Suspect],
     fit: Estimate,
 ) -> list[Candidate]:
-    """Return the named causes, and what may stand instead of one of them."""
+    """Return the named causes and their rivals."""
     several = " and ".join(cause.suspect.name for _, cause in found)
     kept: list[Candidate] = [
         NamedCause(several, min(explains(cause) for _, cause in found), bias, rest=rest)
@@ -329,7 +332,10 @@ def _physical_rows(
     causes: Sequence[SuspectedBias],
     other: Vector | float,
 ) -> tuple[tuple[ParameterBias, ...], list[Warning]]:
-    """Return the biases of the physical parameters: the hull over the causes that move any of them farthest."""
+    """Return the biases of the physical parameters: the hull over the causes that matter.
+
+    Those are the causes that move any of them farthest.
+    """
     assert linearization.physics is not None
     physical, slopes, bias = (
         fit.physical(linearization.physics),
@@ -371,7 +377,9 @@ def _causes(
     suspects: Sequence[Suspect],
     something: Bool[np.ndarray, "ny"],
 ) -> tuple[list[tuple[MeasureLinearization, SuspectedBias]], list[SuspectedBias]]:
-    """Return what explains the learner, with the ground that it does so on: all of it, or what is learned of one output.
+    """Return the causes that explain the learner, each with its linearization.
+
+    One cause explains all of it, or one cause each output's part.
 
     Args:
         something: whether anything is learned of an output.
@@ -404,7 +412,7 @@ def _causes(
 def _owners(
     causes: Sequence[SuspectedBias], moved: Float[np.ndarray, "k n"]
 ) -> list[tuple[str, float]]:
-    """Of each parameter the cause that moves it most, and its share."""
+    """Return for each parameter the cause that moves it most, and its share."""
     return [(causes[i].suspect.name, explains(causes[i])) for i in np.argmax(np.abs(moved), axis=0)]
 
 
@@ -436,13 +444,13 @@ def named_cause(
 def _likeliest(
     linearization: MeasureLinearization, suspects: Sequence[Suspect]
 ) -> SuspectedBias | None:
-    """Return what explains most of the learner, however little, declared or not."""
+    """Return the suspect that explains most of the learner, however little, declared or not."""
     found = (*_declared(linearization, suspects), *_usual(linearization))
     return max((entry for entry in found if entry.explained), key=explains, default=None)
 
 
 def explains(entry: SuspectedBias | TermBias) -> float:
-    """Its share of the learner."""
+    """Return the share of the learner that an entry explains."""
     return entry.explained or 0.0
 
 
@@ -462,7 +470,7 @@ def _usual(linearization: MeasureLinearization) -> tuple[SuspectedBias, ...]:
 
 
 def _families(linearization: MeasureLinearization) -> tuple[SuspectedBias, ...]:
-    """Return what every member of the catalogue does that the learner sees."""
+    """Return the biases by every member of the catalogue that the learner sees."""
     table = linearization.table(catalogue(linearization.problem), certify=False, every=False)
     return tuple(
         entry
@@ -504,7 +512,7 @@ def rival_of(
 def near_causes(
     linearization: MeasureLinearization, cause: SuspectedBias, suspects: Sequence[Suspect]
 ) -> list[SuspectedBias]:
-    """Return the next best causes, one of each variable, beside one that no one declared and that is not sure."""
+    """Return the next best causes, one per variable, for a cause undeclared and unsure."""
     assert cause.explained
     if cause.suspect in suspects or cause.explained >= SURE_SHARE:
         return []
@@ -523,7 +531,9 @@ def near_causes(
 def left_over(
     linearization: MeasureLinearization, cause: SuspectedBias, suspects: Sequence[Suspect]
 ) -> Float[np.ndarray, "k nt"]:
-    """Return standard deviations of the bias of θ that the cause does not tell: k directions, each of one unknown size.
+    """Return the standard deviations of the bias of θ that the cause leaves open.
+
+    They are k directions, each of one unknown size.
 
     What it leaves of the learner counts as biased by as much for its size as the cause, of unknown
     sign; beside that by what the next best cause makes of it. What may stand instead of the cause
@@ -538,7 +548,7 @@ def left_over(
 
 
 def _moved(cause: SuspectedBias) -> Vector:
-    """Return what a cause of the size found makes of θ."""
+    """Return θ moved by a cause of the size found."""
     return (cause.coefficient_found or 0.0) * np.array(cause.bias)
 
 
@@ -572,7 +582,7 @@ def parameter_biases(
 
 
 def _unbounded(names: Sequence[str], std: Vector, ends: Matrix) -> list[Warning]:
-    """Which physical parameters have an interval, but none with their bias."""
+    """Return a warning where physical parameters have an interval but no bounded bias."""
     none = [
         name
         for name, s, e in zip(names, std, ends, strict=True)
@@ -591,7 +601,7 @@ def _warning(
     suspects: Sequence[Suspect],
     of_one: bool,
 ) -> Warning | None:
-    """Return what a cause biases by more than the standard error: its size, remedies.
+    """Return the warning on biases above the standard error: cause, size and remedies.
 
     And how sure the cause is.
     """

@@ -1,4 +1,4 @@
-"""The verb `bias_budget`: what the learner found and the bias that follows, of lagged physics and of a motion."""
+"""The verb `bias_budget`: the cause that explains the learner and the bias that follows from it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Were the inputs recorded under feedback? Whether past outputs tell an input beside its own past.
+"""Detection of feedback in the record: past outputs that predict an input beside its own past.
 
 In open loop an input is told by nothing but its own past. Under feedback, past outputs carry the
 reference and the disturbances into it (Granger 1969; Söderström and Stoica 1989, ch. 10).
@@ -36,7 +36,10 @@ _PERIODIC = 0.9  # autocorrelation at a period, beyond what short lags tell
 
 @dataclass(frozen=True)
 class Feedback:
-    """That past outputs tell `share` of what the own past of the input `name` leaves, at the level `p`."""
+    """Feedback found on an input: past outputs predict a `share` of what its own past leaves.
+
+    `name` is the input, `p` the level of the test.
+    """
 
     name: str
     share: float
@@ -79,7 +82,7 @@ def closed_loop(record: Record) -> tuple[Warning, ...]:
 
 
 def _told(record: Record, j: int) -> tuple[float, float] | None:
-    """Share and level by which past outputs tell input j.
+    """Return share and level of the prediction of input j by past outputs.
 
     None where that is not enough, or cannot be told.
     """
@@ -103,7 +106,9 @@ def _told(record: Record, j: int) -> tuple[float, float] | None:
 
 
 def told_beside(own: Matrix, others: Matrix, target: Vector) -> tuple[float, float] | None:
-    """Cross-validated share of what `own` leaves of a target that `others` tell, and the level of a robust Wald test.
+    """Return the share of a target that `others` predict beside `own`, and its level.
+
+    The share is cross-validated, of what `own` leaves; the level is that of a robust Wald test.
 
     None where there are too few rows, `own` leaves nothing, or the share is not surely large
     enough.
@@ -129,7 +134,10 @@ def told_beside(own: Matrix, others: Matrix, target: Vector) -> tuple[float, flo
 
 
 def _usual(own: Matrix, target: Vector) -> np.ndarray:
-    """Return the rows on which an input does not jump: those of a reference would hide all that lies between them."""
+    """Return the rows on which an input does not jump.
+
+    Jumps of a reference would hide everything between them.
+    """
     base, kept = (
         np.column_stack([np.ones(len(target)), _scaled(own)]),
         np.ones(len(target), dtype=bool),
@@ -143,7 +151,7 @@ def _usual(own: Matrix, target: Vector) -> np.ndarray:
 
 
 def _wald(columns: Matrix, target: Vector) -> float:
-    """Level at which all coefficients are 0, robust against errors of unequal size (White 1980)."""
+    """Return the level at which all coefficients are 0, robust to unequal errors (White 1980)."""
     u, size, _ = np.linalg.svd(columns, full_matrices=False)
     u = u[:, size > 1e-9 * size.max(initial=0.0)]
     told = u.T @ target
@@ -154,7 +162,7 @@ def _wald(columns: Matrix, target: Vector) -> float:
 
 
 def _rows(u: Vector, beside: Matrix, y: Matrix) -> tuple[Matrix, Matrix, Vector] | None:
-    """Past of an input and those `beside` it, past outputs, and the input's value, on the rows that are looked at."""
+    """Return an input's past and that of those `beside` it, past outputs, and the input."""
     u, beside, y = u[-_MOST:], beside[-_MOST:], y[-_MOST:]
     changes = np.flatnonzero(np.diff(u)) + 1
     if len(changes) < (1 - _HELD) * (len(u) - 1):
@@ -185,7 +193,7 @@ def _rows(u: Vector, beside: Matrix, y: Matrix) -> tuple[Matrix, Matrix, Vector]
 
 
 def _own_past(x: Vector, count: int, period: int | None, first: int) -> Matrix:
-    """So many lags, and those about a period."""
+    """Return the first `count` lags, and those about a period."""
     lags = [*range(1, count + 1), *(() if period is None else range(period - 1, period + 2))]
     rows = np.arange(first, len(x))
     return (

@@ -1,4 +1,4 @@
-"""Does a model's free run stay bounded and forget its start? All checks together, and what they say in words.
+"""Stability of a free run: all checks of boundedness and contraction together, with their report.
 
 They are evidence from sampled points, no proof, but for the last: beyond the training a held
 correction is bounded, and stable linear physics keeps it so (`beyond_training`). Two of them look

@@ -1,4 +1,4 @@
-"""What a learner could imitate of the physics, in words, in physical parameters, and with other learner inputs (F8)."""
+"""Directions of the physics that a learner could imitate, also with other learner inputs (F8)."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _NEARLY = (
 
 @dataclass(frozen=True)
 class Alternative:
-    """Other learner inputs: how many directions they share, and what is determined beside such a learner."""
+    """Other learner inputs: the directions they share, and the parameters they leave determined."""
 
     inputs: tuple[str, ...]
     shared: int
@@ -45,7 +45,7 @@ class Alternative:
 
 @dataclass(frozen=True)
 class Imitation:
-    """What a learner on these inputs could imitate.
+    """Parts of the physics that a learner on these inputs could imitate.
 
     `directions` are those of θ that it shares with the physics. `determined` are the parameters,
     and `physical` the physical parameters, that no shared direction moves: the fit determines them
@@ -69,7 +69,7 @@ class Imitation:
 
     @classmethod
     def of(cls, inputs: Sequence[str], shared: Shared, *others: Any) -> Self:
-        """Of the directions that a learner on these inputs shares; `others` are the last fields."""
+        """Return the imitation for the shared directions; `others` are the last fields."""
         return cls(tuple(inputs), shared.all, shared.directions, shared.untouched, *others)
 
     @property
@@ -105,7 +105,10 @@ class Imitation:
 
     @property
     def _nearly(self) -> str:
-        """A sentence where the terms leave so little of a regressor that its parameter rests on next to nothing."""
+        """A sentence on the parameter whose regressor is nearly spanned by the terms.
+
+        It is empty where none is.
+        """
         if self.weakest is None or self.weakest[1] >= _NEARLY:
             return ""
         name, left = self.weakest
@@ -117,7 +120,7 @@ class Imitation:
 
 
 class MotionImitation(Imitation):
-    """The same of a motion.
+    """Parts of a motion that a learner on these inputs could imitate.
 
     Directions are those of the parameters' coordinates, logarithms of positive ones.
     """
@@ -156,7 +159,7 @@ def imitation(
     others: bool = True,
     held: Collection[str] = (),
 ) -> Imitation:
-    """Return what the problem's learner could imitate, and what `others`, other inputs, would make of it.
+    """Return the imitation for the problem's learner, and for `others`, other inputs.
 
     Args:
         held: parameters at a bound.
@@ -181,7 +184,10 @@ def imitation(
 
 
 def _weakest(problem: Problem, determined: Collection[str]) -> tuple[str, float] | None:
-    """Return the parameter whose regressor the others leave least of, relative to what they do without the terms."""
+    """Return the parameter whose regressor loses most of its norm to the terms.
+
+    It is measured relative to the regressor without the terms.
+    """
     if len(problem.outputs) > 1 or not determined or not problem.count:
         return None
     physics, terms = problem.projection.phi[:, 0], problem.feature_rows()
@@ -199,7 +205,7 @@ def _weakest(problem: Problem, determined: Collection[str]) -> tuple[str, float]
 
 
 def _slopes(problem: Problem, physics: PhysicsMap | None) -> dict[str, np.ndarray] | None:
-    """dp/dθ by name, at the spec's initial values or, without any, at least squares.
+    """Return dp/dθ by name, at the spec's initial values or, without any, at least squares.
 
     None where there is none.
     """
@@ -216,7 +222,7 @@ def _slopes(problem: Problem, physics: PhysicsMap | None) -> dict[str, np.ndarra
 
 
 def _untouched(shared: Shared, slopes: dict[str, np.ndarray] | None) -> tuple[str, ...] | None:
-    """Physical parameters that no shared direction moves."""
+    """Return the physical parameters that no shared direction moves."""
     if slopes is None:
         return None
     return tuple(
@@ -229,7 +235,7 @@ def _untouched(shared: Shared, slopes: dict[str, np.ndarray] | None) -> tuple[st
 
 
 def other_inputs(problem: Problem) -> Iterator[tuple[str, ...]]:
-    """Choices of learner inputs that an engineer would think of: velocities, outputs, inputs, single lags."""
+    """Return plausible choices of learner inputs: velocities, outputs, inputs, single lags."""
     for name in problem.outputs:
         lags = [str(lag) for lag in problem.layout if lag.channel == name]
         yield from ((f"{one}-{two}",) for one, two in zip(lags, lags[1:], strict=False))
@@ -260,7 +266,7 @@ def _listed(words: tuple[str, ...] | list[str]) -> str:
 
 
 def imitation_before(form: MotionDynamics, q: Vector, x: Matrix, u: Matrix) -> MotionImitation:
-    """Return what a learner on the form's features would share with the physics, and what others would.
+    """Return the imitation for a learner on the form's features, and for others.
 
     Args:
         x: states (M, nx) of a run at the coordinates q; `u` its inputs (M, nu).

@@ -54,7 +54,7 @@ def linearize(
     frequencies: Any = None,
     continuous: str = "zoh",
 ) -> Linearization:
-    """Return the model about its points of rest as linear systems, with 95 % intervals from its joint covariance.
+    """Return the model about its points of rest as linear systems, with 95 % intervals.
 
     Args: model: a fitted model; of a fit the record is that of training. at: inputs that are held,
         and outputs or states that are fixed, `"force=0, position=1"` or a mapping. Inputs
@@ -109,7 +109,7 @@ def linearize(
 
 
 def _held(search: Search, given: Mapping[str, float], record: Record | None) -> str:
-    """Where inputs come from that nobody named."""
+    """Return a clause on the source of inputs that nobody fixed."""
     if all(name in given for name in search.step.inputs):
         return "given"
     if search.free[len(search.step.rest) :].any():
@@ -221,7 +221,7 @@ def _view(
 def _system(
     search: Search, point: OperatingPoint, spread: _Spread | None, time: float | None
 ) -> System:
-    """Return the matrices of a step of `time`, or of the equations, and how they move along the covariance."""
+    """Return the matrices of a step of `time`, or of the equations, and their covariance."""
     step, numbers, field = search.step, search.numbers, time is None
     width = difference_widths(search.size, point.inputs)
     matrix = np.asarray(slope_at(step, field, numbers, point.rest, point.inputs, width))
@@ -260,10 +260,10 @@ def _smooth(model: Model | MotionModel) -> bool:
 
 
 def _without_next(system: System) -> System:
-    """Return a step that reads the inputs of the next sample as one that does not: `z = x − B₁ u` (first-order hold)."""
+    """Return the system without inputs of the next sample: `z = x − B₁ u` (first-order hold)."""
 
     def rewritten(matrix: Any, moved: Any = None) -> Any:
-        """Of the matrices, or of their change `moved`."""
+        """Return the matrices, or their change `moved`, in the new state."""
         n = system.states
         nu = (matrix.shape[1] - n) // 2
         a, b1, c = matrix[:n, :n], matrix[:n, n + nu :], matrix[n:, :n]
@@ -289,7 +289,10 @@ def _shape(system: System) -> tuple[int, int]:
 
 
 def _kinks(search: Search, point: OperatingPoint, system: System) -> list[Warning]:
-    """Return whether differences tell of another slope than the derivative: then the view holds in no neighbourhood."""
+    """Return warnings where differences give another slope than the derivative.
+
+    The view then holds in no neighbourhood of the point.
+    """
     if not search.step.form.differentiable:
         return []
     width, n = difference_widths(search.size, point.inputs), system.states

@@ -1,4 +1,4 @@
-"""What terms that a motion's equations may lack do to its parameters, and what tells of them.
+"""Bias of a motion's parameters by terms that its equations may lack, and the evidence for them.
 
 The free run answers for what the fit determines: a term moves these parameters as `motion_response`
 says. Along the directions that the learner could imitate the nearest physics decides, so that there
@@ -53,7 +53,7 @@ CERTIFIED_POINTS = (
 
 @dataclass(frozen=True)
 class ResidualStep:
-    """What the free run's residual tells of a term beside all that was fitted: one Gauss-Newton step.
+    """Effect of a term on the free run's residual beside the fit, by one Gauss-Newton step.
 
     `share` is by how much of the residual's squares it falls, `left` what stays of them beyond
     white noise.
@@ -68,7 +68,7 @@ class ResidualStep:
 
 @dataclass(frozen=True, eq=False)
 class TermBias:
-    """What a term of a motion does to its parameters if it is there.
+    """Bias of a motion's parameters by a term.
 
     `moved` (np,) are the coordinates of p̂ less those without the term, per unit of its
     coefficient.
@@ -93,7 +93,7 @@ class TermBias:
 
     @property
     def removed_by(self) -> str | None:
-        """Return what leaves the parameters unbiased by it.
+        """Change that removes this bias from the parameters.
 
         None where that is not known, or nothing is to remove.
         """
@@ -115,7 +115,7 @@ class TermBias:
         return SuspectedBias(shown, *own, None, *found)
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain numbers, text and None, for JSON."""
+        """Return plain numbers, text and None, for JSON."""
         return self._told.as_dict() | {
             "removed_by": self.removed_by,
             "equation": self.equation,
@@ -129,7 +129,7 @@ class TermBias:
 
 @dataclass(frozen=True, eq=False)
 class MotionLinearization:
-    """What biases of a motion are computed on: where it is linearised, and the points that p̂ was split over.
+    """Linearization of a motion for biases: the linearized free run, and the points of p̂'s split.
 
     Args:
         q: coordinates of p̂; those in `shared` directions are told by the nearest physics.
@@ -153,12 +153,15 @@ class MotionLinearization:
 
     @property
     def learns(self) -> bool:
-        """Return whether there is a learner."""
+        """True if there is a learner."""
         return self.place.segmented.bound is not None
 
     @cached_property
     def phi(self) -> Projection:
-        """∂f/∂q of the learned equations over the points, rows times the root of their weights over their sizes."""
+        """∂f/∂q of the learned equations over the points, with rows weighted.
+
+        A row is multiplied by the root of its weight over its size.
+        """
         slopes = np.asarray(
             slopes_at(self.place.segmented.dynamics.alone, self.q, self.field.x, self.field.u)
         )
@@ -170,7 +173,7 @@ class MotionLinearization:
         return rows * np.sqrt(self.field.weight)[:, None] / self.field.size
 
     def usual(self) -> tuple[MotionSuspect, ...]:
-        """Return what is often missing, with widths by where its run goes."""
+        """Return the usual suspects, with widths from the range of the run."""
         place = self.place
         segmented = place.segmented if len(place.w) else place.segmented.alone
         x, u = segmented.trajectory(place.c, place.w, place.states)
@@ -181,7 +184,7 @@ class MotionLinearization:
     def table(
         self, suspects: Sequence[MotionSuspect], used: float | None = None, steps: int | None = None
     ) -> list[TermBias]:
-        """Return what every suspect does; nothing where the free run has no sensitivities.
+        """Return the bias by every suspect; empty where the free run has no sensitivities.
 
         Args: used: weights that a fit used, where it is asked what its residual tells; `steps` of a
             block, where its
@@ -244,7 +247,7 @@ class MotionLinearization:
         return TermBias(*own, *told, None if seen else residual)
 
     def after(self, causes: Sequence[TermBias], table: Sequence[TermBias]) -> list[TermBias]:
-        """Return what terms that the learner sees explain of it without causes that it sees.
+        """Return the suspects that the learner sees, by their shares beside given causes.
 
         Nothing of other causes.
         """
@@ -267,7 +270,7 @@ class MotionLinearization:
         return self.weighed(self._rows(suspect, suspect.place(self.motion)))
 
     def physics_cosine(self, suspect: MotionSuspect) -> float:
-        """Return the cosine of a term that the learner sees with what the shared directions move."""
+        """Return the cosine between a term that the learner sees and the shared directions."""
         held = self.held(suspect)
         size = float(np.linalg.norm(held))
         return (
@@ -277,7 +280,7 @@ class MotionLinearization:
         )
 
     def seen_entry(self, suspect: MotionSuspect) -> TermBias:
-        """Return what a term that the learner sees does, by the measure alone: the free run need not be asked."""
+        """Return the bias by a term that the learner sees, by the measure without the free run."""
         motion, held = self.motion, self.held(suspect)
         moved = self.phi.solve_along(held, self.shared.basis)
         moved = np.where(np.isin(motion.names, self.unknown), np.nan, moved)
@@ -293,7 +296,7 @@ class MotionLinearization:
         return self.beside(self.weighed(np.asarray(self.learned)))
 
     def beside(self, values: Matrix) -> Matrix:
-        """Return what the shared directions leave of values (M, nl) that are weighed."""
+        """Return the part of weighted values (M, nl) outside the shared directions."""
         basis = self.shared.basis
         return (
             values - self.phi.phi @ self.phi.solve_along(values, basis)
@@ -313,7 +316,10 @@ class MotionLinearization:
         return np.where(np.isfinite(rows), rows, 0.0)
 
     def _explained(self, held: Matrix) -> tuple[float | None, float | None]:
-        """Return how much of the learner a term explains, and with which coefficient, beside the shared directions."""
+        """Return the share of the learner that a term explains, and its coefficient.
+
+        Both are taken beside the shared directions.
+        """
         if self.learned is None:
             return None, None
         rest, tilde, size = self.beside(held), self.told(), np.linalg.norm(held)
@@ -324,7 +330,7 @@ class MotionLinearization:
         return float(min((product / np.linalg.norm(tilde)) ** 2, 1.0)), float(product / norm)
 
     def sees(self, suspect: MotionSuspect) -> bool:
-        """Return whether the learner is added where the term acts, and the term is a function of what the learner sees."""
+        """Return whether the term acts where the learner does, and is a function of its inputs."""
         if suspect.place(self.motion) not in learned_places(self.motion):
             return False
         start, end = self._moves
@@ -339,7 +345,7 @@ class MotionLinearization:
 
     @cached_property
     def _moves(self) -> tuple[Matrix, Matrix]:
-        """Pairs of points that the learner does not tell apart."""
+        """Pairs of points that the learner does not distinguish."""
         form, nx = self.place.segmented.dynamics, len(self.motion.states)
         points = np.concatenate([self.field.x, self.field.u], axis=1)
         return moves(
@@ -350,7 +356,9 @@ class MotionLinearization:
 def told_by_residual(
     response: TermsResponse, used: float, steps: int | None
 ) -> list[ResidualStep | None]:
-    """Return what the residual tells of every term, with standard errors that hold for coloured errors where `steps` is given.
+    """Return the effect of every term on the residual, with standard errors.
+
+    They hold for coloured errors where `steps` is given.
 
     Args:
         used: weights that the fit used.
@@ -381,7 +389,7 @@ def told_by_residual(
 
 
 def suspected_bias(fit: MotionEstimate, suspects: Sequence[MotionSuspect]) -> list[TermBias]:
-    """Return what terms that the equations of a fitted motion may lack do to its parameters, and what tells of them.
+    """Return the bias of a fitted motion's parameters by terms that its equations may lack.
 
     Raises:
         InputError: suspects that the motion cannot have, or a fit of difference equations.
@@ -401,7 +409,9 @@ def suspected_bias(fit: MotionEstimate, suspects: Sequence[MotionSuspect]) -> li
 
 
 def softened_bias(fit: MotionEstimate, suspects: Sequence[MotionSuspect]) -> list[TermBias]:
-    """Return what friction among the suspects does that turns round smoothly, of widths by the size of what it acts on.
+    """Return the biases by smooth forms of the friction among the suspects.
+
+    Widths follow the size of the variable.
 
     Nothing without a learner: it alone shows the shape of what is missing.
     """
@@ -413,7 +423,7 @@ def softened_bias(fit: MotionEstimate, suspects: Sequence[MotionSuspect]) -> lis
 
 
 def usual_biases(fit: MotionEstimate) -> tuple[list[TermBias], list[TermBias]]:
-    """Return what usual terms do that nobody declared, and their smooth forms.
+    """Return the biases by usual terms that nobody declared, and by their smooth forms.
 
     Of these only what the learner sees counts: the rest is no likely cause of what it found.
     Nothing where it could imitate no change of a parameter.
@@ -430,7 +440,7 @@ def usual_biases(fit: MotionEstimate) -> tuple[list[TermBias], list[TermBias]]:
 
 
 def linearize_fit(fit: MotionEstimate) -> MotionLinearization | None:
-    """Of a fitted motion under the measure that it was split under.
+    """Return the linearization of a fitted motion under the measure that it was split under.
 
     None where it has no normal equations.
     """
@@ -450,7 +460,7 @@ def linearize_fit(fit: MotionEstimate) -> MotionLinearization | None:
 
 
 def linearize_physics(task: MotionTask, structure: Structure) -> MotionLinearization | None:
-    """Of physics alone, with what a learner of the task's features could hold.
+    """Return the linearization of physics without a learner, for a learner of the task's features.
 
     None where it has no run.
     """

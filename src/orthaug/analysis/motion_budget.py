@@ -1,4 +1,4 @@
-"""What a motion's learner found, or its free run leaves, explained by a term, and the bias that follows from it.
+"""Bias budget of a motion: the term that explains the learner or the free run, and its bias.
 
 With a learner as of difference equations (`budget`), over the points of the measure. Without one
 only terms that someone suspects are looked at; their size is what the free run's residual tells:
@@ -59,7 +59,7 @@ _UNMOVED = 0.1  # standard errors of every parameter
 
 @dataclass(frozen=True, eq=False)
 class MotionBudget:
-    """The bias of every parameter by the terms that explain the learner, or what the free run leaves."""
+    """Bias of every parameter by the terms that explain the learner or the free run's errors."""
 
     causes: tuple[TermBias, ...]
     """One, or one of each learned equation that explain `share` together."""
@@ -85,7 +85,7 @@ class MotionBudget:
 def told_budget(
     fit: MotionEstimate, declared: Sequence[MotionSuspect], table: Sequence[TermBias]
 ) -> MotionBudget | None:
-    """By the declared suspects.
+    """Return the budget by the declared suspects.
 
     Where these are not sure to be it, by the usual ones too that the learner sees.
 
@@ -107,7 +107,7 @@ def told_budget(
 
 
 def families_of(linearization: MotionLinearization) -> list[TermBias]:
-    """Return what every member of the catalogue does that the learner sees.
+    """Return the biases by every member of the catalogue that the learner sees.
 
     Nothing where it could imitate no parameter.
     """
@@ -125,7 +125,7 @@ def families_of(linearization: MotionLinearization) -> list[TermBias]:
 
 
 def noise_share(fit: MotionEstimate, linearization: MotionLinearization) -> float:
-    """ν: how much of what the learner holds beside the physics is noise, by the band of the learned curve."""
+    """Return ν, the share of noise in what the learner holds, by the band of the learned curve."""
     half = learned_reach(fit, linearization.field.x, linearization.field.u)
     if half is None or not np.isfinite(half).all():
         return 0.0
@@ -143,7 +143,7 @@ def motion_budget(
     families: Sequence[TermBias] = (),
     declared: Sequence[MotionSuspect] | None = None,
 ) -> MotionBudget | None:
-    """By the suspect that explains most, or one in each learned equation.
+    """Return the budget by the suspect that explains most, or by one in each learned equation.
 
     None where none explains enough.
 
@@ -187,7 +187,7 @@ def motion_budget(
 def _instead(
     fit: MotionEstimate, table: Sequence[TermBias], declared: set[MotionSuspect]
 ) -> list[Candidate]:
-    """Return what may be the cause as well as the one that is named."""
+    """Return the rivals of the named cause."""
     linearization = linearize_fit(fit)
     assert linearization is not None
     likely = [
@@ -204,7 +204,10 @@ def _instead(
 
 @dataclass(frozen=True, eq=False)
 class _Causes:
-    """Causes, what they move the parameters by (np,), standard deviations (k, np) of what they leave, and rivals."""
+    """Causes, their shifts of the parameters (np,), rivals, and what the causes leave open.
+
+    The last are standard deviations (k, np).
+    """
 
     causes: tuple[TermBias, ...]
     share: float
@@ -214,7 +217,7 @@ class _Causes:
 
 
 def _is_clearly_less(share: float, other: float) -> bool:
-    """Return whether a term with a plain name gives way to a member of a family, which has a width to fit as well."""
+    """Return whether a plain term gives way to a member of a family, which also fits a width."""
     return share < AS_MUCH * other and 1 - share > max(_AS_CLOSE * (1 - other), _CLOSE)
 
 
@@ -226,13 +229,13 @@ def _size(cause: TermBias) -> float:
 
 
 def rivals_of(cause: TermBias, table: Sequence[TermBias]) -> list[TermBias]:
-    """Terms that explain about as much of the learner as a cause, which cannot be told from it."""
+    """Return the terms that explain about as much of the learner as a cause does."""
     most = min(max(_AS_CLOSE * (1 - explains(cause)), _CLOSE), 1 - LEAST_SHARE)
     return [entry for entry in table if entry is not cause and 1 - explains(entry) <= most]
 
 
 def _moved(entry: TermBias) -> Vector:
-    """Return what a term of the size found makes of the parameters."""
+    """Return the parameters moved by a term of the size found."""
     return (entry.coefficient_found or 0.0) * entry.per_unit
 
 
@@ -242,7 +245,10 @@ def _of_learner(
     smooth: Sequence[TermBias],
     families: Sequence[TermBias] = (),
 ) -> _Causes | None:
-    """Return the term that explains most of the learner, or one of each equation that together leave much less of it."""
+    """Return the term that explains most of the learner, or one of each equation.
+
+    One of each is taken where these leave much less of it.
+    """
     best, other = (
         max(table, key=explains, default=None),
         max((*smooth, *families), key=explains, default=None),
@@ -271,7 +277,9 @@ def _of_learner(
 def one_of_each(
     linearization: MotionLinearization, table: Sequence[TermBias]
 ) -> list[list[TermBias]]:
-    """Terms of each learned equation by what they explain of the learner beside the first of the others, best first.
+    """Return terms of each learned equation, ordered by their joint share of the learner.
+
+    The share of a term is that beside the first of the other equations.
 
     The first ones explain most together, over 20,000 points at most. Nothing where terms of one
     equation alone explain any of it.
@@ -290,7 +298,7 @@ def one_of_each(
     cosines = (rows @ rows.T) / np.outer(sizes, sizes)
 
     def beside(others: list[int]) -> tuple[Vector, Vector]:
-        """Return the share of the learner that others explain with each term, and its coefficient."""
+        """Return the share of the learner that others explain with each term, and coefficients."""
         rest = (
             cosines
             - cosines[:, others] @ np.linalg.pinv(cosines[np.ix_(others, others)]) @ cosines[others]
@@ -300,7 +308,7 @@ def one_of_each(
         return 1 - rest[-1, -1] + fitted * product, fitted * sizes[-1] / sizes[:-1]
 
     def best_from(first: int) -> tuple[float, list[int]]:
-        """From one term on: the best of each equation beside the others, until each was chosen beside them."""
+        """Return the best term of each equation beside the others, iterated from a first term."""
         now, share = [first], 0.0
         for k in (*range(1, len(groups)), *range(len(groups)), *range(len(groups))):
             shares = beside(now[:k] + now[k + 1 :])[0][groups[k]]
@@ -324,7 +332,7 @@ def _weighed(
     share: float,
     table: Sequence[TermBias],
 ) -> _Causes:
-    """Causes with how unsure their sizes are, what the next one makes of the rest, and what they cannot be told from.
+    """Return causes with the uncertainty of their sizes, and with their rivals.
 
     Args:
         each: of an equation, or of all, its cause and then what may be it instead.
@@ -348,7 +356,9 @@ def _weighed(
 
 
 def _of_residual(table: Sequence[TermBias]) -> _Causes | None:
-    """Return the term that lowers the residual most, where that is no chance and most of what is no white noise.
+    """Return the term that lowers the residual most, if it is significant and explains most of it.
+
+    Most is of the part that is no white noise.
 
     What stays beyond white noise counts as biased by as much for its size, of unknown sign.
     """
@@ -374,7 +384,7 @@ def _of_residual(table: Sequence[TermBias]) -> _Causes | None:
 def _motion_warning(
     found: _Causes, rows: Sequence[ParameterBias], *, learns: bool
 ) -> Warning | None:
-    """Return one sentence on what is biased by more than its standard error: causes and their sizes."""
+    """Return one sentence on biases above the standard error: causes and their sizes."""
     large = [entry for entry in rows if (entry.errors or 0.0) > 1]
     if not large:
         return None

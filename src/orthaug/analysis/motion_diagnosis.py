@@ -1,4 +1,4 @@
-"""What the free run of a motion leaves: noise, or something that a state or an input tells.
+"""Diagnosis of a motion by its free run: noise, or errors that a state or an input explains.
 
 The criterion of a motion is right for white noise on its outputs. Coloured errors that follow no
 input and no state are noise within the motion; errors that do are physics that is missing, or that
@@ -36,7 +36,7 @@ _MOST_ROWS = 20_000  # at which the error is set beside states
 
 
 def diagnose_motion(fit: MotionEstimate, free_run: Response) -> Diagnosis | None:
-    """Analyse what the free run of the training data leaves.
+    """Return the diagnosis by the free run's errors on the training data.
 
     None where it ran away, or leaves rounding only.
 
@@ -81,14 +81,17 @@ def diagnose_motion(fit: MotionEstimate, free_run: Response) -> Diagnosis | None
 
 
 def _late(fit: MotionEstimate) -> tuple[DeadTime, ...]:
-    """Return inputs that act later, by physics alone, as it was trained in front of the learner: by the same programs."""
+    """Return the inputs that act later, by the physics trained before the learner.
+
+    It runs in the same compiled programs.
+    """
     solver, bound = LevenbergMarquardt().within_limit, fit.model.form.bound
     posed, learner = (fit.problem, bound.learner) if bound else (without_learner(fit.problem), None)
     return dead_times(on_longest(posed, fit.criterion, solver, Orthogonal(), learner), solver)
 
 
 def _coloured(fit: MotionEstimate) -> str:
-    """That errors are coloured, and what its standard errors are worth."""
+    """Return a sentence on coloured errors, and on the standard errors that follow."""
     told = "the errors of the free run are coloured: held-out errors say how good the model is"
     if fit.std is None or fit.plain_covariance is not None:
         return f"{told}."
@@ -104,7 +107,10 @@ _UNCOUNTED = (
 
 
 def _predictable(i: int, test: ResidualTest, errors: list, inputs: list, every: int) -> Predictable:
-    """Shares of an output's error that its own past and lagged inputs tell, and its largest share over a state."""
+    """Return the predictable shares of an output's error.
+
+    Its own past, lagged inputs and functions of states predict it.
+    """
     signal = [piece[:, i] for piece in errors]
     longest = min(_LAGS, min(map(len, signal)) // _ROWS_PER_LAG)
     own = from_own_past(signal, max(longest, 1))
@@ -162,7 +168,7 @@ def _words(
 
 
 def _traces(tests: tuple[ResidualTest, ...], shares: tuple[Predictable, ...]) -> str:
-    """Return what tests surely see beside the noise, too little to conclude otherwise."""
+    """Return a sentence on significant effects that are too small to matter."""
     told = [
         f"{test.name} follows {', '.join(test.correlated_inputs)}"
         for test in tests
@@ -180,7 +186,7 @@ def _traces(tests: tuple[ResidualTest, ...], shares: tuple[Predictable, ...]) ->
 
 
 def _colour(tests: tuple[ResidualTest, ...], shares: tuple[Predictable, ...]) -> str:
-    """Of each output that is coloured its largest autocorrelation, and how much of it its own past tells."""
+    """Return for each coloured output its largest autocorrelation and its predictable share."""
     told = []
     for test, share in zip(tests, shares, strict=True):
         if not test.practically_white():

@@ -1,4 +1,4 @@
-"""Which parameters of a motion the outputs tell apart, before training.
+"""Parameters of a motion that the outputs can distinguish, before training.
 
 They are told apart on the record's inputs, or on inputs that excite everything, by the rank of the
 free run's sensitivities to the parameters' coordinates, the starts of all segments eliminated, at
@@ -30,7 +30,7 @@ _SEED = 20_250_117
 
 @dataclass(frozen=True, eq=False)
 class RankReport:
-    """What the record's own inputs tell apart, and what rich ones do.
+    """Parameters that the record's own inputs can distinguish, and those that rich inputs can.
 
     With points of a run at the initial parameters.
 
@@ -45,7 +45,7 @@ class RankReport:
 
 
 def identified(segmented: SegmentedMotion) -> RankReport | None:
-    """Of the physics alone of a course, over shorter segments where it runs away.
+    """Return the ranks of the physics without a learner, over shorter segments where runs diverge.
 
     None where no run is finite.
     """
@@ -94,7 +94,7 @@ def _telling(found: Excitation) -> tuple[int, int]:
 
 
 def information(segmented: SegmentedMotion, q: Vector) -> Matrix | None:
-    """Gram matrix (np, np) of the outputs' sensitivities to the parameters' coordinates.
+    """Return the Gram matrix (np, np) of the outputs' sensitivities to the parameters' coordinates.
 
     None where a run diverges.
     """
@@ -119,7 +119,10 @@ def _near(segmented: SegmentedMotion) -> Iterator[Vector]:
 
 
 def _richly_excited(segmented: SegmentedMotion, wide: float) -> SegmentedMotion:
-    """The same rows with inputs of random levels, each for a random time, and starts a little off their guesses."""
+    """Return the same rows with random inputs, and starts a little off their guesses.
+
+    Inputs have random levels, each for a random time.
+    """
     record, random = segmented.record, np.random.default_rng(_SEED)
     every = np.concatenate([e.inputs for e in record.experiments])
     low, high = every.min(axis=0), every.max(axis=0)
@@ -137,7 +140,7 @@ def _richly_excited(segmented: SegmentedMotion, wide: float) -> SegmentedMotion:
 
 
 def _on(segmented: SegmentedMotion, record: Record) -> SegmentedMotion:
-    """The same segments on another record."""
+    """Return the same segments on another record."""
     whole = SegmentedMotion.of(segmented.problem.on(record), None, segmented.criterion)
     return (
         whole
@@ -147,6 +150,6 @@ def _on(segmented: SegmentedMotion, record: Record) -> SegmentedMotion:
 
 
 def _levels(count: int, random: np.random.Generator) -> Vector:
-    """Levels in [-1, 1] that stay for 1 to some steps, short ones as often as long ones."""
+    """Return levels in [-1, 1] with durations from 1 to a few steps, log-uniform."""
     lengths = np.exp(random.uniform(0, np.log(_LONGEST_LEVEL), count)).astype(int)
     return np.repeat(random.uniform(-1, 1, count), lengths)[:count]

@@ -1,4 +1,4 @@
-"""Eigenvalues of the linearised motion along a run, in 1/s: how fast small changes of the state grow or decay there.
+"""Modes of the linearised motion along a run, in 1/s: growth or decay of small changes.
 
 They are those of ∂ẋ/∂x with the learner in it; of a discrete motion `ln(λ)/Ts` with those of
 ∂x⁺/∂x. They are local: a run may be bounded where some grow, and need not be where none does.
@@ -71,7 +71,7 @@ class MotionStability:
 def motion_stability(
     model: MotionModel, x: Matrix, u: Matrix, record: Record | None = None
 ) -> MotionStability:
-    """Of the states (N, nx) and inputs (N, nu) of a run; those that are not finite are left out.
+    """Return the stability over states (N, nx) and inputs (N, nu) of a run, where these are finite.
 
     With a `record` its free run is tried on larger and larger inputs.
     """
@@ -88,7 +88,7 @@ def motion_stability(
 
 
 def _of_steps(model: MotionModel, record: Record) -> Matrix:
-    """Return what the steps of a record read, (T, nu)."""
+    """Return the inputs of the steps of a record, (T, nu)."""
     return np.concatenate(
         [model.form.inputs(experiment, record) for experiment in record.experiments]
     )
@@ -112,7 +112,7 @@ def _of_modes(model: MotionModel, x: Matrix, u: Matrix) -> MotionStability:
 
 
 def _sizes(found: Modes) -> str:
-    """Return how many integrators there are, and how fast the other modes."""
+    """Return a clause on the number of integrators and the rates of the other modes."""
     count = found.integrators
     whole = f"{count} integrators" if count > 1 else "an integrator" if count else ""
     if not found.fastest:

@@ -1,4 +1,4 @@
-"""How a motion's estimate answers to further terms in its equations: normal equations of the free run with them in it.
+"""Response of a motion's estimate to further terms in its equations, by normal equations.
 
 With S the sensitivities of the free run to the parameters' coordinates c, the terms' coefficients κ
 and a learner's weights w, the starts eliminated, a term of size κ that the fit does not know moves
@@ -47,7 +47,7 @@ _LARGE_SHARE = 1e-3  # of a parameter that has no standard error
 
 @dataclass(frozen=True, eq=False)
 class FreeRunPoint:
-    """Where a free run is linearised: a course with its coordinates, its learner's weights and its segments' starts."""
+    """Point of a free run's linearization: segments, coordinates, learner's weights, starts."""
 
     segmented: SegmentedMotion
     c: Vector
@@ -85,7 +85,7 @@ class TermsResponse:
     def moved(
         self, k: int, apart: Bool[np.ndarray, "np"]
     ) -> tuple[Vector, Float[np.ndarray, "nw"]]:
-        """Return what a unit of term k adds to c (np,), and to the weights.
+        """Return the changes of c (np,) and of the weights by a unit of term k.
 
         Parameters in `apart` stay.
 
@@ -108,11 +108,11 @@ class TermsResponse:
         return self.information + np.diag(ridge)
 
     def held(self, dw: Vector, x: Matrix, u: Matrix) -> Matrix:
-        """Return what a change of the weights adds to the learner (M, nl) at states (M, nx) and inputs (M, nu)."""
+        """Return the learner's change (M, nl) by a change of weights, at x (M, nx), u (M, nu)."""
         return np.asarray(_along(self.form, self.numbers, dw, x, u))
 
     def cosine(self, k: int) -> float | None:
-        """Return how much of the term's effect on the outputs the fit takes up, in [0, 1].
+        """Return the share of the term's effect on the outputs that the fit takes up, in [0, 1].
 
         None where it has none.
         """
@@ -120,7 +120,7 @@ class TermsResponse:
         return float(np.sqrt(np.clip(1 - self._beside(k)[1] / own, 0.0, 1.0))) if own > 0 else None
 
     def size(self, k: int) -> float:
-        """RMS effect of a unit of the term on the outputs, in their deviations."""
+        """Return the RMS effect of a unit of the term on the outputs, in their deviations."""
         segmented, weight = self.place.segmented, self.place.weight
         whole = segmented.segments.count * float(np.sum((weight * segmented.deviation) ** 2))
         return float(
@@ -128,7 +128,7 @@ class TermsResponse:
         )
 
     def step(self, k: int) -> tuple[float, float, Vector] | None:
-        """Return the coefficient that lowers what is left most, by how much that falls, and the row (n,) of scores it is.
+        """Return a term's best coefficient, the decrease of squares, and its row (n,) of scores.
 
         None where the fit could hold the term as well.
         """
@@ -141,7 +141,7 @@ class TermsResponse:
         return coefficient, coefficient**2 * left, row / left
 
     def squares(self) -> tuple[float, float]:
-        """Return the sum of squares that the free run leaves, and as much of it as neighbouring steps do not share.
+        """Return the free run's sum of squares, and the part that neighbouring steps do not share.
 
         The second is half the sum of squared differences (von Neumann 1941): all of white noise,
         little of what physics leaves out.
@@ -166,7 +166,7 @@ class TermsResponse:
         return FreeRunScores(*made, 1.0, self.slope, missed @ prior)
 
     def _beside(self, k: int) -> tuple[Vector, float]:
-        """Return the row (n,) that takes what was fitted off the term, and what information on it is left."""
+        """Return the row (n,) that removes the fit from the term, and the remaining information."""
         i = self.parameters + k
         row = np.zeros(len(self.fitted))
         row[i] = 1.0
@@ -196,7 +196,7 @@ def respond_to(place: FreeRunPoint, added: tuple[SuspectedTerm, ...]) -> TermsRe
 
 
 def solved(matrix: Matrix, right: Vector) -> Vector:
-    """Least squares with unit columns; what nothing tells stays at 0."""
+    """Return least squares with unit columns; unknowns without information stay 0."""
     if not len(matrix):
         return np.zeros(0)
     scale = 1 / np.sqrt(np.where(np.diag(matrix) > 0, np.diag(matrix), 1.0))
@@ -232,7 +232,7 @@ class SubstepBias:
     warnings: tuple[Warning, ...] = ()
 
     def as_dict(self) -> dict[str, float]:
-        """By parameter."""
+        """Return the biases by parameter."""
         return dict(zip(self.names, map(float, self.value), strict=True))
 
 

@@ -1,4 +1,4 @@
-"""An observer: the state of a fitted model from what is measured, by an extended Kalman filter, with bands."""
+"""Observer: the state of a fitted model from measurements, by an extended Kalman filter."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class Observer:
         return f"Observer({self.model!r})"
 
     def tuned(self, record: Record) -> Observer:
-        """Return the observer whose noises, each times a factor, are the most likely ones for a record.
+        """Return the observer with its noises scaled to be the most likely ones for a record.
 
         A noise that is zero stays so.
 
@@ -85,7 +85,9 @@ class Observer:
         return replace(self, noise=most_likely(self.model, self.noise, record))
 
     def start(self, record: Record, row: int | None = None) -> ObserverState:
-        """Where to begin, before a row of a record of one experiment, by default the first that is estimated.
+        """Return the state before a row of a record of one experiment.
+
+        By default that is the first row that is estimated.
 
         A motion's state is guessed from the outputs about the row, and unknown by the size of the
         states.
@@ -101,7 +103,7 @@ class Observer:
         return ObserverState(self, form.start(experiment, record, row, self.noise, size))
 
     def run(self, record: Record) -> Observations:
-        """Return outputs and states along a record, each row told by what was measured up to it.
+        """Return outputs and states along a record, each row estimated from measurements up to it.
 
         Raises:
             InputError: other channels, too few rows, or an estimate that leaves all bounds.
@@ -113,7 +115,7 @@ class Observer:
         return Observations(told, self.model.outputs, names, record.sampling_time, self._settled)
 
     def predict(self, record: Record, horizon: int = 1) -> Response:
-        """Return each row from the state that was estimated `horizon` samples before it, with its standard deviation.
+        """Return the prediction of each row from `horizon` samples before it, with its deviation.
 
         A motion's first rows, which tell its state, have no value, as in its `predict`.
 
@@ -129,7 +131,7 @@ class Observer:
 
     @property
     def _settled(self) -> int:
-        """Rows that tell where an experiment starts."""
+        """Rows that determine the start of an experiment."""
         form = self.model.filtering[0]
         return self.model.window if form.hidden else form.first_row
 
@@ -139,7 +141,7 @@ class Observer:
     def _along(
         self, experiment: Experiment, record: Record
     ) -> tuple[ObserverRun, StateEstimate, Matrix]:
-        """Return what an experiment tells, what is believed before its rows, and what their steps read."""
+        """Return the observed run of an experiment, the predicted states, and the steps' inputs."""
         form, numbers, size = self.model.filtering
         first = form.first_row
         self.model.check_rows(experiment, first)
@@ -221,7 +223,7 @@ class ObserverState:
 
     @property
     def predicted(self) -> Vector:
-        """The outputs (ny,) at the last sample as those before it told them."""
+        """Outputs (ny,) at the last sample, predicted from those before it."""
         return np.asarray(self._told.predicted)
 
     @property
@@ -241,7 +243,7 @@ class ObserverState:
 
     @property
     def square(self) -> float:
-        """`νᵀS⁻¹ν` of the last sample: χ² with as many degrees of freedom as outputs were measured."""
+        """`νᵀS⁻¹ν` of the last sample: χ² with one degree of freedom per measured output."""
         return float(self._told.square)
 
     @property
@@ -291,7 +293,7 @@ def _row(values: Any, name: str, count: int, *, gaps: bool = False) -> Vector:
 
 
 def _observed(told: FilterRow, experiment: Experiment, first: int) -> ObserverRun:
-    """With NaN before the first row that is estimated."""
+    """Return the run, with NaN before the first row that is estimated."""
 
     def whole(values: Any) -> Any:
         return np.concatenate([np.full((first, *values.shape[1:]), np.nan), values])

@@ -1,4 +1,4 @@
-"""How large the noises of an observer are: by what the residual says of them, or by the likelihood of a record.
+"""Noises of an observer, from the verdict on the residual or by the likelihood of a record.
 
 Noise in the equations moves the state; noise on a sensor does not. The residual tells which
 (`diagnose`): a white one one step ahead is the equation's, R = 0 and Q its covariance; a white one
@@ -37,7 +37,7 @@ _LARGE = 1e12
 
 
 def by_verdict(model: Model | MotionModel, verdict: str | None = None) -> Noise:
-    """Return the noises of a fitted model as the verdict on its residual says, by default what it carries.
+    """Return the noises of a fitted model by a verdict, by default the noises that it carries.
 
     That are noises which the likelihood of its training data told, else those of its verdict.
 
@@ -63,7 +63,7 @@ def _known(noise: Matrix | None) -> TypeGuard[Matrix]:
 
 
 def with_share(model: Model | MotionModel, noise: Matrix, share: float) -> Noise:
-    """Disturbances that make a share of a free run's variance `noise`, about the origin.
+    """Return disturbances that make up a share of a free run's variance `noise`, about the origin.
 
     The sensors make the rest.
     """
@@ -100,7 +100,7 @@ def of_fit(fit: Estimate | MotionEstimate) -> Noise:
 
 
 def to_keep(fit: Estimate | MotionEstimate, verdict: str) -> Noise | None:
-    """Return what a fit keeps with its model, by the likelihood of some of its rows, where its residual has both noises.
+    """Return the noises that a fit keeps with its model, by likelihood, if both kinds are present.
 
     None where the verdict's rule is as good, without an estimate of the noise, and where a filter
     takes long.

@@ -1,4 +1,4 @@
-"""Points where a model rests: its equilibria with inputs held constant, found, or given and checked.
+"""Points of rest of a model: its equilibria under constant inputs, found or given and checked.
 
 Inputs that nobody fixes are 0, or their means over a record. Where outputs or states are fixed,
 inputs that nobody fixes are looked for with the rest.
@@ -31,7 +31,10 @@ _POLISH = 5  # Newton steps
 
 @dataclass(frozen=True, eq=False)
 class Slopes:
-    """How the equations of a point follow (rest, inputs), (m, ne + nu), which of these are `free`, and their values."""
+    """Slopes of a point's equations by (rest, inputs), (m, ne + nu), and the `free` unknowns.
+
+    `value` holds the unknowns.
+    """
 
     matrix: Matrix
     free: Bool[np.ndarray, "k"]
@@ -39,7 +42,7 @@ class Slopes:
     """Numbers of the outputs whose values are equations too."""
 
     def following(self, change: Float[np.ndarray, "m r"]) -> Float[np.ndarray, "k r"]:
-        """Return how (rest, inputs) follow where the equations change (implicit function theorem)."""
+        """Return the change of (rest, inputs) by changed equations (implicit function theorem)."""
         moved = np.zeros((len(self.free), change.shape[1]))
         if self.free.any():
             moved[self.free] = -np.linalg.pinv(self.matrix[:, self.free], rcond=_SINGULAR) @ change
@@ -68,7 +71,7 @@ class OperatingPoint:
 
 
 def parse_point(at: str | Mapping[str, float] | None) -> dict[str, float]:
-    """`"force=0, position=1"` as a mapping.
+    """Return `"force=0, position=1"` as a mapping.
 
     Raises:
         InputError: no pairs of names and finite numbers, or a name twice.
@@ -104,7 +107,10 @@ def _number(text: str) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Search:
-    """What is looked for: `given` values of rest and inputs, NaN where free, and of outputs by their number."""
+    """Search for a point of rest: `given` values of rest and inputs, NaN where free, and outputs.
+
+    `outputs` are by their number.
+    """
 
     step: Step
     numbers: Numbers
@@ -126,7 +132,7 @@ class Search:
         at: Mapping[str, float],
         held: Vector,
     ) -> Search:
-        """`held` (nu,) are the inputs that nobody fixes.
+        """Return the search; `held` (nu,) are the inputs that nobody fixes.
 
         Raises:
             InputError: a name that the model does not have.
@@ -155,16 +161,16 @@ class Search:
 
     @property
     def free(self) -> Bool[np.ndarray, "k"]:
-        """Return what is looked for, of rest and inputs."""
+        """Mask of the unknowns among rest and inputs."""
         return np.isnan(self.given)
 
     @property
     def scale(self) -> Vector:
-        """Return what counts as one, of rest and inputs."""
+        """Scale of rest and inputs."""
         return np.concatenate([self.size, np.maximum(np.abs(self.middle[len(self.size) :]), 1.0)])
 
     def equations(self, point: Vector) -> tuple[Vector, Matrix, Vector]:
-        """Return what must be zero (m,), how it follows rest and inputs (m, k), and the outputs."""
+        """Return the residuals (m,), their slopes by rest and inputs (m, k), and the outputs."""
         ne = len(self.step.rest)
         width = difference_widths(self.size, point[ne:])
         value, outputs, slope = map(
@@ -307,7 +313,7 @@ def _point(search: Search, point: Vector) -> OperatingPoint:
 
 
 def _nothing(search: Search, starts: Matrix, unit: Vector) -> str:
-    """Why there is no point."""
+    """Return the reason why there is no point."""
     names = (*search.step.rest, *search.step.inputs)
     fixed = [
         f"{name} = {value:.6g}"

@@ -1,4 +1,4 @@
-"""Which standard errors a fit has by default: plain ones, robust ones against colour or uneven size, or none."""
+"""Default standard errors of a fit: plain, robust against colour or uneven size, or none."""
 
 from __future__ import annotations
 
@@ -32,7 +32,9 @@ _LEVEL = 0.01  # of the test whether a residual is white
 
 
 def robust_where_asked(fit: Estimate, response: Response) -> Estimate:
-    """Return the fit with the standard errors that its errors ask for: plain, or robust against colour or uneven size.
+    """Return the fit with standard errors that suit its errors: plain, or robust.
+
+    Robust ones hold under colour or uneven size.
 
     One step ahead that is HC3 where White's test finds that the size of the errors goes with what
     moves θ, and Newey and West where they are coloured and the rows suffice. `response` is the
@@ -56,7 +58,7 @@ def robust_where_asked(fit: Estimate, response: Response) -> Estimate:
 
 
 def robust_free_run(fit: Any) -> Any:
-    """Return the fit of a free run, of lagged physics or of a motion, with batch means where its errors ask for them.
+    """Return the fit of a free run with standard errors by batch means, where errors are coloured.
 
     Where they are coloured and the record holds too few stretches that do not remember each other
     for blocks, a model of their colour takes the place of these; where it says that the record is
@@ -110,7 +112,7 @@ def _has_rows(fit: Any, rows: int) -> bool:
 
 
 def _is_uneven(fit: Any, slopes: Any, errors: Matrix) -> bool:
-    """Return whether White's test rejects errors whose size has nothing to do with what moves the parameters."""
+    """Return whether White's test finds the errors' size related to the parameters' slopes."""
     made = fit.moves_by()
     if made is None or not np.isfinite(slopes).all() or not np.isfinite(errors).all():
         return False
@@ -170,7 +172,7 @@ def _names(fit: Any) -> tuple[str, ...]:
 
 
 def _memory(fit: Estimate, response: Response) -> int | None:
-    """Lags for the one-step residual; None where it is white, or rounding."""
+    """Return lags for the one-step residual; None where it is white, or rounding."""
     memory = 0
     if np.all(rms_errors(response) / fit.problem.deviation < ROUNDING):
         return None
@@ -210,7 +212,7 @@ def _coloured_run(fit: Any) -> bool:
 
 
 def _is_coloured(pieces: list[Vector]) -> bool:
-    """Return whether Ljung-Box rejects a white residual and a correlation is large enough to matter."""
+    """Return whether Ljung-Box rejects a white residual and a correlation is sizable."""
     box, acf = (
         ljung_box(pieces, LAGS),
         autocorrelation(pieces, sum(map(len, pieces)) // ROWS_PER_LAG),

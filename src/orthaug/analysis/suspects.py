@@ -1,4 +1,4 @@
-"""Suspected unmodelled terms δ(x): friction, drag, hardening and the like, as expressions of raw lags.
+"""Suspected unmodelled terms δ(x): friction, drag, hardening, as expressions of raw lags.
 
 They are the "suspected unmodeled terms" of the paper's remark after `cond:special_PE`: what the
 physics leaves out by intention, known in form though not in size.
@@ -21,7 +21,7 @@ from orthaug.physics.problem import Problem
 
 
 class _Kind(NamedTuple):
-    """How a kind writes its expression: `text(x, w)` of the channel expression x and the width w."""
+    """Expression of a kind: `text(x, w)` of the channel expression x and the width w."""
 
     text: Callable[[str, str], str]
     width: bool = False
@@ -160,7 +160,7 @@ class Suspect:
             raise InputError(f"suspect '{self.name}': {error}") from None
 
     def sampled(self, sampling_time: float) -> Suspect:
-        """Return the suspect with this value [s] of `Ts`, where its expression reads that without declaring it."""
+        """Return the suspect with this value [s] of `Ts`, if its expression reads it undeclared."""
         if not self.parsed.unsampled:
             return self
         return replace(
@@ -173,7 +173,9 @@ class Suspect:
         return self.parsed.lags
 
     def values(self, x: Matrix, layout: Layout, outputs: Sequence[str]) -> Matrix:
-        """δ(x) (N, ny) for a coefficient of 1: the expression in its output's column, zero in the others.
+        """Return δ(x) (N, ny) for a coefficient of 1: the expression in its output's column.
+
+        Other columns are zero.
 
         Args:
             x: regressors (N, nx) in the order of `layout`.
@@ -228,7 +230,7 @@ def check_coefficient(suspect: str, coefficient: Any) -> None:
 def written(
     kind: str, on: str | None, width: float | None, read: Callable[[str], Any], example: str
 ) -> tuple[str, str, str | None]:
-    """Expression and label of a known kind, and what it acts on in plain spaces.
+    """Return expression and label of a known kind, and its variable in plain spaces.
 
     Args:
         read: raises for what is no expression.
@@ -266,7 +268,9 @@ def written(
 def suspect_columns(
     suspects: Sequence[Suspect], x: Matrix, layout: Layout, outputs: Sequence[str]
 ) -> Float[np.ndarray, "ns N ny"]:
-    """δ(x) of every suspect for a coefficient of 1, (ns, N, ny), in each output's unit per unit of coefficient.
+    """Return δ(x) of every suspect for a coefficient of 1, (ns, N, ny).
+
+    The unit is that of the output per unit of the coefficient.
 
     Raises:
         InputError: two suspects of one name; as `Suspect.values`.
@@ -279,7 +283,7 @@ def suspect_columns(
 def data_width(
     on: str, x: Matrix, layout: Layout, constants: Mapping[str, float] | None = None
 ) -> float:
-    """Return a width from the data's own scale: the median of |x| where x is not zero, to six digits, in the unit of `on`.
+    """Return a width from the data: the median of nonzero |x|, to six digits, in the unit of `on`.
 
     Half of the moving samples then lie inside a dead zone, a saturation or a Stribeck peak, so that
     the data show both sides of it.
@@ -299,7 +303,7 @@ def data_width(
 
 
 def usual_suspects(problem: Problem) -> tuple[Suspect, ...]:
-    """Return what is often missing: friction, drag, hardening, dead zone, saturation, an offset, the root of a level."""
+    """Return the usual suspects: friction, drag, hardening, dead zone, saturation, offset, root."""
     layout, outputs = problem.layout, problem.outputs
     pairs: list[tuple[str, str]] = []
     for channel in dict.fromkeys(lag.channel for lag in layout):
@@ -328,7 +332,10 @@ def usual_suspects(problem: Problem) -> tuple[Suspect, ...]:
 
 
 def saturations(suspects: Sequence[Suspect]) -> list[Suspect]:
-    """Return what is left of the channel beside each dead zone: data of a physics with that channel cannot tell the two."""
+    """Return a saturation for each dead zone, the rest of its channel.
+
+    Data of a physics with that channel cannot distinguish the two.
+    """
     zones = [suspect for suspect in suspects if suspect.name.startswith("dead_zone")]
     return [
         replace(
@@ -350,12 +357,12 @@ def changes_sign(values: Vector) -> bool:
 
 
 def is_level(values: Vector) -> bool:
-    """Return whether values (N,) are positive but for noise, so that a root of them may be missing."""
+    """Return whether values (N,) are positive but for noise, so that their root may be missing."""
     return bool(np.min(values) >= -_BELOW * np.max(values))
 
 
 def usual_terms(problem: Problem) -> tuple[Suspect, ...]:
-    """Products of two lags that the physics or the learner reads, for what no usual suspect explains."""
+    """Return products of two lags of physics or learner, for effects beyond the usual suspects."""
     lags, outputs = problem.used[:_MULTIPLIED], problem.outputs
     pairs = [(one, other) for i, one in enumerate(lags) for other in lags[i:]]
     texts = [f"{one}**2" if one == other else f"{one}*{other}" for one, other in pairs]

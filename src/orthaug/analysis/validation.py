@@ -1,4 +1,4 @@
-"""Does the learner earn its place? Free runs of the model and of physics alone on data that were not fitted."""
+"""Validation of a learner: free runs of the model and of physics alone on unfitted data."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class Extrapolation:
-    """How far a part leaves the training data in one entry of the regressor."""
+    """Distance of a part beyond the training data in one entry of the regressor."""
 
     part: str
     lag: str
@@ -95,7 +95,7 @@ class Verdict:
 
     @property
     def text(self) -> str:
-        """Why, and where the training range is left."""
+        """Reason for the verdict, and channels outside the training range."""
         return " ".join([self.summary, *(f"{e}." for e in self.extrapolation)])
 
     @property
@@ -112,7 +112,9 @@ def free_run_error(
     *,
     response: Response | None = None,
 ) -> float:
-    """RMS of the free run's error, each output in its `unit`, by default its own deviation.
+    """Return the RMS of the free run's error, each output in its `unit`.
+
+    By default that is its own deviation.
 
     Inf where it diverges.
 
@@ -159,7 +161,7 @@ def trials_of(held_out: HeldOutErrors) -> list[Trial]:
 
 
 def _trial(label: str, alone: Pieces, model: Pieces) -> Trial:
-    """Of squared errors in deviations of the training output."""
+    """Return a trial of squared errors, in deviations of the training output."""
     block = label.startswith("block ")
     return Trial(
         label, math.sqrt(mean_square(alone)), math.sqrt(mean_square(model)), block, (alone, model)
@@ -174,7 +176,7 @@ def cross_validate(
     start: int,
     runner: Any = Threads(),  # noqa: B008  (it holds nothing)
 ) -> list[list[Pieces]]:
-    """Squared free-run errors of every way of fitting on every held-out block, in training deviations.
+    """Return squared free-run errors of every fit on every held-out block, in training deviations.
 
     Args:
         fits: each fits a training record; a failed training counts as runs that diverge.
@@ -194,7 +196,7 @@ def cross_validate(
 
 
 def _on_block(given: Any, pair: tuple[Record, Record], tell: Callable[..., None]) -> list[Pieces]:
-    """Errors on a block of every way of fitting the rest."""
+    """Return the errors on a block of every fit of the rest."""
     (fits, unit), (training, held), errors = given, pair, []
     for fit in fits:
         tell()
@@ -209,7 +211,7 @@ def _on_block(given: Any, pair: tuple[Record, Record], tell: Callable[..., None]
 
 
 def block_trials(errors: Sequence[Sequence[Pieces]], fit: int) -> list[Trial]:
-    """Trials of one way of fitting against the first one, from `cross_validate`."""
+    """Return the trials of one fit against the first one, from `cross_validate`."""
     return [
         _trial(f"block {i + 1} of {len(errors)}", block[0], block[fit])
         for i, block in enumerate(errors)
@@ -270,7 +272,7 @@ def judge(trials: Sequence[Trial], extrapolation: Sequence[Extrapolation] = ()) 
 
 
 def _ratio(group: Sequence[Trial], alone: float, model: float) -> Ratio:
-    """Of a group's errors, with its interval where errors along the runs are there."""
+    """Return the ratio of a group's errors, with its interval where errors along runs are known."""
     pieces = [t.pieces for t in group]
     if any(piece is None for piece in pieces):
         return Ratio.exactly(model, alone)
@@ -293,7 +295,7 @@ def _told(alone: float, model: float) -> str:
 
 
 def extrapolation(part: str, x: Matrix, training: Matrix, layout: Layout) -> list[Extrapolation]:
-    """Entries of the regressor in which a part leaves the range of the training data.
+    """Return entries of the regressor in which a part leaves the range of the training data.
 
     One lag a channel.
 
@@ -318,7 +320,7 @@ def extrapolation(part: str, x: Matrix, training: Matrix, layout: Layout) -> lis
 
 
 def dominance(fit: Estimate, *, one_step: Response | None = None) -> float | None:
-    """‖F̃‖ / ‖Φθ̂‖ over the training rows, the learner's part against the physics'.
+    """Return ‖F̃‖ / ‖Φθ̂‖ over the training rows, the learner's part against the physics'.
 
     None where the physics gives 0.
 
@@ -339,7 +341,7 @@ def verdict(
     *,
     skip: int = 0,
 ) -> Verdict:
-    """Return whether the learner helps: free runs of a fit and of physics alone on records that neither was fitted to.
+    """Return whether the learner helps, by free runs of a fit and of physics alone on new records.
 
     Args: fit: with a learner. alone: the same physics without, `estimate(…, learner=None)`, trained
         on the same record. tests: a record, or several by name. A free run starts from the measured

@@ -1,4 +1,4 @@
-"""The verdict on a residual: what it holds, its words, and the warnings that intervals of θ must carry."""
+"""Verdict on a residual: its content, its words, and the warnings for intervals of θ."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class Diagnosis:
 
 @dataclass(frozen=True, eq=False)
 class Finding:
-    """What was found out about a fit's residuals. `ratio` and `noise` are those of `Diagnosis`."""
+    """Findings on a fit's residuals. `ratio` and `noise` are those of `Diagnosis`."""
 
     fit: Estimate
     simulated: bool
@@ -98,7 +98,7 @@ class Finding:
 
     @property
     def lacks(self) -> bool:
-        """Return whether a change of the model itself is worth making."""
+        """True if a change of the model itself is worth making."""
         return any(change.kind != "criterion" for change in self.changes)
 
     @property
@@ -112,12 +112,12 @@ class Finding:
 
     @property
     def drifts(self) -> bool:
-        """Return whether a free run's error is slow, and white noise in the equation does not explain that."""
+        """True if a free run's error is slow, and white equation noise does not explain it."""
         slow = any(one.own_past > _SLOW for one in self.predictable)
         return self.simulated and slow and not self.white and not self.sensor
 
     def follows(self, share: float = SHARE) -> tuple[str, ...]:
-        """Return what the error that was minimised still follows: surely, and by more than a share of its variance."""
+        """Return inputs that the error surely follows, by more than a share of its variance."""
         inputs = (name for test in self.own for name in test.follows(float(np.sqrt(share))))
         return tuple(
             dict.fromkeys(
@@ -257,7 +257,7 @@ def _unmodelled(seen: Finding) -> tuple[str, tuple[Warning, ...]]:
 
 
 def _quantised(seen: Finding) -> str:
-    """That the steps of an output colour the residual one step ahead, and what to do."""
+    """Return sentences on an output's quantisation that colours the one-step residual."""
     if not seen.steps:
         return ""
     units = {c.name: f" {c.unit}".rstrip() for c in seen.fit.problem.record.outputs}
@@ -273,7 +273,7 @@ def _quantised(seen: Finding) -> str:
 
 
 def _cause(seen: Finding) -> str:
-    """Return what may stand behind a residual that none of the changes that were tried lowers, and what to do."""
+    """Return likely causes of a residual that none of the tried changes lowers, and remedies."""
     followed = [name for test in seen.own for name in (*test.follows(), *test.curved_over(SHARE))]
     if followed:
         return (
@@ -298,7 +298,7 @@ def _joined(names: Sequence[str]) -> str:
 
 
 def _small(seen: Finding) -> str:
-    """Return what is said where the tests reject, but hardly anything could be predicted."""
+    """Return sentences on a residual that the tests reject but hardly anything predicts."""
     colour = " Its colour is that of the noise." if seen.simulated and not seen.white else ""
     followed = seen.follows()
     shown = (
@@ -320,7 +320,7 @@ def _size(seen: Finding) -> str:
 
 
 def _shares(seen: Finding) -> str:
-    """Return how much could be predicted, of the output of which most could.
+    """Return the predictable shares, of the output with the largest one.
 
     Of equal ones that which follows something.
     """

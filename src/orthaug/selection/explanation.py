@@ -1,4 +1,4 @@
-"""`explain`: the terms that a learner has found, what they explain of it, and what to write into the physics."""
+"""The verb `explain`: terms that a learner has found, their share, and the lines of a new spec."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _DIVIDED = re.compile(r"\((?P<inner>.+)\)\s*/\s*(?P<by>[A-Za-z_]\w*)")
 
 @dataclass(frozen=True)
 class NewTerm:
-    """A term to be added: its parameter's `name`, the `text` with its `width` as a number, and where it goes.
+    """A term to add: its parameter's `name`, the `text` with its `width` as a number, its place.
 
     `scale` is the expression whose unit the term has; None for one by which no unit is told.
     `template` has `{width}` where the width stands, None without one.
@@ -120,14 +120,14 @@ def baseline_lines(added: Sequence[NewTerm], several: bool) -> str:
 
 @dataclass(frozen=True, eq=False)
 class ChangedMotion:
-    """A motion with terms added to its equations, the new parameters, and the equations that changed by their keys."""
+    """A motion with added terms, the new parameters, and the changed equations by their keys."""
 
     motion: Motion
     parameters: tuple[PhysicalParameter, ...]
     equations: tuple[tuple[str, str, str], ...]
 
     def lines(self) -> str:
-        """Return what to change in a spec."""
+        """Return the lines to change in a spec."""
         blocks = [f"[{table}]\n{key} = {_toml(text)}" for table, key, text in self.equations]
         rows = []
         for one in self.parameters:
@@ -236,7 +236,7 @@ def _balanced(text: str) -> bool:
 
 
 def _short(value: float) -> float:
-    """Six digits: more the learner does not tell."""
+    """Return the value to six digits, as accurate as the learner is."""
     return float(f"{value:.6g}")
 
 
@@ -307,7 +307,7 @@ class MovedParameter:
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """What a learner has found.
+    """Terms that a learner has found.
 
     `share` is what the `terms` explain together of the mean square that the learner adds beside the
     physics, `noise` the share that is its own error as far as training tells, `p` that of the
@@ -330,7 +330,7 @@ class Explanation:
 
     @property
     def found(self) -> bool:
-        """Return whether there are terms to add."""
+        """True if there are terms to add."""
         return bool(self.terms)
 
     def __repr__(self) -> str:
@@ -347,7 +347,7 @@ def explain(
     most: int = 6,
     least: float = LEAST,
 ) -> Explanation:
-    """Which terms a learner has found: its output over a record, regressed on suspects and on products.
+    """Find the terms that a learner holds: its output over a record on suspects and products.
 
     Friction, drag, hardening, dead zones and saturations of everything that the learner sees are
     tried, and products of it. Each is taken as the learner would show it, for a smooth one shows no
@@ -406,7 +406,7 @@ def explain(
 def _declared(
     suspects: Sequence[Any], linearization: LearnedLinearization
 ) -> list[tuple[str, int]]:
-    """Expressions of suspects with the number of their output or equation."""
+    """Return expressions of suspects with the number of their output or equation."""
     names, found = [name for name, _ in linearization.places], []
     for suspect in suspects:
         check_type(

@@ -1,4 +1,4 @@
-"""Whether the chosen terms leave the physics its parameters: θ of physics alone beside θ with the terms.
+"""Comparison of θ of physics alone with θ beside the chosen terms.
 
 A term within the span of the physics takes over a part of it: the sum predicts as before, and θ
 means nothing any more. So each parameter is compared before and after, in units of what the two
@@ -48,7 +48,7 @@ class Shift:
 
     @property
     def moved(self) -> bool:
-        """Return whether the parameter moves by more than its standard errors allow."""
+        """True if the parameter moves by more than its standard errors allow."""
         return self.times is None or self.times > 1
 
     def __str__(self) -> str:
@@ -58,7 +58,7 @@ class Shift:
 
 @dataclass(frozen=True, eq=False)
 class PhysicsComparison:
-    """How the physics fares beside the chosen terms."""
+    """Comparison of the physics without and beside the chosen terms."""
 
     shifts: tuple[Shift, ...]
     left: dict[str, float]
@@ -139,7 +139,10 @@ def kept_physics(
 def _statistics(
     runs: TermRuns, point: Point, own: Equations
 ) -> tuple[list[float | None], Vector, float]:
-    """Return standard errors of all columns, what the others leave of each, and the condition of their Gram matrix."""
+    """Return standard errors of all columns, their parts outside the others, and the condition.
+
+    It is the condition of their Gram matrix.
+    """
     size = np.sqrt(np.maximum(np.diag(own.hessian), 1e-300))
     gram: Matrix = own.hessian / np.outer(size, size)
     values = np.linalg.eigvalsh(gram) if len(gram) else np.ones(1)

@@ -1,4 +1,4 @@
-"""Orders and delays: na, nb and nk of linear lags beside the physics, judged by free runs on held-out blocks.
+"""Orders and delays na, nb and nk beside the physics, judged by free runs on held-out blocks.
 
 From the orders up to the largest, lags are taken away as long as what is left is as good; also a
 past output together with an input, for pole and zero go in pairs where both are superfluous.
@@ -63,7 +63,9 @@ class Orders:
 
 @dataclass(frozen=True, eq=False)
 class Delay:
-    """The delay of an input: by its cross-correlation with the output, both filtered until the input is white.
+    """Delay of an input, by its cross-correlation with the output under whitening.
+
+    Both signals are filtered until the input is white.
 
     `correlation` is None where no lag is significant; `fitted` is the first lag that the choice of
     orders kept, None where it kept none. `square` is that of the cross-correlation of the input's
@@ -182,7 +184,7 @@ def search_orders(
 def _shrink(
     found: dict[Orders, PathModel], judge: Callable[[Iterable[Orders]], None], least: Orders
 ) -> None:
-    """From the best on, as long as one lag less is as good as the best."""
+    """Remove one lag after another from the best orders, as long as the rest is as good."""
     current = min(found, key=lambda orders: found[orders].score)
     while True:
         smaller = list(current.smaller(least))

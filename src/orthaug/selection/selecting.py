@@ -1,4 +1,4 @@
-"""The verb that finds structure: orders and delay, whether anything is nonlinear, and terms or a network."""
+"""The verb `select`: orders and delay, a test for nonlinearity, and terms or a network."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class LearnerSearch(Search):
 
     @property
     def chosen(self) -> MLP | None:
-        """That of the choice; None for physics alone."""
+        """Network of the choice; None for physics alone."""
         return self.learners[self.place]
 
 
@@ -118,7 +118,9 @@ def _largest(lags: Lags) -> int:
 def _on_fold(
     given: Any, item: tuple[MLP | None, int], tell: Callable[..., None]
 ) -> tuple[float, float]:
-    """Mean squared error of free runs on a block of a fit without it, infinite without a model.
+    """Return the mean squared error of free runs on a block that was held out, and seconds.
+
+    The error is infinite without a model.
 
     And seconds.
     """
@@ -158,12 +160,12 @@ there is.
 
 
 def _unheard(stage: str, rung: Any) -> None:
-    """Nobody listens."""
+    """Ignore a model; used where nobody listens."""
 
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """What `select` returns.
+    """Result of `select`.
 
     Print `selection.summary()`; take `selection.table`; go on with `selection.estimate()`.
     """
@@ -191,7 +193,7 @@ class Selection:
 
     @property
     def lags(self) -> Lags:
-        """The orders that were chosen, and lags of inputs that have no linear effect but a nonlinear one."""
+        """Chosen orders, and lags of inputs that have only a nonlinear effect."""
         chosen = self.reach or self.orders.chosen
         return Lags(chosen.na, chosen.nb, chosen.nk)
 
@@ -208,12 +210,12 @@ class Selection:
 
     @cached_property
     def shares(self) -> dict[str, float]:
-        """Of every chosen term, how often it is chosen over random halves of the data."""
+        """Share of random halves of the data on which each chosen term is chosen again."""
         return {} if self.terms is None else self.terms.shares()
 
     @property
     def options(self) -> dict[str, Any]:
-        """Return what `estimate` is to be called with, beside record and baseline."""
+        """Arguments for `estimate`, beside record and baseline."""
         judged = (
             {"regularization": "none", "fallback": False} if isinstance(self.learner, Terms) else {}
         )
@@ -300,7 +302,7 @@ def select(
     engine: Engine | None = None,
     collinear: float = COLLINEAR,
 ) -> Selection:
-    """Choose orders and delay, and terms or a network, by free runs on blocks of the data that are held out.
+    """Choose orders and delay, and terms or a network, by free runs on held-out blocks of the data.
 
     Terms are picked by what they lower the error by beside the physics, which is projected out
     (forward orthogonal regression on the sensitivities of the free run). The choice is the smallest
@@ -455,7 +457,7 @@ def _with_every_input(chosen: Orders, largest: Orders) -> Orders:
 def _reached(
     chosen: Orders, asked: Orders, tested: Nonlinearity | None, names: Sequence[str]
 ) -> Orders:
-    """Return the chosen orders with the inputs whose functions matter although no linear lag of them does."""
+    """Return the chosen orders with the inputs that have only a nonlinear effect."""
     nb, nk = list(chosen.nb), list(chosen.nk)
     for i, name in enumerate(names):
         if chosen.nb[i] or tested is None or not tested.found:
@@ -474,7 +476,7 @@ def _reached(
 def _terms(
     problem: Problem, learner: Terms, largest: Orders, criterion: Criterion, collinear: float
 ) -> tuple[TermRuns, list[Warning]]:
-    """Return the library of terms laid out, and what is to be told of it."""
+    """Return the prepared library of terms, and its warnings."""
     outputs, inputs = problem.outputs, tuple(channel.name for channel in problem.record.inputs)
     lags = Lags(largest.na, largest.nb, largest.nk).layout(outputs, inputs)
     known = regressor_of(problem.baseline, None, None, outputs, inputs)[0]
