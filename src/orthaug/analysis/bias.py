@@ -196,18 +196,22 @@ def bias_table(
 ) -> tuple[SuspectedBias, ...]:
     """Return one `SuspectedBias` for each suspect, under the measure of `projection`.
 
-    Args: projection: of the rows of φ, their outputs multiplied by `gain`. names: the nt
-        parameters. suspects: their forms; `deltas` (ns, N, ny) their values, as
-        `suspects.suspect_columns` gives them. gain: a matrix (ny, ny) for all rows, or one of each
-        row (N, ny, ny); None for none. theta: θ (nt,), for relative biases. physical: a row of
-        dp/dθ (nt,) for each physical parameter p, by name. learned: the learner's values (N, ny) in
-        the outputs' units, projected or not. certify: search for certificates, a linear program per
-        suspect. directions: (nt, s) along which θ is split; None for all. absorbed: what the fit
-        makes of each suspect, where `directions` are not all.
+    Args:
+        projection: of the rows of φ, their outputs multiplied by `gain`.
+        names: the nt parameters.
+        suspects: their forms; `deltas` (ns, N, ny) their values, as `suspects.suspect_columns`
+            gives them.
+        gain: a matrix (ny, ny) for all rows, or one of each row (N, ny, ny); None for none.
+        theta: θ (nt,), for relative biases.
+        physical: a row of dp/dθ (nt,) for each physical parameter p, by name.
+        learned: the learner's values (N, ny) in the outputs' units, projected or not.
+        certify: search for certificates, a linear program per suspect.
+        directions: (nt, s) along which θ is split; None for all.
+        absorbed: what the fit makes of each suspect, where `directions` are not all.
 
-    Raises: InputError: shapes that do not fit, values that are not finite, suspects of one name;
-        RankError for
-            physics that the points do not determine.
+    Raises:
+        InputError: shapes that do not fit, values that are not finite, suspects of one name;
+            RankError for physics that the points do not determine.
     """
     names = tuple(names)
     if not names:

@@ -41,8 +41,9 @@ def divergence_scaling(
     experiment. None where no run up to `largest` diverges, as without a state; at most 1 where the
     record's own run does, and 0 where it does with its inputs at their means.
 
-    Raises: InputError: a record that does not fit the model, or a `largest` that is not above 1 and
-        at most 10⁴.
+    Raises:
+        InputError: a record that does not fit the model, or a `largest` that is not above 1 and at
+            most 10⁴.
     """
     if not 1 < check_number(largest, "largest", positive=True) <= _LARGEST_FACTOR:
         raise InputError(

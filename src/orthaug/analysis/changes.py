@@ -104,11 +104,14 @@ def model_changes(
 ) -> tuple[Change, ...]:
     """Return the best change of each kind that is worth making, the best one first.
 
-    Args: response: of the training data, whose errors are to be explained: the prediction, or with
-        `simulates` the free run. skip: its leading rows that do not count. one_step: the
-        prediction, for a free run that is far from what was measured; None to go along it all the
-        same. functions: what functions of the regressor are known to explain of the errors one step
-        ahead.
+    Args:
+        response: of the training data, whose errors are to be explained: the prediction, or with
+            `simulates` the free run.
+        skip: its leading rows that do not count.
+        one_step: the prediction, for a free run that is far from what was measured; None to go
+            along it all the same.
+        functions: what functions of the regressor are known to explain of the errors one step
+            ahead.
     """
     off = float(np.max(rms_errors(response, skip) / fit.problem.deviation))
     with one_blas_thread():

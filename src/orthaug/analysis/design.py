@@ -231,13 +231,18 @@ def design_input(
 
     The limits are minimum ≤ u ≤ maximum and |u_k − u_{k−1}| ≤ rate · Ts.
 
-    Args: baseline: made of terms; of channels with the names `outputs` and `inputs`. sampling_time:
-        Ts, s. samples: N. amplitude: the limits are ±amplitude, in the channel's unit; or `minimum`
-        and `maximum` instead. rate: in the channel's unit per second, counted from 0, or from the
-        limit next to it, before the first sample. suspects: with their coefficients; without any
-        the design has least variance (A-optimal for W θ). noise: standard deviation of the equation
-        noise in the output's unit, or one for each; 0 counts the bias alone.
-            Without suspects 0 means 1, and `std` is per unit of noise.
+    Args:
+        baseline: made of terms; of channels with the names `outputs` and `inputs`.
+        sampling_time: Ts, s.
+        samples: N.
+        amplitude: the limits are ±amplitude, in the channel's unit; or `minimum` and `maximum`
+            instead.
+        rate: in the channel's unit per second, counted from 0, or from the limit next to it, before
+            the first sample.
+        suspects: with their coefficients; without any the design has least variance (A-optimal for
+            W θ).
+        noise: standard deviation of the equation noise in the output's unit, or one for each; 0
+            counts the bias alone. Without suspects 0 means 1, and `std` is per unit of noise.
         theta: θ to simulate with (nt,); None for the baseline's initial values.
         weights: W, (nt,) for a diagonal, or (m, nt), such as dp/dθ / p for physical parameters p;
             None for 1/|θ|.
@@ -247,9 +252,10 @@ def design_input(
         initial_outputs: before the first row, a number, (ny,) or (largest lag, ny).
         iterations: the most improvements of one pattern; `seed` is that of the random candidates.
 
-    Raises: InputError: numbers out of range, unknown channels, a suspect without coefficient, θ of
-        0 without `weights`,
-            a simulated output that runs away, no candidate within the cap on the condition number.
+    Raises:
+        InputError: numbers out of range, unknown channels, a suspect without coefficient, θ of 0
+            without `weights`, a simulated output that runs away, no candidate within the cap on the
+            condition number.
     """
     sampling_time = check_number(sampling_time, "sampling_time", positive=True)
     limits = input_limits(amplitude, minimum, maximum), rate, condition

@@ -63,8 +63,9 @@ def diagnose(
     for its states are not measured, with a test of the terms that its equations could lack
     (`missing`).
 
-    Args: one_step: the prediction of the training data, if it is there already; likewise their
-        `free_run`.
+    Args:
+        one_step: the prediction of the training data, if it is there already; likewise their
+            `free_run`.
 
     Raises:
         InputError: an estimate that is not usable.

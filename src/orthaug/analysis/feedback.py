@@ -129,8 +129,10 @@ def feedback(
     Radii below 1 do not make a nonlinear run stable, nor do some above 1 make it unstable. They say
     where to look.
 
-    Args: along: "simulation", states of the free run up to where it diverges, or "measured", as the
-        outputs give them. response: the model's free run of the record, if it is there already.
+    Args:
+        along: "simulation", states of the free run up to where it diverges, or "measured", as the
+            outputs give them.
+        response: the model's free run of the record, if it is there already.
 
     Raises:
         InputError: a record that does not fit the model, or another `along`.

@@ -58,9 +58,11 @@ def stability(
 ) -> Stability:
     """Return all checks of a model on a record, with a text that says what they mean.
 
-    Args: response: the model's free run of the record, if it is there already. x: the record's
-        usable regressors (N, nx) in the model's layout, if they are stacked already. box, largest:
-        as in `contraction` and `divergence_scaling`.
+    Args:
+        response: the model's free run of the record, if it is there already.
+        x: the record's usable regressors (N, nx) in the model's layout, if they are stacked
+            already.
+        box, largest: as in `contraction` and `divergence_scaling`.
 
     Raises:
         InputError: as the single checks.

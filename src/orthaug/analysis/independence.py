@@ -121,10 +121,12 @@ def against_regressor(
     bins. Equal values share a bin. None for a regressor or residual that is constant or not finite,
     or fewer than 10 rows.
 
-    Args: residual, regressor: per experiment (N_i,). bins: B at most; fewer where values repeat, or
-        where bins would have fewer than 5 rows. centred: test against the mean of the residual
-        instead of zero, with B − 1 degrees of freedom. a: `whitening(residual)`, where it is known
-        already.
+    Args:
+        residual, regressor: per experiment (N_i,).
+        bins: B at most; fewer where values repeat, or where bins would have fewer than 5 rows.
+        centred: test against the mean of the residual instead of zero, with B − 1 degrees of
+            freedom.
+        a: `whitening(residual)`, where it is known already.
     """
     e, x = pieces_of(residual), np.concatenate(pieces_of(regressor))
     a = whitening(e) if a is None else a

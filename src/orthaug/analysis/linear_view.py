@@ -186,11 +186,13 @@ class LinearView:
     def to_control(self, time: str = "discrete") -> control.StateSpace:
         """Return the system for python-control, with the names of states, inputs and outputs.
 
-        Args: time: "discrete" at the sampling time, or "continuous". Dead time is no part of a
-            continuous system.
+        Args:
+            time: "discrete" at the sampling time, or "continuous". Dead time is no part of a
+                continuous system.
 
-        Raises: InputError: python-control is not installed, another `time`, or no system in
-            continuous time.
+        Raises:
+            InputError: python-control is not installed, another `time`, or no system in continuous
+                time.
         """
         check_choice(time, ("discrete", "continuous"), "`time`")
         try:

@@ -56,17 +56,19 @@ def linearize(
 ) -> Linearization:
     """Return the model about its points of rest as linear systems, with 95 % intervals.
 
-    Args: model: a fitted model; of a fit the record is that of training. at: inputs that are held,
-        and outputs or states that are fixed, `"force=0, position=1"` or a mapping. Inputs
-            that nobody names are 0, or their means over the record; with outputs or states fixed,
-            they are looked for.
+    Args:
+        model: a fitted model; of a fit the record is that of training.
+        at: inputs that are held, and outputs or states that are fixed, `"force=0, position=1"` or a
+            mapping. Inputs that nobody names are 0, or their means over the record; with outputs or
+            states fixed, they are looked for.
         record: measured data whose own frequency response is put beside.
         frequencies: of the frequency response [Hz]; by default 400 up to Nyquist's, on a
             logarithmic grid.
         continuous: how a lagged model is converted to continuous time, zoh or tustin.
 
-    Raises: InputError: no point of rest, a name that the model does not have, a record that does
-        not fit.
+    Raises:
+        InputError: no point of rest, a name that the model does not have, a record that does not
+            fit.
 
     Examples:
         >>> import orthaug as oa

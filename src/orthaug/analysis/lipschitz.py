@@ -69,8 +69,9 @@ def lipschitz(model: Model, record: Record, *, x: Matrix | None = None) -> Lipsc
     fulfils the condition. A model whose state is not made of measured signals has no such
     predictor: None.
 
-    Args: x: the record's usable regressors (N, nx) in the model's layout, if they are stacked
-        already.
+    Args:
+        x: the record's usable regressors (N, nx) in the model's layout, if they are stacked
+            already.
 
     Raises:
         InputError: a record that does not fit the model, or has no outputs.

@@ -29,9 +29,12 @@ _ROUNDING = 1e-9  # of a parameter: an end of its interval that lies so little o
 class MeasureLinearization:
     """Linearization that biases under a measure are computed on.
 
-    Args: weighed: the measure's points and the physics there, of one parameter or more. physics:
-        the map from physical parameters to θ. theta: θ̂ for relative biases and for dp/dθ. learned:
-        f at the measure's points (M, ny) after a fit, to tell how much of it a suspect explains.
+    Args:
+        weighed: the measure's points and the physics there, of one parameter or more.
+        physics: the map from physical parameters to θ.
+        theta: θ̂ for relative biases and for dp/dθ.
+        learned: f at the measure's points (M, ny) after a fit, to tell how much of it a suspect
+            explains.
         directions: (nθ, s) along which θ is split; None for all.
     """
 
@@ -110,9 +113,10 @@ def bias_under(
 
     It is that of θ and, to first order, of the physical parameters.
 
-    Args: suspects: those that were named; without any, the usual ones that have an effect.
+    Args:
+        suspects: those that were named; without any, the usual ones that have an effect.
         certify_usual: seek certificates, a linear program each, for suspects that no one named,
-        too.
+            too.
     """
     named, problem, points = bool(suspects), linearization.problem, linearization.weighed.points
     table = linearization.table(
@@ -210,8 +214,10 @@ def physical_with_bias(
     The interval of p is that of θ in the direction in which p moves most, mapped: p of both of its
     ends, or p's bound where an end has none. Biases are NaN where θ̂ less its bias has no p.
 
-    Args: bias: of θ̂. covariance: of θ̂, by which p is weighted; `spread` counts also what is not
-        known of the bias.
+    Args:
+        bias: of θ̂.
+        covariance: of θ̂, by which p is weighted; `spread` counts also what is not known of the
+            bias.
     """
     physics, problem = linearization.physics, linearization.problem
     assert physics is not None

@@ -186,9 +186,9 @@ class MotionLinearization:
     ) -> list[TermBias]:
         """Return the bias by every suspect; empty where the free run has no sensitivities.
 
-        Args: used: weights that a fit used, where it is asked what its residual tells; `steps` of a
-            block, where its
-                errors are coloured.
+        Args:
+            used: weights that a fit used, where it is asked what its residual tells; `steps` of a
+                block, where its errors are coloured.
         """
         added = tuple(suspect.term(self.motion) for suspect in suspects)
         response = respond_to(self.place, added)

@@ -147,9 +147,10 @@ def motion_budget(
 
     None where none explains enough.
 
-    Args: table: what every suspect does to the fit. smooth: the same of terms that stand beside
-        those of the table (`softened_bias`), named where they explain
-            clearly more of a learner.
+    Args:
+        table: what every suspect does to the fit.
+        smooth: the same of terms that stand beside those of the table (`softened_bias`), named
+            where they explain clearly more of a learner.
         families: the same of members of the catalogue (`families_of`).
         declared: the suspects that were declared; by default those of the table.
     """

@@ -182,19 +182,23 @@ def design_motion_input(
 
     The limits are minimum ≤ u ≤ maximum and |u_k − u_{k−1}| ≤ rate · Ts.
 
-    Args: sampling_time: Ts, s. samples: N. amplitude: the limits are ±amplitude, in the channel's
-        unit; or `minimum` and `maximum` instead. rate: in the channel's unit per second. suspects:
-        with their coefficients; without any the design has least variance. noise: standard
-        deviation of the sensor's noise, or one of each output; 0 counts the bias alone. Without
-            suspects 0 means 1.
+    Args:
+        sampling_time: Ts, s.
+        samples: N.
+        amplitude: the limits are ±amplitude, in the channel's unit; or `minimum` and `maximum`
+            instead.
+        rate: in the channel's unit per second.
+        suspects: with their coefficients; without any the design has least variance.
+        noise: standard deviation of the sensor's noise, or one of each output; 0 counts the bias
+            alone. Without suspects 0 means 1.
         parameters: p to simulate with; None for the initial values.
         substeps: of the integrator in a sample; None for the motion's, 1 where that has none.
         weights: W, (np,) for a diagonal, or (m, np); None for 1/|p|.
         condition, channel, known_inputs, seed, iterations: as in `design_input`.
 
-    Raises: InputError: numbers out of range, a suspect without coefficient, a motion that runs
-        away, no candidate within
-            the cap on the condition number.
+    Raises:
+        InputError: numbers out of range, a suspect without coefficient, a motion that runs away, no
+            candidate within the cap on the condition number.
     """
     sampling_time = check_number(sampling_time, "sampling_time", positive=True)
     limits = input_limits(amplitude, minimum, maximum), rate, condition

@@ -244,8 +244,9 @@ def substep_bias(fit: MotionEstimate) -> SubstepBias | None:
     Args:
         fit: of a motion, from `estimate`.
 
-    Returns: p̂ less what a fit with twice the substeps would give, to first order, in the units of
-        p and in standard errors.
+    Returns:
+        p̂ less what a fit with twice the substeps would give, to first order, in the units of p and
+        in standard errors.
     """
     motion, segmented, numbers = fit.problem.motion, fit.segmented, fit.model.numbers
     slope, substeps = fit.split_by.slope, segmented.dynamics.substeps

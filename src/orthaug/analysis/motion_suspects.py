@@ -88,8 +88,9 @@ class MotionSuspect:
             width: in the unit of `on`.
             factor: an expression that multiplies the kind's.
 
-        Raises: InputError: an unknown kind, an argument that is missing, or that the kind does not
-            take.
+        Raises:
+            InputError: an unknown kind, an argument that is missing, or that the kind does not
+                take.
         """
         text, label, _ = written(kind, on, width, _balanced, "v")
         if factor is not None:
@@ -203,8 +204,9 @@ def softened(
 ) -> tuple[MotionSuspect, ...]:
     """Return smooth forms of friction: each suspect that jumps as tanh(v/width), of several widths.
 
-    Args: p: parameters (np,); with states x (M, nx) and inputs u (M, nu) they tell the widths, in
-        median sizes.
+    Args:
+        p: parameters (np,); with states x (M, nx) and inputs u (M, nu) they tell the widths, in
+            median sizes.
     """
     found = []
     for suspect in suspects:

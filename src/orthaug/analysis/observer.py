@@ -35,16 +35,16 @@ from orthaug.models.stepping import checked_row, one_experiment
 class Observer:
     """An extended Kalman filter of a fitted model, lagged or a motion.
 
-    Args: model: the model, or the fit: of a fit the residual tells how large the noises are
-        (`diagnose`), and where both
-            are there the likelihood of its data does; a model that `orthaug fit` saved carries what
-            they told.
+    Args:
+        model: the model, or the fit: of a fit the residual tells how large the noises are
+            (`diagnose`), and where both are there the likelihood of its data does; a model that
+            `orthaug fit` saved carries what they told.
         noise: the covariances, where they are known better: of the disturbances in a sample, of the
             sensors.
 
-    Raises: InputError: a model whose learner cannot be differentiated, or that has no estimate of
-        its noise; covariances
-            that are none, or of other sizes.
+    Raises:
+        InputError: a model whose learner cannot be differentiated, or that has no estimate of its
+            noise; covariances that are none, or of other sizes.
     """
 
     model: Any
@@ -119,8 +119,9 @@ class Observer:
 
         A motion's first rows, which tell its state, have no value, as in its `predict`.
 
-        Raises: InputError: other channels, a horizon below 1, too few rows, or an estimate that
-            leaves all bounds.
+        Raises:
+            InputError: other channels, a horizon below 1, too few rows, or an estimate that leaves
+                all bounds.
         """
         horizon = check_count(horizon, "horizon", of="steps")
         record = self._record(record)

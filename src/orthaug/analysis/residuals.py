@@ -122,8 +122,9 @@ def analyse(
         level: of every test; the bands hold one value with probability 1 − level.
         fitted: dynamic parameters whose fit has used up degrees of freedom of Ljung-Box.
 
-    Raises: InputError: experiments, rows or columns that do not match, a name twice, or a setting
-        out of range.
+    Raises:
+        InputError: experiments, rows or columns that do not match, a name twice, or a setting out
+            of range.
 
     Examples:
         >>> e, u = np.random.default_rng(0).normal(size=(2, 500, 1))

@@ -108,10 +108,11 @@ def multisine(
 def prbs(samples: int, *, amplitude: float, hold: int = 1, bits: int | None = None) -> Vector:
     """Return a maximum-length pseudo-random binary sequence ±amplitude, `hold` samples a bit.
 
-    Args: samples: N. hold: samples a bit: the sequence is flat up to about 0.4/(hold · Ts) Hz.
+    Args:
+        samples: N.
+        hold: samples a bit: the sequence is flat up to about 0.4/(hold · Ts) Hz.
         bits: of the shift register, whose period is (2^bits − 1) · hold samples; None for the
-        shortest that
-            does not repeat within N.
+            shortest that does not repeat within N.
 
     Raises:
         InputError: numbers out of range, more samples than the longest register gives.
@@ -284,11 +285,12 @@ def limit_rate(u: Vector, largest_step: float, start: float | None = None) -> Ve
     `v_k = v_{k−1} + clip(u_k − v_{k−1}, ±largest_step)`; it stays within the range of u and
     `start`.
 
-    Args: u: the wanted signal (N,). largest_step: in the unit of u, per sample (rate limit times
-        the sampling time). start: the value before the first sample; None for `u[0]`. Symmetries of
-        u survive only up to the
-            run-in, so limit the rate of a signal before `sign_symmetric`, not after, where the seam
-            may jump.
+    Args:
+        u: the wanted signal (N,).
+        largest_step: in the unit of u, per sample (rate limit times the sampling time).
+        start: the value before the first sample; None for `u[0]`. Symmetries of u survive only up
+            to the run-in, so limit the rate of a signal before `sign_symmetric`, not after, where
+            the seam may jump.
 
     Raises:
         InputError: a signal that is not finite, a step that is not positive.
@@ -320,10 +322,12 @@ def space_filling(
     once; within its level the successive visits take the van der Corput numbers. Use it where the
     regressor is `u[k-nk] … u[k-nk-nb+1]`, with order = nb: nk is only a delay.
 
-    Args: samples: N, at least 2^order + order − 1; what is left after one circuit runs through it
-        again. order: lags to fill, 1 to 20. What it gains over white noise shrinks with every lag:
-        the fill distance is 0.63
-            of the white median at 1000 samples of 2 lags, 0.72 at 1500 of 3, 0.84 at 4000 of 5.
+    Args:
+        samples: N, at least 2^order + order − 1; what is left after one circuit runs through it
+            again.
+        order: lags to fill, 1 to 20. What it gains over white noise shrinks with every lag: the
+            fill distance is 0.63 of the white median at 1000 samples of 2 lags, 0.72 at 1500 of 3,
+            0.84 at 4000 of 5.
         seed: of the circuit.
         spread: share of a level's width that is used; 1 for all, the most uniform; 0 for the m
             levels alone, the smallest fill distance and, over one circuit, exact symmetry.

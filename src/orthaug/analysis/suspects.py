@@ -77,8 +77,9 @@ class Suspect:
     its size, in the output's unit per unit of the expression, None where there is none. `output`
     may be left out where there is only one. `on` is what a known kind acts on.
 
-    Raises: InputError: an expression that is not arithmetic on lagged channels, a name or a number
-        that is none.
+    Raises:
+        InputError: an expression that is not arithmetic on lagged channels, a name or a number that
+            is none.
 
     Examples:
         >>> Suspect("drag", "v[k-1]*abs(v[k-1])", coefficient=-0.1).lags
@@ -140,9 +141,9 @@ class Suspect:
             output, coefficient, constants: as in `Suspect`.
             name: default the kind with its arguments, such as `coulomb(v[k-1])`.
 
-        Raises: InputError: an unknown kind, an argument that is missing, that the kind does not
-            take, or that
-                does not parse.
+        Raises:
+            InputError: an unknown kind, an argument that is missing, that the kind does not take,
+                or that does not parse.
 
         Examples:
             >>> Suspect.of("dead_zone", on="u[k-1]", width=0.5).expression
@@ -181,8 +182,9 @@ class Suspect:
             x: regressors (N, nx) in the order of `layout`.
             outputs: names of the ny outputs.
 
-        Raises: InputError: lags that the layout lacks, an output that is missing or unknown, a
-            value that is not finite.
+        Raises:
+            InputError: lags that the layout lacks, an output that is missing or unknown, a value
+                that is not finite.
         """
         values, column = np.zeros((len(x), len(outputs))), self.form(x, layout)
         bad = np.flatnonzero(~np.isfinite(column))
@@ -288,8 +290,9 @@ def data_width(
     Half of the moving samples then lie inside a dead zone, a saturation or a Stribeck peak, so that
     the data show both sides of it.
 
-    Raises: InputError: an expression that does not parse, that is not finite, or that is zero on
-        all rows.
+    Raises:
+        InputError: an expression that does not parse, that is not finite, or that is zero on all
+            rows.
     """
     with np.errstate(all="ignore"):
         size = np.abs(_evaluate(parse(on, constants), x, layout, f"'{on}'"))

@@ -302,8 +302,10 @@ def extrapolation(part: str, x: Matrix, training: Matrix, layout: Layout) -> lis
     Not told is what noise does to extreme values: excursions by less than a hundredth of the range,
     or on few rows.
 
-    Args: part: its name. x: its regressors (N, nx), in the order of the layout; `training` those of
-        the training data.
+    Args:
+        part: its name.
+        x: its regressors (N, nx), in the order of the layout; `training` those of the training
+            data.
     """
     leaving: dict[str, Extrapolation] = {}
     for j, lag in enumerate(layout):
@@ -343,14 +345,16 @@ def verdict(
 ) -> Verdict:
     """Return whether the learner helps, by free runs of a fit and of physics alone on new records.
 
-    Args: fit: with a learner. alone: the same physics without, `estimate(…, learner=None)`, trained
-        on the same record. tests: a record, or several by name. A free run starts from the measured
-        outputs before its first row, that
-            of a motion from the state by which it follows its first rows.
+    Args:
+        fit: with a learner.
+        alone: the same physics without, `estimate(…, learner=None)`, trained on the same record.
+        tests: a record, or several by name. A free run starts from the measured outputs before its
+            first row, that of a motion from the state by which it follows its first rows.
         skip: leading samples of each experiment that are not scored.
 
-    Returns: `code` is helps, no_help or hurts; `text` says why, with the errors of both and where
-        the training range is left; `trials` are the errors.
+    Returns:
+        `code` is helps, no_help or hurts; `text` says why, with the errors of both and where the
+        training range is left; `trials` are the errors.
 
     Raises:
         InputError: a record without outputs or with other channels; an estimate that is not usable.

@@ -353,9 +353,10 @@ def explain(
     tried, and products of it. Each is taken as the learner would show it, for a smooth one shows no
     jumps (`selection.as_shown`).
 
-    Args: model: a model with a learner, or what `estimate` returned. record: best the one that it
-        was trained on; may be left out for an estimate. Outputs are needed but for a
-            motion, whose free run then starts from 0.
+    Args:
+        model: a model with a learner, or what `estimate` returned.
+        record: best the one that it was trained on; may be left out for an estimate. Outputs are
+            needed but for a motion, whose free run then starts from 0.
         suspects: further terms to try.
         degree, functions: of the products, as in `Terms`.
         most: terms at most.

@@ -103,10 +103,12 @@ def forward(
 ) -> list[ForwardStep]:
     """Pick up to `most` columns, one after another, beside those that are `known`.
 
-    Args: least: share of the squared error left that a column must take away. within: share of a
-        column's deviation; one of which less is left lies within the span of those that are in.
+    Args:
+        least: share of the squared error left that a column must take away.
+        within: share of a column's deviation; one of which less is left lies within the span of
+            those that are in.
         constant: the column of a constant, beside which a column's deviation is what is left; None
-        for its norm.
+            for its norm.
     """
     gram, right, square, _ = equations.scaled()
     gram, right, square = gram.copy(), right.copy(), float(square)

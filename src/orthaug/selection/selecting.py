@@ -308,10 +308,11 @@ def select(
     (forward orthogonal regression on the sensitivities of the free run). The choice is the smallest
     model within one standard error of the best, or within 2 % of its error.
 
-    Args: record: measured inputs and one output. baseline: the physics, which is always in the
-        model; None for none. learner: `Terms(…)`, whose library is chosen from; `MLP(…)`, whose
-        width and inputs are chosen; None to choose
-            linear lags only.
+    Args:
+        record: measured inputs and one output.
+        baseline: the physics, which is always in the model; None for none.
+        learner: `Terms(…)`, whose library is chosen from; `MLP(…)`, whose width and inputs are
+            chosen; None to choose linear lags only.
         lags: the largest orders, and the smallest delay; by default na = 4, nb = 5 from the first
             lag of an input that the physics reads, or from 1.
         criterion: what models are trained on; None for the free run.

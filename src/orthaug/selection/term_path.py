@@ -287,10 +287,10 @@ def climb(
 ) -> TermPath:
     """Return the path of up to `most` terms forward, and from the best model on backward.
 
-    Args: near: lags whose terms have a way forward of their own, before the one that has all.
+    Args:
+        near: lags whose terms have a way forward of their own, before the one that has all.
         linear: terms that the last of these ways begins with, the linear lags that the choice of
-        orders has beside the
-            physics.
+            orders has beside the physics.
 
     Raises:
         InputError: too few rows for so many blocks.

@@ -291,9 +291,10 @@ class TermRuns:
 
         Its chosen terms are in the error.
 
-        Args: able: terms that may be chosen, beside those that are; the columns of others are zero.
+        Args:
+            able: terms that may be chosen, beside those that are; the columns of others are zero.
             scored: which steps of the segments count, or chunks of rows one step ahead; None for
-            all.
+                all.
         """
         nt, terms = len(point.c), len(self.library)
         taken = range(terms) if able is None else sorted({*able, *point.chosen})
