@@ -24,7 +24,7 @@ from orthaug._base.parallel import one_blas_thread
 from orthaug.physics.output_weights import times
 from orthaug.physics.problem import Problem
 
-_MOST_WAVES = 100  # tanh functions of z that stand for any function of it
+_MOST_WAVES = 100  # tanh functions of z, for any function of it
 _ROWS_PER_WAVE = 20
 WAVES = 24  # the same, before there is a fit
 _STEEPEST = 30.0  # of their slopes, in units of 1 / range of z
@@ -38,7 +38,7 @@ class TermAfterFit:
     """A term of coefficient 1 after the fit.
 
     `moved` (nθ,) is what it adds to c. `held` (M, ny) is what the learner holds of it on a
-    measure's points. `seen` tells whether it is a function of what the learner sees; None where the
+    measure's points. `seen` is whether it is a function of what the learner sees; None where the
     learner could imitate all of the physics.
     """
 

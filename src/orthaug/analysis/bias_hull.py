@@ -28,7 +28,7 @@ from orthaug.inference.covariance import interval, reach
 _AS_CLOSE = 12.0  # over 17 forms, half of them in no catalogue, the right bias was within in 130 draws; in 128 by 8
 MOST_PHYSICS = 0.986  # cosine with the physics: beyond it a term is six times larger than what the learner shows of it
 _LEAST = 0.8  # of the best share: what explains less is no likely cause
-_TOLD = 4  # parameters that a warning lists at most
+_LISTED = 4  # parameters that a warning lists at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,8 +109,8 @@ def undetermined_warning(
     names: Sequence[str], candidates: Sequence[Candidate], remedies: Sequence[str]
 ) -> Warning:
     """Return the warning on parameters that the hull leaves open, with reason and remedy."""
-    shown = ", ".join(names[:_TOLD]) + (
-        f" and {len(names) - _TOLD} more" if len(names) > _TOLD else ""
+    shown = ", ".join(names[:_LISTED]) + (
+        f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
     )
     apart = sorted(candidates, key=lambda c: float(np.sum(np.sign(c.moved) * c.moved**2)))
     pair = [apart[0], apart[-1]] if len(apart) > 1 else apart

@@ -22,7 +22,7 @@ from orthaug.models.on_records import RUNAWAY
 
 _LARGEST_FACTOR = 1e4  # outputs of a stable linear model grow with its inputs, and 10⁶ times the largest is "diverged"
 _SIDE_BY_SIDE = 16  # runs of one compiled call
-_MARGIN = 1.5  # a factor below is told as a warning
+_MARGIN = 1.5  # a factor below is a warning
 _CLOSE = 1.05  # ratio of two factors at which the bisection ends
 
 Diverging = Callable[[list[float]], np.ndarray]
@@ -81,11 +81,11 @@ def margin(factor: float | None, searched: float, driven: bool) -> tuple[str, st
             "small_margin" if factor is not None else "",
         )
     stays, times = ("stays within", searched) if factor is None else ("leaves", factor)
-    told = (
+    text = (
         f"The free run {stays} all bounds with the inputs' deviations from their means "
         f"{times:.4g} times as large."
     )
-    return told, "small_margin" if factor is not None and factor < _MARGIN else ""
+    return text, "small_margin" if factor is not None and factor < _MARGIN else ""
 
 
 def _doubled(largest: float) -> list[float]:

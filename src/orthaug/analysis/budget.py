@@ -4,8 +4,8 @@ With F the learner's values under the measure and Δ a cause's, the coefficient 
 and the bias, estimate less truth, `Φ_μ⁺Δ` times it. One cause is named: the declared suspect that
 explains most of ‖P⊥F‖² if that is enough, else the usual suspect or product of lags that does, or
 the member of a family (`catalogue`) that explains clearly more; one of each output where none is
-sure to be all of it. The interval is the hull over all causes that noise cannot tell from it
-(`bias_hull`).
+sure to be all of it. The interval is the hull over all causes that noise cannot separate
+from it (`bias_hull`).
 """
 
 from __future__ import annotations
@@ -134,12 +134,12 @@ def _freed(
 LEAST_SHARE = 0.5  # of the learner's energy that a cause must explain to be named
 _NOTHING = 0.01  # of the noise: a learner that is smaller found nothing that could be explained
 _FEWEST_LEFT = 5  # rows beyond what was fitted: where fewer are left any term explains the learner
-AS_MUCH = 0.98  # of what the cause explains: a rival cannot be told from it
-SURE_SHARE = 0.9  # from which on a cause is told without a doubt
+AS_MUCH = 0.98  # of what the cause explains: a rival is as good
+SURE_SHARE = 0.9  # from which on a cause is named without a doubt
 _NEAR = 0.5  # of what the cause explains: a rival that is named beside it
 _MOST_RIVALS = 3
 _ROUNDING = 1e-9  # of a parameter: a bias that no one can speak of
-_TOLD = 4  # parameters that a warning lists at most
+_LISTED = 4  # parameters that a warning lists at most
 
 
 @dataclass(frozen=True)
@@ -154,7 +154,7 @@ class ParameterBias:
     errors: float | None
     """Its size in standard errors; None where there are none."""
     ci95: tuple[float, float] | None
-    """The hull over all causes that noise cannot tell apart; None where that determines nothing."""
+    """The hull over all causes that noise cannot separate; None where that determines nothing."""
     determined: bool = True
     """Whether the data determine the parameter beside this learner: the hull is no wider than the
     value itself.
@@ -257,16 +257,16 @@ def budget_on(
     rows, warnings = (), []
     if linearization.physics is not None:
         rows, warnings = _physical_rows(linearization, fit, candidates, moved, causes, other)
-    told = (
+    raised = (
         _warning(own, cause, (*rows, *parameters), suspects, own is not linearization)
         for own, cause in found
     )
-    told = [warning for warning in told if warning is not None]
+    raised = [warning for warning in raised if warning is not None]
     open_ones = [row.name for row in (*rows, *parameters) if not row.determined]
     if open_ones:
         own, cause = found[0]
-        told.append(undetermined_warning(open_ones, candidates, remedies(own, cause, open_ones)))
-    return Budget(causes, parameters, rows, (*told, *warnings))
+        raised.append(undetermined_warning(open_ones, candidates, remedies(own, cause, open_ones)))
+    return Budget(causes, parameters, rows, (*raised, *warnings))
 
 
 def _norm(rows: Sequence[Vector]) -> Vector | float:
@@ -536,8 +536,8 @@ def left_over(
     They are k directions, each of one unknown size.
 
     What it leaves of the learner counts as biased by as much for its size as the cause, of unknown
-    sign; beside that by what the next best cause makes of it. What may stand instead of the cause
-    is in the hull.
+    sign; beside that by what the next best cause makes of it. Its rivals are in
+    the hull.
     """
     assert cause.explained
     after = _likeliest(
@@ -572,10 +572,17 @@ def parameter_biases(
         if np.isfinite(b):
             errors, relative = float(abs(b) / s) if s > 0 else None, float(b / v) if v else None
             limits = (float(ci[0]), float(ci[1])) if np.isfinite(ci).all() else None
-            told = limits is None or is_determined(float(v), float(s), freedom, *limits)
+            determined = limits is None or is_determined(float(v), float(s), freedom, *limits)
             found.append(
                 ParameterBias(
-                    name, float(b), cause, share, relative, errors, limits if told else None, told
+                    name,
+                    float(b),
+                    cause,
+                    share,
+                    relative,
+                    errors,
+                    limits if determined else None,
+                    determined,
                 )
             )
     return tuple(found)
@@ -590,8 +597,8 @@ def _unbounded(names: Sequence[str], std: Vector, ends: Matrix) -> list[Warning]
     ]
     if not none:
         return []
-    told = f"no interval of {', '.join(none)} counts the bias: some theta within those that do have"
-    return [Warning("physics_not_met", f"{told} no physical parameters.")]
+    text = f"no interval of {', '.join(none)} counts the bias: some theta within those that do have"
+    return [Warning("physics_not_met", f"{text} no physical parameters.")]
 
 
 def _warning(
@@ -610,7 +617,7 @@ def _warning(
     if not large:
         return None
     listed, share, there = (
-        told_biases(large),
+        list_biases(large),
         explains(cause),
         f" in {cause.suspect.output}" if of_one else "",
     )
@@ -640,14 +647,14 @@ def _warning(
     )
 
 
-def told_biases(large: Sequence[ParameterBias]) -> str:
+def list_biases(large: Sequence[ParameterBias]) -> str:
     """Return the largest biases in words."""
-    shown = sorted(large, key=lambda entry: -(entry.errors or 0.0))[:_TOLD]
+    shown = sorted(large, key=lambda entry: -(entry.errors or 0.0))[:_LISTED]
     more = f" and {len(large) - len(shown)} more" if len(large) > len(shown) else ""
-    return f"{', '.join(map(_told_bias, shown))}{more}"
+    return f"{', '.join(map(_describe_bias, shown))}{more}"
 
 
-def _told_bias(entry: ParameterBias) -> str:
+def _describe_bias(entry: ParameterBias) -> str:
     share = "" if entry.relative is None else f", {percent(entry.relative, sign='+')}"
     return (
         f"{entry.name} by {entry.value:+.2g} ({plain_number(entry.errors or 0.0)} standard "

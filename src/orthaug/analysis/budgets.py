@@ -9,7 +9,7 @@ from orthaug._base.checks import check_type
 from orthaug._base.errors import InputError
 from orthaug.analysis.budget import Budget, lagged_budget
 from orthaug.analysis.motion_bias import suspected_bias
-from orthaug.analysis.motion_budget import MotionBudget, told_budget
+from orthaug.analysis.motion_budget import MotionBudget, declared_budget
 from orthaug.analysis.motion_suspects import MotionSuspect
 from orthaug.analysis.suspects import Suspect
 from orthaug.fitting.estimates import Estimate
@@ -40,7 +40,7 @@ def bias_budget(
     Returns:
         The `cause`, the `share` of the learner that it explains, and the bias of each of
         `parameters` and `physical`, estimate less truth, with an interval that covers bias and
-        noise together: the hull over all causes that noise cannot tell apart. Where `determined` is
+        noise together: the hull over all causes that noise cannot separate. Where `determined` is
         False that is wider than the value itself, and there is none.
 
     Raises:
@@ -78,4 +78,4 @@ def bias_budget(
     if not fit.status.ok:
         return None
     declared = cast("Sequence[MotionSuspect]", suspects)
-    return told_budget(fit, declared, suspected_bias(fit, declared) if declared else [])
+    return declared_budget(fit, declared, suspected_bias(fit, declared) if declared else [])

@@ -1,6 +1,6 @@
 """Detection of feedback in the record: past outputs that predict an input beside its own past.
 
-In open loop an input is told by nothing but its own past. Under feedback, past outputs carry the
+In open loop only its own past predicts an input. Under feedback, past outputs carry the
 reference and the disturbances into it (Granger 1969; Söderström and Stoica 1989, ch. 10).
 """
 
@@ -19,8 +19,8 @@ from orthaug.analysis.predictability import BlockSums, Share
 from orthaug.data.record import Record
 
 _LEVEL = 0.001  # of the test, divided by the number of inputs
-_SHARE = 0.02  # of what the own past leaves of an input: what the outputs tell counts from there on
-_SURE = 4.0  # standard errors over blocks by which it stands out
+_SHARE = 0.02  # of what its own past leaves of an input: the share by outputs counts from there on
+_SURE = 4.0  # standard errors over blocks by which it is significant
 _INPUT_LAGS, _OUTPUT_LAGS = 40, 4
 _BESIDE = 10  # lags of the other inputs
 _LEVELS = 6  # of an input that is held: those before the last change that count as its past
@@ -31,7 +31,7 @@ _NOTHING = 1e-3  # of an input's deviation: what its own past leaves is then no 
 _RANK = 1e-10
 _JUMP = 8.0  # times the median size of what its own past leaves of an input
 _ROUNDS = 4
-_PERIODIC = 0.9  # autocorrelation at a period, beyond what short lags tell
+_PERIODIC = 0.9  # autocorrelation at a period, beyond what short lags explain
 
 
 @dataclass(frozen=True)
@@ -49,14 +49,14 @@ class Feedback:
 def feedback_in(record: Record) -> tuple[Feedback, ...]:
     """Return the inputs that surely follow past outputs.
 
-    Of an input that its own past tells, nothing can be said.
+    Nothing can be said of an input that its own past predicts.
     """
     found = []
     with one_blas_thread():
         for j, channel in enumerate(record.inputs):
-            told = _told(record, j)
-            if told is not None and told[1] < _LEVEL / len(record.inputs):
-                found.append(Feedback(channel.name, *told))
+            tested = _input_share(record, j)
+            if tested is not None and tested[1] < _LEVEL / len(record.inputs):
+                found.append(Feedback(channel.name, *tested))
     return tuple(found)
 
 
@@ -81,10 +81,10 @@ def closed_loop(record: Record) -> tuple[Warning, ...]:
     return (Warning("closed_loop", text),)
 
 
-def _told(record: Record, j: int) -> tuple[float, float] | None:
+def _input_share(record: Record, j: int) -> tuple[float, float] | None:
     """Return share and level of the prediction of input j by past outputs.
 
-    None where that is not enough, or cannot be told.
+    None where that is not enough, or cannot be tested.
     """
     every = (
         _rows(e.inputs[:, j], np.delete(e.inputs, j, axis=1), e.outputs) for e in record.experiments
@@ -102,10 +102,10 @@ def _told(record: Record, j: int) -> tuple[float, float] | None:
         )
         pieces = [p for p in pieces if (p[0].shape[1], p[1].shape[1]) == best]
     own, outputs, target = (np.concatenate(parts) for parts in zip(*pieces, strict=True))
-    return told_beside(own, outputs, target)
+    return predicted_share(own, outputs, target)
 
 
-def told_beside(own: Matrix, others: Matrix, target: Vector) -> tuple[float, float] | None:
+def predicted_share(own: Matrix, others: Matrix, target: Vector) -> tuple[float, float] | None:
     """Return the share of a target that `others` predict beside `own`, and its level.
 
     The share is cross-validated, of what `own` leaves; the level is that of a robust Wald test.
@@ -154,10 +154,10 @@ def _wald(columns: Matrix, target: Vector) -> float:
     """Return the level at which all coefficients are 0, robust to unequal errors (White 1980)."""
     u, size, _ = np.linalg.svd(columns, full_matrices=False)
     u = u[:, size > 1e-9 * size.max(initial=0.0)]
-    told = u.T @ target
-    scores = u * (target - u @ told)[:, None]
+    moments = u.T @ target
+    scores = u * (target - u @ moments)[:, None]
     spread = scores.T @ scores * len(target) / max(len(target) - u.shape[1], 1)
-    statistic = float(told @ np.linalg.lstsq(spread, told, rcond=None)[0])
+    statistic = float(moments @ np.linalg.lstsq(spread, moments, rcond=None)[0])
     return float(scipy.special.chdtrc(max(u.shape[1], 1), statistic))
 
 

@@ -40,8 +40,8 @@ _LITTLE_FOLLOWED = 0.1  # correlation of such errors with an input
 _AS_GOOD = 1.05  # free-run error / one-step error up to which measured lags add nothing
 _SMALL = 0.05  # of the residual's variance: what could be predicted below that is a small effect
 _SMALL_SIZE = 0.05  # of the output's deviation, beside it
-_SMALL_COLOUR = 0.2  # the same of what a free run's own past tells: more of it is hardly noise
-_HOLD = 0.5  # share of the squares that stands in wild rows
+_SMALL_COLOUR = 0.2  # the same of what a free run's own past explains: more is hardly noise
+_HOLD = 0.5  # share of the squares in wild rows
 _FEW, _LEAST = (
     0.005,
     6,
@@ -224,13 +224,13 @@ def _effects(fit: Estimate, one_step: Response, free_run: Response | None, simul
     functions = (
         0.0 if simulates else float(np.average([one.functions for one in shares], weights=squares))
     )
-    told: dict[str, Any] = {
+    known: dict[str, Any] = {
         "simulates": simulates,
         "skip": skip,
         "one_step": one_step,
         "functions": functions,
     }
-    return {"predictable": shares, "changes": model_changes(fit, response, **told)}
+    return {"predictable": shares, "changes": model_changes(fit, response, **known)}
 
 
 def _with_criterion(

@@ -121,16 +121,16 @@ def _sentences(checks: Stability, driven: bool) -> Iterator[tuple[str, str]]:
         warns = "spectral_radius_above_one" if run.share_above_one > 0.01 else ""
         yield f"The local spectral radius is {above}; {peak}.", warns
     if run.skipped:
-        told = (
+        text = (
             f"At {run.skipped} points more the model has no finite derivative; they are left out."
         )
-        yield told, "derivative_not_finite"
+        yield text, "derivative_not_finite"
     if contracts is None:
-        told = (
+        text = (
             "Contraction could not be checked: no finite derivatives, or more than 200 past "
             "outputs."
         )
-        yield told, "contraction_not_checked"
+        yield text, "contraction_not_checked"
     elif contracts.rate < 1:
         how = (
             f"contracts in one metric (rate {contracts.rate:.4g}): evidence, not proof, that "

@@ -122,7 +122,7 @@ class StructureTest:
 
         Memory is sure beside static terms, and predicts clearly more.
 
-        Play and hysteresis of a position follow the sign of its speed, so they stand in for
+        Play and hysteresis of a position follow the sign of its speed, so they replace
         friction that is not quite right; a lag of a sample or two is a lag that the physics has too
         few of.
         """
@@ -402,7 +402,7 @@ def _tested(
     q = _range(whole[:, starts])
     whole = whole - q @ (
         q.T @ whole
-    )  # they move a few rows of one run only: blocks would not tell them
+    )  # they move a few rows of one run only: blocks would not show them
     whole[:, starts] = 0.0
     size = np.linalg.norm(whole, axis=0)
     size = np.where(size > 0, size, 1.0)

@@ -91,8 +91,8 @@ class Imitation:
             )
         if not self.directions:
             rest = " other" if self.held else ""
-            told = f"{sees} and could imitate nothing of the{rest} physics"
-            return f"{told}: the fit determines every{rest} parameter beside it.{self._nearly}"
+            text = f"{sees} and could imitate nothing of the{rest} physics"
+            return f"{text}: the fit determines every{rest} parameter beside it.{self._nearly}"
         could = _listed([_combination(direction) for direction in self.directions])
         told = [f"{sees} and could imitate {could}: there, and only there, θ is split off."]
         if self.determined:

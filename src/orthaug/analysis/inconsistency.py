@@ -1,6 +1,6 @@
 """Test for inconsistent one-step θ by coloured errors, in standard errors of θ (Hausman 1978).
 
-Coloured errors stand in the lagged outputs of the next rows, which moves θ̂ by an amount that more
+Coloured errors are in the lagged outputs of the next rows, which moves θ̂ by an amount that more
 rows do not lessen. With a model of the colour, `e_k = Σ_j ρ_j e_{k−j} + ν_k` with ν white, they do
 not. One Gauss-Newton step from ρ = 0 gives ρ̂ and what it moves θ̂ by (Durbin 1970, Breusch 1978,
 Godfrey 1978): with the past errors E and `E⊥` what the model's derivatives ψ leave of them, `ρ̂ =
@@ -37,7 +37,7 @@ _WORTH = 0.5  # standard errors of θ: by less, coverage falls from 95 to 92 % a
 _ORDERS = (1, 4)  # of the autoregressions that are tried
 _FEWEST = 100  # rows
 _STEPS, _CLOSE = 30, 1e-6  # of the iteration, and the relative fall of the squares at which it ends
-_VAGUE = 10.0  # times the standard errors of the fit: instruments that tell less are not shown
+_VAGUE = 10.0  # times the standard errors of the fit: less accurate instruments are not shown
 
 
 @dataclass(frozen=True, eq=False)

@@ -53,7 +53,7 @@ class RegressorTest:
     Per bin: `centres` (mean of the regressor, in its unit), `means` of the residual and their
     standard `errors` (in the residual's unit), and `counts` of rows. The means are those that the
     test looks at: of a coloured residual by generalised least squares, less the mean of all rows
-    where the test is centred. Where the rows do not tell them apart they are plain means, with
+    where the test is centred. Where the rows do not separate them they are plain means, with
     errors that take the residual as white.
     """
 

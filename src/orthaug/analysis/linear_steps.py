@@ -72,7 +72,7 @@ class LaggedStep:
     def seen(self, rest: Vector, inputs: Vector) -> Vector | None:
         """Return the learner's features at rest.
 
-        None where there is no telling what training reached of them.
+        None where it is unknown which of them training reached.
         """
         if self.form.bound is None or not self.form.differentiable:
             return None

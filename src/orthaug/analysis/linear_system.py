@@ -254,9 +254,9 @@ def converted(
     values: Any = poles.values
     negative = values[(values.real < 0) & (np.abs(values.imag) < 1e-9 * np.abs(values))]
     if len(negative):
-        told = ", ".join(f"{value.real:.4g}" for value in negative)
+        listed = ", ".join(f"{value.real:.4g}" for value in negative)
         return (
-            f"a real pole below 0 ({told}) alternates from sample to sample, which no real "
+            f"a real pole below 0 ({listed}) alternates from sample to sample, which no real "
             "system does under a hold; tustin gives one."
         )
     found = _logarithm(system, step)

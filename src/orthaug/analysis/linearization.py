@@ -34,7 +34,7 @@ _POINTS = 400  # of the frequency grid
 _DECADES = 3  # below Nyquist's frequency at least
 _BELOW = 10  # times below the slowest pole
 _LOWEST = 1e-5  # of Nyquist's frequency
-_STEEP = 0.1  # of its matrix: what differences may change before a kink is told
+_STEEP = 0.1  # of its matrix: what differences may change before a kink is reported
 _WIDE = 0.5  # standard error of ln G beyond which the delta method is rough
 
 
@@ -97,8 +97,8 @@ def linearize(
     outputs = [channel.name for channel in model.outputs]
     search = Search.of(step, model, outputs, given, held)
     points, warnings = operating_points(search)
-    spread, told = _spread(model, fit)
-    warnings += told
+    spread, of_spread = _spread(model, fit)
+    warnings += of_spread
     if _smooth(model):
         text = (
             "a spline through the record has no step: the sampled system is that of straight "

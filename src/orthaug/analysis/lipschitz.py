@@ -65,7 +65,7 @@ def lipschitz(model: Model, record: Record, *, x: Matrix | None = None) -> Lipsc
 
     The bounds are those of at most 20000 measured rows, fewer for many weights, and of these θ and
     w, where the condition asks for all; they may be larger elsewhere. A kink, as of relu, makes
-    ∂g/∂w jump between rows and is not seen. None of it tells about the free run: y_k = 2 y_{k−1}
+    ∂g/∂w jump between rows and is not seen. None of it is about the free run: y_k = 2 y_{k−1}
     fulfils the condition. A model whose state is not made of measured signals has no such
     predictor: None.
 

@@ -7,8 +7,8 @@ the errors are `S_p δ + S_b b + e`, so that the F-test of b is right whatever t
 errors δ are. Coloured errors are `e = H ε` with the autoregression `H = 1/A`: rows and columns are
 filtered by A (Cochrane and Orcutt 1949). For the test A is that of the errors beside what was
 estimated; beside all terms it would be found too white, and the test would reject too often. To
-tell terms from each other it is that beside all terms, so that what the missing one leaves does not
-pass for colour.
+distinguish terms from each other A is that beside all terms, so that what the missing one leaves
+does not pass for colour.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from orthaug.models.moving import MotionDynamics
 from orthaug.physics.motion import Motion
 
 _ROWS = 20_000  # that are looked at, in segments spread over the record
-_NUMBERS = 8_000_000  # that stand in memory at most
+_NUMBERS = 8_000_000  # that are in memory at most
 
 Terms = Callable[[Float[np.ndarray, "n r"]], Float[np.ndarray, "t r"]]
 """Makes terms of states and inputs."""
@@ -295,8 +295,8 @@ def doubted(fit: MotionEstimate) -> tuple[int, ...]:
 def _values(z: Matrix, one_sided: list[bool]) -> Any:
     """Return a constant, then the shapes of each variable: (1 + 5 n, r) of z (n, r).
 
-    Where a variable keeps its sign a jump at zero is a constant, and its size itself: zeros stand
-    for them.
+    Where a variable keeps its sign a jump at zero is a constant, and its size is itself: zeros take
+    their places.
     """
     shaped = [
         [one, np.tanh(one / _EDGE) * both, np.abs(one) * both, one**2, one**3]

@@ -99,10 +99,10 @@ class TermBias:
         """
         if self.seen is None:
             return "nothing" if self.moved.any() else None
-        return self._told.removed_by
+        return self._as_suspected.removed_by
 
     @property
-    def _told(self) -> SuspectedBias:
+    def _as_suspected(self) -> SuspectedBias:
         relative = [b / v if v else None for b, v in zip(self.per_unit, self.value, strict=True)]
         shown: Any = self.suspect
         own = (
@@ -116,7 +116,7 @@ class TermBias:
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain numbers, text and None, for JSON."""
-        return self._told.as_dict() | {
+        return self._as_suspected.as_dict() | {
             "removed_by": self.removed_by,
             "equation": self.equation,
             "unit": self.suspect.unit,
@@ -132,10 +132,10 @@ class MotionLinearization:
     """Linearization of a motion for biases: the linearized free run, and the points of p̂'s split.
 
     Args:
-        q: coordinates of p̂; those in `shared` directions are told by the nearest physics.
+        q: coordinates of p̂; those in `shared` directions come from the nearest physics.
         field: the measure's points.
         learned: the learner (M, nl) there beside p̂; None before a fit, and without one.
-        unknown: parameters that no output tells: a term does anything to them.
+        unknown: parameters that no output determines: a term does anything to them.
     """
 
     place: FreeRunPoint
@@ -199,7 +199,7 @@ class MotionLinearization:
         if used is not None and not all(
             seen
         ):  # what the learner sees it has taken from the residual
-            residuals = told_by_residual(response, used, steps)
+            residuals = residual_steps(response, used, steps)
         rows = enumerate(zip(suspects, seen, residuals, strict=True))
         return [self._entry(response, k, *row) for k, row in rows]
 
@@ -243,8 +243,8 @@ class MotionLinearization:
         if suspect.coefficient is not None:
             expected = suspect.coefficient * per_unit
         own = (suspect, equations_of(motion)[place], names, moved, per_unit, value, expected)
-        told = (response.cosine(k), response.size(k), seen, explained, found, certificate)
-        return TermBias(*own, *told, None if seen else residual)
+        effect = (response.cosine(k), response.size(k), seen, explained, found, certificate)
+        return TermBias(*own, *effect, None if seen else residual)
 
     def after(self, causes: Sequence[TermBias], table: Sequence[TermBias]) -> list[TermBias]:
         """Return the suspects that the learner sees, by their shares beside given causes.
@@ -291,7 +291,7 @@ class MotionLinearization:
         own = (suspect, equation, motion.names, moved, per_unit, value, None)
         return TermBias(*own, None, size, True, explained, found, None, None)
 
-    def told(self) -> Matrix:
+    def learned_beside(self) -> Matrix:
         """Return the learner (M, nl), weighed, beside the shared directions."""
         return self.beside(self.weighed(np.asarray(self.learned)))
 
@@ -322,7 +322,7 @@ class MotionLinearization:
         """
         if self.learned is None:
             return None, None
-        rest, tilde, size = self.beside(held), self.told(), np.linalg.norm(held)
+        rest, tilde, size = self.beside(held), self.learned_beside(), np.linalg.norm(held)
         norm = np.linalg.norm(rest)
         if not np.any(tilde) or norm <= IN_SPAN * size:
             return None, None
@@ -353,7 +353,7 @@ class MotionLinearization:
         )
 
 
-def told_by_residual(
+def residual_steps(
     response: TermsResponse, used: float, steps: int | None
 ) -> list[ResidualStep | None]:
     """Return the effect of every term on the residual, with standard errors.
@@ -398,7 +398,7 @@ def suspected_bias(fit: MotionEstimate, suspects: Sequence[MotionSuspect]) -> li
         fit,
         MotionEstimate,
         "fit",
-        "a fit of equations of motion (of difference equations `bias_budget` tells it)",
+        "a fit of equations of motion (for difference equations use `bias_budget`)",
     )
     check_motion_suspects(suspects, fit.problem)
     linearization = linearize_fit(fit)

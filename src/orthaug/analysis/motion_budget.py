@@ -1,8 +1,8 @@
 """Bias budget of a motion: the term that explains the learner or the free run, and its bias.
 
 With a learner as of difference equations (`budget`), over the points of the measure. Without one
-only terms that someone suspects are looked at; their size is what the free run's residual tells:
-one Gauss-Newton step.
+only terms that someone suspects are looked at; their size follows from the free run's residual
+by one Gauss-Newton step.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from orthaug.analysis.budget import (
     SURE_SHARE,
     ParameterBias,
     explains,
+    list_biases,
     parameter_biases,
-    told_biases,
 )
 from orthaug.analysis.catalogue import motion_catalogue
 from orthaug.analysis.learned_part import learned_reach
@@ -46,9 +46,9 @@ from orthaug.analysis.motion_suspects import MotionSuspect
 from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.inference.covariance import reach
 
-_AS_CLOSE = 2.0  # times what a cause leaves of the learner: a rival that leaves no more cannot be told from it
+_AS_CLOSE = 2.0  # times what a cause leaves of the learner: a rival leaves no more
 _CLOSE = 0.005  # of the learner: what leaves no more is as good as any
-_SURE = 3.3  # standard errors of a coefficient that the residual tells: one in a thousand is so large by chance
+_SURE = 3.3  # standard errors of a coefficient: one in a thousand is so large by chance
 _ELSEWHERE = 0.5  # of a bias, from which that of a rival is another one
 _NOTHING = (
     0.01  # of the learned equations: a learner that is smaller, and biases nothing, found nothing
@@ -82,7 +82,7 @@ class MotionBudget:
         return next((entry for entry in self.parameters if entry.name == name), None)
 
 
-def told_budget(
+def declared_budget(
     fit: MotionEstimate, declared: Sequence[MotionSuspect], table: Sequence[TermBias]
 ) -> MotionBudget | None:
     """Return the budget by the declared suspects.
@@ -129,7 +129,7 @@ def noise_share(fit: MotionEstimate, linearization: MotionLinearization) -> floa
     half = learned_reach(fit, linearization.field.x, linearization.field.u)
     if half is None or not np.isfinite(half).all():
         return 0.0
-    own = np.sum(linearization.told() ** 2)
+    own = np.sum(linearization.learned_beside() ** 2)
     return float(
         np.sum(linearization.weighed(half / reach(fit.freedom)) ** 2)
         / max(own, np.finfo(float).tiny)
@@ -292,7 +292,7 @@ def one_of_each(
         return []
     values = (
         *(linearization.beside(linearization.held(entry.suspect)) for entry in seen),
-        linearization.told(),
+        linearization.learned_beside(),
     )
     rows = np.stack([row[:: 1 + len(row) // CERTIFIED_POINTS].ravel() for row in values])
     sizes = np.linalg.norm(rows, axis=1)
@@ -319,11 +319,11 @@ def one_of_each(
     chosen, found = max(best_from(first) for first in groups[0].tolist())[1], []
     for k, group in enumerate(groups):
         shares, fitted = beside(chosen[:k] + chosen[k + 1 :])
-        told = [
+        members = [
             replace(seen[i], explained=float(shares[i]), coefficient_found=float(fitted[i]))
             for i in group
         ]
-        found.append(sorted(told, key=explains, reverse=True))
+        found.append(sorted(members, key=explains, reverse=True))
     return found
 
 
@@ -373,12 +373,12 @@ def _of_residual(table: Sequence[TermBias]) -> _Causes | None:
     )
     if best is None or best.residual is None or best.residual.std is None:
         return None
-    told, std = best.residual, best.residual.std
-    if told.share < LEAST_SHARE * (told.share + told.left):
+    step, std = best.residual, best.residual.std
+    if step.share < LEAST_SHARE * (step.share + step.left):
         return None
-    unsure = np.hypot(std, told.coefficient * np.sqrt(told.left / told.share))
+    unsure = np.hypot(std, step.coefficient * np.sqrt(step.left / step.share))
     return _Causes(
-        (best,), told.share, told.coefficient * best.per_unit, np.array([unsure * best.per_unit])
+        (best,), step.share, step.coefficient * best.per_unit, np.array([unsure * best.per_unit])
     )
 
 
@@ -402,12 +402,12 @@ def _motion_warning(
         return Warning(
             "biased",
             f"what the learner found looks most like {told} ({percent(found.share)} of it), "
-            f"which would move {told_biases(large)}, and the standard errors do not cover "
+            f"which would move {list_biases(large)}, and the standard errors do not cover "
             f"that{other}.",
         )
     return Warning(
         "biased",
         f"{told} explain{'' if several else 's'} {100 * found.share:.0f} % of {what} and "
-        f"move{'' if several else 's'} {told_biases(large)}, which the standard errors do not "
+        f"move{'' if several else 's'} {list_biases(large)}, which the standard errors do not "
         f"cover{other}.",
     )

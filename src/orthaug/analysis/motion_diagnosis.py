@@ -2,7 +2,7 @@
 
 The criterion of a motion is right for white noise on its outputs. Coloured errors that follow no
 input and no state are noise within the motion; errors that do are physics that is missing, or that
-the learner does not see. Simple terms, each tried in each equation, tell what it is
+the learner does not see. Simple terms, each tried in each equation, show what it is
 (`missing_terms`).
 """
 
@@ -25,12 +25,12 @@ from orthaug.fitting.structures import Orthogonal
 from orthaug.models.response import Response
 
 _LEVEL = 0.01  # of the test of missing terms
-_SMALL = 0.05  # of the error's variance: what inputs and states tell below that is a small effect
+_SMALL = 0.05  # of the error's variance: effects of inputs and states below that are small
 _SIZABLE = (
     0.02  # of the output's deviation: a free run that leaves less has no dead time to look for
 )
-_LITTLE = 0.005  # of the error's variance: what its own past tells below that is none
-_LAGS = 10  # of inputs that may tell the error
+_LITTLE = 0.005  # of the error's variance: a share by its own past below that is none
+_LAGS = 10  # of inputs that may predict the error
 _ROWS_PER_LAG = 20
 _MOST_ROWS = 20_000  # at which the error is set beside states
 
@@ -65,17 +65,19 @@ def diagnose_motion(fit: MotionEstimate, free_run: Response) -> Diagnosis | None
     followed = {test.name: test.follows() for test in tests if test.follows()}
     curved = {test.name: test.curved_over(_SMALL) for test in tests if test.curved_over(_SMALL)}
     lacks = missing if missing is not None and missing.found(_LEVEL, _SMALL) else None
-    told = any(share.inputs > _SMALL for share in shares) or bool(curved) or lacks is not None
+    explained = any(share.inputs > _SMALL for share in shares) or bool(curved) or lacks is not None
     white = all(test.practically_white() for test in tests)
     size = rms_errors(free_run) / fit.problem.deviation
-    late = _late(fit) if motion.inputs and (told or not white) and np.any(size > _SIZABLE) else ()
-    verdict = "unmodelled" if told or late else "white" if white else "equation_noise"
+    late = (
+        _late(fit) if motion.inputs and (explained or not white) and np.any(size > _SIZABLE) else ()
+    )
+    verdict = "unmodelled" if explained or late else "white" if white else "equation_noise"
     text = _words(verdict, fit, tests, shares, followed, curved, lacks, late)
     warnings = [one.warning for one in late]
     warnings += (
         []
         if white
-        else [Warning("coloured_residual", _coloured(fit) + (_UNCOUNTED if told else ""))]
+        else [Warning("coloured_residual", _coloured(fit) + (_UNCOUNTED if explained else ""))]
     )
     return Diagnosis(verdict, text, (), tests, None, None, tuple(warnings), shares, (), missing)
 
@@ -92,11 +94,11 @@ def _late(fit: MotionEstimate) -> tuple[DeadTime, ...]:
 
 def _coloured(fit: MotionEstimate) -> str:
     """Return a sentence on coloured errors, and on the standard errors that follow."""
-    told = "the errors of the free run are coloured: held-out errors say how good the model is"
+    text = "the errors of the free run are coloured: held-out errors say how good the model is"
     if fit.std is None or fit.plain_covariance is not None:
-        return f"{told}."
+        return f"{text}."
     return (
-        f"{told}, and standard errors are those of white ones, as rows are too few: take them "
+        f"{text}, and standard errors are those of white ones, as rows are too few: take them "
         "for a rough guide."
     )
 
@@ -117,8 +119,8 @@ def _predictable(i: int, test: ResidualTest, errors: list, inputs: list, every: 
     driven = [
         [u[:, j] for u in inputs] for j in range(inputs[0].shape[1])
     ]  # of each input its experiments
-    tells = [from_lags(signal, [one], range(longest + 1)) for one in driven]
-    best = max((share.sure for share in tells), default=0.0)
+    from_inputs = [from_lags(signal, [one], range(longest + 1)) for one in driven]
+    best = max((share.sure for share in from_inputs), default=0.0)
     return Predictable(
         test.name, float(test.rms or 0.0), own.sure, best, float(test.largest_share or 0.0)
     )
@@ -187,17 +189,17 @@ def _traces(tests: tuple[ResidualTest, ...], shares: tuple[Predictable, ...]) ->
 
 def _colour(tests: tuple[ResidualTest, ...], shares: tuple[Predictable, ...]) -> str:
     """Return for each coloured output its largest autocorrelation and its predictable share."""
-    told = []
+    clauses = []
     for test, share in zip(tests, shares, strict=True):
         if not test.practically_white():
             past = f", and {percent(share.own_past)} of it follows from its own past"
             past = (
                 past if share.own_past > _LITTLE else ", too little to predict it from its own past"
             )
-            told.append(
+            clauses.append(
                 f"{test.name} has autocorrelations of up to {test.largest_acf:.2f} in size{past}"
             )
-    return "; ".join(told)
+    return "; ".join(clauses)
 
 
 def _named(lacks: MissingTest) -> str:

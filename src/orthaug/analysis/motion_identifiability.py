@@ -1,6 +1,6 @@
 """Parameters of a motion that the outputs can distinguish, before training.
 
-They are told apart on the record's inputs, or on inputs that excite everything, by the rank of the
+They are distinguished on the record's inputs, or on inputs that excite everything, by the rank of the
 free run's sensitivities to the parameters' coordinates, the starts of all segments eliminated, at
 the initial parameters and some near them. A direction that only rounding or one particular value
 hides has full rank there.
@@ -22,7 +22,7 @@ from orthaug.physics.excitation import Excitation, of_gram
 _DRAWS = 3  # parameters near the initial ones
 _NEAR = 0.1  # of a logarithm, or of the value
 _SHORTER = (512, 128, 32, 8)  # steps of segments, where physics runs away over longer ones
-_LOOSER = 1e3  # times as free as in training: a start that costs something tells parameters from it
+_LOOSER = 1e3  # times as free as in training: a start that costs something separates parameters
 _WIDTHS = (2.0, 1.0, 0.5)  # times the range of the data, until a run is finite
 _LONGEST_LEVEL = 60  # steps for which a random input stays
 _SEED = 20_250_117
@@ -83,13 +83,13 @@ def _rank(segmented: SegmentedMotion) -> Excitation | None:
         gram = information(segmented, q)
         if gram is not None:
             found = of_gram(gram, segmented.problem.motion.names)
-            best = found if best is None else max(best, found, key=_telling)
+            best = found if best is None else max(best, found, key=_ranks)
         if best is not None and best.full_rank:
             break
     return best
 
 
-def _telling(found: Excitation) -> tuple[int, int]:
+def _ranks(found: Excitation) -> tuple[int, int]:
     return found.rank, sum(map(len, found.collinear))
 
 

@@ -26,7 +26,7 @@ from orthaug.models.moving import MotionDynamics
 
 _LARGEST = 1024.0  # factor on the inputs that is tried
 _POINTS = 2000  # at most
-_OFTEN = 0.01  # of the points: growing modes on more are told as a warning
+_OFTEN = 0.01  # of the points: growing modes on more are a warning
 _STILL = 1e-9  # of the fastest mode: an integrator's eigenvalue is rounding of zero
 
 
@@ -79,10 +79,12 @@ def motion_stability(
     if record is None or not record.inputs:
         return checks
     factor = divergence_scaling(model, record, _LARGEST)
-    told, code = margin(factor, _LARGEST, driven=True)
+    sentence, code = margin(factor, _LARGEST, driven=True)
     radius = radius_beyond(model, x, _of_steps(model, record))
-    text = "\n".join(part for part in (checks.text, told, describe_beyond(model, radius)) if part)
-    warnings = (*checks.warnings, *((Warning(code, told),) if code else ()))
+    text = "\n".join(
+        part for part in (checks.text, sentence, describe_beyond(model, radius)) if part
+    )
+    warnings = (*checks.warnings, *((Warning(code, sentence),) if code else ()))
     found = {"diverges_at": factor, "searched": _LARGEST, "radius_beyond": radius}
     return replace(checks, text=text, warnings=warnings, **found)
 
@@ -98,17 +100,17 @@ def _of_modes(model: MotionModel, x: Matrix, u: Matrix) -> MotionStability:
     found = modes(model, x, u)
     if found is None:
         return MotionStability(None, (), "The motion has no finite derivative along its run.")
-    told = f"The linearised motion has {_sizes(found)} along the free run. "
+    text = f"The linearised motion has {_sizes(found)} along the free run. "
     if not found.growing:
-        return MotionStability(found, (), told + _without_growth(found))
+        return MotionStability(found, (), text + _without_growth(found))
     where = ", ".join(f"{name} = {value:.4g}" for name, value in found.worst.items())
-    told += (
+    text += (
         f"At {percent(found.growing, 3)} of its points one grows, by up to "
         f"{found.rightmost:.4g} 1/s ({where}); median of the largest real part "
         f"{found.median:.4g} 1/s."
     )
-    warnings = (Warning("growing_mode", told),) if found.growing > _OFTEN else ()
-    return MotionStability(found, warnings, told)
+    warnings = (Warning("growing_mode", text),) if found.growing > _OFTEN else ()
+    return MotionStability(found, warnings, text)
 
 
 def _sizes(found: Modes) -> str:
@@ -122,18 +124,20 @@ def _sizes(found: Modes) -> str:
 
 
 def _without_growth(found: Modes) -> str:
-    count, told = found.integrators, []
+    count, sentences = found.integrators, []
     if found.fastest and found.rightmost < 0:
         others = "All others decay" if count else "All decay"
-        told.append(f"{others} everywhere: the largest real part is {found.rightmost:.4g} 1/s.")
+        sentences.append(
+            f"{others} everywhere: the largest real part is {found.rightmost:.4g} 1/s."
+        )
     elif found.fastest:
-        told.append("None grows, and not all decay: the largest real part is 0.")
+        sentences.append("None grows, and not all decay: the largest real part is 0.")
     if count:
-        told.append(
+        sentences.append(
             "What integrates neither decays nor grows: it keeps "
             f"{'their' if count > 1 else 'its'} errors."
         )
-    return " ".join(told)
+    return " ".join(sentences)
 
 
 def modes(model: MotionModel, x: Matrix, u: Matrix) -> Modes | None:

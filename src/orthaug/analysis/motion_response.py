@@ -2,10 +2,10 @@
 
 With S the sensitivities of the free run to the parameters' coordinates c, the terms' coefficients κ
 and a learner's weights w, the starts eliminated, a term of size κ that the fit does not know moves
-(c, w) by `(SᵀS + ridge)⁻¹SᵀS_κ κ`: estimate less truth. What the free run leaves, r, tells κ itself
+(c, w) by `(SᵀS + ridge)⁻¹SᵀS_κ κ`: estimate less truth. What the free run leaves, r, determines κ
 by one Gauss-Newton step, beside all that was fitted.
 
-Before any training waves stand for the learner. They can be any function of what it sees.
+Before any training waves take the learner's place. They can be any function of what it sees.
 
 How much of the estimate is an error of its integrator follows likewise. With Δy what twice as many
 substeps add to the outputs, a fit with them ends at `(c, w) − (SᵀS + ridge)⁻¹SᵀΔy`. S is that of
@@ -39,7 +39,8 @@ from orthaug.physics.motion import MOST_SUBSTEPS
 from orthaug.physics.suspected_motion import SuspectedMotion, SuspectedTerm
 
 LOOSER = 1e-4  # times the weight of the guesses of the starts, as where standard errors are made
-_UNSEEN = 1e-9  # of the largest eigenvalue of normal equations with unit columns: directions that nothing tells
+# Directions without information: below so much of the largest eigenvalue, with unit columns.
+_UNSEEN = 1e-9
 ALIKE = 1e-6  # of a term's effect on the outputs: less than this beside what was fitted is rounding
 _LARGE = 0.1  # standard errors
 _LARGE_SHARE = 1e-3  # of a parameter that has no standard error
@@ -285,28 +286,28 @@ def substep_bias(fit: MotionEstimate) -> SubstepBias | None:
 
 def _warnings(found: SubstepBias, fit: MotionEstimate) -> tuple[Warning, ...]:
     """Return one sentence on the parameters that finer steps would move."""
-    told = []
+    shifts = []
     for name, moved, errors, value in zip(
         found.names, found.value, found.errors, fit.values, strict=True
     ):
         share = f", {percent(moved / value, sign='+')}" if value else ""
         if np.isfinite(errors) and errors > _LARGE:
-            told.append(f"{name} by {moved:+.2g} ({errors:.2g} standard errors{share})")
+            shifts.append(f"{name} by {moved:+.2g} ({errors:.2g} standard errors{share})")
         elif (
             np.isnan(errors)
             and name not in fit.unidentified
             and abs(moved) > _LARGE_SHARE * abs(value)
         ):
-            told.append(
+            shifts.append(
                 f"{name} by "
                 f"{moved:+.2g}{share.replace(',', ' (', 1).replace('( ', '(')}{')' if share else ''}"
             )
-    if not told:
+    if not shifts:
         return ()
     steps = f"{found.substeps} substep{'s' * (found.substeps > 1)} in a sample"
     text = (
         f"the integrator is too coarse for the parameters: with {steps} instead of "
-        f"{2 * found.substeps} it moves {', '.join(told)}; give substeps = "
+        f"{2 * found.substeps} it moves {', '.join(shifts)}; give substeps = "
         f"{2 * found.substeps} or more."
     )
     return (Warning("too_few_substeps", text),)

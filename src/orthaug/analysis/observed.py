@@ -40,7 +40,7 @@ class Consistency:
 class ObserverRun:
     """An observer along one experiment of N rows; NaN on rows before `start`.
 
-    `predicted` (N, ny) are the outputs as the rows before tell them, `spread` (N, ny, ny) the
+    `predicted` (N, ny) are the outputs as the rows before predict them, `spread` (N, ny, ny) the
     covariance of measured less predicted ones. `outputs` (N, ny) are estimates without the sensors'
     noise, with the row's own measurement; `outputs_std` their standard deviations. `states` (N, n),
     `states_std` are those of a motion at the row; a lagged model's are what goes into the next
@@ -83,7 +83,7 @@ class Observations:
     """Of a motion; a lagged model's states are its outputs."""
     sampling_time: float
     settled: int
-    """Rows of each experiment that tell where it started."""
+    """Rows of each experiment that determine where it started."""
 
     def __repr__(self) -> str:
         rows = sum(len(one.square) for one in self.experiments)

@@ -109,15 +109,15 @@ class Observer:
             InputError: other channels, too few rows, or an estimate that leaves all bounds.
         """
         record = self._record(record)
-        told = tuple(self._along(experiment, record)[0] for experiment in record.experiments)
+        runs = tuple(self._along(experiment, record)[0] for experiment in record.experiments)
         form = self.model.filtering[0]
         names = form.names if form.hidden else ()
-        return Observations(told, self.model.outputs, names, record.sampling_time, self._settled)
+        return Observations(runs, self.model.outputs, names, record.sampling_time, self._settled)
 
     def predict(self, record: Record, horizon: int = 1) -> Response:
         """Return the prediction of each row from `horizon` samples before it, with its deviation.
 
-        A motion's first rows, which tell its state, have no value, as in its `predict`.
+        A motion's first rows, which determine its state, have no value, as in its `predict`.
 
         Raises:
             InputError: other channels, a horizon below 1, too few rows, or an estimate that leaves
@@ -148,17 +148,17 @@ class Observer:
         self.model.check_rows(experiment, first)
         begun = form.start(experiment, record, first, self.noise, size)
         inputs = form.inputs(experiment, record)
-        before, told = filtered(
+        before, rows = filtered(
             form, numbers, self.noise, begun, inputs, experiment.outputs[first:]
         )
-        finite = np.isfinite(told.predicted).all(axis=1) & np.isfinite(before.state).all(axis=1)
+        finite = np.isfinite(rows.predicted).all(axis=1) & np.isfinite(before.state).all(axis=1)
         if not finite.all():
             raise InputError(
                 f"{experiment.where(first + int(np.argmin(finite)))}: the estimate leaves all "
                 "bounds there; the model does not hold on this record, or the noise of the "
                 "observer is wrong."
             )
-        return _observed(told, experiment, first), before, inputs
+        return _observed(rows, experiment, first), before, inputs
 
     def _ahead(self, experiment: Experiment, record: Record, horizon: int) -> Trajectory:
         form, numbers, _ = self.model.filtering
@@ -173,12 +173,12 @@ class Observer:
                 known = ahead(alone[0], alone[1], self.noise, before, inputs, horizon)[0]
             parts = Parts(known.total, parts.total - known.total, parts.total - known.total)
         skip = first - form.first_row - horizon + 1
-        told = trajectory(
+        predicted = trajectory(
             Parts(*(part[skip:] for part in parts)), experiment, experiment.outputs, first
         )
         whole = np.full(experiment.outputs.shape, np.nan)
         whole[first:] = std[skip:]
-        return replace(told, std=whole)
+        return replace(predicted, std=whole)
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,8 +201,8 @@ class ObserverState:
     observer: Observer
     belief: StateEstimate
     """The state before the next sample and its covariance."""
-    told: FilterRow | None = None
-    """What the last sample told; None before the first."""
+    latest: FilterRow | None = None
+    """The filter's row of the last sample; None before the first."""
 
     @property
     def state_names(self) -> tuple[str, ...]:
@@ -214,44 +214,44 @@ class ObserverState:
 
         Of a lagged model that which the next step starts from.
         """
-        return np.asarray(self.belief.state if self.told is None else self.told.state)
+        return np.asarray(self.belief.state if self.latest is None else self.latest.state)
 
     @property
     def state_band(self) -> Matrix:
         """Its 95 % limits (2, n)."""
-        covariance = self.belief.covariance if self.told is None else self.told.state_covariance
+        covariance = self.belief.covariance if self.latest is None else self.latest.state_covariance
         return _band(self.state, covariance)
 
     @property
     def predicted(self) -> Vector:
         """Outputs (ny,) at the last sample, predicted from those before it."""
-        return np.asarray(self._told.predicted)
+        return np.asarray(self._update.predicted)
 
     @property
     def predicted_band(self) -> Matrix:
         """The limits (2, ny) within which 95 % of measurements lie."""
-        return _band(self.predicted, self._told.spread)
+        return _band(self.predicted, self._update.spread)
 
     @property
     def outputs(self) -> Vector:
         """The outputs (ny,) at the last sample, without the sensors' noise."""
-        return np.asarray(self._told.outputs)
+        return np.asarray(self._update.outputs)
 
     @property
     def outputs_band(self) -> Matrix:
         """Their 95 % limits (2, ny)."""
-        return _band(self.outputs, self._told.outputs_covariance)
+        return _band(self.outputs, self._update.outputs_covariance)
 
     @property
     def square(self) -> float:
         """`νᵀS⁻¹ν` of the last sample: χ² with one degree of freedom per measured output."""
-        return float(self._told.square)
+        return float(self._update.square)
 
     @property
-    def _told(self) -> FilterRow:
-        if self.told is None:
+    def _update(self) -> FilterRow:
+        if self.latest is None:
             raise InputError("no sample has been measured yet; `update` first.")
-        return self.told
+        return self.latest
 
     def update(self, inputs: Any, outputs: Any) -> ObserverState:
         """Return one sample later.
@@ -267,10 +267,10 @@ class ObserverState:
         row = _row(inputs, "inputs", len(model.step_inputs))
         measured = _row(outputs, "outputs", len(model.outputs), gaps=True)
         form, numbers, _ = model.filtering
-        belief, told = one_row(form, numbers, self.observer.noise, self.belief, row, measured)
-        if not (np.isfinite(told.predicted).all() and np.isfinite(belief.state).all()):
+        belief, latest = one_row(form, numbers, self.observer.noise, self.belief, row, measured)
+        if not (np.isfinite(latest.predicted).all() and np.isfinite(belief.state).all()):
             raise InputError("the estimate leaves all bounds; the model does not hold here.")
-        return replace(self, belief=belief, told=told)
+        return replace(self, belief=belief, latest=latest)
 
 
 def _band(mean: Vector, covariance: Any) -> Matrix:
@@ -293,7 +293,7 @@ def _row(values: Any, name: str, count: int, *, gaps: bool = False) -> Vector:
     return row
 
 
-def _observed(told: FilterRow, experiment: Experiment, first: int) -> ObserverRun:
+def _observed(rows: FilterRow, experiment: Experiment, first: int) -> ObserverRun:
     """Return the run, with NaN before the first row that is estimated."""
 
     def whole(values: Any) -> Any:
@@ -301,13 +301,13 @@ def _observed(told: FilterRow, experiment: Experiment, first: int) -> ObserverRu
 
     return ObserverRun(
         measured=experiment.outputs,
-        predicted=whole(told.predicted),
-        spread=whole(told.spread),
-        outputs=whole(told.outputs),
-        outputs_std=whole(spread_of(told.outputs_covariance)),
-        states=whole(told.state),
-        states_std=whole(spread_of(told.state_covariance)),
-        square=whole(told.square),
+        predicted=whole(rows.predicted),
+        spread=whole(rows.spread),
+        outputs=whole(rows.outputs),
+        outputs_std=whole(spread_of(rows.outputs_covariance)),
+        states=whole(rows.state),
+        states_std=whole(spread_of(rows.state_covariance)),
+        square=whole(rows.square),
         start=first,
         start_time=experiment.start_time,
     )

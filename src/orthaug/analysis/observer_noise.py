@@ -1,6 +1,6 @@
 """Noises of an observer, from the verdict on the residual or by the likelihood of a record.
 
-Noise in the equations moves the state; noise on a sensor does not. The residual tells which
+Noise in the equations moves the state; noise on a sensor does not. The residual shows which
 (`diagnose`): a white one one step ahead is the equation's, R = 0 and Q its covariance; a white one
 of a free run is the sensors', R its covariance, and Q so small that it makes 3 % of the free run's
 variance: that is for a model that is not exact. Otherwise both are there.
@@ -24,7 +24,7 @@ from orthaug.models.model import Model
 from orthaug.models.motion_model import MotionModel
 
 _LITTLE, _MOST = 0.03, 0.9  # shares of a free run's variance that disturbances make
-BOTH = ("equation_noise", "unmodelled")  # verdicts on a free run that tell of disturbances
+BOTH = ("equation_noise", "unmodelled")  # verdicts on a free run that mean disturbances
 _STEPS = 400  # that a disturbance is followed
 _TUNED_ROWS = 4000
 _KEPT_ROWS, _KEPT_STATES = (
@@ -39,7 +39,7 @@ _LARGE = 1e12
 def by_verdict(model: Model | MotionModel, verdict: str | None = None) -> Noise:
     """Return the noises of a fitted model by a verdict, by default the noises that it carries.
 
-    That are noises which the likelihood of its training data told, else those of its verdict.
+    Those are noises by the likelihood of its training data, else those of its verdict.
 
     Raises:
         InputError: a model without an estimate of its noise.

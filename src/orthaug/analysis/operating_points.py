@@ -24,7 +24,7 @@ _STARTS = 32  # points of a Halton sequence in the box of the training data, bes
 _SOLVED = 1e-9  # of what is zero at rest over the starts
 _SAME = 1e-6  # of sizes: points that are as near are one
 _SINGULAR = 1e-10  # of singular values: directions along which rest does not end
-_FAR = 2.0  # times what the training data reached: an equilibrium beyond is told only where there is no other
+_FAR = 2.0  # times the training range: an equilibrium beyond is given only if there is no other
 _NOTHING = 1e-13  # of sizes: rounding of 0
 _POLISH = 5  # Newton steps
 
@@ -53,7 +53,7 @@ class Slopes:
 class OperatingPoint:
     """A point of rest: `values` of states or outputs and inputs by name, `outputs` likewise.
 
-    `outside` tells whether it lies beyond what training reached, or the learner's features do;
+    `outside` is whether it lies beyond what training reached, or the learner's features do;
     `line` whether it is one of a continuum.
     """
 

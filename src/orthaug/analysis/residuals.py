@@ -1,7 +1,7 @@
 """Residual analysis: whiteness, independence of the inputs, and flatness over the regressors.
 
 The tests are those of Ljung, System Identification (1999), sect. 16.6. Experiments are pooled. On a
-large record every test rejects. The sizes of the effects stand beside the p-values for that reason.
+large record every test rejects. The sizes of the effects are given beside the p-values for that reason.
 There is no verdict here.
 """
 
@@ -57,7 +57,7 @@ class ResidualTest:
     white: bool | None
     """Whether Ljung-Box does not reject at `level`."""
     order: int | None
-    """Order of the autoregression that stands for the residual's colour."""
+    """Order of the autoregression that models the residual's colour."""
     cross: Mapping[str, CrossTest | None]
     correlated_inputs: tuple[str, ...]
     """Inputs whose joint test is below `level`, divided by the number of inputs tested

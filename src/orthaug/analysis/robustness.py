@@ -22,8 +22,10 @@ _FEWEST_ROWS, _ROWS_PER_TERM = (
     100,
     10,
 )  # rows that a sum of autocovariances needs, in all and for each of its lags
-_FEWEST_BLOCKS = 12  # of which the variance of a sum can be told, Student's t counting them; shorter blocks held 85 %
-_FEWEST_INDEPENDENT = 10  # errors less one, by which an autoregressive model tells a variance: Student's t counts them
+# A variance of a sum needs so many blocks, which Student's t counts; shorter ones covered 85 %.
+_FEWEST_BLOCKS = 12
+# An autoregressive model needs so many independent errors, less one; Student's t counts them.
+_FEWEST_INDEPENDENT = 10
 _FEWEST_TESTED = 40  # rows from which White's test is asked
 _SHORT = 5  # steps of a block of errors that are white and of uneven size
 UNEVEN = 0.05  # level of White's test

@@ -33,7 +33,7 @@ from orthaug.models.response import Response
 _BEYOND, _FAR = (
     0.01,
     0.1,
-)  # of the training range: an excursion that is told, and one that counts on any row
+)  # of the training range: an excursion that is reported, and one that counts on any row
 _OFTEN = 0.01  # of the rows: a smaller excursion counts from there on
 _MUCH = 0.1  # of a part's rows outside: what is wrong there may be that
 _LIKELY = (
@@ -239,7 +239,7 @@ def judge(trials: Sequence[Trial], extrapolation: Sequence[Extrapolation] = ()) 
         ran_away = any(math.isinf(t.model) and not math.isinf(t.alone) for t in group)
         ratio = _ratio(group, alone, model)
         sure = f" ({ratio})" if str(ratio) and ratio.low < ratio.high else ""
-        told = _told(alone, model) + sure
+        told = _comparison(alone, model) + sure
         if len(group) > 1:
             told = (
                 f"In {where} ({len(group)} blocks, {sum(t.model < t.alone for t in group)} of "
@@ -282,7 +282,7 @@ def _ratio(group: Sequence[Trial], alone: float, model: float) -> Ratio:
     )
 
 
-def _told(alone: float, model: float) -> str:
+def _comparison(alone: float, model: float) -> str:
     """Return both errors in words."""
     errors = {"with the learner": model, "with physics alone": alone}
     if not any(map(math.isinf, errors.values())):
@@ -299,7 +299,7 @@ def extrapolation(part: str, x: Matrix, training: Matrix, layout: Layout) -> lis
 
     One lag a channel.
 
-    Not told is what noise does to extreme values: excursions by less than a hundredth of the range,
+    What noise does to extreme values is not reported: excursions by less than a hundredth of the range,
     or on few rows.
 
     Args:

@@ -17,8 +17,8 @@ from orthaug.fitting.estimates import Estimate
 from orthaug.models.response import Response
 
 SHARE = 0.01  # of the residual's variance: what a regressor explains of it counts from there
-_SLOW = 0.9  # of a free run's variance: what its own past tells from there on is a drift rather than noise
-_TOLD = 5  # findings that a text lists at most
+_SLOW = 0.9  # of a free run's variance: a share by its own past from there on is a drift
+_LISTED = 5  # findings that a text lists at most
 _TOO_FAST = 0.05  # noise variance / smallest variance among the lagged outputs
 
 _BIASED = Warning(
@@ -35,9 +35,7 @@ _OFF = (
     "The errors are coloured by enough to make the one-step θ inconsistent (warning "
     "`inconsistent`)."
 )
-_COLOUR = (
-    0.1  # of the residual's variance that its own past tells: from there on that bias may matter
-)
+_COLOUR = 0.1  # of the residual's variance by its own past: from there on that bias may matter
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +145,7 @@ def words(verdict: str, seen: Finding) -> tuple[str, tuple[Warning, ...]]:
         warnings = (
             *warnings,
             _INCONSISTENT,
-        )  # where the physics lacks something, a model of the colour tells no θ
+        )  # where the physics lacks something, a model of the colour gives no θ
     elif verdict != "sensor_noise" and seen.inconsistent is not None:
         return f"{text} {_OFF}", (*warnings, seen.inconsistent)
     plain = seen.fit.std is not None and seen.fit.plain_covariance is None
@@ -250,7 +248,7 @@ def _unmodelled(seen: Finding) -> tuple[str, tuple[Warning, ...]]:
         told += [
             f"the residual of {test.name} is curved over {name}" for name in test.curved_over(SHARE)
         ]
-    told = [*told[:_TOLD], *(["and more"] if len(told) > _TOLD else [])]
+    told = [*told[:_LISTED], *(["and more"] if len(told) > _LISTED else [])]
     opening = f"The {seen.what}, {_size(seen)}, is not noise alone: {'; '.join(told)}."
     advice = "" if seen.steps and not seen.changes else _advice(seen, _cause(seen))
     return " ".join(part for part in (opening, _shares(seen), _quantised(seen), advice) if part), ()
@@ -277,7 +275,7 @@ def _cause(seen: Finding) -> str:
     followed = [name for test in seen.own for name in (*test.follows(), *test.curved_over(SHARE))]
     if followed:
         return (
-            f"what it follows ({_joined(followed[:_TOLD])}) has a form that was not tried, or "
+            f"what it follows ({_joined(followed[:_LISTED])}) has a form that was not tried, or "
             "comes with dynamics that the lags do not hold; suspects of your own "
             "(`[[suspects]]`) test a form"
         )
@@ -326,8 +324,8 @@ def _shares(seen: Finding) -> str:
     """
     if not seen.predictable:
         return ""
-    told = {test.name for test in seen.own if test.follows() or test.curved_over(SHARE)}
-    one = max(seen.predictable, key=lambda entry: (entry.largest(), entry.name in told))
+    named = {test.name for test in seen.own if test.follows() or test.curved_over(SHARE)}
+    one = max(seen.predictable, key=lambda entry: (entry.largest(), entry.name in named))
     of = f" of {one.name}" if len(seen.predictable) > 1 else ""
     unit = next((c.unit for c in seen.fit.problem.record.outputs if c.name == one.name), "")
     size = float(np.sqrt(one.largest())) * one.rms

@@ -139,7 +139,7 @@ class RunSample:
     """At most so many `points` of a run of `steps` steps, and where it `diverged`.
 
     `unit` (n0,) is what counts as one in each entry of the state: the deviation of the measured
-    output it stands for, or else its own over the points.
+    output it is a lag of, or else its own over the points.
     """
 
     points: RunPoints

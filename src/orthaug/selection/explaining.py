@@ -33,7 +33,7 @@ class LearnerTarget:
 
     Values are its output in a space where its errors are known.
 
-    `view` (P, r) takes whitened values over all points to that; None where the learner tells no
+    `view` (P, r) takes whitened values over all points to that; None where the learner has no
     tangent space: then they are taken as they are, less the physics. `size` is the norm of the
     learner with all that physics expresses.
     """
@@ -153,7 +153,7 @@ _TIE, _TIE_UNKNOWN = (
     2e-4,
     2e-3,
 )  # share of the learner: within this of the best the simpler term is taken
-_PART = 0.1  # of what even the best leaves: less tells no two terms apart either
+_PART = 0.1  # of what even the best leaves: less does not separate two terms either
 _DRAWS = (
     10.0  # variances of the noise in one direction: what two terms with widths differ by at random
 )
@@ -207,7 +207,7 @@ class Space:
     """Candidates as a learner would show them beside the physics, (K, r), and the `target` (r,).
 
     The target has norm 1, so that squares are shares of what the learner adds; `norm` is what it
-    had. `tie` is the share by which two terms cannot be told apart.
+    had. `tie` is the share within which two terms count as equal.
     """
 
     linearization: LearnedLinearization

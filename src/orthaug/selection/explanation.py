@@ -44,8 +44,8 @@ _DIVIDED = re.compile(r"\((?P<inner>.+)\)\s*/\s*(?P<by>[A-Za-z_]\w*)")
 class NewTerm:
     """A term to add: its parameter's `name`, the `text` with its `width` as a number, its place.
 
-    `scale` is the expression whose unit the term has; None for one by which no unit is told.
-    `template` has `{width}` where the width stands, None without one.
+    `scale` is the expression whose unit the term has; None for one without a known unit.
+    `template` has `{width}` in the width's place, None without one.
     """
 
     name: str
@@ -203,7 +203,7 @@ def added_to_motion(
 def _unit_inside(inner: str, added: NewTerm, units: dict[str, str]) -> str:
     """Return the unit of a term's coefficient within a sum.
 
-    None where the sum's or the term's is not told.
+    None where the sum's or the term's is unknown.
     """
     unit = _unit_of_first(inner, units)
     if not unit or added.scale is None:
@@ -249,7 +249,7 @@ _HALF = 0.5  # of the learner, less its own errors: terms that explain less are 
 _LEVEL = 0.01  # at which the learner is something beside its own errors
 _ENDED = ("converged", "exact")
 _SHOWN = 8  # terms, each as the only one
-_OUTSIDE = 0.05  # share of rows beyond the training data that is told of
+_OUTSIDE = 0.05  # share of rows beyond the training data that is reported
 _CONDITIONAL = (
     "the terms were chosen on these data: intervals of a fit with them to the same data are "
     "conditional on the choice; a fit to other data has intervals that are not."
@@ -266,7 +266,7 @@ _NAMES = {
 class ExplainingTerm:
     """A term to add to the physics.
 
-    `coefficient` is in `unit`, None where that is not told; `std` is its standard error by the
+    `coefficient` is in `unit`, None where that is unknown; `std` is its standard error by the
     learner's, None if not known. `share` is what it adds to the terms before it, `alone` what it
     explains as the only one. `rivals` would explain nearly as much in its place.
     """
@@ -310,7 +310,7 @@ class Explanation:
     """Terms that a learner has found.
 
     `share` is what the `terms` explain together of the mean square that the learner adds beside the
-    physics, `noise` the share that is its own error as far as training tells, `p` that of the
+    physics, `noise` the share that is its own error as far as training shows, `p` that of the
     learner being nothing else; None if not known. `physics` is the baseline or motion with the
     terms added, None where there are none or it is a function; `spec` the same as lines of a spec
     file.
@@ -393,15 +393,17 @@ def explain(
         candidates_of(linearization, degree, functions, _declared(suspects, linearization)),
     )
     chosen, fitted, dropped = settled(space, select(space, most, least))
-    told = _told(space, chosen, fitted, dropped)
+    explanation = _explanation(space, chosen, fitted, dropped)
     code = getattr(getattr(fit, "status", None), "code", "converged")
     if code not in _ENDED:
         text = (
             "training did not end at a minimum: the learner may show terms otherwise than they "
             "are; train longer."
         )
-        told = replace(told, warnings=(*told.warnings, Warning("not_converged", text)))
-    return told
+        explanation = replace(
+            explanation, warnings=(*explanation.warnings, Warning("not_converged", text))
+        )
+    return explanation
 
 
 def _declared(
@@ -427,7 +429,7 @@ def _declared(
     return found
 
 
-def _told(space: Space, chosen: list[Candidate], fitted: Fit, dropped: bool) -> Explanation:
+def _explanation(space: Space, chosen: list[Candidate], fitted: Fit, dropped: bool) -> Explanation:
     linearization, noise, p = space.linearization, None, space.shown.p
     if space.shown.covariance is not None and space.norm > 0:
         noise = min(float(np.trace(space.shown.covariance)) / space.norm**2, 1.0)
@@ -452,18 +454,18 @@ def _told(space: Space, chosen: list[Candidate], fitted: Fit, dropped: bool) -> 
         what = named or f"{len(terms)} terms"
         verb = "explains" if len(terms) == 1 else "explain"
         text = f"{what} {verb} {percent(share, 3)} of what the learner adds beside the physics."
-    told = []
+    warnings = []
     if linearization.outside > _OUTSIDE:
         reach = (
             f"{100 * linearization.outside:.0f} % of the rows lie beyond what the learner saw "
             "in training"
         )
-        told.append(Warning("beyond_training", f"{reach}: there it shows how it extrapolates."))
+        warnings.append(Warning("beyond_training", f"{reach}: there it shows how it extrapolates."))
     if terms:
-        told.append(Warning("conditional_on_selection", _CONDITIONAL))
+        warnings.append(Warning("conditional_on_selection", _CONDITIONAL))
     points = len(linearization.target)
     return Explanation(
-        terms, share, noise, p, singles, parameters, physics, spec, points, text, tuple(told)
+        terms, share, noise, p, singles, parameters, physics, spec, points, text, tuple(warnings)
     )
 
 

@@ -37,7 +37,7 @@ class FirstModel:
     """First lag of each input that is significant beside the output's own past; None where none is.
     """
     persistence: tuple[int, ...]
-    """Up to which order each input excites; `PERSISTENCE` stands for that or more."""
+    """Up to which order each input excites; `PERSISTENCE` means that or more."""
     free_run: tuple[float, ...]
     """Error of the free run on rows held out over the output's standard deviation, for each output.
     """
@@ -48,7 +48,7 @@ def first_model(record: Record) -> FirstModel | None:
 
     The orders are the smallest whose free run is within 5 % of the best of up to 4 lags a channel.
     The first lags are the significant ones, unless from 1 or 0 on the best free run is clearly
-    better. Every model that is tried has a constant: without one, lags that are not there stand in
+    better. Every model that is tried has a constant: without one, further lags stand in
     for the level of the signals.
     """
     record = _spread(record)
@@ -119,7 +119,7 @@ def _delay(record: Record, number: int) -> int | None:
 def _tested_delay(record: Record, number: int) -> int | None:
     """Return the delay by t-tests, at 5 % for all lags together.
 
-    None where none is significant or the lags cannot be told apart.
+    None where none is significant or the lags cannot be separated.
     """
     orders = Orders(_MOST, (_DELAY + 1,) * len(record.inputs), (0,) * len(record.inputs))
     phi = np.concatenate([_rows(e, 0, orders, _DELAY) for e in record.experiments])

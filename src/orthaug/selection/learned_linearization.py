@@ -66,7 +66,7 @@ class LearnedLinearization:
     signals: tuple[str, ...]
     """What the learner sees, as expressions, and rates of change that follow from it."""
     seen: int
-    """How many of the signals the learner sees as they stand."""
+    """Number of signals that the learner sees as they are."""
     units: dict[str, str]
     parse: Callable[[str], Expression]
     evaluate: Callable[[Expression], Any]
@@ -212,7 +212,7 @@ class MotionResponse:
     `s_{k+1} = A_k s_k + h/2 (A_k t_k + t_{k+1})`, `y_k = C_k s_k + o_k` for terms t in the
     equations and o in the outputs, h the sampling time; A, `steps`, and C, `outputs`, are
     derivatives of the fitted motion. A segment of training starts anew, from a state that was
-    estimated beside everything else: `begins` (M,) tells where.
+    estimated beside everything else: `begins` (M,) marks where.
     """
 
     steps: Float[np.ndarray, "M nx nx"]

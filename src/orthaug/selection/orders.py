@@ -115,7 +115,7 @@ def search_orders(
     largest: Orders,
     least: Orders,
     blocks: int,
-    told: OnModel = lambda rung: None,
+    report: OnModel = lambda rung: None,
     runner: Any = Threads(),  # noqa: B008  (it holds nothing)
 ) -> OrderSearch:
     """Judge orders from `largest` down, never below `least`, what the physics reads already.
@@ -154,7 +154,7 @@ def search_orders(
                 new, folds.fitted(list(map(chosen, new))), strict=True
             ):
                 found[orders] = PathModel(point, (str(orders),), held, seconds, orders.size)
-                told(found[orders])
+                report(found[orders])
 
         try:
             shorter = []

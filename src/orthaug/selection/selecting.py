@@ -64,7 +64,7 @@ def search_learners(
     widths: Sequence[int],
     criterion: Criterion,
     blocks: int,
-    told: OnModel,
+    report: OnModel,
     runner: Any,
 ) -> LearnerSearch:
     """Judge every width on all lags, and on those whose functions matter by themselves.
@@ -104,7 +104,7 @@ def search_learners(
             )
         )
         try:
-            told(rungs[-1])
+            report(rungs[-1])
         except KeyboardInterrupt:
             break
     return LearnerSearch(tuple(rungs), tuple(tried[: len(rungs)]))
@@ -116,7 +116,7 @@ def _largest(lags: Lags) -> int:
 
 
 def _on_fold(
-    given: Any, item: tuple[MLP | None, int], tell: Callable[..., None]
+    given: Any, item: tuple[MLP | None, int], report: Callable[..., None]
 ) -> tuple[float, float]:
     """Return the mean squared error of free runs on a block that was held out, and seconds.
 
@@ -382,10 +382,10 @@ def select(
         )
         notes += physics.notes if physics else []
     elif isinstance(learner, MLP) and not heard.stopped:
-        told = heard.of("learner")
+        report = heard.of("learner")
         lags = Lags(reach.na, reach.nb, reach.nk)
         found = search_learners(
-            problem, lags, tested, learner, widths, criterion, blocks, told, runner
+            problem, lags, tested, learner, widths, criterion, blocks, report, runner
         )
     if heard.stopped:
         notes.append(
@@ -418,14 +418,14 @@ class _Listener:
         self.progress, self.stopped = progress, False
 
     def of(self, stage: str) -> Callable[[Any], None]:
-        def told(rung: Any) -> None:
+        def report(rung: Any) -> None:
             try:
                 self.progress(stage, rung)
             except KeyboardInterrupt:
                 self.stopped = True
                 raise
 
-        return told
+        return report
 
 
 def _layout(outputs: Sequence[str], inputs: Sequence[str], orders: Orders) -> tuple[Lag, ...]:
