@@ -67,15 +67,14 @@ def describe_beyond(model: Model | MotionModel, radius: float | None) -> str:
     """Return a sentence on what the radius says of the free run; empty without a radius."""
     if radius is None:
         return ""
-    does = "fades" if model.form.beyond == "fade" else "is held"
+    does = "fades" if model.form.beyond == "fade" else "stays constant"
     text = (
-        f"Beyond its training the learned correction {does}, so it is bounded; the physics "
-        "goes on alone there, with "
+        f"Beyond the training data the learned correction {does}, so it is bounded. The physics "
+        f"alone has a spectral radius of {radius:.4g} there"
     )
-    text += f"a spectral radius of {radius:.4g}"
     if radius < 1:
         return f"{text}: bounded inputs give a bounded free run. This is a proof, not a sample."
-    return f"{text}: nothing there bounds the free run."
+    return f"{text}, so the free run is not bounded."
 
 
 def _going_on(model: Model | MotionModel, kind: str) -> Model | MotionModel:

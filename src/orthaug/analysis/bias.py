@@ -116,15 +116,15 @@ class SuspectedBias:
         certificate = self.certificate
         if self.seen is False:
             return (
-                f"{self.suspect.name}: the learner does not see all of it, so that it biases "
-                "also what no measure changes."
+                f"{self.suspect.name}: the learner does not see all of this term, so the term "
+                "biases θ under every measure."
             )
         if certificate is None:
             return ""
         if certificate.verdict == "orthogonal":
             return (
-                f"{self.suspect.name}: φᵀδ is zero on all of these points, so that it biases "
-                "nothing there."
+                f"{self.suspect.name}: φᵀδ is zero on all of these points, so this term "
+                "biases nothing there."
             )
         if certificate.verdict == "removable":
             return f"{self.suspect.name}: some weighting of these points leaves θ unbiased."
@@ -140,10 +140,10 @@ class SuspectedBias:
             if abs(share) > 5e-3
         ]
         return (
-            f"{self.suspect.name}: no weighting of these points leaves θ unbiased if it counts "
-            f"any of the {percent(certificate.positive, 3)} where (φᵀa)δ is positive, for it "
-            f"is nowhere negative; a = {' '.join(terms)} (columns scaled to root mean square "
-            "1). Only the least bias can be asked for."
+            f"{self.suspect.name}: no weighting that counts any of "
+            f"{percent(certificate.positive, 3)} of these points leaves θ unbiased. There "
+            f"(φᵀa)δ is positive, and it is nowhere negative; a = {' '.join(terms)} (columns "
+            "scaled to root mean square 1). Only the least bias can be asked for."
         )
 
     def as_dict(self) -> dict[str, Any]:

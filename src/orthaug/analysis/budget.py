@@ -597,8 +597,10 @@ def _unbounded(names: Sequence[str], std: Vector, ends: Matrix) -> list[Warning]
     ]
     if not none:
         return []
-    text = f"no interval of {', '.join(none)} counts the bias: some theta within those that do have"
-    return [Warning("physics_not_met", f"{text} no physical parameters.")]
+    text = (
+        f"no interval of {', '.join(none)} includes the bias: some theta within the intervals that"
+    )
+    return [Warning("physics_not_met", f"{text} do belongs to no physical parameters.")]
 
 
 def _warning(

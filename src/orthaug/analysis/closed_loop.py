@@ -71,12 +71,11 @@ def closed_loop(record: Record) -> tuple[Warning, ...]:
     outputs = ", ".join(channel.name for channel in record.outputs)
     text = (
         f"past {outputs} predict{'s' if len(record.outputs) == 1 else ''} {named}: the data "
-        "look recorded under feedback. An estimate is then consistent only with the right "
-        "noise: one step ahead white noise in the equation, on the free run white noise on the "
-        "sensor, in both the whole physics; else what the feedback makes of noise and of "
-        "missing physics is taken for an effect of the input. Record the reference and model "
-        "the loop with it as the input, move the reference much more than the noise is, or "
-        "record without the controller."
+        "look recorded under feedback. An estimate is then consistent only with complete "
+        "physics and the right noise: white in the equation for one step ahead, white on the "
+        "sensor for the free run. Otherwise feedback of noise and of missing physics counts as "
+        "an effect of the input. Record the reference and model the loop with it as the input, "
+        "make the reference much larger than the noise, or record without the controller."
     )
     return (Warning("closed_loop", text),)
 

@@ -367,9 +367,9 @@ def wild_rows(response: Response, experiments: Sequence[Experiment]) -> tuple[Wa
         named = [experiments[rows[k][0]].where(rows[k][1]) for k in wild[:_NAMED]]
         more = f" and {len(wild) - _NAMED} more" if len(wild) > _NAMED else ""
         text = (
-            f"{percent(held, 3)} of the squares of the one-step residual of {output.name} stand in "
-            f"{counted(len(wild), 'row')} of {len(error)}: {'; '.join(named)}{more}. If samples are wrong there, so is "
-            'θ: mark them (step = "outliers" of data.prepare), or leave them out.'
+            f"{counted(len(wild), 'row')} of {len(error)} make up {percent(held, 3)} of the squared "
+            f"one-step residual of {output.name}: {'; '.join(named)}{more}. Wrong samples there "
+            'bias θ: mark them (step = "outliers" of data.prepare), or leave them out.'
         )
         found.append(Warning("wild_rows", text))
     return tuple(found)

@@ -102,14 +102,14 @@ def _sentences(checks: Stability, driven: bool) -> Iterator[tuple[str, str]]:
         )
     if run is None:
         yield (
-            "The model uses no past outputs: its free run cannot diverge, and keeps nothing of "
-            "its start.",
+            "The model uses no past outputs: its free run cannot diverge, and does not depend "
+            "on its start.",
             "",
         )
         return
     if run.diverged:
         yield (
-            f"The free run diverges ({'; '.join(run.diverged)}); it is looked at up to there.",
+            f"The free run diverges ({'; '.join(run.diverged)}); the checks end there.",
             "free_run_diverges",
         )
     if run.share_above_one is not None:

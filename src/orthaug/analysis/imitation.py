@@ -80,28 +80,31 @@ class Imitation:
             sees = f"The learner is a sum of {len(self.inputs)} terms"
         if self.everything:
             return (
-                f"{sees} and could imitate all of the physics: θ is split off along every "
-                "direction."
+                f"{sees} and could imitate all of the physics: the orthogonal split sets θ along "
+                "every direction."
             )
         if self.held:
-            columns, them = ("stands", "it") if len(self.held) == 1 else ("stand", "them")
+            are, them = ("is", "it") if len(self.held) == 1 else ("are", "them")
             sees = (
-                f"{_listed(self.held)} {columns} at a bound: θ is not split off along {them}. "
-                f"{sees}"
+                f"{_listed(self.held)} {are} at a bound: the orthogonal split does not move "
+                f"{them}. {sees}"
             )
         if not self.directions:
             rest = " other" if self.held else ""
             text = f"{sees} and could imitate nothing of the{rest} physics"
             return f"{text}: the fit determines every{rest} parameter beside it.{self._nearly}"
         could = _listed([_combination(direction) for direction in self.directions])
-        told = [f"{sees} and could imitate {could}: there, and only there, θ is split off."]
+        along = "this direction" if len(self.directions) == 1 else "these directions"
+        sentences = [
+            f"{sees} and could imitate {could}. The orthogonal split sets θ along {along} only."
+        ]
         if self.determined:
-            told.append(
+            sentences.append(
                 f"The fit determines {_listed(self.determined)} beside any learner of these inputs."
             )
         if self.physical:
-            told.append(f"Of the physical parameters it determines {_listed(self.physical)} so.")
-        return " ".join(told) + self._nearly
+            sentences.append(f"Of the physical parameters it determines {_listed(self.physical)}.")
+        return " ".join(sentences) + self._nearly
 
     @property
     def _nearly(self) -> str:
@@ -113,9 +116,9 @@ class Imitation:
             return ""
         name, left = self.weakest
         return (
-            f" On these rows, however, the terms leave {100 * left:.2g} % of what physics "
-            f"alone has to determine {name}: its value rests on that part, and the terms may "
-            "have taken over the rest."
+            f" On these rows, however, the terms span all but {100 * left:.2g} % of the regressor "
+            f"of {name}. Only that part determines its value; the terms may have taken over the "
+            "rest."
         )
 
 
@@ -131,8 +134,8 @@ class MotionImitation(Imitation):
         sees = f"The learner sees {', '.join(self.inputs)}"
         if self.everything:
             return (
-                f"{sees} and could imitate a change of every parameter: they are those of the "
-                "nearest physics."
+                f"{sees} and could imitate a change of every parameter: the nearest physics "
+                "sets them."
             )
         if not self.directions:
             return (
@@ -140,16 +143,16 @@ class MotionImitation(Imitation):
                 "them beside it."
             )
         moved = "; ".join(" with ".join(direction) for direction in self.directions)
-        told = (
-            f"{sees} and could imitate a change of {moved}: there, and only there, the nearest "
-            "physics decides."
+        text = (
+            f"{sees} and could imitate a change of {moved}. Only there the nearest physics sets "
+            "the parameters."
         )
         if self.determined:
-            told += (
+            text += (
                 f" The fit determines {', '.join(self.determined)} beside any learner of these "
                 "inputs."
             )
-        return told
+        return text
 
 
 def imitation(

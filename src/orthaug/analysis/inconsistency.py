@@ -79,8 +79,8 @@ class Inconsistency:
             for i in self.moved
         ]
         text = (
-            "one-step θ is inconsistent: its errors are coloured, so they stand in the lagged "
-            "outputs of later rows, and more rows do not help. With a model of the colour "
+            "one-step θ is inconsistent: its errors are coloured and so correlated with "
+            "the lagged outputs, and more rows do not help. With a model of the colour "
             f"(autoregression of order {self.order}) {'; '.join(each)}."
         )
         if self.instruments is not None and self.instruments_std is not None:
@@ -90,8 +90,8 @@ class Inconsistency:
             ]
             text += f" Instruments (the outputs of the free run) give {', '.join(given)}."
         text += (
-            ' No interval of the one-step θ counts that, robust or not: train on the free run (focus = "simulation"), '
-            "which has no such bias."
+            " No interval of the one-step θ covers this bias. Train on the free run "
+            '(focus = "simulation"), which does not have it.'
         )
         return Warning("inconsistent", text)
 

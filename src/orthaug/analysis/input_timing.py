@@ -180,8 +180,8 @@ class DeadTime:
         """Gain by the delay, in words."""
         late = f"{self.samples} sample{'s' * (self.samples > 1)}"
         return (
-            f"with a delay of {late} physics alone leaves {self.residual:.3g} deviations of "
-            f"the output instead of {self.undelayed:.3g}"
+            f"with a delay of {late} the error of physics alone is {self.residual:.3g} "
+            f"standard deviations of the output instead of {self.undelayed:.3g}"
         )
 
     @property
@@ -189,9 +189,9 @@ class DeadTime:
         """With what to write into the spec."""
         return Warning(
             "dead_time",
-            f"{self.input} seems to act late: {self.gain}, and its parameters are others. If there is a dead time, "
-            f'delay the input by [[data.prepare]] with step = "shift", channel = "{self.input}", samples = '
-            f"{self.samples}; a lag of its drive belongs into the equations.",
+            f"{self.input} seems to act late: {self.gain}, with other parameters. If there is a dead "
+            f'time, delay the input by [[data.prepare]] with step = "shift", channel = "{self.input}", samples = '
+            f"{self.samples}; if its drive is slow, model that in the equations.",
         )
 
 

@@ -144,8 +144,8 @@ def _spread(model: Model | MotionModel, fit: Any) -> tuple[_Spread | None, list[
     joint, nt = model.statistics.joint(len(model.theta)), len(model.theta)
     if not model.form.differentiable:
         text = (
-            "the learner has no derivatives (a function from another toolbox): differences "
-            "stand in, no intervals."
+            "the learner has no derivatives (a function from another toolbox): finite "
+            "differences replace them, and there are no intervals."
         )
         return None, [Warning("no_intervals", text)]
     if joint is not None and model.numbers.tilt is None:
@@ -157,7 +157,7 @@ def _spread(model: Model | MotionModel, fit: Any) -> tuple[_Spread | None, list[
         values, vectors = np.linalg.eigh(covariance)
         text = (
             "there is no joint covariance with the learner's weights; intervals are those of "
-            "θ, the learner frozen."
+            "θ, with the learner frozen."
         )
         spread = _Spread(vectors * np.sqrt(np.maximum(values, 0.0)), float(fit.freedom), True)
         return spread, [Warning("learner_frozen", text)]

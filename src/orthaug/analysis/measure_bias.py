@@ -33,7 +33,7 @@ class MeasureLinearization:
         weighed: the measure's points and the physics there, of one parameter or more.
         physics: the map from physical parameters to θ.
         theta: θ̂ for relative biases and for dp/dθ.
-        learned: f at the measure's points (M, ny) after a fit, to tell how much of it a suspect
+        learned: f at the measure's points (M, ny) after a fit, to find how much of it a suspect
             explains.
         directions: (nθ, s) along which θ is split; None for all.
     """

@@ -65,8 +65,8 @@ class MissingLags:
         tested = ", ".join(test.lag for test in self.tests)
         if not self.missing:
             return (
-                f"The residual does not depend on what the learner does not see ({tested}), as "
-                "far as it shows."
+                f"The residual shows no dependence on lags that the learner does not see "
+                f"({tested})."
             )
         first = self.missing[0]
         others = (
@@ -75,9 +75,9 @@ class MissingLags:
             else ""
         )
         return (
-            "What the physics lacks is no function of what the learner sees: the residual also "
-            f"depends on {first.lag}{others}, by {percent(first.share)} of its variance, so "
-            "that θ beside the learner is biased; add that lag to learner.inputs."
+            "The learner cannot express all that the physics lacks, which biases θ: "
+            f"{first.lag} explains {percent(first.share)} of the residual's variance{others}. "
+            "Add that lag to learner.inputs."
         )
 
     @property

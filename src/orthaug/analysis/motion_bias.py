@@ -187,7 +187,7 @@ class MotionLinearization:
         """Return the bias by every suspect; empty where the free run has no sensitivities.
 
         Args:
-            used: weights that a fit used, where it is asked what its residual tells; `steps` of a
+            used: weights that a fit used, where its residual is to be used; `steps` of a
                 block, where its errors are coloured.
         """
         added = tuple(suspect.term(self.motion) for suspect in suspects)

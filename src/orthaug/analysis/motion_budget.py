@@ -149,7 +149,7 @@ def motion_budget(
 
     Args:
         table: what every suspect does to the fit.
-        smooth: the same of terms that stand beside those of the table (`softened_bias`), named
+        smooth: the same of terms that go with those of the table (`softened_bias`), named
             where they explain clearly more of a learner.
         families: the same of members of the catalogue (`families_of`).
         declared: the suspects that were declared; by default those of the table.
@@ -392,8 +392,8 @@ def _motion_warning(
     several, first = len(found.causes) > 1, sorted(found.rivals, key=explains, reverse=True)[:2]
     named = " and ".join(f"{rival.suspect.name}, {percent(explains(rival))}" for rival in first)
     other = f" (near it: {named}, and would move them elsewhere)" if first else ""
-    what = "the learner" if learns else "the squares that the free run leaves"
-    told = " and ".join(
+    what = "the learner" if learns else "the free run's squared error"
+    listed = " and ".join(
         f"{c.suspect.name} of size {_size(c):.3g} {c.suspect.unit}".rstrip()
         + f" in the equation of {c.equation}"
         for c in found.causes
@@ -401,13 +401,13 @@ def _motion_warning(
     if learns and found.share < SURE_SHARE:
         return Warning(
             "biased",
-            f"what the learner found looks most like {told} ({percent(found.share)} of it), "
+            f"what the learner found looks most like {listed} ({percent(found.share)} of it), "
             f"which would move {list_biases(large)}, and the standard errors do not cover "
             f"that{other}.",
         )
     return Warning(
         "biased",
-        f"{told} explain{'' if several else 's'} {100 * found.share:.0f} % of {what} and "
+        f"{listed} explain{'' if several else 's'} {100 * found.share:.0f} % of {what} and "
         f"move{'' if several else 's'} {list_biases(large)}, which the standard errors do not "
         f"cover{other}.",
     )

@@ -94,18 +94,16 @@ def _late(fit: MotionEstimate) -> tuple[DeadTime, ...]:
 
 def _coloured(fit: MotionEstimate) -> str:
     """Return a sentence on coloured errors, and on the standard errors that follow."""
-    text = "the errors of the free run are coloured: held-out errors say how good the model is"
+    text = "the errors of the free run are coloured: judge the model by held-out errors"
     if fit.std is None or fit.plain_covariance is not None:
         return f"{text}."
     return (
-        f"{text}, and standard errors are those of white ones, as rows are too few: take them "
-        "for a rough guide."
+        f"{text}. The rows are too few for robust standard errors: those given assume white errors "
+        "and are a rough guide."
     )
 
 
-_UNCOUNTED = (
-    " Intervals count noise alone: what is missing may have moved the parameters by more than that."
-)
+_UNCOUNTED = " Intervals cover noise only: missing physics may have moved the parameters by more."
 
 
 def _predictable(i: int, test: ResidualTest, errors: list, inputs: list, every: int) -> Predictable:
@@ -139,52 +137,52 @@ def _words(
     units = {c.name: c.unit for c in fit.problem.record.outputs}
     sizes = ", ".join(f"{s.rms:.3g} {units[s.name]}".strip() + f" of {s.name}" for s in shares)
     if verdict == "white":
-        noise = "is white: noise on the outputs, which is what it is trained for."
-        return f"What the free run leaves ({sizes}) {noise}{_traces(tests, shares)}"
+        noise = "is white: noise on the outputs, which the training assumes."
+        return f"The free run's error ({sizes}) {noise}{_traces(tests, shares)}"
     if verdict == "equation_noise":
         learner = (
             "that the learner does not see"
             if fit.model.form.bound is not None
-            else "(a learner would tell)"
+            else "(a learner would show which)"
         )
         no_input = "no input, " if fit.problem.motion.inputs else ""
         return (
-            f"What the free run leaves ({sizes}) is coloured ({_colour(tests, shares)}), and "
-            f"follows {no_input}no state at the same instant, and no simple term that an "
-            f"equation could lack: disturbances, or physics missing in an equation {learner}."
+            f"The free run's error ({sizes}) is coloured ({_colour(tests, shares)}). It follows "
+            f"{no_input}no state at the same instant, and no simple missing term. Its cause is "
+            f"disturbances, or physics missing in an equation {learner}."
         )
     if late:
         return (
-            f"What the free run leaves ({sizes}) holds more than noise. Most likely "
-            f"{late[0].input} acts later than the equations say: {late[0].gain}."
+            f"The free run's error ({sizes}) holds more than noise. Most likely "
+            f"{late[0].input} acts later than in the equations: {late[0].gain}."
         )
     if lacks is not None:
-        return f"What the free run leaves ({sizes}) holds more than noise. {_named(lacks)}"
+        return f"The free run's error ({sizes}) holds more than noise. {_named(lacks)}"
     what = [f"{name} follows {', '.join(given)}" for name, given in followed.items()]
     what += [f"{name} is not flat over {', '.join(given)}" for name, given in curved.items()]
     what = what or [f"{100 * max(s.inputs for s in shares):.0f} % follows from the inputs"]
     held = "Physics is missing" + (
         ", or inputs run otherwise between samples" if fit.problem.motion.inputs else ""
     )
-    return f"What the free run leaves ({sizes}) holds more than noise: {'; '.join(what)}. {held}."
+    return f"The free run's error ({sizes}) holds more than noise: {'; '.join(what)}. {held}."
 
 
 def _traces(tests: tuple[ResidualTest, ...], shares: tuple[Predictable, ...]) -> str:
     """Return a sentence on significant effects that are too small to matter."""
-    told = [
+    effects = [
         f"{test.name} follows {', '.join(test.correlated_inputs)}"
         for test in tests
         if test.correlated_inputs
     ]
-    told += [
+    effects += [
         f"{test.name} is not flat over {', '.join(over)}"
         for test in tests
         if (over := test.curved_over(0.0))
     ]
-    if not told:
+    if not effects:
         return ""
     most = max(share.largest(own_past=False) for share in shares)
-    return f" Tests still see traces ({'; '.join(told)}): {percent(most)} of its square at most."
+    return f" Tests still detect small effects ({'; '.join(effects)}): {percent(most)} of its square at most."
 
 
 def _colour(tests: tuple[ResidualTest, ...], shares: tuple[Predictable, ...]) -> str:

@@ -131,11 +131,11 @@ def _without_growth(found: Modes) -> str:
             f"{others} everywhere: the largest real part is {found.rightmost:.4g} 1/s."
         )
     elif found.fastest:
-        sentences.append("None grows, and not all decay: the largest real part is 0.")
+        sentences.append("No mode grows, but not all decay: the largest real part is 0.")
     if count:
         sentences.append(
-            "What integrates neither decays nor grows: it keeps "
-            f"{'their' if count > 1 else 'its'} errors."
+            f"The integrating mode{'s' if count > 1 else ''} neither decay{'' if count > 1 else 's'} "
+            f"nor grow{'' if count > 1 else 's'}: errors in {'them' if count > 1 else 'it'} stay."
         )
     return " ".join(sentences)
 

@@ -205,7 +205,7 @@ def softened(
     """Return smooth forms of friction: each suspect that jumps as tanh(v/width), of several widths.
 
     Args:
-        p: parameters (np,); with states x (M, nx) and inputs u (M, nu) they tell the widths, in
+        p: parameters (np,); with states x (M, nx) and inputs u (M, nu) they give the widths, in
             median sizes.
     """
     found = []
@@ -231,7 +231,7 @@ def usual_motion_suspects(
     """Return the usual suspects: friction, drag, hardening, bent inputs, an offset.
 
     Args:
-        x: states (M, nx) that it is about; with inputs u (M, nu) they tell the widths.
+        x: states (M, nx) that it is about; with inputs u (M, nu) they give the widths.
         on: expressions that the learner sees, such as the distance of two masses.
     """
     names, inputs = motion.names_of_states, motion.inputs

@@ -36,9 +36,9 @@ class Observer:
     """An extended Kalman filter of a fitted model, lagged or a motion.
 
     Args:
-        model: the model, or the fit: of a fit the residual tells how large the noises are
+        model: the model, or the fit: of a fit the residual determines how large the noises are
             (`diagnose`), and where both are there the likelihood of its data does; a model that
-            `orthaug fit` saved carries what they told.
+            `orthaug fit` saved carries them.
         noise: the covariances, where they are known better: of the disturbances in a sample, of the
             sensors.
 

@@ -234,27 +234,24 @@ def _within_reach(
         :1
     ]
     if len(near) < len(found):
-        told = (
-            f"{len(found) - len(near)} more equilibria lie far outside of the training data; "
-            "they are left out."
+        text = (
+            f"{len(found) - len(near)} more equilibria lie far outside of the training data "
+            "and are left out."
         )
-        warnings.append(Warning("equilibria_left_out", told))
+        warnings.append(Warning("equilibria_left_out", text))
     if len(near) > 1:
-        told = f"{len(near)} equilibria belong to these inputs; fix an output to choose one."
-        warnings.append(Warning("several_equilibria", told))
+        text = f"{len(near)} equilibria belong to these inputs; fix an output to choose one."
+        warnings.append(Warning("several_equilibria", text))
     if any(one.line for one in near):
-        told = (
+        text = (
             "the equilibrium is one of a continuum (the model integrates, or too little is "
             "fixed); one is taken."
         )
-        warnings.append(Warning("continuum_of_equilibria", told))
+        warnings.append(Warning("continuum_of_equilibria", text))
     if any(one.outside for one in near):
         where = "the operating point lies" if len(near) == 1 else "operating points so marked lie"
-        told = (
-            f"{where} outside of the training data, which do not tell what the model is worth "
-            "there."
-        )
-        warnings.append(Warning("outside_training", told))
+        text = f"{where} outside of the training data, where the model is not validated."
+        warnings.append(Warning("outside_training", text))
     return near, warnings
 
 

@@ -137,28 +137,28 @@ def _withheld(fit: Any) -> Any:
     known = [length for length in lengths if length is not None]
     if len(known) == len(lengths) and max(known) <= fit.scores.longest:
         why = (
-            f"for {max(known)} steps, and the {segments.count} that were trained on hold too "
-            "few stretches of that"
+            f"over {max(known)} steps, and the {segments.count} steps of training hold too few "
+            "stretches of that length"
         )
     else:
         why = (
-            f"for longer than the segments that were trained on ({fit.scores.longest} steps) "
-            "or a good part of the data"
+            f"over more than the segments of training ({fit.scores.longest} steps) or a good "
+            "part of the data"
         )
     each = (
         ""
         if fit.std is None
-        else "; for white errors it would be "
+        else " White errors would give standard errors of "
         + ", ".join(
             f"{std:.2g} of {name}"
             for name, std in zip(_names(fit), fit.std, strict=True)
             if np.isfinite(std)
         )
+        + ", which is too small."
     )
     text = (
-        "no standard errors and no intervals: the errors of the free run remember each other "
-        f"{why}, so their number does not say how well they average out{each}, which is too "
-        "small. Longer segments, a longer record, or physics that leaves less may tell."
+        "there are no standard errors and no intervals: the errors of the free run are correlated "
+        f"{why}.{each} Use longer segments, a longer record, or physics with smaller errors."
     )
     return replace(
         fit,

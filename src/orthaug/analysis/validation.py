@@ -195,11 +195,11 @@ def cross_validate(
     return list(runner.map(_on_block, (tuple(fits), unit), folds))
 
 
-def _on_block(given: Any, pair: tuple[Record, Record], tell: Callable[..., None]) -> list[Pieces]:
+def _on_block(given: Any, pair: tuple[Record, Record], report: Callable[..., None]) -> list[Pieces]:
     """Return the errors on a block of every fit of the rest."""
     (fits, unit), (training, held), errors = given, pair, []
     for fit in fits:
-        tell()
+        report()
         found: Pieces = [None] * len(held.experiments)
         with suppress(InputError):  # the block took away what the physics needs
             trained = fit(training)
@@ -239,15 +239,15 @@ def judge(trials: Sequence[Trial], extrapolation: Sequence[Extrapolation] = ()) 
         ran_away = any(math.isinf(t.model) and not math.isinf(t.alone) for t in group)
         ratio = _ratio(group, alone, model)
         sure = f" ({ratio})" if str(ratio) and ratio.low < ratio.high else ""
-        told = _comparison(alone, model) + sure
+        sentence = _comparison(alone, model) + sure
         if len(group) > 1:
-            told = (
+            sentence = (
                 f"In {where} ({len(group)} blocks, {sum(t.model < t.alone for t in group)} of "
-                f"them better): {told}"
+                f"them better): {sentence}"
             )
         else:
-            told = f"On {where}: {told}"
-        sentences.append(told)
+            sentence = f"On {where}: {sentence}"
+        sentences.append(sentence)
         codes.append("hurts" if ran_away else ratio.code)
         ratios.append(ratio)
     worst = next(code for code in ("hurts", "no_help", "helps") if code in codes)
@@ -287,11 +287,11 @@ def _comparison(alone: float, model: float) -> str:
     errors = {"with the learner": model, "with physics alone": alone}
     if not any(map(math.isinf, errors.values())):
         return f"free-run NRMSE {model:.4g} with the learner, {alone:.4g} with physics alone"
-    told = (
+    clauses = (
         f"diverges {who}" if math.isinf(e) else f"has an NRMSE of {e:.4g} {who}"
         for who, e in errors.items()
     )
-    return f"the free run {' and '.join(told)}"
+    return f"the free run {' and '.join(clauses)}"
 
 
 def extrapolation(part: str, x: Matrix, training: Matrix, layout: Layout) -> list[Extrapolation]:

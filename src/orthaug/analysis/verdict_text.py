@@ -171,15 +171,15 @@ def _inconsistent(seen: Finding) -> bool:
 
 def _white(seen: Finding) -> tuple[str, tuple[Warning, ...]]:
     if seen.complete and seen.inconsistent is not None:
-        return "The one-step residual is hardly coloured, by enough to move θ.", ()
+        return "The one-step residual is slightly coloured, but enough to move θ.", ()
     if seen.complete:
-        told = (
+        so = (
             "the intervals hold"
             if seen.fit.model.form.bound is None
-            else "it is noise as far as it shows"
+            else "the tests find only noise"
         )
         return (
-            f"The one-step residual is white: {told}, and no criterion is better than this one.",
+            f"The one-step residual is white: {so}, and no criterion is better than this one.",
             (),
         )
     return _small(seen), ()
@@ -220,18 +220,18 @@ def _sensor_noise(seen: Finding) -> tuple[str, tuple[Warning, ...]]:
     text = f"The one-step residual is coloured: {how}. That is noise on the measured output"
     if seen.simulated:
         more = f" {_sentence(seen.changes[0])}" if seen.changes else ""
-        return f"{text}, which the simulation criterion suits.{more}", ()
+        return f"{text}: the simulation criterion is the right one.{more}", ()
     text += '. One-step estimates of θ are then inconsistent, those of focus = "simulation" are not'
     if seen.changes and seen.changes[0].kind == "criterion":
         fall = seen.changes[0].fall
         text += (
-            f"; the error of the free run is predicted to fall by {percent(fall)} with it"
+            f"; that focus is predicted to lower the error of the free run by {percent(fall)}"
             if seen.changes[0].gains
-            else "; the error of the free run is not predicted to fall with it"
+            else "; that focus is not predicted to lower the error of the free run"
         )
     if seen.noise is not None and seen.noise > _TOO_FAST:
         text += (
-            f". The noise is {100 * seen.noise:.0f} % of what tells the lagged outputs apart: "
+            f". The noise is {100 * seen.noise:.0f} % of the least variance among the lagged outputs: "
             "the sampling is too fast for one-step estimation"
         )
     steps = f" {_quantised(seen)}" if seen.steps else ""
@@ -239,17 +239,17 @@ def _sensor_noise(seen: Finding) -> tuple[str, tuple[Warning, ...]]:
 
 
 def _unmodelled(seen: Finding) -> tuple[str, tuple[Warning, ...]]:
-    told = [
+    findings = [
         f"its largest autocorrelation is {max((t.largest_acf or 0.0) for t in seen.own):.2f} "
         "in size"
     ]
     for test in seen.own:
-        told += [f"the residual of {test.name} still follows {name}" for name in test.follows()]
-        told += [
+        findings += [f"the residual of {test.name} still follows {name}" for name in test.follows()]
+        findings += [
             f"the residual of {test.name} is curved over {name}" for name in test.curved_over(SHARE)
         ]
-    told = [*told[:_LISTED], *(["and more"] if len(told) > _LISTED else [])]
-    opening = f"The {seen.what}, {_size(seen)}, is not noise alone: {'; '.join(told)}."
+    findings = [*findings[:_LISTED], *(["and more"] if len(findings) > _LISTED else [])]
+    opening = f"The {seen.what}, {_size(seen)}, is not noise alone: {'; '.join(findings)}."
     advice = "" if seen.steps and not seen.changes else _advice(seen, _cause(seen))
     return " ".join(part for part in (opening, _shares(seen), _quantised(seen), advice) if part), ()
 
@@ -265,8 +265,8 @@ def _quantised(seen: Finding) -> str:
     trained = "" if seen.simulated else 'training on the free run (focus = "simulation"), '
     return (
         f"{'; '.join(each.values())}: such steps colour it as noise on the output does, and "
-        f"bias one-step estimates of θ. Against that help {trained}fewer samples (`decimate` "
-        "of data.prepare), or a finer measurement."
+        f"bias one-step estimates of θ. Remedies: {trained}fewer samples (`decimate` of "
+        "data.prepare), or a finer measurement."
     )
 
 
@@ -275,19 +275,17 @@ def _cause(seen: Finding) -> str:
     followed = [name for test in seen.own for name in (*test.follows(), *test.curved_over(SHARE))]
     if followed:
         return (
-            f"what it follows ({_joined(followed[:_LISTED])}) has a form that was not tried, or "
-            "comes with dynamics that the lags do not hold; suspects of your own "
-            "(`[[suspects]]`) test a form"
+            f"the effect of {_joined(followed[:_LISTED])} has a form that was not tried, or "
+            "dynamics beyond the lags; test a form by your own `[[suspects]]`"
         )
     if seen.drifts:
         return (
-            "the error drifts, which neither white noise in the equation nor noise on the "
-            "sensor explains; a disturbance that was not recorded, or slow dynamics that the "
-            "physics lacks, would: record it as an input"
+            "the error drifts, which no white noise explains. An unrecorded disturbance would, or "
+            "slow dynamics that the physics lacks: record the disturbance as an input"
         )
     return (
-        "its colour is that of a disturbance or of noise on the output that neither criterion "
-        "describes; its own past predicts it, an input that was not recorded might"
+        "its colour is that of a disturbance or of sensor noise that neither criterion describes. "
+        "Its own past predicts it; an unrecorded input might, too"
     )
 
 
@@ -300,9 +298,7 @@ def _small(seen: Finding) -> str:
     colour = " Its colour is that of the noise." if seen.simulated and not seen.white else ""
     followed = seen.follows()
     shown = (
-        f"noise for the most part, but still follows {_joined(followed)}"
-        if followed
-        else "noise as far as it shows"
+        f"mostly noise, but still follows {_joined(followed)}" if followed else "noise by all tests"
     )
     advice = _advice(
         seen, "what it follows is a small effect" if followed else "it is the noise floor"
@@ -331,8 +327,8 @@ def _shares(seen: Finding) -> str:
     size = float(np.sqrt(one.largest())) * one.rms
     past, driven, curved = (percent(share) for share in (one.own_past, one.inputs, one.functions))
     return (
-        f"Of its variance{of} {past} could be predicted from its own past, {driven} from the "
-        f"inputs, {curved} from functions of the regressors: "
+        f"The predictable share of its variance{of} is {past} from its own past, {driven} from "
+        f"the inputs, {curved} from functions of the regressors: "
         f"{size:.2g}{f' {unit}' if unit else ''} at most."
     )
 
@@ -345,7 +341,7 @@ def _advice(seen: Finding, otherwise: str) -> str:
     if seen.changes:
         return _sentence(seen.changes[0])
     if not seen.predictable:
-        return "Options that were not tried are more lags, other learner inputs or neurons."
+        return "Try more lags, other learner inputs or more neurons."
     limit = 100 * fall_of(WORTH)
     return (
         "No further lag, offset or learner is predicted to lower it by "
@@ -359,8 +355,8 @@ def _sentence(change: Change) -> str:
 
 
 def _coloured(what: str) -> Warning:
-    told = (
-        f"standard errors of θ are those of a white residual, but the {what} coloured: take "
-        "them for a rough guide."
+    text = (
+        f"standard errors of θ assume a white residual, but the {what} coloured: they are "
+        "only a rough guide."
     )
-    return Warning("coloured_residual", told)
+    return Warning("coloured_residual", text)

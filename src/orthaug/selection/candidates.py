@@ -147,11 +147,11 @@ def _notes(library: TermLibrary, finite: np.ndarray, own: np.ndarray) -> list[Wa
     texts, notes = library.texts, []
     infinite = [texts[i] for i in np.flatnonzero(~finite)]
     if infinite:
-        text = f"left out, for they are not finite on these data: {_named(infinite)}."
+        text = f"terms that are not finite on these data were left out: {_named(infinite)}."
         notes.append(Warning("terms_not_finite", text))
     known = [texts[i] for i in np.flatnonzero(finite & ~own)]
     if known:
-        text = f"left out, for the physics expresses them already: {_named(known)}."
+        text = f"terms that the physics expresses already were left out: {_named(known)}."
         notes.append(Warning("terms_are_physics", text))
     return notes
 

@@ -460,7 +460,7 @@ def _explanation(space: Space, chosen: list[Candidate], fitted: Fit, dropped: bo
             f"{100 * linearization.outside:.0f} % of the rows lie beyond what the learner saw "
             "in training"
         )
-        warnings.append(Warning("beyond_training", f"{reach}: there it shows how it extrapolates."))
+        warnings.append(Warning("beyond_training", f"{reach}: its values there are extrapolated."))
     if terms:
         warnings.append(Warning("conditional_on_selection", _CONDITIONAL))
     points = len(linearization.target)
@@ -481,17 +481,17 @@ def _why_nothing(
         return "nothing explains the learner: the physics expresses all candidate terms already."
     if not real:
         return (
-            "what the learner adds does not stand out from its own errors; there is nothing to "
-            "explain."
+            "what the learner adds is not significant against its own errors; there is nothing "
+            "to explain."
         )
     best = (
         f"the best single term, {singles[0].expression}, explains {percent(singles[0].share)} of it"
     )
     if dropped and share < _HALF:
-        return f"no term stands out from the learner's own errors; {best}. Keep the learner."
+        return f"no term is significant against the learner's own errors; {best}. Keep the learner."
     return (
-        f"no few terms explain half of what the learner adds; {best}. Keep the learner, or try "
-        "other suspects."
+        f"a few terms do not explain half of what the learner adds; {best}. Keep the learner, or "
+        "try other suspects."
     )
 
 

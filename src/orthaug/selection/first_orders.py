@@ -48,7 +48,7 @@ def first_model(record: Record) -> FirstModel | None:
 
     The orders are the smallest whose free run is within 5 % of the best of up to 4 lags a channel.
     The first lags are the significant ones, unless from 1 or 0 on the best free run is clearly
-    better. Every model that is tried has a constant: without one, further lags stand in
+    better. Every model that is tried has a constant: without one, further lags make up
     for the level of the signals.
     """
     record = _spread(record)

@@ -87,12 +87,11 @@ class PhysicsComparison:
             least = min(moved, key=lambda shift: shift.left)
             text = (
                 f"the chosen terms move {'; '.join(map(str, moved))}: {allowed} what the "
-                f"standard errors allow. Beside the terms {100 * least.left:.2g} % of the "
-                f"regressor of {least.parameter} is left. Either physics alone was biased by "
-                "what the terms now explain, or the terms took over a part of the physics: "
-                "compare both values with what is known of the parameters, and where the first "
-                "is right, put the missing effect into the physics or `exclude` the terms that "
-                "stand in for it."
+                f"standard errors allow. The terms leave {100 * least.left:.2g} % of the "
+                f"regressor of {least.parameter}. Either physics alone was biased by the effect "
+                "of the terms, or the terms took over a part of the physics. Compare both values "
+                "with what is known of the parameters. Where the first is right, put the missing "
+                "effect into the physics, or `exclude` the terms that replace it."
             )
             notes.append(Warning(MOVED, text))
         if self.excluded:

@@ -120,7 +120,7 @@ def search_orders(
 ) -> OrderSearch:
     """Judge orders from `largest` down, never below `least`, what the physics reads already.
 
-    Every model has a constant: without one, lags that are not there stand in for the level of the
+    Every model has a constant: without one, further lags would make up for the level of the
     signals.
 
     Raises:

@@ -185,7 +185,9 @@ class Blocks:
 _Given = tuple[TermRuns, list[tuple[TermRuns, Segments]]]
 
 
-def _on_all(given: _Given, chosen: Sequence[int], tell: Callable[..., None]) -> tuple[Point, float]:
+def _on_all(
+    given: _Given, chosen: Sequence[int], report: Callable[..., None]
+) -> tuple[Point, float]:
     """Return chosen terms beside the physics, fitted from physics alone and from one step ahead.
 
     And what it took [s].
@@ -203,7 +205,7 @@ def _on_all(given: _Given, chosen: Sequence[int], tell: Callable[..., None]) -> 
 
 
 def _on_fold(
-    given: _Given, item: tuple[Point, int], tell: Callable[..., None]
+    given: _Given, item: tuple[Point, int], report: Callable[..., None]
 ) -> tuple[float, float]:
     """Return the mean squared error on a block of a model that is fitted without it.
 
@@ -218,7 +220,7 @@ def _on_fold(
 
 
 def _along(
-    given: _Given, item: tuple[int, Point | None, int, Able], tell: Callable[..., None]
+    given: _Given, item: tuple[int, Point | None, int, Able], report: Callable[..., None]
 ) -> tuple[Point, float]:
     """Return physics alone, or some terms more, picked without a block.
 
@@ -280,7 +282,7 @@ def climb(
     runs: TermRuns,
     blocks: int,
     most: int,
-    told: OnModel = lambda rung: None,
+    report: OnModel = lambda rung: None,
     runner: Any = Threads(),  # noqa: B008  (it holds nothing)
     near: Sequence[Collection[Lag]] = (),
     linear: Sequence[str] = (),
@@ -311,7 +313,7 @@ def climb(
                 point, tuple(change), held, time.monotonic() - began, len(point.chosen), len(lags)
             )
             rungs.append(rung)
-            told(rung)
+            report(rung)
             return rung
 
         def path() -> TermPath:
