@@ -55,7 +55,8 @@ def radius_beyond(model: Model | MotionModel, states: Matrix, inputs: Matrix) ->
         for kind in sorted({does, "hold"})
     ]
     every = np.concatenate(found)
-    # what fades must leave the same physics as what is held: else its share of the physics comes and goes, unbounded
+    # A correction that fades must leave the same physics as a constant one: else its share of the
+    # physics changes without bound.
     if not np.isfinite(every).all() or np.ptp(every, axis=0).max() > _SAME * max(
         np.abs(every).max(), 1.0
     ):

@@ -27,13 +27,12 @@ from orthaug.physics.excitation import excitation, require_rank
 from orthaug.physics.output_weights import times
 from orthaug.physics.projection import Projection
 
-NEGLIGIBLE = 1e-12  # rows whose ‖φᵀδ‖ is below this share of the largest ‖φ‖‖δ‖: only weights of 1e12 could use them
-SMALLEST_COSINE = (
-    1e-6  # between Φa and Δ; below it the optimum of the linear program counts as zero
-)
-VIOLATION = (
-    1e-9  # of (φᵀa)δ, rows and a of unit length; the linear program itself is solved to 1e-10
-)
+# Rows whose ‖φᵀδ‖ is below this share of the largest ‖φ‖‖δ‖: only weights of 1e12 could use them
+NEGLIGIBLE = 1e-12
+# Between Φa and Δ; below it the optimum of the linear program counts as zero
+SMALLEST_COSINE = 1e-6
+# Of (φᵀa)δ, rows and a of unit length; the linear program itself is solved to 1e-10
+VIOLATION = 1e-9
 WORKING_SET = 1000  # rows of the first linear program, and the most that are added at a time
 MOST_ROUNDS = 50
 IN_SPAN = 1e-10  # ‖P⊥Δ‖/‖Δ‖ below which Δ counts as physics

@@ -25,8 +25,10 @@ from orthaug._base.errors import Warning
 from orthaug._base.lines import percent
 from orthaug.inference.covariance import interval, reach
 
-_AS_CLOSE = 12.0  # over 17 forms, half of them in no catalogue, the right bias was within in 130 draws; in 128 by 8
-MOST_PHYSICS = 0.986  # cosine with the physics: beyond it a term is six times larger than what the learner shows of it
+# Over 17 forms, half of them in no catalogue, the right bias was within in 130 draws; in 128 by 8
+_AS_CLOSE = 12.0
+# Cosine with the physics: beyond it a term is six times larger than what the learner shows of it
+MOST_PHYSICS = 0.986
 _LEAST = 0.8  # of the best share: what explains less is no likely cause
 _LISTED = 4  # parameters that a warning lists at most
 

@@ -20,7 +20,8 @@ from orthaug.models.model import Model
 from orthaug.models.motion_model import MotionModel
 from orthaug.models.on_records import RUNAWAY
 
-_LARGEST_FACTOR = 1e4  # outputs of a stable linear model grow with its inputs, and 10⁶ times the largest is "diverged"
+# Outputs of a stable linear model grow with its inputs, and 10⁶ times the largest is "diverged"
+_LARGEST_FACTOR = 1e4
 _SIDE_BY_SIDE = 16  # runs of one compiled call
 _MARGIN = 1.5  # a factor below is a warning
 _CLOSE = 1.05  # ratio of two factors at which the bisection ends

@@ -34,7 +34,8 @@ _INPUTS_FURTHER, _OUTPUTS_FURTHER = 10, 4  # lags beyond the largest of the mode
 _ROWS = 20_000  # that are looked at, spread over the record in stretches
 _STRETCHES = 8
 _ROWS_PER_COLUMN = 5
-_FAR = 0.3  # error of a free run, in the output's deviation, beyond which sensitivities along it say little
+# Error of a free run, in the output's deviation, beyond which sensitivities along it say little
+_FAR = 0.3
 _SURE = 3.0  # standard errors that a gain must exceed, for it is the largest of many
 _SIMPLER = 0.8  # of the gain of a learner, with which a single lag is as good
 

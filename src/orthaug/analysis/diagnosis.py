@@ -35,7 +35,8 @@ from orthaug.inference.covariance import by_experiment
 from orthaug.models.response import Response
 from orthaug.physics.problem import Problem
 
-_LITTLE_COLOUR = 0.2  # of a free run's errors that are noise, beside a start from noisy lags and a fit of finite length
+# Of a free run's errors that are noise, beside a start from noisy lags and a fit of finite length
+_LITTLE_COLOUR = 0.2
 _LITTLE_FOLLOWED = 0.1  # correlation of such errors with an input
 _AS_GOOD = 1.05  # free-run error / one-step error up to which measured lags add nothing
 _SMALL = 0.05  # of the residual's variance: what could be predicted below that is a small effect
@@ -367,8 +368,8 @@ def wild_rows(response: Response, experiments: Sequence[Experiment]) -> tuple[Wa
         named = [experiments[rows[k][0]].where(rows[k][1]) for k in wild[:_NAMED]]
         more = f" and {len(wild) - _NAMED} more" if len(wild) > _NAMED else ""
         text = (
-            f"{counted(len(wild), 'row')} of {len(error)} make up {percent(held, 3)} of the squared "
-            f"one-step residual of {output.name}: {'; '.join(named)}{more}. Wrong samples there "
+            f"{counted(len(wild), 'row')} of {len(error)} make up {percent(held, 3)} of the "
+            f"squared one-step residual of {output.name}: {'; '.join(named)}{more}. Wrong samples there "
             'bias θ: mark them (step = "outliers" of data.prepare), or leave them out.'
         )
         found.append(Warning("wild_rows", text))

@@ -45,9 +45,8 @@ _CENTRES = (
 )  # quantiles about which a function of a learner's feature bends
 _STATIC = 5
 _LEAST_LAG = 3.0  # samples: a faster state is a lag that is missing
-_CLEARLY = (
-    0.1  # of the filtered errors' square, by which memory predicts more than functions of one row
-)
+# Of the filtered errors' square, by which memory predicts more than functions of one row
+_CLEARLY = 0.1
 _SETTLING, _HALVINGS, _SETTLED = (
     8,
     4,

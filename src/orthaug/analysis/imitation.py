@@ -22,9 +22,8 @@ from orthaug.physics.shared import Shared, shared_directions
 
 _STILL = 1e-8  # change of a physical parameter along a shared direction, relative: rounding
 _ALTERNATIVES = 8
-_NEARLY = (
-    0.05  # of a regressor's norm: what widens a standard error twenty times, as in `orthaug select`
-)
+# Of a regressor's norm: what widens a standard error twenty times, as in `orthaug select`
+_NEARLY = 0.05
 
 
 @dataclass(frozen=True)

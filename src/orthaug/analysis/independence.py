@@ -26,9 +26,8 @@ from orthaug.analysis.whiteness import (
     whitening,
 )
 
-_ROWS = (
-    4096  # rows of a regressor matrix that exist at a time: 26 columns of them stay in the cache
-)
+# Rows of a regressor matrix that exist at a time: 26 columns of them stay in the cache
+_ROWS = 4096
 _ROWS_PER_BIN = 5  # fewer would make bins of chance
 _RANK = 1e-10  # eigenvalues of a unit-diagonal Gram matrix below this, of the largest, are rounding
 

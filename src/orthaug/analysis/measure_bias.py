@@ -21,7 +21,8 @@ from orthaug.physics.parameters import PhysicsMap
 from orthaug.physics.problem import Problem
 from orthaug.physics.shared import seen
 
-CERTIFIED_ROWS = 200_000  # of a measure at most, over which certificates are sought for suspects that no one named
+# Of a measure at most, over which certificates are sought for suspects that no one named
+CERTIFIED_ROWS = 200_000
 _ROUNDING = 1e-9  # of a parameter: an end of its interval that lies so little on the wrong side
 
 

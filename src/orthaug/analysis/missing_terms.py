@@ -162,7 +162,8 @@ _MEANINGS = (
     "odd in {} and growing faster than it, as a hardening spring",
 )
 _ONE_SIDED = ("linear in {}", "", "", "curved in {}", "curved in {}, most where that is large")
-_OWN = 0.02  # of a column's size: what remains of it beside all that was estimated, so that it is one of its own
+# Of a column's size: what remains of it beside all that was estimated, so that it is one of its own
+_OWN = 0.02
 _RANK = 1e-6  # of the largest singular value of such columns, each of size 1
 _ROWS_PER_COLUMN = 5
 _PROBED = 20  # points at which an equation is looked at

@@ -46,9 +46,8 @@ from orthaug.physics.projection import Projection
 from orthaug.physics.shared import Shared, moves
 
 _SAME = 1e-6  # of its size: what a term may change over a move that the learner does not see
-CERTIFIED_POINTS = (
-    20_000  # of a measure at most, over which certificates and terms of each equation are sought
-)
+# Of a measure at most, over which certificates and terms of each equation are sought
+CERTIFIED_POINTS = 20_000
 
 
 @dataclass(frozen=True)

@@ -50,9 +50,8 @@ _AS_CLOSE = 2.0  # times what a cause leaves of the learner: a rival leaves no m
 _CLOSE = 0.005  # of the learner: what leaves no more is as good as any
 _SURE = 3.3  # standard errors of a coefficient: one in a thousand is so large by chance
 _ELSEWHERE = 0.5  # of a bias, from which that of a rival is another one
-_NOTHING = (
-    0.01  # of the learned equations: a learner that is smaller, and biases nothing, found nothing
-)
+# Of the learned equations: a learner that is smaller, and biases nothing, found nothing
+_NOTHING = 0.01
 _SAME = 1e-6  # of a term's squares: what others leave of it is none
 _UNMOVED = 0.1  # standard errors of every parameter
 

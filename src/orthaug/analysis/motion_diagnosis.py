@@ -26,9 +26,8 @@ from orthaug.models.response import Response
 
 _LEVEL = 0.01  # of the test of missing terms
 _SMALL = 0.05  # of the error's variance: effects of inputs and states below that are small
-_SIZABLE = (
-    0.02  # of the output's deviation: a free run that leaves less has no dead time to look for
-)
+# Of the output's deviation: a free run that leaves less has no dead time to look for
+_SIZABLE = 0.02
 _LITTLE = 0.005  # of the error's variance: a share by its own past below that is none
 _LAGS = 10  # of inputs that may predict the error
 _ROWS_PER_LAG = 20
@@ -182,7 +181,10 @@ def _traces(tests: tuple[ResidualTest, ...], shares: tuple[Predictable, ...]) ->
     if not effects:
         return ""
     most = max(share.largest(own_past=False) for share in shares)
-    return f" Tests still detect small effects ({'; '.join(effects)}): {percent(most)} of its square at most."
+    return (
+        f" Tests still detect small effects ({'; '.join(effects)}): {percent(most)} of its "
+        "square at most."
+    )
 
 
 def _colour(tests: tuple[ResidualTest, ...], shares: tuple[Predictable, ...]) -> str:

@@ -1,7 +1,7 @@
 """Parameters of a motion that the outputs can distinguish, before training.
 
-They are distinguished on the record's inputs, or on inputs that excite everything, by the rank of the
-free run's sensitivities to the parameters' coordinates, the starts of all segments eliminated, at
+The record's inputs, or inputs that excite everything, distinguish them by the rank of the free
+run's sensitivities to the parameters' coordinates, the starts of all segments eliminated, at
 the initial parameters and some near them. A direction that only rounding or one particular value
 hides has full rank there.
 """

@@ -134,8 +134,9 @@ def _without_growth(found: Modes) -> str:
         sentences.append("No mode grows, but not all decay: the largest real part is 0.")
     if count:
         sentences.append(
-            f"The integrating mode{'s' if count > 1 else ''} neither decay{'' if count > 1 else 's'} "
-            f"nor grow{'' if count > 1 else 's'}: errors in {'them' if count > 1 else 'it'} stay."
+            f"The integrating mode{'s' if count > 1 else ''} neither "
+            f"decay{'' if count > 1 else 's'} nor grow{'' if count > 1 else 's'}: errors in "
+            f"{'them' if count > 1 else 'it'} stay."
         )
     return " ".join(sentences)
 

@@ -1,8 +1,8 @@
 """Residual analysis: whiteness, independence of the inputs, and flatness over the regressors.
 
 The tests are those of Ljung, System Identification (1999), sect. 16.6. Experiments are pooled. On a
-large record every test rejects. The sizes of the effects are given beside the p-values for that reason.
-There is no verdict here.
+large record every test rejects. The sizes of the effects are given beside the p-values for that
+reason. There is no verdict here.
 """
 
 from __future__ import annotations
@@ -31,9 +31,8 @@ from orthaug.data.record import Experiment
 from orthaug.models.response import Response
 
 LAGS = 25  # as MATLAB's `resid`
-PRACTICALLY_WHITE = (
-    0.05  # correlations below this are no matter, however sure a long record makes them
-)
+# Correlations below this are no matter, however sure a long record makes them
+PRACTICALLY_WHITE = 0.05
 ROUNDING = 1e-14  # of the output's deviation: a residual that says nothing
 
 Channels = dict[str, list[Vector]]

@@ -59,9 +59,8 @@ _SINGLE = (
     "coulomb",
 )  # of an output read at one lag only, which may be a velocity
 _CLEARLY = 0.05  # of the largest value
-_BELOW = (
-    0.05  # of the largest value: what is only so far below 0 counts as positive, for it is noise
-)
+# Of the largest value: what is only so far below 0 counts as positive, for it is noise
+_BELOW = 0.05
 _MULTIPLIED = 6  # lags at most, of which products are tried
 _INPUT = ("cubic", "dead_zone", "saturation")
 
@@ -124,7 +123,7 @@ class Suspect:
         | kind | δ | width |
         |---|---|---|
         | `coulomb` | sign(x) | |
-        | `stribeck` | sign(x) exp(−abs(x)/width), the paper's decay from static to Coulomb friction | v_S |
+        | `stribeck` | sign(x) exp(−abs(x)/width), the paper's decay to Coulomb friction | v_S |
         | `stribeck_gauss` | sign(x) exp(−(x/width)²) | v_S |
         | `quadratic_drag` | x abs(x) | |
         | `cubic` | x³ | |

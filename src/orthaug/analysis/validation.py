@@ -36,9 +36,8 @@ _BEYOND, _FAR = (
 )  # of the training range: an excursion that is reported, and one that counts on any row
 _OFTEN = 0.01  # of the rows: a smaller excursion counts from there on
 _MUCH = 0.1  # of a part's rows outside: what is wrong there may be that
-_LIKELY = (
-    0.9  # ratio of errors below which an interval that holds 1 leaves undecided what is not shown
-)
+# Ratio of errors below which an interval that holds 1 leaves undecided what is not shown
+_LIKELY = 0.9
 
 
 @dataclass(frozen=True)
@@ -299,8 +298,8 @@ def extrapolation(part: str, x: Matrix, training: Matrix, layout: Layout) -> lis
 
     One lag a channel.
 
-    What noise does to extreme values is not reported: excursions by less than a hundredth of the range,
-    or on few rows.
+    Effects of noise on extreme values are not reported: excursions by less than a hundredth of the
+    range, or on few rows.
 
     Args:
         part: its name.

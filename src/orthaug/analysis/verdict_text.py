@@ -28,8 +28,9 @@ _BIASED = Warning(
 )
 _INCONSISTENT = Warning(
     "coloured_residual",
-    "the one-step residual is coloured: what disturbs one row is in the lagged outputs of the next, which biases the "
-    'one-step θ, and its intervals do not cover that bias. Training on the free run (focus = "simulation") has none.',
+    "the one-step residual is coloured: a disturbance of one row is in the lagged outputs of the "
+    "next. That biases the one-step θ, and its intervals do not cover that bias. Training on the "
+    'free run (focus = "simulation") has none.',
 )
 _OFF = (
     "The errors are coloured by enough to make the one-step θ inconsistent (warning "
@@ -231,8 +232,8 @@ def _sensor_noise(seen: Finding) -> tuple[str, tuple[Warning, ...]]:
         )
     if seen.noise is not None and seen.noise > _TOO_FAST:
         text += (
-            f". The noise is {100 * seen.noise:.0f} % of the least variance among the lagged outputs: "
-            "the sampling is too fast for one-step estimation"
+            f". The noise is {100 * seen.noise:.0f} % of the least variance among the lagged "
+            "outputs: the sampling is too fast for one-step estimation"
         )
     steps = f" {_quantised(seen)}" if seen.steps else ""
     return f"{text}.{steps}", (_BIASED,) if seen.fit.std is not None else ()

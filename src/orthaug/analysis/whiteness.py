@@ -23,12 +23,10 @@ CONSTANT = (
     64 * np.finfo(float).eps
 )  # rounding of the mean: a smaller deviation, against the largest value, is none
 LARGEST = 1e150  # squares of larger values overflow: a model that left all bounds has no statistics
-_FEW_LAGS = (
-    100  # their products take half as long as the transforms at 10⁶ rows, twice as long at 10⁴
-)
-ROWS_PER_LAG = (
-    20  # with fewer, Ljung-Box rejects too often (3 % instead of 1 % at 4) and AIC overfits
-)
+# Their products take half as long as the transforms at 10⁶ rows, twice as long at 10⁴
+_FEW_LAGS = 100
+# With fewer, Ljung-Box rejects too often (3 % instead of 1 % at 4) and AIC overfits
+ROWS_PER_LAG = 20
 
 
 def autocorrelation(signal: Pieces, lags: int = 25) -> Vector | None:

@@ -154,9 +154,8 @@ _TIE, _TIE_UNKNOWN = (
     2e-3,
 )  # share of the learner: within this of the best the simpler term is taken
 _PART = 0.1  # of what even the best leaves: less does not separate two terms either
-_DRAWS = (
-    10.0  # variances of the noise in one direction: what two terms with widths differ by at random
-)
+# Variances of the noise in one direction: what two terms with widths differ by at random
+_DRAWS = 10.0
 _ROUGH, _FINE = 0.03, 1e-3  # of its logarithm
 _TRIED = 10  # kinds of terms, or pairs of kinds, that are refined before the choice
 _BLOCK, _LOOKED = 256, 200  # candidates whose pairs are looked at together, and pairs of them

@@ -17,7 +17,8 @@ LOOKED_AT = 40_000
 """Rows of a longer record that orders are found on, in windows spread over it."""
 _FITTED = 0.7  # share of the rows that a candidate is fitted to
 _AS_GOOD = 1.05  # free-run error over the best, up to which fewer lags are taken
-_BETTER = 1.2  # free-run error over that from another first lag, up to which the lag that a test found is kept
+# Free-run error over that from another first lag, up to which the lag that a test found is kept
+_BETTER = 1.2
 _RANK = 1e-9  # singular value over the largest
 PERSISTENCE = 20  # the highest order of excitation that is looked for
 _EXCITED = 1e-6  # singular value over the largest

@@ -27,7 +27,9 @@ from orthaug.selection.forward import DEPENDENT
 from orthaug.selection.term_runs import TermRuns
 
 LEVEL = 0.05
-_BLOCKS = 20  # at most: 40 blocks of 1000 rows reject 7 to 13 % under a held input, `benchmarks/coverage_noise.py`
+# At most: 40 blocks of 1000 rows reject 7 to 13 % under a held input,
+# `benchmarks/coverage_noise.py`
+_BLOCKS = 20
 _FEWEST_BLOCKS = 8  # whose signs can make 256 sums
 _MEMORIES = 3  # times as long a block as the products remember each other
 _FEWEST_ROWS = 160

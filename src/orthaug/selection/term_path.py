@@ -29,9 +29,8 @@ from orthaug.selection.term_runs import Able, Point, TermRuns
 
 _ONE_BY_ONE = 8  # terms are added singly up to here, later an eighth at a time
 _LEAST = 1e-6  # share of the squared error left below which nothing is worth adding
-_PATIENCE = (
-    5  # additions that did not improve the score by `_BETTER` each, after which the path ends
-)
+# Additions that did not improve the score by `_BETTER` each, after which the path ends
+_PATIENCE = 5
 _BETTER = 0.005
 _FOLD_ITERATIONS = 10
 _ANEW = 5  # times that the terms are picked anew about the choice

@@ -40,7 +40,8 @@ from orthaug.selection.forward import COLLINEAR, Equations
 
 _PLACES = 32  # for terms in a compiled program; choices that need more take a multiple
 _NARROW = (8, 16)  # places of programs that are worth being compiled besides, from so many rows on:
-_MANY_ROWS = 20_000  # compiling takes 1 s, and a pass over 65,000 rows 0.012 s with 8 places and 0.04 s with 32
+# Compiling takes 1 s, and a pass over 65,000 rows 0.012 s with 8 places and 0.04 s with 32
+_MANY_ROWS = 20_000
 _CHUNK = 4096  # rows
 _SETTLED = 0.1  # of the loss: a step that lowers it by more may change the sensitivities
 _TOLERANCE = 1e-4  # relative change of the loss: models are compared, not published
