@@ -135,7 +135,7 @@ class Smoother:
 
         A row takes the value of the training row with the nearest z.
 
-        Of a linear combination of the features it is that combination.
+        A linear combination of the features is returned as it is.
         """
         if self.problem.features.linear:
             return self._z(x) @ (self._inverse @ values)

@@ -261,7 +261,7 @@ def _overlaps(
 ) -> tuple[float | None, float | None, float | None]:
     """Return cos(Δ, span Φ), R² of the learner's P⊥F on P⊥Δ, and the coefficient of that fit.
 
-    Along `directions` only.
+    All are taken along `directions` only.
     """
     size = np.abs(delta).max(initial=0.0)
     if size == 0:
@@ -292,10 +292,10 @@ def find_certificate(
 ) -> Certificate:
     """Maximise `Σ (φᵀa)δ` subject to `(φᵀa)δ ≥ 0` on every point and `|a| ≤ 1`.
 
-    In the coordinates of Q, so that neither units nor conditioning of Φ matter; a row of several
-    outputs counts the sum over them, weighted as in `projection`. The linear program is solved on a
-    working set, to which the most violated rows are added until there are none: the optimum of a
-    subset bounds that of all.
+    The program is in the coordinates of Q, so that neither units nor conditioning of Φ matter; a
+    row of several outputs counts the sum over them, weighted as in `projection`. The linear program
+    is solved on a working set, to which the most violated rows are added until there are none: the
+    optimum of a subset bounds that of all.
 
     Args:
         projection: of the weighted rows of φ.

@@ -46,7 +46,7 @@ class Candidate:
     def unsure(self) -> Vector:
         """Standard deviation of the bias that the candidate leaves unexplained.
 
-        For its size that part is taken as biased as the cause.
+        Relative to its size that part is assumed to be as biased as the cause.
         """
         return np.abs(self.moved) * np.sqrt(max(1 - self.share, 0.0) / self.share)
 
@@ -66,7 +66,7 @@ class NamedCause(Candidate):
 def compatible(candidates: Sequence[Candidate], noise: float) -> list[Candidate]:
     """Return the causes that noise cannot distinguish from the best.
 
-    Of these the declared ones alone where there are any.
+    Where any of these is declared, only declared ones are returned.
 
     Args:
         noise: ν, the share of what the learner holds that is noise.

@@ -66,7 +66,7 @@ def divergence_scaling(
 def margin(factor: float | None, searched: float, driven: bool) -> tuple[str, str]:
     """Return a sentence on the factor, or that there is none up to `searched`.
 
-    With the code of a warning, or nothing.
+    The second text is the code of a warning, or empty.
 
     A model that is not `driven`, by inputs, has none to scale: its own run leaves the bounds or
     does not.

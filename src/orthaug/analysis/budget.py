@@ -423,8 +423,7 @@ def named_cause(
 
     None where that is less than `least`.
 
-    Of what no one declared only what the learner sees counts: the rest is no likely cause of what
-    it found.
+    Undeclared terms count only if the learner sees them: others are no likely cause.
     """
     for table, families in (
         (_declared(linearization, suspects), ()),
@@ -486,7 +485,8 @@ def rival_of(
 
     None where there is none.
 
-    As a dead zone and a saturation of what the physics has a term in: their sum is that term.
+    An example is a dead zone and a saturation where the physics has a linear term: their sum is
+    that term.
     """
     assert cause.explained
     if cause.suspect in suspects:
@@ -535,9 +535,8 @@ def left_over(
 
     They are k directions, each of one unknown size.
 
-    What it leaves of the learner counts as biased by as much for its size as the cause, of unknown
-    sign; beside that by what the next best cause makes of it. Its rivals are in
-    the hull.
+    The unexplained part of the learner is assumed to be as biased for its size as the cause, with
+    unknown sign; the next best cause adds its own bias. Rivals of the cause are in the hull.
     """
     assert cause.explained
     after = _likeliest(
@@ -612,7 +611,7 @@ def _warning(
 ) -> Warning | None:
     """Return the warning on biases above the standard error: cause, size and remedies.
 
-    And how sure the cause is.
+    The warning also says how sure the cause is.
     """
     own, name = [row for row in rows if row.cause == cause.suspect.name], cause.suspect.name
     large = [row for row in own if (row.errors or 0.0) > 1 and abs(row.relative or 1.0) > _ROUNDING]

@@ -138,7 +138,7 @@ def own_share(fit: Estimate, one_step: Response) -> Share:
 class Candidates:
     """Columns that a model might be given, over the rows of a response.
 
-    With `own` none beside the physics'.
+    With `own` there are only those of the physics.
     """
 
     fit: Estimate
@@ -188,7 +188,7 @@ class Candidates:
     def stretches(self) -> list[tuple[Experiment, Trajectory, int, int]]:
         """Rows that are looked at, from the second number on.
 
-        From the first on the sensitivities are carried along.
+        Sensitivities are carried along from the first number on.
         """
         problem, first = self.fit.problem, self.first
         most = _ROWS // len(problem.outputs)
@@ -303,7 +303,7 @@ class Candidates:
     def changes(self, functions: float = 0.0) -> tuple[Change, ...]:
         """Return the best of each kind that is worth making, the best one first.
 
-        As `model_changes`.
+        See `model_changes`.
         """
         if not self.usable or not np.isfinite(self.sums.grams).all():
             return ()

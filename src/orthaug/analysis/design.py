@@ -458,7 +458,7 @@ class _Search:
     def measured(self, waves: Matrix, period: Vector | None = None) -> tuple[Matrix, Factors]:
         """Return the limited signals (N, M) of waves of amplitude 1, and their factors per row.
 
-        Of whole periods if given.
+        Factors are those of whole periods if given.
         """
         signals, factors, size = [], [], max(1, BATCH // len(waves))
         for first in range(0, waves.shape[1], size):

@@ -60,9 +60,8 @@ def diagnose(
 ) -> Diagnosis | None:
     """Analyse the residuals of a fit on its training data; None where they cannot be tested.
 
-    Of lagged physics those one step ahead and of the free run; of a motion those of the free run,
-    for its states are not measured, with a test of the terms that its equations could lack
-    (`missing`).
+    Lagged physics is tested one step ahead and on the free run; a motion on its free run, since its
+    states are not measured, with a test of the terms that its equations could lack (`missing`).
 
     Args:
         one_step: the prediction of the training data, if it is there already; likewise their
@@ -369,8 +368,8 @@ def wild_rows(response: Response, experiments: Sequence[Experiment]) -> tuple[Wa
         more = f" and {len(wild) - _NAMED} more" if len(wild) > _NAMED else ""
         text = (
             f"{counted(len(wild), 'row')} of {len(error)} make up {percent(held, 3)} of the "
-            f"squared one-step residual of {output.name}: {'; '.join(named)}{more}. Wrong samples there "
-            'bias θ: mark them (step = "outliers" of data.prepare), or leave them out.'
+            f"squared one-step residual of {output.name}: {'; '.join(named)}{more}. Wrong samples "
+            'there bias θ: mark them (step = "outliers" of data.prepare), or leave them out.'
         )
         found.append(Warning("wild_rows", text))
     return tuple(found)

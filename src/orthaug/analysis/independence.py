@@ -115,10 +115,10 @@ def against_regressor(
 ) -> RegressorTest | None:
     """Test whether the mean residual is zero over the regressor, by an F-test over equal bins.
 
-    For a white residual the one-way analysis of variance against zero, `F = Σ n_b m_b² / B : Σ (e −
-    m_b)² / (N − B)`; for a coloured one the same hypothesis on A e with filtered indicators of the
-    bins. Equal values share a bin. None for a regressor or residual that is constant or not finite,
-    or fewer than 10 rows.
+    A white residual is tested by the one-way analysis of variance against zero, `F = Σ n_b m_b² / B
+    : Σ (e − m_b)² / (N − B)`; for a coloured one the same hypothesis on A e with filtered
+    indicators of the bins. Equal values share a bin. None for a regressor or residual that is
+    constant or not finite, or fewer than 10 rows.
 
     Args:
         residual, regressor: per experiment (N_i,).

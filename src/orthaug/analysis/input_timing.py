@@ -191,7 +191,8 @@ class DeadTime:
             "dead_time",
             f"{self.input} seems to act late: {self.gain}, with other parameters. If there is a "
             'dead time, delay the input by [[data.prepare]] with step = "shift", '
-            f'channel = "{self.input}", samples = {self.samples}; if its drive is slow, model that in the equations.',
+            f'channel = "{self.input}", samples = {self.samples}; if its drive is slow, '
+            "model that in the equations.",
         )
 
 
@@ -255,7 +256,7 @@ def _least(leaves: Callable[[int], float], most: int) -> int:
 def _delayed(record: Record, number: int, samples: int) -> Record:
     """Return an input later by so many samples.
 
-    What it was before the record is its first value.
+    Before the record it has its first value.
     """
 
     def moved(inputs: np.ndarray) -> np.ndarray:

@@ -132,7 +132,7 @@ class Modes(NamedTuple):
 
     A derivative is None where it does not exist.
 
-    In the order of decreasing magnitude, the upper one of a conjugate pair first.
+    They are in the order of decreasing magnitude, the upper one of a conjugate pair first.
     """
 
     values: Complex[np.ndarray, "k"]
@@ -271,7 +271,7 @@ def converted(
 def observer_form(system: System, memory: Memory) -> tuple[System, Any]:
     """Return a lagged system with `Σ n_i` states, n_i the largest lag in the equation of output i.
 
-    And dead samples (nu,).
+    The dead samples (nu,) come with it.
 
     `s_i,l⁺ = s_i,l+1 + Σ_j a_ij,l y_j + Σ_j b_ij,l u_j`, `y_i = s_i,1 + Σ_j d_ij u_j`.
     """

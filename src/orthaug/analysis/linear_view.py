@@ -178,7 +178,7 @@ class LinearView:
     def matrix_ci95(self) -> Float[np.ndarray, "m k 2"] | None:
         """Intervals of [[A, B], [C, D]].
 
-        Of entries that are no estimates both ends are the entry.
+        Both ends of an entry that is no estimate are the entry.
         """
         std = self.system.std
         return None if std is None else interval(self.system.matrix, std, self.freedom)

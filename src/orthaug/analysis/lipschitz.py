@@ -54,7 +54,7 @@ class Lipschitz:
 def lipschitz(model: Model, record: Record, *, x: Matrix | None = None) -> Lipschitz | None:
     """Return gradients of the one-step predictor g, of ∂g/∂θ = φ and of ∂g/∂w, over the regressors.
 
-    They are those measured (`cond:pred_stab`).
+    The regressors are measured ones (`cond:pred_stab`).
 
     The predictor γ_k = g(x_k) reads the last n samples only. With ‖∂g/∂x‖ ≤ L on a convex set of
     all regressors, `|γ − γ̃| ≤ L Σ_{i≥k−n} (|u_i − ũ_i| + |y_i − ỹ_i|) ≤ L λ⁻ⁿ Γ_k` for every λ in

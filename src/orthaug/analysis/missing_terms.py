@@ -1,6 +1,6 @@
 """Test for missing terms in a motion's equations: each is tried at weight 0.
 
-What the free run leaves is regressed on its sensitivities to simple functions of every state and
+The error of the free run is regressed on its sensitivities to simple functions of every state and
 input, added to one equation each, beside the sensitivities to all that was estimated: parameters,
 weights and the segments' starts. That is the score test of Rao (1948) of `b = 0`. To first order
 the errors are `S_p δ + S_b b + e`, so that the F-test of b is right whatever the parameters' own
@@ -334,7 +334,7 @@ def _tested(
 ) -> tuple[float, tuple[int, int], float, Vector, Vector, Vector] | None:
     """Return p, degrees of freedom and share of all terms.
 
-    Of each its gain in filtered rows, its share and coefficient.
+    Each term has its gain in filtered rows, its share and its coefficient.
     """
     plain = _regression(found, None)
     null = None if plain is None else _regression(found, _filters(found, plain.errors))

@@ -424,8 +424,8 @@ def softened_bias(fit: MotionEstimate, suspects: Sequence[MotionSuspect]) -> lis
 def usual_biases(fit: MotionEstimate) -> tuple[list[TermBias], list[TermBias]]:
     """Return the biases by usual terms that nobody declared, and by their smooth forms.
 
-    Of these only what the learner sees counts: the rest is no likely cause of what it found.
-    Nothing where it could imitate no change of a parameter.
+    Only terms that the learner sees count: others are no likely cause. There is none where the
+    learner could imitate no change of a parameter.
     """
     linearization = linearize_fit(fit)
     if linearization is None or not linearization.learns or not fit.shared.basis.shape[1]:

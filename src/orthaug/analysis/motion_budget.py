@@ -1,8 +1,8 @@
 """Bias budget of a motion: the term that explains the learner or the free run, and its bias.
 
-With a learner as of difference equations (`budget`), over the points of the measure. Without one
-only terms that someone suspects are looked at; their size follows from the free run's residual
-by one Gauss-Newton step.
+With a learner it is computed as for difference equations (`budget`), over the points of the
+measure. Without one only declared suspects are tried; their size follows from the free run's
+residual by one Gauss-Newton step.
 """
 
 from __future__ import annotations
@@ -360,7 +360,7 @@ def _of_residual(table: Sequence[TermBias]) -> _Causes | None:
 
     Most is of the part that is no white noise.
 
-    What stays beyond white noise counts as biased by as much for its size, of unknown sign.
+    The rest beyond white noise is assumed to be as biased for its size, with unknown sign.
     """
     sure = [
         entry

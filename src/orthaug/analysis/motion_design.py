@@ -1,6 +1,6 @@
 """Experiment design for a motion: an input under which noise and suspects bias p least.
 
-As `design_input`, with the sensitivities of the free run for Φ: `[∂y/∂p]` less what the unknown
+This is `design_input` with the sensitivities of the free run for Φ: `[∂y/∂p]` less what the unknown
 start could do, so that `Cov p̂ = σ²(ΦᵀΦ)⁻¹` for white noise σ on the outputs. All inputs that are
 tried run side by side.
 """
@@ -85,7 +85,7 @@ class MotionPlant:
     ) -> tuple[Float[np.ndarray, "M N ny np+1"], np.ndarray]:
         """Return rows `[∂y/∂p Δ]` without the start's effect; zero where the run runs away.
 
-        And the weights of the outputs (M, 1, ny, 1).
+        The weights of the outputs (M, 1, ny, 1) come with them.
         """
         pieces = [
             self._piece(u[:, first : first + _WIDTH]) for first in range(0, u.shape[1], _WIDTH)

@@ -32,7 +32,7 @@ _SEED = 20_250_117
 class RankReport:
     """Parameters that the record's own inputs can distinguish, and those that rich inputs can.
 
-    With points of a run at the initial parameters.
+    Points of a run at the initial parameters come with them.
 
     `by_any` is None where no run with rich inputs is finite. `states` (M, nx) and `inputs` (M, nu)
     are where physics alone goes on the record.
@@ -75,8 +75,8 @@ def _rank(segmented: SegmentedMotion) -> Excitation | None:
 
     None where no run is finite.
 
-    Of several of that rank the one that ties most: of `a*b` with a = 0 it looks as if b alone were
-    idle.
+    Of several with that rank it is the one that ties most parameters: of `a*b` with a = 0 it looks
+    as if b alone were idle.
     """
     best: Excitation | None = None
     for q in _near(segmented):

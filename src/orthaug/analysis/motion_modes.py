@@ -73,7 +73,7 @@ def motion_stability(
 ) -> MotionStability:
     """Return the stability over states (N, nx) and inputs (N, nu) of a run, where these are finite.
 
-    With a `record` its free run is tried on larger and larger inputs.
+    With a `record` the free run is also tried on larger and larger inputs.
     """
     checks = _of_modes(model, x, u)
     if record is None or not record.inputs:

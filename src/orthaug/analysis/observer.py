@@ -212,7 +212,7 @@ class ObserverState:
     def state(self) -> Vector:
         """The state (n,) at the last sample of a motion.
 
-        Of a lagged model that which the next step starts from.
+        For a lagged model it is the state that the next step starts from.
         """
         return np.asarray(self.belief.state if self.latest is None else self.latest.state)
 

@@ -190,10 +190,10 @@ def from_neighbours(x: Matrix, signal: Vector) -> Share:
 class Predictable:
     """RMS of an output's error, in the output's unit, and its predictable shares.
 
-    From its own past, from lagged inputs, each cross-validated, and from functions of the
-    regressors: products and curves, cross-validated as well, or one step ahead whatever lets
-    neighbours have like errors. Two standard errors are taken off; 0 where that is not surely more
-    than nothing.
+    It is predicted from its own past and from lagged inputs, both cross-validated, and from
+    functions of the regressors: products and curves, cross-validated as well, or one step ahead
+    whatever lets neighbours have like errors. Two standard errors are taken off; 0 where that is
+    not surely more than nothing.
     """
 
     name: str

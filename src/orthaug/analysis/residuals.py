@@ -83,7 +83,7 @@ class ResidualTest:
     def follows(self, small: float = PRACTICALLY_WHITE) -> list[str]:
         """Return inputs that the residual follows significantly, and by enough to matter.
 
-        It also leaves the band of the figure.
+        The correlation is also beyond the band of the figure.
         """
         band = max([small, *(test.band for test in self.cross.values() if test is not None)])
         named = [(name, self.cross[name]) for name in self.correlated_inputs]

@@ -296,7 +296,7 @@ def _comparison(alone: float, model: float) -> str:
 def extrapolation(part: str, x: Matrix, training: Matrix, layout: Layout) -> list[Extrapolation]:
     """Return entries of the regressor in which a part leaves the range of the training data.
 
-    One lag a channel.
+    There is one lag for each channel.
 
     Effects of noise on extreme values are not reported: excursions by less than a hundredth of the
     range, or on few rows.

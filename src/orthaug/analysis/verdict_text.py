@@ -317,7 +317,7 @@ def _size(seen: Finding) -> str:
 def _shares(seen: Finding) -> str:
     """Return the predictable shares, of the output with the largest one.
 
-    Of equal ones that which follows something.
+    Among equal ones it is the one that follows something.
     """
     if not seen.predictable:
         return ""
@@ -337,7 +337,7 @@ def _shares(seen: Finding) -> str:
 def _advice(seen: Finding, otherwise: str) -> str:
     """Return the change that is predicted to help most.
 
-    Or that none of them is, and what follows.
+    Where none helps, say so, and what follows.
     """
     if seen.changes:
         return _sentence(seen.changes[0])

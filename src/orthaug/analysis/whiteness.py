@@ -149,8 +149,8 @@ def normality(signal: Pieces) -> Normality | None:
 
     S and K are of population moments.
 
-    For independent samples. The distribution is approached slowly: below some 2000 rows the p-value
-    is rough.
+    It assumes independent samples. The distribution is approached slowly: below some 2000 rows the
+    p-value is rough.
     """
     e = standardised(signal)
     if e is None:

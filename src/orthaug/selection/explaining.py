@@ -523,7 +523,7 @@ def fit_terms(space: Space, chosen: Sequence[Candidate]) -> Fit:
 def settled(space: Space, chosen: list[Candidate]) -> tuple[list[Candidate], Fit, bool]:
     """Return the terms whose coefficients are significant against the learner's own errors.
 
-    And whether any other was dropped.
+    The last value is whether any other was dropped.
     """
     fit, dropped = fit_terms(space, chosen), False
     while (weak := fit.doubtful()) is not None:

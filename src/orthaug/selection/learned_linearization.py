@@ -1,7 +1,7 @@
 """Linearization of a learner's output over data, beside the physics' own parameters.
 
-Of a lagged model over the rows of a record, of a motion over the states and inputs of its free run
-there, by what it does to the outputs.
+For a lagged model the data are the rows of a record; for a motion the states and inputs of its free
+run, where the output counts by its effect on the outputs.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Orders and delays na, nb and nk beside the physics, judged by free runs on held-out blocks.
 
-From the orders up to the largest, lags are taken away as long as what is left is as good; also a
+Starting from the largest orders, lags are removed as long as the rest is as good; also a
 past output together with an input, for pole and zero go in pairs where both are superfluous.
 """
 
@@ -45,7 +45,7 @@ class Orders:
     def smaller(self, least: Orders) -> Iterator[Orders]:
         """Yield one lag less: the oldest output, the oldest or the newest of an input.
 
-        Or an output and an input at once.
+        An output and an input may also go at once.
         """
         shorter = [replace(self, na=self.na - 1)] if self.na > least.na else []
         yield from shorter

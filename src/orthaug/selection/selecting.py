@@ -121,8 +121,6 @@ def _on_fold(
     """Return the mean squared error of free runs on a block that was held out, and seconds.
 
     The error is infinite without a model.
-
-    And seconds.
     """
     began, (learner, number), (baseline, lags, criterion, folds) = time.monotonic(), item, given
     kept, held = folds[number]

@@ -152,7 +152,7 @@ class Blocks:
     ) -> tuple[list[Point], Vector]:
         """Return the path anew without each block, by as many terms.
 
-        And the mean squared errors on the blocks.
+        The mean squared errors on the blocks come with it.
         """
         items = [(i, point, count, able) for i, point in enumerate(points)]
         points, errors = zip(*self.runner.map(_along, self.given, items), strict=True)
@@ -162,8 +162,6 @@ class Blocks:
         """Yield errors of the same terms on each block, fitted without it, and the seconds it took.
 
         Errors are mean squares of free runs.
-
-        And what it took [s].
         """
         items = [
             (point._replace(states=None), i) for point in points for i in range(len(self.folds))
@@ -189,7 +187,7 @@ def _on_all(
 ) -> tuple[Point, float]:
     """Return chosen terms beside the physics, fitted from physics alone and from one step ahead.
 
-    And what it took [s].
+    The time that it took [s] comes with it.
     """
     runs, began = given[0], time.monotonic()
     point = runs.fit(runs.start(), chosen)
@@ -208,7 +206,7 @@ def _on_fold(
 ) -> tuple[float, float]:
     """Return the mean squared error on a block of a model that is fitted without it.
 
-    And what it took [s].
+    The time that it took [s] comes with it.
     """
     began, (point, number) = time.monotonic(), item
     runs, held = given[1][number]
@@ -223,7 +221,7 @@ def _along(
 ) -> tuple[Point, float]:
     """Return physics alone, or some terms more, picked without a block.
 
-    And the mean squared error on the block.
+    The mean squared error on the block comes with it.
     """
     number, point, count, able = item
     runs, held = given[1][number]
