@@ -187,7 +187,7 @@ def test_errors_that_remember_for_too_long_have_no_interval():
     assert fit.std is None and fit.interval is None and fit.std_kind == "none"
     np.testing.assert_array_equal(fit.plain_covariance, plain.covariance)
     text = dict(fit.warnings)["too_long_memory"]
-    assert "no standard errors and no intervals" in text and "Longer segments" in text
+    assert "no standard errors and no intervals" in text and "longer segments" in text
     assert "std         none" in fit.summary() and fit.split(Training()).std is None
     assert default(fit) is fit
 

@@ -96,7 +96,7 @@ def test_the_physics_with_the_term_leaves_the_learner_nothing(hardening):
     again = oa.estimate(again.problem.record, grown, learner=oa.MLP(hidden=(6,)))
     told = oa.explain(again)
     assert not told.found and told.physics is None and told.spec is None and told.share == 0.0
-    assert "does not stand out from its own errors" in told.text
+    assert "is not significant against its own errors" in told.text
     assert dict(zip(grown.names, again.theta, strict=True)) == pytest.approx(
         TRUE | {"cubic": -0.3}, abs=0.01
     )

@@ -513,8 +513,8 @@ def test_an_angle_integrates_and_does_not_decay():
     shaft = told(oa.State("x", "v"), oa.State("v", "u - c*v - 12*i"), oa.State("i", "u - 3*i"))
     assert shaft.text == (
         "The linearised motion has an integrator and modes of 2 to 3 1/s along the free run. "
-        "All others decay everywhere: the largest real part is -2 1/s. What integrates neither "
-        "decays nor grows: it keeps its errors."
+        "All others decay everywhere: the largest real part is -2 1/s. The integrating mode "
+        "neither decays nor grows: errors in it stay."
     )
     assert (shaft.modes.integrators, shaft.modes.rightmost, shaft.modes.slowest) == pytest.approx(
         (1, -2, 2)
@@ -525,7 +525,7 @@ def test_an_angle_integrates_and_does_not_decay():
         and "decay everywhere" not in mass.text
     )
     swing = told(oa.State("x", "v"), oa.State("v", "c*u - 9*x"))
-    assert "has modes of 3 1/s" in swing.text and "None grows, and not all decay" in swing.text
+    assert "has modes of 3 1/s" in swing.text and "No mode grows, but not all decay" in swing.text
     runaway = told(oa.State("x", "v"), oa.State("v", "u + c*v"))
     assert (
         "has an integrator and modes of 2 1/s" in runaway.text

@@ -487,7 +487,7 @@ def test_traces_that_tests_see_beside_the_noise_are_told() -> None:
     told = _traces(analyse([e], [u], [x], *names), shares)
     assert (
         told
-        == " Tests still see traces (y follows u; z is not flat over v): 2 % of its square at most."
+        == " Tests still detect small effects (y follows u; z is not flat over v): 2 % of its square at most."
     )
 
 

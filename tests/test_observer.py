@@ -97,7 +97,7 @@ def test_the_steady_gain_is_that_of_riccatis_equation(make):
         now = now.update(zeros, np.zeros(ny))
     np.testing.assert_allclose(now.belief.covariance, p, rtol=0, atol=1e-8 * np.abs(p).max())
     told = now.update(zeros, np.zeros(ny))
-    np.testing.assert_allclose(told.told.spread, c @ p @ c.T + r, rtol=1e-8)
+    np.testing.assert_allclose(told.latest.spread, c @ p @ c.T + r, rtol=1e-8)
     for i, unit in enumerate(np.eye(ny)):
         moved = np.asarray(now.update(zeros, unit).belief.state) - np.asarray(told.belief.state)
         np.testing.assert_allclose(moved, gain[:, i], rtol=0, atol=1e-8 * np.abs(gain).max())

@@ -591,9 +591,6 @@ terms = ["TERM"]
         assert done.code == 0, done.err
         texts.append(finite_json(done.out)["shared"]["text"])
     assert (
-        "the fit determines every parameter beside it" in texts[0] and "the terms leave" in texts[0]
+        "the fit determines every parameter beside it" in texts[0] and "the terms span" in texts[0]
     )
-    assert (
-        "% of what physics alone has to determine a1" in texts[0]
-        and "the terms leave" not in texts[1]
-    )
+    assert "% of the regressor of a1" in texts[0] and "the terms span" not in texts[1]

@@ -216,14 +216,14 @@ def _analysed(
     """
     from orthaug.analysis.learned_part import equation_parts
     from orthaug.analysis.motion_bias import suspected_bias
-    from orthaug.analysis.motion_budget import told_budget
+    from orthaug.analysis.motion_budget import declared_budget
     from orthaug.analysis.motion_diagnosis import diagnose_motion
     from orthaug.analysis.motion_modes import motion_stability
     from orthaug.analysis.motion_response import substep_bias
 
     def biases() -> Any:
         table = suspected_bias(fit, job.suspects) if job.suspects else []
-        budget = told_budget(fit, job.suspects, table)
+        budget = declared_budget(fit, job.suspects, table)
         warnings.extend(budget.warnings if budget else ())
         listed = {entry.suspect for entry in table}
         usual = [

@@ -1,4 +1,4 @@
-"""Whether the chosen terms leave the physics its parameters: θ of physics alone beside θ with the terms.
+"""Comparison of θ of physics alone with θ beside the chosen terms.
 
 A term within the span of the physics takes over a part of it: the sum predicts as before, and θ
 means nothing any more. So each parameter is compared before and after, in units of what the two
@@ -51,7 +51,7 @@ class Shift:
 
     @property
     def moved(self) -> bool:
-        """Return whether the parameter moves by more than its standard errors allow."""
+        """True if the parameter moves by more than its standard errors allow."""
         return self.times is None or self.times > 1
 
     def __str__(self) -> str:
@@ -61,7 +61,7 @@ class Shift:
 
 @dataclass(frozen=True, eq=False)
 class PhysicsComparison:
-    """How the physics fares beside the chosen terms."""
+    """Comparison of the physics without and beside the chosen terms."""
 
     shifts: tuple[Shift, ...]
     left: dict[str, float]
@@ -90,12 +90,11 @@ class PhysicsComparison:
             least = min(moved, key=lambda shift: shift.left)
             text = (
                 f"the chosen terms move {'; '.join(map(str, moved))}: {allowed} what the "
-                f"standard errors allow. Beside the terms {100 * least.left:.2g} % of the "
-                f"regressor of {least.parameter} is left. Either physics alone was biased by "
-                "what the terms now explain, or the terms took over a part of the physics: "
-                "compare both values with what is known of the parameters, and where the first "
-                "is right, put the missing effect into the physics or `exclude` the terms that "
-                "stand in for it."
+                f"standard errors allow. The terms leave {100 * least.left:.2g} % of the "
+                f"regressor of {least.parameter}. Either physics alone was biased by the effect "
+                "of the terms, or the terms took over a part of the physics. Compare both values "
+                "with what is known of the parameters. Where the first is right, put the missing "
+                "effect into the physics, or `exclude` the terms that replace it."
             )
             notes.append(Warning(MOVED, text))
         if self.excluded:

@@ -1,4 +1,4 @@
-"""The verb that finds structure: orders and delay, whether anything is nonlinear, and terms or a network."""
+"""The verb `select`: orders and delay, a test for nonlinearity, and terms or a network."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class LearnerSearch(Search):
 
     @property
     def chosen(self) -> MLP | None:
-        """That of the choice; None for physics alone."""
+        """Network of the choice; None for physics alone."""
         return self.learners[self.place]
 
 
@@ -86,7 +86,7 @@ def search_learners(
     widths: Sequence[int],
     criterion: Criterion,
     blocks: int,
-    told: OnModel,
+    report: OnModel,
     runner: Any,
 ) -> LearnerSearch:
     """Judge every width on all lags, and on those whose functions matter by themselves.
@@ -126,7 +126,7 @@ def search_learners(
             )
         )
         try:
-            told(rungs[-1])
+            report(rungs[-1])
         except KeyboardInterrupt:
             break
     return LearnerSearch(tuple(rungs), tuple(tried[: len(rungs)]))
@@ -138,11 +138,11 @@ def _largest(lags: Lags) -> int:
 
 
 def _on_fold(
-    given: Any, item: tuple[MLP | None, int], tell: Callable[..., None]
+    given: Any, item: tuple[MLP | None, int], report: Callable[..., None]
 ) -> tuple[float, float]:
-    """Mean squared error of free runs on a block of a fit without it, infinite without a model.
+    """Return the mean squared error of free runs on a block that was held out, and seconds.
 
-    And seconds.
+    The error is infinite without a model.
     """
     began, (learner, number), (baseline, lags, criterion, folds) = time.monotonic(), item, given
     kept, held = folds[number]
@@ -186,7 +186,7 @@ there is.
 
 
 def _unheard(stage: str, rung: Any) -> None:
-    """Nobody listens."""
+    """Ignore a model; used where nobody listens."""
 
 
 @dataclass(frozen=True)
@@ -203,7 +203,7 @@ class Confirmed:
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """What `select` returns.
+    """Result of `select`.
 
     Print `selection.summary()`; take `selection.table`; go on with `selection.estimate()`.
     """
@@ -235,7 +235,7 @@ class Selection:
 
     @property
     def lags(self) -> Lags:
-        """The orders that were chosen, and lags of inputs that have no linear effect but a nonlinear one."""
+        """Chosen orders, and lags of inputs that have only a nonlinear effect."""
         chosen = self.reach or self.orders.chosen
         return Lags(chosen.na, chosen.nb, chosen.nk)
 
@@ -292,7 +292,7 @@ class Selection:
 
     @property
     def options(self) -> dict[str, Any]:
-        """Return what `estimate` is to be called with, beside record and baseline."""
+        """Arguments for `estimate`, beside record and baseline."""
         judged = (
             {"regularization": "none", "fallback": False} if isinstance(self.learner, Terms) else {}
         )
@@ -410,16 +410,17 @@ def select(
     collinear: float = COLLINEAR,
     level: float = LEVEL,
 ) -> Selection:
-    """Choose orders and delay, and terms or a network, by free runs on blocks of the data that are held out.
+    """Choose orders and delay, and terms or a network, by free runs on held-out blocks of the data.
 
     Terms are picked by what they lower the error by beside the physics, which is projected out
     (forward orthogonal regression on the sensitivities of the free run). The choice is the smallest
     model within one standard error of the best, or within 2 % of its error.
 
-    Args: record: measured inputs and one output. baseline: the physics, which is always in the
-        model; None for none. learner: `Terms(…)`, whose library is chosen from; `MLP(…)`, whose
-        width and inputs are chosen; None to choose
-            linear lags only.
+    Args:
+        record: measured inputs and one output.
+        baseline: the physics, which is always in the model; None for none.
+        learner: `Terms(…)`, whose library is chosen from; `MLP(…)`, whose width and inputs are
+            chosen; None to choose linear lags only.
         lags: the largest orders, and the smallest delay; by default na = 4, nb = 5 from the first
             lag of an input that the physics reads, or from 1.
         criterion: what models are trained on; None for the free run.
@@ -638,14 +639,14 @@ class _Listener:
         self.progress, self.stopped = progress, False
 
     def of(self, stage: str) -> Callable[[Any], None]:
-        def told(rung: Any) -> None:
+        def report(rung: Any) -> None:
             try:
                 self.progress(stage, rung)
             except KeyboardInterrupt:
                 self.stopped = True
                 raise
 
-        return told
+        return report
 
 
 def _layout(outputs: Sequence[str], inputs: Sequence[str], orders: Orders) -> tuple[Lag, ...]:
@@ -678,7 +679,7 @@ def _with_every_input(chosen: Orders, largest: Orders) -> Orders:
 def _reached(
     chosen: Orders, asked: Orders, tested: Nonlinearity | None, names: Sequence[str]
 ) -> Orders:
-    """Return the chosen orders with the inputs whose functions matter although no linear lag of them does."""
+    """Return the chosen orders with the inputs that have only a nonlinear effect."""
     nb, nk = list(chosen.nb), list(chosen.nk)
     for i, name in enumerate(names):
         if chosen.nb[i] or tested is None or not tested.found:
