@@ -166,7 +166,10 @@ def _model(
 
 
 def _limits(problem: Problem, form: Lagged) -> tuple[Matrix | None, Matrix | None]:
-    """Return the range of the features, beyond which the correction is held or fades, and how x follows it there."""
+    """Return the range of the features, and how x follows its limits.
+
+    Beyond the range the correction stays constant or fades.
+    """
     limits = None if form.beyond == "free" else limits_of(problem.feature_range)
     if limits is None:
         return None, None
@@ -201,7 +204,9 @@ def _one_step_errors(
 def _beside_the_learner(
     problem: Problem, structure: Structure, learned: TrainedLearner, whitened: Matrix, fixed: Fixed
 ) -> Matrix | None:
-    """Cov θ̂ where only some directions are split off: `K Cov(c, w) Kᵀ` with `K = [I, ∂θ_aux/∂w]` (F8).
+    """Return Cov θ̂ where only some directions are split off (F8).
+
+    It is `K Cov(c, w) Kᵀ` with `K = [I, ∂θ_aux/∂w]`.
 
     Entries at a bound are no unknowns: they have NaN.
     """
@@ -222,14 +227,14 @@ def _beside_the_learner(
 
 
 def _beside(fixed: Fixed, gram: Matrix) -> Matrix:
-    """Return a Gram matrix of (c, w) in which what stands at a bound is no unknown."""
+    """Return a Gram matrix of (c, w) in which entries at a bound are no unknowns."""
     unknown = np.ones(len(gram))
     unknown[list(fixed)] = 0.0
     return gram * np.outer(unknown, unknown)
 
 
 def _middle(problem: Problem, learned: TrainedLearner, noise: Matrix | None) -> Matrix | None:
-    """ΣψᵀΣ_eψ in whitened outputs, for the intervals of later splits and of predictions."""
+    """Return ΣψᵀΣ_eψ in whitened outputs, for intervals of later splits and predictions."""
     if noise is None or learned.gram is None:
         return None
     whitened = problem.weight.whitened(noise)
@@ -245,7 +250,7 @@ def _defect(
     parameters: ThetaSplit,
     learned: TrainedLearner,
 ) -> float | None:
-    """‖QᵀF̃‖ / ‖F‖ with F̃ = F − Φ θ_aux (eq:orth_property), along the shared directions.
+    """Return ‖QᵀF̃‖ / ‖F‖ with F̃ = F − Φ θ_aux (eq:orth_property), along the shared directions.
 
     None for F = 0.
     """
@@ -257,7 +262,7 @@ def _defect(
 
 
 def without_loss(mean_square: float) -> list[Warning]:
-    """Return what is told of a free run whose mean square over whole experiments does not exist."""
+    """Return the warning that a free run over whole experiments has no mean square."""
     if np.isfinite(mean_square):
         return []
     text = (

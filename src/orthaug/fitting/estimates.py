@@ -1,4 +1,4 @@
-"""The result of an estimation: parameters with intervals, status with cause and remedy, the model."""
+"""The result of an estimation: parameters with intervals, status, model."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class Restart:
 
 
 class AnyFit(FitView):
-    """What fits of lagged models and of motions have in common."""
+    """Methods common to fits of lagged models and of motions."""
 
     model: Any
     warnings: tuple[Warning, ...]
@@ -108,7 +108,7 @@ class AnyFit(FitView):
         raise NotImplementedError
 
     def summary(self) -> str:
-        """Return a page of text: status, parameters, what is known of them, warnings."""
+        """Return a page of text: status, parameters with their uncertainty, warnings."""
         warnings = (
             ["", *(f"warning: {warning}" for warning in self.warnings)] if self.warnings else []
         )
@@ -117,7 +117,7 @@ class AnyFit(FitView):
 
 @dataclass(frozen=True, eq=False)
 class Estimate(AnyFit):
-    """What `estimate` returns. Print `fit.summary()`; use `fit.model`; read `fit.parameters`."""
+    """Result of `estimate`. Print `fit.summary()`; use `fit.model`; read `fit.parameters`."""
 
     model: Model
     status: Status
@@ -160,7 +160,7 @@ class Estimate(AnyFit):
 
     @property
     def layout(self) -> Layout:
-        """Return what the entries of `reach` are called."""
+        """Names of the entries of `reach`."""
         return self.problem.layout
 
     def reach(self, record: Record) -> Matrix:
@@ -169,7 +169,7 @@ class Estimate(AnyFit):
 
     @property
     def one_step_theta(self) -> Vector | None:
-        """Φ⁺Y (nθ,), what one-step least squares gives, where θ was trained on something else.
+        """Φ⁺Y (nθ,), the one-step least squares, where θ was trained on another criterion.
 
         None otherwise.
         """
@@ -196,7 +196,9 @@ class Estimate(AnyFit):
         )
 
     def split(self, measure: Measure) -> Estimate:
-        """The same fitted function with θ, θ_aux, components and intervals under a measure, without training (F2).
+        """Return the same function with θ, components and intervals under a measure (F2).
+
+        Nothing is trained again.
 
         Raises:
             InputError: a measure that does not fit the model, or a θ at a bound.
@@ -248,7 +250,7 @@ class Estimate(AnyFit):
         )
 
     def joint_covariance(self, convention: str = "calibrated") -> Matrix:
-        """Cov of θ̂ and the weights from the raw `[Φ P⊥J]`, (nθ + nw)².
+        """Return Cov (nθ + nw)² of θ̂ and the weights from the raw `[Φ P⊥J]`.
 
         Convention "paper" for eq:cov_approx / N.
         """
@@ -261,7 +263,7 @@ class Estimate(AnyFit):
         return joint_covariance(self.problem, self.model, convention)
 
     def robust(self, lags: int | None = None, kind: str | None = None) -> Estimate:
-        """The same with standard errors of θ that hold for coloured and uneven noise.
+        """Return the fit with standard errors of θ that hold for coloured and uneven noise.
 
         One step ahead they are those of Newey and West, or HC3 for noise that is uneven and white.
         On the free run they are batch means of the scores (`fitting/block_scores.py`). Both these
@@ -307,7 +309,7 @@ class Estimate(AnyFit):
         return replace(self, covariance=covariance, plain_covariance=plain, std_kind=kind)
 
     def _hc3(self) -> Estimate:
-        """With every row's own error in place of one noise variance."""
+        """Return the fit with each row's own error in place of one noise variance."""
         statistics = self.plain_statistics or self.model.statistics
         if (
             statistics.gram is None
@@ -338,13 +340,16 @@ class Estimate(AnyFit):
         )
 
     def _grown(self, covariance: Matrix | None, statistics: Statistics) -> Matrix | None:
-        """Return Cov θ̂, larger along directions that the learner could nearly imitate on the rows."""
+        """Return Cov θ̂, larger along directions that the learner could nearly imitate."""
         return grown(
             covariance, statistics, None if self.model.shared is None else self.problem.shared
         )
 
     def _robust_free_run(self, steps: int | None, kind: str) -> Estimate:
-        """From blocks of so many steps of the free run, or from the colour of its errors."""
+        """Return the fit with robust standard errors of its free run.
+
+        From blocks of so many steps, or from the colour of its errors.
+        """
         assert self.scores is not None
         statistics = self.model.statistics
         if statistics.gram is None or self.model.numbers.tilt is not None:
@@ -369,19 +374,19 @@ class Estimate(AnyFit):
         )
 
     def _cov_along(self, statistics: Statistics, slope: Matrix) -> Matrix | None:
-        """Cov of `θ = c + θ_aux(w)` from statistics of (c, w)."""
+        """Return Cov of `θ = c + θ_aux(w)` from statistics of (c, w)."""
         joint = statistics.joint(len(self.theta))
         return (
             None if joint is None else joint.of(np.column_stack([np.eye(len(self.theta)), slope]))
         )
 
     def moves_by(self) -> tuple[Matrix, Vector] | None:
-        """Return how θ follows (c, w), [I ∂θ_aux/∂w], and which entries of these move."""
+        """Return the derivative [I ∂θ_aux/∂w] of θ by (c, w), and which entries of these move."""
         k = np.column_stack([np.eye(len(self.theta)), self._slope()])
         return k, np.ones(k.shape[1], dtype=bool)
 
     def _slope(self) -> Matrix:
-        """∂θ_aux/∂w under the measure that θ was split under."""
+        """Return ∂θ_aux/∂w under the measure that θ was split under."""
         if self.measure is not None and self.measure.slope is not None:
             return self.measure.slope
         problem = self.problem
@@ -394,12 +399,12 @@ class Estimate(AnyFit):
         return learner_slope(self.model, points, problem.projection, unit)
 
     def physical(self, physics: PhysicsMap) -> PhysicalEstimate:
-        """Return the physical parameters that θ̂ is made of, with intervals by the delta method."""
+        """Return the physical parameters of θ̂, with intervals by the delta method."""
         order, covariance = self._in_order_of(physics)
         return solve(physics, self.theta[order], covariance, freedom=max(self.freedom, 1.0))
 
     def physical_profile(self, physics: PhysicsMap, name: str) -> tuple[float, float]:
-        """95 % profile-likelihood interval of one physical parameter.
+        """Return the 95 % profile-likelihood interval of one physical parameter.
 
         A side without limit is infinite.
         """
@@ -459,7 +464,7 @@ class Estimate(AnyFit):
 
 
 def order_of(physics: PhysicsMap, names: Sequence[str], sampling_time: float) -> list[int]:
-    """Where the θ that the physics gives are among `names`.
+    """Return the places among `names` of the θ that the physics gives.
 
     Raises: InputError: no PhysicsMap, a θ that is not among them, a constant `Ts` that is not the
         sampling time.
@@ -477,7 +482,7 @@ def order_of(physics: PhysicsMap, names: Sequence[str], sampling_time: float) ->
 def parameter_frame(
     parameters: Sequence[Any], values: Vector, std: Vector | None, ci: Matrix | None
 ) -> pd.DataFrame:
-    """Return a row per parameter: unit, initial, value, std, and the 95 % interval.
+    """Return a table with a row per parameter: unit, initial, value, std, 95 % interval.
 
     NaN where there is none.
     """
@@ -501,7 +506,7 @@ def parameter_frame(
 def parameter_lines(
     parameters: Sequence[Any], values: Vector, std: Vector | None, ci: Matrix | None
 ) -> list[str]:
-    """The same as lines of text, a heading first; a dash where there is no interval."""
+    """Return the parameters as lines of text, a heading first; a dash for no interval."""
     width = max([9, *(len(p.name) for p in parameters)])
     lines = [
         f"{'parameter':<{width}}  {'value':>14}  {'std':>11}  {'95 % interval':^29}  "

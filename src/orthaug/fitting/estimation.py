@@ -1,4 +1,4 @@
-"""The one verb: fit physics and learner to a record."""
+"""`estimate`: fit physics and learner to a record."""
 
 from __future__ import annotations
 
@@ -133,7 +133,9 @@ def estimate(
     progress: ProgressCallback = SILENT,
     engine: Engine | None = None,
 ) -> Estimate | MotionEstimate:
-    """Fit `y_k = φ(x_k)θ + learner(x_k) + e_k` by prediction error (eq:cost_fun) or by the error of a free run.
+    """Fit `y_k = φ(x_k)θ + learner(x_k) + e_k` to a record.
+
+    The criterion is the prediction error (eq:cost_fun), or the error of a free run.
 
     θ is solved, never iterated (F1): with the orthogonal structure it is `Φ⁺Y` whatever the learner
     does. Equations of motion (`Motion`) are fitted on their free run, and their parameters are the
@@ -262,7 +264,7 @@ def fit(
     engine: Engine = InMemory(),  # noqa: B008  (frozen)
     checkpoints: Checkpoints | None = None,
 ) -> Estimate:
-    """`estimate` for a problem that is posed already.
+    """Fit a problem that is posed already; arguments as of `estimate`.
 
     Args: problem: record, physics and learner inputs; the other arguments as of `estimate`.
         learner: None for physics alone, on the rows of the problem. engine: where the rows are, or
@@ -349,7 +351,7 @@ def fit(
 
 
 def _again(problem: Problem, last: Estimate, **options: Any) -> Estimate:
-    """Return the fit to other weights of the outputs, from where the last one ended."""
+    """Return the fit to other weights of the outputs, from the end of the last fit."""
     chosen = next((r.regularization for r in last.restarts if r.chosen), "none")
     start = None if last.model.form.bound is None else last.model
     return fit(problem, initial=start, regularization=chosen, **options)
@@ -358,7 +360,10 @@ def _again(problem: Problem, last: Estimate, **options: Any) -> Estimate:
 def _undecided(
     problem: Problem, solver: Solver, structure: Structure, *, warm: bool, ensemble: bool
 ) -> bool:
-    """Return whether the data may decide for the free run: not where nothing but one step ahead can be trained."""
+    """Return whether the data may decide for the free run.
+
+    They may not where only one step ahead can be trained.
+    """
     able = (
         solver.gauss_newton and problem.baseline.linear and not isinstance(problem, StreamedProblem)
     )
@@ -366,7 +371,7 @@ def _undecided(
 
 
 def _settled(criterion: Criterion, problem: Problem) -> Criterion:
-    """Return the criterion with what it left to the record.
+    """Return the criterion with its open choices made for the record.
 
     One step ahead where nothing else can be trained.
     """
@@ -377,12 +382,12 @@ def _settled(criterion: Criterion, problem: Problem) -> Criterion:
 
 
 def _for_runs(engine: Engine, problem: Problem, runs: int) -> Engine:
-    """With a cluster several runs over rows in memory are its tasks."""
+    """Return the engine by which several runs over rows in memory are tasks of a cluster."""
     return runs_on(engine) if runs > 1 and not isinstance(problem, StreamedProblem) else engine
 
 
 def _physics_alone(task: OneStepTask, structure: Structure) -> Estimate:
-    """Physics alone, which is solved: it ends at the loss where it starts."""
+    """Return physics alone, which is solved: it ends at the loss where it starts."""
     estimate = conclude(task, structure, task.physics_learned())
     return replace(estimate, status=replace(estimate.status, start_loss=estimate.status.loss))
 
@@ -390,7 +395,7 @@ def _physics_alone(task: OneStepTask, structure: Structure) -> Estimate:
 def _check_cost(
     problem: Problem, learner: Learner | None, solver: Solver, runs: int, engine: Engine
 ) -> None:
-    """Raise InputError for what would take more memory or time than there is."""
+    """Raise InputError for a fit that would take more memory or time than there is."""
     sizes = {
         "rows": problem.count,
         "features": len(problem.features.entries),
@@ -419,7 +424,7 @@ def _check_blocks(blocks: int) -> int:
 
 
 def _check_ensemble(ensemble: bool, problem: Problem) -> bool:
-    """Return whether there is one.
+    """Return whether an ensemble is asked for, and check the request.
 
     Raise InputError for a median of outputs that are mixed with each other.
     """
@@ -451,7 +456,7 @@ def _splits(structure: Structure) -> bool:
 def _warm_start(
     problem: Problem, model: Model, engine: Engine
 ) -> tuple[OneStepTask, Vector, Vector]:
-    """Return the task of going on from an earlier model's weights, in its scaling.
+    """Return the task of training on from an earlier model's weights, in its scaling.
 
     And the model's c.
     """
@@ -492,7 +497,7 @@ def _check_types(**given: Any) -> None:
 
 
 def _check_regularizations(given: Any, choices: Sequence[Any], chosen: bool) -> bool:
-    """Return whether "auto" was given.
+    """Return whether "auto" was given, and check the regularizations.
 
     Raise InputError for what is none, or for several that nothing chooses between.
     """
@@ -545,7 +550,7 @@ def _engine_of(source: Source) -> Engine:
 
 
 def check_record(record: Any, *, moves: bool = False) -> None:
-    """Raise InputError for what holds no rows, or none in memory where a motion needs them."""
+    """Raise InputError for a record without rows, or with none in memory for a motion."""
     if not isinstance(record, Source):
         check_type(record, Record, "record", "a Record")
     elif moves and not isinstance(record, Record):

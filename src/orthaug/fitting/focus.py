@@ -1,4 +1,4 @@
-"""One step ahead or the free run: what `Auto` chooses, by free runs over rows that were not fitted.
+"""The choice of `Auto` between one step ahead and the free run, by held-out free runs.
 
 A fit one step ahead stays where its free run is finite, no worse than that of physics alone, and
 where its residual is noise of the equation. Otherwise physics and learner are trained on the free
@@ -41,7 +41,7 @@ Key = tuple[str, bool]
 
 
 def choose_focus(problem: Any, fit: Fit, options: Mapping[str, Any], criterion: Any) -> Any:
-    """Return the estimate one step ahead, or the best of it and those trained on the free run.
+    """Return the best of the estimates one step ahead and on the free run.
 
     Args:
         problem: posed, with its rows in memory.
@@ -69,7 +69,7 @@ def choose_focus(problem: Any, fit: Fit, options: Mapping[str, Any], criterion: 
 
 
 def _why_not(problem: Any, first: Any, fit: Fit, options: Mapping[str, Any]) -> str | None:
-    """Return why one step ahead is not enough; None where it is."""
+    """Return the reason why one step ahead is not enough; None where it is."""
     if not first.model.form.states:
         return None  # nothing is fed back: a free run is the prediction
     wrong = _beside_physics(first, [problem.record], problem)
@@ -96,7 +96,7 @@ def _why_not(problem: Any, first: Any, fit: Fit, options: Mapping[str, Any]) -> 
 
 
 def _beside_physics(fit: Any, records: Sequence[Record], problem: Any) -> str | None:
-    """Return what is wrong with the free runs of a fit beside those of its physics alone.
+    """Return the fault of a fit's free runs compared to those of its physics alone.
 
     None for nothing.
     """
@@ -111,14 +111,14 @@ def _beside_physics(fit: Any, records: Sequence[Record], problem: Any) -> str | 
 
 
 def _errors(fit: Any, record: Record, problem: Any) -> Pieces:
-    """Squared errors along the free run of each experiment."""
+    """Return the squared errors along the free run of each experiment."""
     if fit is None or not fit.status.ok:
         return [None] * len(record.experiments)
     return squared_errors(fit.model.simulate(record), problem.deviation)
 
 
 def _on_half(problem: Any, fit: Fit, options: Mapping[str, Any]) -> tuple[Any, Any]:
-    """Return a fit to the first half, and the other half; nothing where the rows are too few."""
+    """Return a fit to the first half, and the other half; nothing for too few rows."""
     try:
         training, held = blocked(problem.record, HALVES, problem.first_row)[-1]
         return fit(problem.on(training), criterion=Prediction(), **_quick(options)), held
@@ -127,7 +127,10 @@ def _on_half(problem: Any, fit: Fit, options: Mapping[str, Any]) -> tuple[Any, A
 
 
 def _quick(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options of a fit to a part of the rows: one start, few iterations, nothing to choose."""
+    """Return options for a quick fit to a part of the rows.
+
+    One start, few iterations, nothing to choose.
+    """
     given = options["regularization"]
     return {
         **{name: value for name, value in options.items() if name != "progress"},
@@ -142,7 +145,10 @@ def _quick(options: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _coloured(fit: Any) -> bool:
-    """Return whether the residual one step ahead is correlated with its own past, clearly and by more than a little."""
+    """Return whether the one-step residual is clearly correlated with its past.
+
+    And by more than a little.
+    """
     for trajectory in fit.model.predict(fit.problem.record).trajectories:
         errors = (trajectory.measured - trajectory.model)[trajectory.start :]
         limit = max(_COLOURED, _SIGNIFICANT / math.sqrt(len(errors)))
@@ -154,7 +160,7 @@ def _coloured(fit: Any) -> bool:
 
 
 def _free_run(criterion: Any, problem: Any) -> Any:
-    """Return the free run that is trained, with a washout that leaves most of a short record to be scored."""
+    """Return the free run to train, with a washout that leaves most of a record."""
     usable = max(map(len, problem.record.experiments)) - problem.first_row
     declared = criterion.simulation
     return replace(declared, washout=min(declared.washout, usable // 4)).on(
@@ -164,7 +170,7 @@ def _free_run(criterion: Any, problem: Any) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class _FocusChoice:
-    """A problem with its fit one step ahead, and how others are made of it."""
+    """A problem with its fit one step ahead, from which the other candidates are made."""
 
     problem: Any
     first: Any
@@ -174,7 +180,7 @@ class _FocusChoice:
 
     @property
     def learns(self) -> bool:
-        """Return whether there is a learner to be with or without."""
+        """True where there is a learner to compare with physics alone."""
         return self.options["learner"] is not None
 
     @cached_property
@@ -207,7 +213,7 @@ class _FocusChoice:
 
     @cached_property
     def errors(self) -> dict[Key, float]:
-        """RMS errors of the free runs of all candidates where nothing was fitted, the simplest first."""
+        """RMS errors of the held-out free runs of all candidates, the simplest first."""
         keys = [
             (focus, own)
             for focus in (ONE_STEP, FREE_RUN)
@@ -226,7 +232,7 @@ class _FocusChoice:
         return {key: math.sqrt(mean_square(found)) for key, found in pieces.items()}
 
     def _folds(self) -> list[tuple[Record, Record]]:
-        """Return what blocks are left out of, and these.
+        """Return pairs of training rows and held-out blocks.
 
         Of few rows the training data themselves.
         """
@@ -245,14 +251,17 @@ class _FocusChoice:
 
 
 def _without(estimate: Any, learner: bool) -> Any:
-    """Return an estimate, or that of physics alone beside it."""
+    """Return an estimate, or that of its physics alone."""
     if learner or estimate is None or estimate.physics_alone is None:
         return estimate
     return estimate.physics_alone
 
 
 def _best(choosing: _FocusChoice, reason: str) -> Any:
-    """Return the estimate of the candidate with the least error, of those whose free run over all rows is sound."""
+    """Return the estimate of the candidate with the least error.
+
+    Only candidates whose free run over all rows is sound count.
+    """
     errors = choosing.errors
     ranked = _ranked(errors, with_learner=choosing.learns and not choosing.options["fallback"])
     chosen = next((key for key in ranked if _sound(choosing, key)), None)
@@ -292,7 +301,7 @@ def _best(choosing: _FocusChoice, reason: str) -> Any:
 
 
 def _ranked(errors: Mapping[Key, float], *, with_learner: bool) -> list[Key]:
-    """Return the candidates, the least error first and of alike ones the simplest.
+    """Return the candidates by error, of similar ones the simplest first.
 
     Wanted learners before physics.
 
@@ -315,7 +324,10 @@ def _ranked(errors: Mapping[Key, float], *, with_learner: bool) -> list[Key]:
 
 
 def _sound(choosing: _FocusChoice, key: Key) -> bool:
-    """Return whether a candidate runs over all training data, with a learner no worse than physics if that may be."""
+    """Return whether a candidate runs over all training data.
+
+    Its learner may be no worse than physics, where `physics` is a candidate.
+    """
     if not math.isfinite(choosing.errors[key]):
         return False
     problem = choosing.problem

@@ -1,4 +1,4 @@
-"""Terms of a learner that say nothing of their own on the data: they are left out, with a sentence."""
+"""Removal of learner terms that are linear combinations of others on the data."""
 
 from __future__ import annotations
 
@@ -19,7 +19,9 @@ _NAMED = 6
 def independent_terms(
     problem: Problem, learner: Learner | None
 ) -> tuple[Problem, Learner | None, tuple[Warning, ...]]:
-    """Problem and learner without the terms that the physics or the terms before them express on these rows.
+    """Return problem and learner without linearly dependent terms, and a warning.
+
+    A term depends on the physics or on the terms before it, on these rows.
 
     Another learner is left as it is; without one the problem has no features.
 
@@ -57,7 +59,7 @@ def independent_terms(
 
 
 def _told_apart(columns: np.ndarray, first: int) -> tuple[list[int], list[int]]:
-    """Which columns from the `first` on are independent of all before them, and which are not."""
+    """Return the columns from `first` that are independent of all before, and the rest."""
     r = np.abs(np.diag(np.linalg.qr(columns, mode="r")))
     left = r[first:] > _LEFT
     return [int(i) for i in np.flatnonzero(left)], [int(i) for i in np.flatnonzero(~left)]

@@ -1,4 +1,4 @@
-"""The result of a motion's estimation: physical parameters with intervals, the model, and what may be doubted."""
+"""The result of a motion's estimation: physical parameters with intervals, model."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _ROUNDING = 1e-11  # of the largest eigenvalue of the information with unit colu
 
 @dataclass(frozen=True, eq=False)
 class MotionEstimate(AnyFit):
-    """What `estimate` returns for a motion.
+    """Result of `estimate` for a motion.
 
     Print `fit.summary()`; use `fit.model`; read `fit.parameters`.
     """
@@ -89,11 +89,11 @@ class MotionEstimate(AnyFit):
 
     @property
     def layout(self) -> Layout:
-        """Return what the entries of `reach` are called."""
+        """Names of the entries of `reach`."""
         return layout_of(self.problem.motion)
 
     def reach(self, record: Record) -> Matrix:
-        """Return the states and inputs (N, nx + nu) of the free run on a record, where they are finite."""
+        """Return the states and inputs (N, nx + nu) of the free run, where they are finite."""
         return self.model.reach(record)
 
     @property
@@ -120,7 +120,7 @@ class MotionEstimate(AnyFit):
         return self._std_of(self.plain_covariance)
 
     def _std_of(self, covariance: Matrix | None) -> Vector | None:
-        """By the delta method, from a covariance of the coordinates."""
+        """Return standard errors by the delta method, from a covariance of the coordinates."""
         if covariance is None:
             return None
         return np.sqrt(np.diag(covariance)) * np.abs(
@@ -139,13 +139,15 @@ class MotionEstimate(AnyFit):
 
     @cached_property
     def parameters(self) -> pd.DataFrame:
-        """Table with a row per parameter: unit, initial, value, std, the 95 % interval, and whether it is shared."""
+        """Table with a row per parameter: unit, initial, value, std, 95 % interval, shared."""
         motion = self.problem.motion
         table = parameter_frame(motion.parameters, self.values, self.std, self.interval)
         return table.assign(shared=[name not in self.shared.untouched for name in motion.names])
 
     def split(self, measure: Measure, shared: str = "auto") -> MotionEstimate:
-        """The same fitted motion with p̂ under another measure over states and inputs, without training.
+        """Return the same motion with p̂ under another measure over states and inputs.
+
+        Nothing is trained again.
 
         Args:
             measure: such as `Uniform({"v": (-1, 1)})`, by the names of states and inputs.
@@ -169,7 +171,9 @@ class MotionEstimate(AnyFit):
         return _with_split(self, replace(split, support=support), told)
 
     def robust(self, steps: int | None = None, kind: str = "batch-means") -> MotionEstimate:
-        """The same with standard errors that hold for coloured errors: batch means of the scores (`block_scores`).
+        """Return the fit with standard errors that hold for coloured errors.
+
+        By batch means of the scores (`block_scores`).
 
         Args: steps: of a block; None to choose it by how long the errors remember each other. kind:
             "batch-means", "batch-means-uneven" where the errors are white and of uneven size, or
@@ -197,7 +201,7 @@ class MotionEstimate(AnyFit):
         return _with_split(robust, self.split_by, kept)
 
     def moves_by(self) -> tuple[Matrix, Vector] | None:
-        """Return how the coordinates follow (c, w), and which entries of these move.
+        """Return the derivative of the coordinates by (c, w), and which of these move.
 
         None without statistics.
         """
@@ -241,7 +245,7 @@ class MotionEstimate(AnyFit):
 
 
 def fitted_numbers(numbers: Numbers) -> Numbers:
-    """Return the numbers before any split: θ are those beside the learner."""
+    """Return the numbers before any split: θ is the one fitted beside the learner."""
     c = np.asarray(numbers.theta - numbers.theta_aux)
     return numbers._replace(theta=c, theta_aux=np.zeros_like(c))
 
@@ -249,7 +253,7 @@ def fitted_numbers(numbers: Numbers) -> Numbers:
 def _with_split(
     fit: MotionEstimate, split: MotionSplit, told: tuple[Warning, ...] = ()
 ) -> MotionEstimate:
-    """Return the estimate with p̂, its intervals and its warnings as a split gives them."""
+    """Return the estimate with p̂, intervals and warnings of a split."""
     motion, numbers = fit.problem.motion, fit.model.numbers
     c = np.asarray(numbers.theta - numbers.theta_aux)
     bounds = motion.coordinates.bounds
@@ -283,7 +287,10 @@ def _with_split(
 def _covariance(
     fit: MotionEstimate, split: MotionSplit, at_bound: tuple[str, ...]
 ) -> tuple[Matrix | None, tuple[str, ...]]:
-    """Cov q̂ = K Cov(c, w) Kᵀ, and which parameters no output tells, or the prior of the weights rather than they."""
+    """Return Cov q̂ = K Cov(c, w) Kᵀ, and the parameters that lack an interval.
+
+    No output determines these, or only the prior of the weights does.
+    """
     names, made = fit.problem.motion.names, free_covariance(fit)
     if split.slope is None or made is None:
         return None, ()
@@ -302,7 +309,7 @@ def _covariance(
 
 
 def free_covariance(fit: MotionEstimate) -> tuple[JointCovariance, Bool[np.ndarray, "n"]] | None:
-    """Cov (c, w) of what is not at a bound, and which entries these are.
+    """Return Cov (c, w) of the entries that are not at a bound, and a mask of these.
 
     None without statistics.
     """
@@ -321,7 +328,7 @@ def free_covariance(fit: MotionEstimate) -> tuple[JointCovariance, Bool[np.ndarr
 
 
 def _wider_without_prior(joint: JointCovariance, slope: Matrix) -> Vector:
-    """Return how many times wider the intervals of K (c, w) were without the ridge on w (m,).
+    """Return how many times wider intervals of K (c, w) are without the ridge on w (m,).
 
     Inf where nothing tells them.
 
@@ -377,7 +384,7 @@ def _doubts(
 
 
 def shared_in_words(shared: Shared) -> str:
-    """Return what the learner could imitate, in words."""
+    """Return the directions that the learner could imitate, in words."""
     if not shared.basis.size:
         return "nothing: the fit tells all parameters from the learner"
     if shared.all:

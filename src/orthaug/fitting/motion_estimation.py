@@ -1,4 +1,4 @@
-"""Fitting a motion to a record, with a learner beside some of its equations: training, and the estimate after it."""
+"""Training of a motion, with a learner in some of its equations, and its estimate."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ left out.
 def pose_for(
     record: Record, motion: Motion, learner: Learner | None, output_weights: str | Sequence[float]
 ) -> MotionProblem:
-    """Return the problem of a motion with what a learner sees.
+    """Return the problem of a motion with the inputs of a learner.
 
     Raises:
         InputError: as `pose_motion`.
@@ -73,7 +73,7 @@ def fit_motion(
     engine: Engine = InMemory(),  # noqa: B008  (frozen)
     checkpoints: Checkpoints | None = None,
 ) -> MotionEstimate:
-    """`estimate` for a motion that is posed already; arguments as there.
+    """Fit a motion that is posed already; arguments as of `estimate`.
 
     Raises:
         InputError: what a motion cannot be trained with.
@@ -96,7 +96,7 @@ def fit_motion(
 
 
 def without_learner(problem: MotionProblem) -> MotionProblem:
-    """The same problem with no state and no output learned."""
+    """Return the problem with no state and no output learned."""
     motion = problem.motion
     states = tuple(replace(state, learned=False) for state in motion.states)
     outputs = tuple(replace(output, learned=False) for output in motion.outputs)
@@ -158,7 +158,7 @@ def conclude_motion(
 
 
 def _learner_values(plan: SegmentedMotion, learned: TrainedLearner) -> Matrix | None:
-    """Return the values (N, nl) of a learner with few effective weights along the training runs.
+    """Return the values (N, nl) of a nearly silent learner along the training runs.
 
     None of others.
     """
@@ -209,7 +209,10 @@ def _model(plan: SegmentedMotion, structure: Structure, learned: TrainedLearner)
 
 
 def _limited(model: MotionModel, record: Record) -> MotionModel:
-    """Return the model with the range beyond which its correction is held or fades: of the features over the fitted run."""
+    """Return the model with the range of its features over the fitted run.
+
+    Beyond that range the correction stays constant or fades.
+    """
     limits = None if model.form.beyond == "free" or model.seen is None else limits_of(model.seen)
     if limits is None:
         return model
@@ -223,7 +226,7 @@ def _limited(model: MotionModel, record: Record) -> MotionModel:
 
 
 def _seen(model: MotionModel, record: Record) -> Matrix | None:
-    """Least and largest (2, nz) of the learner's features over the free run.
+    """Return the least and largest (2, nz) of the learner's features over the free run.
 
     None where it has no finite ones.
     """
@@ -235,7 +238,10 @@ def _seen(model: MotionModel, record: Record) -> Matrix | None:
 
 
 def _best_window(model: MotionModel, record: Record) -> int:
-    """Return the rows to predict from that give the least error one step ahead, on some of the training data."""
+    """Return the window of rows that predicts one step ahead best.
+
+    On some of the training data.
+    """
     longest = max(record.experiments, key=len).rows(0, _TRIED_ROWS)
     tried = [n * (model.form.states + 1) for n in _WINDOWS]
     best, least = tried[0], np.inf
@@ -260,7 +266,9 @@ def _best_window(model: MotionModel, record: Record) -> int:
 
 
 def reopened(model: MotionModel, record: Record) -> MotionEstimate:
-    """Return the estimate of a saved model with its training data, to split again, less what was told of its training.
+    """Return the estimate of a saved model with its training data, to split again.
+
+    It lacks the results of its training.
 
     Raises:
         InputError: other data than the model was trained on.

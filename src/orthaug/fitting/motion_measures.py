@@ -1,4 +1,4 @@
-"""Measures over the states and inputs of a motion: the points on which physics and learner are told apart."""
+"""Measures over the states and inputs of a motion, on which physics is split from learner."""
 
 from __future__ import annotations
 
@@ -25,7 +25,9 @@ if TYPE_CHECKING:
 def field_under(
     measure: Measure, segmented: SegmentedMotion, numbers: Numbers, states: Any
 ) -> tuple[Field, float, tuple[Warning, ...]]:
-    """Points of a measure with the sizes of the learned equations, its support by the data, and what to tell.
+    """Return the points of a measure, its support by the data, and warnings.
+
+    With the sizes of the learned equations.
 
     Raises: InputError: a measure that does not fit the motion, or points at which the motion has no
         value.
@@ -81,7 +83,9 @@ def wobble(
     size: Vector,
     q: Vector,
 ) -> Matrix:
-    """Return how the points of a motion's own measure follow its unknowns: they are where the fitted run goes.
+    """Return the derivative of the points of a motion's own measure by its unknowns.
+
+    These points are states of the fitted run.
 
     A split under the training measure depends on the unknowns twice, through the fitted field and
     through these points. Intervals that leave the second out cover too little. `Σ φ_qx dx/d(c, w)`

@@ -1,4 +1,4 @@
-"""Training of a motion on its free run: the parameters' coordinates, the weights and the segments' starts together.
+"""Training of a motion on its free run: parameters, weights and initial states together.
 
 Physics alone is where every learner starts, and what it has to beat. It is trained over segments
 that lengthen: first the starts of short ones are found, then the parameters over them, then over
@@ -51,7 +51,7 @@ _LOOSER = 1e-4  # times the weight of the guesses, where it is asked what the ou
 def train_motion_physics(
     segmented: SegmentedMotion, solver: LevenbergMarquardt, tell: RunProgress = quiet
 ) -> tuple[SegmentedMotion, FreeRunFit | None]:
-    """Parameters of the physics alone, and the course with segments that start where its runs do.
+    """Return parameters of physics alone, and segments that start at its states.
 
     None: none flies.
     """
@@ -97,7 +97,9 @@ def _descended(
     rows: list[np.ndarray] | None,
     tell: RunProgress = quiet,
 ) -> FreeRunFit | None:
-    """From the best of the starts, whose segments begin at states that follow the outputs.
+    """Return the end of a descent from the best of the starts.
+
+    Its segments begin at states that follow the outputs.
 
     None where none flies.
     """
@@ -116,7 +118,7 @@ def _descended(
 
 
 def _follows(segmented: SegmentedMotion, free_fit: FreeRunFit) -> bool:
-    """Return whether the runs follow most of what the outputs do."""
+    """Return whether the runs follow most of the outputs' variation."""
     return bool(_left(segmented, free_fit) < _POOR**2 * segmented.residuals)
 
 
@@ -132,7 +134,10 @@ def _left(segmented: SegmentedMotion, free_fit: FreeRunFit) -> float:
 def _fine_enough(
     segmented: SegmentedMotion, free_fit: FreeRunFit, solver: LevenbergMarquardt
 ) -> tuple[SegmentedMotion, FreeRunFit]:
-    """Twice the substeps until they move the outputs by less than 1 % of what the physics leaves."""
+    """Return segments with substeps fine enough for the outputs.
+
+    Doubling them moves the outputs by less than 1 % of the residual of the physics.
+    """
     motion = segmented.problem.motion
     while (
         motion.substeps is None
@@ -150,7 +155,7 @@ def _fine_enough(
 
 
 def moved_by(segmented: SegmentedMotion, finer: SegmentedMotion, free_fit: FreeRunFit) -> float:
-    """By how much of the residual the outputs move when the steps of the integrator are finer."""
+    """Return by what share of the residual finer integrator steps move the outputs."""
     point = free_fit.end.point
     runs = []
     for one in (segmented, finer):
@@ -176,7 +181,7 @@ def _descended_on(
 
 @dataclass(frozen=True, eq=False)
 class MotionTask(SimulationTask):
-    """A motion's course, and what its physics alone does on it."""
+    """A motion laid out in segments, and the run of its physics alone."""
 
     plan: SegmentedMotion
 
@@ -188,7 +193,7 @@ class MotionTask(SimulationTask):
         criterion: Criterion,
         engine: Engine | None = None,
     ) -> MotionTask:
-        """Bind a learner to the equations and outputs that it is added to, and lay the record out.
+        """Bind a learner to its equations and outputs, and lay out the record.
 
         Raises:
             InputError: nothing would be scored.
@@ -210,7 +215,7 @@ class MotionTask(SimulationTask):
         return self
 
     def on(self, record: Record) -> MotionTask:
-        """The same motion on another record."""
+        """Return the task on another record."""
         sums = None if self.plan.sums is None else SegmentSums.of(self.plan.sums.engine)
         segmented = SegmentedMotion.of(
             self.problem.on(record), self.bound, self.criterion, self.plan, sums
@@ -218,7 +223,7 @@ class MotionTask(SimulationTask):
         return MotionTask(segmented)
 
     def physics_alone(self) -> tuple[MotionTask, TrainedLearner]:
-        """Return the task without a learner, and what physics alone leaves.
+        """Return the task without a learner, and the residual of physics alone.
 
         Without an end where it cannot fly.
         """
@@ -238,7 +243,7 @@ class MotionTask(SimulationTask):
         )
 
     def median(self, members: list[TrainedLearner], best: int) -> TrainedLearner:
-        """Return the best member: a motion has no ensemble, for medians of outputs follow no equations."""
+        """Return the best member: medians of outputs follow no equations of motion."""
         return members[best]
 
     def learned(self, run: FreeRunFit) -> TrainedLearner:
@@ -260,7 +265,10 @@ class MotionTask(SimulationTask):
         return train_motion_physics(self.plan, solver, tell)
 
     def scaled(self, plan: SegmentedMotion, physics: FreeRunFit) -> SegmentedMotion:
-        """Return the learner's features over the runs of physics alone, and the size of what it is added to."""
+        """Return the size of the learner's features and of the quantities it is added to.
+
+        Over the runs of physics alone.
+        """
         if plan.bound is None:
             return plan
         point = physics.end.point
@@ -281,7 +289,7 @@ class MotionTask(SimulationTask):
         structure: Structure,
         regularization: str | float,
     ) -> list[StartPoint]:
-        """Physics alone with a silent learner.
+        """Return the start at physics alone with a silent learner.
 
         A learner that cannot be silenced starts as it is.
         """

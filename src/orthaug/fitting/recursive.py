@@ -1,4 +1,4 @@
-"""θ followed online: recursive least squares with the learner fixed, intervals, and an alarm.
+"""Recursive estimation of θ with the learner fixed: intervals and an alarm.
 
 With f and θ_aux fixed, the fitted model is linear in θ: `y − known − (f − φθ_aux) = φθ + e`. Over
 the training rows its least-squares solution is the fit's θ, whatever the structure's split: `Φ⁺(Y −
@@ -57,7 +57,7 @@ _LEAST_FACTOR = 0.3  # of forgetting: a memory of one row
 
 
 class Alarm(NamedTuple):
-    """The residual has left its band at `row` of all rows handed in, `time` [s] after the first."""
+    """An alarm: residuals left their band at `row` of all rows given, `time` [s] after the first."""
 
     row: int
     time: float
@@ -67,7 +67,7 @@ class Alarm(NamedTuple):
 
 
 class Recursive:
-    """A fitted model whose θ follows new rows, the learner fixed.
+    """A fitted model whose θ is updated by new rows, the learner fixed.
 
     Args: fit: of `estimate`, one step ahead, or a saved model. training: the record that a saved
         model was trained on; an `Estimate` knows it. forgetting: λ in (0, 1], the weight of a row
@@ -131,7 +131,7 @@ class Recursive:
     def load(
         cls, folder: str | Path, *, baseline: Baseline | None = None, learner: Learner | None = None
     ) -> Recursive:
-        """Go on from where `save` was called.
+        """Return the estimate that `save` wrote, to go on from there.
 
         Args:
             baseline, learner: the Python callables again, where the model had such.
@@ -175,7 +175,7 @@ class Recursive:
     def update(
         self, record: Record | None = None, *, u: Any = None, y: Any = None, gap: bool = False
     ) -> Sequence[Alarm]:
-        """Follow new rows, one or many; they follow on the last ones.
+        """Update θ by new rows, one or many, that follow on the last ones.
 
         Args: record: with the model's channels. Every experiment after the first begins after a
             gap. u, y: instead of a record inputs and outputs, one row or many; NaN is a missing
@@ -211,7 +211,7 @@ class Recursive:
         return told
 
     def _parts(self, record: Record | None, u: Any, y: Any) -> list[Matrix]:
-        """Rows (n, ny + nu) without gaps among them."""
+        """Yield rows (n, ny + nu) without gaps among them."""
         model = self._fitted
         if record is None:
             return [joined_rows(u, y, len(model.inputs), len(model.outputs))]
@@ -223,7 +223,7 @@ class Recursive:
     def _whitened(
         self, x: Matrix, complete: Any, rows: Matrix
     ) -> tuple[Any, WhitenedRows | None, int]:
-        """Which rows are used, and what θ is least squares of in them."""
+        """Return the usable rows and their least-squares problem in θ."""
         used = np.flatnonzero(complete)
         if not len(used):
             return used, None, len(rows)
@@ -251,7 +251,10 @@ class Recursive:
 
     @property
     def _freedom(self) -> float:
-        """Degrees of freedom of s²: effective rows less what parameters and, as long as its rows count, learner use."""
+        """Degrees of freedom of s²: effective rows less those used by parameters and learner.
+
+        The learner's count as long as its training rows do.
+        """
         recursion = self._recursion
         used = self._used * recursion.oldest
         return max(
@@ -291,7 +294,7 @@ class Recursive:
 
     @property
     def alarmed(self) -> bool:
-        """Return whether the residual is out of its band now."""
+        """True while the residual is out of its band."""
         return self.alarm_level > 1
 
     @property
@@ -311,7 +314,7 @@ class Recursive:
 
     @property
     def effective_rows(self) -> float:
-        """As many rows of equal weight say as much as the weighted ones."""
+        """The number of equally weighted rows with the same information."""
         return self._recursion.effective_rows
 
     @property
@@ -332,7 +335,9 @@ class Recursive:
 
     @property
     def history(self) -> pd.DataFrame:
-        """A row per row that was used: time [s], residual of each output, each θ with its interval, alarm level.
+        """A row per row that was used.
+
+        Time [s], residual of each output, each θ with its interval, alarm level.
 
         `alarm` is the largest sum over its limit: above 1 the residual is out of its band. Of more
         than 10 000 rows every second one is kept, every fourth, and so on.
@@ -355,14 +360,14 @@ class Recursive:
         return pd.DataFrame(columns, index=pd.Index(rows[:, 0].astype(int), name="row"))
 
     def physical(self, physics: PhysicsMap) -> PhysicalEstimate:
-        """Return the physical parameters that θ is made of now, with intervals by the delta method."""
+        """Return the physical parameters of the present θ, with intervals (delta method)."""
         order = self._in_order_of(physics)
         covariance = self.covariance
         covariance = None if covariance is None else covariance[np.ix_(order, order)]
         return solve(physics, self.theta[order], covariance, freedom=self._freedom)
 
     def physical_history(self, physics: PhysicsMap, points: int = 100) -> pd.DataFrame:
-        """Return the physical parameters at some instants of `history`, the last one among them.
+        """Return the physical parameters at some instants of `history` and at the last.
 
         Args:
             points: how many, at most.
@@ -430,7 +435,7 @@ class Recursive:
 
 
 def outside_text(outside: int, rows: int) -> str:
-    """Return how many rows the learner extrapolates on."""
+    """Return a sentence on the number of rows on which the learner extrapolates."""
     share = f"{percent(outside / rows)} of the rows"
     return (
         f"the learner's inputs leave those of training on {share}: it extrapolates there, "
@@ -439,7 +444,7 @@ def outside_text(outside: int, rows: int) -> str:
 
 
 def forgetting_factor(forgetting: Any, memory: Any, sampling_time: float) -> float:
-    """λ of either.
+    """Return λ from either a factor or a memory.
 
     Raises:
         InputError: both given, or values that are none.

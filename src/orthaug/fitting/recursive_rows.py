@@ -1,4 +1,4 @@
-"""Rows of a fitted lagged model, learner fixed: new ones across calls, and those of training to start from."""
+"""Rows of a fitted lagged model with its learner fixed: new ones, and those of training."""
 
 from __future__ import annotations
 
@@ -32,7 +32,10 @@ _RIM = 1e-9  # the largest of training is no extrapolation
 
 @partial(jax.jit, static_argnames="form")
 def _evaluated(form: Lagged, numbers: Numbers, x: Float[Array, "m nx"]) -> Float[Array, "m ny ntp"]:
-    """`[φ, known + f − φθ_aux]` of every row, and the largest of its scaled features: 1 at the rim of training."""
+    """Return `[φ, known + f − φθ_aux]` of every row, and the largest of its scaled features.
+
+    That is 1 at the limit of the training data.
+    """
 
     def one(row: Any) -> Any:
         phi = form.baseline.phi(row, form.layout, form.outputs, jnp)
@@ -48,7 +51,9 @@ def _evaluated(form: Lagged, numbers: Numbers, x: Float[Array, "m nx"]) -> Float
 
 
 class WhitenedRows(NamedTuple):
-    """φ (n, ny, nθ) and `y − known − (f − φθ_aux)` (n, ny) in whitened outputs: what θ is least squares of.
+    """φ (n, ny, nθ) and `y − known − (f − φθ_aux)` (n, ny) in whitened outputs.
+
+    θ is the least squares of these.
 
     `inside` (n,) is where the learner's features lie within those of training.
     """
@@ -61,7 +66,7 @@ class WhitenedRows(NamedTuple):
 def whitened_rows(
     model: Model, x: Matrix, y: Matrix, numbers: Numbers | None = None
 ) -> WhitenedRows:
-    """Rows of measured regressors x (n, nx) and outputs y (n, ny).
+    """Return rows of measured regressors x (n, nx) and outputs y (n, ny), whitened.
 
     Args:
         numbers: the model's, where JAX has them already: a call with few rows is faster.
@@ -98,7 +103,7 @@ def whitened_rows(
 
 @dataclass(frozen=True, eq=False)
 class RegressorStream:
-    """Regressors of rows that are handed in a few at a time, from the rows before them."""
+    """Regressors of rows that arrive a few at a time, from the rows before them."""
 
     model: Model
 
@@ -121,7 +126,7 @@ class RegressorStream:
     def regressors(
         self, tail: Matrix, rows: Matrix
     ) -> tuple[Matrix, Bool[np.ndarray, "n"], Matrix]:
-        """x (n, nx) of new rows (n, ny + nu), which of them are complete, and the tail after them."""
+        """Return x (n, nx) of new rows (n, ny + nu), which are complete, and the new tail."""
         whole = np.concatenate([tail, rows])
         lag, column = self._read
         x = whole[(len(tail) + np.arange(len(rows)))[:, None] - lag, column]
@@ -156,7 +161,7 @@ def as_rows(values: Any, channels: int, name: str) -> Matrix:
 
 
 def joined_rows(u: Any, y: Any, inputs: int, outputs: int) -> Matrix:
-    """Return outputs and inputs side by side (n, ny + nu), as they are handed in.
+    """Return outputs and inputs side by side (n, ny + nu), as they were given.
 
     Raises:
         InputError: one of them missing, or of another length.
@@ -254,7 +259,10 @@ def trained(fit: Any, training: Record | None) -> TrainingRowsModel:
 
 
 def _check_solved(began: TrainingRowsModel) -> None:
-    """Raise InputError where θ is not the least squares of the rows: then new rows would not go on from it."""
+    """Raise InputError where θ is not the least squares of the rows.
+
+    New rows could not continue from it.
+    """
     count, ny, nt = began.phi.shape
     stacked = began.phi.reshape(-1, nt)
     left = (began.target - began.phi @ began.model.theta).ravel()
@@ -270,7 +278,10 @@ def _check_solved(began: TrainingRowsModel) -> None:
 
 
 def _saved_covariance(began: TrainingRowsModel) -> Matrix | None:
-    """Cov θ of a saved model under its training measure: `K Cov(c, w) Kᵀ`, K = [I, ∂θ_aux/∂w] from the Gram matrix."""
+    """Return Cov θ of a saved model under its training measure.
+
+    `K Cov(c, w) Kᵀ`, K = [I, ∂θ_aux/∂w] from the Gram matrix.
+    """
     model, nt = began.model, len(began.model.theta)
     joint = model.statistics.joint(nt)
     if joint is None or model.structure != "orthogonal":
@@ -287,7 +298,10 @@ def _saved_covariance(began: TrainingRowsModel) -> Matrix | None:
 def begin(
     began: TrainingRowsModel, forgetting: float, quiet: float, *, empty: bool
 ) -> tuple[Recursion, Reference, Matrix | None]:
-    """Return the state before new rows, what residuals were like, and by what intervals are wider than `s²(ΦᵀΦ)⁻¹`."""
+    """Return the state before new rows, reference residuals, and the inflation.
+
+    The inflation is the factor by which intervals are wider than `s²(ΦᵀΦ)⁻¹`.
+    """
     phi, target, model = began.phi, began.target, began.model
     count, ny, nt = phi.shape
     residual = target - phi @ model.theta
@@ -325,7 +339,7 @@ def begin(
 
 
 def _sandwich(r: Matrix, middle: Matrix) -> Matrix:
-    """`(RᵀR)⁻¹ Ω (RᵀR)⁻¹`."""
+    """Return `(RᵀR)⁻¹ Ω (RᵀR)⁻¹`."""
     unit = np.linalg.norm(r, axis=0)
     inverse = np.linalg.inv(r / unit) / unit[:, None]
     return inverse @ (inverse.T @ middle @ inverse) @ inverse.T
@@ -337,7 +351,7 @@ def _root(matrix: Matrix) -> Matrix:
 
 
 def _memory(stretches: list[Matrix], white: Matrix) -> int:
-    """Return how many lags the colour of the errors takes: three times as many as their correlation lasts."""
+    """Return three times the correlation length of the errors, in lags."""
     longest, rows = max(map(len, stretches)), sum(map(len, stretches))
     padded = [
         np.pad(stretch @ white.T, ((0, longest - len(stretch)), (0, 0))) for stretch in stretches

@@ -1,4 +1,4 @@
-"""Static data as a regressor of scikit-learn: physics in the columns of X, and a learned correction."""
+"""Static data as a regressor of scikit-learn: physics in the columns of X, and a correction."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ class AugmentedRegressor(Augmented):
         return self
 
     def predict(self, X: Any, return_std: bool = False) -> Any:
-        """ŷ, (n,) or (n, n_outputs) as y was.
+        """Return ŷ, (n,) or (n, n_outputs) as y was in the fit.
 
         With `return_std` also its standard error, of the same shape.
 

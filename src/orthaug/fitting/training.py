@@ -54,7 +54,9 @@ def planned(bound: Bound | None, seeds: range, choices: Sequence[str | float]) -
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """How one run is chosen: on `validation`, on held-out `blocks` of the training data, or by the lowest loss.
+    """Choice between runs by held-out errors or by the lowest loss.
+
+    Held-out rows are a `validation` record, or `blocks` of the training data.
 
     With `scored` and without `validation` it is the lowest generalised cross-validation instead,
     one step ahead.
@@ -74,14 +76,17 @@ class Choice:
     """
 
     def compares(self, task: Task, starts: Sequence[PlannedRun]) -> bool:
-        """Return whether there is something to choose by held-out errors: runs that fly, or several regularizations."""
+        """Return whether held-out errors choose between runs or regularizations.
+
+        They can where runs are finite, or regularizations are several.
+        """
         several = len({start.regularization for start in starts}) > 1
         return task.bound is not None and (
             task.criterion.free_run is not None or (several and not self.scored)
         )
 
     def ranking(self, task: Task, runs: Sequence[Any], errors: Sequence[float]) -> np.ndarray:
-        """Return what is lowest for the best run: its held-out error, its score, or its loss.
+        """Return the value that is lowest for the best run: held-out error, score, or loss.
 
         On blocks other runs of its kind were judged: one that ended higher on its own data than
         they did on what they had not seen failed to train, and its loss counts.
@@ -172,7 +177,7 @@ def train(
 
 
 def _beside(conclude: Concluding, task: Task, structure: Structure) -> Any:
-    """Return the estimate of physics alone that a learner stands beside.
+    """Return the estimate of physics alone, to compare with that of a learner.
 
     None without one, and where it costs a pass.
     """
@@ -196,7 +201,7 @@ def _restart(
 
 
 def _cross_validation(task: Task, run: Any) -> float:
-    """Generalised: `N RSS / (N − nθ − 1.4 γ)²` of a run one step ahead.
+    """Return the score `N RSS / (N − nθ − 1.4 γ)²` of a run one step ahead (generalised).
 
     Infinite where it uses up all rows.
     """
@@ -229,7 +234,10 @@ def _run_all(
     progress: ProgressCallback,
     runner: Any,
 ) -> tuple[list[PlannedRun], list[Any]]:
-    """Make every planned run, and more where evidence silenced the learner and held-out rows can choose."""
+    """Make every planned run, and weaker regularizations where evidence silenced the learner.
+
+    The latter only where held-out rows can choose.
+    """
     begun, runs = _run(task, starts, structure, solver, progress, runner)
     if task.bound is None or not choice.retry or (choice.validation is None and not choice.blocks):
         return begun, runs
@@ -316,7 +324,7 @@ def _held_out(
     conclude: Concluding,
     runner: Any,
 ) -> HeldOutErrors | None:
-    """Errors where nothing was fitted: of the runs on the validation record, or of runs on folds on their blocks.
+    """Return held-out errors: of runs on the validation record, or of runs on folds.
 
     `concluded` gives the estimate of a run by its number.
     """
@@ -352,7 +360,7 @@ def _held_out(
 
 
 def _on_fold(given: Any, fold: tuple[Record, Record], tell: Callable[..., None]) -> list[Pieces]:
-    """Errors on a block, of physics alone and of a run from every start on the rest."""
+    """Return errors on a block of physics alone, and of runs from every start on the rest."""
     task, starts, structure, solver, conclude = given
     training, held = fold
     failed: Pieces = [None] * len(held.experiments)
@@ -369,7 +377,7 @@ def _on_fold(given: Any, fold: tuple[Record, Record], tell: Callable[..., None])
 
 
 def _errors(fit: Any, record: Record, unit: Any) -> Pieces:
-    """Of the criterion's own response; None for a run without a model or a value."""
+    """Return errors of the criterion's own response; None for a run without model or value."""
     if not fit.status.ok:
         return [None] * len(record.experiments)
     return squared_errors(fit.criterion.response(fit.model, record), unit)
@@ -395,7 +403,10 @@ def _alone(conclude: Concluding, task: Task, structure: Structure) -> Any:
 
 
 def _kept_physics(conclude: Concluding, task: Task, structure: Structure) -> Any:
-    """Return physics alone to set beside a learner: least squares one step ahead, whatever penalty θ has beside it."""
+    """Return physics alone for comparison with a learner.
+
+    It is least squares one step ahead, also where θ has a penalty.
+    """
     plain = task.criterion.one_step and not structure.projects
     return _alone(conclude, task, Orthogonal() if plain else structure)
 

@@ -1,4 +1,4 @@
-"""Intervals beside a learner that could nearly imitate a direction of the physics, and what is said of it.
+"""Intervals beside a learner that could nearly imitate a direction of the physics.
 
 What functions of the features leave of a direction, a share λ of its squares, is all that
 determines it beside *any* such function. So its variance is at least that of physics alone over λ,
@@ -23,7 +23,7 @@ _NOTHING = 1e-3  # share of a direction's squares below which it is split off, a
 def grown(
     covariance: Matrix | None, statistics: Statistics, shared: Shared | None
 ) -> Matrix | None:
-    """Return Cov θ̂ (nθ, nθ), larger along directions of which the features leave little on the rows.
+    """Return Cov θ̂ (nθ, nθ), larger along directions that the features leave little of.
 
     With `D = Σ v_i λ_i^(−1/2) v_iᵀW` of `L v_i = λ_i W v_i`, W the Gram matrix of the slopes and L
     of what is left of them, the least covariance is `D C Dᵀ`, C that of physics alone.
@@ -56,7 +56,7 @@ def grown(
 
 
 def shared_warnings(shared: Shared | None, inputs: Sequence[str]) -> list[Warning]:
-    """Return what the rows say of directions that the names call determined.
+    """Return warnings where the rows contradict directions that the names call determined.
 
     Args:
         inputs: what the learner sees.

@@ -32,7 +32,10 @@ _SOLVED = {
 
 
 class Consistency(NamedTuple):
-    """Whether θ̂ obeys what the physics fixes among θ: χ² = rᵀCov⁻¹r, its degrees of freedom, p-value, a sentence."""
+    """Test of θ̂ against the relations that the physics imposes on θ.
+
+    χ² = rᵀCov⁻¹r, its degrees of freedom, its p-value, and a sentence.
+    """
 
     chi2: float
     df: int
@@ -101,14 +104,14 @@ class _Fit:
         return cls(physics, target, default if whiten is None else whiten, whiten is not None, free)
 
     def at(self, p: Vector) -> tuple[Vector, Matrix]:
-        """Whitened residual (nθ,) and its derivative (nθ, np)."""
+        """Return the whitened residual (nθ,) and its derivative (nθ, np)."""
         theta, jacobian = self.physics.linearised(p)
         with np.errstate(all="ignore"):
             return self.whiten @ (theta - self.target), self.whiten @ jacobian
 
     @np.errstate(all="ignore")  # where there is no solution p goes to infinity
     def descend(self, p: Vector) -> tuple[float, Vector]:
-        """Cost and p of the minimum that Levenberg-Marquardt finds from p.
+        """Return cost and p of the minimum that Levenberg-Marquardt finds from p.
 
         Cost inf where θ has no value at p.
 
@@ -148,7 +151,7 @@ class _Fit:
         return cost, p
 
     def solutions(self, starts: int) -> list[Vector]:
-        """Return the best p first, then others that explain θ̂ as well.
+        """Return the best p first, then others that explain θ̂ equally well.
 
         From p⁰ and `starts` points about it.
         """
@@ -167,14 +170,17 @@ class _Fit:
 
 
 def _cost(residual: Vector, jacobian: Matrix) -> float:
-    """‖residual‖², infinite where it or the derivative is not finite."""
+    """Return ‖residual‖², infinite where it or the derivative is not finite."""
     with np.errstate(over="ignore", invalid="ignore"):
         cost = float(residual @ residual)
     return cost if np.isfinite(cost) and np.isfinite(jacobian).all() else math.inf
 
 
 def _whitener(target: Vector, covariance: Matrix) -> Matrix | None:
-    """K (nθ, nθ) with KᵀK = Cov⁻¹; None where an entry of θ has no variance, as at a bound."""
+    """Return K (nθ, nθ) with KᵀK = Cov⁻¹.
+
+    None where an entry of θ has no variance, as at a bound.
+    """
     nt = len(target)
     if covariance.shape != (nt, nt):
         raise InputError(
@@ -205,7 +211,7 @@ def solve(
     freedom: float,
     starts: int = 4,
 ) -> PhysicalEstimate:
-    """p̂ = argmin (θ̂ − h(p))ᵀ Cov⁻¹ (θ̂ − h(p)) within the bounds of p, with its statistics.
+    """Return p̂ = argmin (θ̂ − h(p))ᵀ Cov⁻¹ (θ̂ − h(p)) within its bounds, with its statistics.
 
     Args: physics: h. theta_hat: θ̂ (nθ,) in the order of `physics.theta_names`. covariance: Cov θ̂
         (nθ, nθ); None, or one that is not finite, gives relative weights and no statistics.
@@ -266,7 +272,7 @@ def solve(
 
 
 def _held(physics: PhysicsMap, value: Vector, gradient: Vector) -> Bool[np.ndarray, "n"]:
-    """Which parameters the data press against a bound, (np,)."""
+    """Return a mask (np,) of the parameters that the data press against a bound."""
     low, high = physics.bounds
     return ((value <= low) & (gradient > 0)) | ((value >= high) & (gradient < 0))
 
@@ -274,7 +280,10 @@ def _held(physics: PhysicsMap, value: Vector, gradient: Vector) -> Bool[np.ndarr
 def _linear(
     fit: _Fit, value: Vector, jacobian: Matrix, held: Bool[np.ndarray, "n"]
 ) -> tuple[Matrix | None, Matrix]:
-    """Cov p̂ = (HᵀWH)⁻¹, None without Cov θ̂, and ∂ln p̂ / ∂ln θ̂ from dp̂/dθ̂ = (HᵀWH)⁻¹HᵀW, by SVD of KH."""
+    """Return Cov p̂ = (HᵀWH)⁻¹ and ∂ln p̂ / ∂ln θ̂, by SVD of KH.
+
+    The covariance is None without Cov θ̂; dp̂/dθ̂ = (HᵀWH)⁻¹HᵀW.
+    """
     norms = np.linalg.norm(jacobian[:, ~held], axis=0)
     u, sigma, vt = np.linalg.svd(jacobian[:, ~held] / norms, full_matrices=False)
     root = vt.T / sigma / norms[:, None]
@@ -302,7 +311,9 @@ def _check_freedom(freedom: float) -> None:
 
 
 def _consistency(chi2: float, df: int, freedom: float, held: bool) -> Consistency:
-    """χ²/df is compared with F(df, freedom), as the noise variance is estimated itself.
+    """Return the test of θ̂ against h(p̂), with χ²/df compared to F(df, freedom).
+
+    F, not χ², because the noise variance is estimated itself.
 
     Χ² itself where it is known.
     """
@@ -370,7 +381,9 @@ def profile(
     level: float = 0.95,
     starts: int = 4,
 ) -> tuple[float, float]:
-    """Profile-likelihood interval of one physical parameter: {pᵢ : min over the others χ² ≤ least χ² + F(1, freedom)}.
+    """Return the profile-likelihood interval of one physical parameter.
+
+    The interval is {pᵢ : min over the others χ² ≤ least χ² + F(1, freedom)}.
 
     Unlike p̂ ± reach·std it is asymmetric where h bends, and it ends at the parameter's bounds. A
     side without a limit from the data is ±inf.
@@ -417,7 +430,7 @@ def profile(
 
 
 def _crossing(excess: Callable[[float], float], start: float, step: float, bound: float) -> float:
-    """Where `excess`, negative at `start`, changes its sign on the way to `bound`.
+    """Return the point at which `excess`, negative at `start`, changes sign before `bound`.
 
     `bound` where it does not.
     """

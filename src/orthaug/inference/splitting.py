@@ -1,4 +1,4 @@
-"""θ of a fitted function under any measure, with its uncertainty: `θ_μ = c + Φ_μ⁺F_μ`, without training again (F2).
+"""θ of a fitted function under any measure, without new training: `θ_μ = c + Φ_μ⁺F_μ` (F2).
 
 With `Cov(c, w)` from training, `Cov θ_μ = K Cov(c, w) Kᵀ` with `K = [I, Φ_μ⁺J_μ]`. Under another
 measure θ depends on the learner, and shares its variance.
@@ -29,7 +29,10 @@ SUPPORTED = 0.9  # share of a measure within reach of the data, below which it i
 
 @dataclass(frozen=True, eq=False)
 class MeasureSplit:
-    """θ and θ_aux under a measure, Cov θ (None without statistics), and how far the data support the measure."""
+    """θ, θ_aux and Cov θ under a measure, and the share of it that the data support.
+
+    Cov θ is None without statistics.
+    """
 
     name: str
     theta: Vector
@@ -128,7 +131,7 @@ class _PartitionOverlap:
 
 
 def streamed_slope(model: Model, problem: StreamedProblem) -> Matrix:
-    """∂θ_aux/∂w under the training measure, in one pass over all rows of a source."""
+    """Return ∂θ_aux/∂w under the training measure, in one pass over all rows of a source."""
     bound, numbers = model.form.bound, model.numbers
     nt = len(model.theta)
     if bound is None or not bound.size:
@@ -146,7 +149,10 @@ def streamed_slope(model: Model, problem: StreamedProblem) -> Matrix:
 
 
 def learner_slope(model: Model, points: Points, projection: Projection, unit: np.ndarray) -> Matrix:
-    """∂θ_aux/∂w, `Φ_μ⁺J_μ` or `B(Φ_μB)⁺J_μ` (nθ, nw), in one pass over the points."""
+    """Return ∂θ_aux/∂w (nθ, nw), in one pass over the points.
+
+    It is `Φ_μ⁺J_μ`, or `B(Φ_μB)⁺J_μ` along some directions.
+    """
     bound, numbers = model.form.bound, model.numbers
     nt = len(model.theta)
     if bound is None or not bound.size:

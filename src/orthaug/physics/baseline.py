@@ -139,7 +139,7 @@ class Baseline(NotebookView):
     def from_terms(
         cls, terms: Sequence[Term], constants: Mapping[str, float] | None = None
     ) -> Baseline:
-        """Return one term per summand.
+        """Return a baseline with one term per summand.
 
         Expressions may use the names in `constants`, and `Ts` for the sampling time.
 
@@ -185,7 +185,10 @@ class Baseline(NotebookView):
     def from_function(
         cls, function: Callable[[Any], Any], parameters: Sequence[str | Parameter]
     ) -> Baseline:
-        """From a JAX function φ(x) of the regressor x (nx,) in `Lags` order, returning (ny, nθ)."""
+        """Return a baseline of a JAX function φ(x) that returns (ny, nθ).
+
+        x (nx,) is the regressor in the order of `Lags`.
+        """
         if (
             not callable(function)
             or isinstance(parameters, str)
@@ -200,7 +203,7 @@ class Baseline(NotebookView):
 
     @property
     def linear(self) -> bool:
-        """Return whether the output is linear in θ: here always, by its form."""
+        """Always true: φ(x) θ is linear in θ by its form."""
         return True
 
     @property
@@ -248,7 +251,7 @@ class Baseline(NotebookView):
         )
 
     def sampled(self, sampling_time: float) -> Baseline:
-        """Return the baseline with this value [s] of `Ts`, where its expressions read that without declaring it.
+        """Return the baseline with `Ts` [s] given, where its expressions read it undeclared.
 
         Raises:
             InputError: a constant `Ts` of another value.
@@ -261,7 +264,7 @@ class Baseline(NotebookView):
         )
 
     def check_channels(self, outputs: Sequence[str], inputs: Sequence[str]) -> None:
-        """Raise InputError for a term that uses an unknown channel, an output at lag 0 or an unknown output."""
+        """Raise InputError for a term with an unknown channel or output, or an output at lag 0."""
         for name, _ in self.constants:
             if name in (*outputs, *inputs):
                 raise InputError(
@@ -286,7 +289,7 @@ class Baseline(NotebookView):
                 )
 
     def phi(self, x: Any, layout: Layout, outputs: Sequence[str], xp: Any) -> Any:
-        """φ(x), (…, ny, nθ), of regressors x (…, nx).
+        """Return φ(x), (…, ny, nθ), of regressors x (…, nx).
 
         Several terms of a parameter and output add up.
         """
@@ -302,7 +305,7 @@ class Baseline(NotebookView):
         return self._matrix(list(fixed), x, layout, outputs, xp) @ xp.asarray(list(fixed.values()))
 
     def on(self, x: Any, layout: Layout, outputs: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-        """`phi` and `known` by NumPy; not finite where an expression has no value."""
+        """Return `phi` and `known` by NumPy; not finite where an expression has no value."""
         with np.errstate(all="ignore"):
             return np.asarray(self.phi(x, layout, outputs, np)), np.asarray(
                 self.known(x, layout, outputs, np)
@@ -345,7 +348,10 @@ _SHARED = ("initial", "unit", "fixed", "min", "max")  # what the terms of one pa
 
 
 def _agreed(terms: Sequence[Term]) -> list[Term]:
-    """Return the terms; what one of them says about a parameter, all of its terms say."""
+    """Return the terms with their parameters' attributes made common.
+
+    An attribute that one term gives to a parameter holds in all of its terms.
+    """
     said: dict[tuple[str, str], Any] = {}
     for term in terms:
         check_parameter_name(term.parameter)

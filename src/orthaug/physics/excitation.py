@@ -24,7 +24,7 @@ ILL_CONDITIONED = 1e8  # condition number above which half of the digits of θ a
 
 @dataclass(frozen=True, eq=False)
 class Excitation:
-    """How well rows of φ determine θ: rank, condition number, and which columns depend on each other."""
+    """Rank and condition number of rows of φ, and the columns that depend on each other."""
 
     rank: int
     columns: int
@@ -41,7 +41,7 @@ GRAM_TOLERANCE = 3e-6
 
 
 def excitation(r: Matrix, names: Sequence[str], tolerance: float = RANK_TOLERANCE) -> Excitation:
-    """Rank and condition of a matrix from its R factor (or itself), columns scaled to unit norm.
+    """Return rank and condition of a matrix from its R factor (or itself), columns scaled to 1.
 
     The condition number is σmax/σmin of the scaled columns, None where it is infinite. A group
     holds the columns that a null direction ties: nothing in the data can tell their parameters
@@ -60,7 +60,7 @@ def excitation(r: Matrix, names: Sequence[str], tolerance: float = RANK_TOLERANC
 
 
 def of_gram(gram: Matrix, names: Sequence[str]) -> Excitation:
-    """`excitation` from the Gram matrix of the columns."""
+    """Return `excitation` from the Gram matrix of the columns."""
     norms = np.sqrt(np.maximum(np.diag(gram), 0.0))
     unit = np.where(norms > 0, norms, 1.0)
     values, vectors = np.linalg.eigh(gram / np.outer(unit, unit))
@@ -70,7 +70,10 @@ def of_gram(gram: Matrix, names: Sequence[str]) -> Excitation:
 
 
 def _groups(null_space: Matrix, names: Sequence[str]) -> tuple[tuple[str, ...], ...]:
-    """Sets of columns tied by null directions: connected components of the null-space projector."""
+    """Return the sets of columns that null directions tie together.
+
+    They are the connected components of the null-space projector.
+    """
     tied = np.abs(null_space.T @ null_space) > 1e-6
     groups, seen = [], set()
     for start in range(len(names)):
@@ -87,7 +90,7 @@ def _groups(null_space: Matrix, names: Sequence[str]) -> tuple[tuple[str, ...], 
 
 
 def require_rank(excited: Excitation, rows: int) -> None:
-    """Raise RankError where θ is not determined, naming the parameters that cannot be told apart."""
+    """Raise RankError where θ is not determined, naming the parameters that no data separate."""
     if rows < excited.columns:
         raise RankError(
             f"{rows} usable rows for {excited.columns} parameters; give at least as many rows "
@@ -111,7 +114,9 @@ def require_rank(excited: Excitation, rows: int) -> None:
 def identifiability(
     baseline: Baseline, layout: Layout, outputs: Sequence[str], x: Matrix
 ) -> Excitation:
-    """Rank of φ at random points of a box twice as wide as the data's (width 1 where the data do not move).
+    """Return the rank of φ at random points of a box twice as wide as the data's.
+
+    Where the data do not move, the box has width 1.
 
     Args:
         baseline: φ and the names of θ.

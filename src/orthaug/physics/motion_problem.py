@@ -1,4 +1,4 @@
-"""The estimation problem of a motion: its record, what the learner sees, and what can be said before any training.
+"""The estimation problem of a motion: its record, learner inputs, and checks before training.
 
 Where it may start: states as they are declared, from what is measured about a row. An output and
 its derivative are those of a local polynomial (Savitzky and Golay 1964), what nothing is said of
@@ -58,7 +58,7 @@ class MotionProblem:
         return tuple(channel.name for channel in self.record.outputs)
 
     def on(self, record: Record) -> MotionProblem:
-        """The same motion on another record."""
+        """Return the motion's problem on another record."""
         return replace(self, record=record)
 
     @cached_property
@@ -73,7 +73,9 @@ class MotionProblem:
         return np.concatenate(states).T, np.concatenate(inputs).T
 
     def without_value(self, over: Callable[[Any], Any]) -> str:
-        """Return the first equation or output that has no value at the start, in words, at all guessed states or at any.
+        """Return the first equation or output that is not finite at the start, as text.
+
+        Either at all guessed states, or at any of them.
 
         Args:
             over: np.all or np.any.
@@ -112,7 +114,7 @@ class MotionProblem:
 
     @cached_property
     def fastest(self) -> float:
-        """The largest |eigenvalue| of ∂f/∂x at the initial parameters [1/s], over the guessed states."""
+        """The largest |eigenvalue| of ∂f/∂x [1/s], over guessed states and at initial parameters."""
         x, u = self.looked_at
         size = np.maximum(np.abs(x).max(axis=1), 1e-6 * np.abs(x).max(initial=1e-6))
         columns = []
@@ -131,7 +133,7 @@ class MotionProblem:
 
     @property
     def substeps(self) -> int:
-        """With how many substeps training begins."""
+        """Substeps per sample with which training begins."""
         motion = self.motion
         if motion.integrator == "discrete":
             return 1
@@ -209,7 +211,7 @@ def _features(motion: Motion, texts: Sequence[str] | None) -> tuple[Expression, 
 
 
 def _check_start(problem: MotionProblem) -> None:
-    """Raise InputError where the equations have no value at the initial parameters, or modes that are too fast."""
+    """Raise InputError where equations have no value at the start, or a mode is too fast."""
     motion, where = problem.motion, problem.without_value(np.all)
     if where:
         raise InputError(f"{where}; mend it, or start elsewhere.")
@@ -227,7 +229,7 @@ def guess(
     rows: Sequence[int] | Int[np.ndarray, "r"],
     sampling_time: float,
 ) -> Float[np.ndarray, "r n0"]:
-    """Return the states at some rows, made of the outputs (N, ny) that were measured about them."""
+    """Return states at some rows, estimated from the outputs (N, ny) measured about them."""
     rows = np.asarray(rows, dtype=int)
     width = min(_ROWS, len(outputs))
     begin = np.clip(rows - width // 2, 0, len(outputs) - width)
@@ -249,7 +251,7 @@ def guess(
 
 @cache
 def _polynomials(width: int) -> Float[np.ndarray, "width degree+1 width"]:
-    """Return what gives the coefficients of a local polynomial about each of its rows from the values of all."""
+    """Return a map from the values of all rows to a local polynomial about each row."""
     offset = np.arange(width)[None, :] - np.arange(width)[:, None]
     return np.linalg.pinv(offset[..., None] ** np.arange(min(_DEGREE, width - 1) + 1))
 
@@ -262,5 +264,5 @@ class SignalName(Lag):
 
 
 def layout_of(motion: Motion) -> tuple[SignalName, ...]:
-    """States, then inputs."""
+    """Return the names of states, then inputs."""
     return tuple(SignalName(name, 0) for name in (*motion.names_of_states, *motion.inputs))

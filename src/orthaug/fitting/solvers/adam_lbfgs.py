@@ -1,4 +1,4 @@
-"""The paper's pipeline: Adam, then L-BFGS, over θ and the learner's weights together, compiled whole.
+"""The paper's solver: Adam, then L-BFGS, over θ and weights together, compiled whole.
 
 θ starts at θ⁰ in units of its columns, the weights where the caller says. L-BFGS is optax's, in one
 compiled loop. SciPy's L-BFGS-B, called back from Python, took 3 to 6 times longer on both of the
@@ -27,7 +27,7 @@ _SMALL = 1e-14  # a relative decrease below this, five steps in a row, is roundi
 
 
 class GradientRun(NamedTuple):
-    """Where one run ended: θ's unknowns and the weights."""
+    """The end of one run: θ's unknowns and the weights."""
 
     v: Float[Array, "nt"]
     w: Float[Array, "nw"]
@@ -69,7 +69,7 @@ class AdamLBFGS:
         return self.adam_iterations + self.lbfgs_iterations
 
     def at_most(self, iterations: int) -> AdamLBFGS:
-        """Itself: the pipeline is run whole."""
+        """Return itself: the pipeline is run whole."""
         return self
 
     def minimise(

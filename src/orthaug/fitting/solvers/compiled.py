@@ -1,4 +1,4 @@
-"""The Levenberg-Marquardt loop compiled whole, for a criterion whose rows are in memory: the fast path of the solver.
+"""The Levenberg-Marquardt loop compiled whole, for a criterion with rows in memory.
 
 The step solves `(H + (α + μ) I) d = g − α w`. Damping with the identity and Nielsen's update
 (Madsen, Nielsen and Tingleff 2004, algorithm 3.16) converges from Xavier starts on normalised data.
@@ -47,14 +47,14 @@ class State(NamedTuple):
 
 @runtime_checkable
 class CheckpointWriter(Protocol):
-    """Where the states of a run are kept."""
+    """Storage of the states of a run."""
 
     def state(self) -> State | None:
-        """Return the last one; None for none."""
+        """Return the last state; None for none."""
         ...
 
     def keep(self, state: State, *, ended: bool = False) -> None:
-        """Take a state, now and then; `ended` for the last one."""
+        """Store a state, if it is due or if the run `ended`."""
         ...
 
 
@@ -91,7 +91,7 @@ class TrainingRun(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Settings:
-    """What a run is made with.
+    """The settings of a run.
 
     Args:
         limit: of the iterations.
@@ -114,7 +114,7 @@ class Settings:
     kept: CheckpointWriter | None = None
 
     def prepared(self, w: Any) -> tuple[Options, Any, State | None]:
-        """Return the numbers of the compiled program, the ridge it starts with, and the state to go on from."""
+        """Return the numbers of the compiled program, the initial ridge, and the first state."""
         groups = self.groups
         if (
             groups is None and not self.evidence
@@ -145,7 +145,7 @@ class Settings:
         return state._replace(mark=np.asarray(state.normal.loss)) if begins else state
 
     def tell(self, state: State) -> bool:
-        """Whoever listens, and whoever keeps states; whether a listener says that it is enough."""
+        """Report the state to a listener and to checkpoints; return whether to end the run."""
         try:
             self.progress(int(state.iteration), float(state.normal.loss))
         except StopTraining:
@@ -155,7 +155,7 @@ class Settings:
         return False
 
     def ended(self, state: State, seconds: float, *, enough: bool = False) -> TrainingRun:
-        """Return the run, from its last state; `enough` where it was asked to end with that."""
+        """Return the run from its last state; with `enough`, a listener ended it."""
         held: Any = (
             np.asarray(state.ridge)
             if self.groups is not None
@@ -214,7 +214,9 @@ def driven(
     overlap: Overlap,
     settings: Settings,
 ) -> TrainingRun:
-    """`minimise` where every pass over the rows is asked for from here: the same steps, whoever makes the sums.
+    """Minimise as `minimise` does, with every pass over the rows made by the caller's engine.
+
+    The steps are the same wherever the sums are computed.
 
     Args:
         normal_at: the criterion at weights, with the overlap of the pass before.
@@ -237,7 +239,7 @@ def driven(
 
 
 def burst_length(burst: int, spent: float) -> int:
-    """Return how many steps to take at a time, when `burst` of them took `spent` seconds."""
+    """Return the number of steps to take at a time, when `burst` of them took `spent` seconds."""
     return int(np.clip(burst * _SECONDS_PER_BURST / max(spent, 1e-6), 1, 4 * burst))
 
 
@@ -293,7 +295,7 @@ def _proposed(state: State) -> Any:
 
 @jax.jit
 def _judged(state: State, step: Any, trial: Normal, options: Options) -> State:
-    """Return the state after a step was tried: moved where the objective is lower, otherwise damped more."""
+    """Return the state after a tried step: moved where the objective is lower, else damped more."""
     w, normal, alpha, downhill = state.w, state.normal, state.ridge, _downhill(state)
     before = normal.loss + _prior(alpha, w)
     after = trial.loss + _prior(alpha, w + step)
@@ -332,18 +334,23 @@ def _judged(state: State, step: Any, trial: Normal, options: Options) -> State:
 
 
 def _level(normal: Normal, downhill: Any, objective: Any) -> Any:
-    """Residual and Jacobian are orthogonal to rounding (MINPACK's gtol): no step can descend from a minimum."""
+    """Return whether residual and Jacobian are orthogonal to rounding (MINPACK's gtol).
+
+    No step can descend from such a minimum.
+    """
     size = jnp.sqrt(jnp.maximum(jnp.diag(normal.hessian), 0.0) * objective)
     return jnp.all(jnp.abs(downhill) <= 1e-7 * size)
 
 
 def _prior(alpha: Any, w: Any) -> Any:
-    """`Σ α_i w_i²`."""
+    """Return `Σ α_i w_i²`."""
     return alpha * (w @ w) if alpha.ndim == 0 else w @ (alpha * w)
 
 
 def _evidence(w: Any, normal: Normal, alpha: Any, options: Options) -> Any:
-    """MacKay's fixed point: `γ = tr(H(H + αI)⁻¹)`, `α = γ σ² / ‖w‖²` with `σ² = ‖r‖² / (N − γ)`.
+    """Return MacKay's fixed point of the ridge.
+
+    `γ = tr(H(H + αI)⁻¹)`, `α = γ σ² / ‖w‖²` with `σ² = ‖r‖² / (N − γ)`.
 
     With groups γ and ‖w‖² are those of each group (automatic relevance determination).
     """
@@ -361,7 +368,10 @@ def _evidence(w: Any, normal: Normal, alpha: Any, options: Options) -> Any:
 
 
 def _effective(normal: Normal, alpha: Any) -> Any:
-    """Return the diagonal of `H (H + A)⁻¹` for a ridge of each weight, from the eigenvalues of `A^-½ H A^-½`."""
+    """Return the diagonal of `H (H + A)⁻¹` for a ridge of each weight.
+
+    From the eigenvalues of `A^-½ H A^-½`.
+    """
     unit = 1 / jnp.sqrt(alpha)
     scaled = normal.hessian * unit[:, None] * unit
     values, vectors = jnp.linalg.eigh(jnp.where(jnp.isfinite(scaled), scaled, 0.0))
@@ -371,7 +381,10 @@ def _effective(normal: Normal, alpha: Any) -> Any:
 
 @jax.jit
 def effective_weights(normal: Normal, alpha: Any) -> Any:
-    """tr(H (H + αI)⁻¹). Directions that are rounding beside the columns of J count as absent."""
+    """Return tr(H (H + αI)⁻¹).
+
+    Directions that are rounding beside the columns of J count as absent.
+    """
     n = normal.hessian.shape[0]
     if n == 0:
         return jnp.asarray(0.0)
@@ -383,7 +396,7 @@ def effective_weights(normal: Normal, alpha: Any) -> Any:
 
 
 def spanned(normal: Normal) -> Any:
-    """P⊥J = 0: the learner lies in the span of the physics, as in the paper's Example 1."""
+    """Return whether P⊥J = 0: the learner lies in the span of the physics (Example 1)."""
     curvature = jnp.max(jnp.diag(normal.hessian), initial=0.0)
     return curvature <= _NOTHING_LEFT * _largest_column(normal)
 
