@@ -12,7 +12,7 @@ The state that a segment starts from is an unknown too. It is eliminated from ev
 steps, so it can follow the sum over a block. What the measured state adds counts to the first block
 of its segment. No block crosses the end of a segment.
 
-A record that is too short for blocks may still tell the colour by few numbers: with e an
+A record that is too short for blocks may still show the colour by few numbers: with e an
 autoregressive process of autocovariance γ, `Ω = Σ_jk s_jᵀ γ_{j−k} s_k`, for s follows the inputs
 and not the noise (`fitting/colour.py`).
 """
@@ -43,7 +43,7 @@ class FreeRunScores:
     `slope` and `pull` are how the best states follow p and the measured states; None where the
     states are no unknowns. `unit` scales the information of p to the Gram matrix that the model
     keeps. `share` is how many times more was trained on than these segments, which are then a
-    witness of it.
+    subsample of it.
     """
 
     dynamics: Dynamics

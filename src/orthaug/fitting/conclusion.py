@@ -57,10 +57,10 @@ def conclude(task: OneStepTask, structure: Structure, learned: TrainedLearner) -
         learned: of these rows, or of a free run on the same problem.
     """
     problem = task.problem
-    told: list[Warning] = []
+    warnings: list[Warning] = []
     if unfinished(learned) and follows_training(structure, problem, learned):
         learned = withheld(learned)
-        told += (
+        warnings += (
             [not_converged(learned)] if learned.tilt is None else []
         )  # longer training gives an ensemble none
     share = task.share(learned)
@@ -77,22 +77,22 @@ def conclude(task: OneStepTask, structure: Structure, learned: TrainedLearner) -
     noise = errors.noise if ending.usable else None
     identified = structure.projects or (learned.bound is None and structure.identifies)
     known = noise is not None and identified and not learned.elsewhere
-    told += [] if learned.elsewhere else learner_silent(learned)
-    told += _warnings(problem, structure, learned, identified, noise, fixed)
-    if any(warning.code == NOT_CONVERGED for warning in told):
+    warnings += [] if learned.elsewhere else learner_silent(learned)
+    warnings += _warnings(problem, structure, learned, identified, noise, fixed)
+    if any(warning.code == NOT_CONVERGED for warning in warnings):
         pass
     elif known and errors.covariance is None and learned.errors is None:
         text = (
             "no standard errors: beside a learner that sees only some features, an ensemble "
             "leaves none."
         )
-        told.append(Warning("no_standard_errors", text))
+        warnings.append(Warning("no_standard_errors", text))
     elif (
         known
         and errors.covariance is not None
         and np.isnan(np.diag(errors.covariance)).sum() > len(fixed)
     ):
-        told.append(Warning("no_standard_errors", _UNDETERMINED))
+        warnings.append(Warning("no_standard_errors", _UNDETERMINED))
     reason = ALONE.get(ending, "") if learned.bound is None else ""
     reason = reason or ending_in_words(ending, learned.tail)
     model = _model(problem, structure, learned, ThetaSplit(theta, theta_aux, fixed), errors, noise)
@@ -112,7 +112,7 @@ def conclude(task: OneStepTask, structure: Structure, learned: TrainedLearner) -
         problem=problem,
         criterion=task.criterion,
         at_bound={problem.baseline.names[i]: value for i, value in fixed.items()},
-        warnings=tuple(told),
+        warnings=tuple(warnings),
         scores=learned.scores,
     )
 
@@ -280,25 +280,25 @@ def _warnings(
     noise: Matrix | None,
     fixed: Fixed,
 ) -> list[Warning]:
-    told = []
+    warnings = []
     condition = problem.excitation.condition
     if condition is not None and condition > ILL_CONDITIONED:
         text = (
             f"the physics is ill-conditioned on the data (condition {condition:.1e} of the "
             "scaled columns): θ is determined, but small changes of the data move it far."
         )
-        told.append(Warning("ill_conditioned", text))
+        warnings.append(Warning("ill_conditioned", text))
     if learned.ending is Ending.SPANNED:
         text = (
             "the learner lies in the span of the physics (P⊥J = 0): there is nothing for it to "
             "learn that the physics does not express already. Give it another form or other "
             "inputs, or leave it out."
         )
-        told.append(Warning("learner_spanned", text))
+        warnings.append(Warning("learner_spanned", text))
     if learned.errors is not None:
-        told += without_loss(learned.errors.mean_square)
+        warnings += without_loss(learned.errors.mean_square)
     if learned.elsewhere:
-        told.append(
+        warnings.append(
             Warning("no_standard_errors", "no standard errors: the function was trained elsewhere.")
         )
     elif not identified:
@@ -307,14 +307,14 @@ def _warnings(
             "start or on the penalty), so it has no standard error; use the orthogonal "
             "structure for parameters."
         )
-        told.append(Warning(NOT_UNIQUE, text))
+        warnings.append(Warning(NOT_UNIQUE, text))
     elif noise is None:
         text = (
             f"no standard errors: {problem.count} rows leave no degrees of freedom for "
             f"{len(problem.baseline.names)} parameters and {learned.effective:.1f} effective "
             "weights; use more data or a smaller learner."
         )
-        told.append(Warning("no_standard_errors", text))
+        warnings.append(Warning("no_standard_errors", text))
     if fixed:
         names = ", ".join(f"{problem.baseline.names[i]} = {value:g}" for i, value in fixed.items())
         text = (
@@ -328,8 +328,8 @@ def _warnings(
         ):
             text += "the learner is not made orthogonal to it; "
         text += "data that contradict a bound contradict the physics or the bound."
-        told.append(Warning("at_a_bound", text))
-    return told
+        warnings.append(Warning("at_a_bound", text))
+    return warnings
 
 
 def orthogonalize(

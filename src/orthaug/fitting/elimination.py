@@ -14,7 +14,7 @@ from orthaug.physics.problem import Problem
 from orthaug.physics.shared import Shared
 
 Fixed = dict[int, float]
-"""Entries of θ that stand at a bound, with its value."""
+"""Entries of θ at a bound, with its value."""
 
 
 def settle(fixed: Fixed, run: Callable[[Fixed], Fixed | None]) -> Fixed:
@@ -22,7 +22,7 @@ def settle(fixed: Fixed, run: Callable[[Fixed], Fixed | None]) -> Fixed:
 
     What was held together once before is not released again, so that this ends.
 
-    Args: fixed: what is held first. run: runs with some entries held, and gives those that stand at
+    Args: fixed: what is held first. run: runs with some entries held, and gives those that are at
         one then; None to leave it at that.
     """
     tried = [fixed]
@@ -44,7 +44,7 @@ class Elimination:
 
     P, `taken`, is the projector onto what a split moves from the learner to θ: all in the paper's
     structure, nothing in the additive one. `(A, B, e)` are the structure's rows. An active set
-    meets the bounds: some entries of θ stand at a bound, and the others minimise the rest. Where
+    meets the bounds: some entries of θ are at a bound, and the others minimise the rest. Where
     the learner can imitate part of the physics only, they are known terms then, which a split moves
     nothing to: P is that of the `shared` directions that leave them alone.
     """
@@ -56,7 +56,7 @@ class Elimination:
     lower: Vector
     upper: Vector
     shared: Shared | None = None
-    """The directions that P projects onto; None where P is the same whatever stands at a bound."""
+    """The directions that P projects onto; None where P is the same whichever entries are at a bound."""
 
     @property
     def bounded(self) -> bool:
@@ -219,7 +219,7 @@ def directions(structure: Structure, problem: Problem, fixed: Iterable[int] = ()
     None for all.
 
     Args:
-        fixed: entries of θ that stand at a bound, which no direction moves.
+        fixed: entries of θ at a bound, which no direction moves.
     """
     shared = _shared(structure, problem)
     return None if shared.all else shared.leaving(fixed).basis
@@ -246,14 +246,14 @@ def split_theta(
 
     Args:
         coefficients: c = θ − θ_aux (nθ,) where it was an unknown of training; None to solve for θ.
-        fixed: what stands at a bound, where training knows that.
+        fixed: entries at a bound, where training knows them.
     """
     baseline, factor = problem.baseline, problem.projection
     elimination = eliminate(structure, problem)
     if (
         coefficients is not None and fixed is None
     ):  # an iterate need not satisfy what only its end satisfies
-        apart = elimination.shared is not None  # nothing is moved to what stands at a bound
+        apart = elimination.shared is not None  # nothing is moved to entries at a bound
         reached = coefficients + (
             0.0 if apart else factor.from_coordinates(elimination.taken @ share)
         )

@@ -138,7 +138,7 @@ class Estimate(AnyFit):
     measure: MeasureSplit | None = None
     """What θ was split under, if not the training measure."""
     at_bound: Mapping[str, float] = field(default_factory=dict)
-    """Parameters that stand at a bound, with its value."""
+    """Parameters at a bound, with its value."""
     held_out: HeldOutErrors | None = None
     """By what the run was chosen; None where the lowest training loss chose."""
     focus: Focus | None = None

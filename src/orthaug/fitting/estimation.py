@@ -56,7 +56,7 @@ def reweighted(first: Estimate, again: Callable[[Problem, Estimate], Estimate]) 
         again: the fit of a problem with other weights, begun from an earlier estimate.
 
     Returns: The last fit, with the restarts of the first one. It stays at the weights it has where
-        the errors' covariance is singular; a warning tells that the turns did not settle.
+        the errors' covariance is singular; a warning says that the turns did not settle.
     """
     estimate, problem = first, first.problem
     covariance = problem.target_covariance
@@ -77,8 +77,8 @@ def reweighted(first: Estimate, again: Callable[[Problem, Estimate], Estimate]) 
         f"the weights of the outputs still change by {change:.1g} after {_TURNS} fits; θ "
         "depends on where they stopped."
     )
-    told = (*estimate.warnings, Warning("output_weights_unsettled", text))
-    return replace(estimate, restarts=first.restarts, warnings=told)
+    warnings = (*estimate.warnings, Warning("output_weights_unsettled", text))
+    return replace(estimate, restarts=first.restarts, warnings=warnings)
 
 
 Regularization = str | float
@@ -313,13 +313,13 @@ def fit(
     restarts, seed = checked_starts(restarts, seed, warm=initial is not None, ensemble=ensemble)
     check_solver(solver, criterion, () if learner is None else choices)
     engine = _for_runs(engine, problem, len(choices) * (restarts if initial is None else 1))
-    warm, told = None, ()
+    warm, warnings = None, ()
     if initial is not None:
         task, weights, warm = _warm_start(problem, initial, engine)
         starts = [PlannedRun(0, weights, choice) for choice in choices]
     else:
         _check_cost(problem, learner, solver, restarts * len(choices), engine)
-        problem, learner, told = independent_terms(problem, learner)
+        problem, learner, warnings = independent_terms(problem, learner)
         task = OneStepTask.of(problem, learner, engine=engine)
         starts = planned(task.bound, range(seed, seed + restarts), choices)
     solved = criterion.one_step and problem.baseline.linear
@@ -337,7 +337,7 @@ def fit(
         estimate = train(trained, starts, structure, solver, chosen, progress, runner=engine)
         if _splits(structure) and estimate.status.ok and estimate.model.form.bound is not None:
             estimate = estimate.split(structure.measure)
-    estimate = replace(estimate, warnings=(*told, *estimate.warnings))
+    estimate = replace(estimate, warnings=(*warnings, *estimate.warnings))
     if problem.weight.choice != "covariance" or problem.weight.kind == "covariance" or not solved:
         return estimate
     more = {

@@ -29,7 +29,7 @@ ONE_STEP, FREE_RUN = "prediction", "simulation"
 BLOCKS = 4  # blocks that are held out in turn where that is not said
 HALVES = 2  # the later one is run over by a fit to the other
 _SLACK = 1.02  # errors closer than this are the same: then the simpler candidate stays
-_PREFERRED = 1.1  # physics alone one step ahead has to be better by this to stand against that of the free run
+_PREFERRED = 1.1  # physics alone one step ahead has to be better by this to be preferred to that of the free run
 _LAGS = 20  # of the residual's autocorrelation
 _COLOURED = 0.1  # autocorrelation from which a residual is no noise of the equation, where it is significant, too
 _SIGNIFICANT = 4.0  # standard deviations of the autocorrelation of white noise: one lag in 16,000
@@ -282,17 +282,17 @@ def _best(choosing: _FocusChoice, reason: str) -> Any:
         text += ' Training on the free run stopped at its limit to save time; `focus = "simulation"` goes on.'
     if choosing.learns and not key[1]:
         rival = min((one for one in compared if one.learner), key=lambda one: one.error)
-        told = (
+        beginning = (
             f"no learner is better in free run where nothing was fitted ({rival.described}), "
             "so the result is"
         )
-        warnings.append(Warning("physics_alone", f"{told} {named[key].described}."))
+        warnings.append(Warning("physics_alone", f"{beginning} {named[key].described}."))
     if lost:
-        told = (
+        text_of_runs = (
             "every free run diverges, over training or held-out rows: the model is for "
             "one-step prediction only."
         )
-        warnings.append(Warning("one_step_only", told))
+        warnings.append(Warning("one_step_only", text_of_runs))
     physics = min((one for one in errors if not one[1]), key=lambda one: errors[one])
     kept = choosing.estimate(physics) if key[1] else None
     return replace(
@@ -305,7 +305,7 @@ def _ranked(errors: Mapping[Key, float], *, with_learner: bool) -> list[Key]:
 
     Wanted learners before physics.
 
-    Physics alone that was fitted to the free run stands before that of one step ahead where the
+    Physics alone that was fitted to the free run comes before that of one step ahead where the
     errors of a few blocks do not clearly speak against it: it minimises what is compared.
     """
     among = [key for key in errors if key[1] or not with_learner]

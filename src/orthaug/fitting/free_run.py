@@ -38,22 +38,22 @@ _LONGER = (
     2.0,
     1.4,
     1.15,
-)  # times, from one length of the segments to the next: the first that flies
-_SHRUNK = (0.99, 0.9, 0.5, 0.0)  # of the one-step θ: less feedback flies longer
+)  # times, from one length of the segments to the next: the first with a finite run
+_SHRUNK = (0.99, 0.9, 0.5, 0.0)  # of the one-step θ: less feedback diverges later
 
 
 def train_physics_only(
     plan: SegmentedLagged,
     solver: LevenbergMarquardt,
     structure: Structure,
-    tell: RunProgress = quiet,
+    progress: RunProgress = quiet,
 ) -> FreeRunFit | None:
     """Return θ of physics alone under the criterion and the structure's rows and bounds.
 
-    None where none can fly.
+    None where no run is finite.
 
-    Training starts at the one-step solution, or at the initial values where these fly better. Where
-    neither flies, or the end runs away over whole experiments, it goes over segments that lengthen.
+    Training starts at the one-step solution, or at the initial values where these run better. Where
+    neither run is finite, or the end diverges over whole experiments, it goes over segments that lengthen.
     Of all ends the best over whole experiments is kept; where a start was better than them, whole
     experiments are trained on too.
     """
@@ -68,7 +68,7 @@ def train_physics_only(
     losses = [objective.evaluate(p, Start(objective.initial.measured)).loss for p in starts]
     ends: list[FreeRunFit] = []
     if np.isfinite(losses).any():
-        ends.append(plan.descend(objective, starts[int(np.argmin(losses))], solver, tell))
+        ends.append(plan.descend(objective, starts[int(np.argmin(losses))], solver, progress))
     if not np.isfinite(losses[0]) or not ends or not np.isfinite(ends[0].mean_square):
         ends += _lengthening(plan, solver, structure, starts)
     if plan.whole is not plan.segments and plan.lengthens:
@@ -180,7 +180,7 @@ class FreeRunTask(SimulationTask):
     def physics_alone(self) -> tuple[OneStepTask, TrainedLearner]:
         """Return the task without a learner, and the residual of physics alone.
 
-        Least squares where it cannot fly.
+        Least squares where no run of it is finite.
         """
         if self.physics is None:
             return self.rows_task.physics_alone()
@@ -193,9 +193,9 @@ class FreeRunTask(SimulationTask):
         return FreeRunTask(SegmentedLagged.of(self.rows_task.on(record), self.criterion, like))
 
     def train_physics_only(
-        self, solver: LevenbergMarquardt, structure: Structure, tell: RunProgress
+        self, solver: LevenbergMarquardt, structure: Structure, progress: RunProgress
     ) -> tuple[SegmentedLagged, FreeRunFit | None]:
-        return self.plan, train_physics_only(self.plan, solver, structure, tell)
+        return self.plan, train_physics_only(self.plan, solver, structure, progress)
 
     def run(
         self,
@@ -207,8 +207,8 @@ class FreeRunTask(SimulationTask):
     ) -> FreeRunFit:
         """Run, with an orthogonal θ at a bound as a known term beside the learner.
 
-        What stands at a bound where physics alone ends is held there from the start. The run is
-        made again, from there too, where other entries stand at one at its end; what was held once
+        Entries at a bound where physics alone ends are fixed there from the start. The run is
+        made again, from there too, where other entries are at one at its end; what was fixed once
         before is not released again.
         """
         alone: Any = self.physics

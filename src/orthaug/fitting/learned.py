@@ -68,7 +68,7 @@ class TrainedLearner:
 
 @runtime_checkable
 class Task(Protocol):
-    """A problem laid out for training on one criterion; `OneStepTask` and `FreeRunTask`."""
+    """A problem prepared for training on one criterion; `OneStepTask` and `FreeRunTask`."""
 
     @property
     def problem(self) -> Problem: ...

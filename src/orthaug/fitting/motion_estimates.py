@@ -78,7 +78,7 @@ class MotionEstimate(AnyFit):
     """How the standard errors were made, a key of `STD_KINDS`."""
     at_bound: tuple[str, ...] = ()
     unidentified: tuple[str, ...] = ()
-    """Parameters that no output tells beside the learner, or only the prior of its weights."""
+    """Parameters that no output determines beside the learner, or only the prior of its weights."""
     held_out: HeldOutErrors | None = None
     focus: Focus | None = None
     physics_alone: Any = field(default=None, repr=False)
@@ -159,7 +159,7 @@ class MotionEstimate(AnyFit):
         check_type(measure, Measure, "measure", "a measure such as Uniform()")
         form, segmented = self.model.form, self.segmented
         whole = fitted_numbers(self.model.numbers)
-        field, support, told = field_under(measure, segmented, whole, self.states)
+        field, support, of_measure = field_under(measure, segmented, whole, self.states)
         moving = None
         if isinstance(measure, Training) and self.slope is not None:
             moving = partial(
@@ -168,7 +168,7 @@ class MotionEstimate(AnyFit):
         bounds = self.problem.motion.coordinates.bounds
         options = {"everything": shared == "all", "wobble": moving}
         split = split_motion(measure.name, form, whole, self.alone, field, bounds, **options)
-        return _with_split(self, replace(split, support=support), told)
+        return _with_split(self, replace(split, support=support), of_measure)
 
     def robust(self, steps: int | None = None, kind: str = "batch-means") -> MotionEstimate:
         """Return the fit with standard errors that hold for coloured errors.
@@ -251,7 +251,7 @@ def fitted_numbers(numbers: Numbers) -> Numbers:
 
 
 def _with_split(
-    fit: MotionEstimate, split: MotionSplit, told: tuple[Warning, ...] = ()
+    fit: MotionEstimate, split: MotionSplit, of_measure: tuple[Warning, ...] = ()
 ) -> MotionEstimate:
     """Return the estimate with p̂, intervals and warnings of a split."""
     motion, numbers = fit.problem.motion, fit.model.numbers
@@ -263,7 +263,7 @@ def _with_split(
         if q <= low or q >= high
     )
     covariance, unseen = _covariance(fit, split, at_bound)
-    warnings = [*told, *_doubts(split, at_bound, unseen, fit.model.form.bound is not None)]
+    warnings = [*of_measure, *_doubts(split, at_bound, unseen, fit.model.form.bound is not None)]
     model = replace(
         fit.model,
         numbers=numbers._replace(theta=split.q, theta_aux=split.q - c),
@@ -321,7 +321,7 @@ def free_covariance(fit: MotionEstimate) -> tuple[JointCovariance, Bool[np.ndarr
     moves = np.concatenate(
         [(low < c) & (c < high), np.ones(len(statistics.gram) - len(c), dtype=bool)]
     )
-    kept = np.ix_(moves, moves)  # what stands at a bound is a constant
+    kept = np.ix_(moves, moves)  # an entry at a bound is a constant
     own = replace(statistics, gram=statistics.gram[kept], middle=statistics.middle[kept])
     joint = own.joint(int(moves[: len(c)].sum()))
     return None if joint is None else (joint, moves)
@@ -330,7 +330,7 @@ def free_covariance(fit: MotionEstimate) -> tuple[JointCovariance, Bool[np.ndarr
 def _wider_without_prior(joint: JointCovariance, slope: Matrix) -> Vector:
     """Return how many times wider intervals of K (c, w) are without the ridge on w (m,).
 
-    Inf where nothing tells them.
+    Inf where the data do not determine them.
 
     Both for white noise: the question is where the information comes from.
     """
@@ -351,7 +351,7 @@ def _wider_without_prior(joint: JointCovariance, slope: Matrix) -> Vector:
 def _doubts(
     split: MotionSplit, at_bound: tuple[str, ...], unseen: tuple[str, ...], learns: bool
 ) -> list[Warning]:
-    told = []
+    warnings = []
     if split.slope is None:
         text = (
             "the distance between the fitted motion and the physics has no unique minimum near "
@@ -359,14 +359,14 @@ def _doubts(
             "at a good fit), so there are no intervals: the learner found something that "
             "several parameters could explain as well."
         )
-        told.append(Warning("not_unique", text))
+        warnings.append(Warning("not_unique", text))
     if at_bound:
         text = (
             f"at a bound: {', '.join(at_bound)}. What stands at a bound has no interval, and "
             "the others and theirs hold with it there; data that contradict a bound contradict "
             "the physics or the bound."
         )
-        told.append(Warning("at_a_bound", text))
+        warnings.append(Warning("at_a_bound", text))
     if unseen:
         text = (
             f"not identified: {', '.join(unseen)}. Other values, with other weights of the "
@@ -379,8 +379,8 @@ def _doubts(
                 f"not identified: {', '.join(unseen)}. Other values of them together give the "
                 "same outputs, so there is no interval; give some of them as constants."
             )
-        told.append(Warning("not_identified", text))
-    return told
+        warnings.append(Warning("not_identified", text))
+    return warnings
 
 
 def shared_in_words(shared: Shared) -> str:

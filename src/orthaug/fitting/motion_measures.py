@@ -50,14 +50,14 @@ def field_under(
     finite = np.isfinite(found).all(axis=0)
     weight = np.where(finite, points.weight, 0.0)
     share = support.share(points)
-    told = ()
+    warnings = ()
     if share < SUPPORTED and form.bound is not None:
         text = (
             f"only {100 * share:.0f} % of the {measure.name} measure lies within reach of the "
             "training data: elsewhere the parameters rest on how the learner extrapolates."
         )
-        told = (Warning("measure_beyond_data", text),)
-    return Field(at[finite], beside[finite], weight[finite] / weight.sum(), size), share, told
+        warnings = (Warning("measure_beyond_data", text),)
+    return Field(at[finite], beside[finite], weight[finite] / weight.sum(), size), share, warnings
 
 
 def sizes_learned(segmented: SegmentedMotion, c: Any, x: Any, u: Any) -> Any:

@@ -45,15 +45,15 @@ _SETTLING = (
     200  # steps at most by which starts follow the outputs: a descent damps no step of theirs
 )
 _FINE = 0.01  # of the residual: how much the outputs may move when the substeps are doubled
-_LOOSER = 1e-4  # times the weight of the guesses, where it is asked what the outputs tell
+_LOOSER = 1e-4  # times the weight of the guesses, to see what the outputs determine
 
 
 def train_motion_physics(
-    segmented: SegmentedMotion, solver: LevenbergMarquardt, tell: RunProgress = quiet
+    segmented: SegmentedMotion, solver: LevenbergMarquardt, progress: RunProgress = quiet
 ) -> tuple[SegmentedMotion, FreeRunFit | None]:
     """Return parameters of physics alone, and segments that start at its states.
 
-    None: none flies.
+    None where no run is finite.
     """
     own, initial = segmented.alone, segmented.problem.motion.coordinates.initial
     steps = own.segments.steps
@@ -73,7 +73,7 @@ def train_motion_physics(
     for start, known in ((q, rows), (initial, None)):
         if start is initial and ends and (q is initial or _follows(own, ends[0])):
             continue
-        end = _descended(own, solver, [start], known, tell)
+        end = _descended(own, solver, [start], known, progress)
         if end is not None:
             ends.append(end)
             iterations, seconds = iterations + end.iterations, seconds + end.seconds
@@ -95,13 +95,13 @@ def _descended(
     solver: LevenbergMarquardt,
     starts: list[Vector],
     rows: list[np.ndarray] | None,
-    tell: RunProgress = quiet,
+    progress: RunProgress = quiet,
 ) -> FreeRunFit | None:
     """Return the end of a descent from the best of the starts.
 
     Its segments begin at states that follow the outputs.
 
-    None where none flies.
+    None where no run is finite.
     """
     if rows is not None:
         segmented = segmented.starting_from(rows)
@@ -113,7 +113,7 @@ def _descended(
     loss, q, states = min(places, key=lambda place: place[0])
     if not np.isfinite(loss):
         return None
-    free_fit = segmented.descend(objective, q, solver, tell, states)
+    free_fit = segmented.descend(objective, q, solver, progress, states)
     return free_fit if free_fit.ending.usable else None
 
 
@@ -181,7 +181,7 @@ def _descended_on(
 
 @dataclass(frozen=True, eq=False)
 class MotionTask(SimulationTask):
-    """A motion laid out in segments, and the run of its physics alone."""
+    """A motion in segments, and the run of its physics alone."""
 
     plan: SegmentedMotion
 
@@ -225,7 +225,7 @@ class MotionTask(SimulationTask):
     def physics_alone(self) -> tuple[MotionTask, TrainedLearner]:
         """Return the task without a learner, and the residual of physics alone.
 
-        Without an end where it cannot fly.
+        Without an end where no run of it is finite.
         """
         alone = replace(self, plan=self.plan.alone)
         if self.physics is not None:
@@ -249,7 +249,7 @@ class MotionTask(SimulationTask):
     def learned(self, run: FreeRunFit) -> TrainedLearner:
         """Return the learner as a run left it.
 
-        The information counts what the outputs tell, hardly what the guesses do.
+        The information counts the outputs, and hardly the guesses.
         """
         end, objective = run.end, run.objective
         if end.linear is None:
@@ -260,9 +260,9 @@ class MotionTask(SimulationTask):
         )
 
     def train_physics_only(
-        self, solver: LevenbergMarquardt, structure: Structure, tell: RunProgress
+        self, solver: LevenbergMarquardt, structure: Structure, progress: RunProgress
     ) -> tuple[SegmentedMotion, FreeRunFit | None]:
-        return train_motion_physics(self.plan, solver, tell)
+        return train_motion_physics(self.plan, solver, progress)
 
     def scaled(self, plan: SegmentedMotion, physics: FreeRunFit) -> SegmentedMotion:
         """Return the size of the learner's features and of the quantities it is added to.
@@ -295,7 +295,7 @@ class MotionTask(SimulationTask):
         """
         silenced = (
             w if self.bound is None else self.bound.silent(w)
-        )  # no learner: physics alone did not fly
+        )  # no learner: physics alone had no finite run
         q = (
             self.problem.motion.coordinates.initial
             if self.physics is None

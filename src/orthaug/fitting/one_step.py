@@ -226,11 +226,11 @@ class OneStepTask(TrainingRows):
 
         Bounds reach into training (F1).
 
-        Entries at a bound are known terms: they are held there from the first step on, as if they
-        were `fixed`. Where others stand there at the end, the run is made again.
+        Entries at a bound are known terms: they are fixed there from the first step on, as if they
+        were `fixed`. Where others are at a bound at the end, the run is made again.
         """
 
-        def tell(iteration: int, loss: float) -> None:
+        def report(iteration: int, loss: float) -> None:
             progress(iteration, self.mean_square(loss))
 
         runs: list[compiled.TrainingRun] = []
@@ -238,7 +238,7 @@ class OneStepTask(TrainingRows):
         def share(fixed: Fixed) -> Vector | None:
             """Return QᵀF at the end of a run with these fixed; None where the run failed."""
             runs.append(
-                self._run_held(solver, w, structure, elimination, fixed, regularization, tell)
+                self._run_held(solver, w, structure, elimination, fixed, regularization, report)
             )
             reach = elimination.bounded and not elimination.decoupled
             return self.coordinates(runs[-1]) if reach and runs[-1].ending.usable else None

@@ -47,7 +47,7 @@ class Physics(NamedTuple):
 
         A fixed one has none.
 
-        Where θ is `solved` (F1), it stands at its end and has no columns: the learner's path does
+        Where θ is `solved` (F1), it is at its end and has no columns: the learner's path does
         not depend on it.
         """
         to_rows = elimination.to_coordinates / rms

@@ -20,13 +20,13 @@ from scipy.linalg.lapack import dtpqrt, dtrtrs  # pyright: ignore[reportAttribut
 from orthaug._base.checks import Matrix, Vector
 from orthaug.inference.covariance import interval
 
-_DETERMINED = 1e-12  # smallest singular value of R with unit columns that tells all of θ
+_DETERMINED = 1e-12  # smallest singular value of R with unit columns that determines all of θ
 _KEPT = 0.1
 """Share of the information of a whole memory of training rows that forgetting leaves in every
 direction of θ.
 """
 MOST = 10_000
-"""Rows that a course keeps; of more every second one, every fourth, and so on."""
+"""Rows that a history stores; of more every second one, every fourth, and so on."""
 
 
 @dataclass(eq=False)
@@ -44,7 +44,7 @@ class Recursion:
     shape: Matrix
     """Covariance of whitened errors (ny, ny), with a mean of 1 on its diagonal."""
     start: Vector
-    """θ₀ (nθ,), which stays where rows do not tell θ."""
+    """θ₀ (nθ,), which stays where rows do not determine θ."""
     forgetting: float
     floor: Matrix | None
     errors: float
@@ -215,8 +215,8 @@ def squares(phi: Float[np.ndarray, "N ny nt"], shape: Matrix) -> Matrix:
 class EstimateHistory:
     """A row of numbers for each row of data that was used.
 
-    Columns: the row's number, the level of the alarm (above 1 it stands), s², degrees of freedom,
-    whether θ is told, the residuals (ny), θ (nθ), R and M (nθ² each).
+    Columns: the row's number, the level of the alarm (above 1 it is raised), s², degrees of freedom,
+    whether θ is determined, the residuals (ny), θ (nθ), R and M (nθ² each).
     """
 
     ny: int
@@ -282,7 +282,7 @@ def covariances(
     r: Float[np.ndarray, "k nt nt"],
     squared: Float[np.ndarray, "k nt nt"],
     level: Vector,
-    told: Bool[np.ndarray, "k"],
+    determined: Bool[np.ndarray, "k"],
     inflation: Matrix | None,
 ) -> Float[np.ndarray, "k nt nt"]:
     """Return `s² S G Sᵀ` with `S Sᵀ = I⁻¹ M I⁻¹`.
@@ -290,10 +290,10 @@ def covariances(
     G, the inflation, is the factor by which the fit's own covariance exceeds that.
     """
     result = np.full(r.shape, np.nan)
-    if inflation is None or not told.any():
+    if inflation is None or not determined.any():
         return result
-    half = _half(r[told], squared[told])
-    result[told] = level[told, None, None] * (half @ inflation @ np.swapaxes(half, 1, 2))
+    half = _half(r[determined], squared[determined])
+    result[determined] = level[determined, None, None] * (half @ inflation @ np.swapaxes(half, 1, 2))
     return result
 
 

@@ -57,7 +57,7 @@ _LEAST_FACTOR = 0.3  # of forgetting: a memory of one row
 
 
 class Alarm(NamedTuple):
-    """An alarm: residuals left their band at `row` of all rows given, `time` [s] after the first."""
+    """An alarm: residuals left their band at `row` of all rows, `time` [s] after the first."""
 
     row: int
     time: float
@@ -200,15 +200,15 @@ class Recursive:
                 self._lagging.nothing if begins[-1] else tail, rows
             )
             prepared.append(self._whitened(x, complete, rows))
-        told = []
+        alarms = []
         for begun, (used, whitened, count) in zip(begins, prepared, strict=True):
             if begun:
                 self._watch.gap()
-            told += self._follow(used, whitened)
+            alarms += self._follow(used, whitened)
             self.rows += count
         self._tail = tail
-        self.alarms = (*self.alarms, *told)
-        return told
+        self.alarms = (*self.alarms, *alarms)
+        return alarms
 
     def _parts(self, record: Record | None, u: Any, y: Any) -> list[Matrix]:
         """Yield rows (n, ny + nu) without gaps among them."""
@@ -232,9 +232,9 @@ class Recursive:
 
     def _follow(self, used: Any, whitened: WhitenedRows | None) -> list[Alarm]:
         recursion, watch, kept_rows = self._recursion, self._watch, self._rows_kept
-        told: list[Alarm] = []
+        alarms: list[Alarm] = []
         if whitened is None:
-            return told
+            return alarms
         for i, (k, phi, target, inside) in enumerate(zip(used, *whitened, strict=True)):
             if i and k != used[i - 1] + 1:
                 watch.gap()
@@ -244,10 +244,10 @@ class Recursive:
                 watch.skip()
                 self.outside += 1
             elif watch.step(error, spread):
-                told.append(Alarm(row, row * self._fitted.sampling_time))
+                alarms.append(Alarm(row, row * self._fitted.sampling_time))
             if row % kept_rows.stride == 0:
                 kept_rows.add(kept_rows.line(row, watch.level, self._freedom, error, recursion))
-        return told
+        return alarms
 
     @property
     def _freedom(self) -> float:
@@ -270,14 +270,14 @@ class Recursive:
     def covariance(self) -> Matrix | None:
         """Cov θ now (nθ, nθ): of noise, the learner fixed.
 
-        None where the fit has none or the rows do not tell θ.
+        None where the fit has none or the rows do not determine θ.
         """
         recursion = self._recursion
         if self._inflation is None or not recursion.determined:
             return None
-        level, told = np.array([recursion.level]), np.array([True])
+        level, determined = np.array([recursion.level]), np.array([True])
         return covariances(
-            recursion.factor_now[None], recursion.squared[None], level, told, self._inflation
+            recursion.factor_now[None], recursion.squared[None], level, determined, self._inflation
         )[0]
 
     @property

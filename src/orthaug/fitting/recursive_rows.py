@@ -182,7 +182,7 @@ def joined_rows(u: Any, y: Any, inputs: int, outputs: int) -> Matrix:
 
 
 _SOLVED = 1e-6  # of the residual's norm: how far Φθ may be from that of least squares
-_LENGTHS, _ROWS_PER_LAG = 3, 20  # of the correlation of errors; of what tells it
+_LENGTHS, _ROWS_PER_LAG = 3, 20  # of the correlation of errors; of rows that determine it
 _SMALLEST = 1e-10  # of an output's deviation: a residual is at least rounding
 MOTION = (
     "equations of motion cannot be followed by least squares: their outputs are not linear in "

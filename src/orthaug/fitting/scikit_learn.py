@@ -256,7 +256,7 @@ def baseline_of(
     Args: physics: "linear", expressions, `Term`s, a mapping of parameters to expressions, a
         Baseline, or a JAX function. layout: the regressor, for "linear" and for a function.
         outputs: with several, every expression has a parameter of its own for each, `gain_y0`.
-        names: columns that may stand in expressions without an instant.
+        names: columns that expressions may use without an instant.
 
     Raises:
         InputError: none of these.

@@ -58,7 +58,7 @@ class SegmentedLagged(SegmentedProblem):
     dynamics: Lagged
     task: OneStepTask
     fixed: Fixed = field(default_factory=dict)
-    """Entries of an orthogonal θ that are known to stand at a bound beside the learner."""
+    """Entries of an orthogonal θ that are known to be at a bound beside the learner."""
 
     @classmethod
     def of(

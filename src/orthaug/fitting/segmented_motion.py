@@ -39,7 +39,7 @@ class MotionObjective(FreeRunObjective):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SegmentedMotion(SegmentedProblem):
-    """A motion's record laid out in segments.
+    """A motion's record in segments.
 
     `loose` (nx,) is how far a start may be from its guess.
     """
@@ -59,7 +59,7 @@ class SegmentedMotion(SegmentedProblem):
     ) -> SegmentedMotion:
         """Lay out a record as a criterion declares, for a motion and a learner of unit scaling.
 
-        With `like` in the shapes of another course, and with its substeps.
+        With `like` in the shapes of another layout, and with its substeps.
 
         Raises:
             InputError: nothing would be scored.

@@ -74,7 +74,7 @@ class Layout(NamedTuple):
     ) -> Layout:
         """Return the layout that a criterion of several steps declares.
 
-        Padded to the shapes of another course where that is larger.
+        Padded to the shapes of another layout where that is larger.
 
         Raises:
             InputError: nothing would be scored.
@@ -100,7 +100,7 @@ class Layout(NamedTuple):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SegmentedProblem:
-    """A record laid out in segments for a criterion.
+    """A record in segments for a criterion.
 
     `rms` is the unit of the errors. `deviation` (ny,) is that of the outputs, `output_weights` how
     they are weighed against each other; `scaling` and `unit` are the learner's.
@@ -149,7 +149,7 @@ class SegmentedProblem:
         objective: FreeRunObjective,
         p: Vector,
         solver: LevenbergMarquardt,
-        tell: RunProgress = quiet,
+        progress: RunProgress = quiet,
         states: Any = None,
         **options: Any,
     ) -> FreeRunFit:
@@ -171,7 +171,7 @@ class SegmentedProblem:
         first = solver.at_most(solver.iterations // 2) if two_legs else solver
         start = Start(objective.initial.measured if states is None else states)
         kept = self._kept(objective, p, start, options)
-        end = first.descend(objective, p, start, progress=tell, kept=kept, **options)
+        end = first.descend(objective, p, start, progress=progress, kept=kept, **options)
         noise = self.noise(objective, end) if two_legs and end.ending.usable else None
         white = None if noise is None else whitening(noise)
         if noise is not None and white is not None:
@@ -188,7 +188,7 @@ class SegmentedProblem:
                 objective,
                 end.point.p,
                 begun,
-                progress=lambda i, loss: tell(done + i, loss),
+                progress=lambda i, loss: progress(done + i, loss),
                 kept=self._kept(objective, end.point.p, begun, options),
                 **options,
             )

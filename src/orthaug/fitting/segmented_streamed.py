@@ -34,14 +34,14 @@ from orthaug.models.dynamics import Dynamics, Numbers
 from orthaug.models.rows import Engine
 from orthaug.physics.streamed import StreamedProblem
 
-_SETTLING = 4  # Gauss-Newton steps of a witness's states
+_SETTLING = 4  # Gauss-Newton steps of a subsample's states
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SegmentedStreamed(SegmentedLagged):
     """A source's rows cut into segments where an engine reads or keeps them.
 
-    `record` is a witness of them.
+    `record` is a subsample of them.
     """
 
     source: Source

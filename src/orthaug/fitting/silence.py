@@ -60,7 +60,7 @@ def add_retries(
     return starts + free + more, runs + ends + others
 
 
-def tell_retries(
+def retry_warnings(
     planned: int,
     starts: Sequence[Any],
     runs: Sequence[Any],

@@ -67,7 +67,7 @@ class SimulationTask(ABC):
 
     @abstractmethod
     def train_physics_only(
-        self, solver: LevenbergMarquardt, structure: Structure, tell: RunProgress
+        self, solver: LevenbergMarquardt, structure: Structure, progress: RunProgress
     ) -> tuple[Any, FreeRunFit | None]:
         """Return the problem and physics alone trained on it; None where no run is finite."""
 
@@ -96,10 +96,10 @@ class SimulationTask(ABC):
         """
         own = self.plan
 
-        def tell(iteration: int, loss: float) -> None:
+        def report(iteration: int, loss: float) -> None:
             progress(iteration, loss * own.rms**2 / own.residuals)
 
-        plan, physics = self.train_physics_only(solver, structure, tell)
+        plan, physics = self.train_physics_only(solver, structure, report)
         if physics is None:
             return self
         rms = plan.rms * float(np.sqrt(physics.end.point.misfit / plan.residuals))
@@ -178,21 +178,21 @@ class SimulationTask(ABC):
         ):  # one prior deviation of the weights for one of what is left
             ridge = best.loss / plan.residuals
 
-        def tell(iteration: int, loss: float) -> None:
+        def report(iteration: int, loss: float) -> None:
             progress(iteration, loss * plan.rms**2 / plan.residuals)
 
         options: dict[str, Any] = {"ridge": ridge, "evidence": evidence, "evidence_settled": True}
         free_fit = plan.descend(
-            objective, best.p, solver, tell, best.states, ceiling=ceiling, **options
+            objective, best.p, solver, report, best.states, ceiling=ceiling, **options
         )
         if evidence and not _learned(free_fit, best.loss):
             free = plan.descend(
-                objective, best.p, solver.within_limit, tell, best.states, ceiling=ceiling
+                objective, best.p, solver.within_limit, report, best.states, ceiling=ceiling
             )
             if _learned(free, best.loss):
                 point, options = free.end.point, options | {"evidence_settled": False}
                 again = plan.descend(
-                    objective, point.p, solver, tell, point.states, ceiling=ceiling, **options
+                    objective, point.p, solver, report, point.states, ceiling=ceiling, **options
                 )
                 free_fit = again if _learned(again, best.loss) else free_fit
                 spent = {

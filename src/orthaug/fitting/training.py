@@ -23,13 +23,13 @@ from orthaug.fitting.held_out import HeldOutErrors, Pieces, blocked, mean_square
 from orthaug.fitting.kinds import Solver
 from orthaug.fitting.learned import Task, TrainedLearner
 from orthaug.fitting.one_step import OneStepTask
-from orthaug.fitting.silence import add_retries, tell_retries
+from orthaug.fitting.silence import add_retries, retry_warnings
 from orthaug.fitting.status import Ending
 from orthaug.fitting.structures import Orthogonal, Structure
 from orthaug.models.learners import Bound
 
 _INFLATION = 1.4  # of the effective weights in cross-validation, against what follows the noise (Kim and Gu 2004)
-FOLD_ITERATIONS = 60  # enough to tell whether a learner helps, on every block of cross-validation
+FOLD_ITERATIONS = 60  # enough to see whether a learner helps, on every block of cross-validation
 
 
 Concluding = Callable[[Any, Structure, TrainedLearner], Any]
@@ -136,12 +136,12 @@ def train(
     ranking = choice.ranking(task, runs, errors)
     usable = np.array([run.ending.usable for run in runs]) & np.isfinite(ranking)
     best = int(np.argmin(np.where(usable, ranking, np.inf)))
-    told = []
+    replacing = []
     if held_out is not None:
         held_out = replace(held_out, chosen=best)
         runs_freely = task.criterion.free_run is not None and task.start_loss is not None
         if choice.fallback and runs_freely and not held_out.ratio.value < 1:
-            told, best = [_fell_back(held_out)], -1
+            replacing, best = [_fell_back(held_out)], -1
             LOG.info(
                 "no free run is better than physics alone where it was not fitted: physics "
                 "alone is handed over"
@@ -159,8 +159,8 @@ def train(
         estimate = concluded(best)
     scored = choice.scored and held_out is None
     scores = [_cross_validation(task, run) if scored else math.nan for run in runs]
-    told_of = list(zip(starts, runs, losses, errors, scores, strict=True))
-    restarts = tuple(_restart(*told_of[i], chosen=i in members) for i in shown)
+    results = list(zip(starts, runs, losses, errors, scores, strict=True))
+    restarts = tuple(_restart(*results[i], chosen=i in members) for i in shown)
     seconds = task.seconds + sum(run.seconds for run in runs)
     status = replace(estimate.status, seconds=seconds, start_loss=task.start_loss)
     warnings = (
@@ -168,8 +168,8 @@ def train(
         *task.warnings,
         *_replaced(starts, runs),
         *_stopped(stopped, len(runs), untried),
-        *told,
-        *tell_retries(planned, starts, runs, held_out, best),
+        *replacing,
+        *retry_warnings(planned, starts, runs, held_out, best),
     )
     beside = _beside(conclude, task, structure) if best >= 0 else None
     found = {"restarts": restarts, "status": status, "held_out": held_out, "physics_alone": beside}
@@ -262,8 +262,8 @@ def _run(
     made, given = list(starts), (task, solver, structure)
     runs = list(runner.map(_one_run, given, made, progress))
     for i, (start, run) in enumerate(zip(made, runs, strict=True), 1):
-        told = (i, start.seed, run.ending.code, run.iterations, task.loss(run), run.seconds)
-        LOG.info("run %d, seed %d: %s after %d iterations, loss %.4g, %.2f s", *told)
+        figures = (i, start.seed, run.ending.code, run.iterations, task.loss(run), run.seconds)
+        LOG.info("run %d, seed %d: %s after %d iterations, loss %.4g, %.2f s", *figures)
     failed = [start for start, run in zip(made, runs, strict=True) if not run.ending.usable]
     if (
         task.bound is None or not failed or len(failed) == len(made)
@@ -283,10 +283,10 @@ def _run(
 
 
 def _one_run(
-    given: tuple[Task, Solver, Structure], start: PlannedRun, tell: Callable[..., None]
+    given: tuple[Task, Solver, Structure], start: PlannedRun, report: Callable[..., None]
 ) -> Any:
     task, solver, structure = given
-    return task.run(solver, start.weights, structure, start.regularization, tell)
+    return task.run(solver, start.weights, structure, start.regularization, report)
 
 
 def _replaced(starts: Sequence[PlannedRun], runs: Sequence[Any]) -> list[Warning]:
@@ -359,7 +359,7 @@ def _held_out(
     )
 
 
-def _on_fold(given: Any, fold: tuple[Record, Record], tell: Callable[..., None]) -> list[Pieces]:
+def _on_fold(given: Any, fold: tuple[Record, Record], report: Callable[..., None]) -> list[Pieces]:
     """Return errors on a block of physics alone, and of runs from every start on the rest."""
     task, starts, structure, solver, conclude = given
     training, held = fold
@@ -368,7 +368,7 @@ def _on_fold(given: Any, fold: tuple[Record, Record], tell: Callable[..., None])
         own = task.on(training).prepared(solver, structure)
         fits = [_alone(conclude, own, structure)]
         for start in starts:
-            tell()
+            report()
             run = own.run(solver, start.weights, structure, start.regularization)
             fits.append(_concluded(conclude, own, structure, own.learned(run)))
     except InputError:  # the block took away what the physics needs

@@ -80,7 +80,7 @@ def theta_covariance(factor: Factor, middle: Matrix, fixed: Collection[int] = ()
     For one output this is the textbook s²(ΦᵀΦ)⁻¹.
 
     Args: middle: ΣqᵀΣ_eq (nθ, nθ) over the rows q of Q, in whitened outputs; for one output s² I.
-        fixed: entries that stand at a bound. They have NaN; the others' covariance holds with them
+        fixed: entries at a bound. They have NaN; the others' covariance holds with them
         fixed there.
     """
     nt = len(factor.scale)
@@ -168,7 +168,7 @@ def joint_covariance(problem: Problem, model: Model, convention: str = "calibrat
     )
     whitened = problem.weight.whitened(noise)
     bound, w = model.form.bound, np.asarray(model.numbers.weights)
-    share = problem.count / len(problem.rows)  # of which the rows in memory are a witness
+    share = problem.count / len(problem.rows)  # of which the rows in memory are a subsample
     outer, middle = (
         share * projected_gram(engine, bound, w, rows, m) for m in (np.eye(ny), mixing(whitened))
     )
@@ -326,7 +326,7 @@ def robust_split_covariance(
 
 def _correction(problem: Problem, residual: Matrix, used: float) -> float:
     """Return the factor that corrects for the degrees of freedom that the fit has used up."""
-    share = problem.count / len(problem.rows)  # of which the residual is a witness
+    share = problem.count / len(problem.rows)  # of which the residual is a subsample
     samples = residual.size * share
     return share * samples / max(samples - len(problem.baseline.names) - used, 1.0)
 

@@ -152,7 +152,7 @@ def hc3(
     Args:
         errors: of the same rows (N, ny), whitened as ψ is.
         nt: how many of the unknowns are θ.
-        share: how many times more rows were trained on than these, which then stand for them.
+        share: how many times more rows were trained on than these, which then represent them.
     """
     influence = Influence.of(slopes, statistics, np.eye(slopes.shape[2]), nt)
     scores = np.einsum("kon,ko->kn", slopes, influence.less_leverage(errors))

@@ -1,6 +1,6 @@
-"""The nearest physics of a fitted motion, p̂ = argmin_p Σ_μ ‖G − f(·.
+"""The nearest physics of a fitted motion, p̂ = argmin_p Σ_μ ‖G − f(·; p)‖².
 
-P)‖², along what a learner could imitate.
+p̂ moves only along directions that a learner could imitate.
 
 G = f(·; c) + g is the fitted field over points of states and inputs; only learned equations and
 outputs count. p̂ depends on G and the measure alone, not on how G was put together. For f linear in

@@ -54,7 +54,7 @@ class PhysicalEstimate:
     std: tuple[float | None, ...]
     ci95: tuple[tuple[float, float] | None, ...]
     covariance: Matrix | None
-    """Cov p̂ (np, np), NaN at parameters that stand at a bound; None where there are no standard
+    """Cov p̂ (np, np), NaN at parameters at a bound; None where there are no standard
     errors.
     """
     consistency: Consistency | None
@@ -67,11 +67,11 @@ class PhysicalEstimate:
 
     def __repr__(self) -> str:
         rows = zip(self.names, self.value, self.std, self.units, strict=True)
-        told = (
+        parts = (
             f"{n} = {v:.6g}{'' if s is None else f' ± {s:.2g}'} {unit}".rstrip()
             for n, v, s, unit in rows
         )
-        return f"PhysicalEstimate({', '.join(told)})"
+        return f"PhysicalEstimate({', '.join(parts)})"
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,7 +199,7 @@ def _whitener(target: Vector, covariance: Matrix) -> Matrix | None:
             "`covariance` must be symmetric with no negative eigenvalue; expected that of "
             "theta_hat."
         )
-    # a combination of θ without variance is known as well as double precision can tell, not unknown
+    # a combination of θ without variance is known as well as double precision can show, not unknown
     return (vectors / np.sqrt(np.maximum(eigenvalues, _ROUNDING))).T / std
 
 
@@ -244,13 +244,13 @@ def solve(
     if outside:
         warnings.append(_outside(fit, value))
     elif not sensitivity.full_rank:
-        told = (
+        text = (
             f"At the solution {tied(sensitivity)}; the physical parameters have no standard errors."
         )
-        warnings.append(Warning("physical_parameters_tied", told))
+        warnings.append(Warning("physical_parameters_tied", text))
     if not fit.known:
-        told = "theta has no finite covariance, so the physical parameters have no standard errors."
-        warnings.append(Warning("no_standard_errors", told))
+        text = "theta has no finite covariance, so the physical parameters have no standard errors."
+        warnings.append(Warning("no_standard_errors", text))
     if consistency is not None and consistency.p < CONTRADICTION:
         warnings.append(Warning("physics_contradicted", consistency.text))
     std = np.full(len(value), np.nan) if spread is None else np.sqrt(np.diag(spread))
@@ -335,12 +335,12 @@ def _consistency(chi2: float, df: int, freedom: float, held: bool) -> Consistenc
 
 
 def _at_bounds(physics: PhysicsMap, value: Vector, held: Bool[np.ndarray, "n"]) -> list[Warning]:
-    told = (
+    text = (
         "{} stands at its bound {:g} and has no standard error; those of the others hold with "
         "it there."
     )
     return [
-        Warning("at_a_bound", told.format(name, v))
+        Warning("at_a_bound", text.format(name, v))
         for name, v, at_bound in zip(physics.names, value, held, strict=True)
         if at_bound
     ]
@@ -352,23 +352,23 @@ def _elsewhere(physics: PhysicsMap, others: Sequence[Vector]) -> list[Warning]:
     listed = ", ".join(
         f"{name} = {v:.6g}" for name, v in zip(physics.names, others[0], strict=True)
     )
-    told = (
+    text = (
         f"theta is explained as well by {listed}; bounds or better initial values choose "
         "between the solutions."
     )
-    return [Warning("several_solutions", told)]
+    return [Warning("several_solutions", text)]
 
 
 def _outside(fit: _Fit, value: Vector) -> Warning:
     nearby = fit.physics.theta(value)
     worst = int(np.argmax(np.abs(nearby - fit.target) / magnitude(fit.target)))
-    told = (
+    text = (
         "No physical parameters give the estimated theta: nearest is "
         f"{fit.physics.theta_names[worst]} = {nearby[worst]:.6g} instead of "
         f"{fit.target[worst]:.6g}. They have no standard errors; check the expressions of "
         "theta, and whether theta is biased."
     )
-    return Warning("physics_not_met", told)
+    return Warning("physics_not_met", text)
 
 
 def profile(

@@ -51,14 +51,14 @@ class MeasureSplit:
     """What it was split under."""
 
     def __str__(self) -> str:
-        told = (
+        text = (
             f"{self.name}, {self.points} points, {100 * self.support:.0f} % of it within reach "
             "of the data"
         )
         if self.price is None or not np.isfinite(self.price).all():
-            return told
+            return text
         return (
-            f"{told}; standard errors {', '.join(f'{r:.3g}' for r in self.price)} times the "
+            f"{text}; standard errors {', '.join(f'{r:.3g}' for r in self.price)} times the "
             "training measure's"
         )
 
@@ -105,14 +105,14 @@ def split_under(
         "training data"
     )
     learns = form.bound is not None
-    told = Warning(
+    warning = Warning(
         "measure_beyond_data", f"{reach}: elsewhere θ rests on how the learner extrapolates."
     )
-    warnings = (told,) if share < SUPPORTED and learns else ()
+    warnings = (warning,) if share < SUPPORTED and learns else ()
     condition = weighed.excitation.condition
-    told_of = (share, len(points.x), condition, warnings)
+    of_measure = (share, len(points.x), condition, warnings)
     return MeasureSplit(
-        measure.name, theta, aux, covariance, defect, *told_of, slope=slope, measure=measure
+        measure.name, theta, aux, covariance, defect, *of_measure, slope=slope, measure=measure
     )
 
 

@@ -144,7 +144,7 @@ class Baseline(NotebookView):
         Expressions may use the names in `constants`, and `Ts` for the sampling time.
 
         Args:
-            terms: the same parameter may stand in several.
+            terms: several may have the same parameter.
             constants: numbers by name.
 
         Raises: InputError: an expression that is not arithmetic on lagged channels, or terms of one
@@ -400,7 +400,7 @@ def derived_units(
 ) -> dict[str, str]:
     """Return the unit of each parameter by its name, "1" where it has none.
 
-    Without those that the channels do not tell.
+    Units that do not follow from those of the channels are left out.
 
     Examples:
         >>> spring = Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "u[k-1]")])
@@ -414,7 +414,7 @@ def derived_units(
     found: dict[str, set[str | None]] = {}
     for term in baseline.terms:
         own = units[term.output or outputs[0].name]
-        told = coefficient_unit(own, parse(term.regressor, constants), units) if own else None
-        found.setdefault(term.parameter, set()).add("1" if told == "" else told)
-    agreed = {name: next(iter(told)) for name, told in found.items() if len(told) == 1}
+        unit = coefficient_unit(own, parse(term.regressor, constants), units) if own else None
+        found.setdefault(term.parameter, set()).add("1" if unit == "" else unit)
+    agreed = {name: next(iter(given)) for name, given in found.items() if len(given) == 1}
     return {name: unit for name, unit in agreed.items() if unit is not None}

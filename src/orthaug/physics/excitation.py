@@ -44,8 +44,8 @@ def excitation(r: Matrix, names: Sequence[str], tolerance: float = RANK_TOLERANC
     """Return rank and condition of a matrix from its R factor (or itself), columns scaled to 1.
 
     The condition number is σmax/σmin of the scaled columns, None where it is infinite. A group
-    holds the columns that a null direction ties: nothing in the data can tell their parameters
-    apart.
+    holds the columns that a null direction ties: nothing in the data can separate their
+    parameters.
     """
     columns = len(names)
     if columns == 0:

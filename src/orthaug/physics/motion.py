@@ -1,6 +1,4 @@
-"""Equations of motion `ẋ = f(x, u.
-
-P)`, `y = h(x, u; p)`: physics whose parameters may stand anywhere.
+"""Equations of motion `ẋ = f(x, u; p)`, `y = h(x, u; p)`, with parameters anywhere in them.
 
 A learner may be added to some of the equations and outputs. `derivative` is that of a state in
 time; of a `discrete` motion it is the state one sample later. No JAX.

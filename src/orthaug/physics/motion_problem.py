@@ -105,16 +105,16 @@ class MotionProblem:
                     )
                     where = ", ".join(f"{n} = {v:.4g}" for n, v in at)
                     term = motion.term_without_value(first + i, x[:, k], u[:, k])
-                    told = f": {term}" if term else ""
+                    reason = f": {term}" if term else ""
                     return (
                         f"{what} '{name}' is not finite at the start ({where}, initial "
-                        f"parameters){told}"
+                        f"parameters){reason}"
                     )
         return ""
 
     @cached_property
     def fastest(self) -> float:
-        """The largest |eigenvalue| of ∂f/∂x [1/s], over guessed states and at initial parameters."""
+        """The largest |eigenvalue| of ∂f/∂x [1/s], over guessed states, at initial parameters."""
         x, u = self.looked_at
         size = np.maximum(np.abs(x).max(axis=1), 1e-6 * np.abs(x).max(initial=1e-6))
         columns = []

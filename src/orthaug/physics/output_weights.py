@@ -47,13 +47,13 @@ class OutputWeights:
         return {"kind": self.kind, "matrix": self.matrix.tolist()}
 
     def __str__(self) -> str:
-        told = {
+        texts = {
             "none": "every output in its own unit",
             "std": "each output in its standard deviation",
             "covariance": "outputs weighted by the covariance of their errors",
             "given": "outputs weighted as given",
         }
-        return told[self.kind]
+        return texts[self.kind]
 
     def rows(self, values: Float[np.ndarray, "N ny ..."]) -> Float[np.ndarray, "N ny ..."]:
         """Return the rows in whitened outputs."""

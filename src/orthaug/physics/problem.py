@@ -366,7 +366,7 @@ def regressor_of(
         except InputError as error:
             raise InputError(f"learner input: {error}") from None
         features = Features(tuple(expressions))
-    if baseline.function is not None:  # it takes the regressor exactly as `lags` lays it out
+    if baseline.function is not None:  # it takes the regressor exactly as `lags` orders it
         if lags is None:
             raise InputError(
                 "a baseline function needs `lags`: they define the regressor x that it is "

@@ -71,19 +71,17 @@ class Factor:
         basis = np.linalg.qr(self.to_coordinates @ directions)[0]
         return basis @ basis.T
 
-    def told_of(self, directions: Float[np.ndarray, "nt s"]) -> Float[np.ndarray, "nt r"]:
+    def without_null(self, directions: Float[np.ndarray, "nt s"]) -> Float[np.ndarray, "nt r"]:
         """Return a basis of some directions of θ without those that Φ takes to zero.
 
-        The directions as they are where that is none.
-
-        A parameter that stands in none of the rows has a column of zeros.
+        Without such directions, they are returned unchanged. A parameter that appears in none of the rows has a column of zeros.
         """
         moved = self.to_coordinates @ directions
         size = np.linalg.norm(moved, axis=0)
-        told = size > _ROUNDING * np.linalg.norm(
+        seen = size > _ROUNDING * np.linalg.norm(
             np.abs(self.to_coordinates) @ np.abs(directions), axis=0
         )
-        unit = directions[:, told] / size[told]
+        unit = directions[:, seen] / size[seen]
         _, sigma, vt = np.linalg.svd(self.to_coordinates @ unit)
         rank = int(np.sum(sigma > _ROUNDING * sigma.max(initial=0.0)))
         return directions if rank == directions.shape[1] else unit @ vt[:rank].T
@@ -141,17 +139,17 @@ class Projection(Factor):
 
         None for all of them.
 
-        Φ itself need not have full rank: what no row tells stays zero.
+        Φ itself need not have full rank: what no row determines stays zero.
         """
         if directions is None:
             return self.solve(values)
-        told = self.told_of(directions)
-        if not told.shape[1]:
+        directions = self.without_null(directions)
+        if not directions.shape[1]:
             return np.zeros(len(directions))
-        basis, r = np.linalg.qr(self.to_coordinates @ told)
+        basis, r = np.linalg.qr(self.to_coordinates @ directions)
 
         def along(rest: Float[np.ndarray, "N ny"]) -> Vector:
-            return told @ scipy.linalg.solve_triangular(
+            return directions @ scipy.linalg.solve_triangular(
                 r, basis.T @ self.coordinates(rest), check_finite=False
             )
 

@@ -101,17 +101,17 @@ class Shared:
     @property
     def directions(self) -> tuple[dict[str, float], ...]:
         """Each direction as weights of the parameters that it moves, the first one being 1."""
-        told = []
+        described = []
         for column in self.basis.T:
             first = column[np.flatnonzero(column)[0]]
-            told.append(
+            described.append(
                 {
                     name: float(f"{a / first:.12g}")
                     for name, a in zip(self.names, column, strict=True)
                     if a
                 }
             )
-        return tuple(told)
+        return tuple(described)
 
     def leaving(self, held: Iterable[int]) -> Shared:
         """Return the shared directions that leave some entries of θ unchanged.

@@ -2,7 +2,7 @@
 
 Three passes: a survey of sizes and ranges, a tree QR of `[Φ Y]`, and a second QR of the rows that
 the first one gives. The second makes Q orthonormal to rounding however ill-conditioned Φ is, as
-Householder's does in memory. A `witness` of the rows stays in memory for everything that only looks
+Householder's does in memory. A subsample of the rows stays in memory for everything that only looks
 at the data.
 """
 
@@ -253,7 +253,7 @@ class RowBuilder:
 class StreamedProblem(Problem):
     """A problem of a source.
 
-    `record`, `rows` and the rows of `projection` are those of its witness.
+    `record`, `rows` and the rows of `projection` are those of its subsample.
 
     `passes` makes passes over the source. `moments` are those of what the physics leaves, in
     whitened outputs.
@@ -388,7 +388,7 @@ def _factored(
     r, coordinates = first[:nt, :nt], first[:nt, nt]
     excited = excitation(r, seen.baseline.names)
     ready = excited.full_rank and len(r) == nt
-    if not ready:  # `check` tells; nothing can be solved
+    if not ready:  # `check` raises; nothing can be solved
         r, coordinates = np.eye(nt), np.zeros(nt)
     inverse = scale[:, None] * scipy.linalg.solve_triangular(r, np.eye(nt)) if nt else r
     basis = Basis(form, weight, inverse, np.eye(nt))

@@ -83,7 +83,7 @@ class AdamLBFGS:
     ) -> GradientRun:
         """Minimise the joint criterion from θ⁰ and `w`.
 
-        The loss told to `progress` is a mean square.
+        The loss that `progress` receives is a mean square.
         """
         import optax
 

@@ -26,7 +26,7 @@ from orthaug.models.rows import Overlap
 
 _NOTHING_LEFT = 1e-22  # of ‖J‖²: what rounding leaves of a Jacobian in the span of the physics
 _UNUSED = 1e-12  # effective weights of a group at least, so that one that does nothing stays so
-_SECONDS_PER_BURST = 0.5  # how often progress is told and Ctrl-C is heard
+_SECONDS_PER_BURST = 0.5  # how often progress is reported and Ctrl-C noticed
 
 
 class State(NamedTuple):
@@ -100,7 +100,7 @@ class Settings:
         ridge: α in normalised units; with `evidence` where it starts.
         evidence: choose α by MacKay's re-estimation after every accepted step.
         groups: which weights share an α, by number; None where all do.
-        progress: told of the steps.
+        progress: called after the steps.
         kept: where states are kept; a run goes on from the last one.
     """
 
@@ -144,7 +144,7 @@ class Settings:
         begins = self.limit.begins_window(int(state.iteration))
         return state._replace(mark=np.asarray(state.normal.loss)) if begins else state
 
-    def tell(self, state: State) -> bool:
+    def report(self, state: State) -> bool:
         """Report the state to a listener and to checkpoints; return whether to end the run."""
         try:
             self.progress(int(state.iteration), float(state.normal.loss))
@@ -204,7 +204,7 @@ def minimise(
         )
         state = settings.marked(state)
         burst = burst_length(burst, training_clock() - tick)
-        enough = settings.tell(state)
+        enough = settings.report(state)
     return settings.ended(state, training_clock() - began, enough=enough)
 
 
@@ -234,7 +234,7 @@ def driven(
         step = _proposed(state)
         state = _judged(state, step, normal_at(state.w + step, state.normal.overlap), options)
         state = settings.marked(state)
-        enough = settings.tell(state)
+        enough = settings.report(state)
     return settings.ended(state, training_clock() - began, enough=enough)
 
 

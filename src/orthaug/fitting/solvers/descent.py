@@ -342,7 +342,7 @@ def evidence_ridge(
 
     Args:
         objective: that the weights minimise.
-        flown: the trial at the weights.
+        point: the trial at the weights.
         effective: number γ of effective weights there.
         coloured: whether the colour of the residuals counts.
     """
