@@ -216,8 +216,8 @@ class FreeRunScores:
         steps = self.block() if steps is None else steps
         if steps is None:
             raise InputError(
-                "the errors of the free run remember each other for too long to take them in "
-                "blocks."
+                "the errors of the free run are correlated over too many steps for blocks; use "
+                "a longer record."
             )
         middle, blocks = self.middle(steps, used)
         return replace(statistics, middle=middle, freedom=min(freedom, blocks - 1.0))

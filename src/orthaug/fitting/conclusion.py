@@ -83,8 +83,7 @@ def conclude(task: OneStepTask, structure: Structure, learned: TrainedLearner) -
         pass
     elif known and errors.covariance is None and learned.errors is None:
         text = (
-            "no standard errors: beside a learner that sees only some features, an ensemble "
-            "leaves none."
+            "no standard errors: an ensemble has none where its learner sees only some features."
         )
         warnings.append(Warning("no_standard_errors", text))
     elif (
@@ -267,7 +266,7 @@ def without_loss(mean_square: float) -> list[Warning]:
         return []
     text = (
         "the free run diverges over whole experiments of the training data, so it has no loss; "
-        "train with longer segments, or bound what makes it run away."
+        "train with longer segments, or bound the parameters that make it diverge."
     )
     return [Warning("free_run_diverges", text)]
 
@@ -285,7 +284,7 @@ def _warnings(
     if condition is not None and condition > ILL_CONDITIONED:
         text = (
             f"the physics is ill-conditioned on the data (condition {condition:.1e} of the "
-            "scaled columns): θ is determined, but small changes of the data move it far."
+            "scaled columns): θ is determined, but small changes of the data change it strongly."
         )
         warnings.append(Warning("ill_conditioned", text))
     if learned.ending is Ending.SPANNED:
@@ -318,8 +317,8 @@ def _warnings(
     if fixed:
         names = ", ".join(f"{problem.baseline.names[i]} = {value:g}" for i, value in fixed.items())
         text = (
-            f"at a bound: {names}. What stands at a bound is a known term, as with `fixed = "
-            "true`: it has no standard error, and the others and theirs hold with it there; "
+            f"at a bound: {names}. A parameter at a bound is a known term, as with `fixed = "
+            "true`: it has no standard error, and the other estimates hold with it there; "
         )
         if (
             structure.projects

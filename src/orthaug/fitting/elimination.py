@@ -56,7 +56,9 @@ class Elimination:
     lower: Vector
     upper: Vector
     shared: Shared | None = None
-    """The directions that P projects onto; None where P is the same whichever entries are at a bound."""
+    """The directions that P projects onto; None where P is the same whichever entries are at a
+    bound.
+    """
 
     @property
     def bounded(self) -> bool:

@@ -45,14 +45,17 @@ if TYPE_CHECKING:
 NOT_UNIQUE = "theta_not_unique"
 """The code of the warning that a split under a measure makes untrue."""
 STD_KINDS = {
-    "plain": "those of white errors of even size",
-    "hc3": "robust (HC3), for the errors are of uneven size",
-    "newey-west": "robust (Newey-West), for the one-step residual is coloured",
-    "batch-means": "robust (batch means), for the errors of the free run are coloured",
-    "autoregressive": "robust (an autoregressive model of the errors), for the errors of the free run are "
-    "coloured",
-    "batch-means-uneven": "robust (batch means), for the errors of the free run are of uneven size",
-    "none": "none: the errors of the free run remember each other for too long",
+    "plain": "for white errors of constant variance",
+    "hc3": "robust (HC3), because the variance of the errors is not constant",
+    "newey-west": "robust (Newey-West), because the one-step residual is coloured",
+    "batch-means": "robust (batch means), because the errors of the free run are coloured",
+    "autoregressive": (
+        "robust (autoregressive errors), because the errors of the free run are coloured"
+    ),
+    "batch-means-uneven": (
+        "robust (batch means), because the variance of the free run's errors is not constant"
+    ),
+    "none": "none: the errors of the free run are correlated over too many steps",
 }
 """How standard errors were made, in words."""
 
@@ -206,9 +209,9 @@ class Estimate(AnyFit):
         check_type(measure, Measure, "measure", "a measure such as Uniform()")
         if self.at_bound:
             raise InputError(
-                f"{', '.join(self.at_bound)} stand at a bound, and a split under the "
-                f"{measure.name} measure knows none: drop the bounds, keep the training "
-                "measure, or give them `fixed = true` there."
+                f"{', '.join(self.at_bound)} at a bound: a split under the {measure.name} "
+                "measure has no bounds. Drop the bounds, keep the training measure, or set "
+                "`fixed = true` there."
             )
         support = Support(
             self.problem.record, self.problem.layout, self.model.form.used, self.problem.rows.x
@@ -258,7 +261,7 @@ class Estimate(AnyFit):
             self.model.statistics.gram is None and self.model.numbers.tilt is None
         ):
             raise InputError(
-                "the joint covariance is that of a one-step fit with statistics of its own."
+                "the joint covariance needs a one-step fit with its own statistics."
             )
         return joint_covariance(self.problem, self.model, convention)
 
@@ -289,8 +292,8 @@ class Estimate(AnyFit):
         kind = kinds[0] if kind is None else check_choice(kind, kinds, "`kind`")
         if self.covariance is None or self.at_bound or (simulates and self.scores is None):
             raise InputError(
-                "robust standard errors are those of a fit that has standard errors, with no "
-                "parameter at a bound."
+                "robust standard errors need a fit with standard errors and no parameter at a "
+                "bound."
             )
         if simulates:
             return replace(self._robust_free_run(lags, kind), std_kind=kind)
@@ -317,7 +320,7 @@ class Estimate(AnyFit):
             or isinstance(self.problem, StreamedProblem)
         ):
             raise InputError(
-                "the fit has no statistics that robust standard errors could be made of."
+                "the fit has no statistics for robust standard errors; fit the data again."
             )
         trajectories = self.model.predict(self.problem.record).trajectories
         residual = np.concatenate([(t.measured - t.model)[t.start :] for t in trajectories])  # type: ignore[operator]
@@ -354,7 +357,7 @@ class Estimate(AnyFit):
         statistics = self.model.statistics
         if statistics.gram is None or self.model.numbers.tilt is not None:
             raise InputError(
-                "the fit has no statistics that robust standard errors could be made of."
+                "the fit has no statistics for robust standard errors; fit the data again."
             )
         steps = None if steps is None else check_count(steps, "lags")
         used = len(self.theta) + self.effective_weights

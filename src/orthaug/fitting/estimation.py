@@ -555,6 +555,6 @@ def check_record(record: Any, *, moves: bool = False) -> None:
         check_type(record, Record, "record", "a Record")
     elif moves and not isinstance(record, Record):
         raise InputError(
-            "a motion takes a Record, whose segments an engine may share out; read these rows "
-            "into memory (read_record, Record.join), or fit the physics in its lagged form."
+            "a motion needs its rows in memory: read them with read_record or Record.join, or "
+            "fit the physics in its lagged form."
         )

@@ -55,8 +55,8 @@ def choose_focus(problem: Any, fit: Fit, options: Mapping[str, Any], criterion: 
     reason = _why_not(problem, first, fit, options)
     if reason is None:
         text = (
-            "one step ahead is enough: the free run holds where nothing was fitted, and the "
-            "residual is white."
+            "one step ahead is enough: the free run is good on held-out rows, and the residual "
+            "is white."
         )
         return replace(first, focus=Focus(ONE_STEP, text))
     LOG.info("auto: %s; the free run is trained, too", reason)
@@ -89,7 +89,7 @@ def _why_not(problem: Any, first: Any, fit: Fit, options: Mapping[str, Any]) -> 
         if wrong is not None:
             return f"{wrong} {where}"
     return (
-        "its residual remembers its past, as noise on the sensor makes it"
+        "its residual is correlated with its past, as sensor noise makes it"
         if _coloured(first)
         else None
     )
@@ -273,18 +273,21 @@ def _best(choosing: _FocusChoice, reason: str) -> Any:
     )
     named = {(one.focus, one.learner): one for one in compared}
     text = (
-        f"trained one step ahead and, because {reason}, on the free run as well. Errors of "
-        "free runs where nothing was fitted, in standard deviations of the output: "
+        f"trained one step ahead and, because {reason}, on the free run as well. Errors of free "
+        "runs on held-out rows, in standard deviations of the output: "
         f"{'; '.join(one.described for one in compared)}. The result is {named[key]}."
     )
     warnings = list(best.warnings)
     if any(warning.code == NOT_CONVERGED for warning in warnings):
-        text += ' Training on the free run stopped at its limit to save time; `focus = "simulation"` goes on.'
+        text += (
+            " Training on the free run stopped at its limit to save time; `focus = "
+            '"simulation"` trains to the end.'
+        )
     if choosing.learns and not key[1]:
         rival = min((one for one in compared if one.learner), key=lambda one: one.error)
         beginning = (
-            f"no learner is better in free run where nothing was fitted ({rival.described}), "
-            "so the result is"
+            f"no learner is better in the free run on held-out rows ({rival.described}), so the "
+            "result is"
         )
         warnings.append(Warning("physics_alone", f"{beginning} {named[key].described}."))
     if lost:

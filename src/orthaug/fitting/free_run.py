@@ -53,9 +53,9 @@ def train_physics_only(
     None where no run is finite.
 
     Training starts at the one-step solution, or at the initial values where these run better. Where
-    neither run is finite, or the end diverges over whole experiments, it goes over segments that lengthen.
-    Of all ends the best over whole experiments is kept; where a start was better than them, whole
-    experiments are trained on too.
+    neither run is finite, or the end diverges over whole experiments, it goes over segments that
+    lengthen. Of all ends the best over whole experiments is kept; where a start was better than
+    them, whole experiments are trained on too.
     """
     plan = plan.alone
     objective = plan.objective(structure)

@@ -187,7 +187,7 @@ class MotionEstimate(AnyFit):
         check_choice(kind, ("batch-means", "batch-means-uneven", "autoregressive"), "`kind`")
         if self.scores is None or self.covariance is None or statistics.gram is None:
             raise InputError(
-                "the fit has no statistics that robust standard errors could be made of."
+                "the fit has no statistics for robust standard errors; fit the data again."
             )
         used = len(self.theta) + self.effective_weights
         modelled = kind == "autoregressive"
@@ -355,24 +355,23 @@ def _doubts(
     if split.slope is None:
         text = (
             "the distance between the fitted motion and the physics has no unique minimum near "
-            f"the estimate (it does not curve upwards, {split.curvature:.2g} of its curvature "
-            "at a good fit), so there are no intervals: the learner found something that "
-            "several parameters could explain as well."
+            f"the estimate, so there are no intervals. Its curvature is {split.curvature:.2g} "
+            "of that at a good fit: several parameters could explain what the learner found."
         )
         warnings.append(Warning("not_unique", text))
     if at_bound:
         text = (
-            f"at a bound: {', '.join(at_bound)}. What stands at a bound has no interval, and "
-            "the others and theirs hold with it there; data that contradict a bound contradict "
+            f"at a bound: {', '.join(at_bound)}. A parameter at a bound has no interval, and "
+            "the other estimates hold with it there. Data that contradict a bound contradict "
             "the physics or the bound."
         )
         warnings.append(Warning("at_a_bound", text))
     if unseen:
         text = (
             f"not identified: {', '.join(unseen)}. Other values, with other weights of the "
-            "learner, give the same outputs or nearly so, and what picks among them is the "
-            "prior of the weights, so there is no interval; measure more, fix one of them as a "
-            "constant, or let the learner see less or add it to fewer equations."
+            "learner, give nearly the same outputs, and only the prior of the weights decides, "
+            "so there is no interval. Measure more, fix one of them as a constant, give the "
+            "learner fewer inputs, or add it to fewer equations."
         )
         if not learns:
             text = (
@@ -386,11 +385,11 @@ def _doubts(
 def shared_in_words(shared: Shared) -> str:
     """Return the directions that the learner could imitate, in words."""
     if not shared.basis.size:
-        return "nothing: the fit tells all parameters from the learner"
+        return "nothing: the fit determines all parameters beside the learner"
     if shared.all:
         return "all parameters: they are those of the physics nearest to the fitted motion"
     moved = [" with ".join(direction) for direction in shared.directions]
     return (
-        f"{'; '.join(moved)} (by the nearest physics); told by the fit: "
+        f"{'; '.join(moved)} (by the nearest physics); determined by the fit: "
         f"{', '.join(shared.untouched) or 'none'}"
     )

@@ -127,7 +127,7 @@ def conclude_motion(
     model = replace(_model(plan, structure, learned), trained=trained)
     reason = ALONE.get(learned.ending, "") if learned.bound is None or task.physics is None else ""
     if reason and not learned.ending.usable and (where := task.problem.without_value(np.any)):
-        reason = f"{where}; mend it, or bound what it reads"
+        reason = f"{where}; correct it, or bound its parameters"
     silent = learner_silent(learned, _learner_values(plan, learned))
     reason = reason or ending_in_words(learned.ending, learned.tail)
     fit = MotionEstimate(
@@ -275,7 +275,9 @@ def reopened(model: MotionModel, record: Record) -> MotionEstimate:
     """
     kept, form, numbers = model.trained, model.form, model.numbers
     if kept is None:
-        raise InputError("the model was saved without what a split needs; fit it again.")
+        raise InputError((
+            "the model was saved without the statistics that a split needs; fit it again."
+        ))
     record = model.fitting(record, need_outputs=True)
     problem = pose_motion(record, form.motion, [entry.text for entry in form.features] or None)
     problem = replace(problem, weight=replace(problem.weight, matrix=model.weight))
@@ -293,9 +295,9 @@ def reopened(model: MotionModel, record: Record) -> MotionEstimate:
         kept.states
     ):
         raise InputError(
-            f"the model was trained on other rows: on {kept.rows} where these have "
-            f"{segmented.segments.count}, or in other experiments. Give the files, and --rows, "
-            "that it was trained on."
+            f"the model was trained on other rows: {kept.rows} instead of "
+            f"{segmented.segments.count}, or other experiments. Give the files and --rows of "
+            "its training."
         )
     c = np.asarray(numbers.theta - numbers.theta_aux)
     return MotionEstimate(

@@ -54,7 +54,7 @@ def field_under(
     if share < SUPPORTED and form.bound is not None:
         text = (
             f"only {100 * share:.0f} % of the {measure.name} measure lies within reach of the "
-            "training data: elsewhere the parameters rest on how the learner extrapolates."
+            "training data: elsewhere the parameters depend on the learner's extrapolation."
         )
         warnings = (Warning("measure_beyond_data", text),)
     return Field(at[finite], beside[finite], weight[finite] / weight.sum(), size), share, warnings

@@ -215,8 +215,8 @@ def squares(phi: Float[np.ndarray, "N ny nt"], shape: Matrix) -> Matrix:
 class EstimateHistory:
     """A row of numbers for each row of data that was used.
 
-    Columns: the row's number, the level of the alarm (above 1 it is raised), s², degrees of freedom,
-    whether θ is determined, the residuals (ny), θ (nθ), R and M (nθ² each).
+    Columns: the row's number, the level of the alarm (above 1 it is raised), s², degrees of
+    freedom, whether θ is determined, the residuals (ny), θ (nθ), R and M (nθ² each).
     """
 
     ny: int

@@ -420,13 +420,14 @@ class Recursive:
             f"memory      {memory} (forgetting {self.forgetting:.8g}), worth "
             f"{self.effective_rows:.0f} rows",
             "alarms      "
-            f"{'; '.join(map(str, self.alarms)) or 'none'}{' (it stands)' if self.alarmed else ''}",
+            f"{'; '.join(map(str, self.alarms)) or 'none'}{' (still raised)' if self.alarmed else ''}",
         ]
         if self.outside:
             lines.append(f"outside     {outside_text(self.outside, self.rows)}")
         if self.std is None:
             lines.append(
-                "intervals   none: the fit has no standard errors, or the rows do not tell θ yet"
+                "intervals   none: the fit has no standard errors, or the rows do not determine "
+                "θ yet"
             )
         rows = parameter_lines(
             self._fitted.form.baseline.parameters, self.theta, self.std, self.interval
@@ -438,8 +439,8 @@ def outside_text(outside: int, rows: int) -> str:
     """Return a sentence on the number of rows on which the learner extrapolates."""
     share = f"{percent(outside / rows)} of the rows"
     return (
-        f"the learner's inputs leave those of training on {share}: it extrapolates there, "
-        "which raises no alarm"
+        f"the learner's inputs leave their training range on {share}: it extrapolates there, "
+        "without an alarm"
     )
 
 

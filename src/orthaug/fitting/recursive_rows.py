@@ -92,8 +92,8 @@ def whitened_rows(
             f"{lag} = {value:.6g}" for lag, value in zip(model.form.layout, row, strict=True)
         )
         raise InputError(
-            f"physics or learner has no finite value at {at}; give NaN for such a row, or mend "
-            "the data."
+            f"physics or learner has no finite value at {at}; give NaN for such a row, or "
+            "correct the data."
         )
     inside = np.asarray(values[:, 0, -1] <= 1 + _RIM)
     return WhitenedRows(
@@ -185,8 +185,8 @@ _SOLVED = 1e-6  # of the residual's norm: how far Φθ may be from that of least
 _LENGTHS, _ROWS_PER_LAG = 3, 20  # of the correlation of errors; of rows that determine it
 _SMALLEST = 1e-10  # of an output's deviation: a residual is at least rounding
 MOTION = (
-    "equations of motion cannot be followed by least squares: their outputs are not linear in "
-    "the parameters. Write the physics as terms of lagged signals and fit one step ahead, or "
+    "recursive least squares cannot estimate equations of motion: their outputs are not linear "
+    "in the parameters. Write the physics as terms of lagged signals and fit one step ahead, or "
     "fit the motion again on new data."
 )
 
@@ -224,25 +224,25 @@ def trained(fit: Any, training: Record | None) -> TrainingRowsModel:
     if isinstance(fit, Estimate):
         if fit.criterion.free_run is not None:
             raise InputError(
-                "the fit is one of the free run, and recursive least squares looks one step "
-                "ahead: its θ would leave this one. Fit with criterion = Prediction()."
+                "the fit minimises the free run's error, but recursive least squares that of "
+                "one step ahead, so θ would move away. Fit with criterion = Prediction()."
             )
         if fit.at_bound:
             names = ", ".join(fit.at_bound)
             raise InputError(
-                f"{names} stand at a bound, which new rows would leave; fit without the bound."
+                f"{names} at a bound: new rows would move them across it; fit without the bound."
             )
         model, covariance, record = fit.model, fit.covariance, fit.problem.record
     else:
         model = fit
         if training is None:
             raise InputError(
-                "a saved model does not hold its training data; give them, Recursive(model, "
+                "a saved model does not contain its training data; give them, Recursive(model, "
                 "training=…)."
             )
         record = model.fitting(training, need_outputs=True)
     if not len(model.theta):
-        raise InputError("the physics has no parameter to follow.")
+        raise InputError("the physics has no parameter to estimate.")
     rows = stack_rows(record, model.form.layout)
     phi, target, _ = whitened_rows(model, rows.x, rows.y)
     lengths = tuple(len(experiment) - rows.start for experiment in record.experiments)
@@ -270,9 +270,9 @@ def _check_solved(began: TrainingRowsModel) -> None:
     rounding = 1e-10 * np.linalg.norm(began.target)
     if np.linalg.norm(basis.T @ left) > _SOLVED * np.linalg.norm(left) + rounding:
         raise InputError(
-            f"θ of the {began.model.structure} model is not the least-squares estimate of "
-            f"these {count} rows beside its learner: they are not those of its training, or a "
-            "penalty, a bound, the free run or the paper's pipeline has moved it. Give the "
+            f"θ of the {began.model.structure} model is not the least-squares estimate of these "
+            f"{count} rows with its learner. Either they are not its training rows, or a "
+            "penalty, a bound, the free run or the paper's pipeline changed θ. Give the "
             "training data, or fit with the orthogonal structure one step ahead."
         )
 
@@ -308,7 +308,8 @@ def begin(
     freedom = count * ny - nt - began.used
     if freedom < 1:
         raise InputError(
-            f"{count} training rows leave no degrees of freedom to tell noise from; use more data."
+            f"{count} training rows leave no degrees of freedom to estimate the noise; use more "
+            "data."
         )
     noise = residual.T @ residual * (ny / freedom)
     least = (_SMALLEST * model.deviation * np.diag(model.weight)) ** 2

@@ -102,7 +102,7 @@ def load(folder: Any, baseline: Baseline | None, learner: Learner | None) -> Rec
     model = storage.load(folder / _MODEL, baseline=baseline, learner=learner)
     if not isinstance(model, Model) or declared.get("model") != storage.digest(model):
         raise InputError(
-            f"{folder}: its model is not the one that was followed; copy the folder again."
+            f"{folder}: its model is not that of the recursive estimate; copy the folder again."
         )
     try:
         return _rebuilt(model, arrays)

@@ -136,8 +136,8 @@ class Augmented(MultiOutputMixin, RegressorMixin, BaseEstimator):
             if field and is_dataclass(value) and not isinstance(value, type):
                 kind = type(value).__name__
                 raise InputError(
-                    f"`{name}`: {kind} is a declaration that is exchanged whole; give `{own}` itself, in a grid "
-                    f'{{"{own}": [oa.{kind}({rest}=…), …]}}.'
+                    f"`{name}`: {kind} is one object, without parameters of its own; set "
+                    f'`{own}` itself, in a grid {{"{own}": [oa.{kind}({rest}=…), …]}}.'
                 )
         return super().set_params(**params)  # type: ignore[misc]
 
@@ -184,7 +184,7 @@ def check_there(values: np.ndarray) -> None:
     bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
     if bad.size:
         raise InputError(
-            f"the model has no finite value at row {bad[0]} of X; look at the physics there."
+            f"the model has no finite value at row {bad[0]} of X; check the physics there."
         )
 
 

@@ -95,8 +95,8 @@ def retry_warnings(
     text = (
         f"evidence left {counted_weights(effective)} of the learner, no more than a constant, "
         f"so training was tried again with {tried}. Errors in {held_out.where}, in deviations "
-        f"of the output: {found}, physics alone "
-        f"{_error(np.sqrt(mean_square(held_out.alone)))}. Kept is {kept}."
+        f"of the output: {found}, physics alone {_error(np.sqrt(mean_square(held_out.alone)))}. "
+        f"The result is {kept}."
     )
     return [Warning("evidence_retried", text)]
 
@@ -124,9 +124,10 @@ def learner_silent(learned: TrainedLearner, values: Matrix | None = None) -> lis
         return []
     left = f"training left {counted_weights(learned.effective)} of {bound.size}"
     text = (
-        f"{does} ({left}). Either there is nothing to learn from what it sees, and it can be left out, or its "
-        'regularization was too strong: compare `regularization = "none"` and a small ridge such as 0.01 on held-out '
-        "data. A constant that the physics lacks belongs into the physics."
+        f"{does} ({left}). Either its inputs explain nothing more, and it can be left out, or "
+        'its regularization was too strong. Compare `regularization = "none"` and a small ridge '
+        "such as 0.01 on held-out data. A constant that the physics lacks belongs into the "
+        "physics."
     )
     return [Warning("learner_silent", text)]
 

@@ -66,11 +66,15 @@ class Ending(IntEnum):
 
 
 ALONE = {
-    Ending.NO_DESCENT: "no step of the physics' parameters lowered the loss: the start is already a minimum, "
-    "or the free run is too steep about it. Try other initial values, or a shorter "
-    "`segment`",
-    Ending.NON_FINITE: "physics alone has no finite free run from its initial values. Give others, or bounds "
-    "that keep it from running away",
+    Ending.NO_DESCENT: (
+        "no step of the physics' parameters lowered the loss: the start is already a minimum, "
+        "or the free run is too sensitive there. Try other initial values, or a shorter "
+        "`segment`"
+    ),
+    Ending.NON_FINITE: (
+        "physics alone has no finite free run from its initial values. Give others, or bounds "
+        "that keep it from diverging"
+    ),
 }
 """The messages of a training without a learner, where others speak of one."""
 

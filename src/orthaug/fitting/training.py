@@ -143,10 +143,10 @@ def train(
         if choice.fallback and runs_freely and not held_out.ratio.value < 1:
             replacing, best = [_fell_back(held_out)], -1
             LOG.info(
-                "no free run is better than physics alone where it was not fitted: physics "
-                "alone is handed over"
+                "no free run is better than physics alone on held-out rows: the result is "
+                "physics alone"
             )
-    LOG.info("run %d is chosen of %d; 0 is physics alone", best + 1, len(runs))
+    LOG.info("run %d of %d is chosen; 0 is physics alone", best + 1, len(runs))
     alike = _members(starts, ranking, best) if choice.scored else _alike(starts, best)
     shown = alike if choice.scored and held_out is None else list(range(len(starts)))
     members = [best]
@@ -309,7 +309,7 @@ def _stopped(count: int, runs: int, untried: bool) -> list[Warning]:
     text += ", and none was tried on held-out blocks" if untried else ""
     return [
         Warning(
-            "stopped", f"{text}; the best so far is kept, which training to the end may better."
+            "stopped", f"{text}; the best run so far is kept. Training to the end may improve it."
         )
     ]
 
@@ -389,7 +389,7 @@ def _fell_back(held_out: HeldOutErrors) -> Warning:
     )
     errors = f"its error is {model:.4g} deviations of the output, that of physics alone {alone:.4g}"
     if math.isinf(model):
-        errors = "every one of its starts runs away there"
+        errors = "every one of its runs diverges there"
     text = (
         f"in {held_out.where} the learner is not better than physics alone ({errors}), so the "
         "result is physics alone; `fallback = false` keeps the learner."

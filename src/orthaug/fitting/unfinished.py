@@ -99,8 +99,8 @@ def ending_in_words(ending: Ending, tail: Tail | None) -> str:
             )
     if tail.prolonged:
         past = (
-            f"training went on past its limit of {counted(tail.limit, 'iteration')}, for the "
-            "loss still fell"
+            f"training went on past its limit of {counted(tail.limit, 'iteration')}, because "
+            "the loss still fell"
         )
         words = f"{past}; {words or ending.message}".rstrip("; ")
     return words

@@ -201,8 +201,7 @@ def prediction_std(model: Model, record: Record) -> list[Matrix]:
     joint = model.statistics.joint(len(model.theta))
     if joint is None or model.numbers.tilt is not None:
         raise InputError(
-            "the model has no statistics to take standard errors from (an ensemble, or trained "
-            "elsewhere)."
+            "the model has no statistics for standard errors (an ensemble, or trained elsewhere)."
         )
     root = joint.root()
     record = model.fitting(record, need_outputs=True)
@@ -310,7 +309,9 @@ def robust_split_covariance(
     """
     statistics, nt, ny = model.statistics, len(slope), residual.shape[1]
     if statistics.gram is None or model.numbers.tilt is not None:
-        raise InputError("the fit has no statistics that robust standard errors could be made of.")
+        raise InputError((
+            "the fit has no statistics for robust standard errors; fit the data again."
+        ))
     prior = np.concatenate([np.zeros(nt), np.full(len(statistics.gram) - nt, statistics.ridge)])
     half = half_inverse(statistics.gram + np.diag(prior), nt)
     root = half @ (half.T @ np.column_stack([np.eye(nt), slope]).T)

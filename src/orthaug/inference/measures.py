@@ -360,8 +360,8 @@ def weigh(
             for lag, value in zip(support.layout, points.x[point], strict=True)
         )
         raise InputError(
-            f"the physics is not finite on all points of the {measure.name} measure: what "
-            f"{baseline.names[column]} multiplies is not at {at}. Take the training measure, "
+            f"the physics is not finite on all points of the {measure.name} measure: the "
+            f"regressor of {baseline.names[column]} is not at {at}. Take the training measure, "
             "or a uniform one over a box where it is."
         )
     unit = np.sqrt(points.weight)[:, None, None] * weight

@@ -65,18 +65,18 @@ def shared_warnings(shared: Shared | None, inputs: Sequence[str]) -> list[Warnin
         return []
     found, sees = [], ", ".join(inputs)
     remedy = (
-        "Give data in which it moves by itself, a learner that sees less, or name what the learner may add "
-        '(kind = "terms").'
+        "Give data in which it moves independently, a learner with fewer inputs, or a learner "
+        'of named terms (kind = "terms").'
     )
     if shared.on_data:
         share = dict(zip(shared.names, shared.rest.share, strict=True))
         names = " and ".join(f"{name} ({percent(share[name], 2)} left)" for name in shared.on_data)
         text = (
-            f"on these rows functions of what the learner sees ({sees}) follow the regressor "
-            f"of {names}, although its expression reads something else; of functions that the "
-            f"learner itself could be they leave up to {percent(shared.rest.limit, 2)}. The "
-            "data do not tell it from the learner: it is split off as what the learner could "
-            f"imitate is, and its interval counts no share that the learner took. {remedy}"
+            f"on these rows, functions of the learner's inputs ({sees}) follow the regressor of "
+            f"{names}, although its expression reads other signals. They leave up to "
+            f"{percent(shared.rest.limit, 2)} of the learner's own functions. The data do not "
+            "separate it from the learner: it is split off as a direction that the learner "
+            f"could imitate. Its interval excludes any share that the learner took. {remedy}"
         )
         found.append(Warning("shared_on_data", text))
     nearly = {name: share for name, share in shared.nearly.items() if name not in shared.on_data}
@@ -85,9 +85,8 @@ def shared_warnings(shared: Shared | None, inputs: Sequence[str]) -> list[Warnin
             f"{percent(share, 2)} of the regressor of {name}" for name, share in nearly.items()
         )
         text = (
-            f"functions of what the learner sees ({sees}) leave {names} on these rows: the fit "
-            "determines it from that part alone, and its interval is as wide as that part "
-            f"allows. {remedy}"
+            f"functions of the learner's inputs ({sees}) leave {names} on these rows. The fit "
+            f"determines it from that part alone, which sets the width of its interval. {remedy}"
         )
         found.append(Warning("nearly_shared", text))
     return found

@@ -336,8 +336,7 @@ def _consistency(chi2: float, df: int, freedom: float, held: bool) -> Consistenc
 
 def _at_bounds(physics: PhysicsMap, value: Vector, held: Bool[np.ndarray, "n"]) -> list[Warning]:
     text = (
-        "{} stands at its bound {:g} and has no standard error; those of the others hold with "
-        "it there."
+        "{} is at its bound {:g} and has no standard error; those of the others hold with it there."
     )
     return [
         Warning("at_a_bound", text.format(name, v))
@@ -353,8 +352,8 @@ def _elsewhere(physics: PhysicsMap, others: Sequence[Vector]) -> list[Warning]:
         f"{name} = {v:.6g}" for name, v in zip(physics.names, others[0], strict=True)
     )
     text = (
-        f"theta is explained as well by {listed}; bounds or better initial values choose "
-        "between the solutions."
+        f"{listed} explain theta equally well; give bounds or better initial values to choose a "
+        "solution."
     )
     return [Warning("several_solutions", text)]
 

@@ -106,7 +106,7 @@ def split_under(
     )
     learns = form.bound is not None
     warning = Warning(
-        "measure_beyond_data", f"{reach}: elsewhere θ rests on how the learner extrapolates."
+        "measure_beyond_data", f"{reach}: elsewhere θ depends on the learner's extrapolation."
     )
     warnings = (warning,) if share < SUPPORTED and learns else ()
     condition = weighed.excitation.condition

@@ -225,7 +225,8 @@ class Motion(NotebookView):
             raise InputError("the motion has no states; give at least one with its equation.")
         if not outputs:
             raise InputError(
-                "the motion has no outputs; say how the measured channels follow from the states."
+                "the motion has no outputs; give an expression of the states for each measured "
+                "channel."
             )
         check_parameters(parameters, constants, FUNCTIONS)
         motion = cls(

@@ -195,8 +195,8 @@ def _features(motion: Motion, texts: Sequence[str] | None) -> tuple[Expression, 
     texts = (*motion.names_of_states, *motion.inputs) if texts is None else tuple(texts)
     if not texts:
         raise InputError(
-            "the learner sees nothing; give `inputs` such as a state's name, or leave it out "
-            "for all."
+            "the learner has no inputs; give `inputs` such as a state's name, or leave the key "
+            "out for all."
         )
     found = []
     for text in texts:
@@ -214,12 +214,13 @@ def _check_start(problem: MotionProblem) -> None:
     """Raise InputError where equations have no value at the start, or a mode is too fast."""
     motion, where = problem.motion, problem.without_value(np.all)
     if where:
-        raise InputError(f"{where}; mend it, or start elsewhere.")
+        raise InputError(f"{where}; correct it, or change the initial values.")
     if motion.integrator == "rk4" and problem.substeps > MOST_SUBSTEPS:
         raise InputError(
-            f"the sampling time of {problem.record.sampling_time:g} s is too long for the fastest mode of the motion, "
-            f"{problem.fastest:.3g} 1/s: it would take {problem.substeps} substeps, at most {MOST_SUBSTEPS} are made. "
-            'Use `integrator = "exact"`, check units and initial values, or leave the fast mode out.'
+            f"the sampling time of {problem.record.sampling_time:g} s is too long for the "
+            f"fastest mode of the motion, {problem.fastest:.3g} 1/s: it needs "
+            f"{problem.substeps} substeps, but at most {MOST_SUBSTEPS} are allowed. Use "
+            '`integrator = "exact"`, check units and initial values, or leave the fast mode out.'
         )
 
 

@@ -259,7 +259,8 @@ class PhysicsMap:
                 what = f"is {value}" if not np.isfinite(value) else "has no finite derivative"
                 raise InputError(
                     f"physics.theta '{name}' = {expression} {what} at the initial values of "
-                    f"{', '.join(self.names)}; expected a finite one: start elsewhere."
+                    f"{', '.join(self.names)}; expected a finite value: change the initial "
+                    "values."
                 )
 
 
@@ -352,7 +353,7 @@ def _check_identifiable(physics: PhysicsMap) -> None:
         raise InputError(
             f"theta does not determine the physical parameters: {tied(best)} "
             f"({len(physics.theta_names)} theta, rank {best.rank} of {best.columns}). Make one "
-            "of them a constant, or add a term that tells them apart."
+            "of them a constant, or add a term that distinguishes them."
         )
 
 
@@ -361,7 +362,7 @@ def tied(sensitivity: Excitation) -> str:
     return "; ".join(
         f"{group[0]} has no effect"
         if len(group) == 1
-        else f"{', '.join(group)} cannot be told apart"
+        else f"{', '.join(group)} cannot be distinguished"
         for group in sensitivity.collinear
     )
 

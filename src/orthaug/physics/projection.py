@@ -74,7 +74,8 @@ class Factor:
     def without_null(self, directions: Float[np.ndarray, "nt s"]) -> Float[np.ndarray, "nt r"]:
         """Return a basis of some directions of θ without those that Φ takes to zero.
 
-        Without such directions, they are returned unchanged. A parameter that appears in none of the rows has a column of zeros.
+        Without such directions, they are returned unchanged. A parameter that appears in none of
+        the rows has a column of zeros.
         """
         moved = self.to_coordinates @ directions
         size = np.linalg.norm(moved, axis=0)
