@@ -174,10 +174,7 @@ def test_a_record_that_is_too_short_for_blocks_has_the_errors_of_its_colour():
             inside[i] += np.mean((fit.interval[:, 0] <= THETA) & (fit.interval[:, 1] >= THETA)) / 40
     assert inside[0] < 0.75 and 0.88 < inside[1] <= 0.99
     fit = default(flown(0, 0.9, 50))
-    assert (
-        fit.std_kind == "autoregressive"
-        and "robust (autoregressive errors)" in fit.summary()
-    )
+    assert fit.std_kind == "autoregressive" and "robust (autoregressive errors)" in fit.summary()
 
 
 def test_errors_that_remember_for_too_long_have_no_interval():

@@ -235,8 +235,8 @@ def test_two_solutions_are_told():
     found = solve(one("(m - 2)**2", initial=3.5), np.array([1.0]), None, freedom=10)
     np.testing.assert_allclose(found.value, [3.0], rtol=1e-12)
     assert texts(found)[0] == (
-        "m = 1 explain theta equally well; give bounds or better initial values to choose "
-        "a solution."
+        "theta is explained equally well by m = 1; give bounds or better initial values to "
+        "choose a solution."
     )
     alone = solve(one("(m - 2)**2", initial=3.5, min=2.0), np.array([1.0]), None, freedom=10)
     assert not any("as well" in text for text in texts(alone))

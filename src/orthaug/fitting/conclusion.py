@@ -82,9 +82,7 @@ def conclude(task: OneStepTask, structure: Structure, learned: TrainedLearner) -
     if any(warning.code == NOT_CONVERGED for warning in warnings):
         pass
     elif known and errors.covariance is None and learned.errors is None:
-        text = (
-            "no standard errors: an ensemble has none where its learner sees only some features."
-        )
+        text = "no standard errors: an ensemble has none where its learner sees only some features."
         warnings.append(Warning("no_standard_errors", text))
     elif (
         known

@@ -139,7 +139,7 @@ class Simulation:
             above.
 
     Examples:
-        >>> Simulation(segment=0, washout=0).estimates_pasts  # whole experiments, from starts that are estimated
+        >>> Simulation(segment=0, washout=0).estimates_pasts  # whole experiments, estimated starts
         True
     """
 

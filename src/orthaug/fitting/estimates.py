@@ -129,8 +129,10 @@ class Estimate(AnyFit):
     covariance: Matrix | None
     """Cov θ̂ (nθ, nθ); None where θ has no standard error."""
     freedom: float
-    """Degrees of freedom of the residual, rows less parameters less effective weights; of robust errors on the free run
-    blocks less one."""
+    """Degrees of freedom of the residual: rows less parameters less effective weights.
+
+    For robust errors on the free run: blocks less one.
+    """
     effective_weights: float
     defect: float | None
     """‖QᵀF̃‖ / ‖F‖ over the training rows: how much of the learner the physics could express; None
@@ -260,9 +262,7 @@ class Estimate(AnyFit):
         if self.criterion.free_run is not None or (
             self.model.statistics.gram is None and self.model.numbers.tilt is None
         ):
-            raise InputError(
-                "the joint covariance needs a one-step fit with its own statistics."
-            )
+            raise InputError("the joint covariance needs a one-step fit with its own statistics.")
         return joint_covariance(self.problem, self.model, convention)
 
     def robust(self, lags: int | None = None, kind: str | None = None) -> Estimate:
@@ -300,7 +300,9 @@ class Estimate(AnyFit):
         if kind == "hc3":
             return self._hc3()
         trajectories = self.model.predict(self.problem.record).trajectories
-        residual = np.concatenate([(t.measured - t.model)[t.start :] for t in trajectories])  # type: ignore[operator]
+        errors = [t.measured - t.model for t in trajectories]  # type: ignore[operator]
+        starts = [t.start for t in trajectories]
+        residual = np.concatenate([e[s:] for e, s in zip(errors, starts, strict=True)])
         used = (self.problem, residual, self.effective_weights, lags)
         if self.measure is None and self.model.shared is None:
             covariance = robust_covariance(*used)
@@ -323,7 +325,9 @@ class Estimate(AnyFit):
                 "the fit has no statistics for robust standard errors; fit the data again."
             )
         trajectories = self.model.predict(self.problem.record).trajectories
-        residual = np.concatenate([(t.measured - t.model)[t.start :] for t in trajectories])  # type: ignore[operator]
+        errors = [t.measured - t.model for t in trajectories]  # type: ignore[operator]
+        starts = [t.start for t in trajectories]
+        residual = np.concatenate([e[s:] for e, s in zip(errors, starts, strict=True)])
         slopes, share = (
             one_step_slopes(self.problem, self.model),
             self.problem.count / len(self.problem.rows),

@@ -188,7 +188,8 @@ def estimate(
         >>> from orthaug.physics.baseline import Term
         >>> u = np.linspace(-1, 1, 200)
         >>> record = Record.from_arrays(u=u, y=2 * u + u**2)
-        >>> fit = estimate(record, Baseline.from_terms([Term("gain", "u[k]")]), learner=MLP(hidden=(4,)))
+        >>> physics = Baseline.from_terms([Term("gain", "u[k]")])
+        >>> fit = estimate(record, physics, learner=MLP(hidden=(4,)))
         >>> f"{fit.theta[0]:.3f}"
         '2.000'
     """

@@ -29,9 +29,11 @@ ONE_STEP, FREE_RUN = "prediction", "simulation"
 BLOCKS = 4  # blocks that are held out in turn where that is not said
 HALVES = 2  # the later one is run over by a fit to the other
 _SLACK = 1.02  # errors closer than this are the same: then the simpler candidate stays
-_PREFERRED = 1.1  # physics alone one step ahead has to be better by this to be preferred to that of the free run
+# physics alone one step ahead has to be better by this to be preferred to that of the free run
+_PREFERRED = 1.1
 _LAGS = 20  # of the residual's autocorrelation
-_COLOURED = 0.1  # autocorrelation from which a residual is no noise of the equation, where it is significant, too
+# autocorrelation from which a residual is no noise of the equation, where it is significant, too
+_COLOURED = 0.1
 _SIGNIFICANT = 4.0  # standard deviations of the autocorrelation of white noise: one lag in 16,000
 
 Fit = Callable[..., Any]

@@ -35,9 +35,11 @@ if TYPE_CHECKING:
 
     from orthaug.fitting.segmented_motion import SegmentedMotion
 
-_UNSEEN = 1e-3  # share of a parameter in directions that no output shows, above which it is not identified
+# share of a parameter in directions that no output shows, above which it is not identified
+_UNSEEN = 1e-3
 _VAGUE = 1.0  # standard error of a logarithm above which only the order of magnitude is known
-_LEANING = 2.0  # times wider an interval without the prior of the weights: three quarters of what is known is the prior
+# times wider an interval without the prior of the weights: the prior is 3/4 of the information
+_LEANING = 2.0
 _ROUNDING = 1e-11  # of the largest eigenvalue of the information with unit columns
 
 

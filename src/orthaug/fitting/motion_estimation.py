@@ -275,9 +275,9 @@ def reopened(model: MotionModel, record: Record) -> MotionEstimate:
     """
     kept, form, numbers = model.trained, model.form, model.numbers
     if kept is None:
-        raise InputError((
+        raise InputError(
             "the model was saved without the statistics that a split needs; fit it again."
-        ))
+        )
     record = model.fitting(record, need_outputs=True)
     problem = pose_motion(record, form.motion, [entry.text for entry in form.features] or None)
     problem = replace(problem, weight=replace(problem.weight, matrix=model.weight))

@@ -193,7 +193,7 @@ class MotionTask(SimulationTask):
         criterion: Criterion,
         engine: Engine | None = None,
     ) -> MotionTask:
-        """Bind a learner to its equations and outputs, and lay out the record.
+        """Bind a learner to its equations and outputs, and cut the record into segments.
 
         Raises:
             InputError: nothing would be scored.

@@ -115,7 +115,7 @@ class OneStepTask(TrainingRows):
 
     @property
     def alone(self) -> OneStepTask:
-        """The same rows without a learner."""
+        """The task without a learner."""
         problem, scaling = (
             replace(self.problem, features=Features(())),
             Scaling(np.zeros(0), np.ones(0)),

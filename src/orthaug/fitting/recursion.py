@@ -293,7 +293,9 @@ def covariances(
     if inflation is None or not determined.any():
         return result
     half = _half(r[determined], squared[determined])
-    result[determined] = level[determined, None, None] * (half @ inflation @ np.swapaxes(half, 1, 2))
+    result[determined] = level[determined, None, None] * (
+        half @ inflation @ np.swapaxes(half, 1, 2)
+    )
     return result
 
 

@@ -86,7 +86,8 @@ class Recursive:
         >>> u = np.sin(np.arange(300.0) ** 1.1)
         >>> noise = 0.1 * np.cos(37 * np.arange(300.0) ** 1.3)
         >>> record = Record.from_arrays(u, 2 * u + noise)
-        >>> online = Recursive(estimate(record, Baseline.from_terms([Term("gain", "u[k]")]), learner=None), memory=50)
+        >>> fit = estimate(record, Baseline.from_terms([Term("gain", "u[k]")]), learner=None)
+        >>> online = Recursive(fit, memory=50)
         >>> alarms = online.update(u=u[:200], y=2.4 * u[:200] + noise[:200])
         >>> f"{online.theta[0]:.1f}"
         '2.4'
@@ -415,12 +416,12 @@ class Recursive:
         memory = (
             "everything" if self.forgetting == 1 else f"{-step / math.log(self.forgetting):.4g} s"
         )
+        alarms = "; ".join(map(str, self.alarms)) or "none"
         lines = [
             f"rows        {self.rows}, {self.rows * step:g} s",
             f"memory      {memory} (forgetting {self.forgetting:.8g}), worth "
             f"{self.effective_rows:.0f} rows",
-            "alarms      "
-            f"{'; '.join(map(str, self.alarms)) or 'none'}{' (still raised)' if self.alarmed else ''}",
+            f"alarms      {alarms}{' (still raised)' if self.alarmed else ''}",
         ]
         if self.outside:
             lines.append(f"outside     {outside_text(self.outside, self.rows)}")

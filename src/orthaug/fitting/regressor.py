@@ -59,7 +59,8 @@ class AugmentedRegressor(Augmented):
         >>> import numpy as np
         >>> from orthaug.models.learners import MLP
         >>> x = np.linspace(-1, 1, 200)[:, None]
-        >>> fitted = AugmentedRegressor({"gain": "x0"}, learner=MLP(hidden=(4,))).fit(x, 2 * x[:, 0] + x[:, 0] ** 2)
+        >>> regressor = AugmentedRegressor({"gain": "x0"}, learner=MLP(hidden=(4,)))
+        >>> fitted = regressor.fit(x, 2 * x[:, 0] + x[:, 0] ** 2)
         >>> f"{fitted.theta_[0]:.3f}"
         '2.000'
     """

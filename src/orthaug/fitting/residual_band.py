@@ -199,10 +199,9 @@ def _colour(stretches: Sequence[Matrix]) -> Matrix:
     for order in range(most + 1):
         colour, cost = np.zeros((order, ny)), ny * order * math.log(rows)
         for i in range(ny):
-            past = np.concatenate(
-                [np.stack([s[_MOST_LAGS - j : len(s) - j, i] for j in range(1, order + 1)], 1) if order else
-                 np.zeros((len(s) - _MOST_LAGS, 0)) for s in long]
-            )  # fmt: skip
+            past = np.zeros((rows, order))
+            for j in range(1, order + 1):
+                past[:, j - 1] = np.concatenate([s[_MOST_LAGS - j : len(s) - j, i] for s in long])
             now = np.concatenate([s[_MOST_LAGS:, i] for s in long])
             colour[:, i] = np.linalg.lstsq(past, now, rcond=None)[0]
             cost += rows * math.log(max(float(np.mean((now - past @ colour[:, i]) ** 2)), 1e-300))

@@ -23,7 +23,8 @@ from orthaug.models.lagged import Lagged
 from orthaug.models.learners import Bound
 from orthaug.physics.problem import Problem
 
-_SMALL = 4096  # steps: a run over more of them than are needed takes less time than to compile for their number
+# steps: a run over more of them than are needed takes less time than to compile for their number
+_SMALL = 4096
 
 
 def lagged(task: OneStepTask) -> Lagged:
@@ -86,7 +87,7 @@ class SegmentedLagged(SegmentedProblem):
 
     @cached_property
     def alone(self) -> SegmentedLagged:
-        """The same rows and segments without a learner."""
+        """The problem without a learner."""
         alone, task = self.dynamics.alone, self.task.alone
         return replace(
             self, task=task, dynamics=alone, scaling=task.scaling, unit=task.unit, fixed={}

@@ -93,7 +93,7 @@ class SegmentedMotion(SegmentedProblem):
 
     @property
     def alone(self) -> SegmentedMotion:
-        """The same segments without a learner."""
+        """The problem without a learner."""
         nothing = Scaling(np.zeros(0), np.ones(0))
         return replace(self, dynamics=self.dynamics.alone, scaling=nothing, unit=np.ones(0))
 

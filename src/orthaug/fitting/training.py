@@ -28,7 +28,8 @@ from orthaug.fitting.status import Ending
 from orthaug.fitting.structures import Orthogonal, Structure
 from orthaug.models.learners import Bound
 
-_INFLATION = 1.4  # of the effective weights in cross-validation, against what follows the noise (Kim and Gu 2004)
+# of the effective weights in cross-validation, against following the noise (Kim and Gu 2004)
+_INFLATION = 1.4
 FOLD_ITERATIONS = 60  # enough to see whether a learner helps, on every block of cross-validation
 
 
@@ -61,7 +62,7 @@ class Choice:
     With `scored` and without `validation` it is the lowest generalised cross-validation instead,
     one step ahead.
 
-    With `fallback` physics alone is handed over where no free run is better there. An `ensemble`
+    With `fallback` the result is physics alone where no free run is better there. An `ensemble`
     takes them all.
     """
 

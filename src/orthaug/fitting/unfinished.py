@@ -21,7 +21,8 @@ from orthaug.inference.measures import Training
 from orthaug.physics.problem import Problem
 
 NOT_CONVERGED = "not_converged"
-_SETTLED_THETA = 1e-3  # of the loss: half of that is what the standard errors of a θ that does not move change by
+# of the loss: the standard errors of a θ that does not move change by half of that
+_SETTLED_THETA = 1e-3
 
 
 def noticeable_fall(structure: Structure, decoupled: bool, samples: int) -> float:

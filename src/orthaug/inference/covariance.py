@@ -175,7 +175,8 @@ def joint_covariance(problem: Problem, model: Model, convention: str = "calibrat
     change = np.eye(len(outer))
     change[:nt, :nt] = projection.r / projection.scale
     outer, middle = (change.T @ gram @ change for gram in (outer, middle))
-    # block by block, as in the proof: one inverse of both mixes rounding of the weights' singular block into θ's
+    # block by block, as in the proof: one inverse of both mixes rounding of the weights'
+    # singular block into θ's
     half: Any = scipy.linalg.block_diag(
         half_inverse(outer[:nt, :nt], nt), half_inverse(outer[nt:, nt:], 0)
     )
@@ -309,9 +310,9 @@ def robust_split_covariance(
     """
     statistics, nt, ny = model.statistics, len(slope), residual.shape[1]
     if statistics.gram is None or model.numbers.tilt is not None:
-        raise InputError((
+        raise InputError(
             "the fit has no statistics for robust standard errors; fit the data again."
-        ))
+        )
     prior = np.concatenate([np.zeros(nt), np.full(len(statistics.gram) - nt, statistics.ridge)])
     half = half_inverse(statistics.gram + np.diag(prior), nt)
     root = half @ (half.T @ np.column_stack([np.eye(nt), slope]).T)

@@ -26,7 +26,8 @@ from orthaug.models.statistics import Statistics, column_units, half_inverse
 from orthaug.physics.problem import Problem
 
 LARGEST = 30_000_000  # entries of ψ that are made at once, 240 MB
-_MOST_PRODUCTS = 30  # entries of b bᵀ that the squared errors are regressed on; of more parameters only the squares
+# entries of b bᵀ that the squared errors are regressed on; of more parameters only the squares
+_MOST_PRODUCTS = 30
 _ROWS_PER_PRODUCT = 20
 _RANK = 1e-8  # of the largest singular value of the products with columns of size 1
 

@@ -34,7 +34,8 @@ from orthaug.physics.projection import Projection
 _NODES = (1 << 20, 512, 64)  # of the rule for one, two and three coordinates, in each of them
 _PANEL = 8  # Gauss-Legendre nodes of a panel
 _QUASI_RANDOM = 1 << 17  # points for more coordinates, doubled by their mirror images
-_NEIGHBOURS = 20_000  # points at most, of the data and of the measure, by which the reach of the data is judged
+# points at most, of the data and of the measure, by which the reach of the data is judged
+_NEIGHBOURS = 20_000
 
 
 class Points(NamedTuple):

@@ -17,7 +17,8 @@ from orthaug._base.lines import percent
 from orthaug.models.statistics import JointCovariance, Statistics
 from orthaug.physics.shared import Shared
 
-_NOTHING = 1e-3  # share of a direction's squares below which it is split off, and has the variance of the split
+# share of a direction's squares below which it is split off, and has the variance of the split
+_NOTHING = 1e-3
 
 
 def grown(

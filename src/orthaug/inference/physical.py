@@ -352,8 +352,8 @@ def _elsewhere(physics: PhysicsMap, others: Sequence[Vector]) -> list[Warning]:
         f"{name} = {v:.6g}" for name, v in zip(physics.names, others[0], strict=True)
     )
     text = (
-        f"{listed} explain theta equally well; give bounds or better initial values to choose a "
-        "solution."
+        f"theta is explained equally well by {listed}; give bounds or better initial values to "
+        "choose a solution."
     )
     return [Warning("several_solutions", text)]
 

@@ -93,7 +93,8 @@ class Term:
     be left out where there is only one.
 
     Examples:
-        >>> Baseline.from_terms([Term("one", "y[k-1]", initial=1.0, fixed=True), Term("b", "Ts*u[k-1]", unit="m/N")])
+        >>> kept = Term("one", "y[k-1]", initial=1.0, fixed=True)
+        >>> Baseline.from_terms([kept, Term("b", "Ts*u[k-1]", unit="m/N")])
         Baseline(1*y[k-1] + b*(Ts*u[k-1]))
     """
 
@@ -133,7 +134,8 @@ class Baseline(NotebookView):
             alone = re.fullmatch(r"\w+\[[^][]*\]", term.regressor)
             regressor = term.regressor if alone else f"({term.regressor})"
             sums.setdefault(term.output or "", []).append(f"{factor}*{regressor}")
-        return f"Baseline({'; '.join(f'{name} = ' * bool(name) + ' + '.join(terms) for name, terms in sums.items())})"
+        outputs = (f"{name} = " * bool(name) + " + ".join(terms) for name, terms in sums.items())
+        return f"Baseline({'; '.join(outputs)})"
 
     @classmethod
     def from_terms(

@@ -128,7 +128,8 @@ def identifiability(
         >>> from orthaug.data.regressors import Lags
         >>> from orthaug.physics.baseline import Term
         >>> twice = Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "2*y[k-1]")])
-        >>> identifiability(twice, Lags(na=1).layout(["y"], []), ["y"], np.array([[0.0], [1.0]])).rank
+        >>> layout = Lags(na=1).layout(["y"], [])
+        >>> identifiability(twice, layout, ["y"], np.array([[0.0], [1.0]])).rank
         1
     """
     nt = len(baseline.names)

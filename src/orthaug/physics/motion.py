@@ -81,8 +81,12 @@ class Motion(NotebookView):
 
     Examples:
         >>> motion = Motion.from_equations(
-        ...     states=[State("v", "(force - c*v)/m", start=0.0)], outputs=[Output("speed", "v")], inputs=["force"],
-        ...     parameters=[PhysicalParameter("m", 2.0, "kg", min=0), PhysicalParameter("c", 1.0, "N s/m")])
+        ...     states=[State("v", "(force - c*v)/m", start=0.0)],
+        ...     outputs=[Output("speed", "v")], inputs=["force"],
+        ...     parameters=[
+        ...         PhysicalParameter("m", 2.0, "kg", min=0), PhysicalParameter("c", 1.0, "N s/m")
+        ...     ],
+        ... )
         >>> motion.rates(np.array([3.0]), np.array([1.0]), motion.initial, np)
         array([-1.])
     """
