@@ -280,7 +280,7 @@ def fit(
     _check_types(learner=learner, structure=structure, criterion=criterion, solver=solver)
     _check_types(initial=initial, validation=validation)
     _check_splittable(structure, problem.baseline, learner)
-    if criterion.automatic and _undecided(
+    if criterion.automatic and _may_decide(
         problem, solver, structure, warm=initial is not None, ensemble=ensemble
     ):
         options: dict[str, Any] = {
@@ -302,7 +302,7 @@ def fit(
             "checkpoints": checkpoints,
         }
         return choose_focus(problem, fit, options, criterion)
-    criterion = _settled(criterion, problem)
+    criterion = _settle(criterion, problem)
     blocks = _check_blocks(blocks)
     given = {
         "linear": problem.baseline.linear,
@@ -358,7 +358,7 @@ def _again(problem: Problem, last: Estimate, **options: Any) -> Estimate:
     return fit(problem, initial=start, regularization=chosen, **options)
 
 
-def _undecided(
+def _may_decide(
     problem: Problem, solver: Solver, structure: Structure, *, warm: bool, ensemble: bool
 ) -> bool:
     """Return whether the data may decide for the free run.
@@ -371,7 +371,7 @@ def _undecided(
     return able and not (warm or ensemble or structure.from_initial)
 
 
-def _settled(criterion: Criterion, problem: Problem) -> Criterion:
+def _settle(criterion: Criterion, problem: Problem) -> Criterion:
     """Return the criterion with its open choices made for the record.
 
     One step ahead where nothing else can be trained.

@@ -92,7 +92,7 @@ def _why_not(problem: Any, first: Any, fit: Fit, options: Mapping[str, Any]) -> 
             return f"{wrong} {where}"
     return (
         "its residual is correlated with its past, as sensor noise makes it"
-        if _coloured(first)
+        if _is_coloured(first)
         else None
     )
 
@@ -146,7 +146,7 @@ def _quick(options: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _coloured(fit: Any) -> bool:
+def _is_coloured(fit: Any) -> bool:
     """Return whether the one-step residual is clearly correlated with its past.
 
     And by more than a little.
@@ -265,7 +265,7 @@ def _best(choosing: _FocusChoice, reason: str) -> Any:
     Only candidates whose free run over all rows is sound count.
     """
     errors = choosing.errors
-    ranked = _ranked(errors, with_learner=choosing.learns and not choosing.options["fallback"])
+    ranked = _rank(errors, with_learner=choosing.learns and not choosing.options["fallback"])
     chosen = next((key for key in ranked if _sound(choosing, key)), None)
     lost = chosen is None
     key = (ONE_STEP, False) if chosen is None else chosen
@@ -305,7 +305,7 @@ def _best(choosing: _FocusChoice, reason: str) -> Any:
     )
 
 
-def _ranked(errors: Mapping[Key, float], *, with_learner: bool) -> list[Key]:
+def _rank(errors: Mapping[Key, float], *, with_learner: bool) -> list[Key]:
     """Return the candidates by error, of similar ones the simplest first.
 
     Wanted learners before physics.

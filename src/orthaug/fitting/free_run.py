@@ -70,7 +70,7 @@ def train_physics_only(
     if np.isfinite(losses).any():
         ends.append(plan.descend(objective, starts[int(np.argmin(losses))], solver, progress))
     if not np.isfinite(losses[0]) or not ends or not np.isfinite(ends[0].mean_square):
-        ends += _lengthening(plan, solver, structure, starts)
+        ends += _lengthen(plan, solver, structure, starts)
     if plan.whole is not plan.segments and plan.lengthens:
         ends += _over_whole(plan, solver, structure, starts, ends)
     best = _best(ends)
@@ -78,7 +78,7 @@ def train_physics_only(
     return None if best is None else best._replace(**spent)
 
 
-def _lengthening(
+def _lengthen(
     plan: SegmentedLagged,
     solver: LevenbergMarquardt,
     structure: Structure,

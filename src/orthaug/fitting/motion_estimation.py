@@ -204,11 +204,11 @@ def _model(plan: SegmentedMotion, structure: Structure, learned: TrainedLearner)
     return (
         model
         if model.form.bound is None
-        else _limited(replace(model, seen=_seen(model, record)), record)
+        else _with_limits(replace(model, seen=_feature_range(model, record)), record)
     )
 
 
-def _limited(model: MotionModel, record: Record) -> MotionModel:
+def _with_limits(model: MotionModel, record: Record) -> MotionModel:
     """Return the model with the range of its features over the fitted run.
 
     Beyond that range the correction stays constant or fades.
@@ -225,7 +225,7 @@ def _limited(model: MotionModel, record: Record) -> MotionModel:
     return replace(model, numbers=model.numbers._replace(limits=limits, pull=pull))
 
 
-def _seen(model: MotionModel, record: Record) -> Matrix | None:
+def _feature_range(model: MotionModel, record: Record) -> Matrix | None:
     """Return the least and largest (2, nz) of the learner's features over the free run.
 
     None where it has no finite ones.

@@ -101,14 +101,14 @@ def wobble(
         states, *map(np.asarray, segments[1:]), slope, strict=True
     ):
         n0 = start.shape[0]
-        found = np.asarray(_summed(form, numbers, start, inputs, scored, q, size))
+        found = np.asarray(_sum_over(form, numbers, start, inputs, scored, q, size))
         of_start = np.moveaxis(found[:, :n0], -1, 0)  # (m, np, n0)
         total += found[:, n0:].sum(axis=-1) - np.einsum("mqi,min->qn", of_start, own)
     return total / segments.count
 
 
 @partial(jax.jit, static_argnames="form")
-def _summed(
+def _sum_over(
     form: MotionDynamics,
     numbers: Numbers,
     state: Float[Array, "n0 m"],

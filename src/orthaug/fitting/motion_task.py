@@ -63,7 +63,7 @@ def train_motion_physics(
     q, rows = initial, None
     for length in lengths:
         short = own.over(length)
-        end = _descended(short, solver.at_most(_SHORT_ITERATIONS), [q, initial], rows)
+        end = _descend(short, solver.at_most(_SHORT_ITERATIONS), [q, initial], rows)
         if end is None:
             q, rows = initial, None
             continue
@@ -73,7 +73,7 @@ def train_motion_physics(
     for start, known in ((q, rows), (initial, None)):
         if start is initial and ends and (q is initial or _follows(own, ends[0])):
             continue
-        end = _descended(own, solver, [start], known, progress)
+        end = _descend(own, solver, [start], known, progress)
         if end is not None:
             ends.append(end)
             iterations, seconds = iterations + end.iterations, seconds + end.seconds
@@ -90,7 +90,7 @@ def train_motion_physics(
     return segmented, best._replace(mean_square=mean_square, iterations=iterations, seconds=seconds)
 
 
-def _descended(
+def _descend(
     segmented: SegmentedMotion,
     solver: LevenbergMarquardt,
     starts: list[Vector],
@@ -147,7 +147,7 @@ def _fine_enough(
         finer = segmented.refined(2 * segmented.dynamics.substeps)
         if moved_by(segmented.alone, finer.alone, free_fit) <= _FINE:
             break
-        again = _descended_on(finer.alone, solver, free_fit)
+        again = _descend_on(finer.alone, solver, free_fit)
         if again is None:
             break
         segmented, free_fit = finer, again
@@ -171,7 +171,7 @@ def moved_by(segmented: SegmentedMotion, finer: SegmentedMotion, free_fit: FreeR
     return float(ratio) if np.isfinite(ratio) else 0.0
 
 
-def _descended_on(
+def _descend_on(
     segmented: SegmentedMotion, solver: LevenbergMarquardt, free_fit: FreeRunFit
 ) -> FreeRunFit | None:
     point = free_fit.end.point

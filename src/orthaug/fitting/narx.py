@@ -156,7 +156,7 @@ class AugmentedNARX(Augmented):
         found = np.full(y.shape, np.nan)
         for group in _groups(groups, len(X)):
             found[group.rows] = model.predict(self._record(X, y, [group])).model
-        return self._shaped(found)
+        return self._shape(found)
 
     def simulate(self, X: Any, initial: Any = None, groups: Any = None) -> np.ndarray:
         """Return ŷ of the free run, whose past outputs are the model's own.
@@ -182,7 +182,7 @@ class AugmentedNARX(Augmented):
                 given = np.asarray(initial)[group.rows] if whole else initial
                 begin = as_signal(given[: self.first_row_] if np.ndim(given) else given, "initial")
             found[group.rows] = model.simulate(self._record(X, None, [group]), initial=begin).model
-        return self._shaped(found)
+        return self._shape(found)
 
     def score(self, X: Any, y: Any, groups: Any = None) -> float:
         """Return R² on all rows that have a prediction, the mean over outputs.

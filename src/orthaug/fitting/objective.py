@@ -93,7 +93,7 @@ class FreeRunObjective:
         theta, c, w = self.place(p)
         trials: list[TrialPoint] = []
         for follows in (True, False) if self.initial.free and start.follows else (False,):
-            total, states, errors, squares = self._tried(c, w, start, follows)
+            total, states, errors, squares = self._try(c, w, start, follows)
             misfit = total if total < self._largest else np.inf
             trials.append(TrialPoint(p, theta, c, w, states, errors, misfit, misfit, squares))
             if total < start.misfit:
@@ -105,7 +105,7 @@ class FreeRunObjective:
             )
         return best
 
-    def _tried(
+    def _try(
         self, c: Vector, w: Vector, start: Start, follows: bool
     ) -> tuple[float, Any, Any, Matrix | None]:
         """Return `‖r‖²`, states, errors and their squares from the start's states.

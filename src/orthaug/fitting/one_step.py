@@ -287,7 +287,7 @@ class OneStepTask(TrainingRows):
         else:
             joint = PaperCriterion(self.bound, structure.projects)
             end = solver.minimise(joint, w, self.rows, physics, progress=progress)
-        normal = linearise(OneStep(self.bound), end.w, (self.rows, hold), self._nothing)
+        normal = linearise(OneStep(self.bound), end.w, (self.rows, hold), self._no_overlap)
         coordinates = np.asarray(physics.start + physics.basis @ end.v) * self.rms
         coefficients = (
             None if structure.projects else self.problem.projection.from_coordinates(coordinates)
@@ -321,10 +321,10 @@ class OneStepTask(TrainingRows):
         if self.engine.resident:
             criterion, arguments = OneStep(self.bound), (self.rows, hold)
             return solver.minimise(
-                criterion, w, arguments, self._nothing, samples=samples, **options
+                criterion, w, arguments, self._no_overlap, samples=samples, **options
             )
         summed = SummedOneStep(self.engine, self.bound, self.rows, hold)
-        return solver.drive(summed, jnp.asarray(w), self._nothing, samples=samples, **options)
+        return solver.drive(summed, jnp.asarray(w), self._no_overlap, samples=samples, **options)
 
     def loss(self, run: compiled.TrainingRun) -> float:
         """Return the mean of squared errors of a run, each output in its standard deviation."""

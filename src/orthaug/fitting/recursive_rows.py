@@ -31,7 +31,7 @@ _RIM = 1e-9  # the largest of training is no extrapolation
 
 
 @partial(jax.jit, static_argnames="form")
-def _evaluated(form: Lagged, numbers: Numbers, x: Float[Array, "m nx"]) -> Float[Array, "m ny ntp"]:
+def _evaluate(form: Lagged, numbers: Numbers, x: Float[Array, "m nx"]) -> Float[Array, "m ny ntp"]:
     """Return `[φ, known + f − φθ_aux]` of every row, and the largest of its scaled features.
 
     That is 1 at the limit of the training data.
@@ -83,7 +83,7 @@ def whitened_rows(
             if len(rows) < size
             else rows
         )
-        pieces.append(np.asarray(_evaluated(model.form, numbers, padded))[: len(rows)])
+        pieces.append(np.asarray(_evaluate(model.form, numbers, padded))[: len(rows)])
     values = np.concatenate(pieces) if len(pieces) > 1 else pieces[0]
     bad = ~np.isfinite(values).all(axis=(1, 2))
     if bad.any():

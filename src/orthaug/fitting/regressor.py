@@ -127,5 +127,5 @@ class AugmentedRegressor(Augmented):
         response = model.predict(record).model
         check_there(response)
         if not return_std:
-            return self._shaped(response)
-        return self._shaped(response), self._shaped(prediction_std(model, record)[0])
+            return self._shape(response)
+        return self._shape(response), self._shape(prediction_std(model, record)[0])

@@ -65,7 +65,7 @@ class Reference:
         """
         given = [stretch @ white.T for stretch in stretches]
         colour = _colour(given)
-        left = [_filtered(stretch, colour) for stretch in given]
+        left = [_innovations(stretch, colour) for stretch in given]
         rows = np.concatenate(left)
         deviation = np.sqrt(np.mean(rows**2, axis=0))
         deviation = np.where(deviation > 0, deviation, 1.0)
@@ -175,7 +175,7 @@ def _blocks(stretch: Matrix, scale: int) -> Matrix:
     return clipped.reshape(count, scale, -1).sum(axis=1) / math.sqrt(scale)
 
 
-def _filtered(stretch: Matrix, colour: Matrix) -> Matrix:
+def _innovations(stretch: Matrix, colour: Matrix) -> Matrix:
     """Return the innovations of residuals under an autoregression."""
     lags = len(colour)
     left = stretch[lags:].copy()

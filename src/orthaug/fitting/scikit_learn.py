@@ -141,7 +141,7 @@ class Augmented(MultiOutputMixin, RegressorMixin, BaseEstimator):
                 )
         return super().set_params(**params)  # type: ignore[misc]
 
-    def _shaped(self, values: np.ndarray) -> np.ndarray:
+    def _shape(self, values: np.ndarray) -> np.ndarray:
         """Return values (n, n_outputs) with as many axes as y had."""
         return values[:, 0] if self._one_column else values
 

@@ -170,7 +170,7 @@ class SegmentedProblem:
         two_legs = ny > 1 and self.output_weights in ("auto", "covariance")
         first = solver.at_most(solver.iterations // 2) if two_legs else solver
         start = Start(objective.initial.measured if states is None else states)
-        kept = self._kept(objective, p, start, options)
+        kept = self._checkpoint(objective, p, start, options)
         end = first.descend(objective, p, start, progress=progress, kept=kept, **options)
         noise = self.noise(objective, end) if two_legs and end.ending.usable else None
         white = None if noise is None else whitening(noise)
@@ -189,7 +189,7 @@ class SegmentedProblem:
                 end.point.p,
                 begun,
                 progress=lambda i, loss: progress(done + i, loss),
-                kept=self._kept(objective, end.point.p, begun, options),
+                kept=self._checkpoint(objective, end.point.p, begun, options),
                 **options,
             )
             path = (*end.path, *again.path)
@@ -201,7 +201,7 @@ class SegmentedProblem:
         mean_square = self.mean_square(end.point.c, end.point.w)
         return FreeRunFit(objective, end, mean_square, end.iterations, end.seconds)
 
-    def _kept(
+    def _checkpoint(
         self, objective: FreeRunObjective, p: Vector, start: Start, options: dict[str, Any]
     ) -> RunCheckpoint | None:
         """Return the checkpoint of a descent from this start."""

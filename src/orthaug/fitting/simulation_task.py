@@ -41,7 +41,7 @@ class StartPoint(NamedTuple):
     silent: bool
 
 
-def _learned(free_fit: FreeRunFit, first_loss: float) -> bool:
+def _lowers_loss(free_fit: FreeRunFit, first_loss: float) -> bool:
     """Return whether the weights lowered the loss.
 
     If not, evidence may have found too early that none are needed.
@@ -185,16 +185,16 @@ class SimulationTask(ABC):
         free_fit = plan.descend(
             objective, best.p, solver, report, best.states, ceiling=ceiling, **options
         )
-        if evidence and not _learned(free_fit, best.loss):
+        if evidence and not _lowers_loss(free_fit, best.loss):
             free = plan.descend(
                 objective, best.p, solver.within_limit, report, best.states, ceiling=ceiling
             )
-            if _learned(free, best.loss):
+            if _lowers_loss(free, best.loss):
                 point, options = free.end.point, options | {"evidence_settled": False}
                 again = plan.descend(
                     objective, point.p, solver, report, point.states, ceiling=ceiling, **options
                 )
-                free_fit = again if _learned(again, best.loss) else free_fit
+                free_fit = again if _lowers_loss(again, best.loss) else free_fit
                 spent = {
                     "iterations": free.iterations + free_fit.iterations,
                     "seconds": free.seconds + free_fit.seconds,

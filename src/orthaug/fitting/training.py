@@ -123,7 +123,7 @@ def train(
         _run_all(task, starts, structure, solver, choice, progress, runner),
     )
     losses = [task.loss(run) for run in runs]
-    concluded = cache(lambda i: _concluded(conclude, task, structure, task.learned(runs[i])))
+    concluded = cache(lambda i: _conclude(conclude, task, structure, task.learned(runs[i])))
     stopped = sum(run.ending is Ending.STOPPED for run in runs)
     untried = bool(
         stopped and choice.validation is None and choice.blocks and choice.compares(task, starts)
@@ -155,7 +155,7 @@ def train(
         estimate = _alone(conclude, task, structure)
     elif choice.ensemble:
         members = alike
-        estimate = _concluded(conclude, task, structure, _median(task, runs, members, best))
+        estimate = _conclude(conclude, task, structure, _median(task, runs, members, best))
     else:
         estimate = concluded(best)
     scored = choice.scored and held_out is None
@@ -167,8 +167,8 @@ def train(
     warnings = (
         *estimate.warnings,
         *task.warnings,
-        *_replaced(starts, runs),
-        *_stopped(stopped, len(runs), untried),
+        *_replacement_warnings(starts, runs),
+        *_stop_warnings(stopped, len(runs), untried),
         *replacing,
         *retry_warnings(planned, starts, runs, held_out, best),
     )
@@ -183,7 +183,11 @@ def _beside(conclude: Concluding, task: Task, structure: Structure) -> Any:
     None without one, and where it costs a pass.
     """
     streamed = hasattr(task.problem, "source")
-    return None if task.bound is None or streamed else _kept_physics(conclude, task, structure)
+    return (
+        None
+        if task.bound is None or streamed
+        else _physics_for_comparison(conclude, task, structure)
+    )
 
 
 def _restart(
@@ -290,7 +294,7 @@ def _one_run(
     return task.run(solver, start.weights, structure, start.regularization, report)
 
 
-def _replaced(starts: Sequence[PlannedRun], runs: Sequence[Any]) -> list[Warning]:
+def _replacement_warnings(starts: Sequence[PlannedRun], runs: Sequence[Any]) -> list[Warning]:
     failed = [
         str(start.seed) for start, run in zip(starts, runs, strict=True) if not run.ending.usable
     ]
@@ -303,7 +307,7 @@ def _replaced(starts: Sequence[PlannedRun], runs: Sequence[Any]) -> list[Warning
     return [Warning("start_replaced", text)]
 
 
-def _stopped(count: int, runs: int, untried: bool) -> list[Warning]:
+def _stop_warnings(count: int, runs: int, untried: bool) -> list[Warning]:
     if not count:
         return []
     text = f"training was stopped on request: {count} of {counted(runs, 'run')} had not ended"
@@ -371,7 +375,7 @@ def _on_fold(given: Any, fold: tuple[Record, Record], report: Callable[..., None
         for start in starts:
             report()
             run = own.run(solver, start.weights, structure, start.regularization)
-            fits.append(_concluded(conclude, own, structure, own.learned(run)))
+            fits.append(_conclude(conclude, own, structure, own.learned(run)))
     except InputError:  # the block took away what the physics needs
         return [failed] * (1 + len(starts))
     return [_errors(fit, held, task.problem.deviation) for fit in fits]
@@ -403,7 +407,7 @@ def _alone(conclude: Concluding, task: Task, structure: Structure) -> Any:
     return replace(conclude(rows, structure, learned), criterion=task.criterion)
 
 
-def _kept_physics(conclude: Concluding, task: Task, structure: Structure) -> Any:
+def _physics_for_comparison(conclude: Concluding, task: Task, structure: Structure) -> Any:
     """Return physics alone for comparison with a learner.
 
     It is least squares one step ahead, also where θ has a penalty.
@@ -412,7 +416,7 @@ def _kept_physics(conclude: Concluding, task: Task, structure: Structure) -> Any
     return _alone(conclude, task, Orthogonal() if plain else structure)
 
 
-def _concluded(
+def _conclude(
     conclude: Concluding, task: Task, structure: Structure, learned: TrainedLearner
 ) -> Any:
     return replace(conclude(task.rows_task, structure, learned), criterion=task.criterion)

@@ -53,7 +53,7 @@ class TrainingRows:
     rows: Any
 
     @property
-    def _nothing(self) -> Overlap:
+    def _no_overlap(self) -> Overlap:
         """The overlap before any pass."""
         nt, size = len(self.problem.baseline.names), self.bound.size if self.bound else 0
         return Overlap(np.zeros((nt, size)), np.zeros(nt))
@@ -105,7 +105,7 @@ class TrainingRows:
         """Return QᵀF (nθ,) of the learner with the weights w, in whitened outputs."""
         if not self.engine.resident or isinstance(self.problem, StreamedProblem):
             sums = self.engine.sum(
-                LearnerSums(self.bound), self.rows, w, None, self._nothing.values
+                LearnerSums(self.bound), self.rows, w, None, self._no_overlap.values
             )
             return np.asarray(sums[0]) * self.rms
         return self.problem.projection.coordinates(self.problem.weight.rows(self.values(w)))
@@ -115,7 +115,7 @@ class TrainingRows:
         nt = len(self.problem.baseline.names)
         if self.bound is None:
             return np.zeros((nt, 0))
-        total = self.engine.sum(Blocks(self.bound), self.rows, w, self._nothing)
+        total = self.engine.sum(Blocks(self.bound), self.rows, w, self._no_overlap)
         return np.asarray(total[:nt, nt + 1 :]) * self.rms
 
     def _weights(self, learned: TrainedLearner) -> tuple[Any, Any]:

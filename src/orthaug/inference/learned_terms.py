@@ -47,7 +47,7 @@ def learned_terms(model: Any) -> tuple[LearnedTerm, ...]:
     form, numbers, statistics = model.form, model.numbers, model.statistics
     if form.bound is None or not isinstance(form.bound.learner, Terms) or numbers.tilt is not None:
         return ()
-    places, features = _added_to(model), _features(model)
+    places, features = _targets(model), _features(model)
     scale = np.asarray(numbers.gain)[:, None] / np.asarray(numbers.halfwidth)[None, :]
     values = (np.reshape(numbers.weights, scale.shape) * scale).ravel()
     nt = len(numbers.theta)
@@ -109,7 +109,7 @@ def _moves(model: Any) -> bool:
     return hasattr(model.form, "motion")
 
 
-def _added_to(model: Any) -> list[tuple[str, str]]:
+def _targets(model: Any) -> list[tuple[str, str]]:
     """Return the name and unit of the quantity that each row of weights is added to."""
     if not _moves(model):
         return [(channel.name, channel.unit) for channel in model.outputs]

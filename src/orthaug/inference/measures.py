@@ -161,7 +161,7 @@ class Weighted:
 
     def points(self, support: Support) -> Points:
         x = support.x
-        return Points(x, _normalised(self.weights, len(x), "usable rows"))
+        return Points(x, _normalise(self.weights, len(x), "usable rows"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,7 +216,7 @@ class Samples:
         for j, lag in enumerate(support.layout):
             x[:, j] = values.get(lag, 0.0)
         weight = np.ones(count) if self.weights is None else self.weights
-        return Points(x, _normalised(weight, count, "samples"))
+        return Points(x, _normalise(weight, count, "samples"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -273,7 +273,7 @@ class Uniform:
         return low, high
 
 
-def _normalised(weights: Any, count: int, what: str) -> Vector:
+def _normalise(weights: Any, count: int, what: str) -> Vector:
     try:
         values = np.asarray(weights, dtype=float)
     except (TypeError, ValueError):

@@ -97,7 +97,7 @@ def shared_of_motion(form: MotionDynamics, q: Vector, x: Matrix, u: Matrix) -> S
     if not learned_places(motion):
         return Shared(names, np.zeros((len(names), 0)))
     if form.bound is not None and getattr(form.bound.learner, "linear", False):
-        return _spanned(form, q, x, u)
+        return _spanned_directions(form, q, x, u)
     nx = x.shape[1]
     points = np.concatenate([x, u], axis=1)
     points = points[np.isfinite(points).all(axis=1)]
@@ -135,7 +135,7 @@ def _left_over(
     return left_over(slopes, features, _has_learner(form.motion))
 
 
-def _spanned(form: MotionDynamics, q: Vector, x: Matrix, u: Matrix) -> Shared:
+def _spanned_directions(form: MotionDynamics, q: Vector, x: Matrix, u: Matrix) -> Shared:
     """Return the directions that the learner's features span and that move no other equation."""
     some = slice(None, None, max(1, len(x) // _POINTS))
     slopes = np.moveaxis(np.asarray(slopes_at(form, q, x[some], u[some])), 1, 0)
@@ -180,7 +180,7 @@ def nearest(
     shared = directions(q)
     if not shared.basis.size:
         return q, shared
-    gauss = np.asarray(_summed(_gauss_newton, form, numbers, q, field)[1])
+    gauss = np.asarray(_sum_over(_gauss_newton, form, numbers, q, field)[1])
     b, size = _unit(shared.basis, gauss), np.sqrt(np.diag(gauss))
     along = np.linalg.lstsq(size[:, None] * b, size * (start - q), rcond=None)[0]
     candidates = [np.clip(q + b @ along, *bounds), q]
@@ -189,7 +189,7 @@ def nearest(
     for _ in range(_ITERATIONS):
         shared = directions(q)
         gradient, gauss = (
-            np.asarray(part) for part in _summed(_gauss_newton, form, numbers, q, field)
+            np.asarray(part) for part in _sum_over(_gauss_newton, form, numbers, q, field)
         )
         b = _unit(shared.basis, gauss)
         inner, downhill = b.T @ gauss @ b, -b.T @ gradient
@@ -241,7 +241,7 @@ def split_motion(
     q, shared = nearest(form, numbers, start, field, bounds, basis)
     whole = np.concatenate([np.eye(count), np.zeros((count, form.bound.size))], axis=1)
     second, to_c, to_w, gauss, gradient, learner, rest, size = (
-        np.asarray(part) for part in _summed(_second, form, numbers, q, field)
+        np.asarray(part) for part in _sum_over(_second, form, numbers, q, field)
     )
     with np.errstate(all="ignore"):
         share = float(np.sqrt(rest / size)) if size > 0 else None
@@ -293,11 +293,13 @@ def slopes_at(
 
 
 def _distance(form: MotionDynamics, numbers: Numbers, q: Vector, field: Field) -> float:
-    value = float(np.asarray(_summed(_square, form, numbers, q, field)))
+    value = float(np.asarray(_sum_over(_square, form, numbers, q, field)))
     return value if np.isfinite(value) else np.inf
 
 
-def _summed(function: Any, form: MotionDynamics, numbers: Numbers, q: Vector, field: Field) -> Any:
+def _sum_over(
+    function: Any, form: MotionDynamics, numbers: Numbers, q: Vector, field: Field
+) -> Any:
     """Return the sum over the points, batch by batch."""
     total = None
     for begin in range(0, len(field.x), _BATCH):

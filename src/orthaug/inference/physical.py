@@ -422,13 +422,15 @@ def profile(
     )  # at most one standard deviation
     bounds = (physics.parameters[i].min, physics.parameters[i].max)
     low, high = (
-        _crossing(excess, best[i], sign * step, bound)
+        _find_crossing(excess, best[i], sign * step, bound)
         for sign, bound in zip((-1, 1), bounds, strict=True)
     )
     return low, high
 
 
-def _crossing(excess: Callable[[float], float], start: float, step: float, bound: float) -> float:
+def _find_crossing(
+    excess: Callable[[float], float], start: float, step: float, bound: float
+) -> float:
     """Return the point at which `excess`, negative at `start`, changes sign before `bound`.
 
     `bound` where it does not.

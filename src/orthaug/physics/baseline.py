@@ -177,7 +177,7 @@ class Baseline(NotebookView):
                 raise InputError(
                     f"the constant '{name}' must be a finite number; got {shown(value)}."
                 )
-        terms = _agreed(terms)
+        terms = _unify(terms)
         parameters = {t.parameter: _parameter(t) for t in terms if not t.fixed}
         baseline = cls(tuple(parameters.values()), tuple(terms), tuple(sorted(constants.items())))
         _ = baseline.expressions  # report what does not parse here, not at first use
@@ -349,7 +349,7 @@ class Baseline(NotebookView):
 _SHARED = ("initial", "unit", "fixed", "min", "max")  # what the terms of one parameter share
 
 
-def _agreed(terms: Sequence[Term]) -> list[Term]:
+def _unify(terms: Sequence[Term]) -> list[Term]:
     """Return the terms with their parameters' attributes made common.
 
     An attribute that one term gives to a parameter holds in all of its terms.

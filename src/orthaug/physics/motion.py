@@ -154,9 +154,7 @@ class Motion(NotebookView):
             name: parse_named(text, everything, f"motion.define '{name}'")
             for name, text in define.items()
         }
-        motion = replace(
-            plain, definitions=tuple((name, parsed[name]) for name in _ordered(parsed))
-        )
+        motion = replace(plain, definitions=tuple((name, parsed[name]) for name in _order(parsed)))
         for state in plain.states:
             if state.derivative is None:
                 what = "next" if integrator == "discrete" else "derivative"
@@ -462,7 +460,7 @@ class Motion(NotebookView):
             )
 
 
-def _ordered(definitions: Mapping[str, Expression]) -> list[str]:
+def _order(definitions: Mapping[str, Expression]) -> list[str]:
     """Return the names in an order in which each follows those that it uses.
 
     Raises:

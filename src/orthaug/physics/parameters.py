@@ -156,7 +156,7 @@ class PhysicsMap:
             )
         names = [p.name for p in parameters]
         known = constants | {p.name: float(p.initial) for p in parameters}
-        expressions = tuple(_parsed(name, text, known, names) for name, text in theta.items())
+        expressions = tuple(_parse(name, text, known, names) for name, text in theta.items())
         used = {name for expression in expressions for name, _ in expression.constants}
         for name in names:
             if name not in used:
@@ -323,7 +323,7 @@ def check_not_sampling_time(name: str, what: str) -> None:
         )
 
 
-def _parsed(
+def _parse(
     name: str, text: str, known: Mapping[str, float], parameters: Sequence[str]
 ) -> Expression:
     where = f"physics.theta '{name}'"

@@ -225,7 +225,7 @@ class Problem:
 
     def on(self, record: Record) -> Problem:
         """Return the problem with the same physics and features on another record."""
-        return _posed(record, self.baseline, self.layout, self.features, self.weight.choice)
+        return _pose(record, self.baseline, self.layout, self.features, self.weight.choice)
 
     def weighed(self, weight: OutputWeights) -> Problem:
         """Return the problem with other output weights."""
@@ -283,12 +283,12 @@ def pose(
     baseline.check_channels(outputs, inputs)
     layout, features = regressor_of(baseline, lags, learner_inputs, outputs, inputs)
     features = features.sampled(record.sampling_time)
-    return _posed(
+    return _pose(
         record, baseline, layout, features, output_weights, require_full_rank=require_full_rank
     )
 
 
-def _posed(
+def _pose(
     record: Record,
     baseline: Baseline,
     layout: Layout,

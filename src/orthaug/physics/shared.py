@@ -83,7 +83,7 @@ class Shared:
             if row.any() and not own.any()
         ]
         size = np.sqrt(np.maximum(np.diag(rest.whole), 1e-300))[:, None]
-        basis = _reduced(np.column_stack([self.basis, more]) * size, 1 / size[:, 0]) / size
+        basis = _reduce(np.column_stack([self.basis, more]) * size, 1 / size[:, 0]) / size
         return Shared(self.names, basis, tuple(moved), rest)
 
     @property
@@ -202,7 +202,7 @@ def seen(
         values: of rows of the regressor, a column for each function in question.
     """
     if features.linear:
-        return _combined(values(x), _values(features, layout)(x))
+        return _are_combinations(values(x), _values(features, layout)(x))
     if _sees(features, layout):
         return np.ones(values(x[:1]).shape[1], dtype=bool)
     start, end = moves(_values(features, layout), x)
@@ -215,7 +215,7 @@ def seen(
     return still & (np.sum(there, axis=0) >= _FEWEST)
 
 
-def _combined(
+def _are_combinations(
     values: Float[np.ndarray, "N k"], features: Float[np.ndarray, "N nz"]
 ) -> Bool[np.ndarray, "k"]:
     """Return a mask of the columns that are linear combinations of features at the same points."""
@@ -249,10 +249,10 @@ def agreeing(before: Matrix, after: Matrix) -> Matrix:
     root = vt[seen].T / sigma[seen]
     _, change, directions = np.linalg.svd((after - before) * unit @ root, full_matrices=False)
     agreeing = root @ directions[change <= _TOLERANCE].T
-    return unit[:, None] * _reduced(agreeing, unit)
+    return unit[:, None] * _reduce(agreeing, unit)
 
 
-def _reduced(basis: Matrix, unit: Vector) -> Matrix:
+def _reduce(basis: Matrix, unit: Vector) -> Matrix:
     """Return a basis of the same span in reduced column echelon form.
 
     In θ's own units times `1/unit`.

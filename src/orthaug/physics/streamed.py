@@ -204,7 +204,7 @@ def _triangle(blocks: Sequence[Matrix]) -> Matrix:
     return r * np.where(np.diag(r) < 0, -1.0, 1.0)[:, None] if len(r) == r.shape[1] else r
 
 
-def _merged(parts: Sequence[Any], merge: Callable[[Any, Any], Any]) -> Any:
+def _merge(parts: Sequence[Any], merge: Callable[[Any, Any], Any]) -> Any:
     """Return the sum of neighbours two by two, and so on.
 
     This order does not depend on which part was ready first.
@@ -326,13 +326,13 @@ class StreamedProblem(Problem):
     def weighed(self, weight: OutputWeights) -> Problem:
         if weight is self.weight:
             return self
-        return _factored(
+        return _factorise(
             replace(self, weight=weight), self.source, self.passes, self.survey, self.basis.form
         )
 
 
 def _survey(form: Form, source: Source, passes: Passes) -> Survey:
-    found = _merged(passes(PartitionSurvey(form), source.partitions), Survey.__or__)
+    found = _merge(passes(PartitionSurvey(form), source.partitions), Survey.__or__)
     if found is None:
         raise InputError(
             "no experiment has enough rows for a single prediction: the largest lag is "
@@ -371,18 +371,18 @@ def streamed(seen: Problem, source: Source, passes: Passes) -> StreamedProblem:
     weight = seen.weight
     if weight.kind != "covariance":
         weight = weigh_outputs("none" if weight.kind == "none" else weight.choice, deviation)
-    return _factored(
+    return _factorise(
         replace(seen, deviation=deviation, weight=weight), source, passes, survey, form
     )
 
 
-def _factored(
+def _factorise(
     seen: Problem, source: Source, passes: Passes, survey: Survey, form: Form
 ) -> StreamedProblem:
     """Return the factor in two passes: R of `[Φ Y]`, then R of the resulting Q."""
     weight, nt = seen.weight, len(seen.baseline.names)
     scale = powers_of_two(survey.columns * np.abs(weight.matrix).max())
-    first = _merged(
+    first = _merge(
         passes(Factoring(form, weight, scale), source.partitions), lambda a, b: _triangle([a, b])
     )
     r, coordinates = first[:nt, :nt], first[:nt, nt]
@@ -392,7 +392,7 @@ def _factored(
         r, coordinates = np.eye(nt), np.zeros(nt)
     inverse = scale[:, None] * scipy.linalg.solve_triangular(r, np.eye(nt)) if nt else r
     basis = Basis(form, weight, inverse, np.eye(nt))
-    second = _merged(passes(PartitionQR(basis, coordinates), source.partitions), _both)
+    second = _merge(passes(PartitionQR(basis, coordinates), source.partitions), _both)
     turn, rest = (second.r[:nt, :nt], second.r[:nt, nt]) if ready else (np.eye(nt), np.zeros(nt))
     back = np.linalg.inv(turn)
     basis = replace(basis, turn=back)

@@ -231,8 +231,8 @@ def driven(
     assert state is not None
     enough = False
     while settings.runs(state) and not enough:
-        step = _proposed(state)
-        state = _judged(state, step, normal_at(state.w + step, state.normal.overlap), options)
+        step = _propose(state)
+        state = _judge(state, step, normal_at(state.w + step, state.normal.overlap), options)
         state = settings.marked(state)
         enough = settings.report(state)
     return settings.ended(state, training_clock() - began, enough=enough)
@@ -276,8 +276,8 @@ def _advance(
 
 def _trial(criterion: Any, state: State, arguments: tuple[Any, ...], options: Options) -> State:
     """Return one damped step: accept it, or damp more."""
-    step = _proposed(state)
-    return _judged(
+    step = _propose(state)
+    return _judge(
         state, step, one_pass(criterion, state.w + step, arguments, state.normal.overlap), options
     )
 
@@ -287,14 +287,14 @@ def _downhill(state: State) -> Any:
 
 
 @jax.jit
-def _proposed(state: State) -> Any:
+def _propose(state: State) -> Any:
     """Return the damped step."""
     shifted = state.normal.hessian + (state.ridge + state.damping) * jnp.eye(state.w.shape[0])
     return jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(shifted), _downhill(state))
 
 
 @jax.jit
-def _judged(state: State, step: Any, trial: Normal, options: Options) -> State:
+def _judge(state: State, step: Any, trial: Normal, options: Options) -> State:
     """Return the state after a tried step: moved where the objective is lower, else damped more."""
     w, normal, alpha, downhill = state.w, state.normal, state.ridge, _downhill(state)
     before = normal.loss + _prior(alpha, w)

@@ -210,7 +210,7 @@ def descend(
             whole[: objective.physics] = side
     paused = None if kept is None else kept.state()
     if paused is not None:
-        iterate, (done, taken, begun, first_loss, mark), ending = _resumed(objective, paused)
+        iterate, (done, taken, begun, first_loss, mark), ending = _resume(objective, paused)
     else:
         point = objective.evaluate(np.clip(p, *limits), start)
         linear = objective.linearise(point) if np.isfinite(point.loss) else None
@@ -244,7 +244,7 @@ def descend(
         if kept is not None:
             counts = _Counts(done, taken, begun, first_loss, mark)
             kept.keep(
-                partial(_paused, objective, iterate, counts, ending),
+                partial(_pause, objective, iterate, counts, ending),
                 ended=ending is not Ending.RUNNING,
             )
     effective = effective_weights(iterate.linear.hessian, iterate.ridge, objective.physics)
@@ -266,13 +266,13 @@ def descend(
     )
 
 
-def _paused(objective: Any, iterate: _Iterate, counts: _Counts, ending: Ending) -> Pause:
+def _pause(objective: Any, iterate: _Iterate, counts: _Counts, ending: Ending) -> Pause:
     own = (iterate.ridge, iterate.damping, iterate.growth, iterate.small)
     held = (objective.kept(iterate.point), *own, np.stack(iterate.path), iterate.coloured)
     return Pause(*held, np.array(counts, dtype=float), int(ending))
 
 
-def _resumed(objective: Any, paused: Pause) -> tuple[_Iterate, _Counts, Ending]:
+def _resume(objective: Any, paused: Pause) -> tuple[_Iterate, _Counts, Ending]:
     point = objective.again(paused.point)
     ridge, damping, growth = (float(paused[i]) for i in (1, 2, 3))
     path, done = tuple(paused.path), paused.counts.tolist()
