@@ -212,7 +212,7 @@ PHYSICS_ERRORS = [
     (
         f"(2*m + cd*Ts) / {GAMMA}",
         f"2*(m + cd*Ts + ks*Ts**2)/{GAMMA} - m/{GAMMA}",
-        "cannot be told apart",
+        "cannot be distinguished",
         "rank 2 of 3",
     ),
     ("min = 0", "min = 2", "the initial value of 'm' is 1.1; its bounds are 2 and inf"),

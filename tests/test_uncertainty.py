@@ -457,9 +457,7 @@ def test_a_split_leaves_the_standard_errors_of_predictions(noisy):
 
 def test_predictions_without_statistics_are_refused():
     model = orthogonalize(EXAMPLE.train, EXAMPLE.baseline, lambda x: x + x**2).model
-    with pytest.raises(
-        InputError, match="the model has no statistics to take standard errors from"
-    ):
+    with pytest.raises(InputError, match="the model has no statistics for standard errors"):
         prediction_std(model, EXAMPLE.test)
 
 
@@ -563,7 +561,8 @@ def test_noise_of_uneven_size_has_hc3_by_default():
             inside[i] += (found.interval[:, 0] <= [1, -2]) & (found.interval[:, 1] >= [1, -2])
     assert inside[0, 0] < 80 and (inside[1] >= 90).all()
     assert (
-        fit.std_kind == "hc3" and "robust (HC3), for the errors are of uneven size" in fit.summary()
+        fit.std_kind == "hc3"
+        and "robust (HC3), because the variance of the errors is not constant" in fit.summary()
     )
     phi = np.column_stack([plain.problem.record.experiments[0].inputs[:, 0], np.ones(300)])
     e = plain.problem.record.experiments[0].outputs[:, 0] - phi @ plain.theta
@@ -614,9 +613,7 @@ def other(kind):
 
 @pytest.mark.parametrize("kind", ["additive", "penalty", "bound", "elsewhere"])
 def test_robust_errors_need_standard_errors(kind):
-    with pytest.raises(
-        InputError, match="robust standard errors are those of a fit that has standard errors"
-    ):
+    with pytest.raises(InputError, match="robust standard errors need a fit with standard errors"):
         other(kind).robust()
 
 

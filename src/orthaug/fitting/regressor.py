@@ -1,4 +1,4 @@
-"""Static data as a regressor of scikit-learn: physics in the columns of X, and a learned correction."""
+"""Static data as a regressor of scikit-learn: physics in the columns of X, and a correction."""
 
 from __future__ import annotations
 
@@ -59,7 +59,8 @@ class AugmentedRegressor(Augmented):
         >>> import numpy as np
         >>> from orthaug.models.learners import MLP
         >>> x = np.linspace(-1, 1, 200)[:, None]
-        >>> fitted = AugmentedRegressor({"gain": "x0"}, learner=MLP(hidden=(4,))).fit(x, 2 * x[:, 0] + x[:, 0] ** 2)
+        >>> regressor = AugmentedRegressor({"gain": "x0"}, learner=MLP(hidden=(4,)))
+        >>> fitted = regressor.fit(x, 2 * x[:, 0] + x[:, 0] ** 2)
         >>> f"{fitted.theta_[0]:.3f}"
         '2.000'
     """
@@ -106,7 +107,7 @@ class AugmentedRegressor(Augmented):
         return self
 
     def predict(self, X: Any, return_std: bool = False) -> Any:
-        """ŷ, (n,) or (n, n_outputs) as y was.
+        """Return ŷ, (n,) or (n, n_outputs) as y was in the fit.
 
         With `return_std` also its standard error, of the same shape.
 
@@ -126,5 +127,5 @@ class AugmentedRegressor(Augmented):
         response = model.predict(record).model
         check_there(response)
         if not return_std:
-            return self._shaped(response)
-        return self._shaped(response), self._shaped(prediction_std(model, record)[0])
+            return self._shape(response)
+        return self._shape(response), self._shape(prediction_std(model, record)[0])

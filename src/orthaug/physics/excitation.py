@@ -23,7 +23,7 @@ RANK_TOLERANCE = 1e-13  # σmin/σmax of the unit-norm columns below which Φ co
 
 @dataclass(frozen=True, eq=False)
 class Excitation:
-    """How well rows of φ determine θ: rank, condition number, and which columns depend on each other."""
+    """Rank and condition number of rows of φ, and the columns that depend on each other."""
 
     rank: int
     columns: int
@@ -40,11 +40,11 @@ GRAM_TOLERANCE = 3e-6
 
 
 def excitation(r: Matrix, names: Sequence[str], tolerance: float = RANK_TOLERANCE) -> Excitation:
-    """Rank and condition of a matrix from its R factor (or itself), columns scaled to unit norm.
+    """Return rank and condition of a matrix from its R factor (or itself), columns scaled to 1.
 
     The condition number is σmax/σmin of the scaled columns, None where it is infinite. A group
-    holds the columns that a null direction ties: nothing in the data can tell their parameters
-    apart.
+    holds the columns that a null direction ties: nothing in the data can separate their
+    parameters.
     """
     columns = len(names)
     if columns == 0:
@@ -64,7 +64,7 @@ def excitation(r: Matrix, names: Sequence[str], tolerance: float = RANK_TOLERANC
 
 
 def of_gram(gram: Matrix, names: Sequence[str]) -> Excitation:
-    """`excitation` from the Gram matrix of the columns."""
+    """Return `excitation` from the Gram matrix of the columns."""
     norms = np.sqrt(np.maximum(np.diag(gram), 0.0))
     unit = np.where(norms > 0, norms, 1.0)
     values, vectors = np.linalg.eigh(gram / np.outer(unit, unit))
@@ -96,7 +96,7 @@ def tied_columns(directions: Matrix, part: float = 1e-6) -> list[list[int]]:
 
 
 def require_rank(excited: Excitation, rows: int) -> None:
-    """Raise RankError where θ is not determined, naming the parameters that cannot be told apart."""
+    """Raise RankError where θ is not determined, naming the parameters that no data separate."""
     if rows < excited.columns:
         raise RankError(
             f"{rows} usable rows for {excited.columns} parameters; give at least as many rows "
@@ -120,7 +120,9 @@ def require_rank(excited: Excitation, rows: int) -> None:
 def identifiability(
     baseline: Baseline, layout: Layout, outputs: Sequence[str], x: Matrix
 ) -> Excitation:
-    """Rank of φ at random points of a box twice as wide as the data's (width 1 where the data do not move).
+    """Return the rank of φ at random points of a box twice as wide as the data's.
+
+    Where the data do not move, the box has width 1.
 
     Args:
         baseline: φ and the names of θ.
@@ -132,7 +134,8 @@ def identifiability(
         >>> from orthaug.data.regressors import Lags
         >>> from orthaug.physics.baseline import Term
         >>> twice = Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "2*y[k-1]")])
-        >>> identifiability(twice, Lags(na=1).layout(["y"], []), ["y"], np.array([[0.0], [1.0]])).rank
+        >>> layout = Lags(na=1).layout(["y"], [])
+        >>> identifiability(twice, layout, ["y"], np.array([[0.0], [1.0]])).rank
         1
     """
     nt = len(baseline.names)

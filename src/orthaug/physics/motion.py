@@ -1,6 +1,4 @@
-"""Equations of motion `ẋ = f(x, u.
-
-P)`, `y = h(x, u; p)`: physics whose parameters may stand anywhere.
+"""Equations of motion `ẋ = f(x, u; p)`, `y = h(x, u; p)`, with parameters anywhere in them.
 
 A learner may be added to some of the equations and outputs. `derivative` is that of a state in
 time; of a `discrete` motion it is the state one sample later. No JAX.
@@ -37,7 +35,7 @@ _DERIVATIVE = "derivative of "
 
 @dataclass(frozen=True)
 class State:
-    """A state and its equation, such as `State("v", "(force - c*v)/m", start="derivative of position", unit="m/s")`.
+    """A state and its equation: `State("v", "(force - c*v)/m", start="derivative of position")`.
 
     Args: derivative: in time, of a discrete motion the state one sample later; None where the
         motion is a function. start: a first guess, for starts are always estimated: a number, an
@@ -53,7 +51,7 @@ class State:
 
     @property
     def from_output(self) -> tuple[str, int] | None:
-        """The output that it starts from, and how often that is differentiated."""
+        """The output that the state starts from, and how often that is differentiated."""
         if not isinstance(self.start, str):
             return None
         return (
@@ -79,14 +77,18 @@ class Output:
 
 @dataclass(frozen=True)
 class Motion(NotebookView):
-    """Equations of motion; `from_equations` or `from_functions` make one and tell of its fields.
+    """Equations of motion; make one with `from_equations` or `from_functions`.
 
     Hashable.
 
     Examples:
         >>> motion = Motion.from_equations(
-        ...     states=[State("v", "(force - c*v)/m", start=0.0)], outputs=[Output("speed", "v")], inputs=["force"],
-        ...     parameters=[PhysicalParameter("m", 2.0, "kg", min=0), PhysicalParameter("c", 1.0, "N s/m")])
+        ...     states=[State("v", "(force - c*v)/m", start=0.0)],
+        ...     outputs=[Output("speed", "v")], inputs=["force"],
+        ...     parameters=[
+        ...         PhysicalParameter("m", 2.0, "kg", min=0), PhysicalParameter("c", 1.0, "N s/m")
+        ...     ],
+        ... )
         >>> motion.rates(np.array([3.0]), np.array([1.0]), motion.initial, np)
         array([-1.])
     """
@@ -119,7 +121,9 @@ class Motion(NotebookView):
         substeps: int | None = None,
         hold: str = "zero-order",
     ) -> Motion:
-        """Of expressions on the names of states, inputs, parameters, constants and definitions.
+        """Return a motion of expressions.
+
+        They use the names of states, inputs, parameters, constants and definitions.
 
         Args: inputs: names of the input channels, in the record's order. define: names for longer
             expressions. integrator: "rk4" (Runge-Kutta of order 4), "exact" (the linear part by
@@ -152,9 +156,7 @@ class Motion(NotebookView):
             name: parse_named(text, everything, f"motion.define '{name}'")
             for name, text in define.items()
         }
-        motion = replace(
-            plain, definitions=tuple((name, parsed[name]) for name in _ordered(parsed))
-        )
+        motion = replace(plain, definitions=tuple((name, parsed[name]) for name in _order(parsed)))
         for state in plain.states:
             if state.derivative is None:
                 what = "next" if integrator == "discrete" else "derivative"
@@ -183,7 +185,9 @@ class Motion(NotebookView):
         substeps: int | None = None,
         hold: str = "zero-order",
     ) -> Motion:
-        """Of JAX functions f(x, u, p) → (nx,) and h(x, u, p) → (ny,) on vectors of states, inputs and parameters.
+        """Return a motion of JAX functions f(x, u, p) → (nx,) and h(x, u, p) → (ny,).
+
+        The vectors are states, inputs and parameters.
 
         Raises:
             InputError: names that cannot be, or what is no function.
@@ -225,7 +229,8 @@ class Motion(NotebookView):
             raise InputError("the motion has no states; give at least one with its equation.")
         if not outputs:
             raise InputError(
-                "the motion has no outputs; say how the measured channels follow from the states."
+                "the motion has no outputs; give an expression of the states for each measured "
+                "channel."
             )
         check_parameters(parameters, constants, FUNCTIONS)
         motion = cls(
@@ -288,7 +293,7 @@ class Motion(NotebookView):
             )
 
     def _check_used(self) -> None:
-        """Every parameter is used, and every output follows from a state."""
+        """Raise InputError unless every parameter is used and every output depends on a state."""
         used: set[str] = set()
         for state in self.states:
             used |= self._names_in(self.equations[state.name])
@@ -315,7 +320,7 @@ class Motion(NotebookView):
         return found
 
     def parameters_in(self, state: str) -> tuple[str, ...]:
-        """Return the parameters of a state's equation; of a motion that has expressions."""
+        """Return the parameters in a state's equation, for a motion with expressions."""
         there = self._names_in(self.equations[state])
         return tuple(name for name in self.names if name in there)
 
@@ -331,7 +336,7 @@ class Motion(NotebookView):
 
     @property
     def learned(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
-        """The numbers of the states whose equations, and of the outputs that a learner is added to."""
+        """The numbers of the states and of the outputs that a learner is added to."""
         states = tuple(i for i, state in enumerate(self.states) if state.learned)
         return states, tuple(i for i, output in enumerate(self.outputs) if output.learned)
 
@@ -413,7 +418,10 @@ class Motion(NotebookView):
         return values
 
     def rates(self, x: Any, u: Any, p: Any, xp: Any) -> Any:
-        """f(x, u; p) (nx, …) by `xp` (numpy or jax.numpy); of a discrete motion the next state."""
+        """Return f(x, u; p) (nx, …) by `xp` (numpy or jax.numpy).
+
+        Of a discrete motion this is the next state.
+        """
         if self.functions is not None:
             return xp.asarray(self.functions[0](x, u, p))
         values = self.values(x, u, p, xp, self._read[0])
@@ -423,7 +431,7 @@ class Motion(NotebookView):
         )
 
     def observed(self, x: Any, u: Any, p: Any, xp: Any) -> Any:
-        """h(x, u; p) (ny, …)."""
+        """Return h(x, u; p) (ny, …)."""
         if self.functions is not None:
             return xp.asarray(self.functions[1](x, u, p))
         values = self.values(x, u, p, xp, self._read[1])
@@ -433,7 +441,10 @@ class Motion(NotebookView):
         )
 
     def term_without_value(self, i: int, x: Vector, u: Vector) -> str:
-        """Return what is not finite in equation i, outputs after states, at a point (nx,) and (nu,), in words; or nothing."""
+        """Return the name and value of a term of equation i that is not finite, or nothing.
+
+        Outputs are counted after states; the point is (nx,) and (nu,).
+        """
         if self.functions is not None:
             return ""
         with np.errstate(all="ignore"):
@@ -452,7 +463,7 @@ class Motion(NotebookView):
 
     @property
     def coordinates(self) -> Coordinates:
-        """Return what is estimated of p."""
+        """The map from p to the coordinates that are estimated."""
         return Coordinates(self.parameters)
 
     def check_channels(self, inputs: Sequence[str], outputs: Sequence[str]) -> None:
@@ -478,8 +489,8 @@ class Motion(NotebookView):
             )
 
 
-def _ordered(definitions: Mapping[str, Expression]) -> list[str]:
-    """Return the names so that each stands after those that it uses.
+def _order(definitions: Mapping[str, Expression]) -> list[str]:
+    """Return the names in an order in which each follows those that it uses.
 
     Raises:
         InputError: definitions that need each other.

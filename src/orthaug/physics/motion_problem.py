@@ -1,4 +1,4 @@
-"""The estimation problem of a motion: its record, what the learner sees, and what can be said before any training.
+"""The estimation problem of a motion: its record, learner inputs, and checks before training.
 
 Where it may start: states as they are declared, from what is measured about a row. An output and
 its derivative are those of a local polynomial (Savitzky and Golay 1964), what nothing is said of
@@ -65,7 +65,7 @@ class MotionProblem:
         return tuple(channel.name for channel in self.record.outputs)
 
     def on(self, record: Record) -> MotionProblem:
-        """The same motion on another record."""
+        """Return the motion's problem on another record."""
         return replace(self, record=record)
 
     @cached_property
@@ -80,7 +80,9 @@ class MotionProblem:
         return np.concatenate(states).T, np.concatenate(inputs).T
 
     def without_value(self, over: Callable[[Any], Any]) -> str:
-        """Return the first equation or output that has no value at the start, in words, at all guessed states or at any.
+        """Return the first equation or output that is not finite at the start, as text.
+
+        Either at all guessed states, or at any of them.
 
         Args:
             over: np.all or np.any.
@@ -110,10 +112,10 @@ class MotionProblem:
                     )
                     where = ", ".join(f"{n} = {v:.4g}" for n, v in at)
                     term = motion.term_without_value(first + i, x[:, k], u[:, k])
-                    told = f": {term}" if term else ""
+                    reason = f": {term}" if term else ""
                     return (
                         f"{what} '{name}' is not finite at the start ({where}, initial "
-                        f"parameters){told}"
+                        f"parameters){reason}"
                     )
         return ""
 
@@ -143,7 +145,7 @@ class MotionProblem:
 
     @property
     def substeps(self) -> int:
-        """With how many substeps training begins."""
+        """Substeps per sample with which training begins."""
         motion = self.motion
         if motion.integrator == "discrete":
             return 1
@@ -205,8 +207,8 @@ def _features(motion: Motion, texts: Sequence[str] | None) -> tuple[Expression, 
     texts = (*motion.names_of_states, *motion.inputs) if texts is None else tuple(texts)
     if not texts:
         raise InputError(
-            "the learner sees nothing; give `inputs` such as a state's name, or leave it out "
-            "for all."
+            "the learner has no inputs; give `inputs` such as a state's name, or leave the key "
+            "out for all."
         )
     found = []
     for text in texts:
@@ -221,15 +223,16 @@ def _features(motion: Motion, texts: Sequence[str] | None) -> tuple[Expression, 
 
 
 def _check_start(problem: MotionProblem) -> None:
-    """Raise InputError where the equations have no value at the initial parameters, or modes that are too fast."""
+    """Raise InputError where equations have no value at the start, or a mode is too fast."""
     motion, where = problem.motion, problem.without_value(np.all)
     if where:
-        raise InputError(f"{where}; mend it, or start elsewhere.")
+        raise InputError(f"{where}; correct it, or change the initial values.")
     if motion.integrator == "rk4" and problem.substeps > MOST_SUBSTEPS:
         raise InputError(
-            f"the sampling time of {problem.record.sampling_time:g} s is too long for the fastest mode of the motion, "
-            f"{problem.fastest:.3g} 1/s: it would take {problem.substeps} substeps, at most {MOST_SUBSTEPS} are made. "
-            'Use `integrator = "exact"`, check units and initial values, or leave the fast mode out.'
+            f"the sampling time of {problem.record.sampling_time:g} s is too long for the "
+            f"fastest mode of the motion, {problem.fastest:.3g} 1/s: it needs "
+            f"{problem.substeps} substeps, but at most {MOST_SUBSTEPS} are allowed. Use "
+            '`integrator = "exact"`, check units and initial values, or leave the fast mode out.'
         )
     if motion.integrator == "exact":
         _check_exact(problem)
@@ -262,7 +265,7 @@ def guess(
     rows: Sequence[int] | Int[np.ndarray, "r"],
     sampling_time: float,
 ) -> Float[np.ndarray, "r n0"]:
-    """Return the states at some rows, made of the outputs (N, ny) that were measured about them."""
+    """Return states at some rows, estimated from the outputs (N, ny) measured about them."""
     rows = np.asarray(rows, dtype=int)
     width = min(_ROWS, len(outputs))
     begin = np.clip(rows - width // 2, 0, len(outputs) - width)
@@ -284,7 +287,7 @@ def guess(
 
 @cache
 def _polynomials(width: int) -> Float[np.ndarray, "width degree+1 width"]:
-    """Return what gives the coefficients of a local polynomial about each of its rows from the values of all."""
+    """Return a map from the values of all rows to a local polynomial about each row."""
     offset = np.arange(width)[None, :] - np.arange(width)[:, None]
     return np.linalg.pinv(offset[..., None] ** np.arange(min(_DEGREE, width - 1) + 1))
 
@@ -297,5 +300,5 @@ class SignalName(Lag):
 
 
 def layout_of(motion: Motion) -> tuple[SignalName, ...]:
-    """States, then inputs."""
+    """Return the names of states, then inputs."""
     return tuple(SignalName(name, 0) for name in (*motion.names_of_states, *motion.inputs))

@@ -63,7 +63,7 @@ def _as_doubted(line: str, result: FitResult) -> str:
     if result.noise_only:
         line = line.replace(f"{'95 % interval':^29}", f"{'95 %, noise only':^29}")
     if result.shared is not None and result.shared.doubt and line.startswith("shared "):
-        line = f"{line.partition('; told by the fit: ')[0]}; told by the fit: none, see below"
+        line = f"{line.partition('; determined by the fit: ')[0]}; determined by the fit: none, see below"
     return line
 
 
