@@ -1,4 +1,4 @@
-"""The fitted model ŷ_k = φ(x_k)θ + (f(x_k) − φ(x_k)θ_aux): prediction, free run and its two parts."""
+"""The fitted model ŷ_k = φ(x_k)θ + (f(x_k) − φ(x_k)θ_aux): prediction, free run, parts."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ class Model(RecordModel, NotebookView):
     time_column: str | None = None
     statistics: Statistics = Statistics()  # noqa: RUF009  (frozen)
     prepared: tuple[Prepared, ...] = field(default=(), kw_only=True, repr=False)
-    """What the training data went through before."""
+    """Preparation of the training data."""
 
     def __repr__(self) -> str:
         learner = self.form.bound.learner if self.form.bound else "none"
@@ -120,11 +120,11 @@ class Model(RecordModel, NotebookView):
 
     @property
     def alone(self) -> Model:
-        """Its physics without the learner."""
+        """The model without its learner."""
         return replace(self, form=self.form.alone, numbers=self.numbers.alone)
 
     def learner_at(self, x: Float[np.ndarray, "M nx"]) -> Float[np.ndarray, "M ny"]:
-        """f, before any split, at regressors of the form's layout; in the outputs' units.
+        """Return f, before any split, at regressors of the form's layout, in the outputs' units.
 
         It is the learner itself, also beyond the range of its training, where the model holds the
         correction.
@@ -201,7 +201,7 @@ class Model(RecordModel, NotebookView):
 
     @cached_property
     def memory(self) -> Memory:
-        """Return what a step remembers."""
+        """Past samples that a step remembers."""
         return Memory.of(
             self.form.layout, self.form.outputs, [channel.name for channel in self.inputs]
         )
@@ -213,11 +213,13 @@ class Model(RecordModel, NotebookView):
 
     @property
     def step_inputs(self) -> tuple[str, ...]:
-        """Return what a step takes: the inputs at its sample."""
+        """Inputs of a step: those at its sample."""
         return self.memory.inputs
 
     def start(self, record: Record, row: int | None = None) -> Vector:
-        """Return the state before a row of a record of one experiment, by default the first that has a prediction.
+        """Return the state before a row of a record of one experiment.
+
+        By default it is the first row that has a prediction.
 
         Raises:
             InputError: other channels, several experiments, a row that is not there.
@@ -229,7 +231,9 @@ class Model(RecordModel, NotebookView):
         )
 
     def step(self, state: Any, inputs: Any) -> tuple[Array, Array]:
-        """Return one sample of a free run: the next state (n,) and the outputs (ny,), from a state and the inputs (nu,).
+        """Return one sample of a free run: the next state (n,) and the outputs (ny,).
+
+        It starts from a state and the inputs (nu,).
 
         A pure function of JAX arrays, so that `jax.jit`, `jax.vmap` and `jax.grad` take it; to go
         on from a measured output, put that in the place of the model's own.
@@ -238,7 +242,7 @@ class Model(RecordModel, NotebookView):
 
     @property
     def filtering(self) -> tuple[LaggedFilter, Numbers, Vector]:
-        """The model as a filter: its dynamics, its numbers, and how large an unknown output is (ny,)."""
+        """The model as a filter: its dynamics, its numbers, and the size of an unknown output."""
         return LaggedFilter(self.form, self.memory), self.numbers, self.deviation
 
     def check_initial(self, initial: Any) -> Matrix:
@@ -291,7 +295,7 @@ class Model(RecordModel, NotebookView):
         )
 
     def first_state(self, experiment: Experiment, record: Record) -> Vector:
-        """Return the state at the first row of the free run that starts from the measured outputs."""
+        """Return the state at the first row of the free run from the measured outputs."""
         return self._start("measured", experiment.outputs)
 
     def _start(self, initial: Any, measured: Matrix | None) -> Vector:
@@ -310,7 +314,7 @@ class Model(RecordModel, NotebookView):
         return self.form.start(rows, [len(rows)])[0]
 
     def _outside(self, start: Vector, parts: Parts, experiment: Experiment, record: Record) -> Any:
-        """Where along a free run the learner's features lie outside those of training, (N,)."""
+        """Return the rows of a free run where a feature is outside its training range, (N,)."""
         inputs = self.form.inputs(experiment, record)
         with np.errstate(all="ignore"):
             z = self.form.scaled_features(self.numbers, start, np.asarray(parts.total), inputs)
@@ -323,7 +327,7 @@ class Model(RecordModel, NotebookView):
 def _in_batches(
     function: Callable[..., Parts], rows: tuple[np.ndarray, ...], largest: int = _BATCH
 ) -> Parts:
-    """`function` over batches of rows, padded to one shape, its results concatenated."""
+    """Call `function` on batches of rows, padded to one shape, and concatenate its results."""
     count = len(rows[0])
     size, pieces = min(_BATCH, largest), []
     for begin in range(0, count, size):
