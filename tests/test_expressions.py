@@ -230,7 +230,7 @@ REFUSED = [
         r"unknown constant 'y'; declare it with its value, or, for a channel, give its lag, y\[k-1\]",
     ),
     ("2*stifness", "unknown constant 'stifness', did you mean 'stiffness'"),
-    ("k", "k is the time index and cannot stand alone"),
+    ("k", "k is the time index and no value by itself"),
     ("k*y[k-1]", "k is the time index"),
     ("sin", r"sin is a function; write sin\(…\)"),
     ("y[k-1]^2", r"here a power is \*\*; write y\[k-1\]\*\*2\."),

@@ -103,7 +103,8 @@ def export(
         >>> import numpy as np
         >>> import orthaug as oa
         >>> record = oa.Record.from_arrays(u=np.sin(np.arange(50.0)), y=2 * np.sin(np.arange(50.0)))
-        >>> fit = oa.estimate(record, oa.Baseline.from_terms([oa.Term("gain", "u[k]")]), learner=None)
+        >>> physics = oa.Baseline.from_terms([oa.Term("gain", "u[k]")])
+        >>> fit = oa.estimate(record, physics, learner=None)
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     _ = export(fit.model, Path(folder, "code"), to="c", name="plant")
         ...     sorted(file.name for file in Path(folder, "code").iterdir())

@@ -159,7 +159,8 @@ def numpy_step(model: Model | MotionModel) -> NumpyStep:
     Examples:
         >>> import orthaug as oa
         >>> u = [1.0, 2.0, 0.0, 3.0, 1.0, 0.0]
-        >>> record = oa.Record.from_arrays(u=u, y=[0.0, 0.5, 1.25, 0.625, 1.8125, 1.40625])  # 0.5 (y[k-1] + u[k-1])
+        >>> y = [0.0, 0.5, 1.25, 0.625, 1.8125, 1.40625]  # 0.5 (y[k-1] + u[k-1])
+        >>> record = oa.Record.from_arrays(u=u, y=y)
         >>> physics = oa.Baseline.from_terms([oa.Term("a", "y[k-1]"), oa.Term("b", "u[k-1]")])
         >>> step = numpy_step(oa.estimate(record, physics, learner=None).model)
         >>> step.state_names, step.step_inputs

@@ -74,11 +74,12 @@ class Model(RecordModel, NotebookView):
     Examples:
         >>> import orthaug as oa
         >>> u = [1.0, 2.0, 0.0, 3.0, 1.0, 0.0]
-        >>> record = oa.Record.from_arrays(u=u, y=[0.0, 0.5, 1.25, 0.625, 1.8125, 1.40625])  # 0.5 (y[k-1] + u[k-1])
+        >>> y = [0.0, 0.5, 1.25, 0.625, 1.8125, 1.40625]  # 0.5 (y[k-1] + u[k-1])
+        >>> record = oa.Record.from_arrays(u=u, y=y)
         >>> physics = oa.Baseline.from_terms([oa.Term("a", "y[k-1]"), oa.Term("b", "u[k-1]")])
         >>> model = oa.estimate(record, physics, learner=None).model
         >>> other = oa.Record.from_arrays(u=[1.0, 1.0, 1.0], y=[4.0, 0.0, 0.0])
-        >>> model.simulate(other).trajectories[0].model.T.round(6)  # from the first output on its own
+        >>> model.simulate(other).trajectories[0].model.T.round(6)  # from the first output
         array([[ nan, 2.5 , 1.75]])
         >>> model.predict(other).trajectories[0].model.T.round(6)  # from the measured ones
         array([[nan, 2.5, 0.5]])

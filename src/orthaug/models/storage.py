@@ -155,7 +155,8 @@ def save(model: Model | MotionModel, folder: str | Path, *, force: bool = False)
         >>> import numpy as np
         >>> import orthaug as oa
         >>> record = oa.Record.from_arrays(u=np.sin(np.arange(50.0)), y=2 * np.sin(np.arange(50.0)))
-        >>> fit = oa.estimate(record, oa.Baseline.from_terms([oa.Term("gain", "u[k]")]), learner=None)
+        >>> physics = oa.Baseline.from_terms([oa.Term("gain", "u[k]")])
+        >>> fit = oa.estimate(record, physics, learner=None)
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     save(fit.model, Path(folder, "model"))
         ...     load(Path(folder, "model"))
