@@ -145,12 +145,14 @@ class NumpyStep:
 
 
 def numpy_step(model: Model | MotionModel) -> NumpyStep:
-    """Return the step of a fitted model in NumPy alone, for loops in Python and where JAX is too slow to call.
+    """Return the step of a fitted model in NumPy, for loops in Python.
+
+    It is for places where JAX is too slow to call.
 
     Args:
         model: as `estimate` or `load` gives it.
 
-    Returns: `state, outputs = step(state, inputs)`; `step.state_names` and `step.step_inputs` tell
+    Returns: `state, outputs = step(state, inputs)`; `step.state_names` and `step.step_inputs` list
         what is in both.
 
     Raises:
@@ -175,7 +177,7 @@ def numpy_step(model: Model | MotionModel) -> NumpyStep:
 def _advancing(
     rate: Callable[[Vector, Vector], Vector], scheme: Scheme, held: int, ends: int
 ) -> Callable[[Vector, Vector], Vector]:
-    """x one sample later, of x and the step's inputs."""
+    """Return x one sample later, of x and the step's inputs."""
     if scheme.kind == "discrete":
         return rate
     h, halves = scheme.step, 2 * scheme.substeps

@@ -1,7 +1,4 @@
-"""Sect.
-
-5.1: the asymptotic covariance matrix of θ and the learner's weights, zeros in black (thm:zero_cov).
-"""
+"""Sect. 5.1: asymptotic covariance matrix of θ and the weights, zeros black (thm:zero_cov)."""
 
 from __future__ import annotations
 
@@ -21,9 +18,9 @@ ZERO = 1e-6  # what is shown in black; in the paper in absolute value
 
 
 def one(seed: int, pipeline: str) -> dict[str, Any]:
-    """P̂ of eq:cov_approx for one start, as it stands and as correlations.
+    """Return P̂ of eq:cov_approx for one start, unchanged and as correlations.
 
-    Θ's standard errors in both conventions.
+    θ's standard errors are in both conventions.
     """
     fit = trained(static(1, noise=True), "static", pipeline, seed=seed)
     matrix = fit.joint_covariance("paper") * len(fit.problem.rows)
@@ -42,12 +39,12 @@ def one(seed: int, pipeline: str) -> dict[str, Any]:
 
 
 def study(pipeline: str, small: bool) -> Study:
-    """Starts."""
+    """Return the study over starts."""
     return Study("covariance", one, {"seed": range(1 if small else 10), "pipeline": (pipeline,)})
 
 
 def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
-    """Figure "covariance": entries of the first start, as correlations and in absolute value."""
+    """Draw "covariance": entries of the first start, as correlations and in absolute value."""
     figure, axes = panels(2, height=3.3)
     row = table.iloc[0]
     titles = {"correlation": "entries over √(Pᵢᵢ Pⱼⱼ)", "covariance": "entries in absolute value"}
@@ -75,7 +72,7 @@ def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
 
 
 def findings(table: pd.DataFrame) -> list[Finding]:
-    """Zero blocks, and the factor 2."""
+    """Return the share of zeros in the blocks, and the factor 2."""
     across = []
     for deviation, matrix in zip(table["std"], table.correlation, strict=True):
         nt = len(deviation)

@@ -1,6 +1,6 @@
-"""Sect.
+"""Sect. 5.1 without noise: errors of θ and of the test output.
 
-5.1 without noise: errors of θ and of the test output, both structures, three data sets, ten starts.
+Both structures are compared on three data sets, with ten starts.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def study(pipeline: str, small: bool) -> Study:
 
 
 def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
-    """Figures "sigma0_errors", the estimated θ and the learner's outputs."""
+    """Draw "sigma0_errors", the estimated θ and the learner's outputs."""
     starts = table.seed.nunique()
     return {
         "sigma0_errors": Drawing(
@@ -126,14 +126,14 @@ def _both(table: pd.DataFrame) -> bool:
 
 
 def _label(structure: str, table: pd.DataFrame) -> str:
-    """Which additive structure it is, where there are both."""
+    """Return the label of a structure; the additive one is qualified where there are both."""
     return (
         "additive, θ eliminated" if structure == "additive" and _both(table) else LABELS[structure]
     )
 
 
 def _of_scripts(structure: str, table: pd.DataFrame) -> str | None:
-    """Return what the scripts call it.
+    """Return the scripts' name of a structure.
 
     Their additive structure is the one from θ⁰; with θ eliminated they have none.
     """
@@ -250,7 +250,7 @@ def _learner(table: pd.DataFrame) -> Figure:
 
 
 def findings(table: pd.DataFrame) -> list[Finding]:
-    """Return both errors of every data set and structure beside the scripts', and what the paper says about them."""
+    """Return both errors of every data set and structure, with those of scripts and paper."""
     compared = []
     for data_set in (1, 2, 3):
         for structure in reversed(_shown(table)):
