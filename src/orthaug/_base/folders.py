@@ -45,7 +45,7 @@ class Partials:
         self.lock = threading.RLock()
         self.placed: list[Path] = []
         self.seen: dict[str, str] = {}
-        """By folder, the checksum of its manifest when a command that writes it began."""
+        """Checksum of each folder's manifest when a command that writes it began."""
         self.overtaken: list[Path] = []
         """Folders that were replaced although another run had written them meanwhile."""
         self._open: dict[Path, Sequence[Path]] = {}
@@ -113,7 +113,7 @@ PARTIALS = Partials()  # of the process, as its signals are
 def remove_stale(parent: Path, alive: Sequence[Path] | dict[Path, Sequence[Path]] = ()) -> None:
     """Remove what processes of this machine left in `parent` when they were killed.
 
-    What stood there comes back.
+    Folders that were being replaced are restored.
     """
     if os.name != "posix":  # elsewhere asking for a process may end it
         return
@@ -243,7 +243,7 @@ def whole_folder(folder: Path, *, force: bool = False) -> Iterator[Path]:
 
 
 def _put_in_place(partial: Path, place: Path) -> None:
-    """Rename. The folder that was there is kept until the new one is in its place."""
+    """Rename a folder; the former one is kept until the new one is in its place."""
     if not place.exists():
         partial.rename(place)
         return
@@ -329,9 +329,9 @@ def whole_file(path: Path, *, force: bool = False) -> Iterator[Path]:
 
 
 def _place_file(partial: Path, target: Path, force: bool) -> None:
-    """Rename; without force only where nothing else has appeared.
+    """Rename a file; without force only where no other file has appeared.
 
-    Whoever wrote the same bytes is no one else.
+    A file of the same bytes is no other file.
     """
     if not force:
         try:

@@ -92,7 +92,7 @@ def _late_jit(function: Callable[..., Any], **options: Any) -> Callable[..., Any
 def starts() -> bool:
     """Return whether JAX finds a device to compute on.
 
-    What it raises where it does not depends on the platform asked for.
+    Otherwise its exception depends on the platform that is asked for.
     """
     try:
         return bool(_real_jax().devices())
@@ -161,9 +161,9 @@ if not TYPE_CHECKING:
 
 
 def use_compilation_cache() -> None:
-    """Keep compiled programs between processes (the command line does.
+    """Keep compiled programs between processes.
 
-    The library never on its own).
+    The command line does; the library never does on its own.
     """
     import platformdirs
 
@@ -209,7 +209,7 @@ def _digest(key: str, content: bytes) -> bytes:
 def _check_cached_programs() -> None:
     """Make JAX's cache a checked one from now on.
 
-    Where JAX is built otherwise than known, nothing is kept.
+    If this version of JAX has another cache, nothing is kept.
     """
     try:
         from jax._src import compilation_cache

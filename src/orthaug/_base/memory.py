@@ -84,7 +84,7 @@ def _unused() -> float:
 
 
 def _allowed() -> float:
-    """Return what limits on the process (`ulimit -v`) leave."""
+    """Return the bytes that limits on the process (`ulimit -v`) leave."""
     most = limit()
     if math.isinf(most):
         return most

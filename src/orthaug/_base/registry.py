@@ -126,9 +126,8 @@ class Registry(Mapping[str, Any]):
             raise InputError(
                 f"the {self.axis} '{kind}' is registered already; give it another name."
             )
-        if (
-            not dataclasses.is_dataclass(declaration) or not declaration.__dataclass_params__.frozen  # type: ignore[attr-defined]
-        ):
+        parameters = getattr(declaration, "__dataclass_params__", None)
+        if parameters is None or not parameters.frozen:
             raise InputError(
                 f"the {self.axis} '{kind}' must be a frozen dataclass; got {declaration!r}."
             )
@@ -230,7 +229,7 @@ def resolve(declared: Any, context: Any = None) -> Any:
 def check_fields(declared: Any) -> None:
     """Raise InputError for a field outside the limits of its type.
 
-    For the `__post_init__` of declarations.
+    It is called in the `__post_init__` of declarations.
     """
     for name, key in keys_of(type(declared)).items():
         value, metadata = getattr(declared, name), key.metadata

@@ -193,7 +193,7 @@ def _fault(column: Column, rows: int) -> RefusedColumn | None:
 def _resemblance(column: Column) -> RefusedColumn | bool | None:
     """Return whether the values of a column are those of time, whatever its name.
 
-    None where they are, False where nothing shows it.
+    The result is None where they are, False where nothing shows it.
 
     A column that rises and is not the time for another reason comes with the reason.
     """

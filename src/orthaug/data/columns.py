@@ -76,7 +76,7 @@ class Column:
     def limits(self) -> tuple[tuple[float, int], ...]:
         """Extreme values that the signal has much more often than others, with the rows.
 
-        Perhaps saturated.
+        Such a signal may be saturated.
         """
         levels, counts = np.unique(self.finite, return_counts=True)
         if len(levels) < _LEVELS:

@@ -1,6 +1,6 @@
 """Name and unit in the header of a column, and whether it is the time.
 
-And instants in s, of numbers or dates.
+Instants in s are made of numbers or dates.
 """
 
 from __future__ import annotations

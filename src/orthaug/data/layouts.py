@@ -1,6 +1,6 @@
 """Layout of a table: encoding, line of the header and separator of a text.
 
-The cells of a workbook.
+The cells of a workbook are read here as well.
 """
 
 from __future__ import annotations

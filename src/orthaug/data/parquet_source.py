@@ -371,7 +371,7 @@ class _BatchScan:
     def _follow(self, steps: np.ndarray, first: int) -> None:
         """Raise InputError for a step of time that is not the usual one of this file.
 
-        NaN between experiments.
+        Steps between experiments are NaN.
         """
         inside = np.isfinite(steps)
         if not inside.any():

@@ -51,7 +51,7 @@ def _filtered(values: Matrix, sections: Matrix, phase: str, what: str) -> Matrix
 class _Butterworth:
     """A Butterworth filter.
 
-    Of zero phase it goes forth and back, which squares its gain: −6 dB at the cutoff.
+    With zero phase it runs forward and backward, which squares its gain: −6 dB at the cutoff.
     """
 
     cutoff: Annotated[float, Gt(0)]

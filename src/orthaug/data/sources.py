@@ -167,7 +167,7 @@ class Span:
 
 
 def _later(experiment: Experiment, start: int, stop: int | None) -> Experiment:
-    """Rows of an experiment with their offset from the start of the recording."""
+    """Return rows of an experiment with their offset from the start of the recording."""
     return replace(experiment.rows(start, stop), offset=experiment.offset + start)
 
 

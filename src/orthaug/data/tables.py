@@ -1,6 +1,6 @@
 """Named columns of floats from files, by the file's ending.
 
-What is no number is kept, so that messages can name it.
+Cells that are no numbers are kept, so that messages can name it.
 """
 
 from __future__ import annotations
@@ -258,7 +258,7 @@ def _cells(
 def _plain_numbers(path: Path, found: Layout) -> Matrix | None:
     """Return the columns (count, rows) of a small file in which every cell is a finite number.
 
-    None of all other files.
+    The result is None for all other files.
 
     NumPy reads it before pandas would be imported.
     """

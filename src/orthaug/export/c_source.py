@@ -159,7 +159,7 @@ def _source(program: Program, fields: list[tuple[str, Signal, int]]) -> str:
         else:
             zeros.append(f"    state->{identifier} = 0;")
     counter = ["    int i;"] if any(depth for *_, depth in fields) else []
-    return f"""/* {name}: one step of a fitted model. Written by orthaug; the header says what it is. */
+    return f"""/* {name}: one step of a fitted model, described in the header. Written by orthaug. */
 #include "{name}.h"
 
 #include <math.h>
@@ -256,7 +256,7 @@ def _check(program: Program, fields: list[tuple[str, Signal, int]], vectors: Vec
         for i, place in enumerate(places_of(fields))
     )
     states = vectors.states.tolist() if program.states else [[0.0]] * rows
-    return f"""/* Runs the test vectors: `cc -std=c99 -O2 {name}.c check.c -lm -o check && ./check`. */
+    return f"""/* Run the test vectors: `cc -std=c99 -O2 {name}.c check.c -lm -o check && ./check`. */
 #include "{name}.h"
 
 #include <math.h>
@@ -290,7 +290,8 @@ int main(void)
             if (size > largest) largest = size;
         }}
     }}
-    printf("%d steps: largest difference %.3g, largest output %.3g, %d flagged\\n", (int)ROWS, worst, largest, flagged);
+    printf("%d steps: largest difference %.3g, largest output %.3g, %d flagged\\n",
+           (int)ROWS, worst, largest, flagged);
     return flagged || !(worst <= allowed * (largest > 1e-300 ? largest : 1));
 }}
 """

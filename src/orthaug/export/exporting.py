@@ -1,6 +1,6 @@
 """The verb `export`: a folder with the code of a model, its test vectors and how to run it.
 
-Whole or not at all.
+The folder is written whole or not at all.
 """
 
 from __future__ import annotations

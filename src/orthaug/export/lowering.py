@@ -47,7 +47,7 @@ class FadeNodes:
         features: Sequence[Node],
         points: Sequence[Node],
     ) -> FadeNodes:
-        """Return the intermediate results for features z (nz,) of the entries of a point x (nx,)."""
+        """Return the intermediate results for features z (nz,) of a point x (nx,)."""
         low, high = np.asarray(numbers.limits).tolist()
         found: dict[str, Node] = {}
 

@@ -59,7 +59,7 @@ def module(program: Program) -> str:
     """Return the text of the module."""
     return "\n".join(
         [
-            f'"""{program.name}: one step of a fitted model. Written by orthaug; needs only NumPy."""',
+            f'"""{program.name}: one step of a fitted model. Written by orthaug."""',
             "",
             "import numpy as np",
             "",

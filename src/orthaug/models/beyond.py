@@ -38,7 +38,7 @@ _PROBES = 8  # more than the coefficients of an affine function
 def beyond_of(learner: Any, usual: str) -> str:
     """Return how a learner's correction behaves beyond its training range.
 
-    As declared, or `usual` for the physics where the declaration is `auto`.
+    It is as declared, or `usual` for the physics where the declaration is `auto`.
 
     A learner that is linear in declared terms is an equation that a person reads: it goes on as it
     is.

@@ -1,6 +1,6 @@
 """The engine of a Dask cluster: partitions stay on the workers, which sum over them.
 
-N_w² numbers come back.
+N_w² numbers come back from a sum.
 
 Each partition is built once, on the worker that keeps it. A pass is a task for each, and a tree
 of sums in the order of the partitions: whoever computes them, and however often after a worker was
@@ -45,7 +45,7 @@ _PATIENCE = "20 s"  # to reach a scheduler
 class ClusterChunks:
     """Futures of groups of chunks, or tuples of futures whose chunks belong together.
 
-    How many each group has.
+    `counts` are the chunks of each group.
     """
 
     futures: list[Any]
@@ -199,9 +199,9 @@ def _carried(function: Callable[[Any, Any], Any], partition: Any, carry: Any, *h
 
 
 def kept(value: Any) -> Any:
-    """Return what a worker keeps.
+    """Return the value that a worker keeps.
 
-    Made again from what the scheduler knows where that worker is lost.
+    The scheduler makes it again where that worker is lost.
     """
     return value
 

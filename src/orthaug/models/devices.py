@@ -133,7 +133,7 @@ def _mesh(count: int | None) -> tuple[Any, int]:
 def _compiled(function: Callable[..., Any], count: int | None, arguments: int, keeps: bool) -> Any:
     """Compile a sum: each device adds up its own chunks, then all of them have the total.
 
-    With `keeps` beside what each one keeps.
+    With `keeps` each device also returns what it keeps.
     """
     spec = jax.sharding.PartitionSpec
 

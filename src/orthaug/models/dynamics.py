@@ -35,7 +35,7 @@ class Numbers(NamedTuple):
     each; None otherwise.
     """
     scheme: Any = None
-    """What `Dynamics.prepared` makes of them for all steps of a run."""
+    """Results of `Dynamics.prepared` for all steps of a run."""
     limits: Any = None
     """(2, nz), the range of the features over the training rows; None for a learner that goes on as
     it is beyond it.
@@ -126,14 +126,14 @@ class Dynamics(Protocol):
         ...
 
     def start_rows(self, weight: Matrix) -> Matrix:
-        """L (n0, n0): a state x that differs from the measured one costs `‖L (x − start)‖²`.
+        """Return L (n0, n0): a state x costs `‖L (x − start)‖²` about the measured one.
 
         `weight` (ny, ny) multiplies the errors of an output. Zero rows leave an entry free.
         """
         ...
 
     def inputs(self, experiment: Experiment, record: Record) -> Matrix:
-        """Return what the steps of an experiment read, (T, nu), from its first row with an output.
+        """Return the inputs of an experiment's steps, (T, nu), from its first row with an output.
 
         It is affine in the inputs.
         """
@@ -206,7 +206,7 @@ class Local(NamedTuple):
     def along(self, slopes: Any, fused: bool = False) -> tuple[Any, Any, Any, Any]:
         """Return state, slopes, outputs and their slopes as `Dynamics.tangents`, for given slopes.
 
-        What is cheap to compute twice is better `fused`.
+        `fused` sums instead of a matrix product are faster where the slopes are cheap to compute.
         """
         n0 = len(slopes)
         if fused:

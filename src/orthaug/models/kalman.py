@@ -82,7 +82,7 @@ class Filter(Protocol):
         ...
 
     def inputs(self, experiment: Experiment, record: Record) -> Matrix:
-        """Return what the steps read (T, nu), from the first row on."""
+        """Return the inputs of the steps (T, nu), from the first row on."""
         ...
 
     def step(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:

@@ -141,7 +141,7 @@ class MLP:
         return [*labels, (outward, np.full(np.shape(bias), first + 1))]
 
     def weights(self, nz: int, ny: int) -> int:
-        """Return how many weights it has for `nz` features and `ny` outputs."""
+        """Return the number of weights for `nz` features and `ny` outputs."""
         sizes = (nz, *self.hidden, ny)
         return sum(
             (fan_in + 1) * fan_out for fan_in, fan_out in zip(sizes, sizes[1:], strict=False)

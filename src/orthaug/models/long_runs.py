@@ -115,8 +115,8 @@ class RunningScores:
 
 
 Watch = Callable[[Experiment, int, Matrix], None]
-"""Is shown a piece, its first row with a prediction, and the one-step residual from there on (m,
-ny).
+"""Called with a piece, its first row with a prediction, and the one-step residual from there on
+(m, ny).
 """
 
 

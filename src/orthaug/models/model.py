@@ -40,7 +40,7 @@ def _free_run(
 ) -> tuple[Float[Array, "n0"], Parts]:
     """Return one scan over the rows, from the state at the first one.
 
-    With the state after the last.
+    The state after the last row is the second result.
     """
     return jax.lax.scan(lambda state, row: form.step(numbers, state, row), state, inputs)
 
@@ -171,7 +171,9 @@ class Model(RecordModel, NotebookView):
         return Response(tuple(trajectories), horizon, self.outputs, record.sampling_time)
 
     def simulate(self, record: Record, initial: str | Any = "measured") -> Response:
-        """Free run: the outputs' past is the model's own, from the first usable row on.
+        """Simulate the free run from the first usable row on.
+
+        Past outputs in the regressor are the model's own.
 
         Args: record: inputs, and outputs where they are measured. initial: the outputs on the rows
             before the first usable one: "measured" (from the record),

@@ -1,6 +1,6 @@
 """Contents of every saved model: channels, numbers, statistics of training, learner.
 
-Of a registered learner a file holds kind and fields, of a Python callable neither.
+A file holds kind and fields of a registered learner, and neither of a Python callable.
 """
 
 from __future__ import annotations

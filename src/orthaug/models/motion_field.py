@@ -132,16 +132,16 @@ class MotionField:
         return self.motion.coordinates.physical(numbers.theta - numbers.theta_aux, jnp)
 
     def linear_part(self, numbers: Numbers) -> Any:
-        """∂f/∂x of the physics at the origin; 0 where it has none."""
+        """Return ∂f/∂x of the physics at the origin; 0 where it has none."""
         p, rest = self.parameters(numbers), jnp.zeros(len(self.motion.inputs))
         slope = jax.jacfwd(lambda x: self.motion.rates(x, rest, p, jnp))(jnp.zeros(self.states))
         return jnp.where(jnp.isfinite(slope), slope, 0.0)
 
 
 def parts_at(form: MotionField, numbers: Numbers, x: Matrix, u: Matrix) -> tuple[Matrix, Matrix]:
-    """Physics f(x, u.
+    """Return the physics f(x, u; p̂) and the learner, each (M, nl).
 
-    P̂) and what is learned beside it, each (M, nl): learned equations, then learned outputs.
+    Learned equations come first, then learned outputs.
 
     Args:
         x: states (M, nx); `u` inputs (M, nu) at the same instants.

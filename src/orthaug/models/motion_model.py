@@ -1,6 +1,4 @@
-"""The fitted motion ẋ = f(x, u.
-
-P) + learner, y = h(x, u; p): free runs, predictions, and what acts in it.
+"""The fitted motion ẋ = f(x, u; p) + learner, y = h(x, u; p): free runs and predictions.
 
 A run starts from a state that was not measured. It is estimated from the first rows of the record
 or, for a prediction, from a window of rows before it: the state from which a free run over the
@@ -160,7 +158,7 @@ class MotionModel(RecordModel, NotebookView):
         )
 
     def simulate(self, record: Record, initial: str | Any = "measured") -> Response:
-        """Free run from the first row on.
+        """Simulate the free run from the first row on.
 
         `baseline` is the output of the physics alone from the same start, `learner` the difference.
 
@@ -201,9 +199,9 @@ class MotionModel(RecordModel, NotebookView):
     def states(self, record: Record, initial: str | Any = "measured") -> pd.DataFrame:
         """Return the states of a free run.
 
-        Of each learned equation its rate by the physics, and what is learned beside it.
+        The table also has the rate of each learned equation by the physics, and by the learner.
 
-        Of a learned output likewise.
+        Learned outputs have the same columns.
         """
         import pandas as pd
 
@@ -283,7 +281,7 @@ class MotionModel(RecordModel, NotebookView):
     def reached(self) -> Scaling:
         """Range of the learner's features in training.
 
-        Of a model saved without it, what physics alone did.
+        For a model saved without it, it is the range of physics alone.
         """
         return super().reached if self.seen is None else Scaling.fit(self.seen)
 
@@ -330,7 +328,7 @@ class MotionModel(RecordModel, NotebookView):
     def _with_physics(self, run: Trajectory, physics: Matrix) -> Trajectory:
         """Return a run of the whole model with the output of the physics alone.
 
-        No value from where that left all bounds.
+        There is no value from where that output left all bounds.
         """
         with np.errstate(all="ignore"):
             wild = ~(np.abs(physics) <= RUNAWAY * self.largest_output).all(axis=1)

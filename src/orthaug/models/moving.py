@@ -126,7 +126,7 @@ def output_slopes(form: MotionField, numbers: Numbers, x: Any, u: Any) -> Slopes
 def _differentiated(function: Any, x: Any, c: Any) -> tuple[Any, Any, Any]:
     """Return the value and its slopes by x and c.
 
-    Of few entries one at a time, which leaves out what an entry does not touch.
+    Few entries are differentiated one at a time, without what an entry does not touch.
     """
     entries, n0 = [*x, *c], len(x)
     if len(entries) > _FEW:
@@ -255,7 +255,7 @@ class MotionDynamics(MotionField, AutodiffDynamics):
     def local(self, numbers: Numbers, states: Any, inputs: Any) -> Local:
         """Return the slopes of a few Runge-Kutta substeps by the adjoint of their stages.
 
-        Otherwise by automatic differentiation.
+        Other schemes are differentiated automatically.
         """
         if numbers.scheme is not None:
             value, to_state, to_unknowns = super().local(numbers, states, inputs)

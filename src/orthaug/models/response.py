@@ -151,7 +151,7 @@ class Response:
         )
 
     def scores(self, skip: int | tuple[int, ...] = 0) -> Scores:
-        """Scores over all experiments, without the first `skip` samples of each.
+        """Return scores over all experiments, without the first `skip` samples of each.
 
         A tuple has one number per experiment.
 
@@ -180,7 +180,7 @@ class Response:
     def physics_alone(self) -> Response:
         """Response of the physics alone, for the free run of a motion.
 
-        Of other responses the physics' part.
+        For other responses it is the physics' part.
         """
         found = []
         for t in self.trajectories:
@@ -196,7 +196,7 @@ class Response:
     def to_frame(self, experiment: int = 0) -> pd.DataFrame:
         """Return a table with `time` and, per output, measured, model, baseline and learner.
 
-        Of a free run `extrapolates`.
+        A free run also has `extrapolates`.
 
         Of an observer's prediction also the 95 % band of what is measured.
         """

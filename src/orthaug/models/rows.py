@@ -44,7 +44,7 @@ class Chunk(NamedTuple):
     e: Float[Array, "*k ny m"]
     """P⊥Y, what the physics cannot express."""
     gain: Float[Array, "*k ny ny m"]
-    """What turns the learner's outputs into whitened rows."""
+    """Matrices that turn the learner's outputs into whitened rows."""
 
 
 class Overlap(NamedTuple):
@@ -62,7 +62,7 @@ class Room(NamedTuple):
     size: float
     """Its memory in bytes."""
     place: str
-    """What it is called: "the worker tcp://…"."""
+    """Name in messages: "the worker tcp://…"."""
     matrices: int
     """Gram matrices that it holds at once, where sums are made and added."""
 
@@ -100,13 +100,13 @@ class Engine(Protocol):
 
     @property
     def shares(self) -> int:
-        """Return how many can sum at a time: chunks that are placed should be a multiple."""
+        """Number of simultaneous sums; the number of placed chunks should be a multiple of it."""
         ...
 
     def place(self, chunks: Any, like: Any = None) -> Any:
         """Place chunks of any pytree, (k, …) each, as rows.
 
-        Where those of `like` are, which are as many.
+        They go where those of `like` are, which are as many.
         """
         ...
 
@@ -254,7 +254,7 @@ def row_fold(function: Callable[[Any], tuple[Any, Any]], rows: Any) -> tuple[Any
 def chunk_shape(rows: int, limit: int = CHUNK_ROWS) -> tuple[int, int]:
     """Return (number of chunks, rows in each) for `rows` rows in equal chunks of about `limit`.
 
-    Few rows in few sizes.
+    Few rows have few sizes, so that few programs are compiled.
     """
     count = max(1, -(-rows // limit))
     size = -(-rows // count)
@@ -387,7 +387,7 @@ def row_values(
 def _values(bound: Bound | None, chunk: Chunk, w: Any, tilt: Any) -> Float[Array, "ny m"]:
     """Return F of one chunk.
 
-    Of an ensemble the median of its members, each with the physics that it adds.
+    For an ensemble it is the median of the members, each with the physics that it adds.
     """
     if bound is None:
         return jnp.zeros_like(chunk.e)

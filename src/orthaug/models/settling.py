@@ -51,7 +51,7 @@ class Windows(NamedTuple):
 
 
 def padded_steps(steps: int) -> int:
-    """Return what to pad the steps of a window to."""
+    """Return the length that the steps of a window are padded to."""
     return max(_SHORTEST, 1 << (steps - 1).bit_length())
 
 
@@ -145,7 +145,7 @@ def _gram(
 ) -> tuple[Float[Array, "n0 n0+1 m"], Float[Array, "m"]]:
     """Return the Gram matrix of the sensitivities to the start and of the error.
 
-    Of the first `steps` of the windows.
+    The sums are over the first `steps` of the windows.
     """
     numbers = form.prepared(numbers)
     n0, m = states.shape

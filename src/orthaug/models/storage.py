@@ -1,6 +1,6 @@
 """Models on disk: `model.json` for what a model is, `arrays.safetensors` for its numbers.
 
-Nothing executable.
+The files hold nothing executable.
 
 The JSON carries checksums of itself and of the arrays. A file that was cut or altered is refused.
 `pack` writes other content the same way.
@@ -100,7 +100,7 @@ def _check_step(model: Any, path: Path) -> None:
 def _expected(model: Any) -> Iterator[tuple[str, Any, tuple[int, ...] | None]]:
     """Return names, values and shapes of all arrays that a model computes with.
 
-    None for a shape that something else has checked.
+    The shape is None where something else has checked it.
     """
     form, numbers, kept = model.form, model.numbers, model.statistics
     outputs, parameters = len(model.outputs), len(model.estimated[0])

@@ -22,7 +22,7 @@ from orthaug.models.cluster import Dask, cluster_errors, kept, smallest_worker
 from orthaug.models.rows import InMemory, Room
 
 _MATRICES = 3  # of a run in memory
-_WAIT = 0.5  # s between two looks at whether a run is still wanted, and two tellings of a run
+_WAIT = 0.5  # s between two looks at whether a run is still wanted, and two reports of a run
 _ANY_SIZE = {
     "distributed.admin.large-graph-warning-threshold": "1 PB"
 }  # rows are sent on purpose, and once
@@ -93,7 +93,7 @@ def runs_on(engine: Any) -> Any:
 
 
 def places(client: Any) -> int:
-    """Return how many tasks the workers take at a time."""
+    """Return the number of tasks that the workers take at a time."""
     return max(sum(client.nthreads().values()), 1)
 
 

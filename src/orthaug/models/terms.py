@@ -122,7 +122,7 @@ class Terms:
         return Scaling(np.zeros(len(size)), np.where(size > 0, size, 1.0))
 
     def weights(self, nz: int, ny: int) -> int:
-        """Return how many weights it has for `nz` features and `ny` outputs."""
+        """Return the number of weights for `nz` features and `ny` outputs."""
         return nz * ny
 
     def silent(self, tree: Tree) -> Tree:
@@ -178,5 +178,5 @@ def over_states(learner: Any, motion: Motion) -> Any:
 
 
 def scaling_of(learner: Any, features: Matrix) -> Scaling:
-    """Return how a learner's features (N, nz) are scaled: its own way, or into [-1, 1]."""
+    """Return the scaling of a learner's features (N, nz): its own, or into [-1, 1]."""
     return learner.scaling(features) if hasattr(learner, "scaling") else Scaling.fit(features)

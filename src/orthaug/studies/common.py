@@ -314,7 +314,7 @@ def signed(exponent: float) -> str:
 
 
 def agreement(values: Any) -> str:
-    """Return how far rows of values, one per start, lie apart."""
+    """Return a text on the largest difference between starts, one row of values each."""
     apart = float(np.ptp(np.asarray(values, dtype=float), axis=0).max())
     return f"starts agree within {apart:.1g}" if apart else "the same number for every start"
 

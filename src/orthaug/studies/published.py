@@ -90,7 +90,7 @@ def initial_weights(seed: int, nz: int) -> Vector:
 def loss(unknowns: Float[Array, "n"], data: Data, bound: Bound, projects: bool) -> Float[Array, ""]:
     """Return `‖Y − Φ(θ − θ_aux) − F‖²` plus the penalty rows, a sum of squares.
 
-    Θ_aux = 0 unless the structure projects.
+    θ_aux = 0 unless the structure projects.
     """
     theta, w = jnp.split(unknowns, [data.phi.shape[1]])
     f = jax.vmap(bound.values, in_axes=(None, 0))(w, data.z)[:, 0]

@@ -33,7 +33,7 @@ class Spread(NamedTuple):
     def __str__(self) -> str:
         digits = (
             3 if self.high - self.low > 0.01 * self.mean else 6
-        )  # as many as make the ends differ
+        )  # as many as make low and high differ
         return f"{self.mean:.{digits}g} ({self.low:.{digits}g} … {self.high:.{digits}g})"
 
     def scaled(self, factor: float) -> Spread:

@@ -139,7 +139,7 @@ def write(
 ) -> None:
     """Write index.html, and for each study its figures as PNG and its runs as CSV.
 
-    Whole or not at all.
+    The folder is written whole or not at all.
     """
     with whole_folder(folder, force=force) as partial:
         for study in reproduced:

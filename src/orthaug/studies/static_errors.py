@@ -48,7 +48,7 @@ GRID = np.linspace(-1.0, 1.0, 81)  # inputs at which the learner is drawn
 def one(data_set: int, structure: str, seed: int, pipeline: str) -> dict[str, Any]:
     """Return one start: θ, its error, the test RMSE.
 
-    Θ under the uniform measure; the learner on a grid of inputs.
+    θ under the uniform measure and the learner on a grid of inputs are added.
     """
     example = static(data_set)
     fit = trained(example, "static", pipeline, structure=STRUCTURES[structure], seed=seed)

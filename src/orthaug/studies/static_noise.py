@@ -119,7 +119,7 @@ def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
 def findings(table: pd.DataFrame) -> list[Finding]:
     """Return the table's four numbers from the fits as published, without regularization.
 
-    What regularization changes.
+    The effect of regularization follows.
     """
     compared = []
     plain = rows_of(table, regularization="none")

@@ -64,7 +64,10 @@ class Study:
         return [case for case in combinations if self.where is None or self.where(**case)]
 
     def key(self, case: Case) -> str:
-        """Return the key of a stored result: a hash of study, version, arguments, function and this package's code."""
+        """Return the key of a stored result.
+
+        It is a hash of study, version, arguments, function and this package's code.
+        """
         declared = {
             "study": self.name,
             "version": self.version,
