@@ -153,7 +153,7 @@ REFUSED = [
     ("", "empty; write for example"),
     (" \n\t ", "empty"),
     ("1" + "+1" * 250, "has 501 characters; at most 500 are read"),
-    ("~" * 490 + "1", "nested too deeply; write it in simpler terms"),
+    ("~" * 490 + "1", "nested too deeply; write it more simply"),
     ("(" * 240 + "1" + ")" * 240, "too many nested parentheses"),
     ("y[k-1] +", "is not an expression"),
     ("y[k-1", "is not an expression"),

@@ -346,7 +346,7 @@ def test_an_encoding_that_was_guessed_is_told(tmp_path):
     done = run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml")
     assert (
         done.code == 0
-        and "a.csv: 300 rows, 2 columns; no UTF-8, so read as Windows-1252" in done.out
+        and "a.csv: 300 rows, 2 columns; not UTF-8, so read as Windows-1252" in done.out
     )
     assert run("check", tmp_path / "spec.toml").code == 0
 
@@ -610,7 +610,7 @@ NO_TIMES = {
     "another unit": (
         "pos [mm]",
         EVEN,
-        "rises evenly, but its unit mm is none of time, so it is taken for a signal",
+        "rises evenly, but its unit mm is no unit of time, so it is taken for a signal",
     ),
     "a time that begins anew": (
         "time",

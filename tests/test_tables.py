@@ -113,7 +113,7 @@ def test_encodings_of_windows(tmp_path, encoding):
     path = put(tmp_path, "run.csv", "Kraft [µN];Wärme [°C]\n1,5;2\n3;4\n".encode(encoding))
     assert values(path, "Kraft [µN]", "Wärme [°C]") == [[1.5, 3.0], [2.0, 4.0]]
     assert layout(path).note == (
-        "no UTF-8, so read as Windows-1252" if encoding == "cp1252" else ""
+        "not UTF-8, so read as Windows-1252" if encoding == "cp1252" else ""
     )
 
 
@@ -429,7 +429,7 @@ REFUSED_NPZ = [
     ),
     ("x[0]", {"y": np.ones(3)}, "no variable 'x'"),
     ("y", {"y": np.array([1j, 2])}, "'y' is complex; expected real numbers"),
-    ("y", {"y": np.array(["a", "b"])}, "'y' is text, no numbers; the file holds y"),
+    ("y", {"y": np.array(["a", "b"])}, "'y' is text, not numbers; the file holds y"),
     (
         "y",
         {"y": np.array(["2020-01-01"], dtype="datetime64[s]")},

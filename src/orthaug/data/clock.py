@@ -91,7 +91,7 @@ class Clock:
         if not self.by_name:
             known = ", which rises as time does"
             known += (
-                "" if split_header(header)[1] else " and whose header names no unit, so s is taken"
+                "" if split_header(header)[1] else " and whose header has no unit; s is assumed"
             )
         if not self.even:
             text = f"{self.step:g} s is usual in column '{header}'{known}, but the steps are uneven"
@@ -217,7 +217,7 @@ def _resemblance(column: Column) -> RefusedColumn | bool | None:
     unit = unit_of_time(header)[1]
     if unit is None:
         reason = (
-            f"rises evenly, but its unit {split_header(header)[1]} is none of time, so it is "
+            f"rises evenly, but its unit {split_header(header)[1]} is no unit of time, so it is "
             "taken for a signal"
         )
         return RefusedColumn(column, reason, True)

@@ -215,9 +215,7 @@ def parse(text: str, constants: Mapping[str, float] | None = None) -> Expression
             f"'{text}' is not an expression ({reason}); allowed are {_ALLOWED}."
         ) from None
     except (RecursionError, MemoryError):
-        raise InputError(
-            f"'{text[:40]}…' is nested too deeply; write it in simpler terms."
-        ) from None
+        raise InputError(f"'{text[:40]}…' is nested too deeply; write it more simply.") from None
 
 
 def parse_named(
@@ -240,7 +238,7 @@ def parse_named(
         )
     if "[" in text:
         raise InputError(
-            f"{where} = {text}: a signal such as y[k-1] is no part of it; known are "
+            f"{where} = {text}: a signal such as y[k-1] is not allowed here; known are "
             f"{', '.join(known)}."
         )
     for word in re.findall(r"\b[^\W\d]\w*", unicodedata.normalize("NFKC", text)):

@@ -66,7 +66,7 @@ class Layout(NamedTuple):
     @property
     def note(self) -> str:
         """Note on the encoding and the names; mostly empty."""
-        notes = ["no UTF-8, so read as Windows-1252"] if self.encoding == _FALLBACK else []
+        notes = ["not UTF-8, so read as Windows-1252"] if self.encoding == _FALLBACK else []
         if not self.headed:
             named = [name for name in self.names if name]
             called = (

@@ -108,7 +108,7 @@ class Variable:
             for name in names:
                 type_, data, at = _element(body, at, self._order)
                 if type_ != _MATRIX:
-                    raise ValueError("what is in a struct or cell is no matrix")
+                    raise ValueError("the content of a struct or cell is not a matrix")
                 if data:
                     path = f"{self.name}{f'[{i}]' if count > 1 else ''}{name}"
                     yield _variable(data, self._order, lambda data=data: data, path)

@@ -216,8 +216,7 @@ def check_steps(steps: Any) -> None:
     ):
         known = ", ".join(kind.__name__ for kind in STEPS.values())
         raise InputError(
-            f"preparation takes steps, which are {known}, each with its arguments; got "
-            f"{steps!r:.80}."
+            f"preparation takes a list of steps with their arguments: {known}; got {steps!r:.80}."
         )
 
 
@@ -357,7 +356,7 @@ def warnings_of(prepared: Sequence[Prepared], names: Sequence[str]) -> tuple[War
             )
         if done.step not in _FILTERS:
             continue
-        late = ", and delays all that it acts on" if done.options.get("phase") == "causal" else ""
+        late = ", and delays its channels" if done.options.get("phase") == "causal" else ""
         found.append(
             Warning(
                 "filtered_noise",

@@ -298,7 +298,7 @@ def _check_time(time: Any, sampling_time: Any, outputs: Mapping[str, str]) -> No
     for name, column in outputs.items():
         if column == time:
             raise InputError(
-                f"the column '{time}' is `time` and the output '{name}'; one of them is wrong."
+                f"the column '{time}' is both `time` and the output '{name}'; correct one of them."
             )
 
 

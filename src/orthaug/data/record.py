@@ -359,8 +359,8 @@ class Record(NotebookView):
             bad = np.flatnonzero(np.isnan(experiment.outputs).any(axis=1))
             if bad.size:
                 raise InputError(
-                    f"{experiment.where(int(bad[0]))}: an output is missing there, which only an "
-                    "Observer takes; leave "
+                    f"{experiment.where(int(bad[0]))}: an output is missing, which only an "
+                    "Observer accepts; leave "
                     'such rows out (`missing = "skip"`), or split the experiment there.'
                 )
 

@@ -76,7 +76,7 @@ class TermLibrary:
         unknown = [name for name in functions if name not in OF_SIGNALS]
         if unknown:
             hint = nearest(unknown[0], OF_SIGNALS) or f"; known are {', '.join(OF_SIGNALS)}"
-            raise InputError(f"no terms are made of the function '{unknown[0]}'{hint}.")
+            raise InputError(f"a library has no terms of the function '{unknown[0]}'{hint}.")
         signals = tuple(dict.fromkeys(signals))
         made = [
             OF_SIGNALS[name].format(signal)
@@ -88,7 +88,7 @@ class TermLibrary:
         if count > MOST_TERMS:
             raise InputError(
                 f"{len(signals)} signals to the degree {degree} make {count} terms; at most "
-                f"{MOST_TERMS} are weighed. Lower the degree, or give fewer signals."
+                f"{MOST_TERMS} are allowed. Lower the degree, or give fewer signals."
             )
         numbers = range(len(signals))
         products = (

@@ -105,9 +105,9 @@ def foreign(path: Path) -> Iterator[None]:
     except InputError:
         raise
     except MemoryError:
-        raise InputError(f"{path}: reading the file takes more memory than there is.") from None
+        raise InputError(f"{path}: reading the file needs more memory than is available.") from None
     except Exception as error:  # there is no list of what they raise for corrupt files
-        reason = "no archive of plain arrays" if path.suffix.lower() == ".npz" else short(error)
+        reason = "not an archive of plain arrays" if path.suffix.lower() == ".npz" else short(error)
         raise InputError(
             f"{path}: cannot be read as {path.suffix.lower()} ({reason}); is it cut or corrupt?"
         ) from None
@@ -153,8 +153,7 @@ def _member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> File
     if size > _LARGE and size > _DENSEST * info.compress_size:
         packed = in_words(info.compress_size)
         return FileVariable(
-            f"{in_words(size)} in {packed} of the file, denser than measurements; store it "
-            "uncompressed",
+            f"{in_words(size)} in {packed} of the file, which is too dense; store it uncompressed",
             None,
         )
 
@@ -247,7 +246,7 @@ class _Datasets:
         elif item.dtype.kind not in "fiubc" and item.dtype.names is None:
             self.held[key] = FileVariable(f"{item.dtype} values", None)
         elif item.dtype.kind in "fiu" and item.id.get_type() != h5py.h5t.py_create(item.dtype):
-            self.held[key] = FileVariable("numbers in a format of their own", None)
+            self.held[key] = FileVariable("numbers in an unknown format", None)
         else:
             shape = item.shape[::-1] if self.matlab else item.shape
             load = lambda: item[()].T if self.matlab else item[()]  # noqa: E731
@@ -377,7 +376,7 @@ def _pick(path: Path, name: str, held: Mapping[str, FileVariable]) -> Vector:
             else ""
         )
         raise InputError(
-            f"{path}: '{variable}' is {held[variable].what}, no numbers; the file holds "
+            f"{path}: '{variable}' is {held[variable].what}, not numbers; the file holds "
             f"{listing}.{hint}"
         )
     array = np.asarray(read())

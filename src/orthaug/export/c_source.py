@@ -97,7 +97,8 @@ def _header(program: Program, fields: list[tuple[str, Signal, int]]) -> str:
     )
     done = comment(program.preparation)
     prepared = f" * Inputs and outputs are data after {done}.\n" if done else ""
-    return f"""/* {name}: one step of a fitted model, every {program.sampling_time!r} s. Written by orthaug.
+    return f"""/* {name}: one step of a fitted model, every {program.sampling_time!r} s.
+ * Written by orthaug.
  * Model sha256 {program.digest}
 {prepared} *{inputs}{outputs}
  */
@@ -159,7 +160,7 @@ def _source(program: Program, fields: list[tuple[str, Signal, int]]) -> str:
         else:
             zeros.append(f"    state->{identifier} = 0;")
     counter = ["    int i;"] if any(depth for *_, depth in fields) else []
-    return f"""/* {name}: one step of a fitted model, described in the header. Written by orthaug. */
+    return f"""/* {name}: one step of a fitted model (see the header). Written by orthaug. */
 #include "{name}.h"
 
 #include <math.h>
@@ -256,7 +257,7 @@ def _check(program: Program, fields: list[tuple[str, Signal, int]], vectors: Vec
         for i, place in enumerate(places_of(fields))
     )
     states = vectors.states.tolist() if program.states else [[0.0]] * rows
-    return f"""/* Run the test vectors: `cc -std=c99 -O2 {name}.c check.c -lm -o check && ./check`. */
+    return f"""/* Test vectors: `cc -std=c99 -O2 {name}.c check.c -lm -o check && ./check`. */
 #include "{name}.h"
 
 #include <math.h>

@@ -254,7 +254,7 @@ def cluster_errors() -> Iterator[None]:
     except KilledWorker as error:
         raise InputError(
             "the cluster gave up on a partition: its workers died "
-            f"{error.allowed_failures + 1} times, most often for want of memory. Take smaller "
+            f"{error.allowed_failures + 1} times, most often for lack of memory. Take smaller "
             "partitions (engine.partition_rows) or larger workers."
         ) from None
     except (CancelledError, CommClosedError, OSError, TimeoutError) as error:

@@ -116,7 +116,9 @@ class MLP:
             )
         if len(self.hidden) > MOST_LAYERS:
             has = f"`hidden` has {len(self.hidden)} layers"
-            raise InputError(f"{has}; at most {MOST_LAYERS} are taken: more compile for minutes.")
+            raise InputError(
+                f"{has}; at most {MOST_LAYERS} are allowed, since more take minutes to compile."
+            )
         check_fields(self)
 
     def silent(self, tree: Tree) -> Tree:

@@ -121,8 +121,8 @@ def step_inputs(form: MotionDynamics) -> tuple[str, ...]:
     motion = form.motion
     if motion.hold == "spline" and motion.inputs:
         raise InputError(
-            "a step knows no spline through the whole record; fit the motion with hold = "
-            "'zero-order' or 'first-order' to step or export it."
+            "a step cannot interpolate by a spline over the whole record; fit the motion with "
+            "hold = 'zero-order' or 'first-order' to step or export it."
         )
     after = tuple(f"{name}[k+1]" for name in motion.inputs) if motion.hold == "first-order" else ()
     return (*motion.inputs, *after)
@@ -161,8 +161,8 @@ def one_experiment(record: Record) -> Experiment:
     """
     if len(record.experiments) != 1:
         raise InputError(
-            f"the record has {len(record.experiments)} experiments; a state starts in one: "
-            "give a record of one."
+            f"the record has {len(record.experiments)} experiments; give "
+            "a record of one, in which the state starts."
         )
     if not record.outputs:
         raise InputError(

@@ -110,8 +110,8 @@ def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
         "theta_error": Drawing(
             figure,
             "Error of θ against the number of samples under 30 dB of noise, data set 1 (left) "
-            "and 3 (right), for the additive structure and for the orthogonal one under two "
-            "measures.",
+            "and 3 (right).",
+            "The curves are the additive structure and the orthogonal one under two measures. "
             "Marks are medians over runs, bars go from the smallest to the largest of them; "
             "the curves are shifted sideways by a few per cent, so that the bars do not "
             "overlap.",

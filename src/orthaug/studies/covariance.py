@@ -63,10 +63,10 @@ def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
     return {
         "covariance": Drawing(
             figure,
-            "The asymptotic covariance matrix of θ and the weights for the first initial "
-            "weights, each entry over the geometric mean of its two diagonal entries (left) "
-            "and in absolute value as in the paper (right).",
-            "Entries below 10⁻⁶ are black. The first two rows and columns are θ.",
+            "The asymptotic covariance matrix of θ and the weights for the first initial weights.",
+            "Each entry is divided by the geometric mean of its two diagonal entries (left), "
+            "and in absolute value as in the paper (right). Entries below 10⁻⁶ are black. The "
+            "first two rows and columns are θ.",
         )
     }
 

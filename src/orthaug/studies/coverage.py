@@ -133,9 +133,9 @@ def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
         "coverage": Drawing(
             figure,
             f"Share of {_draws(table)} draws of the noise in which a 95 % interval of θ holds "
-            "the true value (left), and the mean width of these intervals (right), for three "
-            "kinds of interval on data sets 1 and 3.",
-            "The grey band is 95 % plus and minus four binomial standard deviations.",
+            "the true value (left), and the mean width of these intervals (right).",
+            "There are three kinds of interval, on data sets 1 and 3. The grey band is 95 % "
+            "plus and minus four binomial standard deviations.",
         )
     }
 

@@ -171,10 +171,10 @@ def findings(table: pd.DataFrame) -> list[Finding]:
 REPRODUCTION = Reproduction(
     "solver_times",
     "Time and loss of the solvers",
-    "The same normalised problem and initial weights for every solver, the orthogonal "
-    "structure, stopped at 3, 10, 30 and 100 % of its iterations: the paper's numbers for "
-    "gradient solvers, 300 for Levenberg-Marquardt. Times are of this machine when the run was "
-    "made, one run at a time, compiled before.",
+    "Every solver has the same normalised problem, the same initial weights and the orthogonal "
+    "structure. It is stopped at 3, 10, 30 and 100 % of its iterations. Gradient solvers have "
+    "the paper's number of iterations, Levenberg-Marquardt 300. Times are of this machine when "
+    "the run was made, one run at a time, compiled before.",
     study,
     figures,
     findings,

@@ -89,7 +89,7 @@ def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
         "sigma0_errors": Drawing(
             _errors(table),
             f"Test error (left) and error of θ (right) of {starts} initial weights on each "
-            "data set, additive and orthogonal structure beside what the scripts gave.",
+            "data set, for both structures, with the results of the scripts.",
             "Filled marks are single starts; a cross with a bar is the mean of the scripts, "
             "from their smallest to their largest run. The scripts train the additive "
             "structure from θ⁰, never with θ eliminated. Errors of θ below 10⁻⁹ are rounding, "
@@ -100,7 +100,7 @@ def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
             f"The estimated θ of {starts} initial weights on each data set, with the true θ "
             "where the dashed lines cross, and θ⁰ as a small cross.",
             "All panels have the same scale, which is finer for θ₃ than for θ₁. The starts of "
-            "the orthogonal structure lie on each other.",
+            "the orthogonal structure coincide.",
         ),
         "learner": Drawing(
             _learner(table),
