@@ -230,7 +230,7 @@ def test_what_python_is_given(hardening):
     with pytest.raises(InputError, match="`functions` must be a list of names"):
         oa.explain(model, record, functions="abs")
     with pytest.raises(
-        InputError, match="no terms are made of the function 'asb', did you mean 'abs'"
+        InputError, match="a library has no terms of the function 'asb', did you mean 'abs'"
     ):
         oa.explain(model, record, functions=["asb"])
     with pytest.raises(InputError, match="candidate terms; at most 3000 are looked at"):

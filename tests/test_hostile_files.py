@@ -316,7 +316,7 @@ def test_time_columns_that_are_even_enough(tmp_path):
 def test_one_column_is_not_time_and_output(tmp_path):
     (tmp_path / "run.csv").write_text("t,u\n0,1\n1,2\n2,0\n")
     with pytest.raises(
-        InputError, match="the column 't' is `time` and the output 'y'; one of them is wrong"
+        InputError, match="the column 't' is both `time` and the output 'y'; correct one of them"
     ):
         read_record(tmp_path / "run.csv", inputs=["u"], outputs=["y"], columns={"y": "t"}, time="t")
 

@@ -305,7 +305,7 @@ def test_columns_of_one_name_are_told_apart(tmp_path, monkeypatch):
     done = run("init", tmp_path / "a.csv", "--inputs", "y", "--outputs", "T [K]", "--out", out)
     assert (
         done.code == 2
-        and "the name 'T [K]' stands twice; from the left: T [K].0, T [K].1" in done.err
+        and "several columns are called 'T [K]'; from the left: T [K].0, T [K].1" in done.err
     )
     assert (
         run("init", tmp_path / "a.csv", "--inputs", "y", "--outputs", "T [K].0", "--out", out).code
@@ -348,7 +348,7 @@ def test_an_encoding_that_was_guessed_is_told(tmp_path):
     done = run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml")
     assert (
         done.code == 0
-        and "a.csv: 300 rows, 2 columns; no UTF-8, so read as Windows-1252" in done.out
+        and "a.csv: 300 rows, 2 columns; not UTF-8, so read as Windows-1252" in done.out
     )
     warning = "line 1 of a.csv is no UTF-8, so the file is read as Windows-1252; save it as UTF-8."
     assert warning in unfolded(run("check", tmp_path / "spec.toml").out)
@@ -475,8 +475,7 @@ THINNED = [
         "aika",
         0.05,
         5,
-        "column 'aika' of a.csv tells 0.01 s from row to row, so rows of which one in 5 is "
-        "kept are 0.05 s",
+        "the rows of a.csv are 0.01 s apart by column 'aika', and the rows that are kept 0.05 s",
     ),
     ("Ts", 0.05, 5, "Give sampling_time = 0.01, that of the file's rows.\n"),
     ("time", 0.01, 5, ""),
@@ -539,7 +538,7 @@ def test_a_single_number_in_a_file_of_matlab_is_the_sampling_time(tmp_path, besi
         ["data_y"],
         step or 1.0,
     )
-    assert ("no column tells it" in done.out) == (step is None)
+    assert ("no column states it" in done.out) == (step is None)
     np.savez(tmp_path / "a.npz", u=u, y=y, **beside)
     assert survey(tmp_path / "a.npz").clock.step == (step if beside else None)
 
@@ -630,7 +629,7 @@ NO_TIMES = {
     "another unit": (
         "pos [mm]",
         EVEN,
-        "rises evenly, but its unit mm is none of time, so it is taken for a signal",
+        "rises evenly, but its unit mm is no unit of time, so it is taken for a signal",
     ),
     "a time that begins anew": (
         "time",
@@ -640,7 +639,7 @@ NO_TIMES = {
     "instants that repeat": (
         "time",
         np.floor(EVEN * 10),
-        "stands still at 0 in row 1, so it is not the time",
+        "stays at 0 in row 1, so it is not the time",
     ),
     "a temperature": ("t", np.cos(EVEN), "falls in many rows, so it is taken for a signal"),
     "a counter": ("row", np.arange(300), "counts the rows"),
@@ -660,7 +659,7 @@ def test_why_a_column_is_not_the_time_is_said(tmp_path, header, values, reason):
         "--out",
         tmp_path / "spec.toml",
     )
-    assert done.code == 0 and "sampling time: no column tells it" in done.out, done.err
+    assert done.code == 0 and "sampling time: no column states it" in done.out, done.err
     assert any(header in line and reason in line for line in done.out.splitlines()), done.out
     signals = [column.header for column in survey(tmp_path / "a.csv").signals]
     assert signals == (["u", "y"] if "signal" not in reason else [header, "u", "y"])

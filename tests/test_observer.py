@@ -440,7 +440,7 @@ def test_others_refuse_missing_outputs(verb):
     y = np.zeros(20)
     y[7] = np.nan
     with pytest.raises(
-        oa.InputError, match="row 7: an output is missing there, which only an Observer takes"
+        oa.InputError, match="row 7: an output is missing, which only an Observer accepts"
     ):
         getattr(model, verb)(record_of(model, np.zeros(20), y))
 
@@ -457,7 +457,7 @@ def test_a_fit_refuses_missing_outputs():
     )
     for physics in (PHYSICS, motion):
         with pytest.raises(
-            oa.InputError, match='row 7: an output is missing there, .*`missing = "skip"`'
+            oa.InputError, match='row 7: an output is missing, .*`missing = "skip"`'
         ):
             oa.estimate(record, physics, learner=None)
     with pytest.raises(oa.InputError, match="not finite at row 7"):

@@ -633,7 +633,7 @@ REFUSED = [
         [M],
         {"a": "m*y[k-1]"},
         {},
-        "physics.theta 'a' = m*y[k-1]: a signal such as y[k-1] is no part of it; known are m.",
+        "physics.theta 'a' = m*y[k-1]: a signal such as y[k-1] is not allowed here; known are m.",
     ),
     (
         [P("mass", 1.0)],

@@ -247,7 +247,7 @@ TIMES = [
         "1.7e18 1.700000001e18 1.700000002e18",
         "instants of 1.7e.18 are no seconds; perhaps they are milli- or nano",
     ),
-    ("0", "one row is too few to tell the sampling time from column 't'"),
+    ("0", "one row is too few for a sampling time from column 't'"),
 ]
 
 

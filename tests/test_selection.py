@@ -529,7 +529,7 @@ def test_select_of_halves_fits_the_other_rows(project, tmp_path):
         (
             "degree = 3",
             'degree = 3\nfunctions = ["cosh"]',
-            "no terms are made of the function 'cosh', did you mean 'cos'",
+            "a library has no terms of the function 'cosh', did you mean 'cos'",
         ),
         ("degree = 3", 'terms = ["v[k-1]"]', "v"),
     ],

@@ -14,7 +14,7 @@ from orthaug._base.lines import counted
 from orthaug._base.memory import few_arenas
 from orthaug.commands.data_sections import PartSection
 from orthaug.commands.spec import Spec
-from orthaug.data.clock import DRIFT, thinned_twice, told_clock
+from orthaug.data.clock import DRIFT, read_clock, thinned_twice
 from orthaug.data.parquet_source import open_parquet
 from orthaug.data.preparation import warnings_of
 from orthaug.data.readers import read_record
@@ -298,7 +298,7 @@ def _other_step(
     used = _used_columns(spec, columns)
     step, given = spec.data.sampling_time or 1.0, spec.data.sampling_time is not None
     for file in files:
-        clock = told_clock(path.parent / file, used)
+        clock = read_clock(path.parent / file, used)
         if clock.column is None or clock.step is None or abs(clock.step - step) <= DRIFT * step:
             continue
         said = (

@@ -44,7 +44,9 @@ _ELEMENT = re.compile(
 
 @dataclass(frozen=True)
 class FileVariable:
-    """A variable of a file: what it is, in words, and how to read it (None where it holds no numbers).
+    """A variable of a file: its description, and a function that reads it.
+
+    The function is None where the variable holds no numbers.
 
     `text` reads a text. `named` is the name that the file itself gives to the signal, beside its
     path.
@@ -72,7 +74,7 @@ def read_variables(path: Path, names: Sequence[str]) -> dict[str, Vector]:
 
 
 def variable_names(path: Path) -> list[str]:
-    """Return the names under which a file's channels are read: vectors, and every line along a narrow matrix.
+    """Return the names of a file's channels: vectors, and every line along a narrow matrix.
 
     Raises:
         InputError: a corrupt file.
@@ -82,7 +84,7 @@ def variable_names(path: Path) -> list[str]:
 
 
 def scalars(path: Path, wanted: Callable[[str], bool]) -> dict[str, float]:
-    """Single numbers that a file holds beside its channels, by name, of the names that are wanted.
+    """Return the wanted single numbers that a file holds beside its channels, by name.
 
     Raises:
         InputError: a corrupt file.
@@ -96,7 +98,7 @@ def scalars(path: Path, wanted: Callable[[str], bool]) -> dict[str, float]:
 
 @contextmanager
 def foreign(path: Path) -> Iterator[None]:
-    """Inside, libraries read a file's bytes: what they raise is an InputError, and what they remark is not told."""
+    """Turn errors of libraries that read a file into InputError, and suppress their warnings."""
     try:
         with warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore")
@@ -104,9 +106,9 @@ def foreign(path: Path) -> Iterator[None]:
     except InputError:
         raise
     except MemoryError:
-        raise InputError(f"{path}: reading the file takes more memory than there is.") from None
+        raise InputError(f"{path}: reading the file needs more memory than is available.") from None
     except Exception as error:  # there is no list of what they raise for corrupt files
-        reason = "no archive of plain arrays" if path.suffix.lower() == ".npz" else short(error)
+        reason = "not an archive of plain arrays" if path.suffix.lower() == ".npz" else short(error)
         raise InputError(
             f"{path}: cannot be read as {path.suffix.lower()} ({reason}); is it cut or corrupt?"
         ) from None
@@ -183,7 +185,7 @@ def _from_mat(path: Path, names: Wanted) -> dict[str, Vector]:
 
 
 def _held(path: Path, variable: Variable, *, deep: bool) -> dict[str, FileVariable]:
-    """Return a variable, with what is in it if wanted, by their paths."""
+    """Return a variable and, if wanted, its contents, by their paths."""
     if not variable.what:
         return {variable.name: _lazy(path, variable.shape, 8, variable.numbers)}
     text = variable.text if variable.what == "text" else None
@@ -194,7 +196,7 @@ def _held(path: Path, variable: Variable, *, deep: bool) -> dict[str, FileVariab
 
 
 def _from_hdf5(path: Path, names: Wanted) -> dict[str, Vector]:
-    """Datasets by their path; MATLAB's v7.3 files hold every matrix transposed."""
+    """Return datasets by their path; MATLAB's v7.3 files hold every matrix transposed."""
     try:
         import h5py
     except ImportError:
@@ -210,7 +212,7 @@ def _from_hdf5(path: Path, names: Wanted) -> dict[str, Vector]:
 
 @dataclass(frozen=True, eq=False)
 class _Datasets:
-    """What an HDF5 file holds, by path.
+    """Contents of an HDF5 file, by path.
 
     MATLAB keeps cells and arrays of structs as references to `#refs#`.
     """
@@ -221,7 +223,7 @@ class _Datasets:
     held: dict[str, FileVariable]
 
     def add(self, name: str, item: Any) -> None:
-        """Note what stands at a path of groups; `#refs#` is reached by its references only."""
+        """Note the contents of a path of groups; `#refs#` is reached by its references only."""
         if not name.startswith("#"):
             self._note(name, item, 0)
 
@@ -249,14 +251,17 @@ class _Datasets:
         elif item.dtype.kind not in "fiubc" and item.dtype.names is None:
             self.held[key] = FileVariable(f"{item.dtype} values", None)
         elif item.dtype.kind in "fiu" and item.id.get_type() != h5py.h5t.py_create(item.dtype):
-            self.held[key] = FileVariable("numbers in a format of their own", None)
+            self.held[key] = FileVariable("numbers in an unknown format", None)
         else:
             shape = item.shape[::-1] if self.matlab else item.shape
             load = lambda: item[()].T if self.matlab else item[()]  # noqa: E731
             self.held[key] = _lazy(self.path, shape, item.dtype.itemsize, load)
 
     def _note_elements(self, name: str, item: Any, cell: bool, depth: int) -> None:
-        """Note what the elements of a cell, or of a field of an array of structs, point at: `c[0]`, `runs[0].u`."""
+        """Note the elements that a cell or a field of an array of structs refers to.
+
+        Their names are `c[0]` and `runs[0].u`.
+        """
         count = math.prod(item.shape)
         parent, _, field = name.rpartition("/")
         if cell:
@@ -274,7 +279,10 @@ def _word(text: Any) -> str:
 
 
 def _with_names(held: Mapping[str, FileVariable]) -> dict[str, FileVariable]:
-    """Add the signals that a file names in a field beside their values, each under its name where no other has it."""
+    """Add the signals that a file names in a field beside their values.
+
+    Each gets its name unless another has it.
+    """
     named: dict[str, str] = {}
     for path, variable in held.items():
         parent, _, field = path.rpartition(".")
@@ -302,7 +310,7 @@ ENDINGS = tuple(_FORMATS)
 
 
 def short(error: Exception) -> str:
-    """Return what a library says, on one line."""
+    """Return the message of a library on one line."""
     if isinstance(error, LookupError) or any(isinstance(part, bytes) for part in error.args):
         return "unknown bytes"
     return " ".join(str(error).split())[:120] or type(error).__name__
@@ -373,7 +381,7 @@ def _pick(path: Path, name: str, held: Mapping[str, FileVariable]) -> Vector:
             else ""
         )
         raise InputError(
-            f"{path}: '{variable}' is {held[variable].what}, no numbers; the file holds "
+            f"{path}: '{variable}' is {held[variable].what}, not numbers; the file holds "
             f"{listing}.{hint}"
         )
     array = np.asarray(read())
@@ -392,7 +400,8 @@ def _pick(path: Path, name: str, held: Mapping[str, FileVariable]) -> Vector:
         array = array.ravel()
     if array.ndim != 1:
         raise InputError(
-            f"{path}: '{name}' is no vector; write a column of a matrix as \"{variable}[0]\", a row as "
+            f"{path}: '{name}' is no vector; write a column of a matrix as "
+            f'"{variable}[0]", a row as '
             f'"{variable}[0,:]". The file holds {listing}.'
         )
     return np.asarray(array, dtype=float)
@@ -408,7 +417,7 @@ def _known_as(name: str, held: Mapping[str, FileVariable]) -> str:
 
 
 def _line(path: Path, name: str) -> tuple[str, int, int]:
-    """Variable, axis and index of a column `U[2]` or a row `U[2,:]`."""
+    """Return variable, axis and index of a column `U[2]` or a row `U[2,:]`."""
     if not (name.endswith("]") and "[" in name):
         return name, 0, 0
     variable, _, place = name[:-1].rpartition("[")
@@ -419,7 +428,8 @@ def _line(path: Path, name: str) -> tuple[str, int, int]:
         comma and ":" not in (first, second)
     ):
         raise InputError(
-            f'{path}: \'{name}\': a column of a matrix is written "{variable}[0]", a row "{variable}[0,:]", '
+            f"{path}: '{name}': a column of a matrix is written "
+            f'"{variable}[0]", a row "{variable}[0,:]", '
             "counted from 0."
         )
     return variable, axis, int(index)

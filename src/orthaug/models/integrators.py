@@ -24,7 +24,7 @@ Field = Callable[[Any, Any], Any]
 
 
 def held(inputs: Matrix, hold: str, substeps: int) -> Matrix:
-    """Return what the steps of a run read of its inputs (N, nu): the input at points of each sample, (N, points nu).
+    """Return the inputs (N, nu) at the points of each sample that a step reads, (N, points nu).
 
     One point under a zero-order hold, both ends under a first-order hold, and under a spline hold
     the ends and middles of all substeps, on a cubic spline through the record.
@@ -47,7 +47,7 @@ def _stacked(*points: Matrix) -> Matrix:
 
 
 def input_at(row: Any, nu: int) -> Callable[[Any, int], Any]:
-    """u (nu,) as a function of the half substep i of a sample and of how many it has."""
+    """Return u (nu,) as a function of the half substep i of a sample and of their number."""
     points = row.reshape(-1, nu) if nu else row.reshape(1, 0)
     if len(points) == 1:
         return lambda i, halves: points[0]
@@ -57,7 +57,10 @@ def input_at(row: Any, nu: int) -> Callable[[Any, int], Any]:
 
 
 class Exponentials(NamedTuple):
-    """Of the linear part A of a motion, over a substep h: e^{Ah}, φ₁ to φ₃ of Ah, and e^{Ah/2}, (h/2) φ₁ of Ah/2."""
+    """Exponentials of the linear part A of a motion over a substep h.
+
+    They are e^{Ah}, φ₁ to φ₃ of Ah, and e^{Ah/2}, (h/2) φ₁ of Ah/2.
+    """
 
     linear: Any
     whole: Any
@@ -89,7 +92,7 @@ def advance(
     *,
     looped: bool = False,
 ) -> Any:
-    """x one sample later.
+    """Return x one sample later.
 
     Args: field: ẋ = F(x, u). scheme: the `Exponentials` of its linear part; None for `rk4`. row:
         the input as `held` lays it out. step: the sampling time. looped: write the field once into
@@ -107,7 +110,10 @@ def advance(
 
 
 def runge_kutta(field: Field, h: float) -> Callable[..., Any]:
-    """Return a step of length h under inputs at its begin, middle and end, of JAX or NumPy arrays alike."""
+    """Return a step of length h under inputs at its begin, middle and end.
+
+    The arrays may be JAX's or NumPy's.
+    """
 
     def one(x: Any, first: Any, middle: Any, last: Any) -> Any:
         k1 = field(x, first)
@@ -158,7 +164,7 @@ def _exponential(field: Field, scheme: Exponentials, h: float) -> Callable[..., 
 
 
 def _phi(a: Any, order: int) -> list[Any]:
-    """e^A, φ₁(A) … φ_order(A), of one exponential of a block matrix (Sidje 1998)."""
+    """Return e^A, φ₁(A) … φ_order(A), from one exponential of a block matrix (Sidje 1998)."""
     n = len(a)
     size = (order + 1) * n
     block = jnp.zeros((size, size)).at[:n, :n].set(a)
@@ -168,7 +174,9 @@ def _phi(a: Any, order: int) -> list[Any]:
 
 
 def _exponential_less_one(a: Any) -> Any:
-    """e^A − I by scaling and squaring: `E ← 2E + E²` keeps the digits that squaring e^A would lose.
+    """Return e^A − I by scaling and squaring.
+
+    `E ← 2E + E²` keeps the digits that squaring e^A would lose.
 
     The number of squarings is fixed, so that it compiles to a few products; it is right for ‖A‖ up
     to some thousand.

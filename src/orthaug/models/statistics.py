@@ -1,4 +1,4 @@
-"""What training leaves for later intervals: the Gram matrix of the model's derivatives, and Cov(c, w) from it."""
+"""Statistics of training for intervals: Gram matrix of the derivatives, Cov(c, w) from it."""
 
 from __future__ import annotations
 
@@ -50,13 +50,15 @@ class JointCovariance:
 
     gram: Matrix
     ridge: float | Vector
-    """Of all weights, or of each (nw,)."""
+    """Ridge of all weights, or of each (nw,)."""
     middle: Matrix
     """ΣψᵀΣ_eψ in whitened outputs, `σ² G` for one output."""
     nt: int
 
     def root(self) -> Float[np.ndarray, "n r"]:
-        """S with `Cov p = S Sᵀ = M⁻¹ (ΣψᵀΣ_eψ + σ² ridge) M⁻¹`, the ridge counted as the prior that it is.
+        """Return S with `Cov p = S Sᵀ = M⁻¹ (ΣψᵀΣ_eψ + σ² ridge) M⁻¹`.
+
+        The ridge is counted as the prior that it is.
 
         Variances are then sums of squares, which no rounding makes negative.
         """
@@ -68,14 +70,14 @@ class JointCovariance:
         return half @ (vectors * np.sqrt(np.maximum(values, 0.0)))
 
     def of(self, k: Float[np.ndarray, "m n"]) -> Matrix:
-        """Cov of `K p`, (m, m)."""
+        """Return Cov of `K p`, (m, m)."""
         reach = k @ self.root()
         return reach @ reach.T
 
 
 @dataclass(frozen=True, eq=False)
 class Statistics:
-    """What training leaves behind; None where it left nothing.
+    """Statistics of training; None where it has none.
 
     `gram` (nθ + nw)² is the Gram matrix of ∂ŷ/∂(c, w) over the training rows in whitened outputs,
     `[Φ J]` one step ahead; `ridge` the weights' prior precision beside it, of all or of each (nw,);
@@ -91,7 +93,7 @@ class Statistics:
     simulated: bool = False
     """Whether `noise` is of a free run's errors, and not of those one step ahead."""
     verdict: str = ""
-    """What the residual says of the noise (`analysis.Diagnosis`); empty where nobody asked."""
+    """Diagnosis of the residual (`analysis.Diagnosis`); empty where none was asked for."""
     disturbance: Matrix | None = None
     """Q of an observer by the likelihood of the training data, and with it R, `sensor`; where
     nobody tuned it.
@@ -99,7 +101,7 @@ class Statistics:
     sensor: Matrix | None = None
 
     def joint(self, nt: int) -> JointCovariance | None:
-        """Cov(c, w), θ in front with nt entries."""
+        """Return Cov(c, w), the nt entries of θ first."""
         if self.gram is None or self.middle is None:
             return None
         return JointCovariance(self.gram, self.ridge, self.middle, nt)

@@ -1,4 +1,4 @@
-"""`orthaug reproduce`: the paper's studies run, drawn, put beside the published numbers, and gathered on one page."""
+"""`orthaug reproduce`: run and draw the paper's studies, and compare them on one page."""
 
 from __future__ import annotations
 
@@ -120,12 +120,12 @@ def reproduce(
     store = Path(platformdirs.user_cache_dir("orthaug")) / "studies" if store is None else store
     reproduced = []
     for entry in entries:
-        tell = (
+        report = (
             None
             if progress is None
             else lambda done, total, e=entry: progress(e.title, done, total)
         )
-        done = runs(entry.study(pipeline, small), store=store, progress=tell, client=client)
+        done = runs(entry.study(pipeline, small), store=store, progress=report, client=client)
         table = as_table(done)
         whole = len(entry.study(pipeline, False).cases())
         shown = dict(entry.figures(table)), entry.findings(table)
@@ -141,9 +141,9 @@ def check_output(folder: Path, *, force: bool = False) -> None:
 def write(
     reproduced: Sequence[StudyOutcome], folder: Path, pipeline: str, *, force: bool = False
 ) -> None:
-    """index.html, and for each study its figures as PNG and its runs as CSV.
+    """Write index.html, and for each study its figures as PNG and its runs as CSV.
 
-    Whole or not at all.
+    The folder is written whole or not at all.
     """
     with whole_folder(folder, force=force) as partial:
         for study in reproduced:
@@ -204,7 +204,7 @@ def _size(reproduced: Sequence[StudyOutcome]) -> dict[str, Any]:
 
 
 def when(done: Sequence[Run]) -> str:
-    """Return how many runs were made now and how many came from a store, when those were made, and their seconds."""
+    """Return how many runs were made now or read from a store, when, and their seconds."""
     parts = []
     for stored in (False, True):
         some = [run for run in done if run.stored is stored]

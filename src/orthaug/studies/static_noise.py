@@ -1,6 +1,6 @@
-"""Sect.
+"""Sect. 5.1 with 30 dB of noise: the paper's table, test RMSE and error of θ.
 
-5.1 with 30 dB of noise: the paper's table, test RMSE and error of θ, data set 1, ten starts.
+The fits are those of data set 1, with ten starts.
 """
 
 from __future__ import annotations
@@ -62,7 +62,10 @@ def one(structure: str, regularization: str, seed: int, pipeline: str) -> dict[s
 
 
 def study(pipeline: str, small: bool) -> Study:
-    """Structures × regularizations × starts; the gradient pipelines have no evidence."""
+    """Return structures × regularizations × starts.
+
+    The gradient pipelines have no evidence.
+    """
     kinds = ("none",) if pipeline != "ours" else ("none", "stopping", "evidence")
     seeds = range(2) if small else range(10)
     grid = {
@@ -75,7 +78,7 @@ def study(pipeline: str, small: bool) -> Study:
 
 
 def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
-    """Figure "errors": test RMSE and error of θ of every start."""
+    """Draw "errors": test RMSE and error of θ of every start."""
     figure, axes = panels(2, height=3.6)
     kinds = list(dict.fromkeys(table.regularization))
     for axis, quantity, scale in zip(axes, ("test_rmse", "theta_error"), (1e3, 1.0), strict=True):
@@ -116,7 +119,7 @@ def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
 def findings(table: pd.DataFrame) -> list[Finding]:
     """Return the table's four numbers from the fits as published, without regularization.
 
-    What regularization changes.
+    The effect of regularization follows.
     """
     compared = []
     plain = rows_of(table, regularization="none")
@@ -168,7 +171,7 @@ def _scripts(structure: str) -> dict[str, references.Spread]:
 
 
 def _beside_printed(values: pd.Series, printed: float) -> tuple[bool, str]:
-    """Return whether a printed mean is one that our starts could have, and that in words."""
+    """Return whether our starts could have a printed mean, and a text on it."""
     ours = float(values.mean())
     if values.min() <= printed <= values.max():
         return True, "the printed number is within our starts"
@@ -180,7 +183,7 @@ def _beside_printed(values: pd.Series, printed: float) -> tuple[bool, str]:
 
 
 def _theta_finding(rows: pd.DataFrame, structure: str) -> Finding:
-    """Error of θ.
+    """Return the finding on the error of θ.
 
     Of the orthogonal structure over every regularization, because none changes it.
     """
@@ -205,7 +208,7 @@ def _theta_finding(rows: pd.DataFrame, structure: str) -> Finding:
 
 
 def _regularized(table: pd.DataFrame, kind: str) -> list[Finding]:
-    """Return what a regularization makes of the errors without any.
+    """Return the effect of a regularization on the errors.
 
     One row where both structures predict the same.
     """

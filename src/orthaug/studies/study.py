@@ -64,7 +64,10 @@ class Study:
         return [case for case in combinations if self.where is None or self.where(**case)]
 
     def key(self, case: Case) -> str:
-        """Return the key of a stored result: a hash of study, version, arguments, function and this package's code."""
+        """Return the key of a stored result.
+
+        It is a hash of study, version, arguments, function and this package's code.
+        """
         declared = {
             "study": self.name,
             "version": self.version,
@@ -129,7 +132,10 @@ def run(
 
 
 def as_table(done: Sequence[Run]) -> pd.DataFrame:
-    """Return a row per run, axes first. It does not tell stored results from those made now."""
+    """Return a row per run, axes first.
+
+    Stored results and those made now are not distinguished.
+    """
     import pandas as pd
 
     return pd.DataFrame([{**run.case, **run.result} for run in done])
@@ -143,7 +149,7 @@ def runs(
     progress: CasesProgress | None = None,
     client: Any = None,
 ) -> list[Run]:
-    """`run`, with the time of every result instead of a table."""
+    """Return the runs as `run` makes them, with the time of every result instead of a table."""
     cases = study.cases()
     found = [_read(store, study, case) for case in cases]
     todo = [i for i, run in enumerate(found) if run is None]
