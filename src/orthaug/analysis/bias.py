@@ -347,7 +347,7 @@ def find_certificate(
 
 def _certificate_along(projection: Projection, delta: Matrix, directions: Matrix) -> Certificate:
     """Return the certificate among some directions, as weights of all parameters."""
-    directions = projection.told_of(directions)
+    directions = projection.without_null(directions)
     if not directions.shape[1]:
         return Certificate("orthogonal")
     found = find_certificate(Projection.factor(projection.phi @ directions), delta)

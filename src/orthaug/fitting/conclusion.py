@@ -77,10 +77,10 @@ def conclude(task: OneStepTask, structure: Structure, learned: TrainedLearner) -
     noise = errors.noise if ending.usable else None
     identified = structure.projects or (learned.bound is None and structure.identifies)
     known = noise is not None and identified and not learned.elsewhere
-    told += [] if learned.elsewhere else learner_silent(learned)
-    told += ill_conditioned.of_physics(problem, theta, errors.covariance if ending.usable else None)
-    told += _warnings(problem, structure, learned, identified, noise, fixed)
-    if any(warning.code == NOT_CONVERGED for warning in told):
+    warnings += [] if learned.elsewhere else learner_silent(learned)
+    warnings += ill_conditioned.of_physics(problem, theta, errors.covariance if ending.usable else None)
+    warnings += _warnings(problem, structure, learned, identified, noise, fixed)
+    if any(warning.code == NOT_CONVERGED for warning in warnings):
         pass
     elif known and errors.covariance is None and learned.errors is None:
         text = "no standard errors: an ensemble has none where its learner sees only some features."
@@ -278,7 +278,7 @@ def _warnings(
     noise: Matrix | None,
     fixed: Fixed,
 ) -> list[Warning]:
-    told: list[Warning] = []
+    warnings: list[Warning] = []
     if learned.ending is Ending.SPANNED:
         text = (
             "the learner lies in the span of the physics (P⊥J = 0): there is nothing for it to "

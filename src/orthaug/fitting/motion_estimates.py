@@ -267,7 +267,7 @@ def _with_split(
     )
     covariance, unseen = _covariance(fit, split, at_bound)
     warnings = [
-        *told,
+        *of_measure,
         *_ill_conditioned(fit, split),
         *_doubts(split, at_bound, unseen, fit.model.form.bound is not None),
     ]

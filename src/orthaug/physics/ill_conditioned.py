@@ -113,10 +113,10 @@ def _warnings(
     groups += [
         g for g in tied_columns(vt[small < _HALF_OF_THE_DIGITS], _PART) if not taken & set(g)
     ]
-    told = []
+    found = []
     for group in groups:
         inflation = np.sqrt(np.sum((vt[:, group] / sigma[:, None]) ** 2, axis=0)).max()
-        listed = ", ".join(names[i] for i in group)
+        listed = ", ".join(names[int(i)] for i in group)
         least = "at least " if small[-1] <= finest else ""
         text = (
             f"the physics is ill-conditioned on the data (condition {least}{1 / small[-1]:.1e} "
@@ -125,5 +125,5 @@ def _warnings(
             f"{inflation:.1e}; its standard error is as many times what it would be alone. Fix "
             "one of them, join them to one parameter, or use data in which they act separately."
         )
-        told.append(Warning("ill_conditioned", text))
-    return told
+        found.append(Warning("ill_conditioned", text))
+    return found

@@ -241,7 +241,8 @@ def _check_start(problem: MotionProblem) -> None:
 def _check_exact(problem: MotionProblem) -> None:
     """Raise InputError for modes that samples do not show, or whose exponential has no digits."""
     sampling_time = problem.record.sampling_time
-    lasting = problem.modes[problem.modes.real * sampling_time > _GONE]
+    modes: Any = problem.modes
+    lasting = modes[modes.real * sampling_time > _GONE]
     turned = float(np.abs(lasting.imag).max(initial=0.0)) * sampling_time
     fast = problem.fastest * sampling_time / problem.substeps
     if turned > _TURNED:
