@@ -500,7 +500,7 @@ def test_a_sampling_time_that_is_thinned_already_is_refused(tmp_path, header, gi
     assert done.code == (2 if told else 0) and told in done.err, done.err
     multiplied = (
         f"data.train: every = {every} multiplies the sampling time {given:g} s to "
-        f"{every * given:g} s, but column"
+        f"{every * given:g} s. But the rows of"
     )
     assert (multiplied in done.err) == bool(told)
     if not told and every > 1:

@@ -198,7 +198,7 @@ REFUSED = [
     (lambda: oa.prepare(record(SLOW), oa.Resample(sampling_time=1e-9)), "take a longer one"),
     (
         lambda: oa.prepare(record(SLOW).rows(0, 9), oa.Lowpass(cutoff=1.0)),
-        "has 9 rows, a filter of zero phase",
+        "has 9 rows, but a filter of zero phase",
     ),
     (
         lambda: oa.prepare(record(SLOW), "lowpass"),

@@ -306,7 +306,7 @@ def test_a_sampling_time_that_every_thins_twice(tmp_path):
     options = {"inputs": ["x2"], "outputs": ["x3"], "every": 5}
     with pytest.raises(
         InputError,
-        match=r"run.txt: every = 5 multiplies the sampling time 0.05 s to 0.25 s, but col.* 'x1'",
+        match=r"run.txt: every = 5 multiplies the sampling time 0.05 s to 0.25 s. But .* 'x1'",
     ):
         read_record(path, sampling_time=0.05, **options)
     assert read_record(path, sampling_time=0.01, **options).sampling_time == pytest.approx(0.05)

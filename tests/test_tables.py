@@ -429,7 +429,7 @@ REFUSED_NPZ = [
     ),
     ("x[0]", {"y": np.ones(3)}, "no variable 'x'"),
     ("y", {"y": np.array([1j, 2])}, "'y' is complex; expected real numbers"),
-    ("y", {"y": np.array(["a", "b"])}, "'y' is text, not numbers; the file holds y"),
+    ("y", {"y": np.array(["a", "b"])}, "'y' is text, no numbers; the file holds y"),
     (
         "y",
         {"y": np.array(["2020-01-01"], dtype="datetime64[s]")},

@@ -64,19 +64,19 @@ class Clock:
 
     @property
     def instants(self) -> bool:
-        """Whether the column holds instants."""
+        """True if the column holds instants."""
         return self.seconds is not None
 
     @property
     def steady(self) -> bool:
-        """Whether the instants of all parts of the file have the same sampling time."""
+        """True if the instants of all parts of the file have the same sampling time."""
         seconds = np.zeros(0) if self.seconds is None else self.seconds[np.isfinite(self.seconds)]
         means = [part.mean() for part in np.array_split(np.diff(seconds), 4) if len(part)]
         return bool(means) and same_step(min(means), max(means))
 
     @property
     def by_name(self) -> bool:
-        """Whether the name or the dates of the column show that it is the time.
+        """True if the name or the dates of the column show that it is the time.
 
         Otherwise only its values do.
         """

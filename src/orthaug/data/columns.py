@@ -69,7 +69,7 @@ class Column:
 
     @property
     def constant(self) -> bool:
-        """Whether all values are the same."""
+        """True if all values are the same."""
         return len(self.finite) > 0 and bool(np.ptp(self.finite) == 0)
 
     @property

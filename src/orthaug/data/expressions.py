@@ -94,7 +94,7 @@ class Expression:
 
     @cached_property
     def unsampled(self) -> bool:
-        """Whether it reads `Ts`, and has no value for that yet."""
+        """True if it reads `Ts`, and has no value for that yet."""
         named = any(
             isinstance(node, ast.Name) and node.id == SAMPLING_TIME
             for node in _free_names(self.tree)

@@ -381,7 +381,7 @@ def _pick(path: Path, name: str, held: Mapping[str, FileVariable]) -> Vector:
             else ""
         )
         raise InputError(
-            f"{path}: '{variable}' is {held[variable].what}, not numbers; the file holds "
+            f"{path}: '{variable}' is {held[variable].what}, no numbers; the file holds "
             f"{listing}.{hint}"
         )
     array = np.asarray(read())

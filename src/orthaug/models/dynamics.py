@@ -90,7 +90,7 @@ class Dynamics(Protocol):
 
     @property
     def linear(self) -> bool:
-        """Whether the output is linear in θ for a given state and inputs.
+        """True if the output is linear in θ for a given state and inputs.
 
         Training then eliminates θ (F1).
         """
@@ -98,7 +98,7 @@ class Dynamics(Protocol):
 
     @property
     def differentiable(self) -> bool:
-        """Whether JAX can differentiate `step`; otherwise finite differences are used."""
+        """True if JAX can differentiate `step`; otherwise finite differences are used."""
         ...
 
     @property

@@ -70,7 +70,7 @@ class Filter(Protocol):
 
     @property
     def hidden(self) -> bool:
-        """Whether the state is more than past outputs, so that some rows must determine it."""
+        """True if the state is more than past outputs, so that some rows must determine it."""
         ...
 
     @property

@@ -39,7 +39,7 @@ class Lagged:
 
     @property
     def alone(self) -> Lagged:
-        """The same physics without a learner."""
+        """These dynamics without the learner."""
         return replace(self, features=Features(()), bound=None)
 
     @property

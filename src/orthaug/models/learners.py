@@ -358,7 +358,7 @@ class Bound:
 
     @property
     def differentiable(self) -> bool:
-        """Whether JAX differentiates the learner; otherwise finite differences are used."""
+        """True if JAX differentiates the learner; otherwise finite differences are used."""
         return getattr(self.learner, "differentiable", True)
 
     @property

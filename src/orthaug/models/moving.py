@@ -174,7 +174,7 @@ class MotionDynamics(MotionField, AutodiffDynamics):
 
     @property
     def alone(self) -> MotionDynamics:
-        """The same motion without a learner."""
+        """These dynamics without the learner."""
         return replace(self, features=(), bound=None)
 
     def start(

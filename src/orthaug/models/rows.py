@@ -73,7 +73,7 @@ class Engine(Protocol):
 
     @property
     def resident(self) -> bool:
-        """Whether all rows are one `Chunk` on the device.
+        """True if all rows are one `Chunk` on the device.
 
         A whole training run can then be compiled around a sum.
         """

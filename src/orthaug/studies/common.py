@@ -92,7 +92,7 @@ class Finding(NamedTuple):
 
     @property
     def beyond(self) -> bool:
-        """Whether there is nothing to compare with.
+        """True if there is nothing to compare with.
 
         Such a row is neither met nor missed.
         """
