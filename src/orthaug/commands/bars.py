@@ -24,15 +24,13 @@ if TYPE_CHECKING:
     from rich.progress import ProgressColumn
 
 TOLD_AS = "ORTHAUG_PROGRESS"
-"""Variable of the environment; where it is `json`, training tells of itself by lines of JSON on
-standard error.
+"""Environment variable: with the value `json`, training writes its progress to standard error, a line of JSON at a time.
 """
 ENOUGH = threading.Event()
-"""Of the process: once it is set, training ends with what it has reached, as a result with the
-warning `stopped`.
+"""An event of the process: once it is set, training ends with the result reached so far, and the warning `stopped`.
 """
 ENOUGH_LINE = b"enough\n"
-"""What sets it, on the standard input of a child of the page."""
+"""The line on the standard input of a child of the page that sets this event."""
 _OFTEN = 0.02  # s between such lines
 _MANY = 1_000_000  # rows from which the rate is told
 _LONG = 5.0  # s of a search that are told beforehand
@@ -40,7 +38,7 @@ _SEEN = 3  # models after which the time of the rest is told: the first ones com
 
 
 def on_terminal() -> bool:
-    """Return whether a person sees standard error.
+    """Return whether standard error is a terminal.
 
     FORCE_COLOR, which build servers set, does not make it one.
     """
@@ -65,10 +63,11 @@ def drawn_bar(*columns: ProgressColumn, transient: bool = True) -> Bar:
 def training_bar(
     runs: int, iterations: int, wanted: bool = True, rows: int = 0
 ) -> Iterator[Progress]:
-    """A progress bar on standard error where that is a terminal; Ctrl-C says what it stopped.
+    """Show a progress bar on standard error where that is a terminal; report what Ctrl-C stopped.
 
-    Args: rows: of the training data. Where there are many, it says how many are gone through in a
-        second.
+    Args:
+        rows: of the training data. Where there are many, it says how many are gone through in a
+            second.
     """
     if not wanted:
         yield SILENT
@@ -108,7 +107,7 @@ def training_bar(
 
 
 class _Lines:
-    """Writes a line of JSON now and then, for a program that follows this one.
+    """A writer of progress as lines of JSON, for a program that follows this one.
 
     Nothing unless it is asked for.
     """
@@ -119,7 +118,7 @@ class _Lines:
         self._first, self._plan = 0, ()
 
     def planned(self, first: int, plan: Plan) -> None:
-        """The runs from this number on are these."""
+        """Set the runs that follow from this number on."""
         self._first, self._plan = first, tuple(plan)
 
     def __call__(self, run: int, iteration: int, loss: float, passes: int) -> None:
@@ -144,7 +143,7 @@ class _Lines:
 
 @contextmanager
 def study_bars() -> Iterator[Callable[[str, int, int], None]]:
-    """A bar per study on standard error where that is a terminal.
+    """Show a bar per study on standard error where that is a terminal.
 
     Ctrl-C stops after the run at hand.
     """
@@ -172,7 +171,7 @@ def study_bars() -> Iterator[Callable[[str, int, int], None]]:
 
 @contextmanager
 def selection_bar(most: int) -> Iterator[Callable[[str, Any], None]]:
-    """A bar of the models that were judged, on standard error.
+    """Show a bar of the models judged so far, on standard error.
 
     Ctrl-C keeps what there is, a second one ends at once.
 
@@ -209,7 +208,7 @@ def selection_bar(most: int) -> Iterator[Callable[[str, Any], None]]:
 
 @contextmanager
 def _asked_to_stop() -> Iterator[threading.Event]:
-    """An event that the first Ctrl-C sets."""
+    """Yield an event that the first Ctrl-C sets."""
     if WATCH.active:
         with WATCH.asking() as event:
             yield event
@@ -220,7 +219,7 @@ def _asked_to_stop() -> Iterator[threading.Event]:
 
 @contextmanager
 def _deferred_interrupt() -> Iterator[threading.Event]:
-    """Ctrl-C sets the event, so that it never lands inside compiled code.
+    """Let Ctrl-C set the event, so that it never interrupts compiled code.
 
     A second one interrupts at once.
 
@@ -245,7 +244,7 @@ def _deferred_interrupt() -> Iterator[threading.Event]:
 
 @contextmanager
 def shown_progress() -> Iterator[ProgressCallback]:
-    """Progress of a fit from Python: a bar on a terminal, a line in a notebook, nothing elsewhere."""
+    """Show the progress of a fit from Python: on a terminal a bar, in a notebook a line."""
     display = _display()
     if display is not None:
         yield from _in_notebook(display)
@@ -256,7 +255,7 @@ def shown_progress() -> Iterator[ProgressCallback]:
 
 
 def _display() -> Any:
-    """IPython's `display` in a notebook, which has loaded it; None elsewhere."""
+    """Return IPython's `display` in a notebook, which has loaded it; None elsewhere."""
     ipython, shown = sys.modules.get("IPython"), sys.modules.get("IPython.display")
     if ipython is None or shown is None:
         return None
@@ -303,7 +302,7 @@ def _words(run: int, iteration: int, loss: float) -> str:
 
 
 def _line(words: str, *, ended: bool) -> str:
-    """Return a bar that moves as long as it is not known how long it takes."""
+    """Return a bar that moves while the total is unknown."""
     moving = (
         ""
         if ended

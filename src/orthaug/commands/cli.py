@@ -130,7 +130,7 @@ def compare(
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
-    """Physics alone and every structure, one table."""
+    """Compare physics alone and every structure in one table."""
     from orthaug.commands.folder import check_folder, check_inputs_kept
     from orthaug.commands.kinds import open_job
     from orthaug.reports.text import compare_text
@@ -269,7 +269,7 @@ def init(
 
 
 def _unsaid(line: str) -> None:
-    """Nobody waits long enough to be told."""
+    """Show nothing: the file is read too quickly for a message."""
 
 
 def _asked(text: str, check: Callable[[str], Any], default: str | None = "") -> str:
@@ -301,7 +301,7 @@ def page(
         bool, typer.Option("--browser/--no-browser", help="Open it in the browser.")
     ] = True,
 ) -> None:
-    """A page on this machine to do all of this in a browser.
+    """Open a page on this machine to do all of this in a browser.
 
     Look at data, write physics, train, compare and export.
     """
@@ -321,7 +321,7 @@ def schema(
         ),
     ] = "fit",
 ) -> None:
-    """The JSON schema of a result or a spec; keys: in words."""
+    """Print the JSON schema of a result or a spec; keys: in words."""
     from orthaug.commands.schema import RESULTS, keys_of_a_spec, schema_of, schema_of_a_spec
 
     if check_choice(command, (*RESULTS, "spec", "keys"), "WHAT") == "keys":
@@ -354,7 +354,7 @@ def reproduce(
     ] = None,
     force: Force = False,
 ) -> None:
-    """The paper's figures and tables beside the published ones.
+    """Compute the paper's figures and tables beside the published ones.
 
     Goes on where it was interrupted.
     """

@@ -1,4 +1,4 @@
-"""What `orthaug fit` does: train a job, score and judge it, and write the folder that holds the result."""
+"""Fit of a spec: train a job, score and judge it, and write the folder with the result."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ class FitReport:
 
     job: Job
     fit: Any
-    """`Estimate`, or `MotionEstimate` of a motion."""
+    """The fit: `Estimate`, or `MotionEstimate` for a motion."""
     result: FitResult
     responses: Mapping[str, tuple[Response, Response]]
     """One-step prediction and free run of every part, by its name; none where training failed."""
     alone: Mapping[str, tuple[Response, Response]] = field(default_factory=dict)
-    """The same of physics alone, where that was fitted, too."""
+    """The responses of physics alone, where that was fitted too."""
 
     def __repr__(self) -> str:
         return f"Fitted({self.job.path.name}: {self.fit!r})"
@@ -71,7 +71,7 @@ class FitReport:
 
 @one_blas_thread()
 def fit_job(job: Job, progress: Progress = SILENT) -> FitReport:
-    """Train as the spec says, score every part, ask whether the learner earns its place, and try what may better it."""
+    """Train as the spec says, score every part, judge the learner, and try improvements."""
     return advised(doubted(judged(fit_variant(job, AS_DECLARED, progress))))
 
 
@@ -96,7 +96,7 @@ def advised(fitted: FitReport) -> FitReport:
 
 
 def judged(fitted: FitReport) -> FitReport:
-    """With whether the learner earns its place."""
+    """Return a fit with the verdict on its learner."""
     job, fit, warnings = fitted.job, fitted.fit, list(fitted.result.warnings)
     if not fit.status.ok or (fit.model.form.bound is None and fit.held_out is None):
         return fitted
@@ -129,7 +129,10 @@ def judged(fitted: FitReport) -> FitReport:
 
 
 def _physics_alone(fitted: FitReport) -> Any:
-    """Return the fit of physics alone that the learner had to beat: the one that was made, or one by the same criterion."""
+    """Return the fit of physics alone that the learner is compared to.
+
+    It is the one that was made already, or one by the same criterion.
+    """
     made = fitted.fit.physics_alone
     return (
         made if made is not None else fitted.job.run(Variant(ALONE, criterion=fitted.fit.criterion))
@@ -137,10 +140,13 @@ def _physics_alone(fitted: FitReport) -> Any:
 
 
 def _unexplained(fitted: FitReport, physics: Callable[[], Any] | None) -> list[Warning]:
-    """That a learner may have taken from parameters that it could imitate, where no cause tells by how much.
+    """Return a warning where the learner may have taken an unknown share of a parameter.
 
-    Args: physics: the fit without the learner, where that does not help: it may still take up what
-        physics alone leaves.
+    It could imitate these parameters, and no suspect explains what it found.
+
+    Args:
+        physics: the fit without the learner, where that does not help: it may still take up what
+            physics alone leaves.
     """
     from orthaug.analysis.diagnosis import diagnose
 
@@ -172,7 +178,7 @@ def _unexplained(fitted: FitReport, physics: Callable[[], Any] | None) -> list[W
 
 
 def keeping(job: Job, folder: Path, *, resume: bool = False) -> Job:
-    """Return the job with the states of its training kept beside the result folder.
+    """Return the job, with its states of training kept beside the result folder.
 
     With `resume` it goes on from them.
 
@@ -195,13 +201,13 @@ def keeping(job: Job, folder: Path, *, resume: bool = False) -> Job:
 
 
 def fit_variant(job: Job, variant: Variant, progress: Progress = SILENT) -> FitReport:
-    """Train a variant of a job and score every part; `judge_fit` asks whether the learner helps."""
+    """Train a variant of a job and score every part; `judge_fit` judges the learner."""
     progress.planned(job.planned(variant))
     return told_of(job, job.run(variant, progress))
 
 
 def told_of(job: Job, fit: Any) -> FitReport:
-    """Scores of a fit on every part of its job, and all that results tell of it but the verdict on the learner."""
+    """Score a fit on every part of its job, and fill its result up to the verdict."""
     warnings: list[Any] = [*job.warnings, *fit.warnings]
     if job.checkpoints is not None and job.checkpoints.lost:
         warnings.append(
@@ -282,7 +288,10 @@ def _status(fit: Any, warnings: Sequence[Any]) -> Any:
 def _one_step_only(
     scores: Mapping[str, PartScores], alone: Mapping[str, PartScores], parts: Sequence[str]
 ) -> list[Warning]:
-    """That a model trained one step ahead by hand is of no use in free run: it diverges, or physics alone is better."""
+    """Return a warning where a model trained one step ahead is of no use in free run.
+
+    It diverges there, or physics alone is better; the user chose the criterion.
+    """
     diverges = any(scores[part].simulation.nrmse is None for part in parts)
     worse = [
         bool(
@@ -310,7 +319,10 @@ def _one_step_only(
 
 
 def _for_observers(fit: Any, verdict: str, warnings: list[Any]) -> Any:
-    """Return the fit whose model keeps what an observer of it asks for: the verdict on the residual, and two noises."""
+    """Return the fit with a model that keeps what observers need.
+
+    These are the verdict on the residual, and the two noises.
+    """
     from orthaug.analysis.observer_noise import to_keep
 
     kept = replace(fit.model.statistics, verdict=verdict)
@@ -326,13 +338,14 @@ def judge_fit(
     blocks: Sequence[Trial] | None = None,
     alone: Mapping[str, tuple[Response, Response]] | None = None,
 ) -> Verdict | None:
-    """Return whether the learner earns its place: free runs against physics alone on what was not fitted.
+    """Return whether the learner is useful: its free run against physics alone on data not fitted.
 
     Where the fit fell back to physics alone, that is judged by which it did.
 
-    Args: physics: gives the fit of physics alone, where a part is held out. blocks: trials of
-        blocked cross-validation; None for those by which the fit was chosen, or to make them, where
-            there is no validation or test part or where the spec asks for them.
+    Args:
+        physics: gives the fit of physics alone, where a part is held out.
+        blocks: trials of blocked cross-validation; None for those by which the fit was chosen, or
+            to make them, where there is no validation or test part or where the spec asks for them.
         alone: the responses of physics alone by part, where they are there already.
     """
     from orthaug.analysis.validation import extrapolation, judge, trial_on, trials_of
@@ -374,18 +387,18 @@ def judge_fit(
 
 
 def _stopped(fit: Any) -> bool:
-    """Return whether training was asked to end with what it had: then nobody waits for cross-validation either."""
+    """Return whether training was asked to end early: then cross-validation is omitted too."""
     return any(warning.code == "stopped" for warning in fit.warnings)
 
 
 def wanted_blocks(job: Job) -> int:
-    """Blocks of cross-validation for a verdict: none where parts are held out, unless the spec asks for them."""
+    """Return the number of blocks of cross-validation: by default none beside held-out parts."""
     asked = job.spec.validation.blocks
     return (0 if job.parts[1:] else DEFAULT_BLOCKS) if asked is None else asked
 
 
 def cross_validated(job: Job, blocks: int, variants: Sequence[Variant]) -> list[list[Trial]]:
-    """Trials of every variant on every block; none where the record is too short for that."""
+    """Return the trials of every variant on every block; none where the record is too short."""
     from orthaug.analysis.validation import block_trials, cross_validate
 
     fits = [
@@ -403,7 +416,7 @@ def cross_validated(job: Job, blocks: int, variants: Sequence[Variant]) -> list[
 def score_part(
     model: Any, part: Part, warnings: list[Any]
 ) -> tuple[PartScores, tuple[Response, Response]]:
-    """Scores of a part, and the responses they come from.
+    """Return the scores of a part, and the responses that they come from.
 
     For a score that does not exist a warning is added.
     """
@@ -438,7 +451,7 @@ def score_part(
 
 
 def _scored_along(model: Any, part: Part, warnings: list[Any]) -> PartScores:
-    """Scores of all rows of a part of which only a witness is in memory, and tests of the residual of all of them."""
+    """Return scores and residual tests over all rows of a part that is kept as a subsample."""
     from orthaug.analysis.residuals import RunningResidual
     from orthaug.data.sources import rows_of
     from orthaug.models.long_runs import scores_along
@@ -462,7 +475,7 @@ def _scored_along(model: Any, part: Part, warnings: list[Any]) -> PartScores:
 
 
 def write_result(fitted: FitReport, folder: Path, *, force: bool = False) -> None:
-    """result.json, model/ and figures/, whole or not at all.
+    """Write result.json, model/ and figures/, whole or not at all.
 
     Without a model where training failed.
     """

@@ -1,4 +1,4 @@
-"""A first spec for a data file: what `orthaug init` tells of it, and writes."""
+"""A first spec for a data file: `orthaug init` describes the file, and writes the spec."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _CLEARLY = "first significant at lag {}; from here on it runs clearly better on 
 
 @dataclass(frozen=True, eq=False)
 class Roles:
-    """Which columns of a file are inputs, which outputs, and the sampling time [s] where a person said it."""
+    """The columns that are inputs and outputs, and the sampling time [s] that the user gave."""
 
     inputs: tuple[Column, ...]
     outputs: tuple[Column, ...]
@@ -43,7 +43,10 @@ def channel_names(columns: Sequence[Column]) -> list[str]:
 
 
 def time_of(found: Survey, roles: Roles) -> str | None:
-    """Return the column of instants, where there is one that is to be used: uneven steps, or such as every part has."""
+    """Return the column of instants, where its times are to be used.
+
+    That is where its steps are uneven, or where every part has it.
+    """
     clock = found.clock
     used = clock.column is not None and clock.instants and not roles.sampling_time
     return (
@@ -52,7 +55,10 @@ def time_of(found: Survey, roles: Roles) -> str | None:
 
 
 def steps_of(found: Survey, roles: Roles) -> list[tuple[str, dict[str, Any]]]:
-    """Preparation that the data need: spikes of outputs replaced, uneven instants put onto a grid."""
+    """Return the preparation that the data need.
+
+    Spikes of outputs are replaced, and uneven instants resampled onto a grid.
+    """
     steps: list[tuple[str, dict[str, Any]]] = []
     if any(column.spikes for column in roles.outputs):
         threshold = min(column.threshold for column in roles.outputs)
@@ -66,12 +72,12 @@ def steps_of(found: Survey, roles: Roles) -> list[tuple[str, dict[str, Any]]]:
 
 
 def step_of(found: Survey, roles: Roles) -> float:
-    """Seconds between rows: as given, as the file tells, or 1."""
+    """Return the seconds between rows: as given, as in the file, or 1."""
     return roles.sampling_time or found.clock.step or 1.0
 
 
 def lacking(rows: int) -> str:
-    """So many rows lack a value, in words."""
+    """Return the number of rows that lack a value, in words."""
     return f"{counted(rows, 'row')} lack{'s' if rows == 1 else ''} a value"
 
 
@@ -221,7 +227,7 @@ _LISTED = 12  # columns in a message
 
 @dataclass(frozen=True, eq=False)
 class Draft:
-    """A spec as text, with the account of what was seen."""
+    """A spec as text, with a description of the file."""
 
     spec: str
     account: str
@@ -239,7 +245,9 @@ def look(path: Path) -> Survey:
 def assign(
     found: Survey, inputs: Names | None, outputs: Names | None, sampling_time: float | None = None
 ) -> Roles | None:
-    """Columns by their names; where nothing is given by what the names say; None if that is open.
+    """Return the columns by name; where none are given, by the meaning of their names.
+
+    None where the names leave that open.
 
     Raises:
         InputError: columns that are not there, twice, constant or the time.
@@ -297,7 +305,7 @@ def columns_of(
 
 
 def _check_no_time(found: Survey, column: Column, kind: str, sampling_time: float | None) -> None:
-    """Raise InputError for the time as a channel.
+    """Raise InputError where the time is named as a channel.
 
     An input may rise as evenly where the time is known otherwise.
     """
@@ -321,7 +329,7 @@ def _check_no_time(found: Survey, column: Column, kind: str, sampling_time: floa
 
 
 def question(found: Survey, inputs: Names | None = None, outputs: Names | None = None) -> str:
-    """Return what to give where the columns do not say what they are.
+    """Return what the user has to give where the columns do not show their roles.
 
     `inputs` and `outputs` are what was given.
 
@@ -357,12 +365,12 @@ def question(found: Survey, inputs: Names | None = None, outputs: Names | None =
 
 
 def _joined(names: Names | None) -> str | None:
-    """Names as a person would write them."""
+    """Return the names as a person would write them."""
     return names if names is None or isinstance(names, str) else ",".join(names)
 
 
 def _nothing_left(found: Survey, inputs: str | None) -> str:
-    """Why there is no output to name."""
+    """Return the reason why no column is left for an output."""
     rows = counted(max(column.filled for column in found.columns), "row")
     others = left_out(found, [*found.signals])
     if not found.signals:
@@ -378,7 +386,7 @@ def _nothing_left(found: Survey, inputs: str | None) -> str:
 
 
 def left_out(found: Survey, used: Sequence[Column]) -> str:
-    """Return the columns that are not used, and why, in a list; the time is none of them."""
+    """Return a list of the unused columns, except the time, with the reasons."""
     apart = {id(c) for c in (*used, found.clock.column)}
     return _listed(
         [f"{c.header} ({found.why_not(c)})" for c in found.columns if id(c) not in apart]
@@ -391,7 +399,7 @@ def _listed(columns: Sequence[str]) -> str:
 
 
 def draft(found: Survey, roles: Roles, out: Path) -> Draft:
-    """Return a spec for a file that runs, for the place `out`, and the account.
+    """Return a spec that runs on a file, for the place `out`, and a description of the file.
 
     Raises:
         InputError: too few rows, or channels without a row where all have a value.
@@ -431,7 +439,7 @@ def draft(found: Survey, roles: Roles, out: Path) -> Draft:
 
 
 def write_spec(found: Draft, out: Path, *, force: bool = False) -> None:
-    """The spec, once it has been opened with its data as `orthaug fit` would."""
+    """Write the spec, after opening it with its data as `orthaug fit` does."""
     from orthaug.commands.kinds import open_job
 
     with whole_file(out, force=force) as partial:
@@ -447,7 +455,7 @@ def write_spec(found: Draft, out: Path, *, force: bool = False) -> None:
 
 
 def _extent(roles: Roles) -> tuple[int, int]:
-    """Rows up to the last value of any channel, and how many of them lack one."""
+    """Return the number of rows up to the last value of any channel, and of those that lack one."""
     columns = [*roles.inputs, *roles.outputs]
     rows = max(column.filled for column in columns)
     there = np.ones(rows, dtype=bool)
@@ -490,7 +498,7 @@ def _account(
     wild: str,
     notes: Sequence[str] = (),
 ) -> str:
-    """Return what was seen, a line each."""
+    """Return the description of the file, a line for each finding."""
     step = f"{roles.sampling_time:g} s, as given" if roles.sampling_time else str(found.clock)
     if roles.sampling_time is None and found.clock.step is None:
         step += "; 1 s is written: change it"
@@ -557,7 +565,7 @@ def _order(order: int) -> str:
 
 
 def as_seen(column: Column, *, spikes: bool) -> str:
-    """Return a channel in words: range, and what is odd about it."""
+    """Return a channel in words: its range, and what is unusual about it."""
     low, high = float(column.finite.min()), float(column.finite.max())
     text = f"{column.name}" + (
         f" = column '{column.header}'" if column.header != column.name else ""

@@ -1,4 +1,4 @@
-"""What is told of jobs whose physics is linear in θ on lagged signals."""
+"""Results of jobs whose physics is linear in θ on lagged signals."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _UNKNOWN = ("physical_parameters", "physical_consistency", "sensitivities", "bia
 
 
 def checked(job: LaggedJob) -> CheckResult:
-    """Excitation on the data, identifiability of the physics, and what each suspect would do to θ."""
+    """Return excitation of the data, identifiability of the physics, and bias by suspects."""
     problem = job.problem
     return CheckResult.model_validate(
         {
@@ -62,7 +62,7 @@ def checked(job: LaggedJob) -> CheckResult:
 
 
 def refused(job: LaggedJob, result: CheckResult) -> InputError | None:
-    """Why the job cannot be fitted, after the report."""
+    """Return the reason why the job cannot be fitted, after the report; None where it can."""
     try:
         require_rank(job.problem.excitation, job.problem.samples)
     except InputError as error:
@@ -76,7 +76,10 @@ def content(
     responses: Mapping[str, tuple[Response, Response]],
     warnings: list[Any],
 ) -> tuple[Estimate, dict[str, Any]]:
-    """Return the fit with the standard errors that its residual asks for, and what results tell of it; warnings are added."""
+    """Return the fit and the content of its result; warnings are added.
+
+    The standard errors are the ones that its residual calls for.
+    """
     from orthaug.analysis.robustness import robust_where_asked
 
     told: dict[str, Any] = dict.fromkeys((*_UNKNOWN, "residuals", "missing_lags", "stability"))
@@ -175,13 +178,13 @@ def figures(
 def physics_alone(
     job: LaggedJob, fit: Estimate, responses: Mapping[str, tuple[Response, Response]]
 ) -> Mapping[str, Response]:
-    """Return the free run of every part by the physics without the learner."""
+    """Return the free run of every part by the model's physics without its learner."""
     alone = fit.model.alone
     return {part.name: alone.simulate(part.record) for part in job.parts}
 
 
 def _physical_content(job: LaggedJob, fit: Estimate, warnings: list[Any]) -> dict[str, Any]:
-    """Return the physical parameters of θ̂ and what belongs to them, where the spec has a map.
+    """Return the physical parameters of θ̂ and their findings, where the spec has a map.
 
     Warnings are added.
     """
@@ -210,7 +213,7 @@ def _physical_content(job: LaggedJob, fit: Estimate, warnings: list[Any]) -> dic
 def _analysed(
     fit: Estimate, one_step: Response, free_run: Response, warnings: list[Any]
 ) -> dict[str, Any]:
-    """Return what the residuals and the free run's sensitivity say; warnings are added."""
+    """Return the findings on the residuals and the free run's sensitivity; warnings are added."""
     from orthaug.analysis.diagnosis import diagnose
     from orthaug.analysis.free_run_stability import stability
     from orthaug.analysis.missing_lags import missing_lags
@@ -267,7 +270,7 @@ def _with_biases(
     budget: Budget | None,
     held: Collection[str] = (),
 ) -> list[ParameterResult]:
-    """Parameters with whether the learner could imitate them, and what biases them.
+    """Return the parameters, with whether the learner could imitate them and what biases them.
 
     Not of those `held` at a bound.
     """
@@ -296,7 +299,7 @@ def _linearization(job: LaggedJob, fit: Estimate | None) -> MeasureLinearization
 
 
 def _said_of_shared(job: LaggedJob, fit: Estimate | None = None) -> list[Warning]:
-    """Return what the rows say of directions that the names call determined beside the learner."""
+    """Return warnings on directions that are determined in name, but not beside the learner."""
     structure, problem = job.spec.declared_structure(), fit.problem if fit else job.problem
     if job.spec.declared_learner() is None or not structure.projects or structure.shared == "all":
         return []
@@ -312,7 +315,7 @@ def _said_of_shared(job: LaggedJob, fit: Estimate | None = None) -> list[Warning
 def _shared_of(
     job: LaggedJob, fit: Estimate | None = None, *, others: bool = True
 ) -> Imitation | None:
-    """Before training already.
+    """Return what the learner could imitate, before training.
 
     None without a learner, or where the structure splits nothing along chosen directions.
 

@@ -23,12 +23,12 @@ if TYPE_CHECKING:
     from orthaug.models.response import Scores
 
 LONG = 1_000_000
-"""Rows of a file that is not read at once."""
+"""Rows from which on a file is read piece by piece."""
 
 
 @dataclass(frozen=True, eq=False)
 class LongRun:
-    """A model with a file that stays where it is; `free` for its free run, else one step ahead."""
+    """A model with a file that is not loaded; `free` for its free run, else one step ahead."""
 
     model: Model
     source: Source
@@ -36,7 +36,7 @@ class LongRun:
 
 
 def long_run(model: Path, data: Path, reading: ReadOptions, *, free: bool) -> LongRun | None:
-    """Return the model on a long Parquet file with all its channels; None for what is read at once.
+    """Return the model on a long Parquet file with all its channels; None for a short file.
 
     Raises:
         InputError: no model, a file that cannot be read, a model of data that had other instants.
@@ -73,7 +73,9 @@ def long_run(model: Path, data: Path, reading: ReadOptions, *, free: bool) -> Lo
 def write(
     run: LongRun, out: Path | None, *, force: bool = False
 ) -> tuple[Scores | None, list[Warning]]:
-    """Return the table of `run.write_csv`, to a file (whole or not at all) or standard output.
+    """Write the table of `run.write_csv`, to a file (whole or not at all) or standard output.
+
+    Return the scores, None where nothing was measured, and warnings.
 
     Scores of all rows, warnings.
 

@@ -48,7 +48,7 @@ def simulate(
     which: Which = "fitted",
     force: Force = False,
 ) -> None:
-    """Free run of a saved model on a data file."""
+    """Simulate a saved model in free run on a data file."""
     from orthaug.commands import run
     from orthaug.commands.folder import check_file, chosen_model
 
@@ -85,7 +85,7 @@ def predict(
     which: Which = "fitted",
     force: Force = False,
 ) -> None:
-    """H-step-ahead prediction of a saved model."""
+    """Predict a data file with a saved model, a number of steps ahead."""
     from orthaug.commands import run
     from orthaug.commands.folder import check_file, chosen_model
 
@@ -132,7 +132,7 @@ def split(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Parameters of a saved model under another measure.
+    """Split the parameters of a saved model under another measure.
 
     Without training again.
     """
@@ -172,7 +172,7 @@ def explain(
     rows: Rows = None,
     as_json: AsJson = False,
 ) -> None:
-    """Which terms the learner of a saved model has found.
+    """Explain which terms the learner of a saved model has found.
 
     And what to write into the physics.
     """
@@ -205,7 +205,7 @@ def export(
     which: Which = "fitted",
     force: Force = False,
 ) -> None:
-    """A saved model as code that needs no orthaug."""
+    """Export a saved model as code that needs no orthaug."""
     from orthaug.commands import export as exporting
     from orthaug.commands.folder import chosen_model
 
@@ -243,7 +243,7 @@ def linearize(
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
-    """Operating points of a saved model; its poles and gains.
+    """Linearize a saved model: operating points, poles and gains.
 
     With intervals, and the frequency response.
     """
@@ -302,7 +302,7 @@ def track(
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
-    """Parameters of a saved model over new data, with an alarm.
+    """Track the parameters of a saved model over new data, with an alarm.
 
     By recursive least squares with forgetting.
     """
@@ -329,7 +329,7 @@ def track(
 def _written_long(
     model: Path, data: Path, reading: ReadOptions, out: Path | None, force: bool, *, free: bool
 ) -> bool:
-    """Return whether the file is one that is not read at once.
+    """Return whether the file is one that is read piece by piece.
 
     Then its table is written piece by piece.
     """
@@ -361,7 +361,7 @@ def _write_response(
     force: bool,
     notes: Sequence[str] = (),
 ) -> None:
-    """The CSV and what is to say about it: scores go where the CSV does not."""
+    """Write the CSV, and print scores where the CSV does not go."""
     from orthaug.commands import run
     from orthaug.reports.text import response_text
 

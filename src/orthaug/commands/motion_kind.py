@@ -1,4 +1,4 @@
-"""What is told of jobs whose physics are equations of motion."""
+"""Results of jobs whose physics are equations of motion."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _NOT_RICH = Warning(
 
 
 def checked(job: MotionJob) -> CheckResult:
-    """Return what the outputs tell apart, what the learner could imitate, substeps and holds."""
+    """Return identifiability, what the learner could imitate, substeps and holds."""
     from orthaug.analysis.absorbed import Waves
     from orthaug.analysis.imitation import imitation_before
     from orthaug.analysis.input_timing import dead_times, try_holds
@@ -111,7 +111,7 @@ def checked(job: MotionJob) -> CheckResult:
 
 
 def _biases(job: MotionJob, trial: Trial) -> list[dict[str, Any]] | None:
-    """Return what every suspect would do, about physics alone.
+    """Return the bias that each suspect would cause, with physics alone.
 
     Of the usual ones those that do anything, where none is named.
 
@@ -127,7 +127,7 @@ def _biases(job: MotionJob, trial: Trial) -> list[dict[str, Any]] | None:
 
 
 def refused(job: MotionJob, result: CheckResult) -> InputError | None:
-    """Parameters that the outputs do not tell apart, after the report."""
+    """Return an error where the outputs do not identify the parameters, after the report."""
     found = result.excitation
     if found.rank == found.columns:
         return None
@@ -154,7 +154,7 @@ def content(
     responses: Mapping[str, tuple[Response, Response]],
     warnings: list[Any],
 ) -> tuple[MotionEstimate, dict[str, Any]]:
-    """Return the fit, and what results tell of it; warnings are added."""
+    """Return the fit and the content of its result; warnings are added."""
     from orthaug.analysis.imitation import MotionImitation
     from orthaug.analysis.robustness import robust_free_run
     from orthaug.inference.nearly_shared import shared_warnings
@@ -204,7 +204,7 @@ def content(
 def _analysed(
     job: MotionJob, fit: MotionEstimate, free_run: Response, warnings: list[Any]
 ) -> dict[str, Any]:
-    """Return what is asked of a fit behind its training; None for an analysis that fails.
+    """Return the analyses of a fit; None for one that fails.
 
     Warnings are added.
     """
@@ -289,12 +289,12 @@ def figures(
 def physics_alone(
     job: MotionJob, fit: MotionEstimate, responses: Mapping[str, tuple[Response, Response]]
 ) -> Mapping[str, Response]:
-    """Return the free run of every part by the physics without the learner."""
+    """Return the free run of every part by the model's physics without its learner."""
     return {part: free.physics_alone for part, (_, free) in responses.items()}
 
 
 def _parameters(fit: MotionEstimate, budget: MotionBudget | None) -> list[ParameterResult]:
-    """Return the parameters with their intervals, whether the learner could imitate them, and what biases them."""
+    """Return the parameters with intervals, whether the learner could imitate them, and biases."""
     motion = fit.problem.motion
     values = fit.values if fit.status.ok else np.full(len(motion.names), np.nan)
     rows = parameter_rows(motion.parameters, values, fit.std, fit.interval, plain_std=fit.plain_std)
@@ -305,7 +305,7 @@ def _parameters(fit: MotionEstimate, budget: MotionBudget | None) -> list[Parame
 
 
 def _about_steps(job: MotionJob, trial: Trial) -> tuple[str, list[Warning]]:
-    """Return what integrator and hold do to the outputs, in words; with what to be warned of."""
+    """Return a text on the errors of integrator and hold in the outputs, and warnings."""
     motion, problem, warnings = job.problem.motion, job.problem, []
     step = problem.record.sampling_time
     if motion.integrator == "discrete":

@@ -31,7 +31,7 @@ def _nothing() -> str:
 
 
 class SignalWatch:
-    """Ends the program on a signal, once it is started.
+    """A watch that ends the program on a signal, once it is started.
 
     Before that, signals do what they always do.
     """
@@ -43,7 +43,7 @@ class SignalWatch:
         self._asked: threading.Event | None = None
 
     def start(self) -> None:
-        """Wait for signals from now on.
+        """Begin to wait for signals.
 
         Those that the program is to ignore, as `nohup` asks, are ignored.
         """
@@ -61,7 +61,7 @@ class SignalWatch:
 
     @contextmanager
     def telling(self, during: Callable[[], str], stop: Callable[[], Any]) -> Iterator[None]:
-        """Say what a signal stopped, and stop drawing before that."""
+        """Report what a signal stopped, and stop drawing before that."""
         self._during, self._stop = during, stop
         try:
             yield
@@ -70,7 +70,7 @@ class SignalWatch:
 
     @contextmanager
     def asking(self) -> Iterator[threading.Event]:
-        """The first Ctrl-C sets the event, for whoever can stop with what there is.
+        """Yield an event that the first Ctrl-C sets, for work that can stop with a partial result.
 
         The next ends the program.
         """
@@ -83,7 +83,7 @@ class SignalWatch:
             self._asked = None
 
     def hold(self) -> None:
-        """Do not go on where the program is about to end: what fails then fails because of that."""
+        """Wait where the program is about to end: an error then is only a consequence."""
         while self.ending:
             time.sleep(1.0)
 
@@ -134,7 +134,10 @@ class SignalWatch:
 
 
 def _leave_to_the_thread(number: int, frame: object) -> None:
-    """Python must have a handler, or the signal ends the process before the thread hears of it."""
+    """Install a handler that does nothing: the thread receives the signal.
+
+    Without a handler Python ends the process before the thread hears of it.
+    """
 
 
 WATCH = SignalWatch()  # of the process, as its signals are

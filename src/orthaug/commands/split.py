@@ -1,4 +1,4 @@
-"""Parameters of a saved model under another measure: what `orthaug split` does."""
+"""Parameters of a saved model under another measure: `orthaug split`."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def open_training(model: Path, data: Sequence[Path], rows: tuple[int, int] | Non
 
 
 def _other_files(model: Path, data: Sequence[Path]) -> list[Warning]:
-    """Return a warning where the result of a model has other files' checksums."""
+    """Return a warning where the checksums of the files differ from those in the model's result."""
     for content in results_beside(model):
         with suppress(KeyError, TypeError):
             kept = {file["sha256"]: file["file"] for file in content["data"]["train"]}
@@ -86,12 +86,13 @@ def _other_files(model: Path, data: Sequence[Path]) -> list[Warning]:
 
 
 def read_measure(kind: str, given: Mapping[str, Sequence[str]], opened: ModelOnData) -> Measure:
-    """Return the measure of a kind from the values `given` to each option.
+    """Return the measure of a kind from the values `given` for each option.
 
     The registry says which kind takes which.
 
-    Raises: InputError: an unknown kind, an option of another kind or without what it needs, files
-        that do not fit.
+    Raises:
+        InputError: an unknown kind, an option of another kind or without what it needs, files that
+            do not fit.
     """
     check_choice(kind, MEASURES, "--measure")
     values = {}
@@ -113,7 +114,7 @@ def read_measure(kind: str, given: Mapping[str, Sequence[str]], opened: ModelOnD
 
 
 def _read(key: Key, option: str, texts: Sequence[str]) -> Any:
-    """Return the value of a key: limits by raw lag for a mapping, the texts themselves otherwise."""
+    """Return the value of a key: for a mapping limits by raw lag, otherwise the texts."""
     if get_origin(key.type) is not Mapping:
         return tuple(texts)
     limits: dict[str, tuple[float, float]] = {}
@@ -137,8 +138,9 @@ def _read(key: Key, option: str, texts: Sequence[str]) -> Any:
 def split_model(opened: ModelOnData, measure: Measure) -> SplitResult:
     """Return the parameters of a saved model under a measure.
 
-    Raises: InputError: a θ at a bound, a measure that does not fit the model, other data than those
-        of its training.
+    Raises:
+        InputError: a θ at a bound, a measure that does not fit the model, other data than those of
+            its training.
     """
     return _SPLITS[type(opened.model)](opened.model, opened.record, measure, opened.warnings)
 

@@ -38,7 +38,9 @@ _CELL = 0.8  # inches
 def residual_analysis_figure(
     tests: Sequence[ResidualTestResult], title: str, units: Mapping[str, str]
 ) -> Figure:
-    """Of each residual: autocorrelation, correlation with the inputs, means over its most telling regressor.
+    """Draw each residual's autocorrelation, correlation with inputs, and means over a regressor.
+
+    The regressor is the one that explains most.
 
     Args:
         units: by channel.
@@ -74,7 +76,7 @@ def residual_analysis_figure(
 
 
 def _correlations(axis: Axes, test: ResidualTestResult) -> None:
-    """Of a residual with every input, in the band of noise."""
+    """Draw the correlation of a residual with every input, in the band of noise."""
     for (name, cross), color in zip(test.crossed.items(), CYCLE * len(test.crossed), strict=False):
         reach = len(cross.values) // 2
         axis.plot(
@@ -92,7 +94,7 @@ def _correlations(axis: Axes, test: ResidualTestResult) -> None:
 
 @plain
 def bias_figure(suspects: Sequence[SuspectResult]) -> Figure:
-    """Heat map of the bias of each parameter by each suspect, in per cent; of many the largest."""
+    """Draw a heat map of the bias of each parameter by each suspect, in per cent."""
     shown = bias_map(suspects)
     longest = max(map(len, shown.parameters))
     upright = longest <= _UPRIGHT

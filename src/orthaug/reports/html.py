@@ -1,4 +1,4 @@
-"""How notebooks show records, physics, fits and models: a title, a few facts, a table."""
+"""Display of records, physics, fits and models in notebooks: a title, a few facts, a table."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Card:
-    """What is shown of an object."""
+    """The content that is shown of an object."""
 
     title: str
     facts: Mapping[str, str] = field(default_factory=dict)
@@ -82,7 +82,7 @@ def _shortened(table: Table) -> Sequence[Sequence[str]]:
 
 @singledispatch
 def card_of(shown: Any) -> Card:
-    """Return what is shown of an object."""
+    """Return the card of an object."""
     return Card(repr(shown))
 
 
@@ -188,7 +188,7 @@ def _fit(fit: Estimate | MotionEstimate) -> Card:
 
 
 def card_of_result(fit: Estimate | MotionEstimate, result: FitResult) -> Card:
-    """Return a fit with what its result tells of every parameter, and all of the result's warnings."""
+    """Return the card of a fit with the findings on every parameter, and all warnings."""
     parameters = [*result.parameters, *(result.physical_parameters or ())]
     columns = ["parameter", "value", "std", "95 % interval", "unit"]
     rows = [
@@ -224,7 +224,7 @@ def _model(model: Model | MotionModel) -> Card:
 
 
 def _declared(parameters: Sequence[Any]) -> Table:
-    """Parameters as they were declared."""
+    """Return the parameters as they were declared."""
     rows = []
     for p in parameters:
         rows.append([p.name, _number(p.initial), p.unit or "–", _bounds(p.min, p.max)])
@@ -232,7 +232,7 @@ def _declared(parameters: Sequence[Any]) -> Table:
 
 
 def _told(facts: Mapping[str, str]) -> dict[str, str]:
-    """Without what is empty; a sentence without a name goes on with the fact before it."""
+    """Return the facts without empty ones; a value without a name continues the fact before it."""
     told: dict[str, str] = {}
     for name, value in facts.items():
         if value and not name and told:

@@ -1,4 +1,4 @@
-"""What `orthaug linearize` tells."""
+"""Results of `orthaug linearize`."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class PoleResult(Content):
 
     @classmethod
     def of(cls, pole: Pole) -> PoleResult:
-        """Of a view's pole."""
+        """Return the result of a view's pole."""
         s = pole.s
         own = {name: getattr(pole, name) for name in cls.model_fields if hasattr(pole, name)}
         own = {
@@ -119,7 +119,7 @@ class LinearPointResult(Content):
 
 
 class MeasuredPairResult(Content):
-    """What data alone say of one pair."""
+    """The frequency response of one pair from the data."""
 
     output: str
     input: str
@@ -129,7 +129,7 @@ class MeasuredPairResult(Content):
 
 
 class MeasuredResponseResult(Content):
-    """The frequency response from data alone."""
+    """The frequency response from the data, without the model."""
 
     method: str
     averages: Number
@@ -138,7 +138,7 @@ class MeasuredResponseResult(Content):
 
 
 class LinearizeResult(ResultHeader):
-    """What `orthaug linearize` tells."""
+    """The result of `orthaug linearize`."""
 
     sampling_time: Number
     inputs: list[str]
@@ -150,7 +150,7 @@ class LinearizeResult(ResultHeader):
 
     @classmethod
     def of(cls, found: Linearization) -> LinearizeResult:
-        """Of what `linearize` returns."""
+        """Return the result of what `linearize` returns."""
         first = found[0]
         return cls.model_validate(
             {

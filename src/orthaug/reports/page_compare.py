@@ -29,7 +29,7 @@ _WORDS = {
 
 @dataclass(frozen=True, eq=False)
 class ComparePage:
-    """What a page tells of a comparison beside its result."""
+    """Additions to a comparison's result on its page."""
 
     origin: Origin
     result: CompareResult
@@ -38,13 +38,13 @@ class ComparePage:
 
     @property
     def outputs(self) -> tuple[str, ...]:
-        """Their names."""
+        """Names of the outputs."""
         runs = next(iter(self.responses.values()), {})
         return tuple(c.name for c in next(iter(runs.values())).outputs) if runs else ()
 
 
 def compare_sections(page: ComparePage) -> list[Section]:
-    """Return all of them; what a result does not have is left out."""
+    """Return all sections; those without content in the result are left out."""
     result = page.result
     scores = {row.name: row.scores for row in result.comparison}
     found = [

@@ -1,4 +1,4 @@
-"""The findings of a fit on its page: residual tests, stability, excitation and suspects, restarts."""
+"""The findings of a fit on its page: residual tests, stability, excitation, suspects, restarts."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from orthaug.reports.result import FitResult
 
 
 def residuals_blocks(result: FitResult, units: Mapping[str, str]) -> list[Any]:
-    """Return what the residuals tell, output by output; units by channel."""
+    """Return the residual tests, output by output; units by channel."""
     blocks: list[Any] = []
     found = result.residuals
     if found is None:
@@ -68,7 +68,7 @@ def _test_cells(what: str, test: ResidualTestResult, units: Mapping[str, str]) -
 
 
 def stability_blocks(result: FitResult) -> list[Any]:
-    """Return what is known of the free run's stability."""
+    """Return the findings on the free run's stability."""
     found = result.stability
     if found is None:
         return []
@@ -118,7 +118,7 @@ def stability_blocks(result: FitResult) -> list[Any]:
 
 
 def excitation_blocks(result: FitResult) -> list[Any]:
-    """Return how well the data tell the parameters apart, and what each suspected term does to them."""
+    """Return how well the data identify the parameters, and the bias by each suspected term."""
     seen = result.excitation
     told = f"The data tell {seen.rank} of {seen.columns} parameters apart; "
     told += f"the condition number is {number(seen.condition, 3)}."

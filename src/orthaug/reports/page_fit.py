@@ -44,7 +44,7 @@ BIAS_TOLD = (
 
 @dataclass(frozen=True, eq=False)
 class Origin:
-    """Where a result comes from: name and text of its spec, the command, when and on what it was made."""
+    """The origin of a result: name and text of its spec, the command, date and versions."""
 
     name: str
     toml: str
@@ -57,7 +57,7 @@ class Origin:
 
 @dataclass(frozen=True, eq=False)
 class FitPage:
-    """What a page tells of a fit beside its result."""
+    """Additions to a fit's result on its page."""
 
     origin: Origin
     result: FitResult
@@ -69,14 +69,14 @@ class FitPage:
 
     @property
     def outputs(self) -> tuple[str, ...]:
-        """Their names."""
+        """Names of the outputs."""
         return tuple(
             channel.name for _, free in self.responses.values() for channel in free.outputs
         )[: self._count]
 
     @property
     def units(self) -> dict[str, str]:
-        """Of channels and states, by name."""
+        """Units of channels and states, by name."""
         return units_of_result(self.result) | {
             c.name: c.unit for _, free in self.responses.values() for c in free.outputs
         }
@@ -87,14 +87,14 @@ class FitPage:
 
 
 def units_of_result(result: FitResult | CompareResult) -> dict[str, str]:
-    """Of channels and states by name, as the spec declares them."""
+    """Return the units of channels and states by name, as the spec declares them."""
     states = (result.spec.get("motion") or {}).get("states") or {}
     channels = (result.spec.get("data") or {}).get("channels") or {}
     return {name: given.get("unit") or "" for name, given in {**states, **channels}.items()}
 
 
 def fit_sections(page: FitPage) -> list[Section]:
-    """Return all of them; what a result does not have is left out."""
+    """Return all sections; those without content in the result are left out."""
     result = page.result
     found = [
         Section("parameters", "Parameters", _parameters(result)),
@@ -170,7 +170,7 @@ def _parameters(result: FitResult) -> list[Any]:
 
 
 def bias_cell(row: ParameterResult) -> str:
-    """Return the bias by what the learner found."""
+    """Return the bias by the learned part."""
     return number(row.bias.value, 2, row.value) if row.bias else "–"
 
 
@@ -287,7 +287,7 @@ def _runs(page: FitPage) -> list[Any]:
 
 
 def _shares(page: FitPage) -> list[Any]:
-    """Return how much of the model's output, or of each equation, is physics and how much the learner."""
+    """Return the shares of physics and learner in the model's output, or in each equation."""
     result = page.result
     if result.motion is not None:
         rows = [
@@ -363,7 +363,7 @@ def _learned(page: FitPage) -> list[Any]:
 def score_blocks(
     scores: Mapping[str, Mapping[str, PartScores]], outputs: Sequence[str], units: Mapping[str, str]
 ) -> list[Any]:
-    """Scores as a plot and a table; of one model, or of several by their names."""
+    """Return the scores as a plot and a table; of one model, or of several by their names."""
     rows = []
     named = any(scores)
     for row, parts in scores.items():
@@ -397,7 +397,7 @@ def score_blocks(
 
 
 def origin_blocks(origin: Origin, result: FitResult | CompareResult) -> list[Any]:
-    """Command, versions, files with their checksums, and the spec as it was written."""
+    """Return command, versions, files with their checksums, and the spec as it was written."""
     rows = [
         ["command", origin.command],
         ["seed", str(origin.seed)],

@@ -1,4 +1,4 @@
-"""What was learned, on a page: a curve over each input of the learner, and a surface over the two that matter most."""
+"""The learned part on a page: a curve over each input, and a surface over the two main ones."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _LEVEL = 0.02  # share of the learned part below which an input is told to do ne
 
 
 def learned_blocks(part: LearnedPart, measure: str) -> list[Text | Grid | Plot]:
-    """Curves over the inputs, the most telling first, and the surface."""
+    """Return the curves over the inputs, by the share that each explains, and the surface."""
     shares = part.shares()
     ranked = list(part.ranked())
     blocks: list[Text | Grid | Plot] = [Text(_told(part, ranked, shares, measure))]

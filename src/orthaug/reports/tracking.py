@@ -1,4 +1,4 @@
-"""What `orthaug track` tells, and its text."""
+"""Result of `orthaug track`, and its text."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from orthaug.reports.text import parameter_table, warning_lines
 
 
 class AlarmResult(Content):
-    """The residual left its band."""
+    """An alarm: the residual left its band."""
 
     row: Whole
     time: Number
 
 
 class TrackResult(ResultHeader):
-    """What `orthaug track` tells."""
+    """The result of `orthaug track`."""
 
     files: list[FileResult]
     model: str
@@ -35,7 +35,7 @@ class TrackResult(ResultHeader):
 
 
 def track_text(result: TrackResult) -> str:
-    """Rows, memory, alarms, and the parameters at the end."""
+    """Return rows, memory, alarms, and the parameters at the end."""
     memory = "everything" if result.memory is None else f"{result.memory:.4g} s"
     lines = [
         f"rows        {result.rows}, {result.time:g} s",

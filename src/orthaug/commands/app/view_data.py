@@ -71,7 +71,7 @@ _DROP = """
 
 
 class DataView:
-    """Draws the data of a session, and follows them."""
+    """The view of a session's data."""
 
     def __init__(self, session: Session) -> None:
         self.session = session
@@ -119,7 +119,7 @@ class DataView:
             self.session.open_file(Path(given).expanduser().absolute())
 
     def follow_data(self) -> None:
-        """What was seen in the file."""
+        """Draw what was found in the file."""
         session, found = self.session, self.session.found
         self._draw_status()
         self.columns.set_visibility(found is not None)
@@ -165,7 +165,7 @@ class DataView:
                         button(label, partial(session.open_spec, place, kept=True))
 
     def _offer_test(self, found: Mapping[str, Any]) -> None:
-        """What may be done with a file that the spec does not name."""
+        """Offer to use a file that the spec does not name as a test."""
         told, lacking = "The spec is kept as it is", self._lacking(found)
         if trained := self._trained():
             told += f"; it trains on {', '.join(file.name for file in trained)}"
@@ -180,7 +180,7 @@ class DataView:
         return [self.session.folder / file for file in spec_text.names(train, "files")]
 
     def _lacking(self, found: Mapping[str, Any]) -> list[str]:
-        """Return the columns that the spec reads and the file does not have."""
+        """Return the columns that the spec reads and the file lacks."""
         heads = {column["header"] for column in found["columns"]}
         return [
             column for column in spec_text.columns(self.session.content()) if column not in heads
@@ -194,7 +194,7 @@ class DataView:
         return {} if self._lacking(found) else spec_text.columns(self.session.content())
 
     def _take_uses(self, found: Mapping[str, Any]) -> None:
-        """The use of each column: what the spec makes of it, otherwise what was chosen or what the file says."""
+        """Set the use of each column: from the spec, or as chosen, or as the file suggests."""
         data, before, _ = self._drawn
         if found is before:
             return
@@ -281,7 +281,7 @@ class DataView:
         self.session.choose(chosen["input"], chosen["output"], step)
 
     def follow_spec(self, author: str) -> None:
-        """The steps of preparation, as the spec has them, and whether it names the file that was looked at."""
+        """Draw the steps of preparation in the spec, and whether it names the file looked at."""
         if self.session.apart != self._apart:
             self._draw_status()
         if author == "steps":
@@ -341,7 +341,7 @@ class DataView:
         self.session.edit("more steps", spec_text.with_row, _STEPS, {"step": kind, **first})
 
     def _whole_file(self) -> tuple[str, Mapping[str, Any]]:
-        """Return a file and its curves: of the training data that were checked, the file looked at where there are none."""
+        """Return a file and its curves: of the checked training data or the file looked at."""
         session, checked = self.session, self.session.checked
         if checked is None:
             if session.found is None or session.data is None:
@@ -352,7 +352,7 @@ class DataView:
         return ("", {}) if place is None else (place.name, session.raw.get(place, {}))
 
     def follow_check(self) -> None:
-        """Curves of the file, and of the training data after preparation.
+        """Draw the curves of the file, and of the training data after preparation.
 
         Why they cannot be drawn.
         """
@@ -410,7 +410,7 @@ class DataView:
 
 
 def _seconds(told: str) -> float | None:
-    """Return a sampling time; None where nothing is told.
+    """Return a sampling time; None for an empty field.
 
     Raises:
         InputError: no positive number.

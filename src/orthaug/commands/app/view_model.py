@@ -1,4 +1,4 @@
-"""The part of the page for the model: forms for physics, learner and training, the spec, and what checking says."""
+"""The part of the page for the model: forms, the text of the spec, and the result of its check."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _STRUCTURES = {
 
 
 class ModelView:
-    """Draws the spec of a session as forms and as text, and follows it."""
+    """The view of a session's spec, as forms and as text."""
 
     def __init__(self, session: Session) -> None:
         self.session = session
@@ -72,7 +72,7 @@ class ModelView:
         self.follow_check()
 
     def follow_spec(self, author: str) -> None:
-        """Forms after a change of the text, the text after a change in a form."""
+        """Update the forms after a change of the text, and the text after a change in a form."""
         if author != "editor" and self.editor.value != self.session.spec:
             self.editor.set_value(self.session.spec)
         if author != "form":
@@ -82,7 +82,7 @@ class ModelView:
                 self._draw_learner(content)
 
     def follow_data(self) -> None:
-        """What comes first, while there is no spec."""
+        """Show the first step while there is no spec."""
         if not self.session.spec.strip():
             self._draw_physics({})
 
@@ -160,7 +160,7 @@ class ModelView:
                             )
 
     def _value(self, *path: str) -> Callable[[str], None]:
-        """Takes what a field says as the value of a key."""
+        """Return a callback that stores the value of a field under a key."""
         return lambda told: self.session.edit(
             "form", spec_text.with_value, path, spec_text.read(path[-1], told)
         )
@@ -228,7 +228,7 @@ class ModelView:
         self.session.edit("form", spec_text.with_value, ("learner", "hidden"), hidden or None)
 
     def follow_check(self) -> None:
-        """What checking says of the spec as it is."""
+        """Show the result of checking the present spec."""
         session = self.session
         with redrawn(self.check):
             if not session.spec.strip():
@@ -262,7 +262,7 @@ class ModelView:
 
 
 def _findings(told: Mapping[str, Any], bias: Sequence[Mapping[str, Any]]) -> None:
-    """The account of `orthaug check`."""
+    """Draw the findings of `orthaug check`."""
     data, physics = told["excitation"], told["identifiability"]
     condition = "infinite" if data["condition"] is None else number(data["condition"], 3)
     rows = [
@@ -301,7 +301,7 @@ def _findings(told: Mapping[str, Any], bias: Sequence[Mapping[str, Any]]) -> Non
 
 
 def _units(units: Sequence[tuple[str, str, str | None]], *, moves: bool) -> None:
-    """What the spec says of units, where it is not what the regressors ask for.
+    """Show where the spec's units differ from those that the regressors imply.
 
     Both are written in one way here.
     """
@@ -328,7 +328,7 @@ def _units(units: Sequence[tuple[str, str, str | None]], *, moves: bool) -> None
 
 
 def _biases(percents: Mapping[str, float | None]) -> str:
-    """Return all on a line that breaks between the parameters only."""
+    """Return all biases on a line that breaks between the parameters only."""
     return ", ".join(f"{name}\u00a0{_percent(value)}" for name, value in percents.items())
 
 

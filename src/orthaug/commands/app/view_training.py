@@ -31,7 +31,7 @@ _TITLES = {"fit": "Training", "compare": "Comparison"}
 
 
 class TrainingView:
-    """Draws what runs and what came of it, and follows both."""
+    """The view of a training and of its results."""
 
     def __init__(self, session: Session) -> None:
         self.session = session
@@ -67,7 +67,7 @@ class TrainingView:
             made.set_enabled(able)
 
     def follow_work(self) -> None:
-        """How far it is, and what came of it."""
+        """Show the progress of training, and its result."""
         session, running = self.session, self.session.running
         self.follow_check()
         self.end.set_visibility(running is not None)
@@ -160,7 +160,7 @@ class TrainingView:
 
 
 def _runs_told(runs: set[Run]) -> str:
-    """Return what the curves are."""
+    """Return a sentence that explains the curves."""
     told = "Each curve is a run: one training"
     if any(run.start for run in runs):
         kinds = ", ".join(sorted({run.regularization for run in runs if run.start}))
@@ -189,7 +189,7 @@ def _parameters(
     models: Sequence[tuple[str, Sequence[Mapping[str, Any]]]],
     units: Mapping[str, str],
 ) -> None:
-    """Of one model, or of several that are named; `units` are those that the channels ask for."""
+    """Draw the parameters of one model, or of several by name; `units` are the implied ones."""
     named, cells = any(name for name, _ in models), []
     for name, rows in models:
         for row in rows:

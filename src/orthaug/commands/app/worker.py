@@ -1,4 +1,4 @@
-"""A process that answers questions of the page: what is in a file, which spec to start with, what a spec is worth.
+"""A process that answers questions of the page: columns of a file, a first spec, a check.
 
 A question is a line of JSON on standard input, its answer one on standard output: `refused` where
 there is none, and `last` where the process ends with it.
@@ -34,7 +34,7 @@ _DRAWN = 12  # columns of a file whose curves are
 
 
 def main() -> None:
-    """Answer questions until nobody asks any more.
+    """Answer questions until the standard input ends.
 
     End where a question took much memory, which would be kept.
     """
@@ -52,7 +52,7 @@ def main() -> None:
 
 
 def _listen(asked: queue.Queue[str]) -> None:
-    """Questions as they come, also while one is answered: where there are no more, nobody waits for that either."""
+    """Read questions, also while one is answered; end the process where there are no more."""
     for line in sys.stdin:
         asked.put(line)
     os._exit(0)
@@ -80,7 +80,7 @@ def _answer(given: dict[str, Any]) -> dict[str, Any]:
 
 
 def peak() -> float:
-    """Bytes that this process has held at most; 0 where the system does not say."""
+    """Return the peak memory of this process in bytes; 0 where the system does not report it."""
     try:
         import resource
     except ImportError:
@@ -92,7 +92,7 @@ def peak() -> float:
 def look(
     path: str, out: str, inputs: str | None, outputs: str | None, step: float | None
 ) -> dict[str, Any]:
-    """Return the columns of a file, their curves, and the first spec for it where its channels are known.
+    """Return the columns of a file, their curves, and a first spec where its channels are known.
 
     Args:
         out: where the spec will stand.
@@ -125,7 +125,7 @@ def look(
 
 
 def _timed(found: Survey) -> str:
-    """Which column gives the time, in words; nothing where none does."""
+    """Return a sentence on the column that gives the time; empty where none does."""
     clock = found.clock
     if clock.column is None or clock.step is None:
         return ""
@@ -165,10 +165,11 @@ def _curves(found: Survey) -> dict[str, Any]:
 
 
 def examine(path: str, whole: bool) -> dict[str, Any]:
-    """Return what `orthaug check` tells of a spec, and its training data as they are after preparation.
+    """Return the findings of `orthaug check` for a spec, and its prepared training data.
 
-    Args: whole: run equations of motion too; without, `check` is None for them, since that takes
-        its time.
+    Args:
+        whole: run equations of motion too; without, `check` is None for them, since that takes its
+            time.
     """
     job = open_job(Path(path), require_full_rank=False)
     moves = job.spec.motion is not None
@@ -197,7 +198,7 @@ def examine(path: str, whole: bool) -> dict[str, Any]:
 
 
 def verdict(path: str, kind: str) -> dict[str, Any]:
-    """Return what the report of a result begins with: `level`, and three `sentences`.
+    """Return the verdict that the report of a result begins with: `level`, and three `sentences`.
 
     Args:
         kind: fit or compare, of which `path` is the result.json.
@@ -214,7 +215,10 @@ def verdict(path: str, kind: str) -> dict[str, Any]:
 
 
 def _units(job: Job) -> list[tuple[str, str, str | None]]:
-    """Of each parameter: its name, the unit that the spec gives, and what its regressor asks for if it has one."""
+    """Return for each parameter its name, the unit in the spec and the one its regressor implies.
+
+    The last is None where the regressor implies none.
+    """
     if job.spec.motion is not None:
         return [
             (name, entry.unit or "", None) for name, entry in job.spec.motion.parameters.items()
@@ -229,7 +233,7 @@ def _units(job: Job) -> list[tuple[str, str, str | None]]:
 
 
 def _prepared_curves(job: Job) -> dict[str, Any]:
-    """By channel, of the training data; experiments are apart."""
+    """Return the curves by channel of the training data, with gaps between experiments."""
     record = job.train.record
     channels: Sequence[Channel] = (*record.inputs, *record.outputs)
     curves = {}
@@ -251,7 +255,7 @@ def _prepared_curves(job: Job) -> dict[str, Any]:
 
 
 def thinned(time: Vector, values: Vector, most: int = MOST) -> dict[str, list[float | None]]:
-    """Return a curve of at most about `most` points: of each stretch the least and the largest value, in their order.
+    """Return a curve of at most about `most` points: minimum and maximum of each stretch, in order.
 
     Examples:
         >>> thinned(np.arange(6.0), np.array([0.0, 5.0, 1.0, 2.0, -1.0, 0.0]), 4)
