@@ -33,18 +33,18 @@ def attempt(what: str, analysis: Callable[[], T], warnings: list[Any], otherwise
     try:
         return analysis()
     except _NUMERICAL as error:
-        told = (
-            f"{what} failed numerically ({str(error).rstrip('.')}): the result stands without it."
+        text = (
+            f"{what} failed numerically ({str(error).rstrip('.')}): the result is given without it."
         )
     except InputError:
         raise
     except DEFECTS as error:
         LOG.info("%s failed", what, exc_info=True)
-        told = (
+        text = (
             f"{what} failed by a defect of orthaug ({type(error).__name__}: {error}): the "
-            "result stands without it."
+            "result is given without it."
         )
-    warnings.append(Warning("analysis_failed", told))
+    warnings.append(Warning("analysis_failed", text))
     return otherwise
 
 

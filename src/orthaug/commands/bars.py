@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress as Bar
     from rich.progress import ProgressColumn
 
-TOLD_AS = "ORTHAUG_PROGRESS"
+PROGRESS_VARIABLE = "ORTHAUG_PROGRESS"
 """Environment variable: with the value `json`, training writes its progress to standard error, a line of JSON at a time.
 """
 ENOUGH = threading.Event()
@@ -78,20 +78,22 @@ def training_bar(
     with (
         _deferred_interrupt() as interrupted,
         drawn_bar(TimeElapsedColumn(), TimeRemainingColumn()) as bar,
-        WATCH.telling(lambda: reached, bar.stop),
+        WATCH.reporting(lambda: reached, bar.stop),
     ):
         task = bar.add_task("compiling", total=runs * iterations)
         done: dict[int, int] = {}
         line = _Lines(runs, iterations)
 
-        def tell(run: int, iteration: int, loss: float) -> None:
+        def show(run: int, iteration: int, loss: float) -> None:
             nonlocal reached
             done[run] = iteration
             reached = f"run {run + 1} of {runs}, iteration {iteration}, loss {loss:.3g}"
             passes = sum(done.values())
             rate = rows * passes / max(time.monotonic() - began, 1e-3)
-            told = f"{reached}, {rate / 1e6:.3g} million rows/s" if rows >= _MANY else reached
-            bar.update(task, completed=passes, description=told)
+            description = (
+                f"{reached}, {rate / 1e6:.3g} million rows/s" if rows >= _MANY else reached
+            )
+            bar.update(task, completed=passes, description=description)
             line(run, iteration, loss, passes)
             if interrupted.is_set():
                 raise KeyboardInterrupt(reached)
@@ -99,7 +101,7 @@ def training_bar(
                 raise StopTraining
 
         try:
-            yield Progress(tell, plan=line.planned)
+            yield Progress(show, plan=line.planned)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(reached) from None
         if interrupted.is_set():
@@ -114,7 +116,7 @@ class _Lines:
 
     def __init__(self, runs: int, iterations: int) -> None:
         self.runs, self.iterations = runs, iterations
-        self._wanted, self._last = os.environ.get(TOLD_AS) == "json", -_OFTEN
+        self._wanted, self._last = os.environ.get(PROGRESS_VARIABLE) == "json", -_OFTEN
         self._first, self._plan = 0, ()
 
     def planned(self, first: int, plan: Plan) -> None:
@@ -125,7 +127,7 @@ class _Lines:
         if not self._wanted or time.monotonic() - self._last < _OFTEN:
             return
         self._last = time.monotonic()
-        told = {
+        fields = {
             "run": run + 1,
             "runs": self.runs,
             "iteration": iteration,
@@ -136,7 +138,7 @@ class _Lines:
         known = self._plan[own] if 0 <= own < len(self._plan) else {}
         streams.say(
             json.dumps(
-                {**told, "loss": loss if math.isfinite(loss) else None, "done": share, **known}
+                {**fields, "loss": loss if math.isfinite(loss) else None, "done": share, **known}
             )
         )
 
@@ -153,11 +155,11 @@ def study_bars() -> Iterator[Callable[[str, int, int], None]]:
     with (
         _deferred_interrupt() as interrupted,
         drawn_bar(MofNCompleteColumn(), TimeElapsedColumn(), transient=False) as bar,
-        WATCH.telling(lambda: reached, bar.stop),
+        WATCH.reporting(lambda: reached, bar.stop),
     ):
         tasks: dict[str, Any] = {}
 
-        def tell(title: str, done: int, total: int) -> None:
+        def show(title: str, done: int, total: int) -> None:
             nonlocal reached
             reached = f"'{title}', {done} of {total} runs done and kept for the next time"
             if title not in tasks:
@@ -166,7 +168,7 @@ def study_bars() -> Iterator[Callable[[str, int, int], None]]:
             if interrupted.is_set():
                 raise KeyboardInterrupt(reached)
 
-        yield tell
+        yield show
 
 
 @contextmanager
@@ -183,12 +185,12 @@ def selection_bar(most: int) -> Iterator[Callable[[str, Any], None]]:
     with (
         _asked_to_stop() as asked,
         drawn_bar(MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn()) as bar,
-        WATCH.telling(lambda: "the selection of a structure", bar.stop),
+        WATCH.reporting(lambda: "the selection of a structure", bar.stop),
     ):
         tasks: dict[str, Any] = {}
         judged: dict[str, list[float]] = {}
 
-        def tell(stage: str, rung: Any) -> None:
+        def show(stage: str, rung: Any) -> None:
             done = judged.setdefault(stage, [])
             done.append(rung.seconds)
             if stage not in tasks:
@@ -203,7 +205,7 @@ def selection_bar(most: int) -> Iterator[Callable[[str, Any], None]]:
             if asked.is_set():
                 raise KeyboardInterrupt
 
-        yield tell
+        yield show
 
 
 @contextmanager
@@ -269,19 +271,19 @@ def _in_notebook(display: Any) -> Iterator[ProgressCallback]:
         {"text/html": _line("compiling", ended=False), "text/plain": ""}, raw=True, display_id=True
     )
 
-    def show(words: str, *, ended: bool) -> None:
+    def draw(words: str, *, ended: bool) -> None:
         handle.update({"text/html": _line(words, ended=ended), "text/plain": words}, raw=True)
 
-    def tell(run: int, iteration: int, loss: float) -> None:
+    def show(run: int, iteration: int, loss: float) -> None:
         with lock:
             runs[run] = (iteration, loss)
-            show(_words(run, iteration, loss), ended=False)
+            draw(_words(run, iteration, loss), ended=False)
 
     try:
-        yield tell
+        yield show
     finally:
         steps = sum(iteration for iteration, _ in runs.values())
-        show(
+        draw(
             f"{len(runs) or 1} runs, {steps} iterations, {time.monotonic() - began:.1f} s",
             ended=True,
         )

@@ -195,7 +195,7 @@ def _saved_row(name: str, model: Model | MotionModel, job: Job) -> RowResult:
 
 
 def _row_of(
-    name: str, model: Model | MotionModel, scores: Any, warnings: Sequence[Any], **told: Any
+    name: str, model: Model | MotionModel, scores: Any, warnings: Sequence[Any], **content: Any
 ) -> RowResult:
     """Return a row of the table; keys that `content` lacks are null."""
     own = {"name": name, "weights": model.form.bound.size if model.form.bound else 0}
@@ -203,7 +203,7 @@ def _row_of(
         dict.fromkeys(RowResult.model_fields)
         | own
         | {"scores": scores, "warnings": warnings}
-        | told
+        | content
     )
 
 

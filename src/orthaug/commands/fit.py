@@ -89,10 +89,10 @@ def advised(fitted: FitReport) -> FitReport:
         *fitted.result.warnings,
         *(WarningResult.model_validate(warning) for warning in failed),
     ]
-    told = (
+    trials = (
         {"warnings": warnings} if found is None else {"advice": found[0], "advice_trials": found[1]}
     )
-    return replace(fitted, result=FitResult.model_validate({**dict(fitted.result), **told}))
+    return replace(fitted, result=FitResult.model_validate({**dict(fitted.result), **trials}))
 
 
 def judged(fitted: FitReport) -> FitReport:
@@ -114,14 +114,14 @@ def judged(fitted: FitReport) -> FitReport:
     if verdict is None and asked and not failed:
         short = "the training data have too few rows for cross-validation in so many blocks"
         why = "training was stopped too early for cross-validation" if _stopped(fit) else short
-        told = f"whether the learner helps is not judged: no part is held out, and {why}."
-        warnings.append(WarningResult(code="not_judged", text=told))
+        text = f"whether the learner helps is not judged: no part is held out, and {why}."
+        warnings.append(WarningResult(code="not_judged", text=text))
     if verdict is not None and fit.model.form.bound is not None:
-        told = (
+        text = (
             *verdict.warnings,
             *_unexplained(fitted, None if verdict.code == "helps" else physics),
         )
-        warnings += [WarningResult.model_validate(warning) for warning in told]
+        warnings += [WarningResult.model_validate(warning) for warning in text]
     result = FitResult.model_validate(
         {**dict(fitted.result), "validation": verdict, "warnings": warnings}
     )
@@ -155,7 +155,7 @@ def _unexplained(fitted: FitReport, physics: Callable[[], Any] | None) -> list[W
     shared = [row.name for row in rows if row.shared]
     if not shared or any(row.bias for row in rows):
         return []
-    told, failed = "no suspect explains half of what the learner found", []
+    text, failed = "no suspect explains half of what the learner found", []
     if physics is not None:
         if not result.residuals or result.residuals.verdict == "unmodelled":
             return []
@@ -165,19 +165,19 @@ def _unexplained(fitted: FitReport, physics: Callable[[], Any] | None) -> list[W
         )
         if not alone or alone.verdict != "unmodelled":
             return failed
-        told = (
+        text = (
             "physics alone leaves more than noise, which the learner takes up without better "
             "free runs"
         )
-    told += (
+    text += (
         f": a part of that may belong to {', '.join(shared)}, and no interval counts it. "
         "`orthaug explain` looks for its terms, [[suspects]] declares them; another measure, "
-        "or a learner that sees less, may tell them apart."
+        "or a learner that sees less, may separate them."
     )
-    return [Warning("unexplained", told)]
+    return [Warning("unexplained", text)]
 
 
-def keeping(job: Job, folder: Path, *, resume: bool = False) -> Job:
+def keep_states(job: Job, folder: Path, *, resume: bool = False) -> Job:
     """Return the job, with its states of training kept beside the result folder.
 
     With `resume` it goes on from them.
@@ -203,10 +203,10 @@ def keeping(job: Job, folder: Path, *, resume: bool = False) -> Job:
 def fit_variant(job: Job, variant: Variant, progress: Progress = SILENT) -> FitReport:
     """Train a variant of a job and score every part; `judge_fit` judges the learner."""
     progress.planned(job.planned(variant))
-    return told_of(job, job.run(variant, progress))
+    return report_of(job, job.run(variant, progress))
 
 
-def told_of(job: Job, fit: Any) -> FitReport:
+def report_of(job: Job, fit: Any) -> FitReport:
     """Score a fit on every part of its job, and fill its result up to the verdict."""
     warnings: list[Any] = [*job.warnings, *fit.warnings]
     if job.checkpoints is not None and job.checkpoints.lost:
@@ -239,10 +239,10 @@ def told_of(job: Job, fit: Any) -> FitReport:
         warnings += _one_step_only(
             scores, alone, [part.name for part in job.parts if part not in job.tests]
         )
-    fit, told = kind_of(job).content(job, fit, responses, warnings)
-    if fit.status.ok and told["residuals"] is not None:
-        fit = _for_observers(fit, told["residuals"].verdict, warnings)
-    content = told | {
+    fit, fields = kind_of(job).content(job, fit, responses, warnings)
+    if fit.status.ok and fields["residuals"] is not None:
+        fit = _for_observers(fit, fields["residuals"].verdict, warnings)
+    content = fields | {
         "spec": job.declaration,
         "data": job.data,
         "status": _status(fit, warnings),
@@ -430,11 +430,11 @@ def score_part(
         scores[kind] = ScoreResult() if runaway is not None else scored
         if runaway is not None:
             step, output = runaway
-            told = (
+            text = (
                 f"{part.name}: the free run diverged in output '{output}' at step {step}; no "
                 "simulation scores."
             )
-            warnings.append(Warning("free_run_diverged", told))
+            warnings.append(Warning("free_run_diverged", text))
         elif np.isnan(scored.rmse).any():
             warnings.append(
                 Warning(
@@ -442,11 +442,11 @@ def score_part(
                 )
             )
         elif np.isnan(scored.nrmse).any():
-            told = (
+            text = (
                 f"{part.name}: an output is constant over the scored samples; no NRMSE and FIT "
                 f"of its {kind}."
             )
-            warnings.append(Warning("constant_output", told))
+            warnings.append(Warning("constant_output", text))
     return PartScores.model_validate(scores), responses
 
 
@@ -462,11 +462,11 @@ def _scored_along(model: Any, part: Part, warnings: list[Any]) -> PartScores:
     found = scores_along(model, part.source, part.skip, None if whole else residual.watch)
     if found.diverged is not None:
         file, row, output = found.diverged
-        told = (
+        text = (
             f"{part.name}: the free run diverged in output '{output}' at row {row} of {file}; "
             "no simulation scores."
         )
-        warnings.append(Warning("free_run_diverged", told))
+        warnings.append(Warning("free_run_diverged", text))
     simulation = ScoreResult() if found.diverged is not None else found.simulation
     tests = residual.tests() or None
     return PartScores.model_validate(

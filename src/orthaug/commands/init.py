@@ -143,7 +143,7 @@ def _data(
     else:
         data.add("sampling_time", step_of(found, roles))
         unknown = clock.step is None and not roles.sampling_time
-        data["sampling_time"].comment("s; no column tells it: change it" if unknown else "s")
+        data["sampling_time"].comment("s; no column gives it: change it" if unknown else "s")
     for key, names in zip(("inputs", "outputs"), named, strict=True):
         data.add(key, names)
     uneven = time is not None and not clock.even
@@ -181,7 +181,7 @@ def _data(
 def _baseline(named: tuple[list[str], list[str]], model: FirstModel) -> Any:
     inputs, outputs = named
     terms, orders = [], model.orders
-    told = {}
+    comments = {}
     for name, nk, seen in zip(inputs, orders.nk, model.delays, strict=True):
         if seen != nk:
             why = (
@@ -189,7 +189,7 @@ def _baseline(named: tuple[list[str], list[str]], model: FirstModel) -> Any:
                 if seen is None
                 else _CLEARLY.format(seen)
             )
-            told[f"{name}[k-{nk}]" if nk else f"{name}[k]"] = why
+            comments[f"{name}[k-{nk}]" if nk else f"{name}[k]"] = why
     for output in outputs:
         own = f"_{output}" if len(outputs) > 1 else ""
         found = [(f"a{i}{own}", f"{output}[k-{i}]") for i in range(1, orders.na + 1)]
@@ -206,8 +206,8 @@ def _baseline(named: tuple[list[str], list[str]], model: FirstModel) -> Any:
                 "parameter", f"{parameter}_" if parameter in (*inputs, *outputs) else parameter
             )
             term.add("regressor", regressor)
-            if regressor in told:
-                term["regressor"].comment(told[regressor])
+            if regressor in comments:
+                term["regressor"].comment(comments[regressor])
             if own:
                 term.add("output", output)
             terms.append(term)
@@ -352,7 +352,7 @@ def question(found: Survey, inputs: Names | None = None, outputs: Names | None =
     proposed = (
         f'--inputs "{into}" --outputs "{_joined(outputs) if output is None else output.header}"'
     )
-    said = "the names of the columns do not tell inputs from outputs"
+    said = "the names of the columns do not show which are inputs and which outputs"
     if inputs is not None or outputs is not None:
         said = f"only {'inputs' if outputs is None else 'outputs'} are named"
     none = ' (--inputs "" for none)' if inputs is None and named else ""
@@ -448,9 +448,9 @@ def write_spec(found: Draft, out: Path, *, force: bool = False) -> None:
             try:
                 open_job(partial)
             except InputError as error:
-                told = str(error).removeprefix(f"{partial}: ")
+                reason = str(error).removeprefix(f"{partial}: ")
                 raise InputError(
-                    f"{out}: a spec for these columns would be refused: {told}"
+                    f"{out}: a spec for these columns would be refused: {reason}"
                 ) from None
 
 
@@ -502,9 +502,9 @@ def _account(
     step = f"{roles.sampling_time:g} s, as given" if roles.sampling_time else str(found.clock)
     if roles.sampling_time is None and found.clock.step is None:
         step += "; 1 s is written: change it"
-    told = f"; {found.note}" if found.note else ""
+    horizon = f"; {found.note}" if found.note else ""
     lines = [
-        f"{found.path.name}: {rows} rows, {len(found.columns)} columns{told}",
+        f"{found.path.name}: {rows} rows, {len(found.columns)} columns{horizon}",
         f"sampling time: {step}",
     ]
     for kind, columns in (("input", roles.inputs), ("output", roles.outputs)):
@@ -534,9 +534,9 @@ def _account(
                 "held out"
             )
     size, errors = model.orders, ", ".join(percent(error, 3) for error in model.free_run)
-    told = "one step ahead" if not roles.inputs else "in free run"
+    horizon = "one step ahead" if not roles.inputs else "in free run"
     lines.append(
-        f"first physics: linear, {size}{', with a constant' if model.offset else ''}; {told} "
+        f"first physics: linear, {size}{', with a constant' if model.offset else ''}; {horizon} "
         "its error"
     )
     lines[-1] += f" on rows held out is {errors} of the output's standard deviation"
@@ -560,7 +560,7 @@ def _order(order: int) -> str:
     from orthaug.selection.first_orders import PERSISTENCE
 
     return f"up to order {order}" + (
-        " or more" if order >= PERSISTENCE else ": few lags can be told apart"
+        " or more" if order >= PERSISTENCE else ": few lags can be distinguished"
     )
 
 

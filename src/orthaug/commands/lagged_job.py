@@ -270,5 +270,5 @@ def _check_measure(weighed: WeighedPhysics, problem: Problem) -> None:
         groups = "; ".join(", ".join(group) for group in weighed.excitation.collinear)
         name = weighed.measure.name
         raise InputError(
-            f"under the {name} measure the physics cannot tell {groups} apart; widen or move it."
+            f"under the {name} measure the physics cannot distinguish {groups}; widen or move it."
         )

@@ -82,16 +82,18 @@ def content(
     """
     from orthaug.analysis.robustness import robust_where_asked
 
-    told: dict[str, Any] = dict.fromkeys((*_UNKNOWN, "residuals", "missing_lags", "stability"))
+    fields: dict[str, Any] = dict.fromkeys((*_UNKNOWN, "residuals", "missing_lags", "stability"))
     if fit.status.ok:
         one_step, free_run = responses[job.train.name]
         plain = fit
         fit = attempt(
             "the robust covariance", lambda: robust_where_asked(plain, one_step), warnings, plain
         )
-        told |= _physical_content(job, fit, warnings)
-        told["bias"] = attempt("the bias by suspects", partial(_bias_of, job, fit), warnings, None)
-        told |= _analysed(fit, one_step, free_run, warnings)
+        fields |= _physical_content(job, fit, warnings)
+        fields["bias"] = attempt(
+            "the bias by suspects", partial(_bias_of, job, fit), warnings, None
+        )
+        fields |= _analysed(fit, one_step, free_run, warnings)
     shared = _shared_of(job, fit, others=False)
     rows = parameter_rows(
         fit.problem.baseline.parameters,
@@ -108,7 +110,7 @@ def content(
         row if row.unit else row.model_copy(update={"derived_unit": units.get(row.name)})
         for row in rows
     ]
-    told |= {
+    fields |= {
         "standard_errors": None
         if fit.std is None
         else "plain"
@@ -130,13 +132,15 @@ def content(
         fit.model.structure != "orthogonal" or fit.model.form.bound is None
     ):  # a variant of what the spec declares
         shared = None
-    told["parameters"] = _with_biases(
+    fields["parameters"] = _with_biases(
         rows, shared.determined if shared else None, budget, fit.at_bound
     )
-    if told["physical_parameters"] is not None:
+    if fields["physical_parameters"] is not None:
         physical = shared.physical if shared else None
-        told["physical_parameters"] = _with_biases(told["physical_parameters"], physical, budget)
-    return fit, told
+        fields["physical_parameters"] = _with_biases(
+            fields["physical_parameters"], physical, budget
+        )
+    return fit, fields
 
 
 def figures(
@@ -280,7 +284,8 @@ def _with_biases(
     ]
     biases = [budget.of(row.name) if budget and row.name not in held else None for row in rows]
     return [
-        row.told(imitated, bias) for row, imitated, bias in zip(rows, shared, biases, strict=True)
+        row.with_bias(imitated, bias)
+        for row, imitated, bias in zip(rows, shared, biases, strict=True)
     ]
 
 

@@ -16,7 +16,7 @@ from orthaug._base.checks import check_type
 from orthaug._base.errors import InputError, TrainingError
 from orthaug._base.folders import check_new_file, whole_file
 from orthaug.commands.doubts import doubted
-from orthaug.commands.fit import FitReport, fit_job, fit_report, judged, told_of, write_result
+from orthaug.commands.fit import FitReport, fit_job, fit_report, judged, report_of, write_result
 from orthaug.commands.folder import check_folder, check_inputs_kept
 from orthaug.commands.job import Job, origin_of
 from orthaug.commands.kinds import open_job
@@ -193,7 +193,7 @@ def page_of(
     made = replace(
         origin_of(job, "fit"), name="spec", command=f"{NAME} in Python", toml=_account(fit)
     )
-    return _written(fit_report(doubted(judged(told_of(job, fit))), made), place)
+    return _written(fit_report(doubted(judged(report_of(job, fit))), made), place)
 
 
 def page_of_spec(fitted: FitReport, path: str | os.PathLike | None, tests: None = None) -> Page:
@@ -227,8 +227,12 @@ def _account(fit: Estimate | MotionEstimate) -> str:
     """Return the text in the place of the spec."""
     physics = fit.problem.motion if isinstance(fit, MotionEstimate) else fit.problem.baseline
     bound = fit.model.form.bound
-    told = (fit.problem.record, physics, f"learner: {'none' if bound is None else bound.learner}")
-    lines = ("Fitted in Python by orthaug.estimate; there is no spec.", *map(str, told))
+    declared = (
+        fit.problem.record,
+        physics,
+        f"learner: {'none' if bound is None else bound.learner}",
+    )
+    lines = ("Fitted in Python by orthaug.estimate; there is no spec.", *map(str, declared))
     return "".join(f"# {line}\n" for text in lines for line in text.splitlines())
 
 

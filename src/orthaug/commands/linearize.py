@@ -102,7 +102,7 @@ def write(found: Linearization, out: Path, *, force: bool = False) -> None:
         save(poles_figure(found), partial / "figures" / "poles.png")
 
 
-def told(found: Linearization, *, as_json: bool) -> str:
+def printed(found: Linearization, *, as_json: bool) -> str:
     """Return the text that the command prints."""
     from orthaug.reports.linear import LinearizeResult
     from orthaug.reports.linear_text import linear_text

@@ -86,16 +86,16 @@ def write(
     scored, warnings, first = RunningScores(), [], run.model.form.first_row
     with _opened(out, force) as file:
         for piece, response in responses(run.model, run.source, free=run.free):
-            (told,) = response.trajectories
+            (trajectory,) = response.trajectories
             frame = response.to_frame()
             if piece.offset:
                 frame = frame.iloc[first:]
                 frame["time"] += piece.offset * response.sampling_time
             frame.to_csv(file, index=False, header=not scored.rows)
             with np.errstate(all="ignore"):
-                scored.add(piece.outputs[first:], told.model[first:])
-            if told.diverged is not None:
-                row, output = told.diverged
+                scored.add(piece.outputs[first:], trajectory.model[first:])
+            if trajectory.diverged is not None:
+                row, output = trajectory.diverged
                 text = f"the free run diverged in output '{output}' at step {piece.offset + row}; "
                 warnings.append(
                     Warning("free_run_diverged", text + "it has no values from there on.")

@@ -26,7 +26,7 @@ from orthaug.commands.program import (
     Which,
     app,
     prepare_jax,
-    tell,
+    print_result,
 )
 
 if TYPE_CHECKING:
@@ -98,10 +98,10 @@ def predict(
     check_file(out, model, data, Path(initial or data), force=force)
     prepare_jax()
     if observer:
-        response, told = run.observed(opened, horizon)
+        response, notes = run.observed(opened, horizon)
     else:
-        response, told = opened.model.predict(opened.record, horizon=horizon), []
-    _write_response(response, opened, out, force, [*opened.notes, *told])
+        response, notes = opened.model.predict(opened.record, horizon=horizon), []
+    _write_response(response, opened, out, force, [*opened.notes, *notes])
 
 
 @app.command()
@@ -151,7 +151,7 @@ def split(
     for line in opened.notes:
         streams.say(line)
     result = splitting.split_model(opened, chosen)
-    tell(result, split_text(result), as_json)
+    print_result(result, split_text(result), as_json)
 
 
 @app.command()
@@ -188,7 +188,7 @@ def explain(
     result = explain_model(opened, degree=degree, functions=functions or (), most=most)
     for line in explain_notes(model) if result.spec else ():
         streams.say(line)
-    tell(result, explain_text(result), as_json)
+    print_result(result, explain_text(result), as_json)
 
 
 @app.command()
@@ -262,7 +262,7 @@ def linearize(
     found = linearized(opened, at, record, continuous=continuous)
     if out is not None:
         linearizing.write(found, out, force=force)
-    streams.echo(linearizing.told(found, as_json=as_json))
+    streams.echo(linearizing.printed(found, as_json=as_json))
     if out is not None and not as_json:
         streams.echo(f"\nwritten to {out}")
 
@@ -323,7 +323,7 @@ def track(
     )
     text = track_text(tracked.result)
     tracking.write_tracked(tracked, folder, text, force=force)
-    tell(tracked.result, text, as_json, folder)
+    print_result(tracked.result, text, as_json, folder)
 
 
 def _written_long(
@@ -368,8 +368,8 @@ def _write_response(
     for line in (*notes, *(f"warning: {warning.text}" for warning in run.warnings(response))):
         streams.say(line)
     run.write_csv(response, opened, out, force=force)
-    told = response_text(response)
-    if told:
-        (streams.say if out is None else streams.echo)(told)
+    scores = response_text(response)
+    if scores:
+        (streams.say if out is None else streams.echo)(scores)
     if out is not None:
         streams.echo(f"written to {out}")

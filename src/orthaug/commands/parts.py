@@ -50,8 +50,8 @@ class Part:
         record, gaps = long_stretches(
             self.record, self.skips, first, least, f"data.{self.name}: ", self.skip
         )
-        told = Warning("missing_rows", f"{self.name}: {gaps}")
-        return replace(self, record=record, warnings=(*self.warnings, told))
+        warning = Warning("missing_rows", f"{self.name}: {gaps}")
+        return replace(self, record=record, warnings=(*self.warnings, warning))
 
     @property
     def skips(self) -> tuple[int, ...]:
@@ -80,7 +80,7 @@ class Part:
             if len(experiment) < least:
                 raise InputError(
                     f"{experiment.source}: data.{self.name} has {len(experiment)} rows, too "
-                    f"few; at least {least} tell where a run of this motion starts."
+                    f"few; at least {least} determine where a run of this motion starts."
                 )
             if len(experiment) <= first:
                 raise InputError(
@@ -204,10 +204,10 @@ def _load(path: Path, spec: Spec, part: PartSection, name: str, *, stays: bool =
         records.append(record)
     record = Record.join(records)
     sources = (file for read, file in zip(records, files, strict=True) for _ in read.experiments)
-    told = tuple(
+    renamed = tuple(
         replace(e, source=file) for e, file in zip(record.experiments, sources, strict=True)
     )
-    record = replace(record, experiments=told)
+    record = replace(record, experiments=renamed)
     warnings = ()
     if part.every > 1:
         given = spec.data.sampling_time
@@ -260,11 +260,11 @@ def _left(path: Path, spec: Spec, part: PartSection, name: str, files: Sequence[
     if spec.data.time is None:
         warnings = _other_step(path, spec, files, name, part.columns)
     if len(record) < total:
-        told = (
+        text = (
             f"{name}: findings and figures look at {len(record)} of {total} rows, in windows "
             "spread over them."
         )
-        warnings += (Warning("witness", told),)
+        warnings += (Warning("witness", text),)
     return Part(name, record, part.skip, tuple(results), warnings, source)
 
 
@@ -300,7 +300,7 @@ def _other_step(
         header = clock.column.header
         remedy = f'time = "{header}"' if clock.instants else f"sampling_time = {clock.step:g}"
         text = (
-            f"{name}: {said}, but column '{header}' of {file} tells {clock.step:g} s; perhaps "
+            f"{name}: {said}, but column '{header}' of {file} gives {clock.step:g} s; perhaps "
             f"{remedy} is meant."
         )
         return (Warning("other_sampling_time", text),)

@@ -246,7 +246,7 @@ def _fail(message: str, code: int) -> None:
     sys.exit(code)
 
 
-def tell(result: Content, text: str, as_json: bool, place: object = None) -> None:
+def print_result(result: Content, text: str, as_json: bool, place: object = None) -> None:
     """Print a result on standard output, as JSON or in words; then the place that was written."""
     written = f"\n\nwritten to {place}" if place is not None else ""
     if place in PARTIALS.overtaken:
@@ -274,17 +274,17 @@ def arguments(command: str, spec: Path, **options: Any) -> tuple[str, ...]:
         >>> arguments("fit", Path("a.toml"), out=Path("b"), resume=False, model=None, force=True)
         ('fit', 'a.toml', '--out', 'b', '--force')
     """
-    told = [command, str(spec)]
+    words = [command, str(spec)]
     for name, value in options.items():
         if value is True:
-            told.append(f"--{name}")
+            words.append(f"--{name}")
         elif value:
-            told += [
+            words += [
                 part
                 for one in (value if isinstance(value, list) else [value])
                 for part in (f"--{name}", str(one))
             ]
-    return tuple(told)
+    return tuple(words)
 
 
 def prepare_jax() -> None:

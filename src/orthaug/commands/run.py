@@ -191,7 +191,7 @@ def open_run(
         record = record_for(loaded, data, held, reading)
     except MissingSampleError as error:
         raise InputError(f"{error} --missing skip leaves such rows out.") from None
-    rows, told = (
+    rows, notes = (
         len(record) + record.missing,
         prepared_notes(loaded, record if reading.prepare else None),
     )
@@ -201,8 +201,8 @@ def open_run(
         )  # a state to predict from
         first = loaded.form.first_row + ahead + bool(estimated)
         record, text = long_stretches(record, [0] * len(record.experiments), first)
-        told += (f"note: {data}: {text}",)
-    return ModelOnData(loaded, record, data, rows, told)
+        notes += (f"note: {data}: {text}",)
+    return ModelOnData(loaded, record, data, rows, notes)
 
 
 def record_for(
@@ -399,29 +399,29 @@ def _of_band(found: Consistency, response: Response) -> list[str]:
     if not np.isfinite(found.nis) or not len(apart):
         return []
     held, (low, high) = float(np.mean(np.abs(apart) <= BAND)), found.expected
-    told = (
+    text = (
         f"the innovations' squares are {found.nis:.3g} times what the observer expects (NIS, "
         f"{low:.3g} to {high:.3g} where it knows its noise); its 95 % band holds "
         f"{percent(held, 3)} of what was measured."
     )
     if found.consistent:
-        return [f"note: {told}"]
+        return [f"note: {text}"]
     why = (
         "its noises are too small, or the model is wrong here"
         if found.nis > high
         else "its noises are too large"
     )
     return [
-        f"warning: {told} Do not take the band for one of 95 %: {why}. "
+        f"warning: {text} Do not take the band for one of 95 %: {why}. "
         "oa.Observer(oa.load(MODEL)).tuned(record) finds noises by the likelihood of a record."
     ]
 
 
 def warnings(response: Response) -> list[Warning]:
     """Return warnings about a response."""
-    told = "the free run diverged in output '{}' at step {}; it has no values from there on."
+    text = "the free run diverged in output '{}' at step {}; it has no values from there on."
     ends = (trajectory.diverged for trajectory in response.trajectories if trajectory.diverged)
-    return [Warning("free_run_diverged", told.format(output, step)) for step, output in ends]
+    return [Warning("free_run_diverged", text.format(output, step)) for step, output in ends]
 
 
 def write_csv(

@@ -67,12 +67,12 @@ def open_select(path: Path) -> tuple[LaggedJob, Spec]:
     return open_lagged(path, alone), spec
 
 
-def select_for(job: LaggedJob, spec: Spec, folder: Path, told: OnStage) -> SelectionReport:
+def select_for(job: LaggedJob, spec: Spec, folder: Path, report_model: OnStage) -> SelectionReport:
     """Select the structure, and write the choice into the spec.
 
     Args:
         folder: where the new spec will be; its paths are relative to that.
-        told: called with the stage and each model that was judged.
+        report_model: called with the stage and each model that was judged.
 
     Raises:
         InputError: what cannot be selected from.
@@ -97,7 +97,7 @@ def select_for(job: LaggedJob, spec: Spec, folder: Path, told: OnStage) -> Selec
         )
     options["engine"] = engine_of(spec.engine, "dask") if spec.engine.kind == "dask" else None
     try:
-        selection = select(job.train.record, job.problem.baseline, **options, progress=told)
+        selection = select(job.train.record, job.problem.baseline, **options, progress=report_model)
     except InputError as error:
         raise InputError(f"{job.path}: {error}") from None
     result = _result(job, selection, time.monotonic() - began)

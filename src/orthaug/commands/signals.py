@@ -60,7 +60,7 @@ class SignalWatch:
         _thread.start_new_thread(self._wait, (reader,))
 
     @contextmanager
-    def telling(self, during: Callable[[], str], stop: Callable[[], Any]) -> Iterator[None]:
+    def reporting(self, during: Callable[[], str], stop: Callable[[], Any]) -> Iterator[None]:
         """Report what a signal stopped, and stop drawing before that."""
         self._during, self._stop = during, stop
         try:

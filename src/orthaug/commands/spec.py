@@ -237,12 +237,12 @@ class Spec(Section):
         wrong = {"output"} if self.motion is not None else {"equation", "factor", "unit"}
         for i, section in enumerate(self.suspects):
             for key in sorted(section.model_fields_set & wrong):
-                told = (
+                found = (
                     "beside [motion]; expected `equation`"
                     if self.motion
                     else "without [motion], whose key it is"
                 )
-                raise ValueError(f"`suspects[{i}].{key}`: found {told}")
+                raise ValueError(f"`suspects[{i}].{key}`: found {found}")
         if self.motion is not None and self.training.ensemble:
             raise ValueError(
                 "`training.ensemble`: a motion has none, for medians of runs follow no equations"

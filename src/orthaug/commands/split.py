@@ -54,11 +54,11 @@ def open_training(model: Path, data: Sequence[Path], rows: tuple[int, int] | Non
         if rows is None:
             notes += [f"note: {path.name}: {taken}, those of the training."] if taken else []
         elif own and own.rows != [list(rows)]:
-            told = (
+            text = (
                 f"the model was trained on {taken or 'all rows'} of {path.name}, not on rows "
                 f"{rows[0]}:{rows[1]}."
             )
-            warnings.append(Warning("other_training_data", told))
+            warnings.append(Warning("other_training_data", text))
         read.append(
             record_for(loaded, path, loaded.outputs, replace(reading, rows=rows or reading.rows))
         )
@@ -146,18 +146,18 @@ def split_model(opened: ModelOnData, measure: Measure) -> SplitResult:
 
 
 def _split_lagged(
-    model: Model, record: Record, measure: Measure, told: Sequence[Warning]
+    model: Model, record: Record, measure: Measure, warnings: Sequence[Warning]
 ) -> SplitResult:
     from orthaug.inference.covariance import interval
     from orthaug.inference.splitting import split_under
 
     parameters = model.form.baseline.parameters
-    stands = [
+    bounded = [
         p.name for p, value in zip(parameters, model.theta, strict=True) if value in (p.min, p.max)
     ]
-    if stands:
+    if bounded:
         raise InputError(
-            f"{', '.join(stands)} stands at a bound, and a split knows none; fit without the "
+            f"{', '.join(bounded)} is at a bound, which a split does not impose; fit without the "
             "bound, or with `fixed = true` there."
         )
     support = Support(model.fitting(record, need_outputs=True), model.form.layout, model.form.used)
@@ -171,13 +171,13 @@ def _split_lagged(
             "measure": measure.name,
             "measure_detail": under,
             "orthogonality_defect": under.defect,
-            "warnings": [*told, *under.warnings, *([] if std is not None else [_UNKNOWN])],
+            "warnings": [*warnings, *under.warnings, *([] if std is not None else [_UNKNOWN])],
         }
     )
 
 
 def _split_motion(
-    model: MotionModel, record: Record, measure: Measure, told: Sequence[Warning]
+    model: MotionModel, record: Record, measure: Measure, warnings: Sequence[Warning]
 ) -> SplitResult:
     from orthaug.fitting.motion_estimation import reopened
 
@@ -191,7 +191,7 @@ def _split_motion(
             "measure": split.name,
             "measure_detail": MeasureResult.of_motion(split),
             "orthogonality_defect": split.defect,
-            "warnings": [*told, *fit.warnings, *([_UNKNOWN] if lacking else [])],
+            "warnings": [*warnings, *fit.warnings, *([_UNKNOWN] if lacking else [])],
         }
     )
 

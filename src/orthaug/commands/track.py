@@ -147,7 +147,7 @@ def _result(opened: TrackingInput, online: Recursive) -> TrackResult:
     baseline = opened.model.form.baseline
     warnings = []
     if online.std is None:
-        text = "no standard errors: the fit has none, or the rows do not tell θ."
+        text = "no standard errors: the fit has none, or the rows do not determine θ."
         warnings.append(Warning("no_standard_errors", text))
     if online.outside:
         text = outside_text(online.outside, online.rows)

@@ -384,6 +384,6 @@ def shared_in_words(shared: Shared) -> str:
         return "all parameters: they are those of the physics nearest to the fitted motion"
     moved = [" with ".join(direction) for direction in shared.directions]
     return (
-        f"{'; '.join(moved)} (by the nearest physics); told by the fit: "
+        f"{'; '.join(moved)} (by the nearest physics); determined by the fit: "
         f"{', '.join(shared.untouched) or 'none'}"
     )

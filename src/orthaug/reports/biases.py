@@ -17,7 +17,7 @@ from orthaug.reports.result import ParameterResult
 
 _MOST_COLUMNS = 12  # more cells beside each other are too narrow for their numbers on paper
 _MOST_CELLS = 200
-_LEAST = 0.01  # per cent: of less only that it is less is told, for a cell is narrow
+_LEAST = 0.01  # per cent: of less only that it is less is text, for a cell is narrow
 _ZERO = 1e-7
 
 
@@ -81,11 +81,11 @@ def bias_map(suspects: Sequence[SuspectResult]) -> BiasMap:
     fewer = " and ".join(
         f"{count} of {whole}" for count, whole in parts if count < int(whole.partition(" ")[0])
     )
-    told = (
+    text = (
         f"Shown are those with the largest biases, {fewer}; result.json has all." if fewer else ""
     )
     return BiasMap(
-        tuple(names[j] for j in columns), tuple(shown), shares[np.ix_(rows, columns)], told
+        tuple(names[j] for j in columns), tuple(shown), shares[np.ix_(rows, columns)], text
     )
 
 

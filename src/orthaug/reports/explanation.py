@@ -68,7 +68,7 @@ def explain_text(result: ExplainResult) -> str:
     if result.noise is not None:
         blocks[0] += [
             f"Of what it adds, {percent(result.noise)} are its own errors, as far as training "
-            "tells."
+            "shows."
         ]
     if result.terms:
         blocks += [_term_lines(result), _parameter_lines(result)]

@@ -285,7 +285,7 @@ class FitPlots:
                 share = 100 * (ends - row["value"]) / abs(row["value"])
                 axis.plot(share, [y, y], "|-", color=GREEN, markersize=10, linewidth=2)
             reach = f"  [{ends[0]:.5g}, {ends[1]:.5g}]" if known else ", no interval"
-            told = f"{name} = {row['value']:.6g}{' ' * bool(row['unit'])}{row['unit']}{reach}"
+            label = f"{name} = {row['value']:.6g}{' ' * bool(row['unit'])}{row['unit']}{reach}"
             axis.plot(
                 [0.0],
                 [y],
@@ -294,7 +294,7 @@ class FitPlots:
                 markerfacecolor=GREEN if known and row["value"] else "none",
             )
             axis.annotate(
-                told, (0.0, y), (0, 9), textcoords="offset points", ha="center", fontsize="small"
+                label, (0.0, y), (0, 9), textcoords="offset points", ha="center", fontsize="small"
             )
         axis.axvline(0.0, color=GREY, linewidth=0.8, zorder=0)
         axis.set_yticks(place, [str(name) for name in table.index])

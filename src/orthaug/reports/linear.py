@@ -235,12 +235,12 @@ def _continuous(view: LinearView) -> dict[str, Any]:
 def _response(view: LinearView, i: int, j: int) -> dict[str, Any]:
     bode = view.bode
     assert bode is not None
-    told = _pair(view, i, j)
+    fields = _pair(view, i, j)
     for name, band in (("magnitude", bode.magnitude_ci95), ("phase", bode.phase_ci95)):
-        told[name] = getattr(bode, name)[:, i, j]
-        told[f"{name}_low"] = None if band is None else band[:, i, j, 0]
-        told[f"{name}_high"] = None if band is None else band[:, i, j, 1]
-    return told
+        fields[name] = getattr(bode, name)[:, i, j]
+        fields[f"{name}_low"] = None if band is None else band[:, i, j, 0]
+        fields[f"{name}_high"] = None if band is None else band[:, i, j, 1]
+    return fields
 
 
 def _measured(measured: MeasuredResponse, view: LinearView) -> dict[str, Any]:

@@ -173,7 +173,7 @@ def _agreement(found: Linearization, view: LinearView) -> list[str]:
     if agreement is None or agreement.points < _FEWEST:
         few = "no" if agreement is None else f"only {agreement.points}"
         return [
-            f"data alone ({how}) tell {few} points of the response with a coherence of "
+            f"data alone ({how}) give {few} points of the response with a coherence of "
             f"{COHERENT} or more"
         ]
     return [

@@ -59,8 +59,8 @@ def compare_page(page: ComparePage) -> str:
 def _title(what: str, outputs: Sequence[str], spec: Mapping[str, Any], origin: Origin) -> str:
     """Return the title of a page; it omits a spec that is called just that."""
     inputs = spec.get("data", {}).get("inputs") or []
-    told = f"{what} of {_listed(outputs)}" + (f" from {_listed(inputs)}" if inputs else "")
-    return told if origin.name == "spec" else f"{told}: {origin.name}"
+    title = f"{what} of {_listed(outputs)}" + (f" from {_listed(inputs)}" if inputs else "")
+    return title if origin.name == "spec" else f"{title}: {origin.name}"
 
 
 def _listed(names: Sequence[str]) -> str:

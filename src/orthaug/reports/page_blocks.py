@@ -78,15 +78,15 @@ def percent(share: float | None, digits: int = 2, *, signed: bool = False) -> st
     shown = 0.0 if abs(share) < _ROUNDING else 100 * share
     if shown and abs(shown) < 10**-3:
         return "< 0.001 %"
-    told = (
+    text = (
         lines.percent(shown / 100, digits, sign="+")
         if signed and shown
         else lines.percent(shown / 100, max(digits, 3))
     )
-    mantissa, power, rest = told.partition("e")
+    mantissa, power, rest = text.partition("e")
     if power:
-        told = f"{mantissa}·10{str(int(rest.removesuffix(' %'))).translate(_RAISED)} %"
-    return told.replace("-", "−")
+        text = f"{mantissa}·10{str(int(rest.removesuffix(' %'))).translate(_RAISED)} %"
+    return text.replace("-", "−")
 
 
 def chance(p: float | None) -> str:

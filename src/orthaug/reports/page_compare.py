@@ -127,8 +127,8 @@ def _models(result: CompareResult) -> list[Any]:
 def _parameters(result: CompareResult) -> list[Any]:
     if not result.comparison or not result.comparison[0].parameters:
         return []
-    told = [(row.name, parameter) for row in result.comparison for parameter in row.parameters]
-    biased = any(parameter.bias for _, parameter in told)
+    rows = [(row.name, parameter) for row in result.comparison for parameter in row.parameters]
+    biased = any(parameter.bias for _, parameter in rows)
     rows = [
         [
             name,
@@ -139,7 +139,7 @@ def _parameters(result: CompareResult) -> list[Any]:
             interval(p.ci95),
             *([bias_cell(p)] if biased else []),
         ]
-        for name, p in told
+        for name, p in rows
     ]
     head = [
         "model",

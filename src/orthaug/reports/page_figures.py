@@ -42,7 +42,7 @@ def interval_plot(rows: Sequence[ParameterResult]) -> Plot | None:
         return None
     traces: list[dict[str, Any]] = []
     layout: dict[str, Any] = {"shapes": []}
-    told = any(row.ci95_with_bias for row in drawn)
+    biased = any(row.ci95_with_bias for row in drawn)
     for i, row in enumerate(drawn):
         number = str(i + 1) if i else ""
         first = {
@@ -77,7 +77,7 @@ def interval_plot(rows: Sequence[ParameterResult]) -> Plot | None:
         + (
             "; the thin bar is its 95 % interval once the bias is taken out, which need not "
             "hold the estimate."
-            if told
+            if biased
             else "."
         )
         + " A diamond is the initial value, where it is near enough to be shown."
@@ -271,7 +271,7 @@ def residual_plots(test: ResidualTestResult, what: str, units: Mapping[str, str]
             "name": "autocorrelation",
             "marker": {"color": "@model"},
         }
-        told = (
+        caption = (
             f"Autocorrelation of the {what} of {test.name}; the band holds 99 % of the values "
             f"that noise gives. The largest in size is {number(test.strongest_acf, 2)}."
         )
@@ -282,7 +282,7 @@ def residual_plots(test: ResidualTestResult, what: str, units: Mapping[str, str]
         plots.append(
             Plot(
                 f"Autocorrelation of the {what} of {test.name}.",
-                told,
+                caption,
                 [bars],
                 layout,
                 280,
@@ -305,7 +305,7 @@ def residual_plots(test: ResidualTestResult, what: str, units: Mapping[str, str]
                     "marker": {"color": color, "size": 4},
                 }
             )
-        told = (
+        caption = (
             f"Correlation of the {what} of {test.name} with the inputs; beyond the band it is "
             "more than noise."
         )
@@ -314,7 +314,7 @@ def residual_plots(test: ResidualTestResult, what: str, units: Mapping[str, str]
         }
         layout["showlegend"] = True
         label = f"Correlation of the {what} of {test.name} with the inputs."
-        plots.append(Plot(label, told, traces, layout, 280, small=True))
+        plots.append(Plot(label, caption, traces, layout, 280, small=True))
     return plots + [
         _means_plot(test, name, curve, what, units) for name, curve in test.most_telling.items()
     ]
@@ -334,7 +334,7 @@ def _means_plot(
         "marker": {"color": "@learner"},
     }
     surely = chance(curve.p)
-    told = (
+    caption = (
         f"Mean of the {what} of {test.name}, less that of all rows, over {name} with 99 % "
         "intervals, both with its autocorrelation taken into account as in the test: that it "
         f"is flat has p {'' if surely.startswith('<') else '= '}{surely}. Plain means explain "
@@ -344,7 +344,7 @@ def _means_plot(
     layout = titled(
         regressor_label(name, units), with_unit(f"residual of {test.name}", units.get(test.name))
     )
-    return Plot(label, told, [dots], layout, 280, small=True)
+    return Plot(label, caption, [dots], layout, 280, small=True)
 
 
 def bias_plot(suspects: Sequence[SuspectResult]) -> Plot:
@@ -448,10 +448,10 @@ def parameter_comparison(rows: Sequence[RowResult]) -> list[Plot]:
             "yaxis": CATEGORIES,
             "showlegend": False,
         }
-        told = (
+        caption = (
             f"{parameter.name} by every way of modelling, with its 95 % interval where it has one."
         )
-        plots.append(Plot(told, told, [dots], layout, 120 + 30 * len(rows), small=True))
+        plots.append(Plot(caption, caption, [dots], layout, 120 + 30 * len(rows), small=True))
     return plots
 
 

@@ -332,8 +332,8 @@ def _plot(run: Run, band: Mapping[str, tuple[float, float]], most: int) -> Plot:
             [name for name, curve in curves.items() if curve is not None], i, limits
         )
         if panels.measured is not None:
-            told = {"name": "measured − model", "line": {"color": "@residual", "width": 1}}
-            panels.add_residual("model", i, model, told)
+            sentences = {"name": "measured − model", "line": {"color": "@residual", "width": 1}}
+            panels.add_residual("model", i, model, sentences)
             if limits is not None:
                 low, high = limits
                 place = {"xref": "paper", "x0": 0, "x1": 1, "yref": f"y{2 * i + 2}"}
@@ -404,9 +404,9 @@ def _mark(layout: dict[str, Any], run: Run, start: float, step: float) -> None:
         if i and breaks:
             layout["shapes"].append(_line(start + step * (row - 0.5), "@grid", "dot"))
         alone = None if run.alone is None else run.alone.trajectories[i]
-        for name, told in (("free run", trajectory), (f"the {WITHOUT}", alone)):
-            if told is not None and told.diverged:
-                at = start + step * (row + told.diverged[0])
+        for name, sentences in (("free run", trajectory), (f"the {WITHOUT}", alone)):
+            if sentences is not None and sentences.diverged:
+                at = start + step * (row + sentences.diverged[0])
                 layout["shapes"].append(_line(at, "@bad", "solid"))
                 layout["annotations"].append(
                     {
@@ -416,8 +416,10 @@ def _mark(layout: dict[str, Any], run: Run, start: float, step: float) -> None:
                         "yref": "paper",
                         "yanchor": "top",
                         "showarrow": False,
-                        "xanchor": "right" if row + told.diverged[0] > _length(run) / 2 else "left",
-                        "text": f"{name} diverges in {told.diverged[1]}",
+                        "xanchor": "right"
+                        if row + sentences.diverged[0] > _length(run) / 2
+                        else "left",
+                        "text": f"{name} diverges in {sentences.diverged[1]}",
                         "font": {"color": "@bad"},
                     }
                 )
@@ -448,29 +450,29 @@ def _caption(run: Run, most: int) -> str:
     response = run.response
     rows, count = sum(len(t.model) for t in response.trajectories), len(response.trajectories)
     files = f" of {count} experiments" if count > 1 else ""
-    told = [
+    sentences = [
         f"The free run on {run.part}, all {rows} samples{files}, and the residual under it on "
         "the same time axis."
     ]
     if rows > most:
-        told.append(
+        sentences.append(
             f"Of each curve {number(most, 3)} points are kept, the least and the largest value "
             "of every stretch."
         )
     for t in response.trajectories:
         if t.diverged:
-            told.append(
+            sentences.append(
                 f"The run leaves all bounds in {t.diverged[1]} at row {t.diverged[0]}, where "
                 "it is cut off."
             )
     outside = [t.outside for t in response.trajectories if t.outside is not None]
     beyond = float(np.concatenate(outside).mean()) if outside else 0.0
     if beyond > 0:
-        told.append(
+        sentences.append(
             f"On {percent(beyond)} of the samples, shaded, the learner is outside what it was "
             "trained on; `learner.beyond` says what its correction does there."
         )
-    return " ".join(told)
+    return " ".join(sentences)
 
 
 def _shades(response: Response, start: float, step: float) -> list[dict[str, Any]]:

@@ -22,11 +22,11 @@ from orthaug.reports.result import (
 )
 
 _GOOD, _POOR = 0.2, 0.5  # NRMSE of a free run up to which it is close, and from which it is far
-_ALIKE = 1.1  # ratio of errors up to which models are told to be as good as each other
-_SURE = 0.1  # standard error over value up to which a parameter is told to be known
+_ALIKE = 1.1  # ratio of errors up to which models are text to be as good as each other
+_SURE = 0.1  # standard error over value up to which a parameter is text to be known
 _NAMED = 0.5  # share of what was learned from which its cause is what to do first
-_FAR = 5.0  # standard errors from which the size of a bias is told in figures
-_MOST_DOUBTS = 3  # that are told in the first sentence
+_FAR = 5.0  # standard errors from which the size of a bias is text in figures
+_MOST_DOUBTS = 3  # that are text in the first sentence
 _WORSE = 1.5  # times the error on the training data: a Gaussian error then leaves the 95 % band on a fifth of the rows
 _STOPPED = ("iteration_limit", "no_descent", "stopped")
 _RAN_AWAY = "free_run_diverged"
@@ -327,26 +327,26 @@ def _use(result: FitResult, level: str) -> str:
     if level == "bad" and not (known and predicts):
         return "Use it for nothing but to look for what is missing."
     if level == "bad":
-        told = "predict the next sample"
+        text = "predict the next sample"
     else:
-        told = f"simulate{' and predict' if predicts else ''} within the range of its training data"
-    told += f" and to read {_joined(known)} as physics" if known else ""
+        text = f"simulate{' and predict' if predicts else ''} within the range of its training data"
+    text += f" and to read {_joined(known)} as physics" if known else ""
     if sure and not known:
         cover = "interval does" if len(sure) == 1 else "intervals do"
-        told += (
+        text += (
             f", but do not read {_joined(sure)} as physics yet: the {cover} not cover what the "
             "residual still holds"
         )
-    told += (
+    text += (
         f"; {_joined(others)} {_is(others)} too uncertain or biased to be read so" if others else ""
     )
     if shared:
-        told += (
+        text += (
             f"; {_joined(shared)} {_is(shared)} what the physics nearest to the data has, for "
             "the learner could"
         )
-        told += f" imitate {'it' if len(shared) == 1 else 'them'}"
-    return f"Use it to {told}."
+        text += f" imitate {'it' if len(shared) == 1 else 'them'}"
+    return f"Use it to {text}."
 
 
 def _noise_alone(result: FitResult) -> bool:
@@ -486,8 +486,8 @@ def _undecided(result: FitResult) -> bool:
 
 def _change(change: object) -> str:
     """Return a change with its predicted gain, as the middle of a sentence."""
-    told = {key: getattr(change, key) for key in ("kind", "what", "fall", "of", "output")}
-    predicted = Change(**{**told, "fall": told["fall"] or 0.0})
+    text = {key: getattr(change, key) for key in ("kind", "what", "fall", "of", "output")}
+    predicted = Change(**{**text, "fall": text["fall"] or 0.0})
     return f"{predicted.name}, with which {predicted.prediction}"
 
 

@@ -214,8 +214,8 @@ def learner_figure(part: LearnedPart, title: str) -> Figure:
             label(axis, x=with_unit(feature, part.units[j]), y=None if column else name)
     for axis in axes.flat:
         axis.set_visible(bool(axis.lines))
-    told = max(axes[0], key=lambda axis: len(axis.get_legend_handles_labels()[1]))
-    legend(axes[0, -1] if axes[0, -1].lines else told, *told.get_legend_handles_labels())
+    main = max(axes[0], key=lambda axis: len(axis.get_legend_handles_labels()[1]))
+    legend(axes[0, -1] if axes[0, -1].lines else main, *main.get_legend_handles_labels())
     return figure
 
 

@@ -135,7 +135,7 @@ class ParameterResult(Content):
         """Unit of the spec, or in brackets the one that follows from those of the channels."""
         return self.unit or (f"({self.derived_unit})" if self.derived_unit else "–")
 
-    def told(self, shared: bool | None, bias: ParameterBias | None) -> ParameterResult:
+    def with_bias(self, shared: bool | None, bias: ParameterBias | None) -> ParameterResult:
         """Return the parameter with its bias, and with whether the learner could imitate it."""
         found: dict[str, object] = {"shared": shared}
         if bias is not None:

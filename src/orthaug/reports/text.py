@@ -50,8 +50,11 @@ def fit_text(fit: Estimate | MotionEstimate, result: FitResult) -> str:
     blocks.append(_bias_lines(result))
     findings = [result.residuals, result.missing_lags, result.validation]
     findings += [result.stability] if result.motion is not None else []
-    told = [finding.text for finding in findings if finding]
-    blocks += [told, warning_lines(w for w in dict.fromkeys(result.warnings) if w.text not in told)]
+    parts = [finding.text for finding in findings if finding]
+    blocks += [
+        parts,
+        warning_lines(w for w in dict.fromkeys(result.warnings) if w.text not in parts),
+    ]
     blocks.append(_advice_lines(result))
     return "\n\n".join("\n".join(fold(lines)) for lines in blocks if lines)
 
@@ -64,7 +67,7 @@ def _as_doubted(line: str, result: FitResult) -> str:
     if result.noise_only:
         line = line.replace(f"{'95 % interval':^29}", f"{'95 %, noise only':^29}")
     if result.shared is not None and result.shared.doubt and line.startswith("shared "):
-        line = f"{line.partition('; told by the fit: ')[0]}; told by the fit: none, see below"
+        line = f"{line.partition('; determined by the fit: ')[0]}; determined by the fit: none, see below"
     return line
 
 
@@ -91,9 +94,9 @@ def check_text(result: CheckResult) -> str:
         f"excitation       rank {data.rank} of {data.columns} on the data, condition {condition}",
         f"identifiability  rank {physics.rank} of {physics.columns} {where}: "
         + (
-            "the parameters can be told apart"
+            "the parameters can be distinguished"
             if physics.identifiable
-            else "no data can tell the parameters apart"
+            else "no data can distinguish the parameters"
         ),
     ]
     for group in physics.inseparable:
@@ -142,15 +145,15 @@ def compare_text(result: CompareResult, verdicts: Mapping[str, Verdict]) -> str:
     lines = [*table(_parameter_cells(result)), "", *table(_score_cells(result.comparison))]
     if result.chosen:
         lines += ["", "* chosen on the validation part"]
-    told = [
+    parts = [
         f"{row.name}: {row.residuals.text}"
         for row in result.comparison
         if row.residuals is not None
     ]
-    lines += ["", *told] if told else []
-    told = [f"{kind}: {verdict.summary}" for kind, verdict in verdicts.items()]
+    lines += ["", *parts] if parts else []
+    parts = [f"{kind}: {verdict.summary}" for kind, verdict in verdicts.items()]
     beyond = dict.fromkeys(f"{e}." for verdict in verdicts.values() for e in verdict.extrapolation)
-    lines += ["", *told, *beyond] if told else []
+    lines += ["", *parts, *beyond] if parts else []
     lines.append("")
     lines += [f"left out: {kind}: {why}" for kind, why in result.left_out.items()]
     lines += warning_lines(result.warnings)
@@ -337,10 +340,10 @@ def _residual_lines(result: FitResult) -> list[str]:
             found = ((name, cross) for name, cross in test.cross.items() if cross is not None)
             largest += [(f"{name} by {cross.values[len(acf) - 1 + cross.lag]:.2g} at lag {cross.lag}", cross.band)
                         for name, cross in found]  # fmt: skip
-            told = ", ".join(f"{words} (band {band:.1g})" for words, band in largest)
+            parts = ", ".join(f"{words} (band {band:.1g})" for words, band in largest)
             lines.append(
                 f"{part}: over all {test.n} rows the one-step residual of {test.name} follows "
-                f"{told}."
+                f"{parts}."
             )
     return lines
 

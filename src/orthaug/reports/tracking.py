@@ -42,14 +42,14 @@ def track_text(result: TrackResult) -> str:
         f"memory      {memory} (forgetting {result.forgetting:.8g}), worth "
         f"{result.effective_rows:.0f} rows",
     ]
-    told = [
+    alarms = [
         f"the residual has left its band at {alarm.time:g} s (row {alarm.row})"
         for alarm in result.alarms
     ]
-    lines += [f"alarm       {sentence}" for sentence in told] or ["alarm       none"]
-    if told:
-        stands = "is still out of it" if result.alarmed else "has come back"
-        lines.append(f"            it {stands}, at {result.alarm_level:.2g} of its limit")
+    lines += [f"alarm       {sentence}" for sentence in alarms] or ["alarm       none"]
+    if alarms:
+        state = "is still out of it" if result.alarmed else "has come back"
+        lines.append(f"            it {state}, at {result.alarm_level:.2g} of its limit")
     blocks = [lines, parameter_table("parameter", result.parameters)]
     if result.physical_parameters:
         blocks.append(parameter_table("physical", result.physical_parameters))

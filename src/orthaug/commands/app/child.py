@@ -30,10 +30,10 @@ def watched() -> None:
 
 
 def _wait() -> None:
-    while told := os.read(0, 4096):
+    while received := os.read(0, 4096):
         from orthaug.commands.bars import ENOUGH, ENOUGH_LINE
 
-        if ENOUGH_LINE in told:
+        if ENOUGH_LINE in received:
             ENOUGH.set()
     if os.name == "posix":
         os.kill(os.getpid(), signal.SIGINT)

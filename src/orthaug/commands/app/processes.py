@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from orthaug._base.errors import InputError
-from orthaug.commands.bars import ENOUGH_LINE, TOLD_AS
+from orthaug.commands.bars import ENOUGH_LINE, PROGRESS_VARIABLE
 
 _LONGEST = 2**26  # bytes of a line of an answer
 _LINES = 400  # of a command that are kept
@@ -30,7 +30,7 @@ class Run(NamedTuple):
     regularization: str = ""
 
     @classmethod
-    def told(cls, line: Mapping[str, Any]) -> Run:
+    def of(cls, line: Mapping[str, Any]) -> Run:
         """Return the run that a line of progress describes."""
         kind = str(line.get("regularization", ""))
         return cls(line["run"], line.get("structure", ""), line.get("start", 0), kind)
@@ -68,9 +68,9 @@ class Command:
     @property
     def complaint(self) -> str:
         """The last message of a command that failed."""
-        told = [line for line in self.lines if line.strip()]
+        lines = [line for line in self.lines if line.strip()]
         known = [
-            line for line in told if line.startswith(("error:", "training failed:", "interrupted"))
+            line for line in lines if line.startswith(("error:", "training failed:", "interrupted"))
         ]
         last = (known or ["it ended without a word; is there enough memory?"])[-1]
         return last.removeprefix("error:").strip()
@@ -94,7 +94,12 @@ class Command:
             stdout=asyncio.subprocess.DEVNULL,
             stderr=asyncio.subprocess.PIPE,
             limit=_LONGEST,
-            env={**os.environ, TOLD_AS: "json", "PYTHONIOENCODING": "utf-8", "NO_COLOR": "1"},
+            env={
+                **os.environ,
+                PROGRESS_VARIABLE: "json",
+                "PYTHONIOENCODING": "utf-8",
+                "NO_COLOR": "1",
+            },
         )
         assert self.process.stderr is not None
         if self.stopping:
@@ -103,12 +108,12 @@ class Command:
             self.finish()
         async for raw in self.process.stderr:
             line = raw.decode("utf-8", "replace").rstrip()
-            told = _progress(line)
-            if told is None:
+            progress = _progress(line)
+            if progress is None:
                 self.lines = [*self.lines, line][-_LINES:]
             else:
-                self.progress = told
-                self.losses.append((Run.told(told), told["iteration"], told["loss"]))
+                self.progress = progress
+                self.losses.append((Run.of(progress), progress["iteration"], progress["loss"]))
             self.changed()
         return await self.process.wait()
 

@@ -141,12 +141,12 @@ class Page:
         self.title.set_content(escape(self.session.title or "from data to a model"))
 
     def _complain(self, error: Exception) -> None:
-        told = (
+        message = (
             str(error)
             if isinstance(error, InputError)
             else f"this did not work ({type(error).__name__})."
         )
-        ui.notify(sentence(told), type="negative")
+        ui.notify(sentence(message), type="negative")
 
 
 def application(sessions: Sessions, spec: Path | None) -> FastAPI:

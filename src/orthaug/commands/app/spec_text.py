@@ -207,7 +207,7 @@ def changed(text: str, change: Callable[[Any], None]) -> str:
     written = tomlkit.dumps(document)
     if plain(written) != document.unwrap():
         raise InputError(
-            "a form cannot write this change into the spec as it is laid out; make it in the text."
+            "a form cannot write this change into the spec in its present layout; make it in the text."
         )
     return written
 
@@ -262,11 +262,11 @@ def with_row(text: str, path: Sequence[str], row: Mapping[str, Any]) -> str:
     return changed(text, change)
 
 
-def with_told(text: str, path: Sequence[str], index: int, key: str, told: str) -> str:
+def with_field(text: str, path: Sequence[str], index: int, key: str, entered: str) -> str:
     """Return the text with a key of one table of a list set; an empty field removes it."""
 
     def change(document: Any) -> None:
-        row, value = _at(document, path)[index], read(key, told)
+        row, value = _at(document, path)[index], read(key, entered)
         if value is None:
             row.pop(key, None)
         else:
@@ -342,7 +342,7 @@ def as_motion(text: str) -> str:
     return changed(_without_comments(text, _OF_TERMS), change)
 
 
-def _without_comments(text: str, told: Sequence[str]) -> str:
+def _without_comments(text: str, phrases: Sequence[str]) -> str:
     """Return the text without the comments that contain one of these phrases.
 
     A line that holds nothing else goes too.
@@ -350,7 +350,7 @@ def _without_comments(text: str, told: Sequence[str]) -> str:
     kept = []
     for line in text.splitlines(keepends=True):
         before, mark, comment = line.partition("# ")
-        if mark and any(one in comment for one in told):
+        if mark and any(one in comment for one in phrases):
             if not before.strip():
                 continue
             line = before.rstrip() + "\n"

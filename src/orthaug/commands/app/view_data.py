@@ -64,7 +64,7 @@ _DROP = """
 <label class="drop" id="drop">
   <input type="file" id="dropped" class="unseen" accept="{endings}">
   <span class="drop-title">Drop a data file here, or choose one</span>
-  <span class="hint" id="drop-told" role="status">{told}</span>
+  <span class="hint" id="drop-message" role="status">{message}</span>
   <progress id="drop-bar" max="1" value="0" hidden aria-label="file taken in"></progress>
 </label>
 """
@@ -88,7 +88,7 @@ class DataView:
         with ui.element("div").classes("columns wide-right"):
             with ui.element("div").classes("stack"):
                 with card("Data file"):
-                    ui.html(_DROP.format(endings=",".join(KNOWN), told=_KNOWN), sanitize=False)
+                    ui.html(_DROP.format(endings=",".join(KNOWN), message=_KNOWN), sanitize=False)
                     with ui.element("div").classes("fields"):
                         self.path = ui.input("or its path on this machine").props(
                             "outlined dense stack-label"
@@ -166,12 +166,12 @@ class DataView:
 
     def _offer_test(self, found: Mapping[str, Any]) -> None:
         """Offer to use a file that the spec does not name as a test."""
-        told, lacking = "The spec is kept as it is", self._lacking(found)
+        message, lacking = "The spec is kept as it is", self._lacking(found)
         if trained := self._trained():
-            told += f"; it trains on {', '.join(file.name for file in trained)}"
+            message += f"; it trains on {', '.join(file.name for file in trained)}"
         if lacking:
-            told += f". This file has no column {', '.join(lacking)}, which the spec reads"
-        note(f"{told}. Take this file as a test of it, or begin anew below.", "care")
+            message += f". This file has no column {', '.join(lacking)}, which the spec reads"
+        note(f"{message}. Take this file as a test of it, or begin anew below.", "care")
         button("Take it as a test", self.session.add_test, main=not lacking)
 
     def _trained(self) -> list[Path]:
@@ -218,7 +218,7 @@ class DataView:
                 with ui.element("div").classes("entry"):
                     with ui.element("div").classes("grow"):
                         text(column["header"], "p", "strong")
-                        text(column["told"], "p", "hint")
+                        text(column["description"], "p", "hint")
                     head = column["header"]
                     choice(
                         f"use of {head}",
@@ -233,7 +233,7 @@ class DataView:
             if left:
                 text(
                     "Not usable: "
-                    + ", ".join(f"{c['header']} ({c['told']})" for c in left[:_LISTED]),
+                    + ", ".join(f"{c['header']} ({c['description']})" for c in left[:_LISTED]),
                     "p",
                     "hint",
                 )
@@ -317,7 +317,7 @@ class DataView:
                             partial(
                                 self.session.edit,
                                 "steps",
-                                spec_text.with_told,
+                                spec_text.with_field,
                                 _STEPS,
                                 index,
                                 own.name,
@@ -372,8 +372,8 @@ class DataView:
             unit = ""
             for channel, curve in prepared.items():
                 if curve["column"] == name:
-                    told = "prepared, training" if cleaned else "training"
-                    drawn.append({**curve, "name": told})
+                    message = "prepared, training" if cleaned else "training"
+                    drawn.append({**curve, "name": message})
                     unit, name = curve["unit"], channel
             if drawn:
                 rows.append((f"{name} [{unit}]" if unit else name, drawn))
@@ -398,28 +398,30 @@ class DataView:
             plot(
                 curves_figure(rows), f"Curves of {', '.join(label for label, _ in rows)} over time."
             )
-            told = f"All of {whole}"
+            message = f"All of {whole}"
             if prepared:
                 grey = f", in grey all of {whole}" * bool(raw)
-                told = f"In colour the training data{', after preparation' * cleaned}{grey}{other}"
-            text(f"{told}. Drag to zoom, double-click for all.", "p", "hint")
+                message = (
+                    f"In colour the training data{', after preparation' * cleaned}{grey}{other}"
+                )
+            text(f"{message}. Drag to zoom, double-click for all.", "p", "hint")
             for done in (checked or {}).get("prepared", ()):
                 text(f"Done: {done}", "p", "hint")
             if checked and session.spec:
                 table(("part", "rows"), list(checked["rows"].items()), "Rows that are used")
 
 
-def _seconds(told: str) -> float | None:
+def _seconds(message: str) -> float | None:
     """Return a sampling time; None for an empty field.
 
     Raises:
         InputError: no positive number.
     """
-    told = told.strip()
-    if not told:
+    message = message.strip()
+    if not message:
         return None
     try:
-        step = float(told)
+        step = float(message)
     except ValueError:
-        raise InputError(f"it must be a number of seconds, such as 0.01; got {told}.") from None
+        raise InputError(f"it must be a number of seconds, such as 0.01; got {message}.") from None
     return check_step(step)

@@ -28,7 +28,7 @@ from orthaug.commands.app.widgets import (
 _TERMS = ("baseline", "terms")
 _LEARNERS = {"mlp": "a network", "terms": "a sum of terms", "none": "none: physics alone"}
 _FOCUS = {"prediction": "one step ahead", "simulation": "the free run"}
-_MULTIPLE = 1e5  # % from which a change is told in words
+_MULTIPLE = 1e5  # % from which a change is checked in words
 _ROUNDING = 1e-7  # % below which it is none
 _STRUCTURES = {
     "orthogonal": "orthogonal",
@@ -116,7 +116,7 @@ class ModelView:
                 for key in keys:
                     wide = "" if key in ("parameter", "regressor") else "short"
                     change = partial(
-                        self.session.edit, "form", spec_text.with_told, _TERMS, index, key
+                        self.session.edit, "form", spec_text.with_field, _TERMS, index, key
                     )
                     field(key, term.get(key), change, classes=f"{wide} {key}")
             remove = partial(self.session.edit, "more terms", spec_text.without_row, _TERMS, index)
@@ -161,8 +161,8 @@ class ModelView:
 
     def _value(self, *path: str) -> Callable[[str], None]:
         """Return a callback that stores the value of a field under a key."""
-        return lambda told: self.session.edit(
-            "form", spec_text.with_value, path, spec_text.read(path[-1], told)
+        return lambda checked: self.session.edit(
+            "form", spec_text.with_value, path, spec_text.read(path[-1], checked)
         )
 
     def _draw_learner(self, content: Mapping[str, Any]) -> None:
@@ -245,14 +245,14 @@ class ModelView:
                 note(sentence(session.refused), "bad")
             else:
                 note("This spec can be trained.", "good")
-            told = None if session.checked is None else session.checked["check"]
+            checked = None if session.checked is None else session.checked["check"]
             stale = session.checking or session.stale
-            if told is not None:
+            if checked is not None:
                 if stale:
                     text("As the spec was before:", "p", "hint")
                 with ui.element("div").classes("stale" if stale else ""):
-                    _units((session.checked or {})["units"], moves=bool(told.get("motion")))
-                    _findings(told, (session.checked or {})["bias"])
+                    _units((session.checked or {})["units"], moves=bool(checked.get("motion")))
+                    _findings(checked, (session.checked or {})["bias"])
             elif session.checking and session.checked is not None:
                 text(
                     "The equations are run to see what they determine; that takes a while.",
@@ -261,29 +261,29 @@ class ModelView:
                 )
 
 
-def _findings(told: Mapping[str, Any], bias: Sequence[Mapping[str, Any]]) -> None:
+def _findings(checked: Mapping[str, Any], bias: Sequence[Mapping[str, Any]]) -> None:
     """Draw the findings of `orthaug check`."""
-    data, physics = told["excitation"], told["identifiability"]
+    data, physics = checked["excitation"], checked["identifiability"]
     condition = "infinite" if data["condition"] is None else number(data["condition"], 3)
     rows = [
-        ("parameters", ", ".join(told["parameters"]) or "none"),
-        ("usable rows", told["rows"]),
+        ("parameters", ", ".join(checked["parameters"]) or "none"),
+        ("usable rows", checked["rows"]),
         ("rank on these data", f"{data['rank']} of {data['columns']}, condition {condition}"),
         ("rank on any data", f"{physics['rank']} of {physics['columns']}"),
     ]
     table(("what", "found"), rows)
     for group in physics["inseparable"]:
-        note(f"No data can tell apart: {', '.join(group)}.", "care")
+        note(f"No data can distinguish {', '.join(group)}.", "care")
     for group in data["collinear"] if physics["identifiable"] else ():
         note(f"These data do not excite separately: {', '.join(group)}.", "care")
-    if told.get("motion"):
-        text(told["motion"]["text"], "p", "small")
-    if told["shared"]:
+    if checked.get("motion"):
+        text(checked["motion"]["text"], "p", "small")
+    if checked["shared"]:
         text("Shared with the learner", "h3")
-        text(told["shared"]["text"], "p", "small")
+        text(checked["shared"]["text"], "p", "small")
         rows = [
             (", ".join(o["inputs"]), o["shared"], ", ".join(o["determined"]) or "–")
-            for o in told["shared"]["alternatives"] or ()
+            for o in checked["shared"]["alternatives"] or ()
         ]
         if rows:
             table(("if it sees only", "shared", "determined"), rows)
@@ -296,7 +296,7 @@ def _findings(told: Mapping[str, Any], bias: Sequence[Mapping[str, Any]]) -> Non
         text(hint, "p", "hint")
         rows = [(one["name"], _biases(one["percent"]), one["removed_by"] or "–") for one in bias]
         table(("missing term", "change of each parameter", "removed by"), rows)
-    for warning in told["warnings"]:
+    for warning in checked["warnings"]:
         note(warning["text"], "care")
 
 
@@ -321,7 +321,7 @@ def _units(units: Sequence[tuple[str, str, str | None]], *, moves: bool) -> None
     bare = [name for name, given, _ in units if moves and not given]
     if bare:
         text(
-            f"No unit is given for {', '.join(bare)}, and none can be told from the channels.",
+            f"No unit is given for {', '.join(bare)}, and the channels do not determine it.",
             "p",
             "hint",
         )

@@ -152,7 +152,7 @@ class ExportView:
         if beside := self._beside():
             them = "the two" if len(beside) == 1 else "them and the spec"
             named = " and ".join(", ".join(beside).rsplit(", ", 1))
-            text(f"The spec names {named}: let {them} stand in one folder.", "p", "hint")
+            text(f"The spec names {named}: keep {them} in one folder.", "p", "hint")
 
     def _beside(self) -> list[str]:
         """Return the files that the spec names without a folder, since they were uploaded."""

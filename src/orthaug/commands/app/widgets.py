@@ -37,9 +37,9 @@ def _whole(what: Any) -> str:
     return re.sub(r"\[k-\d+\]", r"<span class='n'>\g<0></span>", escape(str(what)))
 
 
-def sentence(told: str) -> str:
+def sentence(message: str) -> str:
     """Return a message with a capital first letter, unless it begins with the name of a file."""
-    return told if "." in told.partition(" ")[0] else told[:1].upper() + told[1:]
+    return message if "." in message.partition(" ")[0] else message[:1].upper() + message[1:]
 
 
 def card(title: str, hint: str = "", classes: str = "") -> ui.element:
@@ -101,10 +101,10 @@ def choice(
                 if key == value:
                     option.props("selected")
 
-        def told(event: Any) -> None:
+        def emit_change(event: Any) -> None:
             changed(str(event.args))
 
-        made.on("change", told, js_handler="(event) => emit(event.target.value)")
+        made.on("change", emit_change, js_handler="(event) => emit(event.target.value)")
     return made
 
 
@@ -259,7 +259,7 @@ def loss_figure(losses: Sequence[tuple[Run, int, float | None]]) -> dict[str, An
         group = groups[run]
         color = _COLORS[entries.index(group) % len(_COLORS)]
         hover = f"{escape(names[run])}<br>iteration %{{x}}, loss %{{y:.4g}}<extra></extra>"
-        told = {
+        entry = {
             "name": escape(group),
             "legendgroup": group,
             "showlegend": shown and group not in named,
@@ -267,7 +267,7 @@ def loss_figure(losses: Sequence[tuple[Run, int, float | None]]) -> dict[str, An
         traces.append(
             {
                 **own,
-                **told,
+                **entry,
                 "x": x,
                 "y": y,
                 "hovertemplate": hover,

@@ -74,7 +74,7 @@ def _answer(given: dict[str, Any]) -> dict[str, Any]:
         }
     except Exception as error:  # a page shows no traceback
         return {
-            "refused": f"this cannot be told: {type(error).__name__}: "
+            "refused": f"this question has no answer: {type(error).__name__}: "
             f"{' '.join(str(error).split())[:300]}"
         }
 
@@ -139,7 +139,7 @@ def _timed(found: Survey) -> str:
 
 def _column(found: Survey, column: Column) -> dict[str, Any]:
     usable = column in found.signals
-    told = (
+    described = (
         starting.as_seen(column, spikes=column.kind != "input") if usable else found.why_not(column)
     )
     head = column.name + (f" = column '{column.header}'" if column.header != column.name else "")
@@ -149,7 +149,7 @@ def _column(found: Survey, column: Column) -> dict[str, Any]:
         "usable": usable,
         "timed": column is found.clock.column,
     }
-    return own | {"told": told.removeprefix(f"{head}: ")}
+    return own | {"description": described.removeprefix(f"{head}: ")}
 
 
 def _curves(found: Survey) -> dict[str, Any]:
@@ -173,7 +173,7 @@ def examine(path: str, whole: bool) -> dict[str, Any]:
     """
     job = open_job(Path(path), require_full_rank=False)
     moves = job.spec.motion is not None
-    told: dict[str, Any] = {"check": None, "refusal": None, "bias": []}
+    answer: dict[str, Any] = {"check": None, "refusal": None, "bias": []}
     if whole or not moves:
         if moves:
             from orthaug._base.jax import use_compilation_cache
@@ -185,9 +185,9 @@ def examine(path: str, whole: bool) -> dict[str, Any]:
             {"name": one.name, "removed_by": one.removed_by, "percent": one.percent}
             for one in result.bias or ()
         ]
-        told = {"check": json.loads(result.to_json()), "bias": bias}
-        told["refusal"] = None if refused is None else str(refused)
-    return told | {
+        answer = {"check": json.loads(result.to_json()), "bias": bias}
+        answer["refusal"] = None if refused is None else str(refused)
+    return answer | {
         "rows": {part.name: len(part.record) for part in job.parts},
         "files": [os.path.abspath(job.path.parent / entry.file) for entry in job.train.files],
         "step": job.train.record.sampling_time,
@@ -208,10 +208,10 @@ def verdict(path: str, kind: str) -> dict[str, Any]:
 
     text = Path(path).read_text(encoding="utf-8")
     if kind == "fit":
-        told = fit_verdict(FitResult.model_validate_json(text))
+        found = fit_verdict(FitResult.model_validate_json(text))
     else:
-        told = compare_verdict(CompareResult.model_validate_json(text))
-    return {"level": told.level, "sentences": told.sentences}
+        found = compare_verdict(CompareResult.model_validate_json(text))
+    return {"level": found.level, "sentences": found.sentences}
 
 
 def _units(job: Job) -> list[tuple[str, str, str | None]]:
