@@ -137,7 +137,7 @@ def test_forms_change_a_spec_and_nothing_else(tmp_path):
     steps = ("data", "prepare")
     spec = spec_text.with_row(SPEC, steps, {"step": "detrend"})
     spec = spec_text.with_row(spec, steps, {"step": "lowpass", "cutoff": 2.0})
-    spec = spec_text.with_told(spec, steps, 1, "order", "2")
+    spec = spec_text.with_field(spec, steps, 1, "order", "2")
     assert spec_text.rows_of(spec, steps) == [
         {"step": "detrend"},
         {"step": "lowpass", "cutoff": 2.0, "order": 2},
@@ -326,7 +326,7 @@ def test_lines_of_progress_say_what_each_run_is(csv, tmp_path, monkeypatch, caps
     lines = [
         json.loads(line) for line in capsys.readouterr().err.splitlines() if line.startswith("{")
     ]
-    told = [Run.told(line) for line in lines]
+    told = [Run.of(line) for line in lines]
     assert told == [Run(2, "orthogonal", 2, "none"), Run(6, "baseline-penalty", 2, "none"), Run(9)]
 
 
@@ -464,7 +464,7 @@ def test_sessions_that_nobody_used_make_room(tmp_path):
 def looked(**given: Any) -> dict[str, Any]:
     """What a look at a file with the columns left and right gives."""
     columns = [
-        {"header": head, "kind": "", "usable": True, "timed": False, "told": ""}
+        {"header": head, "kind": "", "usable": True, "timed": False, "description": ""}
         for head in ("left", "right")
     ]
     curves = {head: {"x": [0.0, 1.0], "y": [0.0, 1.0]} for head in ("left", "right")}

@@ -1,4 +1,4 @@
-"""Advice that was tried: changes of a spec, each refitted, and what it does to the free run where nothing was fitted.
+"""Tested advice: changes of a spec, each refitted and judged by its free run on data not fitted.
 
 The model as it is and every change of it are fitted to the same rows and run over the same others:
 the validation part, or the last third of the training rows as one long run. A change is advised
@@ -52,13 +52,13 @@ class Proposal:
     words: str
     change: dict[str, Any]
     learns: bool = False
-    """Whether it is about a learner, which physics alone would not show."""
+    """Whether the change is about a learner: a fit of physics alone would not show its effect."""
     refocuses: bool = False
     positive: str | None = None
-    """A parameter that has to be positive, as the size of a dead zone."""
+    """A parameter that has to be positive, such as the size of a dead zone."""
 
     def accepts(self, fit: Any) -> bool:
-        """Return whether a fit of the changed spec is what the words say."""
+        """Return whether the result of a changed spec agrees with the words of the proposal."""
         if self.positive is None:
             return True
         return bool(fit.parameters.loc[self.positive, "value"] > 0)
@@ -93,7 +93,7 @@ def _biased(result: FitResult) -> bool:
 
 
 def _missing_terms(job: Job, result: FitResult) -> Iterator[Proposal]:
-    """Terms that the free run of a motion asks for."""
+    """Yield the terms that the free run of a motion lacks."""
     test = result.residuals.missing if result.residuals is not None else None
     if test is None or result.residuals is None or result.residuals.verdict != "unmodelled":
         return
@@ -104,7 +104,7 @@ def _missing_terms(job: Job, result: FitResult) -> Iterator[Proposal]:
 
 
 def _suspected_terms(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal]:
-    """Yield the suspects that explain most of what the learner found, or of what the physics leaves."""
+    """Yield the suspects that explain most of the learned part, or of the physics' residual."""
     plain = job.spec.motion is None and fit.model.form.bound is None and len(fit.theta) > 0
     left = _residual_columns(fit) if plain else None
     found = []
@@ -127,7 +127,10 @@ def _suspected_terms(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal
 
 
 def _residual_columns(fit: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return an orthonormal basis of the physics (N ny, nθ) and the one-step residual beside it (N ny,), in deviations."""
+    """Return an orthonormal basis of the physics (N ny, nθ) and the residual beside it (N ny,).
+
+    Both are scaled by the deviations of the outputs; the residual is the one-step one.
+    """
     problem = fit.problem
     x, unit = problem.rows.x[:: _every(fit)], problem.deviation
     phi = np.asarray(problem.baseline.phi(x, problem.layout, problem.outputs, np)) / unit[:, None]
@@ -143,14 +146,17 @@ def _residual_columns(fit: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _every(fit: Any) -> int:
-    """Of so many rows one is looked at."""
+    """Return the stride of the rows that are looked at."""
     return 1 + len(fit.problem.rows.x) // _ROWS
 
 
 def _residual_share(
     fit: Any, entry: SuspectResult, basis: np.ndarray, error: np.ndarray
 ) -> tuple[float, float]:
-    """Return the share of the one-step residual that a suspect explains beside the physics, and its coefficient."""
+    """Return the share of the one-step residual that a suspect explains, and its coefficient.
+
+    Both are beside the physics: the part of the suspect that the physics spans is removed.
+    """
     problem = fit.problem
     constants = {SAMPLING_TIME: problem.record.sampling_time} | dict(problem.baseline.constants)
     suspect = Suspect(entry.name, entry.expression, entry.output, constants=constants)
@@ -174,7 +180,7 @@ def _term(
     *,
     positive: bool = False,
 ) -> Iterator[Proposal]:
-    """Yield the proposal of a term with its size as a parameter.
+    """Yield the proposal to add a term, with its coefficient as a new parameter.
 
     Nothing where the spec has the term.
     """
@@ -215,7 +221,7 @@ def _term(
 
 
 def _equation(job: Job, equation: str | None) -> str | None:
-    """Return the state whose equation a term goes to; None for a term of an output."""
+    """Return the state whose equation a term is added to; None for a term of an output."""
     from orthaug.analysis.motion_suspects import equations_of, usual_places
 
     motion = job.problem.motion
@@ -226,7 +232,7 @@ def _equation(job: Job, equation: str | None) -> str | None:
 
 
 def _new_name(job: Job) -> str:
-    """Return a parameter that the spec does not have."""
+    """Return a name for a parameter that the spec does not use."""
     spec, number = job.spec, 1
     taken = set(spec.data.inputs) | set(spec.data.outputs)
     if spec.motion is not None:
@@ -255,7 +261,7 @@ def _same(one: str, other: str, output: str | None, equation: str | None) -> boo
 
 
 def _predicted_changes(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal]:
-    """Yield the changes that the residual of lagged physics predicts a gain of."""
+    """Yield the changes of lagged physics for which its residual predicts a gain."""
     for change in result.residuals.changes if result.residuals is not None else ():
         if change.kind in ("input_lag", "output_lag", "offset"):
             yield from _term(job, change.what, change.output, None, _lag_words(change))
@@ -272,7 +278,7 @@ def _predicted_changes(job: Job, result: FitResult, fit: Any) -> Iterator[Propos
 
 
 def _compared(result: FitResult) -> bool:
-    """Return whether both criteria were tried by the fit itself."""
+    """Return whether the fit itself has already tried both criteria."""
     return result.focus is not None and bool(result.focus.candidates)
 
 
@@ -313,7 +319,10 @@ def _learner(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal]:
 
 
 def _learner_for_equation(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal]:
-    """Yield a learner in the equation of a motion that lacks something, or one that sees what it lacks a function of."""
+    """Yield proposals of a learner in the equation of a motion that lacks something.
+
+    Where there is one already, it is given the signals that the missing part depends on.
+    """
     test = result.residuals.missing if result.residuals is not None else None
     if job.spec.motion is None or test is None or not test.terms or result.residuals is None:
         return
@@ -346,7 +355,7 @@ def _reads(inputs: tuple[str, ...], variable: str) -> bool:
 
 
 def _holds(job: Job, result: FitResult) -> Iterator[Proposal]:
-    """Yield the holds of its inputs that a motion does not have."""
+    """Yield the holds of the inputs that a motion does not use yet."""
     motion = job.spec.motion
     if motion is None or not job.spec.data.inputs or motion.integrator == "discrete":
         return
@@ -368,7 +377,7 @@ _LISTED = 3  # changes without gain that the text names
 
 @dataclass(frozen=True, eq=False)
 class ValidationRows:
-    """The rows that models are fitted to, and those that they run over."""
+    """The rows that models are fitted to, and those on which their free runs are judged."""
 
     training: Record
     held: Record
@@ -397,7 +406,7 @@ class ValidationRows:
 
 @dataclass(frozen=True, eq=False)
 class ProposalErrors:
-    """A proposal with the errors of its free run; `pieces` is None where it could not be fitted."""
+    """A proposal with the errors of its free run; `pieces` is None where its fit failed."""
 
     proposal: Proposal
     pieces: Pieces | None
@@ -418,10 +427,10 @@ class Trials:
     variant: Variant
     unit: Any
     substeps: int | None = None
-    """Of a motion that is integrated."""
+    """Substeps of a motion that is integrated."""
 
     def changed(self, change: dict[str, Any]) -> Job:
-        """Return the job of a changed spec, with the substeps of the fit: looking for them would cost most.
+        """Return the job of a changed spec, with the substeps of the fit: a search would cost most.
 
         Raises:
             InputError: the change is not possible; ValueError likewise.
@@ -434,7 +443,7 @@ class Trials:
     def run(
         self, job: Job, variant: Variant, accepts: Callable[[Any], bool] = lambda fit: True
     ) -> Pieces | None:
-        """Squared errors of the free run of a job's model.
+        """Return the squared errors of the free run of a job's model.
 
         None where there is none, or it is not accepted.
         """
@@ -461,7 +470,7 @@ class Trials:
 
 
 def changed(declaration: dict[str, Any], change: dict[str, Any]) -> dict[str, Any]:
-    """Return a declaration with the values of a change at their keys, dots between the parts of a key."""
+    """Return a declaration with the values of a change; dots in a key separate its levels."""
     found = deepcopy(declaration)
     for key, value in change.items():
         *path, last = key.split(".")
@@ -477,7 +486,7 @@ def changed(declaration: dict[str, Any], change: dict[str, Any]) -> dict[str, An
 def advise(
     job: Job, fit: Any, result: FitResult
 ) -> tuple[list[AdviceResult], AdviceTrialsResult] | None:
-    """Return the changes that better the free run where nothing was fitted, and an account of all trials.
+    """Return the changes that lower the free run's validation error, and a count of all trials.
 
     None where nothing is proposed, or nothing can be tried.
     """
@@ -552,7 +561,10 @@ def _which(better: int, tried: int) -> str:
 
 
 def _ratio(pieces: Pieces, base: Pieces) -> Ratio:
-    """Errors against those of the model as it is, on the rows that both have: more lags begin later."""
+    """Return the ratio of errors to those of the present model, on the rows that both predict.
+
+    More lags begin later.
+    """
     cut = [
         (a, b) if a is None or b is None else (a[-min(len(a), len(b)) :], b[-min(len(a), len(b)) :])
         for a, b in zip(pieces, base, strict=True)

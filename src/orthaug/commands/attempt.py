@@ -1,4 +1,4 @@
-"""Analyses behind a finished training: where one fails the result stands, and a warning says which."""
+"""Analyses after training: where one fails the fit is kept, and a warning names the analysis."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ DEFECTS: tuple[type[BaseException], ...] = (
 
 
 def attempt(what: str, analysis: Callable[[], T], warnings: list[Any], otherwise: T) -> T:
-    """Return what an analysis finds, or `otherwise` with one more warning where it fails.
+    """Return the result of an analysis, or `otherwise` with one more warning where it fails.
 
     A training may have taken hours: a defect of an analysis does not take it away, and is logged.
 
@@ -33,25 +33,25 @@ def attempt(what: str, analysis: Callable[[], T], warnings: list[Any], otherwise
     try:
         return analysis()
     except _NUMERICAL as error:
-        told = (
-            f"{what} failed numerically ({str(error).rstrip('.')}): the result stands without it."
+        text = (
+            f"{what} failed numerically ({str(error).rstrip('.')}): the result is given without it."
         )
     except InputError:
         raise
     except DEFECTS as error:
         LOG.info("%s failed", what, exc_info=True)
-        told = (
+        text = (
             f"{what} failed by a defect of orthaug ({type(error).__name__}: {error}): the "
-            "result stands without it."
+            "result is given without it."
         )
-    warnings.append(Warning("analysis_failed", told))
+    warnings.append(Warning("analysis_failed", text))
     return otherwise
 
 
 def attempt_warned(
     what: str, analysis: Callable[[], T | None], warnings: list[Any], without: Warning | None = None
 ) -> T | None:
-    """As `attempt`, with the warnings that the finding has, or `without` where there is none.
+    """Return the result of an analysis, or `without`; its own warnings are added too.
 
     None where it fails.
     """

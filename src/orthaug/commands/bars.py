@@ -23,13 +23,11 @@ if TYPE_CHECKING:
     from rich.progress import Progress as Bar
     from rich.progress import ProgressColumn
 
-TOLD_AS = "ORTHAUG_PROGRESS"
-"""Variable of the environment; where it is `json`, training tells of itself by lines of JSON on
-standard error.
+PROGRESS_VARIABLE = "ORTHAUG_PROGRESS"
+"""Environment variable: with the value `json`, training writes its progress to standard error, a line of JSON at a time.
 """
 ENOUGH = threading.Event()
-"""Of the process: once it is set, training ends with what it has reached, as a result with the
-warning `stopped`.
+"""An event of the process: once it is set, training ends with the result reached so far, and the warning `stopped`.
 """
 ENOUGH_LINE = b"enough\n"
 """What sets it, on the standard input of a child of the page."""
@@ -42,7 +40,7 @@ _SEEN = 3  # models after which the time of the rest is told: the first ones com
 
 
 def on_terminal() -> bool:
-    """Return whether a person sees standard error.
+    """Return whether standard error is a terminal.
 
     FORCE_COLOR, which build servers set, does not make it one.
     """
@@ -67,10 +65,11 @@ def drawn_bar(*columns: ProgressColumn, transient: bool = True) -> Bar:
 def training_bar(
     runs: int, iterations: int, wanted: bool = True, rows: int = 0
 ) -> Iterator[Progress]:
-    """A progress bar on standard error where that is a terminal; Ctrl-C says what it stopped.
+    """Show a progress bar on standard error where that is a terminal; report what Ctrl-C stopped.
 
-    Args: rows: of the training data. Where there are many, it says how many are gone through in a
-        second.
+    Args:
+        rows: of the training data. Where there are many, it says how many are gone through in a
+            second.
     """
     if not wanted:
         yield SILENT
@@ -81,20 +80,22 @@ def training_bar(
     with (
         _deferred_interrupt() as interrupted,
         drawn_bar(TimeElapsedColumn(), TimeRemainingColumn()) as bar,
-        WATCH.telling(lambda: reached, bar.stop),
+        WATCH.reporting(lambda: reached, bar.stop),
     ):
         task = bar.add_task("compiling", total=runs * iterations)
         done: dict[int, int] = {}
         line = _Lines(runs, iterations)
 
-        def tell(run: int, iteration: int, loss: float) -> None:
+        def show(run: int, iteration: int, loss: float) -> None:
             nonlocal reached
             done[run] = iteration
             reached = f"run {run + 1} of {runs}, iteration {iteration}, loss {loss:.3g}"
             passes = sum(done.values())
             rate = rows * passes / max(time.monotonic() - began, 1e-3)
-            told = f"{reached}, {rate / 1e6:.3g} million rows/s" if rows >= _MANY else reached
-            bar.update(task, completed=passes, description=told)
+            description = (
+                f"{reached}, {rate / 1e6:.3g} million rows/s" if rows >= _MANY else reached
+            )
+            bar.update(task, completed=passes, description=description)
             line(run, iteration, loss, passes)
             if interrupted.is_set():
                 raise KeyboardInterrupt(reached)
@@ -102,7 +103,7 @@ def training_bar(
                 raise StopTraining
 
         try:
-            yield Progress(tell, plan=line.planned)
+            yield Progress(show, plan=line.planned)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(reached) from None
         if interrupted.is_set():
@@ -110,25 +111,25 @@ def training_bar(
 
 
 class _Lines:
-    """Writes a line of JSON now and then, for a program that follows this one.
+    """A writer of progress as lines of JSON, for a program that follows this one.
 
     Nothing unless it is asked for.
     """
 
     def __init__(self, runs: int, iterations: int) -> None:
         self.runs, self.iterations = runs, iterations
-        self._wanted, self._last = os.environ.get(TOLD_AS) == "json", -_OFTEN
+        self._wanted, self._last = os.environ.get(PROGRESS_VARIABLE) == "json", -_OFTEN
         self._first, self._plan = 0, ()
 
     def planned(self, first: int, plan: Plan) -> None:
-        """The runs from this number on are these."""
+        """Set the runs that follow from this number on."""
         self._first, self._plan = first, tuple(plan)
 
     def __call__(self, run: int, iteration: int, loss: float, passes: int) -> None:
         if not self._wanted or time.monotonic() - self._last < _OFTEN:
             return
         self._last = time.monotonic()
-        told = {
+        fields = {
             "run": run + 1,
             "runs": self.runs,
             "iteration": iteration,
@@ -139,14 +140,14 @@ class _Lines:
         known = self._plan[own] if 0 <= own < len(self._plan) else {}
         streams.say(
             json.dumps(
-                {**told, "loss": loss if math.isfinite(loss) else None, "done": share, **known}
+                {**fields, "loss": loss if math.isfinite(loss) else None, "done": share, **known}
             )
         )
 
 
 @contextmanager
 def study_bars() -> Iterator[Callable[[str, int, int], None]]:
-    """A bar per study on standard error where that is a terminal.
+    """Show a bar per study on standard error where that is a terminal.
 
     Ctrl-C stops after the run at hand.
     """
@@ -160,7 +161,7 @@ def study_bars() -> Iterator[Callable[[str, int, int], None]]:
     ):
         tasks: dict[str, Any] = {}
 
-        def tell(title: str, done: int, total: int) -> None:
+        def show(title: str, done: int, total: int) -> None:
             nonlocal reached
             reached = f"'{title}', {done} of {total} runs done"
             if title not in tasks:
@@ -169,12 +170,12 @@ def study_bars() -> Iterator[Callable[[str, int, int], None]]:
             if interrupted.is_set():
                 raise KeyboardInterrupt(reached, GO_ON)
 
-        yield tell
+        yield show
 
 
 @contextmanager
 def selection_bar(most: int) -> Iterator[Callable[[str, Any], None]]:
-    """A bar of the models that were judged, on standard error.
+    """Show a bar of the models judged so far, on standard error.
 
     Ctrl-C keeps what there is, a second one ends at once.
 
@@ -186,12 +187,12 @@ def selection_bar(most: int) -> Iterator[Callable[[str, Any], None]]:
     with (
         _asked_to_stop() as asked,
         drawn_bar(MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn()) as bar,
-        WATCH.telling(lambda: "the selection of a structure", bar.stop),
+        WATCH.reporting(lambda: "the selection of a structure", bar.stop),
     ):
         tasks: dict[str, Any] = {}
         judged: dict[str, list[float]] = {}
 
-        def tell(stage: str, rung: Any) -> None:
+        def show(stage: str, rung: Any) -> None:
             done = judged.setdefault(stage, [])
             done.append(rung.seconds)
             if stage not in tasks:
@@ -206,12 +207,12 @@ def selection_bar(most: int) -> Iterator[Callable[[str, Any], None]]:
             if asked.is_set():
                 raise KeyboardInterrupt
 
-        yield tell
+        yield show
 
 
 @contextmanager
 def _asked_to_stop() -> Iterator[threading.Event]:
-    """An event that the first Ctrl-C sets."""
+    """Yield an event that the first Ctrl-C sets."""
     if WATCH.active:
         with WATCH.asking() as event:
             yield event
@@ -222,7 +223,7 @@ def _asked_to_stop() -> Iterator[threading.Event]:
 
 @contextmanager
 def _deferred_interrupt() -> Iterator[threading.Event]:
-    """Ctrl-C sets the event, so that it never lands inside compiled code.
+    """Let Ctrl-C set the event, so that it never interrupts compiled code.
 
     A second one interrupts at once.
 
@@ -247,7 +248,7 @@ def _deferred_interrupt() -> Iterator[threading.Event]:
 
 @contextmanager
 def shown_progress() -> Iterator[ProgressCallback]:
-    """Progress of a fit from Python: a bar on a terminal, a line in a notebook, nothing elsewhere."""
+    """Show the progress of a fit from Python: on a terminal a bar, in a notebook a line."""
     display = _display()
     if display is not None:
         yield from _in_notebook(display)
@@ -258,7 +259,7 @@ def shown_progress() -> Iterator[ProgressCallback]:
 
 
 def _display() -> Any:
-    """IPython's `display` in a notebook, which has loaded it; None elsewhere."""
+    """Return IPython's `display` in a notebook, which has loaded it; None elsewhere."""
     ipython, shown = sys.modules.get("IPython"), sys.modules.get("IPython.display")
     if ipython is None or shown is None:
         return None
@@ -272,19 +273,19 @@ def _in_notebook(display: Any) -> Iterator[ProgressCallback]:
         {"text/html": _line("compiling", ended=False), "text/plain": ""}, raw=True, display_id=True
     )
 
-    def show(words: str, *, ended: bool) -> None:
+    def draw(words: str, *, ended: bool) -> None:
         handle.update({"text/html": _line(words, ended=ended), "text/plain": words}, raw=True)
 
-    def tell(run: int, iteration: int, loss: float) -> None:
+    def show(run: int, iteration: int, loss: float) -> None:
         with lock:
             runs[run] = (iteration, loss)
-            show(_words(run, iteration, loss), ended=False)
+            draw(_words(run, iteration, loss), ended=False)
 
     try:
-        yield tell
+        yield show
     finally:
         steps = sum(iteration for iteration, _ in runs.values())
-        show(
+        draw(
             f"{len(runs) or 1} runs, {steps} iterations, {time.monotonic() - began:.1f} s",
             ended=True,
         )
@@ -305,7 +306,7 @@ def _words(run: int, iteration: int, loss: float) -> str:
 
 
 def _line(words: str, *, ended: bool) -> str:
-    """Return a bar that moves as long as it is not known how long it takes."""
+    """Return a bar that moves while the total is unknown."""
     moving = (
         ""
         if ended

@@ -30,7 +30,7 @@ from orthaug.commands.program import (
     main,
     other_writes,
     prepare_jax,
-    tell,
+    print_result,
 )
 from orthaug.commands.signals import WATCH
 
@@ -73,7 +73,7 @@ def check(
     if job.spec.motion is not None:  # its runs are computed
         prepare_jax()
     result = kind_of(job).checked(job)
-    tell(result, check_text(result), as_json)
+    print_result(result, check_text(result), as_json)
     if figure is not None and result.bias:
         from orthaug.reports.finding_plots import bias_figure
 
@@ -94,7 +94,7 @@ def fit(
     force: Force = False,
 ) -> None:
     """Fit a spec, print a summary and write the result folder."""
-    from orthaug.commands.fit import fit_job, keeping, write_result
+    from orthaug.commands.fit import fit_job, keep_states, write_result
     from orthaug.commands.folder import check_folder, check_inputs_kept
     from orthaug.commands.kinds import open_job
     from orthaug.reports.text import fit_text
@@ -105,14 +105,14 @@ def fit(
     check_inputs_kept(job, folder)
     prepare_jax()
     asked = arguments("fit", spec, out=out, resume=resume, json=as_json, force=force)
-    job = replace(keeping(job, folder, resume=resume), arguments=asked)
+    job = replace(keep_states(job, folder, resume=resume), arguments=asked)
     learns, rows = job.spec.declared_learner() is not None, getattr(job.problem, "count", 0)
     with training_bar(job.run_count, job.iterations, learns, rows) as progress:
         fitted = fit_job(job, progress)
     if other_writes():
         return
     write_result(fitted, folder, force=force)
-    tell(fitted.result, fit_text(fitted.fit, fitted.result), as_json, folder)
+    print_result(fitted.result, fit_text(fitted.fit, fitted.result), as_json, folder)
     if not fitted.fit.status.ok:
         raise TrainingError(
             f"{fitted.result.status.message.removesuffix('.')}. The account is in "
@@ -131,7 +131,7 @@ def compare(
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
-    """Physics alone and every structure, one table."""
+    """Compare physics alone and every structure in one table."""
     from orthaug.commands.folder import check_folder, check_inputs_kept
     from orthaug.commands.kinds import open_job
     from orthaug.reports.text import compare_text
@@ -150,7 +150,9 @@ def compare(
     if other_writes():
         return
     comparing.write(comparison, folder, force=force)
-    tell(comparison.result, compare_text(comparison.result, comparison.verdicts), as_json, folder)
+    print_result(
+        comparison.result, compare_text(comparison.result, comparison.verdicts), as_json, folder
+    )
 
 
 @app.command()
@@ -177,7 +179,7 @@ def design(
     for line in designing.notes(job):
         streams.say(line)
     result = DesignResult.of(designed)
-    tell(result, design_text(result), as_json, out)
+    print_result(result, design_text(result), as_json, out)
 
 
 @app.command()
@@ -198,11 +200,11 @@ def select(
     job, given = open_select(spec)
     check_inputs_kept(job, folder)
     prepare_jax()
-    with selection_bar(steps_at_most(given.selection.terms)) as told:
-        selected = select_for(job, given, folder, told)
+    with selection_bar(steps_at_most(given.selection.terms)) as report_model:
+        selected = select_for(job, given, folder, report_model)
     write_selected(selected, folder, force=force)
     place = f"{folder}; next: orthaug fit {folder / 'spec.toml'}"
-    tell(selected.result, selection_text(selected.result), as_json, place)
+    print_result(selected.result, selection_text(selected.result), as_json, place)
 
 
 @app.command(cls=ListOptionCommand)
@@ -236,8 +238,8 @@ def init(
     if sampling_time is not None:
         check_step(sampling_time)
     large = data.is_file() and data.stat().st_size > _LARGE
-    told = streams.say if large and on_terminal() else _unsaid
-    told(f"reading {data.name}")
+    report_stage = streams.say if large and on_terminal() else _silent
+    report_stage(f"reading {data.name}")
     found = look(data)
     roles = assign(found, inputs, outputs, sampling_time)
     if roles is None:
@@ -262,15 +264,15 @@ def init(
             sampling_time=check_step(typer.prompt("seconds between rows", type=float, default=1.0)),
         )
     assert roles is not None  # both are given
-    told("looking at signals, delays and orders")
+    report_stage("looking at signals, delays and orders")
     spec = draft(found, roles, out)
-    told("opening the spec as a fit would")
+    report_stage("opening the spec as a fit would")
     write_spec(spec, out, force=force)
     streams.echo(f"{spec.account}\n\nwritten to {out}; next: orthaug fit {out}")
 
 
-def _unsaid(line: str) -> None:
-    """Nobody waits long enough to be told."""
+def _silent(line: str) -> None:
+    """Show nothing: the file is read too quickly for a message."""
 
 
 def _asked(text: str, check: Callable[[str], Any], default: str | None = "") -> str:
@@ -302,7 +304,7 @@ def page(
         bool, typer.Option("--browser/--no-browser", help="Open it in the browser.")
     ] = True,
 ) -> None:
-    """A page on this machine to do all of this in a browser.
+    """Open a page on this machine to do all of this in a browser.
 
     Look at data, write physics, train, compare and export.
     """
@@ -322,7 +324,7 @@ def schema(
         ),
     ] = "fit",
 ) -> None:
-    """The JSON schema of a result or a spec; keys: in words."""
+    """Print the JSON schema of a result or a spec; keys: in words."""
     from orthaug.commands.schema import RESULTS, keys_of_a_spec, schema_of, schema_of_a_spec
 
     if check_choice(command, (*RESULTS, "spec", "keys"), "WHAT") == "keys":
@@ -355,7 +357,7 @@ def reproduce(
     ] = None,
     force: Force = False,
 ) -> None:
-    """The paper's figures and tables beside the published ones.
+    """Compute the paper's figures and tables beside the published ones.
 
     Goes on where it was interrupted.
     """

@@ -34,7 +34,7 @@ from orthaug.reports.result import CompareResult, RowResult, parameter_rows
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """One entry per way of modelling: the fitted ones, and models that were saved earlier."""
+    """A comparison: one entry per model, fitted now or saved earlier."""
 
     job: Job
     fitted: dict[str, FitReport]
@@ -55,7 +55,7 @@ class Comparison:
 
 
 def compare(job: Job, saved: Sequence[Path] = (), progress: Progress = SILENT) -> Comparison:
-    """Fit every structure as the spec trains, score each on every part, and put saved models beside them.
+    """Fit every structure as the spec trains, and score each and every saved model on every part.
 
     A structure that the spec does not allow (a baseline penalty with an initial value of 0) is left
     out with the reason. With a validation part the row of the lowest error there is marked as
@@ -95,7 +95,7 @@ def compare(job: Job, saved: Sequence[Path] = (), progress: Progress = SILENT) -
 
 
 def _criterion(job: Job, progress: Progress) -> tuple[Criterion, FitReport | None]:
-    """Return the criterion that every structure is trained by, and the fit that decided it where the data were to decide."""
+    """Return the criterion that trains every structure, and the fit that chose it, if any."""
     declared = job.spec.declared_criterion()
     if not declared.automatic:
         return declared, None
@@ -105,7 +105,7 @@ def _criterion(job: Job, progress: Progress) -> tuple[Criterion, FitReport | Non
 
 
 def _verdicts(job: Job, fitted: dict[str, FitReport]) -> dict[str, Verdict]:
-    """Return whether the learner earns its place in each structure, by blocked cross-validation and the held-out parts."""
+    """Return whether each structure's learner helps, by cross-validation and held-out parts."""
     alone = fitted[ALONE].fit
     kinds = [kind for kind, tried in fitted.items() if kind != ALONE and tried.fit.status.ok]
     if not kinds or not alone.status.ok:
@@ -127,7 +127,7 @@ def _verdicts(job: Job, fitted: dict[str, FitReport]) -> dict[str, Verdict]:
 
 
 def write(comparison: Comparison, folder: Path, *, force: bool = False) -> None:
-    """result.json, models/, figures/ and report.html, whole or not at all."""
+    """Write result.json, models/, figures/ and report.html, whole or not at all."""
     with whole_folder(folder, force=force) as partial:
         (partial / "result.json").write_text(comparison.result.to_json() + "\n", encoding="utf-8")
         for kind, fitted in comparison.fitted.items():
@@ -157,7 +157,7 @@ def compare_report(comparison: Comparison) -> str:
 
 
 def _matching(path: Path, job: Job) -> Model | MotionModel:
-    """Return a saved model that the job's data fit."""
+    """Return a saved model that fits the job's data."""
     model = storage.load(path)
     record = job.problem.record
     lacking = [c.name for c in model.inputs if c.name not in [own.name for own in record.inputs]]
@@ -195,20 +195,20 @@ def _saved_row(name: str, model: Model | MotionModel, job: Job) -> RowResult:
 
 
 def _row_of(
-    name: str, model: Model | MotionModel, scores: Any, warnings: Sequence[Any], **told: Any
+    name: str, model: Model | MotionModel, scores: Any, warnings: Sequence[Any], **content: Any
 ) -> RowResult:
-    """Return a row; null for what is not `told`."""
+    """Return a row of the table; keys that `content` lacks are null."""
     own = {"name": name, "weights": model.form.bound.size if model.form.bound else 0}
     return RowResult.model_validate(
         dict.fromkeys(RowResult.model_fields)
         | own
         | {"scores": scores, "warnings": warnings}
-        | told
+        | content
     )
 
 
 def _chosen(rows: Sequence[RowResult], simulates: bool) -> str | None:
-    """Return the row of the lowest error on the validation part, of the free run or one step ahead as training looks at it.
+    """Return the row with the lowest error on the validation part, by the criterion of training.
 
     Physics alone wins where the verdict is that the learner of that row does not help.
     """

@@ -1,4 +1,4 @@
-"""The sections [data], [engine] and [motion] of a spec: channels, files, who sums over rows, equations of motion."""
+"""The sections [data], [engine] and [motion] of a spec."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class ChannelSection(Section):
 
 
 class PrepareSection(KindSection):
-    """A step that every part of the data goes through."""
+    """A step of preparation that every part of the data goes through."""
 
     registries = {"step": STEPS}
     step: str
@@ -83,7 +83,7 @@ class Data(Section):
 
     @property
     def step(self) -> float | None:
-        """Seconds between the rows that are kept of the training data; None where the data tell."""
+        """Seconds between the rows kept for training; None where the data determine it."""
         if self.time or any(section.step in ("decimate", "resample") for section in self.prepare):
             return None
         return (self.sampling_time or 1.0) * self.train.every
@@ -105,7 +105,7 @@ class Data(Section):
         return self
 
     def _no_channel(self, name: str) -> str:
-        """Return what is wrong with a section of `channels` for no channel: it, or the name that it should have met."""
+        """Return a message on a section of `channels` that names no channel."""
         known = (*self.inputs, *self.outputs)
         open_names = [other for other in known if other not in self.channels]
         close = difflib.get_close_matches(name, open_names, n=1)
@@ -123,7 +123,7 @@ class Data(Section):
 
 
 class EngineSection(Section):
-    """Who sums over the rows."""
+    """The engine that sums over the rows."""
 
     kind: Literal["auto", "memory", "stream", "devices", "dask"] = "auto"
     scheduler: str | None = None
@@ -133,7 +133,7 @@ class EngineSection(Section):
     checkpoint: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 10.0
 
     def chosen(self, files: Sequence[Path]) -> str:
-        """Return the kind; "auto" streams Parquet files that are too large for memory."""
+        """Return the kind of engine; "auto" streams Parquet files that are too large for memory."""
         if self.kind != "auto":
             return self.kind
         parquet = all(file.suffix.lower() == _PARQUET for file in files)
@@ -202,7 +202,7 @@ class MotionSection(Section):
 
     @model_validator(mode="after")
     def _check_equations(self) -> MotionSection:
-        """Return each state has the equation that its integrator reads."""
+        """Check that each state has the equation that its integrator reads."""
         discrete = self.integrator == "discrete"
         own, other = ("next", "derivative") if discrete else ("derivative", "next")
         kind = "a discrete motion" if discrete else f'`integrator = "{self.integrator}"`'
@@ -215,17 +215,18 @@ class MotionSection(Section):
 
     @property
     def learns(self) -> bool:
-        """Return whether a learner is added to any equation or output."""
+        """Whether a learner is added to any equation or output."""
         outputs = (
             output.learned for output in self.outputs.values() if not isinstance(output, str)
         )
         return any(state.learned for state in self.states.values()) or any(outputs)
 
     def declared(self, inputs: Sequence[str], outputs: Sequence[str]) -> Motion:
-        """Return the motion, its channels in the order of the data.
+        """Return the motion, with its channels in the order of the data.
 
-        Raises: InputError: names and expressions that cannot be, and what else
-            `Motion.from_equations` refuses.
+        Raises:
+            InputError: names and expressions that cannot be, and what else `Motion.from_equations`
+                refuses.
         """
         given = {
             name: OutputSection(expression=o) if isinstance(o, str) else o

@@ -1,4 +1,7 @@
-"""The built-in example: the paper's mass-spring-damper, where two structures fit alike and only one keeps θ."""
+"""The built-in example: the paper's mass-spring-damper.
+
+Two structures fit it equally well, and only the orthogonal one keeps θ.
+"""
 
 from __future__ import annotations
 
@@ -59,7 +62,7 @@ regularization = "none"
 
 
 def run(folder: Path, progress: Progress = SILENT, *, force: bool = False) -> str:
-    """Generate the record, fit both structures, write data, spec and orthogonal fit.
+    """Generate the record, fit both structures; write data, spec and orthogonal fit.
 
     Return the comparison.
     """

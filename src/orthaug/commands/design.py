@@ -24,8 +24,9 @@ def design_for(job: Job) -> Design:
     a motion are those of physics alone. Inputs beside the one that is designed are as they were
     recorded.
 
-    Raises: InputError: no `[design]` section, limits that cannot be met, suspects without a
-        coefficient.
+    Raises:
+        InputError: no `[design]` section, limits that cannot be met, suspects without a
+            coefficient.
     """
     section = job.spec.design
     if section is None:
@@ -96,7 +97,10 @@ def _input(name: str | None, known: list[str]) -> str:
 
 
 def _others(job: Job, chosen: str, samples: int) -> dict[str, np.ndarray]:
-    """Return the other inputs as the longest experiment of the training data has them, repeated where it ends."""
+    """Return the other inputs, as in the longest experiment of the training data.
+
+    They are repeated where that ends.
+    """
     record = job.problem.record
     longest = max(record.experiments, key=len).inputs
     named = zip((channel.name for channel in record.inputs), longest.T, strict=True)
@@ -108,7 +112,7 @@ def _others(job: Job, chosen: str, samples: int) -> dict[str, np.ndarray]:
 
 
 def notes(job: Job) -> list[str]:
-    """Return what stands in the inputs that are not designed."""
+    """Return notes on the inputs that are not designed."""
     assert job.spec.design is not None
     others = [c.name for c in job.problem.record.inputs if c.name != job.spec.design.input]
     return (
@@ -119,7 +123,7 @@ def notes(job: Job) -> list[str]:
 
 
 def write(job: Job, design: Design, out: Path, *, force: bool = False) -> None:
-    """The signal as CSV, `time` and every input, whole or not at all."""
+    """Write the signal as CSV, `time` and every input, whole or not at all."""
     assert job.spec.design is not None
     names = [channel.name for channel in job.problem.record.inputs]
     chosen, count = job.spec.design.input or names[0], len(design.signal)

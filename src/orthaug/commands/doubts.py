@@ -1,4 +1,4 @@
-"""What intervals of a fit do not count: structure that noise does not explain, and a state that the model lacks.
+"""Causes of error that the intervals of a fit do not count: missing structure or a missing state.
 
 It is asked of every fit, of lagged physics and of motions, whether a learner stayed, fell back or
 was never declared.
@@ -29,7 +29,10 @@ _DETERMINED = re.compile(
 
 
 def doubted(fitted: Any) -> Any:
-    """Return a `Fitted` with the warnings `unexplained` and `hidden_state`, and intervals that say what they count."""
+    """Return a fit with the warnings `unexplained` and `hidden_state`, and its intervals marked.
+
+    The marks say what the intervals count.
+    """
     from orthaug.analysis.hidden_state import structure_test
 
     fit, result = fitted.fit, fitted.result
@@ -66,7 +69,7 @@ def doubted(fitted: Any) -> Any:
 
 
 def _noise_only(rows: list[ParameterResult] | None) -> list[ParameterResult] | None:
-    """Mark the intervals as those of noise alone."""
+    """Return the parameters with their intervals marked as those of noise alone."""
     if rows is None:
         return None
     return [
@@ -121,7 +124,7 @@ def _hidden_state(fit: Any, test: StructureTest) -> str:
 
 
 def _moved(fit: Any, best: FamilyTest) -> str:
-    """Return by how much the parameters move with a term, in words."""
+    """Return a sentence on how much a term moves the parameters."""
     values = _values_with(fit, best)
     if not values:
         return ""
@@ -141,7 +144,7 @@ def _now(fit: Any) -> dict[str, float]:
 
 
 def _values_with(fit: Any, best: FamilyTest) -> dict[str, float]:
-    """Return the parameters with a term fitted beside them."""
+    """Return the parameters of a fit with an additional term."""
     names = list(_now(fit))
     moved: Vector = np.asarray(fit.theta) + np.array(best.moves)
     if len(best.moves) != len(names):
@@ -177,7 +180,7 @@ def memory_result(one: FamilyTest, parameters: dict[str, float] | None = None) -
 
 
 def _reason(result: FitResult, test: StructureTest | None, unmodelled: bool) -> str:
-    """Return why no parameter counts as determined by the fit; nothing where it does."""
+    """Return the reason why the fit determines no parameter; empty where it determines some."""
     if test is not None and test.found:
         best = max(
             (one for one in (test.static, test.memory) if one is not None),
@@ -196,7 +199,7 @@ def _reason(result: FitResult, test: StructureTest | None, unmodelled: bool) -> 
 
 
 def _withdrawn(shared: SharedResult, reason: str) -> SharedResult:
-    """Return what the learner could imitate, without the parameters that the fit would otherwise determine."""
+    """Return what the learner could imitate, with no parameter determined by the fit."""
     lost = [*shared.determined, *(shared.physical or [])]
     if not lost:
         return shared

@@ -1,4 +1,4 @@
-"""Where the program starts: signals first, then streams and surroundings, and only then the command line.
+"""Entry point of the program: signals first, then streams and environment, then the command line.
 
 The user's switches for libraries that orthaug uses within itself do not reach them.
 """
@@ -59,7 +59,7 @@ def _open_streams() -> None:
 
 
 def _complaint() -> str | None:
-    """Return what keeps every command from running, in words."""
+    """Return a message on the cause that keeps every command from running; None without one."""
     from orthaug._base.memory import in_words, limit
 
     try:
@@ -76,7 +76,7 @@ def _complaint() -> str | None:
 
 
 def _settle() -> None:
-    """Surroundings in which libraries neither fail nor talk: their warnings are no lines for users."""
+    """Prepare the environment so that libraries neither fail nor print warnings of their own."""
     import logging
     import warnings
 

@@ -1,4 +1,4 @@
-"""What `orthaug fit` does: train a job, score and judge it, and write the folder that holds the result."""
+"""Fit of a spec: train a job, score and judge it, and write the folder with the result."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ class FitReport:
 
     job: Job
     fit: Any
-    """`Estimate`, or `MotionEstimate` of a motion."""
+    """The fit: `Estimate`, or `MotionEstimate` for a motion."""
     result: FitResult
     responses: Mapping[str, tuple[Response, Response]]
     """One-step prediction and free run of every part, by its name; none where training failed."""
     alone: Mapping[str, tuple[Response, Response]] = field(default_factory=dict)
-    """The same of physics alone, where that was fitted, too."""
+    """The responses of physics alone, where that was fitted too."""
 
     def __repr__(self) -> str:
         return f"Fitted({self.job.path.name}: {self.fit!r})"
@@ -72,7 +72,7 @@ class FitReport:
 
 @one_blas_thread()
 def fit_job(job: Job, progress: Progress = SILENT) -> FitReport:
-    """Train as the spec says, score every part, ask whether the learner earns its place, and try what may better it."""
+    """Train as the spec says, score every part, judge the learner, and try improvements."""
     return advised(doubted(judged(fit_variant(job, AS_DECLARED, progress))))
 
 
@@ -90,14 +90,14 @@ def advised(fitted: FitReport) -> FitReport:
         *fitted.result.warnings,
         *(WarningResult.model_validate(warning) for warning in failed),
     ]
-    told = (
+    trials = (
         {"warnings": warnings} if found is None else {"advice": found[0], "advice_trials": found[1]}
     )
-    return replace(fitted, result=FitResult.model_validate({**dict(fitted.result), **told}))
+    return replace(fitted, result=FitResult.model_validate({**dict(fitted.result), **trials}))
 
 
 def judged(fitted: FitReport) -> FitReport:
-    """With whether the learner earns its place."""
+    """Return a fit with the verdict on its learner."""
     job, fit, warnings = fitted.job, fitted.fit, list(fitted.result.warnings)
     if not fit.status.ok or (fit.model.form.bound is None and fit.held_out is None):
         return fitted
@@ -115,14 +115,14 @@ def judged(fitted: FitReport) -> FitReport:
     if verdict is None and asked and not failed:
         short = "the training data have too few rows for cross-validation in so many blocks"
         why = "training was stopped too early for cross-validation" if _stopped(fit) else short
-        told = f"whether the learner helps is not judged: no part is held out, and {why}."
-        warnings.append(WarningResult(code="not_judged", text=told))
+        text = f"whether the learner helps is not judged: no part is held out, and {why}."
+        warnings.append(WarningResult(code="not_judged", text=text))
     if verdict is not None and fit.model.form.bound is not None:
-        told = (
+        text = (
             *verdict.warnings,
             *_unexplained(fitted, None if verdict.code == "helps" else physics),
         )
-        warnings += [WarningResult.model_validate(warning) for warning in told]
+        warnings += [WarningResult.model_validate(warning) for warning in text]
     result = FitResult.model_validate(
         {**dict(fitted.result), "validation": verdict, "warnings": warnings}
     )
@@ -130,7 +130,10 @@ def judged(fitted: FitReport) -> FitReport:
 
 
 def _physics_alone(fitted: FitReport) -> Any:
-    """Return the fit of physics alone that the learner had to beat: the one that was made, or one by the same criterion."""
+    """Return the fit of physics alone that the learner is compared to.
+
+    It is the one that was made already, or one by the same criterion.
+    """
     made = fitted.fit.physics_alone
     return (
         made if made is not None else fitted.job.run(Variant(ALONE, criterion=fitted.fit.criterion))
@@ -138,10 +141,13 @@ def _physics_alone(fitted: FitReport) -> Any:
 
 
 def _unexplained(fitted: FitReport, physics: Callable[[], Any] | None) -> list[Warning]:
-    """That a learner may have taken from parameters that it could imitate, where no cause tells by how much.
+    """Return a warning where the learner may have taken an unknown share of a parameter.
 
-    Args: physics: the fit without the learner, where that does not help: it may still take up what
-        physics alone leaves.
+    It could imitate these parameters, and no suspect explains what it found.
+
+    Args:
+        physics: the fit without the learner, where that does not help: it may still take up what
+            physics alone leaves.
     """
     from orthaug.analysis.diagnosis import diagnose
 
@@ -150,7 +156,7 @@ def _unexplained(fitted: FitReport, physics: Callable[[], Any] | None) -> list[W
     shared = [row.name for row in rows if row.shared]
     if not shared or any(row.bias for row in rows):
         return []
-    told, failed = "no suspect explains half of what the learner found", []
+    text, failed = "no suspect explains half of what the learner found", []
     if physics is not None:
         if not result.residuals or result.residuals.verdict == "unmodelled":
             return []
@@ -160,20 +166,20 @@ def _unexplained(fitted: FitReport, physics: Callable[[], Any] | None) -> list[W
         )
         if not alone or alone.verdict != "unmodelled":
             return failed
-        told = (
+        text = (
             "physics alone leaves more than noise, which the learner takes up without better "
             "free runs"
         )
-    told += (
+    text += (
         f": a part of that may belong to {', '.join(shared)}, and no interval counts it. "
         "`orthaug explain` looks for its terms, [[suspects]] declares them; another measure, "
-        "or a learner that sees less, may tell them apart."
+        "or a learner that sees less, may separate them."
     )
-    return [Warning("unexplained", told)]
+    return [Warning("unexplained", text)]
 
 
-def keeping(job: Job, folder: Path, *, resume: bool = False) -> Job:
-    """Return the job with the states of its training kept beside the result folder.
+def keep_states(job: Job, folder: Path, *, resume: bool = False) -> Job:
+    """Return the job, with its states of training kept beside the result folder.
 
     With `resume` it goes on from them.
 
@@ -196,9 +202,9 @@ def keeping(job: Job, folder: Path, *, resume: bool = False) -> Job:
 
 
 def fit_variant(job: Job, variant: Variant, progress: Progress = SILENT) -> FitReport:
-    """Train a variant of a job and score every part; `judge_fit` asks whether the learner helps."""
+    """Train a variant of a job and score every part; `judge_fit` judges the learner."""
     progress.planned(job.planned(variant))
-    return told_of(job, job.run(variant, progress))
+    return report_of(job, job.run(variant, progress))
 
 
 def told_of(job: Job, fit: Any) -> FitReport:
@@ -235,10 +241,10 @@ def told_of(job: Job, fit: Any) -> FitReport:
         warnings += _one_step_only(
             scores, alone, [part.name for part in job.parts if part not in job.tests]
         )
-    fit, told = kind_of(job).content(job, fit, responses, warnings)
-    if fit.status.ok and told["residuals"] is not None:
-        fit = _for_observers(fit, told["residuals"].verdict, warnings)
-    content = told | {
+    fit, fields = kind_of(job).content(job, fit, responses, warnings)
+    if fit.status.ok and fields["residuals"] is not None:
+        fit = _for_observers(fit, fields["residuals"].verdict, warnings)
+    content = fields | {
         "spec": job.declaration,
         "data": job.data,
         "status": _status(fit, warnings),
@@ -285,7 +291,10 @@ def _status(fit: Any, warnings: Sequence[Any]) -> Any:
 def _one_step_only(
     scores: Mapping[str, PartScores], alone: Mapping[str, PartScores], parts: Sequence[str]
 ) -> list[Warning]:
-    """That a model trained one step ahead by hand is of no use in free run: it diverges, or physics alone is better."""
+    """Return a warning where a model trained one step ahead is of no use in free run.
+
+    It diverges there, or physics alone is better; the user chose the criterion.
+    """
     diverges = any(scores[part].simulation.nrmse is None for part in parts)
     worse = [
         bool(
@@ -313,7 +322,10 @@ def _one_step_only(
 
 
 def _for_observers(fit: Any, verdict: str, warnings: list[Any]) -> Any:
-    """Return the fit whose model keeps what an observer of it asks for: the verdict on the residual, and two noises."""
+    """Return the fit with a model that keeps what observers need.
+
+    These are the verdict on the residual, and the two noises.
+    """
     from orthaug.analysis.observer_noise import to_keep
 
     kept = replace(fit.model.statistics, verdict=verdict)
@@ -329,13 +341,14 @@ def judge_fit(
     blocks: Sequence[Trial] | None = None,
     alone: Mapping[str, tuple[Response, Response]] | None = None,
 ) -> Verdict | None:
-    """Return whether the learner earns its place: free runs against physics alone on what was not fitted.
+    """Return whether the learner is useful: its free run against physics alone on data not fitted.
 
     Where the fit fell back to physics alone, that is judged by which it did.
 
-    Args: physics: gives the fit of physics alone, where a part is held out. blocks: trials of
-        blocked cross-validation; None for those by which the fit was chosen, or to make them, where
-            there is no validation or test part or where the spec asks for them.
+    Args:
+        physics: gives the fit of physics alone, where a part is held out.
+        blocks: trials of blocked cross-validation; None for those by which the fit was chosen, or
+            to make them, where there is no validation or test part or where the spec asks for them.
         alone: the responses of physics alone by part, where they are there already.
     """
     from orthaug.analysis.validation import extrapolation, judge, trial_on, trials_of
@@ -377,18 +390,18 @@ def judge_fit(
 
 
 def _stopped(fit: Any) -> bool:
-    """Return whether training was asked to end with what it had: then nobody waits for cross-validation either."""
+    """Return whether training was asked to end early: then cross-validation is omitted too."""
     return any(warning.code == "stopped" for warning in fit.warnings)
 
 
 def wanted_blocks(job: Job) -> int:
-    """Blocks of cross-validation for a verdict: none where parts are held out, unless the spec asks for them."""
+    """Return the number of blocks of cross-validation: by default none beside held-out parts."""
     asked = job.spec.validation.blocks
     return (0 if job.parts[1:] else DEFAULT_BLOCKS) if asked is None else asked
 
 
 def cross_validated(job: Job, blocks: int, variants: Sequence[Variant]) -> list[list[Trial]]:
-    """Trials of every variant on every block; none where the record is too short for that."""
+    """Return the trials of every variant on every block; none where the record is too short."""
     from orthaug.analysis.validation import block_trials, cross_validate
 
     fits = [
@@ -406,7 +419,7 @@ def cross_validated(job: Job, blocks: int, variants: Sequence[Variant]) -> list[
 def score_part(
     model: Any, part: Part, warnings: list[Any]
 ) -> tuple[PartScores, tuple[Response, Response]]:
-    """Scores of a part, and the responses they come from.
+    """Return the scores of a part, and the responses that they come from.
 
     For a score that does not exist a warning is added.
     """
@@ -420,11 +433,11 @@ def score_part(
         scores[kind] = ScoreResult() if runaway is not None else scored
         if runaway is not None:
             step, output = runaway
-            told = (
+            text = (
                 f"{part.name}: the free run diverged in output '{output}' at step {step}; no "
                 "simulation scores."
             )
-            warnings.append(Warning("free_run_diverged", told))
+            warnings.append(Warning("free_run_diverged", text))
         elif np.isnan(scored.rmse).any():
             warnings.append(
                 Warning(
@@ -432,16 +445,16 @@ def score_part(
                 )
             )
         elif np.isnan(scored.nrmse).any():
-            told = (
+            text = (
                 f"{part.name}: an output is constant over the scored samples; no NRMSE and FIT "
                 f"of its {kind}."
             )
-            warnings.append(Warning("constant_output", told))
+            warnings.append(Warning("constant_output", text))
     return PartScores.model_validate(scores), responses
 
 
 def _scored_along(model: Any, part: Part, warnings: list[Any]) -> PartScores:
-    """Scores of all rows of a part of which only a witness is in memory, and tests of the residual of all of them."""
+    """Return scores and residual tests over all rows of a part that is kept as a subsample."""
     from orthaug.analysis.residuals import RunningResidual
     from orthaug.data.sources import rows_of
     from orthaug.models.long_runs import scores_along
@@ -452,11 +465,11 @@ def _scored_along(model: Any, part: Part, warnings: list[Any]) -> PartScores:
     found = scores_along(model, part.source, part.skip, None if whole else residual.watch)
     if found.diverged is not None:
         file, row, output = found.diverged
-        told = (
+        text = (
             f"{part.name}: the free run diverged in output '{output}' at row {row} of {file}; "
             "no simulation scores."
         )
-        warnings.append(Warning("free_run_diverged", told))
+        warnings.append(Warning("free_run_diverged", text))
     simulation = ScoreResult() if found.diverged is not None else found.simulation
     tests = residual.tests() or None
     return PartScores.model_validate(
@@ -465,7 +478,7 @@ def _scored_along(model: Any, part: Part, warnings: list[Any]) -> PartScores:
 
 
 def write_result(fitted: FitReport, folder: Path, *, force: bool = False) -> None:
-    """result.json, model/ and figures/, whole or not at all.
+    """Write result.json, model/ and figures/, whole or not at all.
 
     Without a model where training failed.
     """

@@ -22,7 +22,9 @@ PHYSICS = "model-physics"
 
 
 def chosen_model(model: Path, which: str) -> Path:
-    """Return the folder of the model that a command runs: the fitted one, or `physics`, the one without a learner.
+    """Return the folder of the model that a command runs.
+
+    It is the fitted one, or `physics`: the one without a learner.
 
     Raises:
         InputError: neither of these, or a fit that has no physics alone beside its model.
@@ -57,7 +59,7 @@ def check_folder(folder: Path, *, force: bool = False) -> None:
 
 
 def check_inputs_kept(job: Job, folder: Path, models: Iterable[Path] = ()) -> None:
-    """Raise InputError where the result would take the place of a file or model that the job reads."""
+    """Raise InputError where the result would replace a file or model that the job reads."""
     for file in (*job.files, *models):
         if file.resolve().is_relative_to(folder.resolve()):
             what = file.name if file in job.files else f"the model {file}"
@@ -65,7 +67,7 @@ def check_inputs_kept(job: Job, folder: Path, models: Iterable[Path] = ()) -> No
 
 
 def check_kept(folder: Path, *read: Path) -> None:
-    """Raise InputError where a result folder would take the place of what is read."""
+    """Raise InputError where a result folder would replace what is read."""
     for path in read:
         try:
             inside = path.exists() and path.resolve().is_relative_to(folder.resolve())
@@ -76,7 +78,7 @@ def check_kept(folder: Path, *read: Path) -> None:
 
 
 def check_file(out: Path | None, *read: Path, force: bool = False) -> None:
-    """Raise InputError early where a file could not be written, is there, or is one of those that are read."""
+    """Raise InputError early where a file cannot be written, exists, or is one of those read."""
     if out is None:
         return
     try:
@@ -90,14 +92,14 @@ def check_file(out: Path | None, *read: Path, force: bool = False) -> None:
 
 
 def check_figure(out: Path | None, *read: Path, force: bool = False) -> None:
-    """`check_file` of a figure, whose ending says in which format it is drawn."""
+    """Check the file of a figure as `check_file` does, and that its ending is a known format."""
     if out is not None and out.suffix.lower() not in (".png", ".pdf", ".svg"):
         raise InputError(f"{out}: found the ending '{out.suffix}'; expected .png, .pdf or .svg.")
     check_file(out, *read, force=force)
 
 
 def save_figure(figure: Figure, out: Path, *, force: bool = False) -> None:
-    """The figure in the format of its ending, whole or not at all."""
+    """Write the figure in the format of its ending, whole or not at all."""
     from orthaug.reports.drawing import save
 
     with whole_file(out, force=force) as partial:

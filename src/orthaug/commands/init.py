@@ -1,4 +1,4 @@
-"""A first spec for a data file: what `orthaug init` tells of it, and writes."""
+"""A first spec for a data file: `orthaug init` describes the file, and writes the spec."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _CLEARLY = "first significant at lag {}; from here on it runs clearly better on 
 
 @dataclass(frozen=True, eq=False)
 class Roles:
-    """Which columns of a file are inputs, which outputs, and the sampling time [s] where a person said it."""
+    """The columns that are inputs and outputs, and the sampling time [s] that the user gave."""
 
     inputs: tuple[Column, ...]
     outputs: tuple[Column, ...]
@@ -43,7 +43,10 @@ def channel_names(columns: Sequence[Column]) -> list[str]:
 
 
 def time_of(found: Survey, roles: Roles) -> str | None:
-    """Return the column of instants, where there is one that is to be used: uneven steps, or such as every part has."""
+    """Return the column of instants, where its times are to be used.
+
+    That is where its steps are uneven, or where every part has it.
+    """
     clock = found.clock
     used = clock.column is not None and clock.instants and not roles.sampling_time
     return (
@@ -52,7 +55,10 @@ def time_of(found: Survey, roles: Roles) -> str | None:
 
 
 def steps_of(found: Survey, roles: Roles) -> list[tuple[str, dict[str, Any]]]:
-    """Preparation that the data need: spikes of outputs replaced, uneven instants put onto a grid."""
+    """Return the preparation that the data need.
+
+    Spikes of outputs are replaced, and uneven instants resampled onto a grid.
+    """
     steps: list[tuple[str, dict[str, Any]]] = []
     if any(column.spikes for column in roles.outputs):
         threshold = min(column.threshold for column in roles.outputs)
@@ -66,12 +72,12 @@ def steps_of(found: Survey, roles: Roles) -> list[tuple[str, dict[str, Any]]]:
 
 
 def step_of(found: Survey, roles: Roles) -> float:
-    """Seconds between rows: as given, as the file tells, or 1."""
+    """Return the seconds between rows: as given, as in the file, or 1."""
     return roles.sampling_time or found.clock.step or 1.0
 
 
 def lacking(rows: int) -> str:
-    """So many rows lack a value, in words."""
+    """Return the number of rows that lack a value, in words."""
     return f"{counted(rows, 'row')} lack{'s' if rows == 1 else ''} a value"
 
 
@@ -137,7 +143,7 @@ def _data(
     else:
         data.add("sampling_time", step_of(found, roles))
         unknown = clock.step is None and not roles.sampling_time
-        data["sampling_time"].comment("s; no column tells it: change it" if unknown else "s")
+        data["sampling_time"].comment("s; no column gives it: change it" if unknown else "s")
     for key, names in zip(("inputs", "outputs"), named, strict=True):
         data.add(key, names)
     uneven = time is not None and not clock.even
@@ -175,7 +181,7 @@ def _data(
 def _baseline(named: tuple[list[str], list[str]], model: FirstModel) -> Any:
     inputs, outputs = named
     terms, orders = [], model.orders
-    told = {}
+    comments = {}
     for name, nk, seen in zip(inputs, orders.nk, model.delays, strict=True):
         if seen != nk:
             why = (
@@ -183,7 +189,7 @@ def _baseline(named: tuple[list[str], list[str]], model: FirstModel) -> Any:
                 if seen is None
                 else _CLEARLY.format(seen)
             )
-            told[f"{name}[k-{nk}]" if nk else f"{name}[k]"] = why
+            comments[f"{name}[k-{nk}]" if nk else f"{name}[k]"] = why
     for output in outputs:
         own = f"_{output}" if len(outputs) > 1 else ""
         found = [(f"a{i}{own}", f"{output}[k-{i}]") for i in range(1, orders.na + 1)]
@@ -200,8 +206,8 @@ def _baseline(named: tuple[list[str], list[str]], model: FirstModel) -> Any:
                 "parameter", f"{parameter}_" if parameter in (*inputs, *outputs) else parameter
             )
             term.add("regressor", regressor)
-            if regressor in told:
-                term["regressor"].comment(told[regressor])
+            if regressor in comments:
+                term["regressor"].comment(comments[regressor])
             if own:
                 term.add("output", output)
             terms.append(term)
@@ -221,7 +227,7 @@ _LISTED = 12  # columns in a message
 
 @dataclass(frozen=True, eq=False)
 class Draft:
-    """A spec as text, with the account of what was seen."""
+    """A spec as text, with a description of the file."""
 
     spec: str
     account: str
@@ -239,7 +245,9 @@ def look(path: Path) -> Survey:
 def assign(
     found: Survey, inputs: Names | None, outputs: Names | None, sampling_time: float | None = None
 ) -> Roles | None:
-    """Columns by their names; where nothing is given by what the names say; None if that is open.
+    """Return the columns by name; where none are given, by the meaning of their names.
+
+    None where the names leave that open.
 
     Raises:
         InputError: columns that are not there, twice, constant or the time.
@@ -297,7 +305,7 @@ def columns_of(
 
 
 def _check_no_time(found: Survey, column: Column, kind: str, sampling_time: float | None) -> None:
-    """Raise InputError for the time as a channel.
+    """Raise InputError where the time is named as a channel.
 
     An input may rise as evenly where the time is known otherwise.
     """
@@ -321,7 +329,7 @@ def _check_no_time(found: Survey, column: Column, kind: str, sampling_time: floa
 
 
 def question(found: Survey, inputs: Names | None = None, outputs: Names | None = None) -> str:
-    """Return what to give where the columns do not say what they are.
+    """Return what the user has to give where the columns do not show their roles.
 
     `inputs` and `outputs` are what was given.
 
@@ -344,7 +352,7 @@ def question(found: Survey, inputs: Names | None = None, outputs: Names | None =
     proposed = (
         f'--inputs "{into}" --outputs "{_joined(outputs) if output is None else output.header}"'
     )
-    said = "the names of the columns do not tell inputs from outputs"
+    said = "the names of the columns do not show which are inputs and which outputs"
     if inputs is not None or outputs is not None:
         said = f"only {'inputs' if outputs is None else 'outputs'} are named"
     none = ' (--inputs "" for none)' if inputs is None and named else ""
@@ -357,12 +365,12 @@ def question(found: Survey, inputs: Names | None = None, outputs: Names | None =
 
 
 def _joined(names: Names | None) -> str | None:
-    """Names as a person would write them."""
+    """Return the names as a person would write them."""
     return names if names is None or isinstance(names, str) else ",".join(names)
 
 
 def _nothing_left(found: Survey, inputs: str | None) -> str:
-    """Why there is no output to name."""
+    """Return the reason why no column is left for an output."""
     rows = counted(max(column.filled for column in found.columns), "row")
     others = left_out(found, [*found.signals])
     if not found.signals:
@@ -378,7 +386,7 @@ def _nothing_left(found: Survey, inputs: str | None) -> str:
 
 
 def left_out(found: Survey, used: Sequence[Column]) -> str:
-    """Return the columns that are not used, and why, in a list; the time is none of them."""
+    """Return a list of the unused columns, except the time, with the reasons."""
     apart = {id(c) for c in (*used, found.clock.column)}
     return _listed(
         [f"{c.header} ({found.why_not(c)})" for c in found.columns if id(c) not in apart]
@@ -391,7 +399,7 @@ def _listed(columns: Sequence[str]) -> str:
 
 
 def draft(found: Survey, roles: Roles, out: Path) -> Draft:
-    """Return a spec for a file that runs, for the place `out`, and the account.
+    """Return a spec that runs on a file, for the place `out`, and a description of the file.
 
     Raises:
         InputError: too few rows, or channels without a row where all have a value.
@@ -431,7 +439,7 @@ def draft(found: Survey, roles: Roles, out: Path) -> Draft:
 
 
 def write_spec(found: Draft, out: Path, *, force: bool = False) -> None:
-    """The spec, once it has been opened with its data as `orthaug fit` would."""
+    """Write the spec, after opening it with its data as `orthaug fit` does."""
     from orthaug.commands.kinds import open_job
 
     with whole_file(out, force=force) as partial:
@@ -440,14 +448,14 @@ def write_spec(found: Draft, out: Path, *, force: bool = False) -> None:
             try:
                 open_job(partial)
             except InputError as error:
-                told = str(error).removeprefix(f"{partial}: ")
+                reason = str(error).removeprefix(f"{partial}: ")
                 raise InputError(
-                    f"{out}: a spec for these columns would be refused: {told}"
+                    f"{out}: a spec for these columns would be refused: {reason}"
                 ) from None
 
 
 def _extent(roles: Roles) -> tuple[int, int]:
-    """Rows up to the last value of any channel, and how many of them lack one."""
+    """Return the number of rows up to the last value of any channel, and of those that lack one."""
     columns = [*roles.inputs, *roles.outputs]
     rows = max(column.filled for column in columns)
     there = np.ones(rows, dtype=bool)
@@ -490,13 +498,13 @@ def _account(
     wild: str,
     notes: Sequence[str] = (),
 ) -> str:
-    """Return what was seen, a line each."""
+    """Return the description of the file, a line for each finding."""
     step = f"{roles.sampling_time:g} s, as given" if roles.sampling_time else str(found.clock)
     if roles.sampling_time is None and found.clock.step is None:
         step += "; 1 s is written: change it"
-    told = f"; {found.note}" if found.note else ""
+    horizon = f"; {found.note}" if found.note else ""
     lines = [
-        f"{found.path.name}: {rows} rows, {len(found.columns)} columns{told}",
+        f"{found.path.name}: {rows} rows, {len(found.columns)} columns{horizon}",
         f"sampling time: {step}",
     ]
     for kind, columns in (("input", roles.inputs), ("output", roles.outputs)):
@@ -526,9 +534,9 @@ def _account(
                 "held out"
             )
     size, errors = model.orders, ", ".join(percent(error, 3) for error in model.free_run)
-    told = "one step ahead" if not roles.inputs else "in free run"
+    horizon = "one step ahead" if not roles.inputs else "in free run"
     lines.append(
-        f"first physics: linear, {size}{', with a constant' if model.offset else ''}; {told} "
+        f"first physics: linear, {size}{', with a constant' if model.offset else ''}; {horizon} "
         "its error"
     )
     lines[-1] += f" on rows held out is {errors} of the output's standard deviation"
@@ -552,12 +560,12 @@ def _order(order: int) -> str:
     from orthaug.selection.first_orders import PERSISTENCE
 
     return f"up to order {order}" + (
-        " or more" if order >= PERSISTENCE else ": few lags can be told apart"
+        " or more" if order >= PERSISTENCE else ": few lags can be distinguished"
     )
 
 
 def as_seen(column: Column, *, spikes: bool) -> str:
-    """Return a channel in words: range, and what is odd about it."""
+    """Return a channel in words: its range, and what is unusual about it."""
     low, high = float(column.finite.min()), float(column.finite.max())
     text = f"{column.name}" + (
         f" = column '{column.header}'" if column.header != column.name else ""

@@ -44,9 +44,9 @@ class LaggedJob(Job):
     weighed: WeighedPhysics
     physics: PhysicsMap | None
     engine: Engine
-    """Who sums over the rows."""
+    """The engine that sums over the rows."""
     left_out: tuple[Warning, ...] = ()
-    """What is told of terms that the learner was declared with, and that say nothing of their own.
+    """Warnings on terms declared for the learner that give none of their own.
     """
 
     @property
@@ -107,7 +107,10 @@ class LaggedJob(Job):
         return runs_on(self.engine)
 
     def fold_fit(self, variant: Variant) -> Callable[[Record], Estimate]:
-        """As there; it can be sent to another process. A fold is small: its rows are in memory."""
+        """Return a function that trains a variant on a fold, and can be sent to another process.
+
+        A fold is small: its rows are in memory.
+        """
         spec, options = self.spec, self.training_options(variant.on(self.train.record))
         options["structure"] = spec.declared_structure(
             variant.structure_kind
@@ -231,7 +234,7 @@ def open_lagged(path: Path, spec: Spec, *, require_full_rank: bool = True) -> La
 
 
 def _check_scored(spec: Spec, problem: Problem) -> None:
-    """`check_scored` in the words of the spec."""
+    """Check that the parts can be scored, as `check_scored`; errors use the words of the spec."""
     longest = max(len(e) for e in problem.record.experiments) - problem.rows.start
     try:
         check_scored(spec.declared_criterion(), longest)
@@ -240,7 +243,7 @@ def _check_scored(spec: Spec, problem: Problem) -> None:
 
 
 def _check_cost(spec: Spec, problem: Problem, engine: Engine) -> None:
-    """`check_cost` before JAX is loaded."""
+    """Check the cost of training, as `check_cost`, before JAX is loaded."""
     sizes = {
         "rows": problem.count,
         "features": len(problem.features.entries),
@@ -262,10 +265,10 @@ def measure_of(spec: Spec, problem: Problem, folder: Path) -> Measure:
 
 
 def _check_measure(weighed: WeighedPhysics, problem: Problem) -> None:
-    """Raise InputError for a measure under which the physics is rank-deficient, where on the data it is not."""
+    """Raise InputError where the physics is rank-deficient under the measure but not on the data."""
     if problem.excitation.full_rank and not weighed.excitation.full_rank:
         groups = "; ".join(", ".join(group) for group in weighed.excitation.collinear)
         name = weighed.measure.name
         raise InputError(
-            f"under the {name} measure the physics cannot tell {groups} apart; widen or move it."
+            f"under the {name} measure the physics cannot distinguish {groups}; widen or move it."
         )

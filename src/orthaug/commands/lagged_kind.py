@@ -1,4 +1,4 @@
-"""What is told of jobs whose physics is linear in θ on lagged signals."""
+"""Results of jobs whose physics is linear in θ on lagged signals."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _UNKNOWN = ("physical_parameters", "physical_consistency", "sensitivities", "bia
 
 
 def checked(job: LaggedJob) -> CheckResult:
-    """Excitation on the data, identifiability of the physics, and what each suspect would do to θ."""
+    """Return excitation of the data, identifiability of the physics, and bias by suspects."""
     problem = job.problem
     return CheckResult.model_validate(
         {
@@ -68,7 +68,7 @@ def checked(job: LaggedJob) -> CheckResult:
 
 
 def refused(job: LaggedJob, result: CheckResult) -> InputError | None:
-    """Why the job cannot be fitted, after the report."""
+    """Return the reason why the job cannot be fitted, after the report; None where it can."""
     try:
         require_rank(job.problem.excitation, job.problem.samples)
     except InputError as error:
@@ -82,19 +82,24 @@ def content(
     responses: Mapping[str, tuple[Response, Response]],
     warnings: list[Any],
 ) -> tuple[Estimate, dict[str, Any]]:
-    """Return the fit with the standard errors that its residual asks for, and what results tell of it; warnings are added."""
+    """Return the fit and the content of its result; warnings are added.
+
+    The standard errors are the ones that its residual calls for.
+    """
     from orthaug.analysis.robustness import robust_where_asked
 
-    told: dict[str, Any] = dict.fromkeys((*_UNKNOWN, "residuals", "missing_lags", "stability"))
+    fields: dict[str, Any] = dict.fromkeys((*_UNKNOWN, "residuals", "missing_lags", "stability"))
     if fit.status.ok:
         one_step, free_run = responses[job.train.name]
         plain = fit
         fit = attempt(
             "the robust covariance", lambda: robust_where_asked(plain, one_step), warnings, plain
         )
-        told |= _physical_content(job, fit, warnings)
-        told["bias"] = attempt("the bias by suspects", partial(_bias_of, job, fit), warnings, None)
-        told |= _analysed(fit, one_step, free_run, warnings)
+        fields |= _physical_content(job, fit, warnings)
+        fields["bias"] = attempt(
+            "the bias by suspects", partial(_bias_of, job, fit), warnings, None
+        )
+        fields |= _analysed(fit, one_step, free_run, warnings)
     shared = _shared_of(job, fit, others=False)
     rows = parameter_rows(
         fit.problem.baseline.parameters,
@@ -111,7 +116,7 @@ def content(
         row if row.unit else row.model_copy(update={"derived_unit": units.get(row.name)})
         for row in rows
     ]
-    told |= {
+    fields |= {
         "standard_errors": None
         if fit.std is None
         else "plain"
@@ -133,13 +138,15 @@ def content(
         fit.model.structure != "orthogonal" or fit.model.form.bound is None
     ):  # a variant of what the spec declares
         shared = None
-    told["parameters"] = _with_biases(
+    fields["parameters"] = _with_biases(
         rows, shared.determined if shared else None, budget, fit.at_bound
     )
-    if told["physical_parameters"] is not None:
+    if fields["physical_parameters"] is not None:
         physical = shared.physical if shared else None
-        told["physical_parameters"] = _with_biases(told["physical_parameters"], physical, budget)
-    return fit, told
+        fields["physical_parameters"] = _with_biases(
+            fields["physical_parameters"], physical, budget
+        )
+    return fit, fields
 
 
 def figures(
@@ -181,13 +188,13 @@ def figures(
 def physics_alone(
     job: LaggedJob, fit: Estimate, responses: Mapping[str, tuple[Response, Response]]
 ) -> Mapping[str, Response]:
-    """Return the free run of every part by the physics without the learner."""
+    """Return the free run of every part by the model's physics without its learner."""
     alone = fit.model.alone
     return {part.name: alone.simulate(part.record) for part in job.parts}
 
 
 def _physical_content(job: LaggedJob, fit: Estimate, warnings: list[Any]) -> dict[str, Any]:
-    """Return the physical parameters of θ̂ and what belongs to them, where the spec has a map.
+    """Return the physical parameters of θ̂ and their findings, where the spec has a map.
 
     Warnings are added.
     """
@@ -216,7 +223,7 @@ def _physical_content(job: LaggedJob, fit: Estimate, warnings: list[Any]) -> dic
 def _analysed(
     fit: Estimate, one_step: Response, free_run: Response, warnings: list[Any]
 ) -> dict[str, Any]:
-    """Return what the residuals and the free run's sensitivity say; warnings are added."""
+    """Return the findings on the residuals and the free run's sensitivity; warnings are added."""
     from orthaug.analysis.diagnosis import diagnose
     from orthaug.analysis.free_run_stability import stability
     from orthaug.analysis.missing_lags import missing_lags
@@ -273,7 +280,7 @@ def _with_biases(
     budget: Budget | None,
     held: Collection[str] = (),
 ) -> list[ParameterResult]:
-    """Parameters with whether the learner could imitate them, and what biases them.
+    """Return the parameters, with whether the learner could imitate them and what biases them.
 
     Not of those `held` at a bound.
     """
@@ -283,7 +290,8 @@ def _with_biases(
     ]
     biases = [budget.of(row.name) if budget and row.name not in held else None for row in rows]
     return [
-        row.told(imitated, bias) for row, imitated, bias in zip(rows, shared, biases, strict=True)
+        row.with_bias(imitated, bias)
+        for row, imitated, bias in zip(rows, shared, biases, strict=True)
     ]
 
 
@@ -302,7 +310,7 @@ def _linearization(job: LaggedJob, fit: Estimate | None) -> MeasureLinearization
 
 
 def _said_of_shared(job: LaggedJob, fit: Estimate | None = None) -> list[Warning]:
-    """Return what the rows say of directions that the names call determined beside the learner."""
+    """Return warnings on directions that are determined in name, but not beside the learner."""
     structure, problem = job.spec.declared_structure(), fit.problem if fit else job.problem
     if job.spec.declared_learner() is None or not structure.projects or structure.shared == "all":
         return []
@@ -318,7 +326,7 @@ def _said_of_shared(job: LaggedJob, fit: Estimate | None = None) -> list[Warning
 def _shared_of(
     job: LaggedJob, fit: Estimate | None = None, *, others: bool = True
 ) -> Imitation | None:
-    """Before training already.
+    """Return what the learner could imitate, before training.
 
     None without a learner, or where the structure splits nothing along chosen directions.
 

@@ -1,4 +1,4 @@
-"""What users of Python call: specs opened, fitted and compared, and the page of a fit.
+"""The interface for users of Python: open, fit and compare specs, and write the page of a fit.
 
 For a fit without a spec a job is made of what the fit knows.
 """
@@ -16,7 +16,7 @@ from orthaug._base.checks import check_type
 from orthaug._base.errors import InputError, TrainingError
 from orthaug._base.folders import check_new_file, whole_file
 from orthaug.commands.doubts import doubted
-from orthaug.commands.fit import FitReport, fit_job, fit_report, judged, told_of, write_result
+from orthaug.commands.fit import FitReport, fit_job, fit_report, judged, report_of, write_result
 from orthaug.commands.folder import check_folder, check_inputs_kept
 from orthaug.commands.job import Job, origin_of
 from orthaug.commands.kinds import open_job
@@ -45,8 +45,9 @@ def load_spec(path: str | os.PathLike) -> Job:
     Args:
         path: of the spec, a TOML file; paths in it start at its folder.
 
-    Returns: What `fit_spec` and `compare` take. `train.record`, `validation` and `tests` are its
-        data, `problem` the rows with the physics, `spec` the declarations.
+    Returns:
+        What `fit_spec` and `compare` take. `train.record`, `validation` and `tests` are its data,
+        `problem` the rows with the physics, `spec` the declarations.
 
     Raises:
         InputError: anything wrong with spec, files or physics; one line that names it.
@@ -56,15 +57,15 @@ def load_spec(path: str | os.PathLike) -> Job:
 
 
 def fit_spec(spec: Spec, out: str | os.PathLike | None = None) -> FitReport:
-    """Return what `orthaug fit` does: train, score every part, and ask whether the learner earns its place.
+    """Train the job of a spec, score every part and judge the learner, as `orthaug fit` does.
 
     Args:
         spec: a spec file, or what `load_spec` returned.
         out: folder to write result, model, figures and report into; None to write nothing.
 
-    Returns: `fit`, the `Estimate`; `result`, the content of result.json; `summary()`, what the
-        command prints. Where training failed numerically `fit.status` says so, and there are no
-        scores.
+    Returns:
+        `fit`, the `Estimate`; `result`, the content of result.json; `summary()`, what the command
+        prints. Where training failed numerically `fit.status` says so, and there are no scores.
 
     Raises:
         InputError: as `load_spec`; a folder that cannot be written or holds something else.
@@ -79,14 +80,15 @@ def fit_spec(spec: Spec, out: str | os.PathLike | None = None) -> FitReport:
 def compare(
     spec: Spec, models: Sequence[str | os.PathLike] = (), out: str | os.PathLike | None = None
 ) -> Comparison:
-    """Return what `orthaug compare` does: physics alone and every structure on the same data and seeds.
+    """Compare physics alone and every structure on the same data and seeds, as `orthaug compare`.
 
     Args:
         spec: a spec file, or what `load_spec` returned.
         models: folders of saved models to put beside.
         out: folder to write result, models and figure into; None to write nothing.
 
-    Returns: `fitted`, one `FitReport` by the name of the structure; `verdicts`, whether the learner
+    Returns:
+        `fitted`, one `FitReport` by the name of the structure; `verdicts`, whether the learner
         helps in each; `result`, the content of result.json; `summary()`, what the command prints.
 
     Raises:
@@ -136,7 +138,7 @@ class Page:
 
 @dataclass(frozen=True)
 class FitFacts:
-    """What a fit tells in the place of a spec."""
+    """The declarations of a fit, where there is no spec."""
 
     fit: Any
     suspects: tuple[()] = ()
@@ -155,17 +157,17 @@ class FitFacts:
         return STRUCTURES[kind or self.fit.model.structure]()
 
     def declared_criterion(self) -> Any:
-        """Return what was fitted."""
+        """Return the criterion that was fitted."""
         return self.fit.criterion
 
     def declared_solver(self) -> Any:
-        """Return the default: physics alone needs no other."""
+        """Return the default solver: physics alone needs no other."""
         from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 
         return LevenbergMarquardt()
 
     def model_dump(self, **_: Any) -> dict[str, Any]:
-        """Return what a title is made of."""
+        """Return the declarations that a title is made of."""
         record = self.fit.problem.record
         return {
             "data": {
@@ -180,21 +182,22 @@ def page_of(
     path: str | os.PathLike | None = None,
     tests: Mapping[str, Record] | None = None,
 ) -> Page:
-    """Return what `fit.report` returns: parameters, free runs, what was learned, residuals, stability.
+    """Return the page of a fit: parameters, free runs, learned part, residuals, stability.
 
-    Raises: TrainingError: a fit without a usable model. InputError: a path that cannot be written,
-        records that do not fit.
+    Raises:
+        TrainingError: a fit without a usable model. InputError: a path that cannot be written,
+            records that do not fit.
     """
     place = _checked(fit, path)
     job = job_of(fit, {} if tests is None else tests)
     made = replace(
         origin_of(job, "fit"), name="spec", command=f"{NAME} in Python", toml=_account(fit)
     )
-    return _written(fit_report(doubted(judged(told_of(job, fit))), made), place)
+    return _written(fit_report(doubted(judged(report_of(job, fit))), made), place)
 
 
 def page_of_spec(fitted: FitReport, path: str | os.PathLike | None, tests: None = None) -> Page:
-    """Return the page of what `fit_spec` returned, as the command line writes it.
+    """Return the page of a report by `fit_spec`, as the command line writes it.
 
     Errors as `page_of`.
     """
@@ -221,16 +224,20 @@ def _written(text: str, path: Path | None) -> Page:
 
 
 def _account(fit: Estimate | MotionEstimate) -> str:
-    """Return what stands in the place of the spec."""
+    """Return the text in the place of the spec."""
     physics = fit.problem.motion if isinstance(fit, MotionEstimate) else fit.problem.baseline
     bound = fit.model.form.bound
-    told = (fit.problem.record, physics, f"learner: {'none' if bound is None else bound.learner}")
-    lines = ("Fitted in Python by orthaug.estimate; there is no spec.", *map(str, told))
+    declared = (
+        fit.problem.record,
+        physics,
+        f"learner: {'none' if bound is None else bound.learner}",
+    )
+    lines = ("Fitted in Python by orthaug.estimate; there is no spec.", *map(str, declared))
     return "".join(f"# {line}\n" for text in lines for line in text.splitlines())
 
 
 def job_of(fit: Any, tests: Mapping[str, Record]) -> Job:
-    """Return the job whose result the fit is, as far as the fit knows it."""
+    """Return the job of a fit, with as much as the fit knows of it."""
     if not isinstance(tests, Mapping) or not all(
         isinstance(record, Record) for record in tests.values()
     ):

@@ -22,7 +22,7 @@ _FIGURES = (".png", ".pdf", ".svg")
 
 
 def check_place(out: Path | None, *read: Path, force: bool = False) -> None:
-    """Raise InputError early where the folder or file could not be written, or would replace what is read."""
+    """Raise InputError early where the output cannot be written, or would replace an input."""
     if out is None:
         return
     suffix = out.suffix.lower()
@@ -45,7 +45,7 @@ def check_place(out: Path | None, *read: Path, force: bool = False) -> None:
 
 
 def open_linear(model: Path, data: Path | None) -> tuple[Model | MotionModel, Record | None]:
-    """Return the model, and the record of a data file, or of the training data of a spec.
+    """Return the model, and the record of a data file or of the training data of a spec.
 
     Raises:
         InputError: no model, no file, missing columns.
@@ -68,7 +68,7 @@ def open_linear(model: Path, data: Path | None) -> tuple[Model | MotionModel, Re
 
 
 def write(found: Linearization, out: Path, *, force: bool = False) -> None:
-    """A folder with result.json, linear.txt and figures/.
+    """Write a folder with result.json, linear.txt and figures/.
 
     Or one file, by its ending JSON or the frequency response.
 
@@ -102,8 +102,8 @@ def write(found: Linearization, out: Path, *, force: bool = False) -> None:
         save(poles_figure(found), partial / "figures" / "poles.png")
 
 
-def told(found: Linearization, *, as_json: bool) -> str:
-    """Return what the command prints."""
+def printed(found: Linearization, *, as_json: bool) -> str:
+    """Return the text that the command prints."""
     from orthaug.reports.linear import LinearizeResult
     from orthaug.reports.linear_text import linear_text
 

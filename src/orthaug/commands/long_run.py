@@ -23,12 +23,12 @@ if TYPE_CHECKING:
     from orthaug.models.response import Scores
 
 LONG = 1_000_000
-"""Rows of a file that is not read at once."""
+"""Rows from which on a file is read piece by piece."""
 
 
 @dataclass(frozen=True, eq=False)
 class LongRun:
-    """A model with a file that stays where it is; `free` for its free run, else one step ahead."""
+    """A model with a file that is not loaded; `free` for its free run, else one step ahead."""
 
     model: Model
     source: Source
@@ -36,7 +36,7 @@ class LongRun:
 
 
 def long_run(model: Path, data: Path, reading: ReadOptions, *, free: bool) -> LongRun | None:
-    """Return the model on a long Parquet file with all its channels; None for what is read at once.
+    """Return the model on a long Parquet file with all its channels; None for a short file.
 
     Raises:
         InputError: no model, a file that cannot be read, a model of data that had other instants.
@@ -73,7 +73,9 @@ def long_run(model: Path, data: Path, reading: ReadOptions, *, free: bool) -> Lo
 def write(
     run: LongRun, out: Path | None, *, force: bool = False
 ) -> tuple[Scores | None, list[Warning]]:
-    """Return the table of `run.write_csv`, to a file (whole or not at all) or standard output.
+    """Write the table of `run.write_csv`, to a file (whole or not at all) or standard output.
+
+    Return the scores, None where nothing was measured, and warnings.
 
     Scores of all rows, warnings.
 
@@ -84,16 +86,16 @@ def write(
     scored, warnings, first = RunningScores(), [], run.model.form.first_row
     with _opened(out, force) as file:
         for piece, response in responses(run.model, run.source, free=run.free):
-            (told,) = response.trajectories
+            (trajectory,) = response.trajectories
             frame = response.to_frame()
             if piece.offset:
                 frame = frame.iloc[first:]
                 frame["time"] += piece.offset * response.sampling_time
             frame.to_csv(file, index=False, header=not scored.rows)
             with np.errstate(all="ignore"):
-                scored.add(piece.outputs[first:], told.model[first:])
-            if told.diverged is not None:
-                row, output = told.diverged
+                scored.add(piece.outputs[first:], trajectory.model[first:])
+            if trajectory.diverged is not None:
+                row, output = trajectory.diverged
                 text = f"the free run diverged in output '{output}' at step {piece.offset + row}; "
                 warnings.append(
                     Warning("free_run_diverged", text + "it has no values from there on.")

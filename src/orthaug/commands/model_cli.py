@@ -26,7 +26,7 @@ from orthaug.commands.program import (
     Which,
     app,
     prepare_jax,
-    tell,
+    print_result,
 )
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def simulate(
     which: Which = "fitted",
     force: Force = False,
 ) -> None:
-    """Free run of a saved model on a data file."""
+    """Simulate a saved model in free run on a data file."""
     from orthaug.commands import run
     from orthaug.commands.folder import check_file, chosen_model
 
@@ -85,7 +85,7 @@ def predict(
     which: Which = "fitted",
     force: Force = False,
 ) -> None:
-    """H-step-ahead prediction of a saved model."""
+    """Predict a data file with a saved model, a number of steps ahead."""
     from orthaug.commands import run
     from orthaug.commands.folder import check_file, chosen_model
 
@@ -98,10 +98,10 @@ def predict(
     check_file(out, model, data, Path(initial or data), force=force)
     prepare_jax()
     if observer:
-        response, told = run.observed(opened, horizon)
+        response, notes = run.observed(opened, horizon)
     else:
-        response, told = opened.model.predict(opened.record, horizon=horizon), []
-    _write_response(response, opened, out, force, [*opened.notes, *told])
+        response, notes = opened.model.predict(opened.record, horizon=horizon), []
+    _write_response(response, opened, out, force, [*opened.notes, *notes])
 
 
 @app.command()
@@ -132,7 +132,7 @@ def split(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Parameters of a saved model under another measure.
+    """Split the parameters of a saved model under another measure.
 
     Without training again.
     """
@@ -151,7 +151,7 @@ def split(
     for line in opened.notes:
         streams.say(line)
     result = splitting.split_model(opened, chosen)
-    tell(result, split_text(result), as_json)
+    print_result(result, split_text(result), as_json)
 
 
 @app.command()
@@ -172,7 +172,7 @@ def explain(
     rows: Rows = None,
     as_json: AsJson = False,
 ) -> None:
-    """Which terms the learner of a saved model has found.
+    """Explain which terms the learner of a saved model has found.
 
     And what to write into the physics.
     """
@@ -188,7 +188,7 @@ def explain(
     result = explain_model(opened, degree=degree, functions=functions or (), most=most)
     for line in explain_notes(model) if result.spec else ():
         streams.say(line)
-    tell(result, explain_text(result), as_json)
+    print_result(result, explain_text(result), as_json)
 
 
 @app.command()
@@ -205,7 +205,7 @@ def export(
     which: Which = "fitted",
     force: Force = False,
 ) -> None:
-    """A saved model as code that needs no orthaug."""
+    """Export a saved model as code that needs no orthaug."""
     from orthaug.commands import export as exporting
     from orthaug.commands.folder import chosen_model
 
@@ -243,7 +243,7 @@ def linearize(
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
-    """Operating points of a saved model; its poles and gains.
+    """Linearize a saved model: operating points, poles and gains.
 
     With intervals, and the frequency response.
     """
@@ -262,7 +262,7 @@ def linearize(
     found = linearized(opened, at, record, continuous=continuous)
     if out is not None:
         linearizing.write(found, out, force=force)
-    streams.echo(linearizing.told(found, as_json=as_json))
+    streams.echo(linearizing.printed(found, as_json=as_json))
     if out is not None and not as_json:
         streams.echo(f"\nwritten to {out}")
 
@@ -302,7 +302,7 @@ def track(
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
-    """Parameters of a saved model over new data, with an alarm.
+    """Track the parameters of a saved model over new data, with an alarm.
 
     By recursive least squares with forgetting.
     """
@@ -323,13 +323,13 @@ def track(
     )
     text = track_text(tracked.result)
     tracking.write_tracked(tracked, folder, text, force=force)
-    tell(tracked.result, text, as_json, folder)
+    print_result(tracked.result, text, as_json, folder)
 
 
 def _written_long(
     model: Path, data: Path, reading: ReadOptions, out: Path | None, force: bool, *, free: bool
 ) -> bool:
-    """Return whether the file is one that is not read at once.
+    """Return whether the file is one that is read piece by piece.
 
     Then its table is written piece by piece.
     """
@@ -361,15 +361,15 @@ def _write_response(
     force: bool,
     notes: Sequence[str] = (),
 ) -> None:
-    """The CSV and what is to say about it: scores go where the CSV does not."""
+    """Write the CSV, and print scores where the CSV does not go."""
     from orthaug.commands import run
     from orthaug.reports.text import response_text
 
     for line in (*notes, *(f"warning: {warning.text}" for warning in run.warnings(response))):
         streams.say(line)
     run.write_csv(response, opened, out, force=force)
-    told = response_text(response)
-    if told:
-        (streams.say if out is None else streams.echo)(told)
+    scores = response_text(response)
+    if scores:
+        (streams.say if out is None else streams.echo)(scores)
     if out is not None:
         streams.echo(f"written to {out}")

@@ -47,7 +47,7 @@ class MotionJob(Job):
     problem: MotionProblem
     measure: Measure
     engine: Engine
-    """Who sums over the segments."""
+    """The engine that sums over the segments."""
     suspects: tuple[MotionSuspect, ...] = ()
 
     @property
@@ -143,7 +143,7 @@ def _parts(loaded: tuple[Part, Part | None, tuple[Part, ...]]) -> list[Part | No
 
 
 def _check_choices(spec: Spec, motion: Motion) -> None:
-    """The rules between motion, learner, structure, criterion and solver, in the words of the spec."""
+    """Check that motion, learner, structure, criterion and solver go together."""
     try:
         learner, structure = spec.declared_learner(), spec.declared_structure()
         solver, criterion = spec.declared_solver(), spec.declared_criterion()
@@ -162,7 +162,7 @@ def _place(error: KeyedError) -> str:
 
 
 def _check_sizes(spec: Spec, problem: MotionProblem) -> None:
-    """Raise InputError where nothing would be scored, or training would not end."""
+    """Raise InputError where no row would be scored, or training would not end."""
     criterion = spec.declared_criterion()
     try:
         check_scored(criterion, max(len(e) for e in problem.record.experiments))
@@ -181,7 +181,10 @@ def _check_sizes(spec: Spec, problem: MotionProblem) -> None:
 
 
 def _measure_of(spec: Spec, problem: MotionProblem, folder: Path) -> Measure:
-    """Return the measure that a spec declares, tried on the guessed states: names and limits are wrong before any training."""
+    """Return the measure that a spec declares, tried on the guessed states.
+
+    So wrong names and limits are found before training.
+    """
     names = [str(lag) for lag in layout_of(problem.motion)]
     measure = spec.declared_measure(MeasurePlace(folder, names, problem.record, problem.first_row))
     rows = len(problem.record)  # a measure may weigh each of them

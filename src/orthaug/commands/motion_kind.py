@@ -1,4 +1,4 @@
-"""What is told of jobs whose physics are equations of motion."""
+"""Results of jobs whose physics are equations of motion."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _NOT_RICH = Warning(
 
 
 def checked(job: MotionJob) -> CheckResult:
-    """Return what the outputs tell apart, what the learner could imitate, substeps and holds."""
+    """Return identifiability, what the learner could imitate, substeps and holds."""
     from orthaug.analysis.absorbed import Waves
     from orthaug.analysis.imitation import imitation_before
     from orthaug.analysis.input_timing import dead_times, try_holds
@@ -56,8 +56,8 @@ def checked(job: MotionJob) -> CheckResult:
     problem, spec = job.problem, job.spec
     motion, criterion = problem.motion, spec.declared_criterion()
     segmented = SegmentedMotion.of(without_learner(problem), None, criterion)
-    told = identified(segmented)
-    if told is None:
+    identification = identified(segmented)
+    if identification is None:
         wild = "".join(
             f" {warning.text}" for warning in job.warnings if warning.code == "wild_samples"
         )
@@ -72,8 +72,12 @@ def checked(job: MotionJob) -> CheckResult:
         form = MotionDynamics(
             motion, problem.features, None, problem.record.sampling_time, problem.substeps
         )
-        shared = imitation_before(form, motion.coordinates.initial, told.states, told.inputs)
-        seen = shared_of_motion(form, motion.coordinates.initial, told.states, told.inputs)
+        shared = imitation_before(
+            form, motion.coordinates.initial, identification.states, identification.inputs
+        )
+        seen = shared_of_motion(
+            form, motion.coordinates.initial, identification.states, identification.inputs
+        )
         on_rows = shared_warnings(seen, [str(entry) for entry in form.features])
     posed, waves = (
         (problem, Waves())
@@ -83,7 +87,7 @@ def checked(job: MotionJob) -> CheckResult:
     trial = try_holds(posed, criterion, spec.declared_solver(), job.structure, waves)
     text, warnings = _about_steps(job, trial)
     warnings += [late.warning for late in dead_times(trial.task, spec.declared_solver())]
-    if told.by_any is None:
+    if identification.by_any is None:
         warnings.append(_NOT_RICH)
     return CheckResult.model_validate(
         {
@@ -91,10 +95,10 @@ def checked(job: MotionJob) -> CheckResult:
             "parameters": motion.names,
             "regressor": [*motion.names_of_states, *motion.inputs],
             "rows": len(problem.record),
-            "excitation": told.on_data,
-            "identifiability": told.by_any or told.on_data,
+            "excitation": identification.on_data,
+            "identifiability": identification.by_any or identification.on_data,
             "shared": shared,
-            "bias": _biases(job, trial) if told.on_data.full_rank else None,
+            "bias": _biases(job, trial) if identification.on_data.full_rank else None,
             "motion": {
                 "states": motion.names_of_states,
                 "integrator": motion.integrator,
@@ -117,7 +121,7 @@ def checked(job: MotionJob) -> CheckResult:
 
 
 def _biases(job: MotionJob, trial: Trial) -> list[dict[str, Any]] | None:
-    """Return what every suspect would do, about physics alone.
+    """Return the bias that each suspect would cause, with physics alone.
 
     Of the usual ones those that do anything, where none is named.
 
@@ -133,14 +137,14 @@ def _biases(job: MotionJob, trial: Trial) -> list[dict[str, Any]] | None:
 
 
 def refused(job: MotionJob, result: CheckResult) -> InputError | None:
-    """Parameters that the outputs do not tell apart, after the report."""
+    """Return an error where the outputs do not identify the parameters, after the report."""
     found = result.excitation
     if found.rank == found.columns:
         return None
     groups = "; ".join(
         f"{group[0]} changes no output"
         if len(group) == 1
-        else f"{', '.join(group)} cannot be told apart"
+        else f"{', '.join(group)} cannot be distinguished"
         for group in found.collinear
     )
     lacking = found.columns - found.rank
@@ -160,7 +164,7 @@ def content(
     responses: Mapping[str, tuple[Response, Response]],
     warnings: list[Any],
 ) -> tuple[MotionEstimate, dict[str, Any]]:
-    """Return the fit, and what results tell of it; warnings are added."""
+    """Return the fit and the content of its result; warnings are added."""
     from orthaug.analysis.imitation import MotionImitation
     from orthaug.analysis.robustness import robust_free_run
     from orthaug.inference.nearly_shared import shared_warnings
@@ -169,7 +173,7 @@ def content(
     motion, form = job.problem.motion, fit.model.form
     count, gram = len(motion.names), fit.model.statistics.gram
     found: dict[str, Any] = dict.fromkeys(("budget", "coarse", "parts"))
-    told: dict[str, Any] = dict.fromkeys(
+    fields: dict[str, Any] = dict.fromkeys(
         (*_UNKNOWN, "residuals", "stability", "shared", "measure_detail")
     )
     if fit.status.ok:
@@ -177,14 +181,14 @@ def content(
         fit = attempt("the robust covariance", lambda: robust_free_run(plain), warnings, plain)
         found = _analysed(job, fit, responses[job.train.name][1], warnings)
         warnings += closed_loop(job.train.record)
-        told |= {name: found[name] for name in ("residuals", "stability", "bias")}
+        fields |= {name: found[name] for name in ("residuals", "stability", "bias")}
     budget, coarse, parts = found["budget"], found["coarse"], found["parts"] or ()
     if fit.status.ok and form.bound is not None:
         seen = [str(entry) for entry in form.features]
-        told["shared"] = MotionImitation.of(seen, fit.shared)
+        fields["shared"] = MotionImitation.of(seen, fit.shared)
         warnings += shared_warnings(fit.shared, seen)
-        told["measure_detail"] = MeasureResult.of_motion(fit.split_by)
-    return fit, told | {
+        fields["measure_detail"] = MeasureResult.of_motion(fit.split_by)
+    return fit, fields | {
         "parameters": _parameters(fit, budget),
         "standard_errors": None
         if fit.std is None
@@ -210,7 +214,7 @@ def content(
 def _analysed(
     job: MotionJob, fit: MotionEstimate, free_run: Response, warnings: list[Any]
 ) -> dict[str, Any]:
-    """Return what is asked of a fit behind its training; None for an analysis that fails.
+    """Return the analyses of a fit; None for one that fails.
 
     Warnings are added.
     """
@@ -295,34 +299,37 @@ def figures(
 def physics_alone(
     job: MotionJob, fit: MotionEstimate, responses: Mapping[str, tuple[Response, Response]]
 ) -> Mapping[str, Response]:
-    """Return the free run of every part by the physics without the learner."""
+    """Return the free run of every part by the model's physics without its learner."""
     return {part: free.physics_alone for part, (_, free) in responses.items()}
 
 
 def _parameters(fit: MotionEstimate, budget: MotionBudget | None) -> list[ParameterResult]:
-    """Return the parameters with their intervals, whether the learner could imitate them, and what biases them."""
+    """Return the parameters with intervals, whether the learner could imitate them, and biases."""
     motion = fit.problem.motion
     values = fit.values if fit.status.ok else np.full(len(motion.names), np.nan)
     rows = parameter_rows(motion.parameters, values, fit.std, fit.interval, plain_std=fit.plain_std)
     learns = fit.model.form.bound is not None and fit.status.ok
-    told = [row.name not in fit.shared.untouched if learns else None for row in rows]
+    imitable = [row.name not in fit.shared.untouched if learns else None for row in rows]
     biases = [budget.of(row.name) if budget else None for row in rows]
-    return [row.told(shared, bias) for row, shared, bias in zip(rows, told, biases, strict=True)]
+    return [
+        row.with_bias(shared, bias)
+        for row, shared, bias in zip(rows, imitable, biases, strict=True)
+    ]
 
 
 def _about_steps(job: MotionJob, trial: Trial) -> tuple[str, list[Warning]]:
-    """Return what integrator and hold do to the outputs, in words; with what to be warned of."""
+    """Return a text on the errors of integrator and hold in the outputs, and warnings."""
     motion, problem, warnings = job.problem.motion, job.problem, []
     step = problem.record.sampling_time
     if motion.integrator == "discrete":
         return "The equations give the state one sample later: nothing is integrated.", warnings
     if trial.substeps is None:
-        told = (
+        sentences = (
             "physics alone has no finite free run from its initial values, so substeps and "
             "holds were not tried."
         )
-        return "", [Warning("physics_runs_away", told)]
-    told = [
+        return "", [Warning("physics_runs_away", sentences)]
+    sentences = [
         f"The fastest mode of the initial physics is {problem.fastest:.3g} 1/s, sampled every "
         f"{step:g} s; {trial.substeps} substep{'s' * (trial.substeps > 1)} of "
         f"{motion.integrator} in a sample"
@@ -340,13 +347,13 @@ def _about_steps(job: MotionJob, trial: Trial) -> tuple[str, list[Warning]]:
             f"{held.hold} {'no run' if held.residual is None else f'{held.residual:.4g}'}"
             for held in trial.holds
         )
-        told.append(
+        sentences.append(
             "Physics alone leaves, by the hold of its inputs, in deviations of the output: "
             f"{shown}."
         )
         if trial.best is None:
-            told.append("None explains the data clearly better than the declared one.")
+            sentences.append("None explains the data clearly better than the declared one.")
         else:
             text = f'the data are explained better by hold = "{trial.best}" than by the declared "{motion.hold}".'
             warnings.append(Warning("other_hold", text))
-    return " ".join(told), warnings
+    return " ".join(sentences), warnings

@@ -26,19 +26,21 @@ from orthaug.reports.result import FileResult
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """A part of the data: its record, and how many leading samples of each recording are not scored."""
+    """A part of the data: its record, and the leading samples of each recording not scored."""
 
     name: str
     record: Record
     skip: int
     files: tuple[FileResult, ...]
     warnings: tuple[Warning, ...] = ()
-    """Rows that were thinned out, or left out around missing samples."""
+    """Warnings on rows that were thinned out, or left out around missing samples."""
     source: Source | None = None
-    """All rows of the part, where its record is a witness of them only."""
+    """All rows of the part, where its record is only a subsample of them."""
 
     def without_short(self, first: int, least: int = 0) -> Part:
-        """Without stretches between missing samples that are too short for a row after the first `first`.
+        """Return the part without stretches between missing samples that are too short.
+
+        They have no row after the first `first`.
 
         Args:
             least: rows of a stretch that has a use.
@@ -48,8 +50,8 @@ class Part:
         record, gaps = long_stretches(
             self.record, self.skips, first, least, f"data.{self.name}: ", self.skip
         )
-        told = Warning("missing_rows", f"{self.name}: {gaps}")
-        return replace(self, record=record, warnings=(*self.warnings, told))
+        warning = Warning("missing_rows", f"{self.name}: {gaps}")
+        return replace(self, record=record, warnings=(*self.warnings, warning))
 
     @property
     def skips(self) -> tuple[int, ...]:
@@ -59,7 +61,7 @@ class Part:
         )
 
     def scored(self, start: int) -> Record:
-        """Return the record of the scored rows and their lags, where the first usable row is `start`."""
+        """Return the record of the scored rows and their lags; the first usable row is `start`."""
         kept = tuple(
             e.rows(max(0, skip - start), None)
             for e, skip in zip(self.record.experiments, self.skips, strict=True)
@@ -67,7 +69,7 @@ class Part:
         return replace(self.record, experiments=kept)
 
     def check_scorable(self, start: int, sampling_time: float, least: int = 0) -> None:
-        """Raise InputError where an experiment has no row to score or fewer than `least`, or another sampling time."""
+        """Raise InputError for an experiment with too few rows, or another sampling time."""
         if not same_step(self.record.sampling_time, sampling_time):
             raise InputError(
                 f"data.{self.name}: sampled every {self.record.sampling_time:g} s, the "
@@ -78,7 +80,7 @@ class Part:
             if len(experiment) < least:
                 raise InputError(
                     f"{experiment.source}: data.{self.name} has {len(experiment)} rows, too "
-                    f"few; at least {least} tell where a run of this motion starts."
+                    f"few; at least {least} determine where a run of this motion starts."
                 )
             if len(experiment) <= first:
                 raise InputError(
@@ -91,7 +93,7 @@ class Part:
 def long_stretches(
     record: Record, skips: Sequence[int], first: int, least: int = 0, what: str = "", skip: int = 0
 ) -> tuple[Record, str]:
-    """Return a record without stretches that are too short for a row after the first ones, and what was left out, in words.
+    """Return a record without stretches too short to predict a row, and a text on these.
 
     Args:
         skips: leading samples of each stretch that are not scored.
@@ -123,7 +125,7 @@ def long_stretches(
 
 
 def load_parts(path: Path, spec: Spec) -> tuple[Part, Part | None, tuple[Part, ...]]:
-    """Training, validation and test parts of the spec at `path`, as their files hold them."""
+    """Return training, validation and test parts of the spec at `path`, unprepared."""
     files = [path.parent / file for file in expanded(path, spec.data.train.files, "train")]
     stays = spec.engine_kind(files) in ("stream", "dask") and not spec.brought
     train = _load(path, spec, spec.data.train, "train", stays=stays)
@@ -138,7 +140,10 @@ def load_parts(path: Path, spec: Spec) -> tuple[Part, Part | None, tuple[Part, .
 
 
 def expanded(path: Path, entries: Sequence[str], name: str) -> list[str]:
-    """Files as the spec names them: a pattern such as `runs/*.parquet`, or a folder, stands for all in it, sorted."""
+    """Return the files that the spec names, sorted.
+
+    A pattern such as `runs/*.parquet`, or a folder, gives all files in it.
+    """
     found = []
     for entry in entries:
         if (path.parent / entry).is_dir():
@@ -161,7 +166,7 @@ def expanded(path: Path, entries: Sequence[str], name: str) -> list[str]:
 
 
 def _load(path: Path, spec: Spec, part: PartSection, name: str, *, stays: bool = False) -> Part:
-    """Read a part's files.
+    """Return a part with its files read.
 
     Messages begin with the file at fault; once it is read, with its name in the spec.
 
@@ -199,10 +204,10 @@ def _load(path: Path, spec: Spec, part: PartSection, name: str, *, stays: bool =
         records.append(record)
     record = Record.join(records)
     sources = (file for read, file in zip(records, files, strict=True) for _ in read.experiments)
-    told = tuple(
+    renamed = tuple(
         replace(e, source=file) for e, file in zip(record.experiments, sources, strict=True)
     )
-    record = replace(record, experiments=told)
+    record = replace(record, experiments=renamed)
     warnings = ()
     if part.every > 1:
         given = spec.data.sampling_time
@@ -224,7 +229,7 @@ def _load(path: Path, spec: Spec, part: PartSection, name: str, *, stays: bool =
 
 
 def _left(path: Path, spec: Spec, part: PartSection, name: str, files: Sequence[str]) -> Part:
-    """Return a part whose rows stay in its Parquet files."""
+    """Return a part whose rows remain in its Parquet files."""
     if spec.data.prepare:
         raise InputError(
             f"{path}: 'data.prepare' needs the rows in memory, and these stay in their files; prepare the files, or "
@@ -256,16 +261,16 @@ def _left(path: Path, spec: Spec, part: PartSection, name: str, files: Sequence[
     if spec.data.time is None:
         warnings = _other_step(path, spec, files, name, part.columns)
     if len(record) < total:
-        told = (
+        text = (
             f"{name}: findings and figures look at {len(record)} of {total} rows, in windows "
             "spread over them."
         )
-        warnings += (Warning("witness", told),)
+        warnings += (Warning("witness", text),)
     return Part(name, record, part.skip, tuple(results), warnings, source)
 
 
 def _options(spec: Spec, part: PartSection) -> dict[str, Any]:
-    """Return how the files of a part are read, wherever their rows are."""
+    """Return the options for reading the files of a part, in memory or not."""
     data = spec.data
     named = {key: getattr(data, key) for key in ("sampling_time", "time", "experiment", "missing")}
     channels = {"inputs": spec.channels(data.inputs), "outputs": spec.channels(data.outputs)}
@@ -273,7 +278,7 @@ def _options(spec: Spec, part: PartSection) -> dict[str, Any]:
 
 
 def _used_columns(spec: Spec, columns: Mapping[str, str]) -> set[str]:
-    """Return the columns of a part's files that are channels, or tell experiments apart."""
+    """Return the columns of a part's files that are channels, or that separate experiments."""
     channels = [*spec.channels(spec.data.inputs), *spec.channels(spec.data.outputs)]
     return {columns.get(c.name, c.file_column) for c in channels} | {spec.data.experiment or ""}
 
@@ -294,7 +299,7 @@ def _guessed_encoding(path: Path, files: Sequence[str], name: str) -> tuple[Warn
 def _other_step(
     path: Path, spec: Spec, files: Sequence[str], name: str, columns: Mapping[str, str]
 ) -> tuple[Warning, ...]:
-    """Return a warning where a file tells another sampling time than the spec does."""
+    """Return a warning where the sampling time of a file differs from that of the spec."""
     used = _used_columns(spec, columns)
     step, given = spec.data.sampling_time or 1.0, spec.data.sampling_time is not None
     for file in files:
@@ -309,7 +314,7 @@ def _other_step(
         header = clock.column.header
         remedy = f'time = "{header}"' if clock.instants else f"sampling_time = {clock.step:g}"
         text = (
-            f"{name}: {said}, but column '{header}' of {file} tells {clock.step:g} s; perhaps "
+            f"{name}: {said}, but column '{header}' of {file} gives {clock.step:g} s; perhaps "
             f"{remedy} is meant."
         )
         return (Warning("other_sampling_time", text),)

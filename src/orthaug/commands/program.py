@@ -1,4 +1,4 @@
-"""The program around its commands: what arguments mean, and how errors become one line and an exit code."""
+"""The frame of the commands: meaning of arguments, and errors as one line and an exit code."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Interrupted(Exception):
 
 
 class OutputClosed(Exception):
-    """Nobody reads the output any more, as after `| head`.
+    """The reader of the output has closed it, as after `| head`.
 
     Typer would turn a BrokenPipeError into exit code 1.
     """
@@ -47,7 +47,7 @@ class _Group(typer.core.TyperGroup):
 
 
 class ListOptionCommand(typer.core.TyperCommand):
-    """A command each of whose repeatable options takes several values too: `--inputs a b`."""
+    """A command whose repeatable options take several values too: `--inputs a b`."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         valued = {
@@ -61,7 +61,7 @@ class ListOptionCommand(typer.core.TyperCommand):
 
 
 def _repeated(args: Sequence[str], lists: Set[str], valued: Set[str]) -> list[str]:
-    """Return arguments where an option of a list stands before each of its values.
+    """Return arguments with the option of a list repeated before each of its values.
 
     One value is left to be the argument of the command where there would be none: a file that
     exists, or the last.
@@ -156,7 +156,7 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of the 
 
 
 def main() -> None:
-    """Entry point: runs the command and turns errors into one line and an exit code."""
+    """Run the command and turn errors into one line and an exit code."""
     try:
         code = app(prog_name="orthaug", standalone_mode=False)
         sys.stdout.flush()
@@ -190,7 +190,7 @@ def main() -> None:
 
 
 def _complaint(error: Exception) -> str | None:
-    """Return what to tell of an error that is not ours; None of one that should not be."""
+    """Return the message for an error of another library; None for one that is not caught."""
     from orthaug._base.jax import starts
 
     complaint = getattr(error, "format_message", None)  # typer's own, about arguments
@@ -227,7 +227,7 @@ def options(
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
-    """What stands before a command: -v, -vv or ORTHAUG_LOG ask for the log."""
+    """Set the options before a command: -v, -vv or ORTHAUG_LOG ask for the log."""
     level, levels = os.environ.get("ORTHAUG_LOG", "").lower(), ("info", "debug")
     if verbose or level:
         from orthaug._base.progress import show_log
@@ -243,8 +243,8 @@ def _fail(message: str, code: int) -> None:
     sys.exit(code)
 
 
-def tell(result: Content, text: str, as_json: bool, place: object = None) -> None:
-    """A result on standard output, as JSON or in words; then what was written."""
+def print_result(result: Content, text: str, as_json: bool, place: object = None) -> None:
+    """Print a result on standard output, as JSON or in words; then the place that was written."""
     written = f"\n\nwritten to {place}" if place is not None else ""
     if place in PARTIALS.overtaken:
         streams.say(
@@ -255,7 +255,7 @@ def tell(result: Content, text: str, as_json: bool, place: object = None) -> Non
 
 
 def other_writes() -> bool:
-    """Return whether this is one of several processes and another one writes, which is said."""
+    """Return whether another one of several processes writes the result; then print that."""
     from orthaug.models.hosts import waits
 
     text = waits()
@@ -265,23 +265,23 @@ def other_writes() -> bool:
 
 
 def arguments(command: str, spec: Path, **options: Any) -> tuple[str, ...]:
-    """Return what a command was asked for, to be asked again: the options that were given, under their names.
+    """Return the arguments of a command, to run it again: the options that were given, by name.
 
     Examples:
         >>> arguments("fit", Path("a.toml"), out=Path("b"), resume=False, model=None, force=True)
         ('fit', 'a.toml', '--out', 'b', '--force')
     """
-    told = [command, str(spec)]
+    words = [command, str(spec)]
     for name, value in options.items():
         if value is True:
-            told.append(f"--{name}")
+            words.append(f"--{name}")
         elif value:
-            told += [
+            words += [
                 part
                 for one in (value if isinstance(value, list) else [value])
                 for part in (f"--{name}", str(one))
             ]
-    return tuple(told)
+    return tuple(words)
 
 
 def prepare_jax() -> None:

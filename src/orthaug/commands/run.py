@@ -1,4 +1,4 @@
-"""Saved models on data files: what `orthaug simulate`, `orthaug predict` and `orthaug explain` do."""
+"""Saved models on data files: `orthaug simulate`, `orthaug predict` and `orthaug explain`."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """Which rows and columns of a data file are read, as a part of a spec says it."""
+    """The rows and columns of a data file to read, as a part of a spec declares them."""
 
     missing: str = "error"
     rows: Any = None
@@ -40,8 +40,7 @@ class ReadOptions:
     every: int = 1
     columns: Mapping[str, str] = field(default_factory=dict)
     prepare: bool | None = None
-    """Whether the rows go through the steps of the model's training data; None where nobody has
-    said.
+    """Whether the rows go through the preparation of the training data; None where that is open.
     """
 
     @classmethod
@@ -53,7 +52,7 @@ class ReadOptions:
         columns: Sequence[str],
         prepare: bool | None,
     ) -> ReadOptions:
-        """Of the options of a command.
+        """Return the options of a command.
 
         Raises:
             InputError: an option that is none.
@@ -74,7 +73,7 @@ class ReadOptions:
 
 @dataclass(frozen=True, eq=False)
 class ModelOnData:
-    """A saved model with the record of a data file, and how many rows of it were read, missing ones too."""
+    """A saved model with the record of a data file, and the number of rows read."""
 
     model: Model | MotionModel
     record: Record
@@ -85,7 +84,7 @@ class ModelOnData:
 
 
 def read_rows(text: str | None) -> tuple[int, int] | None:
-    """`A:B` as a half-open range of rows."""
+    """Return the range `A:B` as a half-open range of rows."""
     if text is None:
         return None
     start, _, stop = text.partition(":")
@@ -97,7 +96,7 @@ def read_rows(text: str | None) -> tuple[int, int] | None:
 
 
 def trained_reading(model: Path, data: Path) -> ReadOptions | None:
-    """Return how a file was read to train a model, by the result beside that.
+    """Return the options by which a model's training file was read, from the result beside it.
 
     None where it is none of its files.
     """
@@ -114,7 +113,9 @@ def trained_reading(model: Path, data: Path) -> ReadOptions | None:
 
 
 def open_explained(model: Path, data: Sequence[Path], rows: tuple[int, int] | None) -> ModelOnData:
-    """Return a model with files to explain it over: of those that it was trained on, where no `rows` are given, those rows.
+    """Return a model with the files to explain it over.
+
+    Of files that it was trained on, those rows are read where no `rows` are given.
 
     Raises:
         InputError: as `open_run`.
@@ -137,7 +138,7 @@ def open_explained(model: Path, data: Sequence[Path], rows: tuple[int, int] | No
 
 
 def rows_taken(reading: ReadOptions) -> str:
-    """Which rows of a file were trained on, where that is not all."""
+    """Return a text on the rows of a file that were trained on; empty where these are all."""
     return (
         "rows " + " and ".join(f"{start}:{stop}" for start, stop in reading.rows)
         if reading.rows
@@ -157,8 +158,9 @@ def open_run(
 
     Outputs only where the file has them, unless needed.
 
-    Args: ahead: rows behind the first usable one before a stretch between missing samples has a
-        value.
+    Args:
+        ahead: rows behind the first usable one before a stretch between missing samples has a
+            value.
 
     Raises:
         InputError: no model, no file, missing columns, no stretch that is long enough.
@@ -189,7 +191,7 @@ def open_run(
         record = record_for(loaded, data, held, reading)
     except MissingSampleError as error:
         raise InputError(f"{error} --missing skip leaves such rows out.") from None
-    rows, told = (
+    rows, notes = (
         len(record) + record.missing,
         prepared_notes(loaded, record if reading.prepare else None),
     )
@@ -199,8 +201,8 @@ def open_run(
         )  # a state to predict from
         first = loaded.form.first_row + ahead + bool(estimated)
         record, text = long_stretches(record, [0] * len(record.experiments), first)
-        told += (f"note: {data}: {text}",)
-    return ModelOnData(loaded, record, data, rows, told)
+        notes += (f"note: {data}: {text}",)
+    return ModelOnData(loaded, record, data, rows, notes)
 
 
 def record_for(
@@ -229,7 +231,7 @@ def record_for(
 
 
 def check_instants(model: Model | MotionModel, data: Path) -> None:
-    """Raise InputError for a model of data with other instants than their files: nobody said which these are."""
+    """Raise InputError where the file cannot give the instants that the model needs."""
     steps = [done.named for done in model.prepared if done.step in SAMPLING]
     if steps:
         raise InputError(
@@ -240,7 +242,7 @@ def check_instants(model: Model | MotionModel, data: Path) -> None:
 
 
 def held_outputs(model: Model | MotionModel, data: Path, reading: ReadOptions) -> list[Channel]:
-    """Return the outputs that a file has columns of."""
+    """Return the outputs that a file has columns for."""
     return [
         c for c in model.outputs if has_column(data, reading.columns.get(c.name, c.file_column))
     ]
@@ -253,7 +255,7 @@ _DETRENDED = " Detrended signals are deviations from their trend in each file."
 def prepared_notes(
     model: Model | MotionModel, record: Record | None = None, what: str = _RAW
 ) -> tuple[str, ...]:
-    """Return what to know of a model whose training data were prepared.
+    """Return notes on a model whose training data were prepared.
 
     Args:
         record: other data that went through the same; what the steps found there is told.
@@ -274,7 +276,10 @@ def prepared_notes(
 
 
 def read_initial(initial: str | None, opened: ModelOnData) -> str | Any:
-    """Return the `initial` of `Model.simulate`: measured where the data have outputs, zero otherwise, or a CSV's rows."""
+    """Return the `initial` of `Model.simulate`.
+
+    It is "measured" where the data have outputs, "zero" otherwise, or the rows of a CSV.
+    """
     gaps, measured = len(opened.record.experiments) > 1, bool(opened.record.outputs)
     if gaps and not (measured and initial in (None, "measured")):
         remedy = (
@@ -311,7 +316,7 @@ def read_initial(initial: str | None, opened: ModelOnData) -> str | Any:
 
 
 def notes(opened: ModelOnData, initial: str | None) -> list[str]:
-    """Return what a user may not expect of a free run: where it starts when nothing says so."""
+    """Return notes on a free run: where it starts when no initial state is given."""
     if initial is not None or opened.record.outputs or not opened.model.form.states:
         return [*opened.notes]
     names = ", ".join(channel.name for channel in opened.model.outputs)
@@ -323,7 +328,7 @@ def notes(opened: ModelOnData, initial: str | None) -> list[str]:
 
 
 def with_initial(opened: ModelOnData, initial: str | Any) -> Record:
-    """Return the record with the outputs of its first rows replaced, for predictions that start from others."""
+    """Return the record with the outputs of its first rows replaced, as another initial state."""
     if isinstance(initial, str) and initial == "measured":
         return opened.record
     start = opened.model.form.first_row
@@ -348,7 +353,7 @@ def open_ahead(
     *,
     observer: bool = False,
 ) -> ModelOnData:
-    """As `open_run` for predictions `horizon` steps ahead.
+    """Load a model and read its channels as `open_run`, for predictions `horizon` steps ahead.
 
     An observer's record keeps missing outputs.
 
@@ -370,7 +375,7 @@ def open_ahead(
 
 
 def observed(opened: ModelOnData, horizon: int) -> tuple[Response, list[str]]:
-    """Return the prediction `horizon` steps ahead from an observer's state, and whether its band is what it says."""
+    """Return the prediction `horizon` steps ahead from an observer's state, and notes."""
     from orthaug.analysis.observer import Observer
 
     observer = Observer(opened.model)
@@ -379,7 +384,7 @@ def observed(opened: ModelOnData, horizon: int) -> tuple[Response, list[str]]:
 
 
 def _of_band(found: Consistency, response: Response) -> list[str]:
-    """NIS with its interval where outputs were measured.
+    """Return the NIS with its interval where outputs were measured.
 
     A warning where it leaves that, for the band is then wrong.
     """
@@ -394,35 +399,35 @@ def _of_band(found: Consistency, response: Response) -> list[str]:
     if not np.isfinite(found.nis) or not len(apart):
         return []
     held, (low, high) = float(np.mean(np.abs(apart) <= BAND)), found.expected
-    told = (
+    text = (
         f"the innovations' squares are {found.nis:.3g} times what the observer expects (NIS, "
         f"{low:.3g} to {high:.3g} where it knows its noise); its 95 % band holds "
         f"{percent(held, 3)} of what was measured."
     )
     if found.consistent:
-        return [f"note: {told}"]
+        return [f"note: {text}"]
     why = (
         "its noises are too small, or the model is wrong here"
         if found.nis > high
         else "its noises are too large"
     )
     return [
-        f"warning: {told} Do not take the band for one of 95 %: {why}. "
+        f"warning: {text} Do not take the band for one of 95 %: {why}. "
         "oa.Observer(oa.load(MODEL)).tuned(record) finds noises by the likelihood of a record."
     ]
 
 
 def warnings(response: Response) -> list[Warning]:
-    """Warnings about a response."""
-    told = "the free run diverged in output '{}' at step {}; it has no values from there on."
+    """Return warnings about a response."""
+    text = "the free run diverged in output '{}' at step {}; it has no values from there on."
     ends = (trajectory.diverged for trajectory in response.trajectories if trajectory.diverged)
-    return [Warning("free_run_diverged", told.format(output, step)) for step, output in ends]
+    return [Warning("free_run_diverged", text.format(output, step)) for step, output in ends]
 
 
 def write_csv(
     response: Response, opened: ModelOnData, out: Path | None, *, force: bool = False
 ) -> None:
-    """One row per data row, empty cells where there is no value.
+    """Write one row per data row, with empty cells where there is no value.
 
     To a file (whole or not at all) or standard output.
     """
@@ -435,7 +440,7 @@ def write_csv(
 
 
 def _table(response: Response, opened: ModelOnData) -> Any:
-    """Return the tables of all stretches in the rows of the file.
+    """Return the tables of all stretches in the order of the file's rows.
 
     Of rows that were left out the time alone.
     """
@@ -456,7 +461,7 @@ def _table(response: Response, opened: ModelOnData) -> Any:
 
 
 def explain_notes(model: Path) -> list[str]:
-    """Return what to write beside proposed terms, where the result of the model has a map to physical parameters."""
+    """Return notes beside proposed terms, where the result has a map to physical parameters."""
     for content in results_beside(model):
         with suppress(AttributeError, KeyError, TypeError):
             if content["spec"].get("physics"):
@@ -472,8 +477,9 @@ def explain_model(
 ) -> ExplainResult:
     """Return the content of the explanation of a model over its data.
 
-    Raises: InputError: physics alone, data without what the learner is evaluated at, too many
-        candidates.
+    Raises:
+        InputError: physics alone, data without what the learner is evaluated at, too many
+            candidates.
     """
     from orthaug.analysis.hidden_state import structure_test
     from orthaug.commands.attempt import attempt

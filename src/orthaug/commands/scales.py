@@ -1,4 +1,4 @@
-"""Channels whose numbers are of a size that hardly any unit has: the likely cause where a free run overflows."""
+"""Channels with numbers of an unlikely size: a probable cause where a free run overflows."""
 
 from __future__ import annotations
 

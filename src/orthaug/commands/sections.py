@@ -1,4 +1,4 @@
-"""Tables of the spec as pydantic models: their common base, and the keys that a registry's kinds declare.
+"""Tables of the spec as pydantic models: a common base, and the keys of the kinds in a registry.
 
 What is wrong with one is told in one sentence: pydantic's complaints in the words of TOML.
 """
@@ -55,7 +55,7 @@ class KindSection(Section):
     """
 
     registries: ClassVar[Mapping[str, Registry]] = {}
-    """By the key that chooses a kind."""
+    """The registries, by the key that chooses a kind."""
 
     if TYPE_CHECKING:
 
@@ -100,7 +100,7 @@ def _field(key: Key) -> tuple[Any, Any]:
 
 
 def _in_file(annotation: Any) -> Any:
-    """Return the type of what a file holds for a declaration's type: lists for tuples, finite numbers."""
+    """Return the type in a file for a type in a declaration: lists for tuples, finite numbers."""
     origin, inner = typing.get_origin(annotation), typing.get_args(annotation)
     if origin is Annotated:
         limits = []
@@ -130,7 +130,7 @@ def _in_file(annotation: Any) -> Any:
 
 
 def _thawed(value: Any) -> Any:
-    """Tuples as lists, as files hold them."""
+    """Return a value with tuples as lists, as files hold them."""
     if isinstance(value, tuple | list):
         return [_thawed(item) for item in value]
     return (
@@ -181,7 +181,7 @@ def _shown(value: Any) -> str:
 
 
 def _plain(message: str) -> str:
-    """Pydantic's words in those of TOML."""
+    """Return a message of pydantic in the words of TOML."""
     if "at least 1 item" in message or "at least 1 character" in message:
         return "at least one entry" if "item" in message else "some text"
     if "after validation" in message:
@@ -195,7 +195,7 @@ def _plain(message: str) -> str:
 
 
 def _key(location: tuple[Any, ...], content: Any) -> str:
-    """Return the key's path in the file; pydantic's names of union branches are not part of it."""
+    """Return the key's path in the file, without pydantic's names of union branches."""
     text = ""
     for i, part in enumerate(location):
         if isinstance(part, int):

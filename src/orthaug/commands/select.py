@@ -1,4 +1,4 @@
-"""The structure for a spec: what `orthaug select` does."""
+"""Selection of the structure of a spec: what `orthaug select` does."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ _DEGREE = 3  # of the terms that a spec without [learner] is searched with
 
 @dataclass(frozen=True, eq=False)
 class SelectionReport:
-    """A job, what was selected for it, and the result that is written."""
+    """A job, its selected structure, and the result that is written."""
 
     job: LaggedJob
     selection: Selection
     result: SelectResult
     spec: str
-    """The spec with the choice, for its folder."""
+    """The spec with the selection, for its folder."""
 
 
 def open_select(path: Path) -> tuple[LaggedJob, Spec]:
@@ -69,12 +69,12 @@ def open_select(path: Path) -> tuple[LaggedJob, Spec]:
     return open_lagged(path, alone), spec
 
 
-def select_for(job: LaggedJob, spec: Spec, folder: Path, told: OnStage) -> SelectionReport:
-    """Select, and write the choice into the spec.
+def select_for(job: LaggedJob, spec: Spec, folder: Path, report_model: OnStage) -> SelectionReport:
+    """Select the structure, and write the choice into the spec.
 
     Args:
         folder: where the new spec will be; its paths are relative to that.
-        told: called with the stage and each model that was judged.
+        report_model: called with the stage and each model that was judged.
 
     Raises:
         InputError: what cannot be selected from.
@@ -108,7 +108,7 @@ def select_for(job: LaggedJob, spec: Spec, folder: Path, told: OnStage) -> Selec
 
 
 def steps_at_most(terms: int | None) -> int:
-    """Return how many models the path of terms has at most, forward."""
+    """Return the largest number of models on the path of terms, forward."""
     from orthaug.selection.selecting import MOST
     from orthaug.selection.term_path import steps
 
@@ -116,7 +116,7 @@ def steps_at_most(terms: int | None) -> int:
 
 
 def write_selected(selected: SelectionReport, folder: Path, *, force: bool = False) -> None:
-    """result.json, spec.toml, table.csv and the figure, whole or not at all."""
+    """Write result.json, spec.toml, table.csv and the figure, whole or not at all."""
     from orthaug.reports.drawing import save
     from orthaug.reports.plots import selection_figure
 
@@ -130,7 +130,7 @@ def write_selected(selected: SelectionReport, folder: Path, *, force: bool = Fal
 
 
 def _learner(spec: Spec) -> Learner | None:
-    """Return what is searched: the declared learner, or terms where none is declared."""
+    """Return the learner to search: the declared one, or terms where none is declared."""
     if "learner" not in spec.model_fields_set:
         return Terms(degree=_DEGREE)
     declared = spec.learner.declared(LEARNERS, spec.learner.kind)
@@ -152,7 +152,7 @@ def _largest(spec: Spec) -> Lags | None:
 
 
 def _criterion(spec: Spec) -> Criterion:
-    """Return the declared one; the free run where the spec does not say."""
+    """Return the declared criterion; the free run where the spec has none."""
     focus = "simulation" if spec.training.focus == "auto" else spec.training.focus
     return spec.training.declared(CRITERIA, focus)
 
@@ -281,7 +281,7 @@ def _from(folder: Path, job: LaggedJob, files: Sequence[str]) -> list[str]:
 
 
 def _rebase(table: Any, old: Path, new: Path) -> None:
-    """Make every list `files` relative to another folder."""
+    """Rewrite every list `files` relative to another folder."""
     for key, value in table.items():
         if isinstance(value, dict):
             _rebase(value, old, new)

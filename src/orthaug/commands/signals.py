@@ -39,7 +39,7 @@ def ending(words: str, during: str, kept: str = "", then: str = "") -> str:
 
 
 class SignalWatch:
-    """Ends the program on a signal, once it is started.
+    """A watch that ends the program on a signal, once it is started.
 
     Before that, signals do what they always do.
     """
@@ -52,7 +52,7 @@ class SignalWatch:
         self._asked: threading.Event | None = None
 
     def start(self) -> None:
-        """Wait for signals from now on.
+        """Begin to wait for signals.
 
         Those that the program is to ignore, as `nohup` asks, are ignored.
         """
@@ -82,7 +82,7 @@ class SignalWatch:
 
     @contextmanager
     def asking(self) -> Iterator[threading.Event]:
-        """The first Ctrl-C sets the event, for whoever can stop with what there is.
+        """Yield an event that the first Ctrl-C sets, for work that can stop with a partial result.
 
         The next ends the program.
         """
@@ -95,7 +95,7 @@ class SignalWatch:
             self._asked = None
 
     def hold(self) -> None:
-        """Do not go on where the program is about to end: what fails then fails because of that."""
+        """Wait where the program is about to end: an error then is only a consequence."""
         while self.ending:
             time.sleep(1.0)
 
@@ -144,7 +144,10 @@ class SignalWatch:
 
 
 def _leave_to_the_thread(number: int, frame: object) -> None:
-    """Python must have a handler, or the signal ends the process before the thread hears of it."""
+    """Install a handler that does nothing: the thread receives the signal.
+
+    Without a handler Python ends the process before the thread hears of it.
+    """
 
 
 WATCH = SignalWatch()  # of the process, as its signals are

@@ -91,7 +91,7 @@ class BaselineSection(Section):
 
 
 class PhysicsSection(Section):
-    """What θ is made of."""
+    """Physical parameters, and the expressions of θ in them."""
 
     parameters: Annotated[dict[str, PhysicalSection], Field(min_length=1)]
     theta: Annotated[dict[str, str], Field(min_length=1)]
@@ -148,7 +148,7 @@ class MeasureSection(KindSection):
 
 
 class StructureSection(KindSection):
-    """How physics and learner share the fitted function."""
+    """The structure: how physics and learner share the fitted function."""
 
     registries = {"kind": STRUCTURES}
     kind: str = "orthogonal"
@@ -181,7 +181,7 @@ class TrainingSection(KindSection):
         return self
 
     def chosen_focus(self) -> str:
-        """Return the focus.
+        """Return the focus of training.
 
         `prediction` where `horizon` asks for more than one step ahead and no focus is written.
         """
@@ -197,7 +197,7 @@ class ChosenOnSection(Section):
 
 
 class SelectionSection(Section):
-    """What `orthaug select` looks through: the largest orders, terms at most, widths, blocks held out; and on what."""
+    """Limits of `orthaug select`: the largest orders, terms at most, widths, blocks held out."""
 
     na: Count | None = None
     nb: Orders | None = None
@@ -246,12 +246,12 @@ class Spec(Section):
         wrong = {"output"} if self.motion is not None else {"equation", "factor", "unit"}
         for i, section in enumerate(self.suspects):
             for key in sorted(section.model_fields_set & wrong):
-                told = (
+                found = (
                     "beside [motion]; expected `equation`"
                     if self.motion
                     else "without [motion], whose key it is"
                 )
-                raise ValueError(f"`suspects[{i}].{key}`: found {told}")
+                raise ValueError(f"`suspects[{i}].{key}`: found {found}")
         if self.motion is not None and self.training.ensemble:
             raise ValueError(
                 "`training.ensemble`: a motion has none, for medians of runs follow no equations"
@@ -316,7 +316,7 @@ class Spec(Section):
         )
 
     def declared_learner(self) -> Learner | None:
-        """Return the learner; None for physics alone, as of a motion that nothing is added to."""
+        """Return the learner; None for physics alone, as of a motion with no learned part."""
         if (
             self.motion is not None
             and not self.motion.learns
@@ -332,13 +332,13 @@ class Spec(Section):
         return over_lags(learner, self.declared_baseline(), self.lag_orders(), *channels)
 
     def learner_inputs(self) -> tuple[str, ...] | None:
-        """Return what the learner sees; None for all lags."""
+        """Return the learner's inputs; None for all lags."""
         return getattr(self.declared_learner(), "inputs", None)
 
     def declared_structure(
         self, kind: str | None = None, measure: Measure | None = None
     ) -> Structure:
-        """Return the structure, or another kind with the same keys.
+        """Return the declared structure, or another kind with the same keys.
 
         Under a measure where it splits θ by one.
         """
@@ -347,7 +347,7 @@ class Spec(Section):
         return replace(structure, measure=measure) if takes and measure is not None else structure
 
     def declared_measure(self, place: MeasurePlace) -> Measure:
-        """Return the measure, with what it reads from files."""
+        """Return the measure, with its data read from files."""
         section = self.structure.measure
         return resolve(section.declared(MEASURES, section.kind), place)
 
@@ -368,7 +368,7 @@ class Spec(Section):
         return resolve(self.training.declared(SOLVERS, self.training.solver))
 
     def engine_kind(self, files: Sequence[Path]) -> str:
-        """Who sums over rows that come from these files.
+        """Return the kind of engine that sums over the rows of these files.
 
         Raises:
             InputError: rows that are not in memory, for training that flies over them.
@@ -387,14 +387,14 @@ class Spec(Section):
 
     @property
     def brought(self) -> bool:
-        """Return whether training reads all rows into memory: of a motion, and of free runs over whole experiments."""
+        """Whether training reads all rows into memory."""
         free_run = self.declared_criterion().free_run
         return self.motion is not None or (free_run is not None and not free_run.steps)
 
     def regularizations(
         self, *, linear: bool, validated: bool, kind: str | None = None
     ) -> tuple[str | float, ...]:
-        """Return those that every start is run with, in the structure that is declared or another kind."""
+        """Return the regularizations that every start is run with, in a structure."""
         given = self.training.regularization
         declared = (
             self.declared_solver(),
@@ -411,7 +411,7 @@ class Spec(Section):
         )
 
     def runs(self, *, linear: bool) -> int:
-        """Return how many runs a fit makes: restarts times regularizations."""
+        """Number of runs in a fit: restarts times regularizations."""
         validated = self.data.validation is not None
         return self.training.restarts * len(
             self.regularizations(linear=linear, validated=validated)

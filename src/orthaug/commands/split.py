@@ -1,4 +1,4 @@
-"""Parameters of a saved model under another measure: what `orthaug split` does."""
+"""Parameters of a saved model under another measure: `orthaug split`."""
 
 from __future__ import annotations
 
@@ -54,11 +54,11 @@ def open_training(model: Path, data: Sequence[Path], rows: tuple[int, int] | Non
         if rows is None:
             notes += [f"note: {path.name}: {taken}, those of the training."] if taken else []
         elif own and own.rows != [list(rows)]:
-            told = (
+            text = (
                 f"the model was trained on {taken or 'all rows'} of {path.name}, not on rows "
                 f"{rows[0]}:{rows[1]}."
             )
-            warnings.append(Warning("other_training_data", told))
+            warnings.append(Warning("other_training_data", text))
         read.append(
             record_for(loaded, path, loaded.outputs, replace(reading, rows=rows or reading.rows))
         )
@@ -69,7 +69,7 @@ def open_training(model: Path, data: Sequence[Path], rows: tuple[int, int] | Non
 
 
 def _other_files(model: Path, data: Sequence[Path]) -> list[Warning]:
-    """Return a warning where the result of a model has other files' checksums."""
+    """Return a warning where the checksums of the files differ from those in the model's result."""
     for content in results_beside(model):
         with suppress(KeyError, TypeError):
             kept = {file["sha256"]: file["file"] for file in content["data"]["train"]}
@@ -86,12 +86,13 @@ def _other_files(model: Path, data: Sequence[Path]) -> list[Warning]:
 
 
 def read_measure(kind: str, given: Mapping[str, Sequence[str]], opened: ModelOnData) -> Measure:
-    """Return the measure of a kind from the values `given` to each option.
+    """Return the measure of a kind from the values `given` for each option.
 
     The registry says which kind takes which.
 
-    Raises: InputError: an unknown kind, an option of another kind or without what it needs, files
-        that do not fit.
+    Raises:
+        InputError: an unknown kind, an option of another kind or without what it needs, files that
+            do not fit.
     """
     check_choice(kind, MEASURES, "--measure")
     values = {}
@@ -113,7 +114,7 @@ def read_measure(kind: str, given: Mapping[str, Sequence[str]], opened: ModelOnD
 
 
 def _read(key: Key, option: str, texts: Sequence[str]) -> Any:
-    """Return the value of a key: limits by raw lag for a mapping, the texts themselves otherwise."""
+    """Return the value of a key: for a mapping limits by raw lag, otherwise the texts."""
     if get_origin(key.type) is not Mapping:
         return tuple(texts)
     limits: dict[str, tuple[float, float]] = {}
@@ -137,25 +138,26 @@ def _read(key: Key, option: str, texts: Sequence[str]) -> Any:
 def split_model(opened: ModelOnData, measure: Measure) -> SplitResult:
     """Return the parameters of a saved model under a measure.
 
-    Raises: InputError: a θ at a bound, a measure that does not fit the model, other data than those
-        of its training.
+    Raises:
+        InputError: a θ at a bound, a measure that does not fit the model, other data than those of
+            its training.
     """
     return _SPLITS[type(opened.model)](opened.model, opened.record, measure, opened.warnings)
 
 
 def _split_lagged(
-    model: Model, record: Record, measure: Measure, told: Sequence[Warning]
+    model: Model, record: Record, measure: Measure, warnings: Sequence[Warning]
 ) -> SplitResult:
     from orthaug.inference.covariance import interval
     from orthaug.inference.splitting import split_under
 
     parameters = model.form.baseline.parameters
-    stands = [
+    bounded = [
         p.name for p, value in zip(parameters, model.theta, strict=True) if value in (p.min, p.max)
     ]
-    if stands:
+    if bounded:
         raise InputError(
-            f"{', '.join(stands)} stands at a bound, and a split knows none; fit without the "
+            f"{', '.join(bounded)} is at a bound, which a split does not impose; fit without the "
             "bound, or with `fixed = true` there."
         )
     support = Support(model.fitting(record, need_outputs=True), model.form.layout, model.form.used)
@@ -169,13 +171,13 @@ def _split_lagged(
             "measure": measure.name,
             "measure_detail": under,
             "orthogonality_defect": under.defect,
-            "warnings": [*told, *under.warnings, *([] if std is not None else [_UNKNOWN])],
+            "warnings": [*warnings, *under.warnings, *([] if std is not None else [_UNKNOWN])],
         }
     )
 
 
 def _split_motion(
-    model: MotionModel, record: Record, measure: Measure, told: Sequence[Warning]
+    model: MotionModel, record: Record, measure: Measure, warnings: Sequence[Warning]
 ) -> SplitResult:
     from orthaug.fitting.motion_estimation import reopened
 
@@ -189,7 +191,7 @@ def _split_motion(
             "measure": split.name,
             "measure_detail": MeasureResult.of_motion(split),
             "orthogonality_defect": split.defect,
-            "warnings": [*told, *fit.warnings, *([_UNKNOWN] if lacking else [])],
+            "warnings": [*warnings, *fit.warnings, *([_UNKNOWN] if lacking else [])],
         }
     )
 

@@ -46,10 +46,11 @@ def check_suspects(sections: Sequence[SuspectSection], problem: Problem) -> None
 def declared_terms(
     sections: Sequence[SuspectSection], problem: MotionProblem
 ) -> tuple[MotionSuspect, ...]:
-    """As `declared`, of a motion.
+    """Return the suspects of a spec, as terms of a motion.
 
-    Raises: InputError: an unknown kind, equation or name, an expression that cannot be read or has
-        no value.
+    Raises:
+        InputError: an unknown kind, equation or name, an expression that cannot be read or has no
+            value.
     """
     suspects, (x, u) = [], problem.looked_at
     for section in sections:

@@ -1,4 +1,4 @@
-"""The parameters of a saved model followed over new data: what `orthaug track` does."""
+"""Tracking of a saved model's parameters over new data: `orthaug track`."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ if TYPE_CHECKING:
     from orthaug.models.model import Model
 
 STATE = "state"
-"""The folder in a result from which a later run goes on."""
+"""The folder in a result that a later run continues from."""
 
 
 @dataclass(frozen=True, eq=False)
 class TrackingInput:
-    """A model with new data, what it was trained on, and the physical parameters that its result declares."""
+    """A model with new data, its training data, and the physical parameters of its result."""
 
     model: Model
     record: Record
@@ -41,7 +41,7 @@ class TrackingInput:
 
 @dataclass(frozen=True, eq=False)
 class TrackingReport:
-    """What was found."""
+    """The result of tracking."""
 
     online: Recursive
     result: TrackResult
@@ -57,8 +57,9 @@ def open_track(
 ) -> TrackingInput:
     """Load a model, new data, and the files that it was trained on.
 
-    Raises: InputError: no model, no data, a motion, training files missing where no state is given,
-        or given beside one.
+    Raises:
+        InputError: no model, no data, a motion, training files missing where no state is given, or
+            given beside one.
     """
     from orthaug.models.model import Model
     from orthaug.models.storage import load
@@ -93,7 +94,7 @@ def open_track(
 
 
 def _physics_of(model: Path, sampling_time: float) -> PhysicsMap | None:
-    """Return what θ is made of, from the result beside a model; None where there is none."""
+    """Return the map to physical parameters, from the result beside a model; None without one."""
     from orthaug.commands.spec import spec_model
 
     for content in results_beside(model):
@@ -110,10 +111,11 @@ def track(
     state: Path | None,
     follows: bool,
 ) -> TrackingReport:
-    """Follow the new rows.
+    """Track the parameters over the new rows.
 
-    Raises: InputError: forgetting beside a state, a state of another model, other than the training
-        data.
+    Raises:
+        InputError: forgetting beside a state, a state of another model, other than the training
+            data.
     """
     from orthaug.fitting.recursive import Recursive
     from orthaug.models.storage import digest
@@ -145,7 +147,7 @@ def _result(opened: TrackingInput, online: Recursive) -> TrackResult:
     baseline = opened.model.form.baseline
     warnings = []
     if online.std is None:
-        text = "no standard errors: the fit has none, or the rows do not tell θ."
+        text = "no standard errors: the fit has none, or the rows do not determine θ."
         warnings.append(Warning("no_standard_errors", text))
     if online.outside:
         text = outside_text(online.outside, online.rows)
@@ -178,7 +180,7 @@ def _result(opened: TrackingInput, online: Recursive) -> TrackResult:
 
 
 def write_tracked(tracked: TrackingReport, folder: Path, text: str, *, force: bool = False) -> None:
-    """result.json, report.txt, table.csv, figures/ and the state, whole or not at all."""
+    """Write result.json, report.txt, table.csv, figures/ and the state, whole or not at all."""
     from orthaug.reports.drawing import save
     from orthaug.reports.plots import tracking_figure
 

@@ -1,4 +1,4 @@
-"""Parameters by what biases them.
+"""Table of the parameters' biases, by their causes.
 
 Which biases by suspected terms a heat map shows, and how its cells are written.
 """
@@ -17,7 +17,7 @@ from orthaug.reports.result import ParameterResult
 
 _MOST_COLUMNS = 12  # more cells beside each other are too narrow for their numbers on paper
 _MOST_CELLS = 200
-_LEAST = 0.01  # per cent: of less only that it is less is told, for a cell is narrow
+_LEAST = 0.01  # per cent: of less only that it is less is text, for a cell is narrow
 _ZERO = 1e-7
 
 
@@ -33,11 +33,11 @@ class BiasMap:
     suspects: tuple[str, ...]
     shares: Matrix
     left_out: str
-    """A sentence on what the map leaves out; empty where it has all."""
+    """A sentence on what the map leaves out; empty where it is complete."""
 
     @property
     def colours(self) -> Matrix:
-        """Return what the colours stand for."""
+        """Values that the colours show."""
         return np.sign(self.shares) * np.log10(1 + np.abs(self.shares))
 
     @property
@@ -47,12 +47,12 @@ class BiasMap:
 
     @property
     def cells(self) -> list[list[str]]:
-        """Return what is written in them."""
+        """Texts of the cells."""
         return [[_cell(value) for value in row] for row in self.shares]
 
 
 def biased_by(rows: Sequence[ParameterResult]) -> dict[tuple[str, float], list[ParameterResult]]:
-    """Parameters with a bias, by its cause and the share that this explains."""
+    """Return the parameters with a bias, by its cause and the share that this explains."""
     found: dict[tuple[str, float], list[ParameterResult]] = {}
     for row in rows:
         if row.bias:
@@ -61,7 +61,10 @@ def biased_by(rows: Sequence[ParameterResult]) -> dict[tuple[str, float], list[P
 
 
 def bias_map(suspects: Sequence[SuspectResult]) -> BiasMap:
-    """Return all biases, or those of the suspects and parameters with the largest ones, in the order of the result."""
+    """Return all biases, or the largest, in the order of the result.
+
+    Where there are too many, it has the suspects and parameters with the largest ones.
+    """
     names = list(suspects[0].percent)
     shares = np.array(
         [[suspect.percent[name] for name in names] for suspect in suspects], dtype=float
@@ -78,16 +81,16 @@ def bias_map(suspects: Sequence[SuspectResult]) -> BiasMap:
     fewer = " and ".join(
         f"{count} of {whole}" for count, whole in parts if count < int(whole.partition(" ")[0])
     )
-    told = (
+    text = (
         f"Shown are those with the largest biases, {fewer}; result.json has all." if fewer else ""
     )
     return BiasMap(
-        tuple(names[j] for j in columns), tuple(shown), shares[np.ix_(rows, columns)], told
+        tuple(names[j] for j in columns), tuple(shown), shares[np.ix_(rows, columns)], text
     )
 
 
 def _largest(size: np.ndarray, most: int) -> list[int]:
-    """Return the places of the largest values, in their order."""
+    """Return the indices of the largest values, in their order."""
     return sorted(np.argsort(-size, kind="stable")[:most].tolist())
 
 

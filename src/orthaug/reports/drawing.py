@@ -1,4 +1,4 @@
-"""The style of all figures: panels at fixed places, labels, colours, and how a figure is written."""
+"""The style of all figures: fixed panels, labels, colours, and the formats of files."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ Drawn = ParamSpec("Drawn")
 
 
 def _own_style() -> AbstractContextManager[None]:
-    """Figures look the same whatever the user's own settings of matplotlib are.
+    """Return a context in which the user's own settings of matplotlib do not change the figures.
 
     A `$` in a unit begins no formula.
     """
@@ -52,7 +52,7 @@ def _own_style() -> AbstractContextManager[None]:
 
 
 def plain(draw: Callable[Drawn, Figure]) -> Callable[Drawn, Figure]:
-    """Figures in our own style."""
+    """Return a function that draws in the style of this package."""
 
     @wraps(draw)
     def drawn(*arguments: Drawn.args, **options: Drawn.kwargs) -> Figure:
@@ -63,7 +63,7 @@ def plain(draw: Callable[Drawn, Figure]) -> Callable[Drawn, Figure]:
 
 
 def axes_for(ax: Axes | None) -> Axes:
-    """Return the given axes, or new ones: of pyplot where that is in use, so that a notebook shows them.
+    """Return the given axes, or new ones: of pyplot where that is in use, for notebooks to show.
 
     Raises:
         InputError: something else.
@@ -81,14 +81,14 @@ def axes_for(ax: Axes | None) -> Axes:
 
 
 def ruled(axis: Axes) -> Axes:
-    """Axes with a faint grid, and no frame above and beside it."""
+    """Return axes with a faint grid, and no frame above and beside it."""
     axis.grid(alpha=0.25)
     axis.spines[["top", "right"]].set_visible(False)
     return axis
 
 
 def panels(response: Response, title: str, heights: tuple[int, ...] = (1,)) -> tuple[Figure, list]:
-    """Stacked axes, `len(heights)` per output."""
+    """Return a figure with stacked axes, `len(heights)` per output."""
     ratios = heights * len(response.outputs)
     figure = Figure(figsize=(SIZE[0], TOP + SIZE[1] * sum(ratios) / max(heights)))
     axes = grid(figure, len(ratios), 1, sharex=True, height_ratios=ratios)[:, 0]
@@ -106,7 +106,7 @@ def grid(
     bottom: float = BOTTOM,
     **options: Any,
 ) -> np.ndarray:
-    """Panels (rows, columns) at fixed places.
+    """Return panels (rows, columns) at fixed places.
 
     A layout found from the sizes of all texts takes longer than drawing.
 
@@ -130,14 +130,14 @@ def grid(
 
 
 def headline(figure: Figure, title: str) -> None:
-    """The title above all panels."""
+    """Write the title above all panels."""
     figure.suptitle(title, fontsize=10, y=1 - _TITLE / figure.get_size_inches()[1], va="top")
 
 
 def label(
     axis: Axes, *, x: str | None = None, y: str | None = None, title: str | None = None
 ) -> None:
-    """Labels at a fixed distance from the panel."""
+    """Label an axis at a fixed distance from the panel."""
     figure = axis.get_figure(root=True)
     assert figure is not None
     wide, high = axis.get_position().size * figure.get_size_inches()
@@ -152,7 +152,7 @@ def label(
 
 
 def outline(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return a curve to draw: of a long one the least and the largest value in every column of pixels."""
+    """Return a curve to draw; of a long one the extremes in every column of pixels."""
     if len(values) <= 4 * _COLUMNS:
         return time, values
     starts = np.linspace(0, len(values), _COLUMNS, endpoint=False).astype(int)
@@ -161,7 +161,7 @@ def outline(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def extent(response: Response, rows: slice) -> str:
-    """Which samples of the record are drawn, in words."""
+    """Return a text on which samples of the record are drawn."""
     whole = len(response.trajectories[0].model)
     text = f"samples {rows.start} to {rows.stop - 1} of {whole}"
     return text + (
@@ -179,7 +179,7 @@ def window(response: Response) -> tuple[np.ndarray, slice]:
 
 
 def legend(axis: Axes, *shown: Any) -> None:
-    """What the lines are, above the panel: its own, or the handles and labels that are `shown`."""
+    """Draw the legend above the panel: of its own lines, or of those in `shown`."""
     axis.legend(
         *shown,
         loc="lower right",

@@ -1,4 +1,4 @@
-"""What `orthaug explain` tells, and its text."""
+"""Result of `orthaug explain`, and its text."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class MovedParameterResult(Content):
 
 
 class ExplainResult(ResultHeader):
-    """What `orthaug explain` tells."""
+    """The result of `orthaug explain`."""
 
     found: Flag
     share: Number
@@ -63,12 +63,12 @@ class ExplainResult(ResultHeader):
 
 
 def explain_text(result: ExplainResult) -> str:
-    """Return what the learner has found, the terms alone, θ with them in the physics, and what to write into the spec."""
+    """Return the terms that were found, their effect on θ, and the lines for the spec, as text."""
     blocks = [[_capital(result.text)]]
     if result.noise is not None:
         blocks[0] += [
             f"Of what it adds, {percent(result.noise)} are its own errors, as far as training "
-            "tells."
+            "shows."
         ]
     if result.terms:
         blocks += [_term_lines(result), _parameter_lines(result)]
@@ -121,6 +121,6 @@ def _percent(share: float | None) -> str:
 
 
 def _capital(text: str) -> str:
-    """Return a sentence; one that begins with an expression stays as it is."""
+    """Return a sentence with a capital first letter, unless it begins with an expression."""
     first = text.split(" ", 1)[0]
     return text[:1].upper() + text[1:] if first.isalpha() else text

@@ -1,4 +1,4 @@
-"""Figures from Python: those of the result folders, and `fit.plot` on matplotlib axes of one's own."""
+"""Figures from Python: those of the result folders, and `fit.plot` on given matplotlib axes."""
 
 from __future__ import annotations
 
@@ -36,18 +36,18 @@ def plot(
 ) -> Figure:
     """Return a matplotlib figure; also written as a PNG where there is a `path`.
 
-    Args: what: a response, of `model.simulate` or `model.predict`; what `linearize` returns; a
-        `Recursive`, for θ over
-            time; or the `result` of `fit_spec` or `compare`.
+    Args:
+        what: a response, of `model.simulate` or `model.predict`; what `linearize` returns; a
+            `Recursive`, for θ over time; or the `result` of `fit_spec` or `compare`.
         kind: of a response "output" (measured and model; the default), "residual" or "components"
             (physics and learner); of linear views "bode" (the default) or "poles". A result has one
             figure: the biases by suspected terms of a fit, or the comparison.
         title: of the figure of a response or of a `Recursive`; by default what kind it is.
         path: PNG file to write; a file of that name is replaced.
 
-    Raises: InputError: nothing that has a figure, an unknown kind, outputs that were not measured,
-        a path that cannot be
-            written.
+    Raises:
+        InputError: nothing that has a figure, an unknown kind, outputs that were not measured, a
+            path that cannot be written.
     """
     wanted = (
         "a Response, such as model.simulate(record), what linearize gives, a Recursive, or the "
@@ -131,7 +131,7 @@ class FitPlots:
         experiment: int = 0,
         ax: Axes | None = None,
     ) -> Axes:
-        """Measured output, free run of the model, and that of the model without its learner, over time [s].
+        """Draw measured output, free run, and free run without the learner, over time [s].
 
         Args:
             record: any with the model's channels; None for that of training.
@@ -163,7 +163,7 @@ class FitPlots:
         experiment: int = 0,
         ax: Axes | None = None,
     ) -> Axes:
-        """Measured output and the prediction one step ahead, over time [s].
+        """Draw measured output and the prediction one step ahead, over time [s].
 
         Arguments as `free_run`.
         """
@@ -179,7 +179,7 @@ class FitPlots:
         experiment: int = 0,
         ax: Axes | None = None,
     ) -> Axes:
-        """Measured less model over time [s]; `kind` is one_step or free_run.
+        """Draw measured less model over time [s]; `kind` is one_step or free_run.
 
         Other arguments as `free_run`.
 
@@ -210,7 +210,7 @@ class FitPlots:
     def learned(
         self, feature: str | None = None, *, output: str | None = None, ax: Axes | None = None
     ) -> Axes:
-        """Return what was learned, over one of the learner's inputs: means of the data with the cloud, or the curve itself.
+        """Draw the learned part over one input of the learner: means with the cloud, or the curve.
 
         The curve, all else at its median, is drawn where the data can move the input alone; a band
         is its 95 % interval, dashed is where the training data do not reach.
@@ -270,7 +270,7 @@ class FitPlots:
         return axis
 
     def parameters(self, *, ax: Axes | None = None) -> Axes:
-        """Return the 95 % interval of every parameter, in per cent of the estimate.
+        """Draw the 95 % interval of every parameter, in per cent of the estimate.
 
         Values and limits are written above.
 
@@ -285,7 +285,7 @@ class FitPlots:
                 share = 100 * (ends - row["value"]) / abs(row["value"])
                 axis.plot(share, [y, y], "|-", color=GREEN, markersize=10, linewidth=2)
             reach = f"  [{ends[0]:.5g}, {ends[1]:.5g}]" if known else ", no interval"
-            told = f"{name} = {row['value']:.6g}{' ' * bool(row['unit'])}{row['unit']}{reach}"
+            label = f"{name} = {row['value']:.6g}{' ' * bool(row['unit'])}{row['unit']}{reach}"
             axis.plot(
                 [0.0],
                 [y],
@@ -294,7 +294,7 @@ class FitPlots:
                 markerfacecolor=GREEN if known and row["value"] else "none",
             )
             axis.annotate(
-                told, (0.0, y), (0, 9), textcoords="offset points", ha="center", fontsize="small"
+                label, (0.0, y), (0, 9), textcoords="offset points", ha="center", fontsize="small"
             )
         axis.axvline(0.0, color=GREY, linewidth=0.8, zorder=0)
         axis.set_yticks(place, [str(name) for name in table.index])
@@ -312,12 +312,13 @@ class FitPlots:
         phase: bool = False,
         ax: Axes | None = None,
     ) -> Axes:
-        """Gain over frequency [Hz] about a point of rest, with its 95 % band.
+        """Draw the gain over frequency [Hz] about an operating point, with its 95 % band.
 
         With `phase` the phase in degrees.
 
-        Raises: InputError: a model without inputs or without a point of rest, names that it does
-            not have.
+        Raises:
+            InputError: a model without inputs or without a point of rest, names that it does not
+                have.
         """
         from orthaug.analysis.linearization import linearize
 
@@ -358,7 +359,7 @@ class FitPlots:
     def _response(
         self, verb: str, record: Record | None, output: str | None, experiment: int
     ) -> tuple[Response, int]:
-        """Return the response on a record, and which of its outputs is drawn."""
+        """Return the response on a record, and the index of the output that is drawn."""
         given = self._record(record)
         if not self.fit.status.ok:
             raise InputError(f"training failed ({self.fit.status.code}); there is nothing to draw.")

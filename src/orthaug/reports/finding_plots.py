@@ -38,7 +38,9 @@ _CELL = 0.8  # inches
 def residual_analysis_figure(
     tests: Sequence[ResidualTestResult], title: str, units: Mapping[str, str]
 ) -> Figure:
-    """Of each residual: autocorrelation, correlation with the inputs, means over its most telling regressor.
+    """Draw each residual's autocorrelation, correlation with inputs, and means over a regressor.
+
+    The regressor is the one that explains most.
 
     Args:
         units: by channel.
@@ -60,21 +62,21 @@ def residual_analysis_figure(
             )
             over.errorbar(centres, means, 2.576 * errors, fmt="o", color=GREEN, markersize=3)
             over.axhline(0.0, color=BLACK, linewidth=0.6)
-            told, share = (
+            words, share = (
                 with_unit("mean residual", units.get(test.name)),
                 percent(curve.share or 0.0),
             )
             label(
                 over,
                 x=regressor_label(name, units),
-                y=told,
+                y=words,
                 title=f"explains {share} of its variance",
             )
     return figure
 
 
 def _correlations(axis: Axes, test: ResidualTestResult) -> None:
-    """Of a residual with every input, in the band of noise."""
+    """Draw the correlation of a residual with every input, in the band of noise."""
     for (name, cross), color in zip(test.crossed.items(), CYCLE * len(test.crossed), strict=False):
         reach = len(cross.values) // 2
         axis.plot(
@@ -92,7 +94,7 @@ def _correlations(axis: Axes, test: ResidualTestResult) -> None:
 
 @plain
 def bias_figure(suspects: Sequence[SuspectResult]) -> Figure:
-    """Heat map of the bias of each parameter by each suspect, in per cent; of many the largest."""
+    """Draw a heat map of the bias of each parameter by each suspect, in per cent."""
     shown = bias_map(suspects)
     longest = max(map(len, shown.parameters))
     upright = longest <= _UPRIGHT
@@ -100,16 +102,18 @@ def bias_figure(suspects: Sequence[SuspectResult]) -> Figure:
         0.3 + 0.075 * max(map(len, shown.suspects)),
         BOTTOM if upright else 0.3 + 0.075 * longest,
     )
-    told = (
+    title = (
         "bias of each parameter [%] by terms that may be missing (without a guess: of 1 % of "
         "the output)"
     )
-    told += f"\ncolours are logarithmic{'; ' if shown.left_out else ''}{shown.left_out[:1].lower()}"
-    told += shown.left_out[1:].rstrip(".")
+    title += (
+        f"\ncolours are logarithmic{'; ' if shown.left_out else ''}{shown.left_out[:1].lower()}"
+    )
+    title += shown.left_out[1:].rstrip(".")
     width = max(
         left + _CELL * len(shown.parameters) + RIGHT,
         SIZE[0],
-        0.08 * max(map(len, told.split("\n"))),
+        0.08 * max(map(len, title.split("\n"))),
     )
     figure = Figure(figsize=(width, TOP + bottom + 0.28 * len(shown.suspects)))
     ((axis,),) = grid(figure, 1, 1, left=left, bottom=bottom)
@@ -124,7 +128,7 @@ def bias_figure(suspects: Sequence[SuspectResult]) -> Figure:
     axis.tick_params(length=0)
     axis.grid(visible=False)
     axis.spines[:].set_visible(False)
-    headline(figure, told)
+    headline(figure, title)
     return figure
 
 

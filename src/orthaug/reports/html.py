@@ -1,4 +1,4 @@
-"""How notebooks show records, physics, fits and models: a title, a few facts, a table."""
+"""Display of records, physics, fits and models in notebooks: a title, a few facts, a table."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Card:
-    """What is shown of an object."""
+    """The content that is shown of an object."""
 
     title: str
     facts: Mapping[str, str] = field(default_factory=dict)
@@ -82,7 +82,7 @@ def _shortened(table: Table) -> Sequence[Sequence[str]]:
 
 @singledispatch
 def card_of(shown: Any) -> Card:
-    """Return what is shown of an object."""
+    """Return the card of an object."""
     return Card(repr(shown))
 
 
@@ -131,7 +131,7 @@ def _baseline(baseline: Baseline) -> Card:
     if any(t.output for t in baseline.terms):  # else there is only one
         columns = ["output", *columns]
         rows = [[t.output or "–", *row] for t, row in zip(baseline.terms, rows, strict=True)]
-    return Card("Baseline", _told(facts), [Table(columns, rows), _declared(baseline.parameters)])
+    return Card("Baseline", _facts(facts), [Table(columns, rows), _declared(baseline.parameters)])
 
 
 @card_of.register
@@ -154,7 +154,7 @@ def _motion(motion: Motion) -> Card:
     equations = Table(["", "equation", "unit of the state", "learned beside it"], rows)
     return Card(
         "Motion",
-        _told(facts),
+        _facts(facts),
         [equations, Table(["defined", "as"], defined), _declared(motion.parameters)],
     )
 
@@ -183,12 +183,12 @@ def _fit(fit: Estimate | MotionEstimate) -> Card:
     ]
     parameters = Table(["parameter", "value", "std", "95 % interval", "unit"], rows)
     return Card(
-        type(fit).__name__, _told(facts), [parameters], [warning.text for warning in fit.warnings]
+        type(fit).__name__, _facts(facts), [parameters], [warning.text for warning in fit.warnings]
     )
 
 
 def card_of_result(fit: Estimate | MotionEstimate, result: FitResult) -> Card:
-    """Return a fit with what its result tells of every parameter, and all of the result's warnings."""
+    """Return the card of a fit with the findings on every parameter, and all warnings."""
     parameters = [*result.parameters, *(result.physical_parameters or ())]
     columns = ["parameter", "value", "std", "95 % interval", "unit"]
     rows = [
@@ -220,27 +220,27 @@ def _model(model: Model | MotionModel) -> Card:
     rows = [
         [p.name, _number(value), p.unit or "–"] for p, value in zip(parameters, values, strict=True)
     ]
-    return Card(type(model).__name__, _told(facts), [Table(["parameter", "value", "unit"], rows)])
+    return Card(type(model).__name__, _facts(facts), [Table(["parameter", "value", "unit"], rows)])
 
 
 def _declared(parameters: Sequence[Any]) -> Table:
-    """Parameters as they were declared."""
+    """Return the parameters as they were declared."""
     rows = []
     for p in parameters:
         rows.append([p.name, _number(p.initial), p.unit or "–", _bounds(p.min, p.max)])
     return Table(["parameter", "initial", "unit", "bounds"], rows)
 
 
-def _told(facts: Mapping[str, str]) -> dict[str, str]:
-    """Without what is empty; a sentence without a name goes on with the fact before it."""
-    told: dict[str, str] = {}
+def _facts(facts: Mapping[str, str]) -> dict[str, str]:
+    """Return the facts without empty ones; a value without a name continues the fact before it."""
+    named: dict[str, str] = {}
     for name, value in facts.items():
-        if value and not name and told:
-            last = list(told)[-1]
-            told[last] += f"; {value}"
+        if value and not name and named:
+            last = list(named)[-1]
+            named[last] += f"; {value}"
         elif value:
-            told[name] = value
-    return told
+            named[name] = value
+    return named
 
 
 def _number(value: Any, digits: int = 6) -> str:

@@ -1,4 +1,4 @@
-"""What was learned beside the physics, as a function: along the training data, over one input, and over two."""
+"""The learned part as a function: along the training data, over one input, and over two."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Curve:
 
     along: Vector
     inside: Bool[np.ndarray, "n"]
-    """Where the data reach."""
+    """The range of the data."""
     learned: Matrix
     half: Matrix | None
     """Half the length of 95 % intervals."""
@@ -61,7 +61,9 @@ class Surface:
 
 @dataclass(frozen=True, eq=False)
 class LearnedPart:
-    """The learned part of a model on training data: points (M, n) of the `variables`, and `at` any other of them.
+    """The learned part of a model on training data: its points, and its values at any others.
+
+    Points are (M, n) of the `variables`.
 
     `seen` (M, nz) are the learner's `features` at the points, `values` (M, nl) the learned part,
     named `names` with their units.
@@ -70,7 +72,7 @@ class LearnedPart:
     names: tuple[str, ...]
     features: tuple[str, ...]
     units: tuple[str, ...]
-    """Of the features; empty for expressions."""
+    """Units of the features; empty for expressions."""
     variables: tuple[str, ...]
     points: Matrix
     seen: Matrix
@@ -82,7 +84,7 @@ class LearnedPart:
     def of_motion(
         cls, model: MotionModel, record: Record, reach: Reach | None = None
     ) -> LearnedPart:
-        """Of a motion, along the free run of the first experiment."""
+        """Return the learned part of a motion, along the free run of the first experiment."""
         states, inputs = trajectory_of(model, record)
         chosen = spread(len(states))
         points, size = np.concatenate([states, inputs], axis=1)[chosen], states.shape[1]
@@ -114,7 +116,7 @@ class LearnedPart:
 
     @classmethod
     def of_lagged(cls, model: Model, record: Record) -> LearnedPart:
-        """Of a lagged model, at the measured regressors of all experiments: `f − φ θ_aux`."""
+        """Return the learned part `f − φ θ_aux` of a lagged model, at all measured regressors."""
         form, record = model.form, model.fitting(record, need_outputs=True)
         rows = np.concatenate(
             [form.regressors(experiment, record) for experiment in record.experiments]
@@ -125,7 +127,7 @@ class LearnedPart:
         features = tuple(str(entry) for entry in form.features.entries)
 
         def at(x: Matrix) -> Matrix:
-            """Of as many rows as the points at least, for which there is a program."""
+            """Return the learned part at any points."""
             rows = np.minimum(np.arange(max(len(x), len(points))), len(x) - 1)
             return np.asarray(model.parts_at(x[rows]).learner)[: len(x)]
 
@@ -141,7 +143,7 @@ class LearnedPart:
         )
 
     def curve(self, feature: str) -> Curve | None:
-        """Over a variable, a fifth of the data's reach beyond them; None of an expression."""
+        """Return the curve over a variable, a fifth beyond the data; None of an expression."""
         if feature not in self.variables:
             return None
         place = self.variables.index(feature)
@@ -154,7 +156,7 @@ class LearnedPart:
         return Curve(along, (along >= low) & (along <= high), self.at(rows), half)
 
     def telling_pair(self) -> tuple[str, str]:
-        """Return the most telling feature, and of those that do not move along with it the next.
+        """Return the feature that explains most, and of those that are not tied to it the next.
 
         Of at least two features.
         """
@@ -167,7 +169,10 @@ class LearnedPart:
         return first, others[0]
 
     def tied(self, feature: str, but: str = "") -> bool:
-        """Return whether the data move another feature along with it, `but` one: then they hold nothing with that at rest."""
+        """Return whether the data move another feature along with it, except the feature `but`.
+
+        Then no data show its effect with the other at rest.
+        """
         moving = [
             name
             for name, spread in zip(self.features, self.seen.std(axis=0), strict=True)
@@ -180,29 +185,29 @@ class LearnedPart:
         )
 
     def alone(self, across: str, along: str) -> bool:
-        """Return whether two features are variables that can be moved with all else at rest."""
+        """Return whether two features are variables that can be varied with all else at rest."""
         known = across in self.variables and along in self.variables
         return known and not self.tied(across, along) and not self.tied(along, across)
 
     def means(self, feature: str) -> tuple[Vector, Matrix]:
-        """Means of feature and learned part over bins of the feature of equally many points, (k,) and (k, nl)."""
+        """Return means of feature (k,) and learned part (k, nl) over bins of equally many points."""
         order = np.argsort(self.seen[:, self.features.index(feature)], kind="stable")
         bins = np.array_split(order, min(_BINS, max(len(order) // 8, 1)))
         centres = np.array([self.seen[b, self.features.index(feature)].mean() for b in bins])
         return centres, np.array([self.values[b].mean(axis=0) for b in bins])
 
     def shares(self) -> Matrix:
-        """Share of the learned part's variance that the means over each feature explain, (nz, nl)."""
+        """Return the share of variance that the means over each feature explain, (nz, nl)."""
         total = np.maximum(self.values.var(axis=0), 1e-300)
         return np.array([self.means(feature)[1].var(axis=0) / total for feature in self.features])
 
     def ranked(self) -> Sequence[str]:
-        """Features, the one that explains most of the learned part first."""
+        """Return the features, the one that explains most of the learned part first."""
         order = np.argsort(-self.shares().max(axis=1), kind="stable")
         return [self.features[j] for j in order]
 
     def surface(self, across: str, along: str) -> Surface:
-        """Over two features where data are near.
+        """Return the surface over two features where there are data near.
 
         Of such that do not move alone the mean of the data in each cell.
         """
@@ -231,7 +236,7 @@ class LearnedPart:
 
 
 def learned_of(fit: Estimate | MotionEstimate, record: Record) -> LearnedPart | None:
-    """Return what a fit learned along a record, with intervals where it has some.
+    """Return the learned part of a fit along a record, with intervals where it has them.
 
     None where nothing was learned.
     """
@@ -248,7 +253,7 @@ def learned_of(fit: Estimate | MotionEstimate, record: Record) -> LearnedPart | 
 
 
 def _near(cells: np.ndarray) -> Bool[np.ndarray, "a b"]:
-    """Cells with data, and those beside them."""
+    """Return the cells with data, and those beside them."""
     there = np.zeros((_CELLS + 2, _CELLS + 2), dtype=bool)
     for i in (0, 1, 2):
         for j in (0, 1, 2):
@@ -264,12 +269,12 @@ def _mean_in_cells(cells: np.ndarray, values: Matrix, size: int) -> Float[np.nda
 
 
 def spread(count: int, most: int = _MOST_POINTS) -> np.ndarray:
-    """Places of at most so many points, spread evenly over `count`."""
+    """Return at most so many indices, spread evenly over `count`."""
     return np.linspace(0, count - 1, min(count, most)).astype(int)
 
 
 def trajectory_of(model: MotionModel, record: Record) -> tuple[Matrix, Matrix]:
-    """States and inputs of the free run of the first experiment, as far as it is finite."""
+    """Return states and inputs of the free run of the first experiment, as far as it is finite."""
     record = model.fitting(record, need_outputs=False)
     frame = model.states(record)
     first = record.experiments[0]
@@ -280,20 +285,20 @@ def trajectory_of(model: MotionModel, record: Record) -> tuple[Matrix, Matrix]:
 
 
 def labels_with_units(model: MotionModel) -> list[str]:
-    """Of learned equations and outputs."""
+    """Return the labels of learned equations and outputs, with their units."""
     units = {channel.name: channel.unit for channel in model.outputs}
     return [with_unit(name, unit or units.get(name)) for name, unit in labels_of(model.form)]
 
 
 def units_of(model: MotionModel) -> dict[str, str]:
-    """Of states and inputs by name."""
+    """Return the units of states and inputs by name."""
     return {s.name: s.unit for s in model.form.motion.states} | {
         c.name: c.unit for c in model.inputs
     }
 
 
 def curve_limits(curve: Curve, k: int, cloud: Vector) -> tuple[float, float]:
-    """Return what a panel of a curve's output k shows: the cloud and the curve within reach, not all that it is beyond."""
+    """Return the limits of the panel of output k: of the cloud, and the curve within the data."""
     both = np.concatenate([curve.learned[curve.inside, k], cloud])
     low, high = float(np.nanmin(both)), float(np.nanmax(both))
     margin = 0.15 * max(high - low, 1e-12)

@@ -1,4 +1,4 @@
-"""What `orthaug linearize` tells."""
+"""Results of `orthaug linearize`."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class PoleResult(Content):
 
     @classmethod
     def of(cls, pole: Pole) -> PoleResult:
-        """Of a view's pole."""
+        """Return the result of a view's pole."""
         s = pole.s
         own = {name: getattr(pole, name) for name in cls.model_fields if hasattr(pole, name)}
         own = {
@@ -119,7 +119,7 @@ class LinearPointResult(Content):
 
 
 class MeasuredPairResult(Content):
-    """What data alone say of one pair."""
+    """The frequency response of one pair from the data."""
 
     output: str
     input: str
@@ -129,7 +129,7 @@ class MeasuredPairResult(Content):
 
 
 class MeasuredResponseResult(Content):
-    """The frequency response from data alone."""
+    """The frequency response from the data, without the model."""
 
     method: str
     averages: Number
@@ -138,7 +138,7 @@ class MeasuredResponseResult(Content):
 
 
 class LinearizeResult(ResultHeader):
-    """What `orthaug linearize` tells."""
+    """The result of `orthaug linearize`."""
 
     sampling_time: Number
     inputs: list[str]
@@ -150,7 +150,7 @@ class LinearizeResult(ResultHeader):
 
     @classmethod
     def of(cls, found: Linearization) -> LinearizeResult:
-        """Of what `linearize` returns."""
+        """Return the result of what `linearize` returns."""
         first = found[0]
         return cls.model_validate(
             {
@@ -235,12 +235,12 @@ def _continuous(view: LinearView) -> dict[str, Any]:
 def _response(view: LinearView, i: int, j: int) -> dict[str, Any]:
     bode = view.bode
     assert bode is not None
-    told = _pair(view, i, j)
+    fields = _pair(view, i, j)
     for name, band in (("magnitude", bode.magnitude_ci95), ("phase", bode.phase_ci95)):
-        told[name] = getattr(bode, name)[:, i, j]
-        told[f"{name}_low"] = None if band is None else band[:, i, j, 0]
-        told[f"{name}_high"] = None if band is None else band[:, i, j, 1]
-    return told
+        fields[name] = getattr(bode, name)[:, i, j]
+        fields[f"{name}_low"] = None if band is None else band[:, i, j, 0]
+        fields[f"{name}_high"] = None if band is None else band[:, i, j, 1]
+    return fields
 
 
 def _measured(measured: MeasuredResponse, view: LinearView) -> dict[str, Any]:

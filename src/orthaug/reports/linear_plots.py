@@ -35,7 +35,7 @@ _WIDE = 4.2  # inches of a column of several
 
 @plain
 def bode_figure(found: Linearization) -> Figure:
-    """Magnitude and phase from every input to every output, with 95 % bands; grey: data alone.
+    """Draw magnitude and phase from every input to every output, with 95 % bands; grey: from data.
 
     Points of rest outside of the training data are drawn where there is no other.
     """
@@ -75,7 +75,7 @@ def _draw_pair(
     lower: Any,
     pair: tuple[int, int],
 ) -> None:
-    """One input and output; bands that leave all bounds do not hide the curves."""
+    """Draw one input and output; bands that leave all bounds do not hide the curves."""
     place = (slice(None), *pair)
     curves, turns = [], []
     for number, view in views.items():
@@ -123,7 +123,7 @@ def _at(found: Linearization, number: int) -> str:
 def _draw_measured(
     found: Linearization, upper: Any, lower: Any, pair: tuple[int, int], model: Vector
 ) -> tuple[Vector, Vector]:
-    """Return what data alone say of gain and phase, on the turn that the model's phase is on."""
+    """Draw gain and phase from the data, on the turn that the model's phase is on; return both."""
     measured, bode = found.measured, found[0].bode
     if measured is None or bode is None:
         return np.zeros(0), np.zeros(0)
@@ -144,7 +144,7 @@ def _draw_measured(
 
 
 def _log_labels(axis: Any, *, sparse: bool) -> None:
-    """Numbers as they are written in text; of a short axis those between powers of ten too."""
+    """Write numbers as in text; on a short axis also those between powers of ten."""
     axis.set_major_formatter(lambda value, _: f"{value:g}")
     axis.set_minor_formatter(
         lambda value, _: "" if sparse or f"{value:.0e}"[0] not in "235" else f"{value:g}"
@@ -153,7 +153,7 @@ def _log_labels(axis: Any, *, sparse: bool) -> None:
 
 @plain
 def poles_figure(found: Linearization) -> Figure:
-    """Return the poles of all points of rest beside the unit circle, with 95 % intervals of their magnitudes."""
+    """Draw the poles of all operating points in the unit circle, with 95 % intervals."""
     figure = Figure(figsize=(5.2, 5.2 + TOP - 0.3))
     ((axis,),) = grid(figure, 1, 1)
     turn = np.linspace(0, 2 * np.pi, 400)

@@ -1,4 +1,4 @@
-"""Linear views in words: what `orthaug linearize` prints."""
+"""Linear views as text: what `orthaug linearize` prints."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _HELD = {
 
 
 def linear_text(found: Linearization) -> str:
-    """Return all points of rest, each with gains, poles and matrices.
+    """Return all operating points as text, each with gains, poles and matrices.
 
     Then what data alone say, and warnings.
     """
@@ -173,7 +173,7 @@ def _agreement(found: Linearization, view: LinearView) -> list[str]:
     if agreement is None or agreement.points < _FEWEST:
         few = "no" if agreement is None else f"only {agreement.points}"
         return [
-            f"data alone ({how}) tell {few} points of the response with a coherence of "
+            f"data alone ({how}) give {few} points of the response with a coherence of "
             f"{COHERENT} or more"
         ]
     return [

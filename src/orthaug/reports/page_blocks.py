@@ -1,4 +1,4 @@
-"""What a page is made of: sections of paragraphs, tables and plots.
+"""Building blocks of a page: sections of paragraphs, tables and plots.
 
 And how numbers are written in cells.
 """
@@ -24,7 +24,7 @@ _MINUS = re.compile(r"(?<![\w\])}.-])-(?=[\d.])")  # before a number that stands
 
 
 def number(value: float | None, digits: int = 5, scale: float | None = None) -> str:
-    """Return a cell; 0 for what is rounding beside a `scale`, a dash where there is no number."""
+    """Return the text of a number; 0 for rounding error beside a `scale`, a dash for no number."""
     if value is None:
         return "–"
     if value == 0 or (scale is not None and abs(value) <= _ROUNDING * abs(scale)):
@@ -39,7 +39,7 @@ def number(value: float | None, digits: int = 5, scale: float | None = None) -> 
 
 
 def interval(ends: Sequence[float | None] | None, digits: int = 5) -> str:
-    """Return the two ends of an interval, of so many digits at least that they are told apart.
+    """Return the two ends of an interval, with at least as many digits as show their difference.
 
     A dash where there is none.
     """
@@ -60,7 +60,7 @@ def interval(ends: Sequence[float | None] | None, digits: int = 5) -> str:
 
 
 def digits_for(value: float | None, spread: float | None, least: int) -> int:
-    """Digits of a value that show two of its spread, but `least`.
+    """Return the digits of a value that show two of its spread, but at least `least`.
 
     Examples:
         >>> digits_for(1.45951, 9e-6, 5), digits_for(1.45951, 0.1, 5)
@@ -78,15 +78,15 @@ def percent(share: float | None, digits: int = 2, *, signed: bool = False) -> st
     shown = 0.0 if abs(share) < _ROUNDING else 100 * share
     if shown and abs(shown) < 10**-3:
         return "< 0.001 %"
-    told = (
+    text = (
         lines.percent(shown / 100, digits, sign="+")
         if signed and shown
         else lines.percent(shown / 100, max(digits, 3))
     )
-    mantissa, power, rest = told.partition("e")
+    mantissa, power, rest = text.partition("e")
     if power:
-        told = f"{mantissa}·10{str(int(rest.removesuffix(' %'))).translate(_RAISED)} %"
-    return told.replace("-", "−")
+        text = f"{mantissa}·10{str(int(rest.removesuffix(' %'))).translate(_RAISED)} %"
+    return text.replace("-", "−")
 
 
 def chance(p: float | None) -> str:
@@ -95,7 +95,7 @@ def chance(p: float | None) -> str:
 
 
 def prose(text: str) -> str:
-    """Return a sentence with the minus signs that tables have.
+    """Return a sentence with the minus signs of the tables.
 
     Examples:
         >>> prose("moves y[k-1] by -0.015, from -2 to 3")
@@ -115,7 +115,7 @@ def regressor_label(name: str, units: Mapping[str, str]) -> str:
 
 
 def parameter_label(row: ParameterResult) -> str:
-    """Return a parameter with its unit, or with the one that the channels ask for where the spec gives none."""
+    """Return a parameter with its unit, or with the implied one where the spec gives none."""
     return with_unit(row.name, row.unit or ("" if row.derived_unit == "1" else row.derived_unit))
 
 
@@ -124,17 +124,17 @@ CATEGORIES = {"autorange": "reversed", "automargin": True, "type": "category"}
 
 
 def titled(x: str, y: str) -> dict[str, Any]:
-    """Plotly's layout of two axes with titles and no legend."""
+    """Return Plotly's layout of two axes with titles and no legend."""
     return {"xaxis": {"title": {"text": x}}, "yaxis": {"title": {"text": y}}, "showlegend": False}
 
 
 def area(color: str, **place: Any) -> dict[str, Any]:
-    """Plotly's rectangle behind the curves."""
+    """Return Plotly's rectangle behind the curves."""
     return {"type": "rect", **place, "fillcolor": color, "line": {"width": 0}, "layer": "below"}
 
 
 def rounded(values: Any, digits: int = 6) -> list[Any]:
-    """Numbers, or rows of them, that are drawn only; None for what is not finite."""
+    """Return numbers, or rows of them, rounded for drawing; None for what is not finite."""
     if np.ndim(values) > 1:
         return [rounded(row, digits) for row in values]
     return [
@@ -162,7 +162,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Code:
-    """Text as it is, such as a spec; folded where it is `long`."""
+    """Verbatim text, such as a spec; folded where it is `long`."""
 
     text: str
     label: str
@@ -183,7 +183,7 @@ class Plot:
     height: int = 320
     small: bool = False
     series: Mapping[str, Any] = field(default_factory=dict)
-    """Long curves by a name that traces give."""
+    """Long curves by the name that traces refer to."""
 
 
 @dataclass(frozen=True)

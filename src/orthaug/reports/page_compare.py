@@ -29,7 +29,7 @@ _WORDS = {
 
 @dataclass(frozen=True, eq=False)
 class ComparePage:
-    """What a page tells of a comparison beside its result."""
+    """Additions to a comparison's result on its page."""
 
     origin: Origin
     result: CompareResult
@@ -38,13 +38,13 @@ class ComparePage:
 
     @property
     def outputs(self) -> tuple[str, ...]:
-        """Their names."""
+        """Names of the outputs."""
         runs = next(iter(self.responses.values()), {})
         return tuple(c.name for c in next(iter(runs.values())).outputs) if runs else ()
 
 
 def compare_sections(page: ComparePage) -> list[Section]:
-    """Return all of them; what a result does not have is left out."""
+    """Return all sections; those without content in the result are left out."""
     result = page.result
     scores = {row.name: row.scores for row in result.comparison}
     found = [
@@ -127,8 +127,8 @@ def _models(result: CompareResult) -> list[Any]:
 def _parameters(result: CompareResult) -> list[Any]:
     if not result.comparison or not result.comparison[0].parameters:
         return []
-    told = [(row.name, parameter) for row in result.comparison for parameter in row.parameters]
-    biased = any(parameter.bias for _, parameter in told)
+    rows = [(row.name, parameter) for row in result.comparison for parameter in row.parameters]
+    biased = any(parameter.bias for _, parameter in rows)
     rows = [
         [
             name,
@@ -139,7 +139,7 @@ def _parameters(result: CompareResult) -> list[Any]:
             interval(p.ci95),
             *([bias_cell(p)] if biased else []),
         ]
-        for name, p in told
+        for name, p in rows
     ]
     head = [
         "model",

@@ -33,13 +33,16 @@ _KINDS = {"prediction": ("one step", "@physics"), "simulation": ("free run", "@m
 
 
 def interval_plot(rows: Sequence[ParameterResult]) -> Plot | None:
-    """Return every parameter on an axis of its own unit: value, intervals, and the initial value where it is near."""
+    """Return a plot of every parameter on an axis of its own unit, with its intervals.
+
+    It shows the initial value too, where that is near.
+    """
     drawn = [row for row in rows if row.value is not None and row.ci95 and None not in row.ci95]
     if not drawn:
         return None
     traces: list[dict[str, Any]] = []
     layout: dict[str, Any] = {"shapes": []}
-    told = any(row.ci95_with_bias for row in drawn)
+    biased = any(row.ci95_with_bias for row in drawn)
     for i, row in enumerate(drawn):
         number = str(i + 1) if i else ""
         first = {
@@ -74,7 +77,7 @@ def interval_plot(rows: Sequence[ParameterResult]) -> Plot | None:
         + (
             "; the thin bar is its 95 % interval once the bias is taken out, which need not "
             "hold the estimate."
-            if told
+            if biased
             else "."
         )
         + " A diamond is the initial value, where it is near enough to be shown."
@@ -88,7 +91,10 @@ def interval_plot(rows: Sequence[ParameterResult]) -> Plot | None:
 
 
 def _interval_traces(row: ParameterResult) -> list[dict[str, Any]]:
-    """Bars of the intervals, the circle of the estimate, and the diamond of the initial value where it is near."""
+    """Return the traces of a parameter: bars of its intervals, a circle, a diamond.
+
+    The circle is the estimate, the diamond the initial value where it is near.
+    """
     bars = {"95 % interval": (row.ci95, "@model", 7)}
     if row.ci95_with_bias and None not in row.ci95_with_bias:
         bars = {"95 % interval less the bias": (row.ci95_with_bias, "@bias", 3), **bars}
@@ -121,7 +127,7 @@ def _interval_traces(row: ParameterResult) -> list[dict[str, Any]]:
 
 
 def _first(rows: Sequence[ParameterResult], holds: Callable[[ParameterResult], bool]) -> int:
-    """Return the number of the first row of which something holds."""
+    """Return the number of the first row for which a condition holds."""
     return next((i for i, row in enumerate(rows) if holds(row)), 0)
 
 
@@ -137,7 +143,10 @@ def _tick(row: ParameterResult) -> str:
 
 
 def _reach(row: ParameterResult) -> list[float]:
-    """Return what the axis of a parameter shows: its intervals with a margin, and the initial value where it is near."""
+    """Return the limits of a parameter's axis: its intervals with a margin.
+
+    They include the initial value where it is near.
+    """
     ends = [
         row.value,
         *(row.ci95 or ()),
@@ -159,7 +168,7 @@ def _near(row: ParameterResult) -> bool:
 def score_plot(
     scores: Mapping[str, Mapping[str, PartScores]], outputs: Sequence[str]
 ) -> Plot | None:
-    """NRMSE of every part, or of every way of modelling.
+    """Return a plot of the NRMSE of every part, or of every model.
 
     Logarithmic where some are bad or far apart.
 
@@ -246,7 +255,9 @@ def score_plot(
 
 
 def residual_plots(test: ResidualTestResult, what: str, units: Mapping[str, str]) -> list[Plot]:
-    """Autocorrelation, correlation with the inputs, and means over the most telling regressor.
+    """Return plots of autocorrelation, correlation with the inputs, and means over a regressor.
+
+    The regressor is the one that explains most of the residual.
 
     Units by channel.
     """
@@ -260,7 +271,7 @@ def residual_plots(test: ResidualTestResult, what: str, units: Mapping[str, str]
             "name": "autocorrelation",
             "marker": {"color": "@model"},
         }
-        told = (
+        caption = (
             f"Autocorrelation of the {what} of {test.name}; the band holds 99 % of the values "
             f"that noise gives. The largest in size is {number(test.strongest_acf, 2)}."
         )
@@ -271,7 +282,7 @@ def residual_plots(test: ResidualTestResult, what: str, units: Mapping[str, str]
         plots.append(
             Plot(
                 f"Autocorrelation of the {what} of {test.name}.",
-                told,
+                caption,
                 [bars],
                 layout,
                 280,
@@ -294,7 +305,7 @@ def residual_plots(test: ResidualTestResult, what: str, units: Mapping[str, str]
                     "marker": {"color": color, "size": 4},
                 }
             )
-        told = (
+        caption = (
             f"Correlation of the {what} of {test.name} with the inputs; beyond the band it is "
             "more than noise."
         )
@@ -303,7 +314,7 @@ def residual_plots(test: ResidualTestResult, what: str, units: Mapping[str, str]
         }
         layout["showlegend"] = True
         label = f"Correlation of the {what} of {test.name} with the inputs."
-        plots.append(Plot(label, told, traces, layout, 280, small=True))
+        plots.append(Plot(label, caption, traces, layout, 280, small=True))
     return plots + [
         _means_plot(test, name, curve, what, units) for name, curve in test.most_telling.items()
     ]
@@ -312,7 +323,7 @@ def residual_plots(test: ResidualTestResult, what: str, units: Mapping[str, str]
 def _means_plot(
     test: ResidualTestResult, name: str, curve: RegressorResult, what: str, units: Mapping[str, str]
 ) -> Plot:
-    """Means over a regressor."""
+    """Return a plot of the means over a regressor."""
     errors = [None if e is None else 2.576 * e for e in curve.errors]
     dots = {
         "x": curve.centres,
@@ -323,7 +334,7 @@ def _means_plot(
         "marker": {"color": "@learner"},
     }
     surely = chance(curve.p)
-    told = (
+    caption = (
         f"Mean of the {what} of {test.name}, less that of all rows, over {name} with 99 % "
         "intervals, both with its autocorrelation taken into account as in the test: that it "
         f"is flat has p {'' if surely.startswith('<') else '= '}{surely}. Plain means explain "
@@ -333,11 +344,11 @@ def _means_plot(
     layout = titled(
         regressor_label(name, units), with_unit(f"residual of {test.name}", units.get(test.name))
     )
-    return Plot(label, told, [dots], layout, 280, small=True)
+    return Plot(label, caption, [dots], layout, 280, small=True)
 
 
 def bias_plot(suspects: Sequence[SuspectResult]) -> Plot:
-    """Heat map of the bias of each parameter by each suspect, in per cent; of many the largest."""
+    """Return a heat map of the bias of each parameter by each suspect, in per cent."""
     shown = bias_map(suspects)
     heat = {
         "type": "heatmap",
@@ -369,7 +380,7 @@ def bias_plot(suspects: Sequence[SuspectResult]) -> Plot:
 
 
 def restart_plot(restarts: Sequence[RestartResult]) -> Plot | None:
-    """Return the loss that every start came to."""
+    """Return a plot of the loss that every start reached."""
     if len([run for run in restarts if run.loss is not None]) < 3:
         return None
     place = [f"{run.seed}, {run.regularization}" for run in restarts]
@@ -397,7 +408,7 @@ def restart_plot(restarts: Sequence[RestartResult]) -> Plot | None:
 
 
 def parameter_comparison(rows: Sequence[RowResult]) -> list[Plot]:
-    """Of every parameter its value and 95 % interval in each way of modelling."""
+    """Return plots of every parameter's value and 95 % interval in each model."""
     plots = []
     for parameter in rows[0].parameters:
         x, y, arms = [], [], []
@@ -437,10 +448,10 @@ def parameter_comparison(rows: Sequence[RowResult]) -> list[Plot]:
             "yaxis": CATEGORIES,
             "showlegend": False,
         }
-        told = (
+        caption = (
             f"{parameter.name} by every way of modelling, with its 95 % interval where it has one."
         )
-        plots.append(Plot(told, told, [dots], layout, 120 + 30 * len(rows), small=True))
+        plots.append(Plot(caption, caption, [dots], layout, 120 + 30 * len(rows), small=True))
     return plots
 
 

@@ -1,4 +1,4 @@
-"""The findings of a fit on its page: residual tests, stability, excitation and suspects, restarts."""
+"""The findings of a fit on its page: residual tests, stability, excitation, suspects, restarts."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from orthaug.reports.result import FitResult
 
 
 def residuals_blocks(result: FitResult, units: Mapping[str, str]) -> list[Any]:
-    """Return what the residuals tell, output by output; units by channel."""
+    """Return the residual tests, output by output; units by channel."""
     blocks: list[Any] = []
     found = result.residuals
     if found is None:
-        told = next((w.text for w in result.warnings if w.code == "residual_not_analysed"), "")
-        blocks += [Text(told)] if told else []
+        reason = next((w.text for w in result.warnings if w.code == "residual_not_analysed"), "")
+        blocks += [Text(reason)] if reason else []
     else:
         blocks.append(Text(found.text))
         tests = [
@@ -38,7 +38,7 @@ def residuals_blocks(result: FitResult, units: Mapping[str, str]) -> list[Any]:
         blocks.append(
             Table(
                 "Tests of the residuals on the training data, at the levels that the result "
-                "tells; RMS and mean are in the output's unit.",
+                "gives; RMS and mean are in the output's unit.",
                 head,
                 rows,
             )
@@ -68,21 +68,21 @@ def _test_cells(what: str, test: ResidualTestResult, units: Mapping[str, str]) -
 
 
 def stability_blocks(result: FitResult) -> list[Any]:
-    """Return what is known of the free run's stability."""
+    """Return the findings on the free run's stability."""
     found = result.stability
     if found is None:
         return []
     blocks: list[Any] = [Text(line) for line in found.text.splitlines() if line.strip()]
-    told: list[list[str]] = []
+    rows: list[list[str]] = []
     if found.feedback:
         f = found.feedback
-        told += [
+        rows += [
             ["local spectral radius, largest", number(f.largest, 4)],
             ["its median", number(f.median, 4)],
             ["steps on which it is above 1", percent(f.share_above_one)],
         ]
     if found.contraction:
-        told.append(["rate of the best norm", number(found.contraction.rate, 4)])
+        rows.append(["rate of the best norm", number(found.contraction.rate, 4)])
     if found.modes:
         m = found.modes
         slow, fast = number(m.slowest, 3), number(m.fastest, 3)
@@ -91,7 +91,7 @@ def stability_blocks(result: FitResult) -> list[Any]:
             if slow == fast
             else ["slowest and fastest mode [1/s]", f"{slow} and {fast}"]
         )
-        told += [
+        rows += [
             ["rightmost eigenvalue, real part [1/s]", number(m.rightmost, 4, m.fastest)],
             modes,
             *(
@@ -103,7 +103,7 @@ def stability_blocks(result: FitResult) -> list[Any]:
         ]
     if found.diverges_at is not None or found.searched is not None:
         at = "none found" if found.diverges_at is None else number(found.diverges_at, 4)
-        told.append(
+        rows.append(
             [
                 "factor on the inputs at which the run diverges (searched to "
                 f"{number(found.searched, 4)})",
@@ -111,22 +111,22 @@ def stability_blocks(result: FitResult) -> list[Any]:
             ]
         )
     return (
-        [*blocks, Table("Evidence on the free run's stability.", ["measure", "value"], told)]
-        if told
+        [*blocks, Table("Evidence on the free run's stability.", ["measure", "value"], rows)]
+        if rows
         else blocks
     )
 
 
 def excitation_blocks(result: FitResult) -> list[Any]:
-    """Return how well the data tell the parameters apart, and what each suspected term does to them."""
+    """Return how well the data identify the parameters, and the bias by each suspected term."""
     seen = result.excitation
-    told = f"The data tell {seen.rank} of {seen.columns} parameters apart; "
-    told += f"the condition number is {number(seen.condition, 3)}."
+    text = f"The data identify {seen.rank} of {seen.columns} parameters; "
+    text += f"the condition number is {number(seen.condition, 3)}."
     if result.orthogonality_defect is not None:
         small = result.orthogonality_defect < 1e-10
         shown = "0 up to rounding" if small else number(result.orthogonality_defect, 2)
-        told += f" The overlap of physics and learner, ‖QᵀF̃‖/‖F‖, is {shown}."
-    blocks: list[Any] = [Text(told)]
+        text += f" The overlap of physics and learner, ‖QᵀF̃‖/‖F‖, is {shown}."
+    blocks: list[Any] = [Text(text)]
     if result.measure_detail:
         detail = result.measure_detail
         blocks.append(
@@ -155,7 +155,7 @@ def excitation_blocks(result: FitResult) -> list[Any]:
             rows = [[*row, s.removed_by or "–"] for row, s in zip(rows, result.bias, strict=True)]
         else:
             caption += (
-                " Whether a measure takes their bias from the parameters is told by `orthaug "
+                " Whether a measure takes their bias from the parameters is shown by `orthaug "
                 "check`."
             )
         blocks.append(Table(caption, head, rows))
@@ -178,7 +178,7 @@ _CHOOSES = {
 def restarts_blocks(result: FitResult) -> list[Any]:
     """Return how training ended, from every start."""
     status = result.status
-    told = (
+    text = (
         f"Training ended with “{status.code.replace('_', ' ')}” after {status.iterations} "
         f"iterations and {number(status.seconds, 3)} s. {_sentence(status.message)}"
     )
@@ -201,7 +201,7 @@ def restarts_blocks(result: FitResult) -> list[Any]:
         + [str(r.iterations), r.code.replace("_", " "), "yes" if r.chosen else "no"]
         for r in runs
     ]
-    blocks: list[Any] = [Text(told + fall)]
+    blocks: list[Any] = [Text(text + fall)]
     plot = restart_plot(result.restarts)
     blocks += [plot] if plot else []
     return blocks + ([Table(caption, head, rows)] if rows else [])

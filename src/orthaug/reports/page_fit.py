@@ -44,7 +44,7 @@ BIAS_TOLD = (
 
 @dataclass(frozen=True, eq=False)
 class Origin:
-    """Where a result comes from: name and text of its spec, the command, when and on what it was made."""
+    """The origin of a result: name and text of its spec, the command, date and versions."""
 
     name: str
     toml: str
@@ -57,7 +57,7 @@ class Origin:
 
 @dataclass(frozen=True, eq=False)
 class FitPage:
-    """What a page tells of a fit beside its result."""
+    """Additions to a fit's result on its page."""
 
     origin: Origin
     result: FitResult
@@ -69,14 +69,14 @@ class FitPage:
 
     @property
     def outputs(self) -> tuple[str, ...]:
-        """Their names."""
+        """Names of the outputs."""
         return tuple(
             channel.name for _, free in self.responses.values() for channel in free.outputs
         )[: self._count]
 
     @property
     def units(self) -> dict[str, str]:
-        """Of channels and states, by name."""
+        """Units of channels and states, by name."""
         return units_of_result(self.result) | {
             c.name: c.unit for _, free in self.responses.values() for c in free.outputs
         }
@@ -87,14 +87,14 @@ class FitPage:
 
 
 def units_of_result(result: FitResult | CompareResult) -> dict[str, str]:
-    """Of channels and states by name, as the spec declares them."""
+    """Return the units of channels and states by name, as the spec declares them."""
     states = (result.spec.get("motion") or {}).get("states") or {}
     channels = (result.spec.get("data") or {}).get("channels") or {}
     return {name: given.get("unit") or "" for name, given in {**states, **channels}.items()}
 
 
 def fit_sections(page: FitPage) -> list[Section]:
-    """Return all of them; what a result does not have is left out."""
+    """Return all sections; those without content in the result are left out."""
     result = page.result
     found = [
         Section("parameters", "Parameters", _parameters(result)),
@@ -115,7 +115,7 @@ def _parameters(result: FitResult) -> list[Any]:
     rows = [*result.parameters, *(result.physical_parameters or [])]
     if not rows:
         return [Text("The physics has no parameters: all of the model was learned.")]
-    told = {
+    text = {
         "robust": "Standard errors are robust against a coloured residual.",
         "plain": "Standard errors are those of a white residual.",
         None: "There are no standard errors.",
@@ -126,7 +126,7 @@ def _parameters(result: FitResult) -> list[Any]:
     columns += ["bias", "95 % interval with it"] if biased else []
     shared = any(row.shared is not None for row in rows)
     columns += ["learner could imitate it"] if shared else []
-    caption = f"What was estimated. {told[result.standard_errors]}"
+    caption = f"What was estimated. {text[result.standard_errors]}"
     if result.standard_errors_by is not None:
         caption = f"What was estimated. Standard errors: {STD_KINDS[result.standard_errors_by]}."
     if result.noise_only:
@@ -143,7 +143,7 @@ def _parameters(result: FitResult) -> list[Any]:
         caption += " A unit in brackets is not the spec's: the channels' units ask for it."
     if biased:
         caption += f"{BIAS_TOLD[:-1]};"
-        caption += " the interval with it is the hull over all causes that noise cannot tell apart."
+        caption += " the interval with it is the hull over all causes that noise cannot distinguish."
     blocks: list[Any] = [
         Table(caption, columns, [_parameter_cells(row, biased, shared) for row in rows])
     ]
@@ -151,17 +151,17 @@ def _parameters(result: FitResult) -> list[Any]:
     blocks += [plot] if plot else []
     causes = [f"{percent(share)} is {cause}" for cause, share in biased_by(rows)]
     if causes:
-        told, more = (
+        text, more = (
             f"{' in one equation' if len(causes) > 1 else ''} {', in another '.join(causes)}",
             "",
         )
         if result.learns:
             more = (
                 ", once what the physics can imitate is taken out of both; drawn over one "
-                "input it may tell less"
+                "input it may explain less"
             )
         what = "what the learner found" if result.learns else "the squares that the free run leaves"
-        blocks.append(Text(f"The bias budget: of {what}{told}{more}."))
+        blocks.append(Text(f"The bias budget: of {what}{text}{more}."))
     if result.physical_consistency:
         blocks.append(Text(result.physical_consistency.text))
     if result.shared is not None:
@@ -170,7 +170,7 @@ def _parameters(result: FitResult) -> list[Any]:
 
 
 def bias_cell(row: ParameterResult) -> str:
-    """Return the bias by what the learner found."""
+    """Return the bias by the learned part."""
     return number(row.bias.value, 2, row.value) if row.bias else "–"
 
 
@@ -208,11 +208,11 @@ def _equations(result: FitResult) -> list[Any]:
             ]
             for state, given in declared["states"].items()
         ]
-        told = result.motion
+        text = result.motion
         caption = (
-            f"The equations of motion, {told.integrator} with {told.substeps} "
-            f"substep{'s' * (told.substeps > 1)} in a sample and a {told.hold} hold; a "
-            f"prediction starts from a state estimated over {told.window} rows."
+            f"The equations of motion, {text.integrator} with {text.substeps} "
+            f"substep{'s' * (text.substeps > 1)} in a sample and a {text.hold} hold; a "
+            f"prediction starts from a state estimated over {text.window} rows."
         )
         blocks.append(
             Table(
@@ -263,17 +263,17 @@ def _runs(page: FitPage) -> list[Any]:
         if w.code in ("witness", "free_run_diverged")
     ]
     band, alone = error_band(train), bool(page.alone)
-    told = (
+    text = (
         "A model in free run sees the inputs alone and lives on its own past; the residual is "
         "measured less model."
     )
     if alone:
-        told += (
+        text += (
             " The model without its learner has the same parameters and the learner switched "
             "off; it is not the"
         )
-        told += " physics alone of the verdict, which is fitted by itself."
-    told += (
+        text += " physics alone of the verdict, which is fitted by itself."
+    text += (
         " Between the limits of the band lie 95 % of the errors on the training data."
         if band
         else ""
@@ -283,11 +283,11 @@ def _runs(page: FitPage) -> list[Any]:
         "arrows move, + and − zoom, 0 shows all.",
         "hint",
     )
-    return [*notes, Text(told), how, *run_plots(runs, band)]
+    return [*notes, Text(text), how, *run_plots(runs, band)]
 
 
 def _shares(page: FitPage) -> list[Any]:
-    """Return how much of the model's output, or of each equation, is physics and how much the learner."""
+    """Return the shares of physics and learner in the model's output, or in each equation."""
     result = page.result
     if result.motion is not None:
         rows = [
@@ -326,14 +326,14 @@ def _shares(page: FitPage) -> list[Any]:
     largest = max((x for x in bars["x"] if x is not None), default=0.0)
     axis = {"title": {"text": "share of the learner [%]"}, "range": [0, max(100.0, 1.05 * largest)]}
     layout = {"xaxis": axis, "yaxis": CATEGORIES, "showlegend": False}
-    told = "The learner's RMS over that of physics and learner together."
+    text = "The learner's RMS over that of physics and learner together."
     if result.structure == "orthogonal":
-        told += (
+        text += (
             " The learner holds only what the physics cannot: its overlap with the physics is "
             "split off."
         )
     label = "Share of the learner; the table has the numbers."
-    return [Table(caption, head, cells), Plot(label, told, [bars], layout, 90 + 34 * len(rows))]
+    return [Table(caption, head, cells), Plot(label, text, [bars], layout, 90 + 34 * len(rows))]
 
 
 def _part_shares(
@@ -363,7 +363,7 @@ def _learned(page: FitPage) -> list[Any]:
 def score_blocks(
     scores: Mapping[str, Mapping[str, PartScores]], outputs: Sequence[str], units: Mapping[str, str]
 ) -> list[Any]:
-    """Scores as a plot and a table; of one model, or of several by their names."""
+    """Return the scores as a plot and a table; of one model, or of several by their names."""
     rows = []
     named = any(scores)
     for row, parts in scores.items():
@@ -397,7 +397,7 @@ def score_blocks(
 
 
 def origin_blocks(origin: Origin, result: FitResult | CompareResult) -> list[Any]:
-    """Command, versions, files with their checksums, and the spec as it was written."""
+    """Return command, versions, files with their checksums, and the spec as it was written."""
     rows = [
         ["command", origin.command],
         ["seed", str(origin.seed)],

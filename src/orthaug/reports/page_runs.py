@@ -1,4 +1,4 @@
-"""Free runs on a page: whole records with the residual below, packed as numbers of four bytes for the page to draw.
+"""Free runs on a page: whole records with the residual below, packed as four-byte numbers.
 
 The page draws of every curve the least and the largest value in each column of pixels, anew
 whenever it is zoomed.
@@ -45,10 +45,11 @@ class Run:
 
 
 def run_plots(runs: Sequence[Run], band: Mapping[str, tuple[float, float]]) -> list[Plot]:
-    """Return a plot for every part: measured, model, the model without its learner, and the residual.
+    """Return a plot for every part: measured, model, the model without its learner, residual.
 
-    Args: band: of each output the two limits between which 95 % of the errors on the training data
-        lie.
+    Args:
+        band: of each output the two limits between which 95 % of the errors on the training data
+            lie.
     """
     lengths = [
         _length(run)
@@ -117,7 +118,7 @@ def _compared(part: str, runs: Mapping[str, Response], most: int) -> Plot:
 
 
 def error_band(response: Response) -> dict[str, tuple[float, float]]:
-    """Of each output the limits between which 95 % of the errors of a run lie.
+    """Return for each output the limits between which 95 % of the errors of a run are.
 
     None of one that diverged.
     """
@@ -141,7 +142,7 @@ def _length(run: Run) -> int:
 
 
 def _fair(lengths: Sequence[int], budget: int) -> int:
-    """Return how many points a curve may have, so that short ones stay whole and all fit into the budget."""
+    """Return how many points a curve may have: short ones are whole, all fit the budget."""
     left, ordered = budget, sorted(lengths)
     for i, length in enumerate(ordered):
         share = left // (len(ordered) - i)
@@ -180,14 +181,14 @@ def packed(values: Vector, x0: float, dx: float, most: int = MOST_POINTS) -> dic
 
 
 def joined(response: Response, values: Sequence[Matrix | None]) -> Matrix:
-    """Experiments one after another, with a gap between."""
+    """Return the experiments one after another, with a gap between."""
     gap = np.full((1, len(response.outputs)), np.nan)
     pieces = [np.asarray(piece, dtype=float) for piece in values if piece is not None]
     return np.concatenate([part for piece in pieces for part in (piece, gap)][:-1])
 
 
 class _Panels:
-    """A plot of runs as it is drawn: of each output a panel of curves, and the residuals below.
+    """A plot of runs while it is drawn: for each output a panel of curves, and the residuals below.
 
     `measured` (N, ny) are the measured outputs, experiments one after another; None where there are
     none.
@@ -211,7 +212,7 @@ class _Panels:
         return f"{name} {i}"
 
     def add_residual(self, name: str, i: int, model: Matrix, drawn: Mapping[str, Any]) -> None:
-        """Measured less a curve that is kept: their difference, or of thinned curves one of its own."""
+        """Draw measured less a curve that is kept, as their difference or as a curve of its own."""
         assert self.measured is not None
         own: dict[str, Any] = {"minus": [f"measured {i}", f"{name} {i}"]}
         if len(model) > self.most:
@@ -223,7 +224,7 @@ class _Panels:
         self.traces.append({**own, **drawn, "yaxis": f"y{2 * i + 2}", "showlegend": False})
 
     def finish(self, i: int, drawn: Mapping[str, Matrix]) -> None:
-        """The axes of output i, and where what is `drawn` leaves them."""
+        """Draw the axes of output i, and mark where the curves in `drawn` leave them."""
         curves = {name: curve[:, i] for name, curve in drawn.items()}
         limits = None if self.measured is None else frame_of(self.measured[:, i], curves.values())
         if limits is not None:
@@ -231,7 +232,7 @@ class _Panels:
         self.layout |= _axes(i, 2 * len(self.outputs), self.outputs[i], limits)
 
     def plot(self, label: str, caption: str, time: str) -> Plot:
-        """Return all of it; `time` stands at the axis that the panels share."""
+        """Return the whole plot; `time` is the title of the axis that the panels share."""
         for one in self._left:
             channel = self.outputs[one.output]
             reached = f"{number(one.farthest, 3)} {channel.unit}".strip()
@@ -253,7 +254,7 @@ class _Panels:
 
 @dataclass(frozen=True)
 class PanelExit:
-    """A curve that leaves its panel: the output, the instant [s], the edge it leaves by, and the value farthest out."""
+    """A curve that leaves its panel: output, instant [s], edge, and the value farthest out."""
 
     name: str
     output: int
@@ -282,7 +283,7 @@ class PanelExit:
 
 
 def frame_of(measured: Vector, curves: Iterable[Vector]) -> list[float] | None:
-    """Return what the upper panel shows where a curve leaves what was measured by far.
+    """Return the limits of the upper panel where a curve leaves the measured range by far.
 
     None for all of it.
     """
@@ -331,8 +332,8 @@ def _plot(run: Run, band: Mapping[str, tuple[float, float]], most: int) -> Plot:
             [name for name, curve in curves.items() if curve is not None], i, limits
         )
         if panels.measured is not None:
-            told = {"name": "measured − model", "line": {"color": "@residual", "width": 1}}
-            panels.add_residual("model", i, model, told)
+            sentences = {"name": "measured − model", "line": {"color": "@residual", "width": 1}}
+            panels.add_residual("model", i, model, sentences)
             if limits is not None:
                 low, high = limits
                 place = {"xref": "paper", "x0": 0, "x1": 1, "yref": f"y{2 * i + 2}"}
@@ -347,7 +348,7 @@ def _plot(run: Run, band: Mapping[str, tuple[float, float]], most: int) -> Plot:
 
 
 def _upper(curves: Sequence[str], i: int, limits: tuple[float, float] | None) -> list[dict]:
-    """Measured, band, the model without its learner and with it, of output i.
+    """Return the traces of output i: measured, band, the model without its learner and with it.
 
     The legend tells of the first.
     """
@@ -377,7 +378,7 @@ def _upper(curves: Sequence[str], i: int, limits: tuple[float, float] | None) ->
 
 
 def _axes(i: int, panels: int, channel: Channel, limits: list[float] | None) -> dict[str, Any]:
-    """Return the two panels of an output from the top down, on the x axis that all share."""
+    """Return the axes of the two panels of an output, from the top down, on a shared x axis."""
     high = 2 / panels
     top = 1 - i * high
     middle = top - (high - _GAP) * _UPPER
@@ -392,20 +393,20 @@ def _axes(i: int, panels: int, channel: Channel, limits: list[float] | None) -> 
 
 
 def _stacked(name: str, unit: str) -> str:
-    """Return a title on two lines: the panels are too low on paper for name and unit behind each other."""
+    """Return a title on two lines: the panels are too low on paper for name and unit on one."""
     return f"{name}<br>[{unit}]" if unit else name
 
 
 def _mark(layout: dict[str, Any], run: Run, start: float, step: float) -> None:
-    """Lines where an experiment begins, and where a run left all bounds."""
+    """Mark where an experiment begins, and where a run diverged."""
     row, breaks = 0, len(run.response.trajectories) <= _MOST_BREAKS
     for i, trajectory in enumerate(run.response.trajectories):
         if i and breaks:
             layout["shapes"].append(_line(start + step * (row - 0.5), "@grid", "dot"))
         alone = None if run.alone is None else run.alone.trajectories[i]
-        for name, told in (("free run", trajectory), (f"the {WITHOUT}", alone)):
-            if told is not None and told.diverged:
-                at = start + step * (row + told.diverged[0])
+        for name, sentences in (("free run", trajectory), (f"the {WITHOUT}", alone)):
+            if sentences is not None and sentences.diverged:
+                at = start + step * (row + sentences.diverged[0])
                 layout["shapes"].append(_line(at, "@bad", "solid"))
                 layout["annotations"].append(
                     {
@@ -415,8 +416,10 @@ def _mark(layout: dict[str, Any], run: Run, start: float, step: float) -> None:
                         "yref": "paper",
                         "yanchor": "top",
                         "showarrow": False,
-                        "xanchor": "right" if row + told.diverged[0] > _length(run) / 2 else "left",
-                        "text": f"{name} diverges in {told.diverged[1]}",
+                        "xanchor": "right"
+                        if row + sentences.diverged[0] > _length(run) / 2
+                        else "left",
+                        "text": f"{name} diverges in {sentences.diverged[1]}",
                         "font": {"color": "@bad"},
                     }
                 )
@@ -443,37 +446,37 @@ def _label(run: Run) -> str:
 
 
 def _caption(run: Run, most: int) -> str:
-    """Return what is drawn, in sentences."""
+    """Return sentences on what is drawn."""
     response = run.response
     rows, count = sum(len(t.model) for t in response.trajectories), len(response.trajectories)
     files = f" of {count} experiments" if count > 1 else ""
-    told = [
+    sentences = [
         f"The free run on {run.part}, all {rows} samples{files}, and the residual under it on "
         "the same time axis."
     ]
     if rows > most:
-        told.append(
+        sentences.append(
             f"Of each curve {number(most, 3)} points are kept, the least and the largest value "
             "of every stretch."
         )
     for t in response.trajectories:
         if t.diverged:
-            told.append(
+            sentences.append(
                 f"The run leaves all bounds in {t.diverged[1]} at row {t.diverged[0]}, where "
                 "it is cut off."
             )
     outside = [t.outside for t in response.trajectories if t.outside is not None]
     beyond = float(np.concatenate(outside).mean()) if outside else 0.0
     if beyond > 0:
-        told.append(
+        sentences.append(
             f"On {percent(beyond)} of the samples, shaded, the learner is outside what it was "
             "trained on; `learner.beyond` says what its correction does there."
         )
-    return " ".join(told)
+    return " ".join(sentences)
 
 
 def _shades(response: Response, start: float, step: float) -> list[dict[str, Any]]:
-    """Return areas over the stretches on which the learner is outside its training, close ones as one."""
+    """Return areas over stretches where the learner extrapolates; close ones are merged."""
     rows, flags = 0, []
     for t in response.trajectories:
         flags.append(

@@ -1,4 +1,4 @@
-"""The verdict that a page begins with, in three sentences: is the model to be trusted, for what, what comes next."""
+"""The verdict at the top of a page: is the model reliable, for what use, what to do next."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from orthaug.reports.result import (
 )
 
 _GOOD, _POOR = 0.2, 0.5  # NRMSE of a free run up to which it is close, and from which it is far
-_ALIKE = 1.1  # ratio of errors up to which models are told to be as good as each other
-_SURE = 0.1  # standard error over value up to which a parameter is told to be known
+_ALIKE = 1.1  # ratio of errors up to which models are text to be as good as each other
+_SURE = 0.1  # standard error over value up to which a parameter is text to be known
 _NAMED = 0.5  # share of what was learned from which its cause is what to do first
-_FAR = 5.0  # standard errors from which the size of a bias is told in figures
-_MOST_DOUBTS = 3  # that are told in the first sentence
+_FAR = 5.0  # standard errors from which the size of a bias is text in figures
+_MOST_DOUBTS = 3  # that are text in the first sentence
 _WORSE = 1.5  # times the error on the training data: a Gaussian error then leaves the 95 % band on a fifth of the rows
 _STOPPED = ("iteration_limit", "no_descent", "stopped")
 _RAN_AWAY = "free_run_diverged"
@@ -49,12 +49,12 @@ class PageVerdict(NamedTuple):
 
     @property
     def sentences(self) -> tuple[str, str, str]:
-        """In the order in which they are read."""
+        """The three sentences, in the order in which they are read."""
         return self.trust, self.use, self.then
 
 
 def fit_verdict(result: FitResult) -> PageVerdict:
-    """Of a fit, from its own findings."""
+    """Return the verdict of a fit, from its own findings."""
     doubts = list(_doubts(result, result.data))
     error, part = _worst(result.scores)
     bad = (
@@ -80,7 +80,7 @@ def fit_verdict(result: FitResult) -> PageVerdict:
 
 
 def compare_verdict(result: CompareResult) -> PageVerdict:
-    """Of a comparison: which model to take."""
+    """Return the verdict of a comparison: which model to use."""
     rows = [row for row in result.comparison if _worst(row.scores)[0] is not None]
     if not rows:
         return PageVerdict(
@@ -170,7 +170,7 @@ def _on(part: str) -> str:
 
 
 def _worse(scores: dict[str, PartScores]) -> tuple[float, str] | None:
-    """Return how many times as large as in training the free run's error on a held-out part is, where that is a lot."""
+    """Return the free run's error on a held-out part over that in training, where it is large."""
     found = {}
     trained = scores["train"].simulation.rmse if "train" in scores else None
     for part, score in scores.items():
@@ -183,7 +183,7 @@ def _worse(scores: dict[str, PartScores]) -> tuple[float, str] | None:
 
 
 def _worst(scores: dict[str, PartScores], kind: str = "simulation") -> tuple[float | None, str]:
-    """NRMSE of the free run on the held-out part where it is largest, RMS over outputs.
+    """Return the NRMSE of the free run on the held-out part where it is largest, RMS over outputs.
 
     Of training if none is.
 
@@ -217,7 +217,7 @@ def _warned(result: FitResult | RowResult, code: str) -> bool:
 
 
 def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
-    """Yield what speaks against the model, the gravest first."""
+    """Yield the objections to the model, the gravest first."""
     runaway = [w.text.split(":")[0] for w in result.warnings if w.code == _RAN_AWAY]
     if runaway:
         yield f"its free run diverges on {_joined(runaway)}"
@@ -275,7 +275,7 @@ def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
 
 
 def _size_of_bias(rows: Sequence[ParameterResult]) -> str:
-    """Return how large the biases are.
+    """Return a text on the size of the biases.
 
     In figures where one is far larger than its standard error.
     """
@@ -327,26 +327,26 @@ def _use(result: FitResult, level: str) -> str:
     if level == "bad" and not (known and predicts):
         return "Use it for nothing but to look for what is missing."
     if level == "bad":
-        told = "predict the next sample"
+        text = "predict the next sample"
     else:
-        told = f"simulate{' and predict' if predicts else ''} within the range of its training data"
-    told += f" and to read {_joined(known)} as physics" if known else ""
+        text = f"simulate{' and predict' if predicts else ''} within the range of its training data"
+    text += f" and to read {_joined(known)} as physics" if known else ""
     if sure and not known:
         cover = "interval does" if len(sure) == 1 else "intervals do"
-        told += (
+        text += (
             f", but do not read {_joined(sure)} as physics yet: the {cover} not cover what the "
             "residual still holds"
         )
-    told += (
+    text += (
         f"; {_joined(others)} {_is(others)} too uncertain or biased to be read so" if others else ""
     )
     if shared:
-        told += (
+        text += (
             f"; {_joined(shared)} {_is(shared)} what the physics nearest to the data has, for "
             "the learner could"
         )
-        told += f" imitate {'it' if len(shared) == 1 else 'them'}"
-    return f"Use it to {told}."
+        text += f" imitate {'it' if len(shared) == 1 else 'them'}"
+    return f"Use it to {text}."
 
 
 def _noise_alone(result: FitResult) -> bool:
@@ -372,7 +372,7 @@ def _is(names: list[str]) -> str:
 
 
 def _then(result: FitResult) -> str:
-    """Return the first thing to do: a change that bettered the free run in a trial.
+    """Return the first thing to do: a change that lowered the free run's error in a trial.
 
     Else an option, named as one.
     """
@@ -394,7 +394,7 @@ def _then(result: FitResult) -> str:
 
 
 def _option(result: FitResult) -> str | None:
-    """Return what may help and was not tried, as the middle of a sentence."""
+    """Return a change that may help and was not tried, as the middle of a sentence."""
     if _code(result) == "hurts":
         return (
             'physics alone (`learner.kind = "none"`), or a learner of other inputs or fewer neurons'
@@ -446,7 +446,7 @@ def _option(result: FitResult) -> str | None:
 
 
 def _predicted(result: FitResult) -> str | None:
-    """Return the change with the largest gain that findings predict, where none was tried."""
+    """Return the change with the largest predicted gain, where none was tried."""
     causes = [row.bias for row in _rows(result) if _biased(row) and row.bias]
     cause = max(causes, key=lambda bias: bias.share or 0.0, default=None)
     missing = (
@@ -468,7 +468,7 @@ def _predicted(result: FitResult) -> str | None:
 
 
 def _cause_option(cause: BiasResult, learned: bool) -> str:
-    """Return a cause of what was learned, or of what the free run leaves, as a term of the physics."""
+    """Return a term that explains the learned part or the residual, for the physics."""
     looks = "looks most like it" if (cause.share or 0.0) < SURE_SHARE and learned else "is that"
     what = "what was learned" if learned else "what the free run leaves"
     return f"“{cause.cause}” in the physics, for {percent(cause.share)} of {what} {looks}"
@@ -485,9 +485,9 @@ def _undecided(result: FitResult) -> bool:
 
 
 def _change(change: object) -> str:
-    """Return a change with what it is predicted to gain, as the middle of a sentence."""
-    told = {key: getattr(change, key) for key in ("kind", "what", "fall", "of", "output")}
-    predicted = Change(**{**told, "fall": told["fall"] or 0.0})
+    """Return a change with its predicted gain, as the middle of a sentence."""
+    text = {key: getattr(change, key) for key in ("kind", "what", "fall", "of", "output")}
+    predicted = Change(**{**text, "fall": text["fall"] or 0.0})
     return f"{predicted.name}, with which {predicted.prediction}"
 
 

@@ -1,4 +1,4 @@
-"""Figures of results. They show what a result holds, and compute nothing else."""
+"""Figures of results: they draw the numbers of a result, and compute nothing else."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ _OVER_TIME = "parameters over time with 95 % bands; vertical lines: the residual
 
 @plain
 def output_figure(response: Response, title: str, *, learns: bool = False) -> Figure:
-    """Measured output against the model, and below it their difference, from the first value on.
+    """Draw measured output and model, and below them their difference, from the first value on.
 
     Args:
         learns: draw the free run of a motion without its learner, too.
@@ -89,7 +89,7 @@ def output_figure(response: Response, title: str, *, learns: bool = False) -> Fi
 
 @plain
 def residual_figure(response: Response, title: str) -> Figure:
-    """Measured minus model over the whole record, one panel per output."""
+    """Draw measured minus model over the whole record, one panel per output."""
     trajectory = response.trajectories[0]
     figure, axes = panels(
         response, f"{title}: {extent(response, slice(trajectory.start, len(trajectory.model)))}"
@@ -107,7 +107,7 @@ def residual_figure(response: Response, title: str) -> Figure:
 
 @plain
 def components_figure(response: Response, title: str) -> Figure:
-    """Return the baseline's and the learner's part of the model's output, each on its own scale.
+    """Draw the baseline's and the learner's part of the output, each on its own scale.
 
     Two panels per output.
     """
@@ -134,7 +134,7 @@ def components_figure(response: Response, title: str) -> Figure:
 
 @plain
 def states_figure(model: MotionModel, record: Record, title: str) -> Figure:
-    """Return every state along the free run of the first experiment."""
+    """Draw every state along the free run of the first experiment."""
     states, _ = trajectory_of(model, record)
     motion = model.form.motion
     rows = slice(0, min(len(states), 250))
@@ -149,7 +149,7 @@ def states_figure(model: MotionModel, record: Record, title: str) -> Figure:
 
 @plain
 def parts_figure(model: MotionModel, record: Record, title: str) -> Figure:
-    """Of each learned equation and output what the physics gives, and what is learned beside it, along the free run."""
+    """Draw physics and learned part of each learned equation and output, along the free run."""
     states, inputs = trajectory_of(model, record)
     rows = slice(0, min(len(states), 250))
     physics, learner = parts_at(model.form, model.numbers, states[rows], inputs[rows])
@@ -168,7 +168,9 @@ def parts_figure(model: MotionModel, record: Record, title: str) -> Figure:
 
 @plain
 def learner_figure(part: LearnedPart, title: str) -> Figure:
-    """Return what was learned over each input of the learner: along the training run, and as a curve where that is one.
+    """Draw the learned part over each input of the learner: along the training run, and as a curve.
+
+    The curve is drawn where the input is a variable.
 
     The curve of a state or input is drawn with all others at their medians, dashed beyond the reach
     of the data.
@@ -212,14 +214,14 @@ def learner_figure(part: LearnedPart, title: str) -> Figure:
             label(axis, x=with_unit(feature, part.units[j]), y=None if column else name)
     for axis in axes.flat:
         axis.set_visible(bool(axis.lines))
-    told = max(axes[0], key=lambda axis: len(axis.get_legend_handles_labels()[1]))
-    legend(axes[0, -1] if axes[0, -1].lines else told, *told.get_legend_handles_labels())
+    main = max(axes[0], key=lambda axis: len(axis.get_legend_handles_labels()[1]))
+    legend(axes[0, -1] if axes[0, -1].lines else main, *main.get_legend_handles_labels())
     return figure
 
 
 @plain
 def comparison_figure(rows: Sequence[RowResult]) -> Figure:
-    """Scores and parameters of several ways of modelling, from the rows of a comparison.
+    """Draw scores and parameters of several models, from the rows of a comparison.
 
     Upper panel: free-run and one-step NRMSE on the last part. Below, a panel per parameter with 95
     % intervals.
@@ -269,7 +271,7 @@ def comparison_figure(rows: Sequence[RowResult]) -> Figure:
 
 @plain
 def selection_figure(result: SelectResult, unit: str) -> Figure:
-    """Score against size, a panel for each stage, the choice marked."""
+    """Draw score against size, a panel for each stage, with the choice marked."""
     stages = list(dict.fromkeys(row.stage for row in result.models))
     figure = Figure(figsize=(SIZE[0], TOP + SIZE[1] * len(stages)))
     axes = grid(figure, len(stages), 1, gap=(0.55, 0.0))[:, 0]
@@ -316,7 +318,7 @@ def tracking_figure(
     physical: pd.DataFrame | None = None,
     physical_parameters: Sequence[Any] = (),
 ) -> Figure:
-    """Return a panel for each parameter with its 95 % band, and the alarm below.
+    """Draw a panel for each parameter with its 95 % band, and the alarm below.
 
     Vertical lines are where it was raised.
 
@@ -346,7 +348,7 @@ def tracking_figure(
 
 
 def _band(axis: Any, frame: pd.DataFrame, name: str) -> None:
-    """A parameter over time, as wide as what most of it needs: the first rows of an empty start are wild."""
+    """Draw a parameter over time, with limits from most of it: the first rows vary wildly."""
     time, value, low, high = (
         frame[key].to_numpy() for key in ("time", name, f"{name}_low", f"{name}_high")
     )
@@ -360,7 +362,7 @@ def _band(axis: Any, frame: pd.DataFrame, name: str) -> None:
 
 
 def _mean_nrmse(row: RowResult, kind: str) -> float:
-    """RMS over outputs of the last part's NRMSE; NaN where there is none."""
+    """Return the RMS over outputs of the last part's NRMSE; NaN where there is none."""
     if not row.scores:
         return float("nan")
     nrmse = list(row.scores.values())[-1].kinds[kind].nrmse
@@ -377,7 +379,7 @@ def _floats(values: Sequence[float | None]) -> np.ndarray:
 
 
 def _stacked(count: int, title: str) -> tuple[Figure, list]:
-    """Panels below each other."""
+    """Return panels below each other."""
     figure = Figure(figsize=(SIZE[0], TOP + 1.6 * count))
     axes = grid(figure, count, 1, sharex=True)[:, 0]
     headline(figure, title)

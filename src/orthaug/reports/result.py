@@ -1,4 +1,4 @@
-"""The content of result.json, and of what other commands print as JSON. Text, page and plots read it."""
+"""Content of result.json, and of other commands' JSON; text, page and plots read it."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ SCHEMA = 2
 
 
 class ResultHeader(Content):
-    """What every result begins with."""
+    """The fields that every result begins with."""
 
     schema_number: Literal[2] = Field(
         SCHEMA, validation_alias="schema", serialization_alias="schema"
@@ -64,7 +64,7 @@ class FileResult(Content):
 
 
 class PreparedResult(Content):
-    """A step of preparation: `samples` were marked as missing or reconstructed in all files of the training data."""
+    """A step of preparation: `samples` marked as missing or reconstructed in all training files."""
 
     step: str
     options: dict[str, Any]
@@ -73,7 +73,7 @@ class PreparedResult(Content):
 
 
 class DataResult(Content):
-    """The files of each part, and what all parts went through."""
+    """The files of each part, and the steps of preparation common to all parts."""
 
     absent: ClassVar = frozenset({"validation", "tests", "prepare"})
 
@@ -84,13 +84,13 @@ class DataResult(Content):
 
     @property
     def parts(self) -> dict[str, list[FileResult]]:
-        """Every part by its name."""
+        """Files of every part, by its name."""
         held_out = {} if self.validation is None else {"validation": self.validation}
         return {"train": self.train, **held_out, **(self.tests or {})}
 
 
 class StatusResult(Content):
-    """How training ended."""
+    """The status: how training ended."""
 
     code: str
     message: str
@@ -125,7 +125,7 @@ class ParameterResult(Content):
     name: str
     unit: str
     derived_unit: str | None = None
-    """What the channels' units ask for, where the spec gives none."""
+    """The unit implied by those of the channels, where the spec gives none."""
     initial: Number
     value: Number
     one_step: Number = None
@@ -133,7 +133,7 @@ class ParameterResult(Content):
     plain_std: Number = None
     ci95: Numbers | None = None
     ci95_counts: Literal["noise only"] | None = None
-    """What the interval counts, where the model leaves more than noise."""
+    """What the interval counts, where the residual shows more than noise."""
     profile95: Numbers | None = None
     shared: Flag | None = None
     bias: BiasResult | None = None
@@ -141,11 +141,11 @@ class ParameterResult(Content):
 
     @property
     def shown_unit(self) -> str:
-        """The unit of the spec, or in brackets the one that follows from those of the channels."""
+        """Unit of the spec, or in brackets the one that follows from those of the channels."""
         return self.unit or (f"({self.derived_unit})" if self.derived_unit else "–")
 
-    def told(self, shared: bool | None, bias: ParameterBias | None) -> ParameterResult:
-        """The same with whether the learner could imitate it, and its bias."""
+    def with_bias(self, shared: bool | None, bias: ParameterBias | None) -> ParameterResult:
+        """Return the parameter with its bias, and with whether the learner could imitate it."""
         found: dict[str, object] = {"shared": shared}
         if bias is not None:
             interval = None if bias.ci95 is None else list(bias.ci95)
@@ -154,7 +154,7 @@ class ParameterResult(Content):
 
 
 class ConsistencyResult(Content):
-    """Whether θ̂ obeys what the physics fixes among θ."""
+    """Test of whether θ̂ obeys the relations that the physics fixes among θ."""
 
     chi2: Number
     df: Whole
@@ -173,20 +173,20 @@ class MeasureResult(Content):
 
     @classmethod
     def of_motion(cls, split: MotionSplit) -> MeasureResult:
-        """Of a motion, which has neither a condition of Φ nor a price."""
+        """Return the measure of a motion, which has neither a condition of Φ nor a price."""
         own = {"name": split.name, "points": len(split.field.x), "support": split.support}
         return cls.model_validate({**own, "condition": None, "price": None})
 
 
 class OutputWeightsResult(Content):
-    """How the outputs are weighed against each other: errors e count as ‖matrix · e‖²."""
+    """Weights of the outputs against each other: errors e count as ‖matrix · e‖²."""
 
     kind: str
     matrix: list[Numbers]
 
 
 class ExcitationResult(Content):
-    """How well the data tell the parameters apart."""
+    """Excitation: how well the data identify the parameters."""
 
     rank: Whole
     columns: Whole
@@ -194,13 +194,13 @@ class ExcitationResult(Content):
 
 
 class GroupedExcitation(ExcitationResult):
-    """The same, with the groups that the data do not tell apart."""
+    """Excitation, with the groups of parameters that the data do not separate."""
 
     collinear: list[list[str]]
 
 
 class IdentifiabilityResult(Content):
-    """Whether any data could tell the parameters apart."""
+    """Identifiability: whether any data could separate the parameters."""
 
     identifiable: Flag = Field(validation_alias="full_rank")
     rank: Whole
@@ -209,7 +209,7 @@ class IdentifiabilityResult(Content):
 
 
 def _where_any(values: Any) -> Any:
-    """None instead of a list where no output has a score."""
+    """Return None instead of a list where no output has a score."""
     return None if isinstance(values, np.ndarray) and np.isnan(values).all() else values
 
 
@@ -234,7 +234,7 @@ class PartScores(Content):
 
     @property
     def kinds(self) -> dict[str, ScoreResult]:
-        """By horizon: one step ahead, and the free run."""
+        """Scores by horizon: one step ahead, and the free run."""
         return {"prediction": self.prediction, "simulation": self.simulation}
 
 
@@ -258,7 +258,7 @@ class EquationResult(Content):
 
 
 class FocusCandidateResult(Content):
-    """A model whose free run was compared where nothing was fitted.
+    """A model whose free run was compared on validation data.
 
     `error` in standard deviations of the output.
     """
@@ -269,7 +269,7 @@ class FocusCandidateResult(Content):
 
 
 class FocusResult(Content):
-    """Whether the fit was trained one step ahead or on the free run, where that was left to the data, and why."""
+    """The criterion that the data chose, one step ahead or free run, and the reason."""
 
     chosen: str
     text: str
@@ -277,13 +277,13 @@ class FocusResult(Content):
 
 
 class PhysicsAloneResult(Content):
-    """The physics without a learner that stands beside the model."""
+    """The physics without a learner beside the model."""
 
     scores: dict[str, PartScores]
 
 
 class FitResult(ResultHeader):
-    """What `orthaug fit` leaves."""
+    """The result of `orthaug fit`."""
 
     absent: ClassVar = frozenset(
         {"motion", "terms", "equation", "unexplained", "standard_errors_by", "intervals"}
@@ -296,8 +296,7 @@ class FitResult(ResultHeader):
     parameters: list[ParameterResult]
     standard_errors: str | None
     standard_errors_by: str | None = None
-    """How they were made, a key of `fitting.estimates.STD_KINDS`; None for those of white and even
-    errors.
+    """How the standard errors were computed, a key of `fitting.estimates.STD_KINDS`; None for white noise of even size.
     """
     physical_parameters: list[ParameterResult] | None
     physical_consistency: ConsistencyResult | None
@@ -329,12 +328,12 @@ class FitResult(ResultHeader):
 
     @property
     def noise_only(self) -> bool:
-        """Return whether the intervals count noise only: the model leaves more than that."""
+        """Whether the intervals count noise only, although the residual shows more than that."""
         return any(row.ci95_counts for row in (*self.parameters, *(self.physical_parameters or ())))
 
     @property
     def learns(self) -> bool:
-        """Return whether biases are of what a learner found.
+        """Whether the biases are due to a learned part.
 
         Of a motion without one they are of what the free run leaves.
         """
@@ -342,7 +341,7 @@ class FitResult(ResultHeader):
 
 
 class CheckResult(ResultHeader):
-    """What `orthaug check` tells."""
+    """The result of `orthaug check`."""
 
     absent: ClassVar = frozenset({"motion"})
 
@@ -359,7 +358,7 @@ class CheckResult(ResultHeader):
 
 
 class RowResult(Content):
-    """One way of modelling in a comparison."""
+    """One model in a comparison."""
 
     name: str
     status: str
@@ -375,7 +374,7 @@ class RowResult(Content):
 
 
 class CompareResult(ResultHeader):
-    """What `orthaug compare` leaves."""
+    """The result of `orthaug compare`."""
 
     spec: dict[str, Any]
     data: DataResult
@@ -386,7 +385,7 @@ class CompareResult(ResultHeader):
 
 
 class SplitResult(ResultHeader):
-    """What `orthaug split` tells."""
+    """The result of `orthaug split`."""
 
     parameters: list[ParameterResult]
     theta_aux: Numbers
@@ -407,7 +406,7 @@ class CandidateResult(Content):
 
 
 class DesignResult(Content):
-    """What `orthaug design` tells."""
+    """The result of `orthaug design`."""
 
     kind: str
     relative_error: Number
@@ -436,7 +435,7 @@ def parameter_rows(
     one_step: Any = None,
     plain_std: Any = None,
 ) -> list[ParameterResult]:
-    """θ as results list it; what stands at a bound has no interval."""
+    """Return θ as results list it; a parameter at a bound has no interval."""
     return [
         ParameterResult.model_validate(
             {
@@ -457,7 +456,7 @@ def parameter_rows(
 def physical_rows(
     estimate: PhysicalEstimate, profiles: dict[str, tuple[float, float]] | None = None
 ) -> list[ParameterResult]:
-    """Return the physical parameters as results list them, with the profile intervals that were made."""
+    """Return the physical parameters as results list them, with their profile intervals."""
     columns = (
         estimate.names,
         estimate.units,

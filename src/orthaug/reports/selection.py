@@ -1,4 +1,4 @@
-"""What `orthaug select` leaves: as JSON, and in words."""
+"""Result of `orthaug select`: as JSON, and in words."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class OrdersResult(Content):
 
 
 class DelayResult(Content):
-    """The delay of an input in samples: by its cross-correlation with the output, by the fit, by that of its square."""
+    """The delay of an input in samples, by three estimates."""
 
     input: str
     correlation: int | None
@@ -35,7 +35,7 @@ class DelayResult(Content):
 
 
 class NonlinearityResult(Content):
-    """Whether anything nonlinear is missing beside physics and linear lags."""
+    """Test of whether physics and linear lags lack something nonlinear."""
 
     p: Number
     regressors: dict[str, Number]
@@ -61,7 +61,7 @@ class TermShareResult(Content):
 
 
 class ShiftResult(Content):
-    """A parameter of physics alone and with the chosen terms, and what these leave of its regressor."""
+    """A parameter without and with the chosen terms, and the share of its regressor that is left."""
 
     parameter: str
     unit: str | None
@@ -87,7 +87,7 @@ class SelectionRowResult(Content):
 
 
 class SelectResult(ResultHeader):
-    """What `orthaug select` leaves."""
+    """The result of `orthaug select`."""
 
     data: DataResult
     orders: OrdersResult
@@ -107,7 +107,7 @@ class SelectResult(ResultHeader):
 
 
 def selection_text(result: SelectResult) -> str:
-    """Return a page: what was chosen, why, and the models beside it."""
+    """Return a page of text: what was chosen, why, and the models beside it."""
     from orthaug.selection.orders import Delay, Orders
 
     orders = Orders(result.orders.na, tuple(result.orders.nb), tuple(result.orders.nk))

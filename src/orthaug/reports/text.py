@@ -35,7 +35,7 @@ ADVISED = 2  # changes that a text advises at most; result.json has all
 
 
 def fit_text(fit: Estimate | MotionEstimate, result: FitResult) -> str:
-    """Parameters, scores on every part, what the residual says, whether the learner earns its place, warnings."""
+    """Return parameters, scores on every part, residual tests, the verdict and warnings."""
     if not fit.status.ok:
         return ""
     lines = [_as_doubted(line, result) for line in fit.lines()]
@@ -52,14 +52,20 @@ def fit_text(fit: Estimate | MotionEstimate, result: FitResult) -> str:
     blocks.append(_bias_lines(result))
     findings = [result.residuals, result.missing_lags, result.validation]
     findings += [result.stability] if result.motion is not None else []
-    told = [finding.text for finding in findings if finding]
-    blocks += [told, warning_lines(w for w in dict.fromkeys(result.warnings) if w.text not in told)]
+    parts = [finding.text for finding in findings if finding]
+    blocks += [
+        parts,
+        warning_lines(w for w in dict.fromkeys(result.warnings) if w.text not in parts),
+    ]
     blocks.append(_advice_lines(result))
     return "\n\n".join("\n".join(fold(lines)) for lines in blocks if lines)
 
 
 def _as_doubted(line: str, result: FitResult) -> str:
-    """Return a line of a fit with intervals that say that they count noise only, and without withdrawn claims."""
+    """Return a line of a fit whose intervals count noise only, without withdrawn claims.
+
+    The line says so.
+    """
     if result.noise_only:
         line = line.replace(f"{'95 % interval':^29}", f"{'95 %, noise only':^29}")
     if result.shared is not None and result.shared.doubt and line.startswith("shared "):
@@ -68,7 +74,7 @@ def _as_doubted(line: str, result: FitResult) -> str:
 
 
 def _advice_lines(result: FitResult) -> list[str]:
-    """Changes of the spec that bettered the free run in a trial, and an account of all trials."""
+    """Return the changes that lowered the free run's error, and a count of all trials."""
     lines = [
         f"{'Next: ' if i == 0 else 'Or: '}{advice.text}"
         for i, advice in enumerate(result.advice[:ADVISED])
@@ -77,7 +83,7 @@ def _advice_lines(result: FitResult) -> list[str]:
 
 
 def check_text(result: CheckResult) -> str:
-    """Excitation, identifiability, and what would bias the parameters."""
+    """Return excitation, identifiability, and possible biases of the parameters."""
     data, physics = result.excitation, result.identifiability
     condition = f"{data.condition:.4g}" if data.condition is not None else "infinite"
     moves = result.motion is not None
@@ -90,9 +96,9 @@ def check_text(result: CheckResult) -> str:
         f"excitation       rank {data.rank} of {data.columns} on the data, condition {condition}",
         f"identifiability  rank {physics.rank} of {physics.columns} {where}: "
         + (
-            "the parameters can be told apart"
+            "the parameters can be distinguished"
             if physics.identifiable
-            else "no data can tell the parameters apart"
+            else "no data can distinguish the parameters"
         ),
     ]
     for group in physics.inseparable:
@@ -117,7 +123,7 @@ def check_text(result: CheckResult) -> str:
 
 
 def _shared_lines(shared: SharedResult) -> list[str]:
-    """Return what the learner could imitate, and a table of what other inputs would make of it."""
+    """Return the physics that the learner could imitate, and a table of other learner inputs."""
     lines = [shared.text]
     if shared.alternatives:
         head = ["with learner.inputs", "shared directions", "determined beside it"]
@@ -141,15 +147,15 @@ def compare_text(result: CompareResult, verdicts: Mapping[str, Verdict]) -> str:
     lines = [*table(_parameter_cells(result)), "", *table(_score_cells(result.comparison))]
     if result.chosen:
         lines += ["", "* chosen on the validation part"]
-    told = [
+    parts = [
         f"{row.name}: {row.residuals.text}"
         for row in result.comparison
         if row.residuals is not None
     ]
-    lines += ["", *told] if told else []
-    told = [f"{kind}: {verdict.summary}" for kind, verdict in verdicts.items()]
+    lines += ["", *parts] if parts else []
+    parts = [f"{kind}: {verdict.summary}" for kind, verdict in verdicts.items()]
     beyond = dict.fromkeys(f"{e}." for verdict in verdicts.values() for e in verdict.extrapolation)
-    lines += ["", *told, *beyond] if told else []
+    lines += ["", *parts, *beyond] if parts else []
     lines.append("")
     lines += [f"left out: {kind}: {why}" for kind, why in result.left_out.items()]
     lines += warning_lines(result.warnings)
@@ -161,7 +167,7 @@ def compare_text(result: CompareResult, verdicts: Mapping[str, Verdict]) -> str:
 
 
 def split_text(result: SplitResult) -> str:
-    """θ under the measure, with intervals."""
+    """Return θ under the measure, with intervals."""
     detail = result.measure_detail
     support = "–" if detail.support is None else f"{100 * detail.support:.0f} %"
     lines = [
@@ -173,7 +179,7 @@ def split_text(result: SplitResult) -> str:
 
 
 def parameter_table(name: str, rows: Sequence[ParameterResult]) -> list[str]:
-    """Parameters with standard errors and intervals, under a head that begins with `name`."""
+    """Return parameters with standard errors and intervals; the head begins with `name`."""
     width = _width(rows)
     return [
         f"{name:<{width}}  {'value':>14}  {'std':>11}  {'95 % interval':^29}  unit",
@@ -182,7 +188,7 @@ def parameter_table(name: str, rows: Sequence[ParameterResult]) -> list[str]:
 
 
 def design_text(result: DesignResult) -> str:
-    """Return the design and what else was tried."""
+    """Return the design, and the signals that were tried beside it."""
     rows = [["signal", "error", "bias", "std", "condition"]]
     for signal in result.candidates[:SHOWN]:
         error = None if signal.cost is None else float(np.sqrt(signal.cost))
@@ -216,7 +222,7 @@ def warning_lines(warnings: Iterable[WarningResult]) -> list[str]:
 
 
 def _suspect_lines(suspects: Sequence[SuspectResult]) -> list[str]:
-    """Return what each suspect does, biases in per cent."""
+    """Return the effect of each suspect, with biases in per cent."""
     rows = [["suspect", "size", *suspects[0].percent, "cosine", "removed by"]]
     for suspect in suspects:
         guess = suspect.coefficient
@@ -237,7 +243,7 @@ def _suspect_lines(suspects: Sequence[SuspectResult]) -> list[str]:
 
 
 def _bias_lines(result: FitResult) -> list[str]:
-    """Return the bias of every parameter by what the learner found, and the interval that covers it."""
+    """Return the bias of every parameter by the learned part, and the interval that covers it."""
     rows = [*result.parameters, *(result.physical_parameters or ())]
     lines, width, causes = [], _width([row for row in rows if row.bias]), biased_by(rows)
     what = ("learner found" if result.learns else "free run leaves") + (
@@ -272,7 +278,7 @@ def _bias_line(row: ParameterResult, width: int) -> str:
 
 
 def _rounded(share: float) -> float:
-    """Zero for what is rounding of zero."""
+    """Return a number, zero where it is only the rounding error of zero."""
     return 0.0 if abs(share) < 1e-9 else share
 
 
@@ -296,7 +302,7 @@ def _width(rows: Sequence[ParameterResult]) -> int:
 
 
 def _value_cells(row: ParameterResult, interval: Sequence[float | None] | None, width: int) -> str:
-    """Name, value, standard error and interval."""
+    """Return name, value, standard error and interval."""
     spread = f"{row.std:11.4g}" if row.std is not None else f"{'–':>11}"
     reach = (
         f"[{_limit(interval[0])}, {_limit(interval[1])}]" if interval is not None else f"{'–':^29}"
@@ -326,7 +332,7 @@ def _score_lines(fit: Estimate | MotionEstimate, result: FitResult) -> list[str]
 
 
 def _residual_lines(result: FitResult) -> list[str]:
-    """Return how much the one-step residual follows its own past and the inputs, where all rows were looked at."""
+    """Return the correlations of the one-step residual, where all rows were looked at."""
     lines = []
     for part, scores in result.scores.items():
         for test in scores.residual or ():
@@ -336,16 +342,16 @@ def _residual_lines(result: FitResult) -> list[str]:
             found = ((name, cross) for name, cross in test.cross.items() if cross is not None)
             largest += [(f"{name} by {cross.values[len(acf) - 1 + cross.lag]:.2g} at lag {cross.lag}", cross.band)
                         for name, cross in found]  # fmt: skip
-            told = ", ".join(f"{words} (band {band:.1g})" for words, band in largest)
+            parts = ", ".join(f"{words} (band {band:.1g})" for words, band in largest)
             lines.append(
                 f"{part}: over all {test.n} rows the one-step residual of {test.name} follows "
-                f"{told}."
+                f"{parts}."
             )
     return lines
 
 
 def response_text(response: Response) -> str:
-    """Scores of a response where its outputs were measured and it has a value on every row.
+    """Return the scores of a response where its outputs were measured and every row has a value.
 
     Otherwise nothing.
     """
@@ -355,7 +361,7 @@ def response_text(response: Response) -> str:
 
 
 def scores_text(scored: Scores, outputs: Sequence[Channel], horizon: int | None) -> str:
-    """Scores of each output; `horizon` in steps, None for a free run."""
+    """Return the scores of each output; `horizon` in steps, None for a free run."""
     kind = "free run" if horizon is None else f"{horizon} step{'s' * (horizon > 1)} ahead"
     rows = [[f"{kind}, {scored.samples} rows", "RMSE", "NRMSE", "FIT %"]]
     for channel, *numbers in zip(outputs, scored.rmse, scored.nrmse, scored.fit, strict=True):

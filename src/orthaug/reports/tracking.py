@@ -1,4 +1,4 @@
-"""What `orthaug track` tells, and its text."""
+"""Result of `orthaug track`, and its text."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from orthaug.reports.text import parameter_table, warning_lines
 
 
 class AlarmResult(Content):
-    """The residual left its band."""
+    """An alarm: the residual left its band."""
 
     row: Whole
     time: Number
 
 
 class TrackResult(ResultHeader):
-    """What `orthaug track` tells."""
+    """The result of `orthaug track`."""
 
     files: list[FileResult]
     model: str
@@ -35,21 +35,21 @@ class TrackResult(ResultHeader):
 
 
 def track_text(result: TrackResult) -> str:
-    """Rows, memory, alarms, and the parameters at the end."""
+    """Return rows, memory, alarms, and the parameters at the end."""
     memory = "everything" if result.memory is None else f"{result.memory:.4g} s"
     lines = [
         f"rows        {result.rows}, {result.time:g} s",
         f"memory      {memory} (forgetting {result.forgetting:.8g}), worth "
         f"{result.effective_rows:.0f} rows",
     ]
-    told = [
+    alarms = [
         f"the residual has left its band at {alarm.time:g} s (row {alarm.row})"
         for alarm in result.alarms
     ]
-    lines += [f"alarm       {sentence}" for sentence in told] or ["alarm       none"]
-    if told:
-        stands = "is still out of it" if result.alarmed else "has come back"
-        lines.append(f"            it {stands}, at {result.alarm_level:.2g} of its limit")
+    lines += [f"alarm       {sentence}" for sentence in alarms] or ["alarm       none"]
+    if alarms:
+        state = "is still out of it" if result.alarmed else "has come back"
+        lines.append(f"            it {state}, at {result.alarm_level:.2g} of its limit")
     blocks = [lines, parameter_table("parameter", result.parameters)]
     if result.physical_parameters:
         blocks.append(parameter_table("physical", result.physical_parameters))

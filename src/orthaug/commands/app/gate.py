@@ -1,4 +1,4 @@
-"""Who may use the page: whoever knows the token, from this machine, through a page of this server."""
+"""Access to the page: by a secret token, from this machine, through a page of this server only."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PLAIN = (
     "<!doctype html><html lang='en'><title>orthaug</title><body style='font:1rem "
     "system-ui;margin:3rem'>"
 )
-"""How a page begins that only says something."""
+"""The beginning of a page that shows a message only."""
 _REFUSED = (
     f"{PLAIN}<h1>This page needs its token</h1><p>Open the address that <code>orthaug "
     "app</code> printed in the terminal. It ends in <code>?token=…</code>.</p></body></html>"
@@ -35,7 +35,7 @@ _HEADERS = {
 
 
 class Gate:
-    """Stands before an application: requests and websockets without the token never reach it.
+    """A guard before an application: requests and websockets without the token never reach it.
 
     The token comes in the query of the first request, which is sent on without it; from then on a
     secret of its own in a cookie opens the gate. A ticket is a token for one request: who finds it
@@ -52,11 +52,14 @@ class Gate:
 
     @property
     def url(self) -> str:
-        """Where the page is, with the token."""
+        """Address of the page, with the token."""
         return f"http://127.0.0.1:{self.port}/?token={self.token}"
 
     def ticket(self) -> str:
-        """Return an address that opens the page once: every user of the machine reads a browser's arguments."""
+        """Return an address that opens the page once.
+
+        Every user of the machine can read the arguments of a browser.
+        """
         token = secrets.token_urlsafe(32)
         self._tickets.add(token)
         return f"http://127.0.0.1:{self.port}/?token={token}"
@@ -101,7 +104,7 @@ class Gate:
         return None if morsel is None else morsel.value
 
     def _spend(self, token: str | None) -> bool:
-        """Take a ticket: whether it was one that nobody had used."""
+        """Take a ticket; return whether it was still unused."""
         found = next((ticket for ticket in self._tickets if _same(token, ticket)), None)
         self._tickets.discard(found or "")
         return found is not None
@@ -142,7 +145,7 @@ async def _refuse(scope: Scope, send: Send) -> None:
 
 
 def _with_headers(send: Send) -> Send:
-    """Return every answer says that it is for this page alone.
+    """Return a sender that marks every answer as one for this page only.
 
     What an answer says itself stands.
     """

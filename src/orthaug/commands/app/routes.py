@@ -1,4 +1,4 @@
-"""What the server answers: the page of a session, files that are dropped, files that are taken away."""
+"""Routes of the server: the page of a session, uploads and downloads."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ MARK = (
     "stroke-linecap='round'/><path d='M9 17h6v6' stroke='#9cc8ff' stroke-width='2.2' "
     "fill='none'/></svg>"
 )
-"""The mark of the program, as a picture."""
+"""The icon of the program."""
 
 
 class Page:
-    """What one browser tab shows of a session. Several may show the same."""
+    """The view of a session in one browser tab; several tabs may show the same session."""
 
     def __init__(self, session: Session) -> None:
         self.session = session
@@ -84,7 +84,7 @@ class Page:
         ui.timer(_OFTEN, self.follow)
 
     def _keep_history(self, tabs: ui.tabs, start: str) -> None:
-        """Let Back and Forward of the browser go through the parts, and a reload show the same one."""
+        """Let the browser's Back, Forward and reload lead to the part that was shown."""
 
         def go(event: Any) -> None:
             if event.args in _PARTS:
@@ -103,7 +103,7 @@ class Page:
         ui.timer(_OFTEN, lambda: ui.run_javascript(opened.format(json.dumps(start))), once=True)
 
     def follow(self) -> None:
-        """Let each part see what has changed since the last look."""
+        """Let each part of the page redraw what has changed since it was last drawn."""
         now, seen = dict(self.session.versions), self.seen
         self.seen = now
 
@@ -141,16 +141,16 @@ class Page:
         self.title.set_content(escape(self.session.title or "from data to a model"))
 
     def _complain(self, error: Exception) -> None:
-        told = (
+        message = (
             str(error)
             if isinstance(error, InputError)
             else f"this did not work ({type(error).__name__})."
         )
-        ui.notify(sentence(told), type="negative")
+        ui.notify(sentence(message), type="negative")
 
 
 def application(sessions: Sessions, spec: Path | None) -> FastAPI:
-    """Return all routes, with the pages of NiceGUI behind them."""
+    """Return the application with all its routes, and the pages of NiceGUI behind them."""
     app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
 
     @app.get("/")
@@ -204,7 +204,7 @@ def application(sessions: Sessions, spec: Path | None) -> FastAPI:
 
 
 async def _kept(sessions: Sessions, key: str, name: str, request: Request) -> Response:
-    """Return a file as it comes, a piece at a time, and looked at once it is whole."""
+    """Return the answer to an upload: the file is written piece by piece, then examined."""
     session = sessions.find(key)
     if session is None:
         return _refused("this work is not open any more; open the page anew.", 404)

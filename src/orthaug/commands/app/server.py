@@ -1,4 +1,4 @@
-"""The server of the page: on this machine only, behind a token, ended by Ctrl-C with all that it started."""
+"""The server of the page: local only, behind a token, ended by Ctrl-C with all that it started."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _LOOK = 0.2  # s between looks at whether Ctrl-C came
 
 
 def free_port(wanted: int | None) -> socket.socket:
-    """Return a socket that listens on this machine alone, on the wanted port or a free one.
+    """Return a socket that listens on this machine only, on the wanted port or a free one.
 
     Raises:
         InputError: a port that is taken or not allowed.
@@ -57,7 +57,7 @@ def check_installed() -> None:
 
 @contextlib.contextmanager
 def private_folder() -> Iterator[Path]:
-    """A folder that only this user may read, gone with the program.
+    """Yield a folder that only this user can read; it is removed at the end.
 
     What a killed one left goes with the next.
     """
@@ -94,7 +94,7 @@ def serve(spec: Path | None, *, port: int | None = None, browser: bool = True) -
 
 @contextlib.contextmanager
 def _asked_to_end() -> Iterator[threading.Event]:
-    """An event that Ctrl-C sets; a second one ends the program at once."""
+    """Yield an event that Ctrl-C sets; a second Ctrl-C ends the program at once."""
     if WATCH.active:
         with WATCH.asking() as event:
             yield event

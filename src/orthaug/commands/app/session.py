@@ -41,7 +41,7 @@ KINDS = ("fit", "compare")
 
 
 class Session:
-    """State and actions.
+    """State and actions of one user's work.
 
     `versions` counts the changes of `data`, `spec`, `check` and `work`, for pages to follow.
     """
@@ -87,22 +87,22 @@ class Session:
 
     @property
     def untouched(self) -> bool:
-        """Return whether nobody has done anything in it yet."""
+        """Whether the session has not been used yet."""
         return not self.commands and self.data is None and set(self.authors) <= {"file"}
 
     def changed(self, what: str) -> None:
-        """Let every page of the session see it."""
+        """Mark the session as changed, so that every page of it redraws."""
         self.versions[what] += 1
 
     def start(self, work: Awaitable[Any]) -> asyncio.Task[Any]:
-        """Let something run without waiting for it."""
+        """Start a coroutine without waiting for it."""
         task = asyncio.ensure_future(work)
         self._tasks.add(task)
         task.add_done_callback(self._ended)
         return task
 
     def _ended(self, task: asyncio.Task[Any]) -> None:
-        """Let no task fail without a word."""
+        """Report the error of a task that has failed."""
         self._tasks.discard(task)
         if not task.cancelled() and (error := task.exception()) is not None:
             LOG.error("a task of the page failed", exc_info=error)
@@ -111,7 +111,7 @@ class Session:
 
     @property
     def first_step(self) -> str:
-        """Return what begins the work, where there is no spec yet."""
+        """The first step of the work, where there is no spec yet."""
         return (
             "It begins with a data file."
             if self.found is None
@@ -121,7 +121,7 @@ class Session:
     # Data
 
     def place_for(self, name: str) -> Path:
-        """Where a file of that name that was dropped is kept.
+        """Return the path under which an uploaded file of that name is kept.
 
         Raises:
             InputError: an ending of no data file.
@@ -135,7 +135,7 @@ class Session:
         return self.folder / plain_name
 
     def begin_file(self, name: str) -> Path:
-        """Return a file to write what is dropped under that name into.
+        """Return the path of a partial file for an upload of that name.
 
         `keep_file` gives it its place.
 
@@ -146,7 +146,7 @@ class Session:
         return self.folder / f"{secrets.token_hex(8)}.partial"
 
     def keep_file(self, partial: Path, name: str) -> tuple[Path, str]:
-        """Give a dropped file its place and return that, with what the page says of it.
+        """Move an uploaded file to its place; return that place and a message for the page.
 
         Nothing that is there is replaced: another content under the same name gets a number.
         """
@@ -164,7 +164,7 @@ class Session:
         )
 
     def open_file(self, path: Path) -> None:
-        """Look at a data file, and begin a spec for it where its columns tell what they are."""
+        """Look at a data file; begin a spec for it where its columns show their roles."""
         self.data, self.found = Path(os.path.abspath(path)), None
         self.title = (self.spec.strip() and self.title) or path.name
         self._look_again(None, None, None)
@@ -208,7 +208,10 @@ class Session:
 
     @property
     def _may_begin(self) -> bool:
-        """Return whether looking at a file may begin the spec: there is none, or one that it began and nobody worked on."""
+        """Whether looking at a file may begin the spec.
+
+        It may where there is no spec, or one that an earlier look began and nobody has edited.
+        """
         return not self.spec.strip() or (set(self.authors) <= {"look"} and not self.apart)
 
     def _begin(self, spec: str) -> None:
@@ -220,17 +223,17 @@ class Session:
 
     @property
     def apart(self) -> bool:
-        """Return whether the file that was looked at is one that the spec does not name."""
+        """Whether the spec does not name the file that was looked at."""
         return self.data is not None and bool(self.spec.strip()) and not self.names(self.data)
 
     def names(self, file: Path) -> bool:
-        """Return whether the spec names a file, or has a pattern for it."""
+        """Return whether the spec names a file, or has a pattern that matches it."""
         whole = os.path.abspath(file)
         named = [os.path.abspath(self.folder / name) for name in files(self.content())]
         return any(whole == name or fnmatch(whole, name) for name in named)
 
     def add_test(self) -> None:
-        """Let the file that was looked at be a test of the spec."""
+        """Add the file that was looked at to the tests of the spec."""
         assert self.data is not None
         file = self.data.name if self.data.parent == self.folder else self.data.as_posix()
         taken, name = section(self.content(), "data", "tests"), re.sub(r"\W", "_", self.data.stem)
@@ -240,7 +243,7 @@ class Session:
         self.changed("data")
 
     def open_spec(self, path: Path, *, kept: bool = False) -> None:
-        """Take a spec that stands somewhere, or one of earlier work that was kept.
+        """Open a spec from a file, or one of earlier work that was kept.
 
         It is read, and never written.
 
@@ -259,7 +262,7 @@ class Session:
     # Spec
 
     def write(self, text: str, author: str) -> None:
-        """Take a spec, and check it when nobody has changed it for a moment."""
+        """Take a new text of the spec; check it when it has not changed for a moment."""
         if text == self.spec:
             return
         self.spec = text
@@ -271,7 +274,7 @@ class Session:
         self._check_soon()
 
     def edit(self, author: str, change: Callable[..., str], *given: Any) -> None:
-        """Take the spec after a change of `spec_text`, which is given the rest."""
+        """Replace the spec by the result of a function of `spec_text` with these arguments."""
         self.write(change(self.spec, *given), author)
 
     def _check_soon(self) -> None:
@@ -303,7 +306,7 @@ class Session:
 
     @property
     def units(self) -> dict[str, str]:
-        """Return what the channels ask for as units of parameters, of the spec as it is.
+        """Units of parameters that follow from the channels of the present spec.
 
         Nothing until it is checked.
         """
@@ -312,7 +315,7 @@ class Session:
         return {name: asked or "1" for name, _, asked in self.checked["units"] if asked is not None}
 
     def content(self) -> dict[str, Any]:
-        """Return the spec as dictionaries; empty while its TOML is broken."""
+        """Return the spec as dictionaries; empty while its TOML is invalid."""
         try:
             return plain(self.spec)
         except InputError:
@@ -331,7 +334,7 @@ class Session:
 
     @property
     def running(self) -> Command | None:
-        """The training that goes on."""
+        """The training that runs now."""
         return next(
             (command for kind in KINDS if (command := self.commands.get(kind)) and command.running),
             None,
@@ -358,7 +361,7 @@ class Session:
         self.changed("work")
 
     async def _read_result(self, kind: str) -> None:
-        """The result that lies in the folder, and the verdict that its report begins with."""
+        """Read the result in the folder, and the verdict that its report begins with."""
         place = self.folder / kind / "result.json"
         self.verdicts.pop(kind, None)
         with suppress(OSError, ValueError):  # InputError among them
@@ -366,13 +369,13 @@ class Session:
             self.verdicts[kind] = await self.desk.ask("verdict", path=place, kind=kind)
 
     def stop(self) -> None:
-        """Interrupt the training that goes on."""
+        """Interrupt the training that runs now."""
         if self.running is not None:
             self.running.stop()
             self.changed("work")
 
     def finish(self) -> None:
-        """Let the training that goes on end with what it has reached."""
+        """Let the training that runs now end with the result reached so far."""
         if self.running is not None:
             self.running.finish()
             self.changed("work")
@@ -402,7 +405,7 @@ class Session:
             self.changed("work")
 
     def download(self, what: str) -> Path:
-        """Return the file that is handed out under a name: from a list, never a path.
+        """Return the file to download under a name: from a fixed list, never a path.
 
         Raises:
             InputError: nothing there.
@@ -431,7 +434,7 @@ class Session:
 
 
 class Sessions:
-    """All work that goes on, by keys that cannot be guessed."""
+    """All sessions, by keys that cannot be guessed."""
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.desk = folder, WorkerPool()
@@ -439,7 +442,7 @@ class Sessions:
         self._made = 0
 
     def new(self, spec: Path | None = None) -> Session:
-        """Return a session in a folder of its own, which nobody else may read.
+        """Return a session in a folder of its own, which nobody else can read.
 
         Raises:
             InputError: too many sessions, or a spec that cannot be read.
@@ -470,7 +473,7 @@ class Sessions:
 
 
 def _as_name(text: str) -> str:
-    """Return what any system takes as the name of a file."""
+    """Return a name that any system accepts as the name of a file."""
     return re.sub(r"[^\w. -]", "_", text).strip(" .")[-60:]
 
 

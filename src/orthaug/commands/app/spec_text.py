@@ -43,7 +43,7 @@ def opened(text: str) -> tomlkit.TOMLDocument:
 
 
 def in_file(path: Path) -> str:
-    """Return the text of a spec that stands somewhere.
+    """Return the text of a spec in a file.
 
     Raises:
         InputError: a file that cannot be read, or broken TOML.
@@ -62,7 +62,7 @@ def in_file(path: Path) -> str:
 
 
 def keep(title: str, key: str, spec: str) -> None:
-    """Write the spec of a piece of work anew, whole or not at all.
+    """Write the spec of a session anew, whole or not at all.
 
     Nothing where the folder cannot be written.
     """
@@ -86,7 +86,7 @@ def earlier() -> list[Path]:
 
 
 def kept_title(place: Path) -> str:
-    """Return what it was called."""
+    """Return the title under which a spec was kept."""
     return place.stem[:-_MARK]
 
 
@@ -95,7 +95,7 @@ def _folder() -> Path:
 
 
 def absolute(text: str, folder: Path) -> str:
-    """The same spec with whole paths for files that it names from `folder` on, so that it may stand anywhere."""
+    """Return the spec with absolute paths for the files that it names relative to `folder`."""
     document = opened(text)
     for entry in _with_files(document):
         entry["files"] = [_whole(folder, file) for file in entry["files"]]
@@ -103,7 +103,7 @@ def absolute(text: str, folder: Path) -> str:
 
 
 def _whole(folder: Path, file: Any) -> Any:
-    """Not resolved: links and patterns stay what they are."""
+    """Return a path as an absolute one, not resolved: links and patterns remain what they are."""
     return Path(os.path.abspath(folder / file)).as_posix() if isinstance(file, str) else file
 
 
@@ -123,7 +123,7 @@ def files(content: Mapping[str, Any]) -> list[str]:
 
 
 def columns(content: Mapping[str, Any]) -> dict[str, str]:
-    """Of the columns of a file that hold the channels: whether each is an `input` or an `output`."""
+    """Return the use, `input` or `output`, of each column of a file that holds a channel."""
     data = section(content, "data")
     kinds = {name: kind for kind in ("input", "output") for name in names(data, f"{kind}s")}
     return {
@@ -161,7 +161,7 @@ def shown(value: Any) -> str:
 
 
 def read(key: str, value: str) -> Any:
-    """Return what a field says: a number, names, or text; None for nothing.
+    """Return the value of a field's text: a number, names, or text; None for nothing.
 
     The spec's own check says what is wrong.
     """
@@ -179,7 +179,7 @@ def read(key: str, value: str) -> Any:
 
 
 def _made(document: Any, path: Sequence[str]) -> Any:
-    """Return the table at the end of the path, made where there is none."""
+    """Return the table at the end of the path; it is made where there is none."""
     for key in path:
         if not isinstance(document.get(key), Mapping):
             document[key] = tomlkit.table()
@@ -207,13 +207,13 @@ def changed(text: str, change: Callable[[Any], None]) -> str:
     written = tomlkit.dumps(document)
     if plain(written) != document.unwrap():
         raise InputError(
-            "a form cannot write this change into the spec as it is laid out; make it in the text."
+            "a form cannot write this change into the spec in its present layout; make it in the text."
         )
     return written
 
 
 def with_value(text: str, path: Sequence[str], value: Any) -> str:
-    """With a key of a table set, or without it where the value is None.
+    """Return the text with a key of a table set, or removed where the value is None.
 
     Tables on the way are made.
     """
@@ -245,7 +245,7 @@ def rows_of(text: str, path: Sequence[str]) -> list[dict[str, Any]]:
 
 
 def with_row(text: str, path: Sequence[str], row: Mapping[str, Any]) -> str:
-    """With a table more at the end of a list of tables."""
+    """Return the text with one more table at the end of a list of tables."""
 
     def change(document: Any) -> None:
         table = _made(document, path[:-1])
@@ -262,11 +262,11 @@ def with_row(text: str, path: Sequence[str], row: Mapping[str, Any]) -> str:
     return changed(text, change)
 
 
-def with_told(text: str, path: Sequence[str], index: int, key: str, told: str) -> str:
-    """With a key of one table of a list as a field says it, or without it where that says nothing."""
+def with_field(text: str, path: Sequence[str], index: int, key: str, entered: str) -> str:
+    """Return the text with a key of one table of a list set; an empty field removes it."""
 
     def change(document: Any) -> None:
-        row, value = _at(document, path)[index], read(key, told)
+        row, value = _at(document, path)[index], read(key, entered)
         if value is None:
             row.pop(key, None)
         else:
@@ -276,7 +276,7 @@ def with_told(text: str, path: Sequence[str], index: int, key: str, told: str) -
 
 
 def without_row(text: str, path: Sequence[str], index: int) -> str:
-    """Without one table of a list."""
+    """Return the text without one table of a list."""
 
     def change(document: Any) -> None:
         rows = _at(document, path)
@@ -298,7 +298,7 @@ _OF_TERMS = (
     "sees the lags that the physics reads",
     'focus = "simulation"',
 )
-"""What comments of `orthaug init` that equations of motion make untrue have in them."""
+"""Phrases of comments by `orthaug init` that do not hold for equations of motion."""
 MOTION = """
 [motion]
 [motion.states]
@@ -314,7 +314,9 @@ k = {{ initial = 1.0{k}, min = 0 }}
 
 
 def as_motion(text: str) -> str:
-    """With the equations of a mass, a spring and a damper in place of the baseline, for a person to change.
+    """Return the spec with the equations of a mass, spring and damper in place of the baseline.
+
+    A person is to change them.
 
     Comments about the baseline go with it; the parameters get units where force and output have
     theirs.
@@ -340,15 +342,15 @@ def as_motion(text: str) -> str:
     return changed(_without_comments(text, _OF_TERMS), change)
 
 
-def _without_comments(text: str, told: Sequence[str]) -> str:
-    """Without the comments that have one of these in them.
+def _without_comments(text: str, phrases: Sequence[str]) -> str:
+    """Return the text without the comments that contain one of these phrases.
 
     A line that holds nothing else goes too.
     """
     kept = []
     for line in text.splitlines(keepends=True):
         before, mark, comment = line.partition("# ")
-        if mark and any(one in comment for one in told):
+        if mark and any(one in comment for one in phrases):
             if not before.strip():
                 continue
             line = before.rstrip() + "\n"
@@ -357,7 +359,10 @@ def _without_comments(text: str, told: Sequence[str]) -> str:
 
 
 def _motion_units(force: str, output: str) -> dict[str, str]:
-    """Of states and parameters in `force = m dv/dt + c v + k x`, x in the unit of the output."""
+    """Return the units of states and parameters in `force = m dv/dt + c v + k x`.
+
+    `x` has the unit of the output.
+    """
     if not force or not output or set('"\\') & {*force, *output}:
         return {}
     own = f"({output})" if set(" */") & set(output) else output

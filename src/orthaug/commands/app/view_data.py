@@ -64,14 +64,14 @@ _DROP = """
 <label class="drop" id="drop">
   <input type="file" id="dropped" class="unseen" accept="{endings}">
   <span class="drop-title">Drop a data file here, or choose one</span>
-  <span class="hint" id="drop-told" role="status">{told}</span>
+  <span class="hint" id="drop-message" role="status">{message}</span>
   <progress id="drop-bar" max="1" value="0" hidden aria-label="file taken in"></progress>
 </label>
 """
 
 
 class DataView:
-    """Draws the data of a session, and follows them."""
+    """The view of a session's data."""
 
     def __init__(self, session: Session) -> None:
         self.session = session
@@ -88,7 +88,7 @@ class DataView:
         with ui.element("div").classes("columns wide-right"):
             with ui.element("div").classes("stack"):
                 with card("Data file"):
-                    ui.html(_DROP.format(endings=",".join(KNOWN), told=_KNOWN), sanitize=False)
+                    ui.html(_DROP.format(endings=",".join(KNOWN), message=_KNOWN), sanitize=False)
                     with ui.element("div").classes("fields"):
                         self.path = ui.input("or its path on this machine").props(
                             "outlined dense stack-label"
@@ -119,7 +119,7 @@ class DataView:
             self.session.open_file(Path(given).expanduser().absolute())
 
     def follow_data(self) -> None:
-        """What was seen in the file."""
+        """Draw what was found in the file."""
         session, found = self.session, self.session.found
         self._draw_status()
         self.columns.set_visibility(found is not None)
@@ -165,13 +165,13 @@ class DataView:
                         button(label, partial(session.open_spec, place, kept=True))
 
     def _offer_test(self, found: Mapping[str, Any]) -> None:
-        """What may be done with a file that the spec does not name."""
-        told, lacking = "The spec is kept as it is", self._lacking(found)
+        """Offer to use a file that the spec does not name as a test."""
+        message, lacking = "The spec is kept as it is", self._lacking(found)
         if trained := self._trained():
-            told += f"; it trains on {', '.join(file.name for file in trained)}"
+            message += f"; it trains on {', '.join(file.name for file in trained)}"
         if lacking:
-            told += f". This file has no column {', '.join(lacking)}, which the spec reads"
-        note(f"{told}. Take this file as a test of it, or begin anew below.", "care")
+            message += f". This file has no column {', '.join(lacking)}, which the spec reads"
+        note(f"{message}. Take this file as a test of it, or begin anew below.", "care")
         button("Take it as a test", self.session.add_test, main=not lacking)
 
     def _trained(self) -> list[Path]:
@@ -180,7 +180,7 @@ class DataView:
         return [self.session.folder / file for file in spec_text.names(train, "files")]
 
     def _lacking(self, found: Mapping[str, Any]) -> list[str]:
-        """Return the columns that the spec reads and the file does not have."""
+        """Return the columns that the spec reads and the file lacks."""
         heads = {column["header"] for column in found["columns"]}
         return [
             column for column in spec_text.columns(self.session.content()) if column not in heads
@@ -194,7 +194,7 @@ class DataView:
         return {} if self._lacking(found) else spec_text.columns(self.session.content())
 
     def _take_uses(self, found: Mapping[str, Any]) -> None:
-        """The use of each column: what the spec makes of it, otherwise what was chosen or what the file says."""
+        """Set the use of each column: from the spec, or as chosen, or as the file suggests."""
         data, before, _ = self._drawn
         if found is before:
             return
@@ -218,7 +218,7 @@ class DataView:
                 with ui.element("div").classes("entry"):
                     with ui.element("div").classes("grow"):
                         text(column["header"], "p", "strong")
-                        text(column["told"], "p", "hint")
+                        text(column["description"], "p", "hint")
                     head = column["header"]
                     choice(
                         f"use of {head}",
@@ -233,7 +233,7 @@ class DataView:
             if left:
                 text(
                     "Not usable: "
-                    + ", ".join(f"{c['header']} ({c['told']})" for c in left[:_LISTED]),
+                    + ", ".join(f"{c['header']} ({c['description']})" for c in left[:_LISTED]),
                     "p",
                     "hint",
                 )
@@ -281,7 +281,7 @@ class DataView:
         self.session.choose(chosen["input"], chosen["output"], step)
 
     def follow_spec(self, author: str) -> None:
-        """The steps of preparation, as the spec has them, and whether it names the file that was looked at."""
+        """Draw the steps of preparation in the spec, and whether it names the file looked at."""
         if self.session.apart != self._apart:
             self._draw_status()
         if author == "steps":
@@ -317,7 +317,7 @@ class DataView:
                             partial(
                                 self.session.edit,
                                 "steps",
-                                spec_text.with_told,
+                                spec_text.with_field,
                                 _STEPS,
                                 index,
                                 own.name,
@@ -341,7 +341,7 @@ class DataView:
         self.session.edit("more steps", spec_text.with_row, _STEPS, {"step": kind, **first})
 
     def _whole_file(self) -> tuple[str, Mapping[str, Any]]:
-        """Return a file and its curves: of the training data that were checked, the file looked at where there are none."""
+        """Return a file and its curves: of the checked training data or the file looked at."""
         session, checked = self.session, self.session.checked
         if checked is None:
             if session.found is None or session.data is None:
@@ -352,7 +352,7 @@ class DataView:
         return ("", {}) if place is None else (place.name, session.raw.get(place, {}))
 
     def follow_check(self) -> None:
-        """Curves of the file, and of the training data after preparation.
+        """Draw the curves of the file, and of the training data after preparation.
 
         Why they cannot be drawn.
         """
@@ -372,8 +372,8 @@ class DataView:
             unit = ""
             for channel, curve in prepared.items():
                 if curve["column"] == name:
-                    told = "prepared, training" if cleaned else "training"
-                    drawn.append({**curve, "name": told})
+                    message = "prepared, training" if cleaned else "training"
+                    drawn.append({**curve, "name": message})
                     unit, name = curve["unit"], channel
             if drawn:
                 rows.append((f"{name} [{unit}]" if unit else name, drawn))
@@ -398,28 +398,30 @@ class DataView:
             plot(
                 curves_figure(rows), f"Curves of {', '.join(label for label, _ in rows)} over time."
             )
-            told = f"All of {whole}"
+            message = f"All of {whole}"
             if prepared:
                 grey = f", in grey all of {whole}" * bool(raw)
-                told = f"In colour the training data{', after preparation' * cleaned}{grey}{other}"
-            text(f"{told}. Drag to zoom, double-click for all.", "p", "hint")
+                message = (
+                    f"In colour the training data{', after preparation' * cleaned}{grey}{other}"
+                )
+            text(f"{message}. Drag to zoom, double-click for all.", "p", "hint")
             for done in (checked or {}).get("prepared", ()):
                 text(f"Done: {done}", "p", "hint")
             if checked and session.spec:
                 table(("part", "rows"), list(checked["rows"].items()), "Rows that are used")
 
 
-def _seconds(told: str) -> float | None:
-    """Return a sampling time; None where nothing is told.
+def _seconds(message: str) -> float | None:
+    """Return a sampling time; None for an empty field.
 
     Raises:
         InputError: no positive number.
     """
-    told = told.strip()
-    if not told:
+    message = message.strip()
+    if not message:
         return None
     try:
-        step = float(told)
+        step = float(message)
     except ValueError:
-        raise InputError(f"it must be a number of seconds, such as 0.01; got {told}.") from None
+        raise InputError(f"it must be a number of seconds, such as 0.01; got {message}.") from None
     return check_step(step)

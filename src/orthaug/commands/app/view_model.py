@@ -1,4 +1,4 @@
-"""The part of the page for the model: forms for physics, learner and training, the spec, and what checking says."""
+"""The part of the page for the model: forms, the text of the spec, and the result of its check."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from orthaug.commands.app.widgets import (
 _TERMS = ("baseline", "terms")
 _LEARNERS = {"mlp": "a network", "terms": "a sum of terms", "none": "none: physics alone"}
 _FOCUS = {"prediction": "one step ahead", "simulation": "the free run"}
-_MULTIPLE = 1e5  # % from which a change is told in words
+_MULTIPLE = 1e5  # % from which a change is checked in words
 _ROUNDING = 1e-7  # % below which it is none
 _STRUCTURES = {
     "orthogonal": "orthogonal",
@@ -39,7 +39,7 @@ _STRUCTURES = {
 
 
 class ModelView:
-    """Draws the spec of a session as forms and as text, and follows it."""
+    """The view of a session's spec, as forms and as text."""
 
     def __init__(self, session: Session) -> None:
         self.session = session
@@ -72,7 +72,7 @@ class ModelView:
         self.follow_check()
 
     def follow_spec(self, author: str) -> None:
-        """Forms after a change of the text, the text after a change in a form."""
+        """Update the forms after a change of the text, and the text after a change in a form."""
         if author != "editor" and self.editor.value != self.session.spec:
             self.editor.set_value(self.session.spec)
         if author != "form":
@@ -82,7 +82,7 @@ class ModelView:
                 self._draw_learner(content)
 
     def follow_data(self) -> None:
-        """What comes first, while there is no spec."""
+        """Show the first step while there is no spec."""
         if not self.session.spec.strip():
             self._draw_physics({})
 
@@ -116,7 +116,7 @@ class ModelView:
                 for key in keys:
                     wide = "" if key in ("parameter", "regressor") else "short"
                     change = partial(
-                        self.session.edit, "form", spec_text.with_told, _TERMS, index, key
+                        self.session.edit, "form", spec_text.with_field, _TERMS, index, key
                     )
                     field(key, term.get(key), change, classes=f"{wide} {key}")
             remove = partial(self.session.edit, "more terms", spec_text.without_row, _TERMS, index)
@@ -160,9 +160,9 @@ class ModelView:
                             )
 
     def _value(self, *path: str) -> Callable[[str], None]:
-        """Takes what a field says as the value of a key."""
-        return lambda told: self.session.edit(
-            "form", spec_text.with_value, path, spec_text.read(path[-1], told)
+        """Return a callback that stores the value of a field under a key."""
+        return lambda checked: self.session.edit(
+            "form", spec_text.with_value, path, spec_text.read(path[-1], checked)
         )
 
     def _draw_learner(self, content: Mapping[str, Any]) -> None:
@@ -228,7 +228,7 @@ class ModelView:
         self.session.edit("form", spec_text.with_value, ("learner", "hidden"), hidden or None)
 
     def follow_check(self) -> None:
-        """What checking says of the spec as it is."""
+        """Show the result of checking the present spec."""
         session = self.session
         with redrawn(self.check):
             if not session.spec.strip():
@@ -245,14 +245,14 @@ class ModelView:
                 note(sentence(session.refused), "bad")
             else:
                 note("This spec can be trained.", "good")
-            told = None if session.checked is None else session.checked["check"]
+            checked = None if session.checked is None else session.checked["check"]
             stale = session.checking or session.stale
-            if told is not None:
+            if checked is not None:
                 if stale:
                     text("As the spec was before:", "p", "hint")
                 with ui.element("div").classes("stale" if stale else ""):
-                    _units((session.checked or {})["units"], moves=bool(told.get("motion")))
-                    _findings(told, (session.checked or {})["bias"])
+                    _units((session.checked or {})["units"], moves=bool(checked.get("motion")))
+                    _findings(checked, (session.checked or {})["bias"])
             elif session.checking and session.checked is not None:
                 text(
                     "The equations are run to see what they determine; that takes a while.",
@@ -261,29 +261,29 @@ class ModelView:
                 )
 
 
-def _findings(told: Mapping[str, Any], bias: Sequence[Mapping[str, Any]]) -> None:
-    """The account of `orthaug check`."""
-    data, physics = told["excitation"], told["identifiability"]
+def _findings(checked: Mapping[str, Any], bias: Sequence[Mapping[str, Any]]) -> None:
+    """Draw the findings of `orthaug check`."""
+    data, physics = checked["excitation"], checked["identifiability"]
     condition = "infinite" if data["condition"] is None else number(data["condition"], 3)
     rows = [
-        ("parameters", ", ".join(told["parameters"]) or "none"),
-        ("usable rows", told["rows"]),
+        ("parameters", ", ".join(checked["parameters"]) or "none"),
+        ("usable rows", checked["rows"]),
         ("rank on these data", f"{data['rank']} of {data['columns']}, condition {condition}"),
         ("rank on any data", f"{physics['rank']} of {physics['columns']}"),
     ]
     table(("what", "found"), rows)
     for group in physics["inseparable"]:
-        note(f"No data can tell apart: {', '.join(group)}.", "care")
+        note(f"No data can distinguish {', '.join(group)}.", "care")
     for group in data["collinear"] if physics["identifiable"] else ():
         note(f"These data do not excite separately: {', '.join(group)}.", "care")
-    if told.get("motion"):
-        text(told["motion"]["text"], "p", "small")
-    if told["shared"]:
+    if checked.get("motion"):
+        text(checked["motion"]["text"], "p", "small")
+    if checked["shared"]:
         text("Shared with the learner", "h3")
-        text(told["shared"]["text"], "p", "small")
+        text(checked["shared"]["text"], "p", "small")
         rows = [
             (", ".join(o["inputs"]), o["shared"], ", ".join(o["determined"]) or "–")
-            for o in told["shared"]["alternatives"] or ()
+            for o in checked["shared"]["alternatives"] or ()
         ]
         if rows:
             table(("if it sees only", "shared", "determined"), rows)
@@ -296,12 +296,12 @@ def _findings(told: Mapping[str, Any], bias: Sequence[Mapping[str, Any]]) -> Non
         text(hint, "p", "hint")
         rows = [(one["name"], _biases(one["percent"]), one["removed_by"] or "–") for one in bias]
         table(("missing term", "change of each parameter", "removed by"), rows)
-    for warning in told["warnings"]:
+    for warning in checked["warnings"]:
         note(warning["text"], "care")
 
 
 def _units(units: Sequence[tuple[str, str, str | None]], *, moves: bool) -> None:
-    """What the spec says of units, where it is not what the regressors ask for.
+    """Show where the spec's units differ from those that the regressors imply.
 
     Both are written in one way here.
     """
@@ -321,14 +321,14 @@ def _units(units: Sequence[tuple[str, str, str | None]], *, moves: bool) -> None
     bare = [name for name, given, _ in units if moves and not given]
     if bare:
         text(
-            f"No unit is given for {', '.join(bare)}, and none can be told from the channels.",
+            f"No unit is given for {', '.join(bare)}, and the channels do not determine it.",
             "p",
             "hint",
         )
 
 
 def _biases(percents: Mapping[str, float | None]) -> str:
-    """Return all on a line that breaks between the parameters only."""
+    """Return all biases on a line that breaks between the parameters only."""
     return ", ".join(f"{name}\u00a0{_percent(value)}" for name, value in percents.items())
 
 

@@ -43,7 +43,7 @@ _TARGETS = {
 
 
 class ReportView:
-    """Shows report.html."""
+    """The view of report.html."""
 
     def __init__(self, session: Session) -> None:
         self.session, self.shown = session, "report.html"
@@ -54,7 +54,7 @@ class ReportView:
         self.follow_work()
 
     def follow_work(self) -> None:
-        """The report of the last result."""
+        """Show the report of the last result."""
         session = self.session
         kinds = {"fit": "report.html", "compare": "comparison.html"}
         marks = {
@@ -102,7 +102,7 @@ class ReportView:
 
 
 class ExportView:
-    """Hands out files, and lets the model be written as code."""
+    """The view of downloads, and of the export of the model as code."""
 
     def __init__(self, session: Session) -> None:
         self.session, self.name = session, "model"
@@ -152,10 +152,10 @@ class ExportView:
         if beside := self._beside():
             them = "the two" if len(beside) == 1 else "them and the spec"
             named = " and ".join(", ".join(beside).rsplit(", ", 1))
-            text(f"The spec names {named}: let {them} stand in one folder.", "p", "hint")
+            text(f"The spec names {named}: keep {them} in one folder.", "p", "hint")
 
     def _beside(self) -> list[str]:
-        """Return the files that the spec names without a folder, since they were dropped."""
+        """Return the files that the spec names without a folder, since they were uploaded."""
         return [file for file in files(self.session.content()) if not Path(file).is_absolute()]
 
     def _draw_code(self) -> None:

@@ -31,7 +31,7 @@ _TITLES = {"fit": "Training", "compare": "Comparison"}
 
 
 class TrainingView:
-    """Draws what runs and what came of it, and follows both."""
+    """The view of a training and of its results."""
 
     def __init__(self, session: Session) -> None:
         self.session = session
@@ -67,7 +67,7 @@ class TrainingView:
             made.set_enabled(able)
 
     def follow_work(self) -> None:
-        """How far it is, and what came of it."""
+        """Show the progress of training, and its result."""
         session, running = self.session, self.session.running
         self.follow_check()
         self.end.set_visibility(running is not None)
@@ -106,29 +106,29 @@ class TrainingView:
         figure = loss_figure(losses[:: max(1, len(losses) // _MOST)])
         if self._curve is None or not losses or not self._told:
             with redrawn(self.losses):
-                told = "Loss of every run over its iterations, on a logarithmic axis."
-                self._curve = plot(figure, told) if losses else None
+                progress = "Loss of every run over its iterations, on a logarithmic axis."
+                self._curve = plot(figure, progress) if losses else None
                 self.caption = text("", "p", "hint")
         else:
             self._curve.update_figure(figure)
         if losses:
-            self.caption.set_content(escape(_runs_told({run for run, _, _ in losses})))
+            self.caption.set_content(escape(_runs_caption({run for run, _, _ in losses})))
         self._told = len(losses)
 
     def _tell(self, command: Command) -> None:
-        told, what = command.progress, _TITLES.get(command.arguments[0], "")
+        progress, what = command.progress, _TITLES.get(command.arguments[0], "")
         took = f"{command.seconds:.0f} s"
         if command.running:
             now = "reading and compiling"
-            if told:
-                name = run_name(Run.told(told), of_structure=command.arguments[0] == "compare")
-                name = f" ({name})" if told.get("structure") else ""
-                now = f"run {told['run']} of {told['runs']}{name}, iteration {told['iteration']}"
-                now += f", loss {number(told['loss'], 4)}"
+            if progress:
+                name = run_name(Run.of(progress), of_structure=command.arguments[0] == "compare")
+                name = f" ({name})" if progress.get("structure") else ""
+                now = f"run {progress['run']} of {progress['runs']}{name}, iteration {progress['iteration']}"
+                now += f", loss {number(progress['loss'], 4)}"
             if command.stopping or command.ending:
                 now = "stopping …" if command.stopping else "ending with the best so far …"
             note(f"{what}: {now} · {took}", "busy")
-            self.bar.props(f"value={told.get('done', 0)}")
+            self.bar.props(f"value={progress.get('done', 0)}")
         elif command.stopping and command.code != 0:
             note(f"{what} was stopped after {took}; nothing was kept of it.", "care")
         elif command.code == 0 and command.ending:
@@ -159,16 +159,16 @@ class TrainingView:
                     draw(result, session.units if same else {})
 
 
-def _runs_told(runs: set[Run]) -> str:
-    """Return what the curves are."""
-    told = "Each curve is a run: one training"
+def _runs_caption(runs: set[Run]) -> str:
+    """Return a sentence that explains the curves."""
+    caption = "Each curve is a run: one training"
     if any(run.start for run in runs):
         kinds = ", ".join(sorted({run.regularization for run in runs if run.start}))
-        told += " from one start, which is first weights of the learner drawn at random"
-        told += f", with one regularization of them ({kinds})" if kinds else ""
+        caption += " from one start, which is first weights of the learner drawn at random"
+        caption += f", with one regularization of them ({kinds})" if kinds else ""
     if of_several(runs):
-        told += ". The colour tells the structure; point at a curve for its run"
-    return f"{told}."
+        caption += ". The colour shows the structure; point at a curve for its run"
+    return f"{caption}."
 
 
 def _fit(result: Mapping[str, Any], units: Mapping[str, str]) -> None:
@@ -189,7 +189,7 @@ def _parameters(
     models: Sequence[tuple[str, Sequence[Mapping[str, Any]]]],
     units: Mapping[str, str],
 ) -> None:
-    """Of one model, or of several that are named; `units` are those that the channels ask for."""
+    """Draw the parameters of one model, or of several by name; `units` are the implied ones."""
     named, cells = any(name for name, _ in models), []
     for name, rows in models:
         for row in rows:
@@ -251,7 +251,9 @@ def _compare(result: Mapping[str, Any], units: Mapping[str, str]) -> None:
             text(f"{row['name']}: {row['validation']['text']}", "p", "small")
     for kind, why in result["left_out"].items():
         text(f"Left out: {kind}: {why}", "p", "small")
-    told = [warning["text"] for warning in result["warnings"]]
-    told += [f"{row['name']}: {warning['text']}" for row in models for warning in row["warnings"]]
-    for one in dict.fromkeys(told):
+    progress = [warning["text"] for warning in result["warnings"]]
+    progress += [
+        f"{row['name']}: {warning['text']}" for row in models for warning in row["warnings"]
+    ]
+    for one in dict.fromkeys(progress):
         note(one, "care")

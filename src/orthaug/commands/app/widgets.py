@@ -22,24 +22,24 @@ _WIDE = 5  # columns of a table that may be wider than its place
 
 
 def named(element: Drawn, label: str) -> Drawn:
-    """With what is read aloud in its place; as it is, never as a piece of markup."""
+    """Return a widget with its accessible name, which is plain text and never markup."""
     element.props["aria-label"] = label
     return element
 
 
 def text(what: Any, tag: str = "p", classes: str = "") -> ui.html:
-    """Text in an element; never read as HTML."""
+    """Return an element with text that is never read as HTML."""
     return ui.html(_whole(what), sanitize=False, tag=tag).classes(classes)
 
 
 def _whole(what: Any) -> str:
-    """Escaped, with lags that no line breaks at their minus."""
+    """Return escaped text in which no line breaks at the minus of a lag."""
     return re.sub(r"\[k-\d+\]", r"<span class='n'>\g<0></span>", escape(str(what)))
 
 
-def sentence(told: str) -> str:
-    """Return a message as it begins on a page; the name of a file stays as it is."""
-    return told if "." in told.partition(" ")[0] else told[:1].upper() + told[1:]
+def sentence(message: str) -> str:
+    """Return a message with a capital first letter, unless it begins with the name of a file."""
+    return message if "." in message.partition(" ")[0] else message[:1].upper() + message[1:]
 
 
 def card(title: str, hint: str = "", classes: str = "") -> ui.element:
@@ -65,7 +65,7 @@ def redrawn(place: ui.element) -> Any:
 def field(
     label: str, value: Any, changed: Callable[[str], None], *, classes: str = "", hint: str = ""
 ) -> ui.input:
-    """Return a line of text; told when it is left, or by Enter."""
+    """Return a line of text; `on_change` is called when it is left, or by Enter."""
     made = (
         ui.input(label, value="" if value is None else str(value))
         .props("outlined dense stack-label")
@@ -78,7 +78,7 @@ def field(
 
 
 def refuse(made: ui.input, why: str) -> None:
-    """Say under a field what is wrong with it; nothing takes that back."""
+    """Show an error under a field."""
     made.props["error"], made.props["error-message"] = bool(why), why
     made.update()
 
@@ -90,7 +90,7 @@ def choice(
     changed: Callable[[str], None],
     classes: str = "",
 ) -> ui.element:
-    """Return a list to choose from, as every phone knows it; the label is above."""
+    """Return a native list to choose from, with its label above."""
     with ui.element("label").classes(f"choice {classes}"):
         text(label, "span")
         made = named(ui.element("select"), label)
@@ -101,15 +101,15 @@ def choice(
                 if key == value:
                     option.props("selected")
 
-        def told(event: Any) -> None:
+        def emit_change(event: Any) -> None:
             changed(str(event.args))
 
-        made.on("change", told, js_handler="(event) => emit(event.target.value)")
+        made.on("change", emit_change, js_handler="(event) => emit(event.target.value)")
     return made
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[Any]], caption: str = "") -> None:
-    """A table; on a phone each row of more than two cells is a block with the heads beside them."""
+    """Draw a table; on a phone each row of more than two cells is a labelled block."""
     kinds = [
         "w" if any(str(row[i])[:1].isalpha() for row in rows) else "" for i in range(len(head))
     ]  # words, numbers
@@ -134,14 +134,14 @@ def table(head: Sequence[str], rows: Sequence[Sequence[Any]], caption: str = "")
 
 
 def number(value: Any, digits: int = 5) -> str:
-    """Return a number as it is read; a dash where there is none."""
+    """Return a number as text; a dash where there is none."""
     return "–" if value is None else f"{value:.{digits}g}"
 
 
 def button(
     label: str, clicked: Callable[[], Any], *, main: bool = False, classes: str = ""
 ) -> ui.button:
-    """Return a button; the main one of its place is filled."""
+    """Return a button; the main one of a card is filled."""
     made = ui.button(label, on_click=clicked, color=None).props(
         "no-caps unelevated" if main else "no-caps outline"
     )
@@ -149,14 +149,14 @@ def button(
 
 
 def link(label: str, place: str) -> ui.element:
-    """Return a file to take, as a link that looks like a button."""
+    """Return a link to a file for download that looks like a button."""
     made = text(label, "a", "download").props("download")
     made.props["href"] = place
     return made
 
 
 def note(what: str, kind: str = "") -> ui.html:
-    """Return a sentence that must be seen: `bad`, `care` or `good`."""
+    """Return a note that stands out: `bad`, `care` or `good`."""
     return text(what, "p", f"note {kind}").props("role=alert" if kind == "bad" else "role=status")
 
 
@@ -168,7 +168,10 @@ _COLORS = ("#3b82d0", "#d9730d", "#159a7c", "#9a5fd6", "#c2498a", "#8a7a12")
 def curves_figure(
     rows: Sequence[tuple[str, Sequence[Mapping[str, Any]]]], unit: str = "time in s"
 ) -> dict[str, Any]:
-    """Curves below one another on one axis of time: of each row a label, and traces `x`, `y`, `name`, `raw`."""
+    """Return a figure of curves below one another on a common time axis.
+
+    Each row has a label, and traces with `x`, `y`, `name` and `raw`.
+    """
     traces: list[dict[str, Any]] = []
     layout = _layout(70 + 130 * len(rows))
     layout["xaxis"] |= {"title": _small(unit), "anchor": f"y{len(rows)}" if len(rows) > 1 else "y"}
@@ -207,7 +210,7 @@ def curves_figure(
 
 
 def run_name(run: Run, *, of_structure: bool = False, of_regularization: bool = True) -> str:
-    """Return what is known of a run; its number where that is nothing."""
+    """Return a description of a run; its number where nothing else is known."""
     words = [run.structure] if of_structure and run.structure else []
     words += [f"start {run.start}"] if run.start else []
     if of_regularization and run.regularization:
@@ -216,12 +219,15 @@ def run_name(run: Run, *, of_structure: bool = False, of_regularization: bool = 
 
 
 def of_several(runs: Iterable[Run]) -> bool:
-    """Return whether they are of more structures than one."""
+    """Return whether the runs are of more than one structure."""
     return len({run.structure for run in runs if run.structure}) > 1
 
 
 def loss_figure(losses: Sequence[tuple[Run, int, float | None]]) -> dict[str, Any]:
-    """Return the loss of every run over its iterations: each named below the axis, of several structures each one."""
+    """Return a figure of the loss of every run over its iterations.
+
+    Each run has a name below the axis; of several structures, each structure has one.
+    """
     runs: dict[Run, tuple[list[int], list[float | None]]] = {}
     for run, iteration, loss in losses:
         x, y = runs.setdefault(run, ([], []))
@@ -253,7 +259,7 @@ def loss_figure(losses: Sequence[tuple[Run, int, float | None]]) -> dict[str, An
         group = groups[run]
         color = _COLORS[entries.index(group) % len(_COLORS)]
         hover = f"{escape(names[run])}<br>iteration %{{x}}, loss %{{y:.4g}}<extra></extra>"
-        told = {
+        entry = {
             "name": escape(group),
             "legendgroup": group,
             "showlegend": shown and group not in named,
@@ -261,7 +267,7 @@ def loss_figure(losses: Sequence[tuple[Run, int, float | None]]) -> dict[str, An
         traces.append(
             {
                 **own,
-                **told,
+                **entry,
                 "x": x,
                 "y": y,
                 "hovertemplate": hover,
@@ -297,5 +303,5 @@ def _layout(height: int) -> dict[str, Any]:
 
 
 def plot(figure: dict[str, Any], label: str) -> ui.plotly:
-    """Return a figure, with a sentence that is read aloud in its place."""
+    """Return a figure with a text for screen readers."""
     return named(ui.plotly(figure).classes("plot").props("role=img"), label)

@@ -1,4 +1,4 @@
-"""A process that answers questions of the page: what is in a file, which spec to start with, what a spec is worth.
+"""A process that answers questions of the page: columns of a file, a first spec, a check.
 
 A question is a line of JSON on standard input, its answer one on standard output: `refused` where
 there is none, and `last` where the process ends with it.
@@ -34,7 +34,7 @@ _DRAWN = 12  # columns of a file whose curves are
 
 
 def main() -> None:
-    """Answer questions until nobody asks any more.
+    """Answer questions until the standard input ends.
 
     End where a question took much memory, which would be kept.
     """
@@ -52,7 +52,7 @@ def main() -> None:
 
 
 def _listen(asked: queue.Queue[str]) -> None:
-    """Questions as they come, also while one is answered: where there are no more, nobody waits for that either."""
+    """Read questions, also while one is answered; end the process where there are no more."""
     for line in sys.stdin:
         asked.put(line)
     os._exit(0)
@@ -74,13 +74,13 @@ def _answer(given: dict[str, Any]) -> dict[str, Any]:
         }
     except Exception as error:  # a page shows no traceback
         return {
-            "refused": f"this cannot be told: {type(error).__name__}: "
+            "refused": f"this question has no answer: {type(error).__name__}: "
             f"{' '.join(str(error).split())[:300]}"
         }
 
 
 def peak() -> float:
-    """Bytes that this process has held at most; 0 where the system does not say."""
+    """Return the peak memory of this process in bytes; 0 where the system does not report it."""
     try:
         import resource
     except ImportError:
@@ -92,7 +92,7 @@ def peak() -> float:
 def look(
     path: str, out: str, inputs: str | None, outputs: str | None, step: float | None
 ) -> dict[str, Any]:
-    """Return the columns of a file, their curves, and the first spec for it where its channels are known.
+    """Return the columns of a file, their curves, and a first spec where its channels are known.
 
     Args:
         out: where the spec will stand.
@@ -125,7 +125,7 @@ def look(
 
 
 def _timed(found: Survey) -> str:
-    """Which column gives the time, in words; nothing where none does."""
+    """Return a sentence on the column that gives the time; empty where none does."""
     clock = found.clock
     if clock.column is None or clock.step is None:
         return ""
@@ -139,7 +139,7 @@ def _timed(found: Survey) -> str:
 
 def _column(found: Survey, column: Column) -> dict[str, Any]:
     usable = column in found.signals
-    told = (
+    described = (
         starting.as_seen(column, spikes=column.kind != "input") if usable else found.why_not(column)
     )
     head = column.name + (f" = column '{column.header}'" if column.header != column.name else "")
@@ -149,7 +149,7 @@ def _column(found: Survey, column: Column) -> dict[str, Any]:
         "usable": usable,
         "timed": column is found.clock.column,
     }
-    return own | {"told": told.removeprefix(f"{head}: ")}
+    return own | {"description": described.removeprefix(f"{head}: ")}
 
 
 def _curves(found: Survey) -> dict[str, Any]:
@@ -165,14 +165,15 @@ def _curves(found: Survey) -> dict[str, Any]:
 
 
 def examine(path: str, whole: bool) -> dict[str, Any]:
-    """Return what `orthaug check` tells of a spec, and its training data as they are after preparation.
+    """Return the findings of `orthaug check` for a spec, and its prepared training data.
 
-    Args: whole: run equations of motion too; without, `check` is None for them, since that takes
-        its time.
+    Args:
+        whole: run equations of motion too; without, `check` is None for them, since that takes its
+            time.
     """
     job = open_job(Path(path), require_full_rank=False)
     moves = job.spec.motion is not None
-    told: dict[str, Any] = {"check": None, "refusal": None, "bias": []}
+    answer: dict[str, Any] = {"check": None, "refusal": None, "bias": []}
     if whole or not moves:
         if moves:
             from orthaug._base.jax import use_compilation_cache
@@ -184,9 +185,9 @@ def examine(path: str, whole: bool) -> dict[str, Any]:
             {"name": one.name, "removed_by": one.removed_by, "percent": one.percent}
             for one in result.bias or ()
         ]
-        told = {"check": json.loads(result.to_json()), "bias": bias}
-        told["refusal"] = None if refused is None else str(refused)
-    return told | {
+        answer = {"check": json.loads(result.to_json()), "bias": bias}
+        answer["refusal"] = None if refused is None else str(refused)
+    return answer | {
         "rows": {part.name: len(part.record) for part in job.parts},
         "files": [os.path.abspath(job.path.parent / entry.file) for entry in job.train.files],
         "step": job.train.record.sampling_time,
@@ -197,7 +198,7 @@ def examine(path: str, whole: bool) -> dict[str, Any]:
 
 
 def verdict(path: str, kind: str) -> dict[str, Any]:
-    """Return what the report of a result begins with: `level`, and three `sentences`.
+    """Return the verdict that the report of a result begins with: `level`, and three `sentences`.
 
     Args:
         kind: fit or compare, of which `path` is the result.json.
@@ -207,14 +208,17 @@ def verdict(path: str, kind: str) -> dict[str, Any]:
 
     text = Path(path).read_text(encoding="utf-8")
     if kind == "fit":
-        told = fit_verdict(FitResult.model_validate_json(text))
+        found = fit_verdict(FitResult.model_validate_json(text))
     else:
-        told = compare_verdict(CompareResult.model_validate_json(text))
-    return {"level": told.level, "sentences": told.sentences}
+        found = compare_verdict(CompareResult.model_validate_json(text))
+    return {"level": found.level, "sentences": found.sentences}
 
 
 def _units(job: Job) -> list[tuple[str, str, str | None]]:
-    """Of each parameter: its name, the unit that the spec gives, and what its regressor asks for if it has one."""
+    """Return for each parameter its name, the unit in the spec and the one its regressor implies.
+
+    The last is None where the regressor implies none.
+    """
     if job.spec.motion is not None:
         return [
             (name, entry.unit or "", None) for name, entry in job.spec.motion.parameters.items()
@@ -229,7 +233,7 @@ def _units(job: Job) -> list[tuple[str, str, str | None]]:
 
 
 def _prepared_curves(job: Job) -> dict[str, Any]:
-    """By channel, of the training data; experiments are apart."""
+    """Return the curves by channel of the training data, with gaps between experiments."""
     record = job.train.record
     channels: Sequence[Channel] = (*record.inputs, *record.outputs)
     curves = {}
@@ -251,7 +255,7 @@ def _prepared_curves(job: Job) -> dict[str, Any]:
 
 
 def thinned(time: Vector, values: Vector, most: int = MOST) -> dict[str, list[float | None]]:
-    """Return a curve of at most about `most` points: of each stretch the least and the largest value, in their order.
+    """Return a curve of at most about `most` points: minimum and maximum of each stretch, in order.
 
     Examples:
         >>> thinned(np.arange(6.0), np.array([0.0, 5.0, 1.0, 2.0, -1.0, 0.0]), 4)
