@@ -13,7 +13,7 @@ from orthaug._base.errors import InputError
 from orthaug._base.jax import jnp
 from orthaug.analysis.budget import AS_MUCH
 from orthaug.analysis.motion_bias import linearize_fit, softened_bias, usual_biases
-from orthaug.analysis.motion_budget import motion_budget, one_of_each, rivals_of, declared_budget
+from orthaug.analysis.motion_budget import declared_budget, motion_budget, one_of_each, rivals_of
 from orthaug.analysis.motion_suspects import check_motion_suspects, usual_motion_suspects
 from orthaug.physics.motion_problem import MotionProblem, pose_motion
 

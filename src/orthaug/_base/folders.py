@@ -71,7 +71,7 @@ class Partials:
         shelter.mkdir()
         return shelter
 
-    def stands(self, partial: Path, place: Path, *, result: bool = True) -> None:
+    def mark_placed(self, partial: Path, place: Path, *, result: bool = True) -> None:
         """Note that a partial one is in its place.
 
         `placed` has only what is a result of the command.
@@ -321,7 +321,7 @@ def whole_file(path: Path, *, force: bool = False, result: bool = True) -> Itera
         yield partial
         with PARTIALS.lock:
             _place_file(partial, target, force)
-            PARTIALS.stands(partial, path, result=result)
+            PARTIALS.mark_placed(partial, path, result=result)
     except FileExistsError:
         text = (
             f"{path}: exists and holds something else; give another name, or replace it with "

@@ -207,7 +207,7 @@ def fit_variant(job: Job, variant: Variant, progress: Progress = SILENT) -> FitR
     return report_of(job, job.run(variant, progress))
 
 
-def told_of(job: Job, fit: Any) -> FitReport:
+def report_of(job: Job, fit: Any) -> FitReport:
     """Scores of a fit on every part of its job, and all that results tell of it but the verdict on the learner."""
     fit, intervals = after_choice(job, fit)
     warnings: list[Any] = [*job.warnings, *fit.warnings]

@@ -111,7 +111,7 @@ def checked(job: MotionJob) -> CheckResult:
             },
             "warnings": [
                 *job.warnings,
-                *(ill_conditioned_alone(trial.task) if told.on_data.full_rank else ()),
+                *(ill_conditioned_alone(trial.task) if identification.on_data.full_rank else ()),
                 *on_rows,
                 *warnings,
                 *closed_loop(job.train.record),

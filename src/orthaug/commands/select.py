@@ -99,7 +99,7 @@ def select_for(job: LaggedJob, spec: Spec, folder: Path, report_model: OnStage) 
     options["engine"] = engine_of(spec.engine, "dask") if spec.engine.kind == "dask" else None
     try:
         selection = select(
-            job.train.record, job.problem.baseline, **options, halves=parts, progress=told
+            job.train.record, job.problem.baseline, **options, halves=parts, progress=report_model
         )
     except InputError as error:
         raise InputError(f"{job.path}: {error}") from None

@@ -69,7 +69,7 @@ class SignalWatch:
         _thread.start_new_thread(self._wait, (reader,))
 
     @contextmanager
-    def telling(
+    def reporting(
         self, during: Callable[[], str], stop: Callable[[], Any] = _nothing, then: str = ""
     ) -> Iterator[None]:
         """Say what a signal stopped and how to go on, `then`, and stop drawing before that."""

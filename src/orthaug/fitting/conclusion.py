@@ -78,7 +78,9 @@ def conclude(task: OneStepTask, structure: Structure, learned: TrainedLearner) -
     identified = structure.projects or (learned.bound is None and structure.identifies)
     known = noise is not None and identified and not learned.elsewhere
     warnings += [] if learned.elsewhere else learner_silent(learned)
-    warnings += ill_conditioned.of_physics(problem, theta, errors.covariance if ending.usable else None)
+    warnings += ill_conditioned.of_physics(
+        problem, theta, errors.covariance if ending.usable else None
+    )
     warnings += _warnings(problem, structure, learned, identified, noise, fixed)
     if any(warning.code == NOT_CONVERGED for warning in warnings):
         pass

@@ -143,7 +143,9 @@ def _parameters(result: FitResult) -> list[Any]:
         caption += " A unit in brackets is not the spec's: the channels' units ask for it."
     if biased:
         caption += f"{BIAS_TOLD[:-1]};"
-        caption += " the interval with it is the hull over all causes that noise cannot distinguish."
+        caption += (
+            " the interval with it is the hull over all causes that noise cannot distinguish."
+        )
     blocks: list[Any] = [
         Table(caption, columns, [_parameter_cells(row, biased, shared) for row in rows])
     ]

@@ -28,7 +28,9 @@ def learned_blocks(part: LearnedPart, measure: str) -> list[Text | Grid | Plot]:
     blocks.append(Grid(plots))
     if len(ranked) > _MOST_CURVES:
         blocks.append(
-            Text(f"The {_MOST_CURVES} inputs that explain most, of {len(ranked)}, are drawn.", "note")
+            Text(
+                f"The {_MOST_CURVES} inputs that explain most, of {len(ranked)}, are drawn.", "note"
+            )
         )
     if len(ranked) > 1:
         blocks += [_surface_plot(part, k, *part.telling_pair()) for k in range(len(part.names))]
