@@ -22,8 +22,9 @@ def as_signal(values: Any, name: str, *, gaps: bool = False) -> Matrix:
 
     NaN may mark missing ones if `gaps`.
 
-    Raises: InputError: not numeric, more than two axes, or a cell that is not finite (named by its
-        row).
+    Raises:
+        InputError: not numeric, more than two axes, or a cell that is not finite (named by its
+            row).
     """
     try:
         array = np.asarray(values)

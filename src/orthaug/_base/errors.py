@@ -78,8 +78,11 @@ class InputError(ValueError):
 class KeyedError(InputError):
     """Bad input in one key of a declaration.
 
-    Args: text: the whole sentence, for users of Python. key: the key at fault. words: what a spec's
-        or an option's message says after the key, such as `: found 3; expected less than 2`.
+    Args:
+        text: the whole sentence, for users of Python.
+        key: the key at fault.
+        words: what a spec's or an option's message says after the key, such as `: found 3; expected
+            less than 2`.
     """
 
     def __init__(self, text: str, key: str, words: str) -> None:

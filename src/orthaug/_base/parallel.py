@@ -91,8 +91,10 @@ def each(
 
     The first that fails ends the others, and so does a caller that takes no more.
 
-    Args: function: calls `check()` now and then, which raises `RunCancelled` once the results are
-        not wanted. workers: how many at a time; by default the machine's cores.
+    Args:
+        function: calls `check()` now and then, which raises `RunCancelled` once the results are not
+            wanted.
+        workers: how many at a time; by default the machine's cores.
     """
     stop = threading.Event()
 

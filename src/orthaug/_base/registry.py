@@ -119,8 +119,9 @@ class Registry(Mapping[str, Any]):
     def add(self, kind: str, declaration: type) -> None:
         """Register a declaration.
 
-        Raises: InputError: a name that is taken, no frozen dataclass, or a key that means something
-            else already.
+        Raises:
+            InputError: a name that is taken, no frozen dataclass, or a key that means something
+                else already.
         """
         if kind in self._entries:
             raise InputError(

@@ -38,15 +38,18 @@ class FitView(NotebookView):
     def report(self, path: Any = None, *, tests: Any = None) -> Any:
         """Return the page that `orthaug fit` writes, with all figures in one file.
 
-        Args: path: HTML file to write, which is replaced; None to get the page as text that a
-            notebook shows. tests: records to score and judge the model on, by their names; none for
-            the training data alone.
+        Args:
+            path: HTML file to write, which is replaced; None to get the page as text that a
+                notebook shows.
+            tests: records to score and judge the model on, by their names; none for the training
+                data alone.
 
         Returns:
             The `Page`: `html` is its text, `path` its file or None.
 
-        Raises: InputError: training that failed, a path that cannot be written, a record that does
-            not fit the model.
+        Raises:
+            InputError: training that failed, a path that cannot be written, a record that does not
+                fit the model.
         """
         return MAKERS["report"](self, path, tests)
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from rich.progress import ProgressColumn
 
 PROGRESS_VARIABLE = "ORTHAUG_PROGRESS"
-"""Environment variable: with the value `json`, training writes its progress to standard error, a line of JSON at a time.
+"""Environment variable; `json` writes the progress of training to standard error, a line each.
 """
 ENOUGH = threading.Event()
 """An event of the process: once it is set, training ends with the result reached so far, and the warning `stopped`.

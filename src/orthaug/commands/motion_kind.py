@@ -340,7 +340,10 @@ def _about_steps(job: MotionJob, trial: Trial) -> tuple[str, list[Warning]]:
         )
     ]
     if trial.substeps >= _STIFF:
-        text = f'the motion is stiff for its sampling: {trial.substeps} substeps; `integrator = "exact"` may need fewer.'
+        text = (
+            f"the motion is stiff for its sampling: {trial.substeps} substeps; "
+            '`integrator = "exact"` may need fewer.'
+        )
         warnings.append(Warning("stiff", text))
     if len(trial.holds) > 1:
         shown = ", ".join(

@@ -183,8 +183,9 @@ def parse(text: str, constants: Mapping[str, float] | None = None) -> Expression
     It may also use `Ts`, the sampling time of the record that it will be read on
     (`Expression.sampled`).
 
-    Raises: InputError: anything that is not arithmetic on lagged channels, with the offending piece
-        named.
+    Raises:
+        InputError: anything that is not arithmetic on lagged channels, with the offending piece
+            named.
     """
     constants = dict(constants or {})
     if not isinstance(text, str):

@@ -121,11 +121,14 @@ def dated(cells: Sequence[Any] | np.ndarray, where: str) -> Vector | None:
 
     None where they are no dates.
 
-    Args: cells: texts, or what a library makes of a date, a time of the day or a duration; None or
-        "" where empty. where: begins messages.
+    Args:
+        cells: texts, or what a library makes of a date, a time of the day or a duration; None or ""
+            where empty.
+        where: begins messages.
 
-    Raises: InputError: dates that may begin with the day or with the month, where that makes a
-        difference.
+    Raises:
+        InputError: dates that may begin with the day or with the month, where that makes a
+            difference.
     """
     import pandas as pd
 

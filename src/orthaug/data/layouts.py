@@ -94,8 +94,9 @@ class Layout(NamedTuple):
 def layout(path: Path, columns: Sequence[str] = ()) -> Layout:
     """Find the layout of a text table; remarks above its header are skipped.
 
-    Args: columns: names that are asked for. A first line of numbers is a header only where it holds
-        all of them.
+    Args:
+        columns: names that are asked for. A first line of numbers is a header only where it holds
+            all of them.
 
     Raises:
         InputError: what is no text, or only blank lines.
@@ -348,8 +349,9 @@ def read_sheet(path: Path, place: Place) -> tuple[int, list[list[Any]]]:
 
     The first row that holds anything is the header. A cell that is not there is None.
 
-    Raises: InputError: no openpyxl, an encrypted file, no worksheet, an empty one, entities, more
-        than fits into memory.
+    Raises:
+        InputError: no openpyxl, an encrypted file, no worksheet, an empty one, entities, more than
+            fits into memory.
     """
     try:
         import openpyxl

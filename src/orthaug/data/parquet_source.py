@@ -211,9 +211,9 @@ def open_parquet(
         at rows with a missing sample. partition_rows: rows of a partition at least; row groups are
         never cut.
 
-    Raises: InputError: a file that cannot be read, has no rows, lacks a column or holds another
-        type in it; experiments
-            that are not in one piece; time that does not rise evenly within one.
+    Raises:
+        InputError: a file that cannot be read, has no rows, lacks a column or holds another type in
+            it; experiments that are not in one piece; time that does not rise evenly within one.
     """
     given, groups = (
         dict(columns or {}),

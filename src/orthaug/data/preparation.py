@@ -86,10 +86,12 @@ class _Butterworth:
 class Lowpass(_Butterworth):
     """A Butterworth low-pass over all channels alike; `cutoff` in Hz.
 
-    Args: cutoff: Hz, below half the sampling frequency. order: 1 to 10. phase: "zero" goes forth
-        and back: nothing is delayed, the gain is squared (−6 dB at the cutoff), and a sample
-            depends on later ones, which a loop does not have. "causal" goes forth once and delays
-            what it filters.
+    Args:
+        cutoff: Hz, below half the sampling frequency.
+        order: 1 to 10.
+        phase: "zero" goes forth and back: nothing is delayed, the gain is squared (−6 dB at the
+            cutoff), and a sample depends on later ones, which a loop does not have. "causal" goes
+            forth once and delays what it filters.
         channels: names; None for all. Inputs and outputs that are filtered alike keep the linear
             relation between them; filter some alone, and the filter becomes part of the model.
 
@@ -106,10 +108,12 @@ class Lowpass(_Butterworth):
 class Highpass(_Butterworth):
     """A Butterworth high-pass over all channels alike; `cutoff` in Hz.
 
-    Args: cutoff: Hz, below half the sampling frequency. order: 1 to 10. phase: "zero" goes forth
-        and back: nothing is delayed, the gain is squared (−6 dB at the cutoff), and a sample
-            depends on later ones, which a loop does not have. "causal" goes forth once and delays
-            what it filters.
+    Args:
+        cutoff: Hz, below half the sampling frequency.
+        order: 1 to 10.
+        phase: "zero" goes forth and back: nothing is delayed, the gain is squared (−6 dB at the
+            cutoff), and a sample depends on later ones, which a loop does not have. "causal" goes
+            forth once and delays what it filters.
         channels: names; None for all. Inputs and outputs that are filtered alike keep the linear
             relation between them; filter some alone, and the filter becomes part of the model.
     """
@@ -124,9 +128,10 @@ class Decimate:
 
     The low-pass is a Chebyshev filter of order 8 at 0.8 of the new Nyquist frequency.
 
-    Args: factor: 2 or more; the sampling time is multiplied by it. phase: of the low-pass, over all
-        channels: "zero" (forth and back, no delay, looks at later samples) or
-            "causal" (delays all channels alike).
+    Args:
+        factor: 2 or more; the sampling time is multiplied by it.
+        phase: of the low-pass, over all channels: "zero" (forth and back, no delay, looks at later
+            samples) or "causal" (delays all channels alike).
 
     Examples:
         >>> import numpy as np

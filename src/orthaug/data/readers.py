@@ -78,8 +78,9 @@ def read_record(
         prepare: steps such as `Fill()` or `Lowpass(cutoff=10.0)`, in order, before missing samples
             are looked at; with `Resample()` the instants of `time` may be uneven.
 
-    Raises: InputError: no such file, wrong type, missing columns, cells that are empty or no finite
-        numbers.
+    Raises:
+        InputError: no such file, wrong type, missing columns, cells that are empty or no finite
+            numbers.
 
     Examples:
         >>> import tempfile

@@ -380,9 +380,11 @@ class Record(NotebookView):
     def split(self, fraction: float, by: str = "rows") -> tuple[Record, Record]:
         """Return two records: the first `fraction` and the rest.
 
-        Args: fraction: between 0 and 1, rounded to whole rows or experiments. by: "rows" cuts every
-            experiment, the first `fraction` of its rows into the first record; "experiments"
-                leaves each whole, and puts the first `fraction` of them into the first record.
+        Args:
+            fraction: between 0 and 1, rounded to whole rows or experiments.
+            by: "rows" cuts every experiment, the first `fraction` of its rows into the first
+                record; "experiments" leaves each whole, and puts the first `fraction` of them into
+                the first record.
 
         Raises:
             InputError: a part that would be empty.

@@ -75,8 +75,9 @@ def _per_channel(
 def in_order(lags: Iterable[Lag], outputs: Sequence[str], inputs: Sequence[str]) -> Layout:
     """Return the distinct lags in regressor order.
 
-    Raises: InputError: an unknown channel, or an output at lag 0 (the model would look at what it
-        predicts).
+    Raises:
+        InputError: an unknown channel, or an output at lag 0 (the model would look at what it
+            predicts).
     """
     place = {name: i for i, name in enumerate((*outputs, *inputs))}
     for lag in lags:

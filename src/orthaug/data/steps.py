@@ -128,10 +128,11 @@ class Resample:
 
     Nothing across more than three steps.
 
-    Args: sampling_time: s; None for the median of the steps. method: "linear" between neighbours,
-        or "pchip", a smooth cubic without overshoot. Both look at the next
-            sample, and neither removes what is faster than the new grid: put a `Lowpass` before it
-            where that matters.
+    Args:
+        sampling_time: s; None for the median of the steps.
+        method: "linear" between neighbours, or "pchip", a smooth cubic without overshoot. Both look
+            at the next sample, and neither removes what is faster than the new grid: put a
+            `Lowpass` before it where that matters.
     """
 
     sampling_time: float | None = None

@@ -129,8 +129,9 @@ class Survey:
 def survey(path: Path) -> Survey:
     """Look at every column of a file.
 
-    Raises: InputError: no such file, an unknown ending, a file that cannot be read or has no column
-        of numbers.
+    Raises:
+        InputError: no such file, an unknown ending, a file that cannot be read or has no column of
+            numbers.
     """
     columns: list[Column] = []
     every = list(column_names(path))

@@ -66,11 +66,14 @@ def read_table(
 ) -> Table:
     """Return the named columns of a file.
 
-    Args: time: the one of them that holds instants, numbers in the unit of its header or dates: it
-        comes in s. most: rows that are enough, where a file can be read in part; None for all.
+    Args:
+        time: the one of them that holds instants, numbers in the unit of its header or dates: it
+            comes in s.
+        most: rows that are enough, where a file can be read in part; None for all.
 
-    Raises: InputError: no such file, an unknown ending, content that does not fit it, or missing
-        columns.
+    Raises:
+        InputError: no such file, an unknown ending, content that does not fit it, or missing
+            columns.
     """
     check_readable(path)
     reader = _READERS.get(path.suffix.lower())

@@ -70,8 +70,9 @@ class TermLibrary:
             terms: further ones by hand, any expressions.
             exclude: texts of terms to leave out; factors in any order.
 
-        Raises: InputError: an unknown function, an excluded term that is none, or more terms than
-            can be weighed.
+        Raises:
+            InputError: an unknown function, an excluded term that is none, or more terms than can
+                be weighed.
         """
         unknown = [name for name in functions if name not in OF_SIGNALS]
         if unknown:

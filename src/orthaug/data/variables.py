@@ -65,9 +65,9 @@ def read_variables(path: Path, names: Sequence[str]) -> dict[str, Vector]:
     A column is written `"U[2]"`, a row `"U[2,:]"`; what is in MATLAB's structs or in groups of HDF5
     `"data.u"`.
 
-    Raises: InputError: a missing variable, a struct, text, complex numbers, a corrupt file; the
-        message lists
-            what the file holds.
+    Raises:
+        InputError: a missing variable, a struct, text, complex numbers, a corrupt file; the message
+            lists what the file holds.
     """
     with foreign(path):
         return _FORMATS[path.suffix.lower()](path, names)

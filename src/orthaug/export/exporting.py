@@ -94,9 +94,9 @@ def export(
         name: is put in front of the functions in C, and names the files.
         force: replace the folder whatever it holds.
 
-    Raises: InputError: an unknown target, a model that has no code (a Python function, an ensemble,
-        a spline hold), or a
-            folder that cannot be written.
+    Raises:
+        InputError: an unknown target, a model that has no code (a Python function, an ensemble, a
+            spline hold), or a folder that cannot be written.
 
     Examples:
         >>> import tempfile

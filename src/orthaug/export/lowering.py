@@ -103,8 +103,9 @@ _OWN_FUNCTION = (
 def program_of(model: Model | MotionModel, name: str = "model", digest: str = "") -> Program:
     """Return the step of a model in the intermediate form.
 
-    Raises: InputError: physics or a learner that is a Python function, an ensemble, a hold that
-        needs the whole record.
+    Raises:
+        InputError: physics or a learner that is a Python function, an ensemble, a hold that needs
+            the whole record.
     """
     check_type(model, Model | MotionModel, "model", "a fitted model")
     numbers = model.numbers

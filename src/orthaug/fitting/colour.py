@@ -102,8 +102,9 @@ def independent_share(residuals: Matrix) -> float:
 
     The sum ends at the first correlation that is noise.
 
-    Args: residuals: stretches (s, T), 0 where there is no residual; lags never reach from one into
-        the next.
+    Args:
+        residuals: stretches (s, T), 0 where there is no residual; lags never reach from one into
+            the next.
     """
     longest = residuals.shape[1]
     return share_of(_spectrum(residuals), longest, int(np.count_nonzero(residuals)))

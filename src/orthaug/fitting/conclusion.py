@@ -330,13 +330,16 @@ def orthogonalize(
 ) -> Estimate:
     """Split a model trained elsewhere into physics and an orthogonal rest (F2).
 
-    Args: record: the rows over which the rest is made orthogonal, usually the training data.
-        baseline: the physics. function: `g(x)` on NumPy regressors (N, nx) in `Lags` order, giving
-        (N, ny); from any toolbox. lags: the regressor that `function` expects; None for the raw
-        lags of the baseline.
+    Args:
+        record: the rows over which the rest is made orthogonal, usually the training data.
+        baseline: the physics.
+        function: `g(x)` on NumPy regressors (N, nx) in `Lags` order, giving (N, ny); from any
+            toolbox.
+        lags: the regressor that `function` expects; None for the raw lags of the baseline.
 
-    Returns: An estimate whose model predicts what `function` does, with `θ = Φ⁺G` and the learner
-        `g − φθ`. There are no standard errors: they belong to how `function` was trained.
+    Returns:
+        An estimate whose model predicts what `function` does, with `θ = Φ⁺G` and the learner `g −
+        φθ`. There are no standard errors: they belong to how `function` was trained.
     """
     problem = pose(record, baseline, lags)
     ny, nz = len(problem.outputs), len(problem.features.entries)

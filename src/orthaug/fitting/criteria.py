@@ -130,9 +130,10 @@ class Simulation:
     others: they are unknowns too (`InitialStates`). Segments without a washout start exactly from
     what was measured.
 
-    Args: segment: steps of a segment; 0 for whole experiments; "auto" for 20 times as many steps as
-        the outputs remember
-            themselves, 512 or more, and whole experiments where these are not twice as long.
+    Args:
+        segment: steps of a segment; 0 for whole experiments; "auto" for 20 times as many steps as
+            the outputs remember themselves, 512 or more, and whole experiments where these are not
+            twice as long.
         washout: leading steps of a segment that are not scored, until its start is forgotten.
         start_iterations: one-step iterations that training starts from.
         exact_start: whether a segment starts exactly from what was measured; None for the rule

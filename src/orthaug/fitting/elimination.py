@@ -159,8 +159,9 @@ class Elimination:
 
         Those of physics alone at first.
 
-        Args: run: trains with some entries held, and gives the learner's coordinates f; None to
-            leave it at that.
+        Args:
+            run: trains with some entries held, and gives the learner's coordinates f; None to leave
+                it at that.
         """
         first = {} if self.decoupled else self.active(np.zeros_like(self.outputs))
         return settle(first, lambda fixed: None if (f := run(fixed)) is None else self.active(f))

@@ -288,16 +288,17 @@ class Estimate(AnyFit):
         On the free run they are batch means of the scores (`fitting/block_scores.py`). Both these
         hold for predictions too.
 
-        Args: lags: of the autocovariances; on the free run steps of a block. By default `⌊4
-            (N/100)^(2/9)⌋`, on the free
-                run three times as many as the correlation of the errors lasts.
+        Args:
+            lags: of the autocovariances; on the free run steps of a block. By default `⌊4
+                (N/100)^(2/9)⌋`, on the free run three times as many as the correlation of the
+                errors lasts.
             kind: "newey-west" or "hc3" one step ahead; on the free run "batch-means", or
                 "autoregressive" for errors of an autoregressive process; None for the first that
                 there is.
 
-        Raises: InputError: a fit without standard errors or with a parameter at a bound; errors
-            that remember each other
-                for too long; a kind that is not for this criterion.
+        Raises:
+            InputError: a fit without standard errors or with a parameter at a bound; errors that
+                remember each other for too long; a kind that is not for this criterion.
         """
         simulates = self.criterion.free_run is not None
         kinds = (
@@ -489,8 +490,9 @@ class Estimate(AnyFit):
 def order_of(physics: PhysicsMap, names: Sequence[str], sampling_time: float) -> list[int]:
     """Return the places among `names` of the θ that the physics gives.
 
-    Raises: InputError: no PhysicsMap, a θ that is not among them, a constant `Ts` that is not the
-        sampling time.
+    Raises:
+        InputError: no PhysicsMap, a θ that is not among them, a constant `Ts` that is not the
+            sampling time.
     """
     check_type(physics, PhysicsMap, "physics", "a PhysicsMap, such as PhysicsMap.of(…)")
     check_sampling_constant(physics.constants, sampling_time)

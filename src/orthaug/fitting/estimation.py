@@ -141,15 +141,16 @@ def estimate(
     does. Equations of motion (`Motion`) are fitted on their free run, and their parameters are the
     physics nearest to the fitted motion.
 
-    Args: record: measured inputs and outputs; or `open_parquet(…)`, `open_frame(…)`, whose rows
-        stay where they are. baseline: the physics; a `Motion` has no `lags`, `ensemble` and
-        `initial`. lags: the learner's regressor; None for the raw lags that the baseline's
-        expressions use. learner: a declaration such as `MLP(hidden=(16,))`; None for physics alone.
+    Args:
+        record: measured inputs and outputs; or `open_parquet(…)`, `open_frame(…)`, whose rows stay
+            where they are.
+        baseline: the physics; a `Motion` has no `lags`, `ensemble` and `initial`.
+        lags: the learner's regressor; None for the raw lags that the baseline's expressions use.
+        learner: a declaration such as `MLP(hidden=(16,))`; None for physics alone.
         structure: `Orthogonal()`, `Additive()`, `OrthogonalPenalty(λ)` or `BaselinePenalty(λ)`.
         criterion: `Prediction(horizon)`, 1 step by default, or `Simulation(segment, washout)`, the
-        free run: then θ is
-            trained with the weights and split off at the end (F2). A motion takes the latter, by
-            default without washout.
+            free run: then θ is trained with the weights and split off at the end (F2). A motion
+            takes the latter, by default without washout.
         solver: `LevenbergMarquardt(…)`, or `AdamLBFGS(…)`, the paper's pipeline from θ⁰.
         regularization: "none"; "evidence" (MacKay; the weights' prior is estimated too); "ard"
             (automatic relevance determination: the prior of each neuron, one step ahead); or a
@@ -267,11 +268,12 @@ def fit(
 ) -> Estimate:
     """Fit a problem that is posed already; arguments as of `estimate`.
 
-    Args: problem: record, physics and learner inputs; the other arguments as of `estimate`.
-        learner: None for physics alone, on the rows of the problem. engine: where the rows are, or
-        segments of a free run, and who sums over them. On a cluster several runs over
-            rows that are in memory are tasks, each whole on one worker, and so are their held-out
-            blocks.
+    Args:
+        problem: record, physics and learner inputs; the other arguments as of `estimate`.
+        learner: None for physics alone, on the rows of the problem.
+        engine: where the rows are, or segments of a free run, and who sums over them. On a cluster
+            several runs over rows that are in memory are tasks, each whole on one worker, and so
+            are their held-out blocks.
         checkpoints: where the states of its runs are kept, to go on from; None to keep none.
 
     Raises:
@@ -527,8 +529,9 @@ def posed_on(
 ) -> tuple[Problem, Engine]:
     """Return the problem with the engine that sums over its rows; further arguments as of `pose`.
 
-    Args: engine: None for what suits the record: memory, a stream of its files, the cluster that
-        holds it.
+    Args:
+        engine: None for what suits the record: memory, a stream of its files, the cluster that
+            holds it.
 
     Raises:
         InputError: as `pose`.

@@ -178,13 +178,14 @@ class MotionEstimate(AnyFit):
 
         By batch means of the scores (`block_scores`).
 
-        Args: steps: of a block; None to choose it by how long the errors remember each other. kind:
-            "batch-means", "batch-means-uneven" where the errors are white and of uneven size, or
-            "autoregressive"
-                for errors of an autoregressive process.
+        Args:
+            steps: of a block; None to choose it by how long the errors remember each other.
+            kind: "batch-means", "batch-means-uneven" where the errors are white and of uneven size,
+                or "autoregressive" for errors of an autoregressive process.
 
-        Raises: InputError: another kind, no statistics, or errors that remember each other for too
-            long.
+        Raises:
+            InputError: another kind, no statistics, or errors that remember each other for too
+                long.
         """
         statistics = self.model.statistics
         check_choice(kind, ("batch-means", "batch-means-uneven", "autoregressive"), "`kind`")

@@ -29,8 +29,9 @@ def field_under(
 
     With the sizes of the learned equations.
 
-    Raises: InputError: a measure that does not fit the motion, or points at which the motion has no
-        value.
+    Raises:
+        InputError: a measure that does not fit the motion, or points at which the motion has no
+            value.
     """
     motion, form = segmented.problem.motion, segmented.dynamics
     c, w = np.asarray(numbers.theta - numbers.theta_aux), numbers.weights

@@ -125,10 +125,10 @@ class AugmentedNARX(Augmented):
             y: outputs.
             groups: the experiment of every row (n,); None for one.
 
-        Raises: InputError (a ValueError): data and physics that do not fit together, a signal that
-            does not move, too short
-                an experiment; RankError where the rows do not determine θ. TrainingError where
-                training gives no finite model.
+        Raises:
+            InputError (a ValueError): data and physics that do not fit together, a signal that does
+                not move, too short an experiment; RankError where the rows do not determine θ.
+                TrainingError where training gives no finite model.
         """
         check_choice(self.score_on, SCORED_ON, "`score_on`")
         given = y
@@ -163,14 +163,16 @@ class AugmentedNARX(Augmented):
 
         Its shape, (n,) or (n, n_outputs), is that of y in the fit.
 
-        Args: X: inputs. initial: outputs before the first prediction: y itself, (n,) or (n,
-            n_outputs), of which only the first
-                `first_row_` rows of each experiment are looked at; or these rows alone, the same
-                for every experiment; None for zero.
+        Args:
+            X: inputs.
+            initial: outputs before the first prediction: y itself, (n,) or (n, n_outputs), of which
+                only the first `first_row_` rows of each experiment are looked at; or these rows
+                alone, the same for every experiment; None for zero.
             groups: the experiment of every row (n,); None for one.
 
-        Raises: InputError (a ValueError): other columns than in the fit, too short an experiment or
-            `initial`.
+        Raises:
+            InputError (a ValueError): other columns than in the fit, too short an experiment or
+                `initial`.
         """
         model = self._fitted().model
         X = checked_again(self, X)

@@ -69,15 +69,19 @@ class Alarm(NamedTuple):
 class Recursive:
     """A fitted model whose θ is updated by new rows, the learner fixed.
 
-    Args: fit: of `estimate`, one step ahead, or a saved model. training: the record that a saved
-        model was trained on; an `Estimate` knows it. forgetting: λ in (0, 1], the weight of a row
-        against the next one; 1 (default) forgets nothing. memory: the same in seconds, `λ = exp(−Ts
-        / memory)`. start: "fit" begins with the training rows, at most as many as one memory holds;
-        "empty" without them. quiet: rows between false alarms, at least on average, while nothing
-        changes.
+    Args:
+        fit: of `estimate`, one step ahead, or a saved model.
+        training: the record that a saved model was trained on; an `Estimate` knows it.
+        forgetting: λ in (0, 1], the weight of a row against the next one; 1 (default) forgets
+            nothing.
+        memory: the same in seconds, `λ = exp(−Ts / memory)`.
+        start: "fit" begins with the training rows, at most as many as one memory holds; "empty"
+            without them.
+        quiet: rows between false alarms, at least on average, while nothing changes.
 
-    Raises: InputError: a motion, a fit of the free run, a θ that is not the least squares of its
-        rows (a bound, a penalty).
+    Raises:
+        InputError: a motion, a fit of the free run, a θ that is not the least squares of its rows
+            (a bound, a penalty).
 
     Examples:
         >>> import numpy as np
@@ -178,18 +182,19 @@ class Recursive:
     ) -> Sequence[Alarm]:
         """Update θ by new rows, one or many, that follow on the last ones.
 
-        Args: record: with the model's channels. Every experiment after the first begins after a
-            gap. u, y: instead of a record inputs and outputs, one row or many; NaN is a missing
-            sample. Rows that read one
-                are left out.
+        Args:
+            record: with the model's channels. Every experiment after the first begins after a gap.
+            u, y: instead of a record inputs and outputs, one row or many; NaN is a missing sample.
+                Rows that read one are left out.
             gap: whether these rows do not follow on the last ones: then the first lags are history
                 only.
 
         Returns:
             The alarms that these rows raised.
 
-        Raises: InputError: other channels or sampling time, values that are infinite; nothing is
-            changed then.
+        Raises:
+            InputError: other channels or sampling time, values that are infinite; nothing is
+                changed then.
         """
         check_type(gap, bool, "gap", "true or false")
         begins: list[bool] = []

@@ -57,10 +57,11 @@ class Reference:
     def of(cls, stretches: Sequence[Matrix], white: Matrix, used: float, quiet: float) -> Reference:
         """Return the reference of training errors.
 
-        Args: stretches: whitened outputs' errors of each experiment, (N, ny). white: their
-            whitening. used: share of the rows' degrees of freedom that parameters and learner have
-            used up: by as much their
-                errors move new residuals, and slowly.
+        Args:
+            stretches: whitened outputs' errors of each experiment, (N, ny).
+            white: their whitening.
+            used: share of the rows' degrees of freedom that parameters and learner have used up: by
+                as much their errors move new residuals, and slowly.
             quiet: rows between false alarms.
         """
         given = [stretch @ white.T for stretch in stretches]

@@ -127,8 +127,9 @@ class Augmented(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def set_params(self, **params: Any) -> Any:
         """Set parameters, as scikit-learn does.
 
-        Raises: InputError (a ValueError): a field of a declaration, which is exchanged whole: no
-            `learner__hidden`.
+        Raises:
+            InputError (a ValueError): a field of a declaration, which is exchanged whole: no
+                `learner__hidden`.
         """
         for name in params:
             own, field, rest = name.partition("__")

@@ -52,8 +52,9 @@ class SegmentedStreamed(SegmentedLagged):
     def of(cls, task: OneStepTask, criterion: Criterion) -> SegmentedStreamed:
         """Cut the problem's source as a criterion of several steps declares.
 
-        Raises: InputError: nothing would be scored; whole experiments as segments, which would have
-            to fit into memory.
+        Raises:
+            InputError: nothing would be scored; whole experiments as segments, which would have to
+                fit into memory.
         """
         problem, free_run, sums = task.problem, criterion.free_run, SegmentSums(task.engine)
         assert free_run is not None and isinstance(problem, StreamedProblem)

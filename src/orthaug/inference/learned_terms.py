@@ -76,11 +76,13 @@ def learned_terms(model: Any) -> tuple[LearnedTerm, ...]:
 def equation(model: Any, writing: str = "text") -> str:
     """Return the fitted model with its numbers, an equation per output or per motion equation.
 
-    Args: writing: "text", "latex", or "python": expressions of arrays that Python evaluates, in
-        full precision.
+    Args:
+        writing: "text", "latex", or "python": expressions of arrays that Python evaluates, in full
+            precision.
 
-    Raises: InputError: a learner that is no sum of terms, physics that is a Python function,
-        another writing.
+    Raises:
+        InputError: a learner that is no sum of terms, physics that is a Python function, another
+            writing.
     """
     check_choice(writing, WRITINGS, "`writing`")
     form = model.form

@@ -228,8 +228,9 @@ class Uniform:
     Composite Gauss-Legendre in up to three coordinates, Sobol points with their mirror images in
     more.
 
-    Args: box: limits of raw lags, `{"force[k-1]": (-200, 200)}`; lags that are not named take the
-        data's own range.
+    Args:
+        box: limits of raw lags, `{"force[k-1]": (-200, 200)}`; lags that are not named take the
+            data's own range.
 
     Examples:
         >>> Uniform(box={"u[k-1]": (-2, 2)}).name  # fit.split(Uniform(…)) gives θ under it
@@ -348,8 +349,9 @@ def weigh(
     Args:
         weight: the matrix of the output weights, (ny, ny).
 
-    Raises: InputError: a measure that does not fit the data, or on whose points the physics is not
-        finite.
+    Raises:
+        InputError: a measure that does not fit the data, or on whose points the physics is not
+            finite.
     """
     points = measure.points(support)
     with np.errstate(all="ignore"):

@@ -227,10 +227,12 @@ def split_motion(
 ) -> MotionSplit:
     """Return p̂ of a fitted motion under a measure.
 
-    Args: name: of the measure. start: coordinates of physics alone. everything: whether all
-        directions count as shared (the paper's projection). wobble: (np, np + nw) from (q̂): `Σ
-        φ_qx dx/d(c, w)` of points that are the fitted run's; None where they
-            are fixed.
+    Args:
+        name: of the measure.
+        start: coordinates of physics alone.
+        everything: whether all directions count as shared (the paper's projection).
+        wobble: (np, np + nw) from (q̂): `Σ φ_qx dx/d(c, w)` of points that are the fitted run's;
+            None where they are fixed.
     """
     count = len(form.motion.parameters)
     basis = np.eye(count) if everything else None

@@ -213,13 +213,17 @@ def solve(
 ) -> PhysicalEstimate:
     """Return p̂ = argmin (θ̂ − h(p))ᵀ Cov⁻¹ (θ̂ − h(p)) within its bounds, with its statistics.
 
-    Args: physics: h. theta_hat: θ̂ (nθ,) in the order of `physics.theta_names`. covariance: Cov θ̂
-        (nθ, nθ); None, or one that is not finite, gives relative weights and no statistics.
+    Args:
+        physics: h.
+        theta_hat: θ̂ (nθ,) in the order of `physics.theta_names`.
+        covariance: Cov θ̂ (nθ, nθ); None, or one that is not finite, gives relative weights and no
+            statistics.
         freedom: degrees of freedom of the noise variance within it; inf where that is known.
         starts: points about p⁰ from which the solution is sought besides p⁰ itself.
 
-    Raises: InputError: arguments of another shape, or that are no estimate, covariance or degrees
-        of freedom.
+    Raises:
+        InputError: arguments of another shape, or that are no estimate, covariance or degrees of
+            freedom.
     """
     _check_freedom(freedom)
     fit = _Fit.of(physics, theta_hat, covariance)

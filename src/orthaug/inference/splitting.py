@@ -73,8 +73,9 @@ def split_under(
         support: the training data.
         joint: Cov(c, w) from training; None for no intervals.
 
-    Raises: InputError: a measure that does not fit the model, or under which the physics is
-        rank-deficient.
+    Raises:
+        InputError: a measure that does not fit the model, or under which the physics is
+            rank-deficient.
     """
     weighed = weigh(measure, support, model.form.baseline, model.form.outputs, model.weight)
     points, unit, projection = weighed.points, weighed.unit, weighed.projection

@@ -73,12 +73,13 @@ class MLP:
     Initialised as in Sect. 5.1 (Xavier): weights uniform on (-a, a), `a = gain √(6 / (fan_in +
     fan_out))`, biases 0.
 
-    Args: hidden: neurons of each hidden layer; () is a linear learner. activation: one of tanh,
-        relu, gelu, sigmoid, silu, elu, softplus, identity. inputs: what it sees, as expressions or
-        raw lags; None for all lags. beyond: what the correction does beyond the range of its
-        training: "hold", "fade" within a quarter of the
-            half-range, or "free"; "auto" holds it beside lagged physics and lets it fade in a
-            motion.
+    Args:
+        hidden: neurons of each hidden layer; () is a linear learner.
+        activation: one of tanh, relu, gelu, sigmoid, silu, elu, softplus, identity.
+        inputs: what it sees, as expressions or raw lags; None for all lags.
+        beyond: what the correction does beyond the range of its training: "hold", "fade" within a
+            quarter of the half-range, or "free"; "auto" holds it beside lagged physics and lets it
+            fade in a motion.
 
     Examples:
         >>> MLP(hidden=(8, 8), inputs=("v[k-1]", "x[k-1] - x[k-2]"))

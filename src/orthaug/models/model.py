@@ -175,9 +175,10 @@ class Model(RecordModel, NotebookView):
 
         Past outputs in the regressor are the model's own.
 
-        Args: record: inputs, and outputs where they are measured. initial: the outputs on the rows
-            before the first usable one: "measured" (from the record),
-                "zero", or an array (rows, ny) that holds them.
+        Args:
+            record: inputs, and outputs where they are measured.
+            initial: the outputs on the rows before the first usable one: "measured" (from the
+                record), "zero", or an array (rows, ny) that holds them.
 
         Raises:
             InputError: other channels, too few rows, or initial values that are not there.

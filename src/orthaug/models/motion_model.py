@@ -162,9 +162,10 @@ class MotionModel(RecordModel, NotebookView):
 
         `baseline` is the output of the physics alone from the same start, `learner` the difference.
 
-        Args: record: inputs, and outputs where they are measured. initial: "measured" (the state by
-            which a free run follows the first rows of the record best), "zero", or an
-                array (rows, ny) of outputs to follow instead.
+        Args:
+            record: inputs, and outputs where they are measured.
+            initial: "measured" (the state by which a free run follows the first rows of the record
+                best), "zero", or an array (rows, ny) of outputs to follow instead.
 
         Raises:
             InputError: other channels, no rows, or initial values that are not there.

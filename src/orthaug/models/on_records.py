@@ -88,9 +88,9 @@ class RecordModel:
     def fitting(self, record: Record, *, need_outputs: bool, gaps: bool = False) -> Record:
         """Return the record's channels in the model's order, by name.
 
-        Raises: InputError: a channel is missing, the sampling time differs by more than 0.1 %, or
-            outputs are missing
-                samples and `gaps` are not allowed.
+        Raises:
+            InputError: a channel is missing, the sampling time differs by more than 0.1 %, or
+                outputs are missing samples and `gaps` are not allowed.
         """
         check_type(record, Record, "record", self._wanted(need_outputs))
         if not same_step(record.sampling_time, self.sampling_time):

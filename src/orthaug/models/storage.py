@@ -188,9 +188,10 @@ def load(
 ) -> Model | MotionModel:
     """Read a model that `save` or `orthaug fit` wrote.
 
-    Args: folder: the model's folder, or the result folder that holds it as `model/`. baseline,
-        learner: the Python callables again, where the saved model had such; a motion counts as a
-        baseline.
+    Args:
+        folder: the model's folder, or the result folder that holds it as `model/`.
+        baseline, learner: the Python callables again, where the saved model had such; a motion
+            counts as a baseline.
 
     Raises:
         InputError: no model there; a file that is cut, altered, or from a newer version.

@@ -33,10 +33,11 @@ class Terms:
     Terms given by hand are what it sees. A `degree` adds all products of so many of its inputs, and
     `functions` of them, when the lags or the states are known (`over`).
 
-    Args: terms: expressions such as `v[k-1]**3`, of a motion of states and inputs. degree: of the
-        products, the constant included; 0 for none. functions: abs, sign, sqrt (of the size), tanh,
-        sin, cos, exp; one in a product, times up to `degree − 1`
-            signals.
+    Args:
+        terms: expressions such as `v[k-1]**3`, of a motion of states and inputs.
+        degree: of the products, the constant included; 0 for none.
+        functions: abs, sign, sqrt (of the size), tanh, sin, cos, exp; one in a product, times up to
+            `degree − 1` signals.
         exclude: terms of the library to leave out.
         inputs: the signals that the library is made of; None for all lags, or all states and inputs
             of a motion.

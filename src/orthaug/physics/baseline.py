@@ -149,9 +149,9 @@ class Baseline(NotebookView):
             terms: several may have the same parameter.
             constants: numbers by name.
 
-        Raises: InputError: an expression that is not arithmetic on lagged channels, or terms of one
-            parameter
-                that disagree on its initial value, unit or being fixed.
+        Raises:
+            InputError: an expression that is not arithmetic on lagged channels, or terms of one
+                parameter that disagree on its initial value, unit or being fixed.
 
         Examples:
             >>> Baseline.from_terms([Term("g", "c*u[k]**2")], constants={"c": 0.5}).names

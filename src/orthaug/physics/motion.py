@@ -37,10 +37,12 @@ _DERIVATIVE = "derivative of "
 class State:
     """A state and its equation: `State("v", "(force - c*v)/m", start="derivative of position")`.
 
-    Args: derivative: in time, of a discrete motion the state one sample later; None where the
-        motion is a function. start: a first guess, for starts are always estimated: a number, an
-        output, "derivative of" one, or None. learned: whether the learner is added to this
-        equation.
+    Args:
+        derivative: in time, of a discrete motion the state one sample later; None where the motion
+            is a function.
+        start: a first guess, for starts are always estimated: a number, an output, "derivative of"
+            one, or None.
+        learned: whether the learner is added to this equation.
     """
 
     name: str
@@ -65,9 +67,10 @@ class State:
 class Output:
     """An output channel, such as `Output("position", "x")`.
 
-    Args: expression: of states, inputs and parameters; None where the motion is a function.
+    Args:
+        expression: of states, inputs and parameters; None where the motion is a function.
         learned: whether the learner is added to it: a sensor's curve, rather than a force that is
-        missing.
+            missing.
     """
 
     name: str
@@ -125,15 +128,19 @@ class Motion(NotebookView):
 
         They use the names of states, inputs, parameters, constants and definitions.
 
-        Args: inputs: names of the input channels, in the record's order. define: names for longer
-            expressions. integrator: "rk4" (Runge-Kutta of order 4), "exact" (the linear part by
-            matrix exponential), or "discrete". substeps: steps of the integrator in a sample, 1 to
-            256; None to choose them by the data. hold: inputs between samples: "zero-order" (a
-            value is held), "first-order" (straight) or "spline".
+        Args:
+            inputs: names of the input channels, in the record's order.
+            define: names for longer expressions.
+            integrator: "rk4" (Runge-Kutta of order 4), "exact" (the linear part by matrix
+                exponential), or "discrete".
+            substeps: steps of the integrator in a sample, 1 to 256; None to choose them by the
+                data.
+            hold: inputs between samples: "zero-order" (a value is held), "first-order" (straight)
+                or "spline".
 
-        Raises: InputError: names or expressions that cannot be, definitions that need each other,
-            parameters that
-                no equation uses, an output that no state enters.
+        Raises:
+            InputError: names or expressions that cannot be, definitions that need each other,
+                parameters that no equation uses, an output that no state enters.
         """
         constants, define = dict(constants or {}), dict(define or {})
         plain = cls._declared(

@@ -164,12 +164,14 @@ def pose_motion(
 ) -> MotionProblem:
     """Check record and motion against each other.
 
-    Args: learner_inputs: expressions of states and inputs that the learner sees; None for all of
-        them.
+    Args:
+        learner_inputs: expressions of states and inputs that the learner sees; None for all of
+            them.
 
-    Raises: InputError: other channels, outputs that do not move, learner inputs that cannot be,
-        equations that have no
-            value at the start, a sampling time too long for the fastest mode.
+    Raises:
+        InputError: other channels, outputs that do not move, learner inputs that cannot be,
+            equations that have no value at the start, a sampling time too long for the fastest
+            mode.
     """
     inputs, outputs = (tuple(c.name for c in group) for group in (record.inputs, record.outputs))
     motion = motion.sampled(record.sampling_time)

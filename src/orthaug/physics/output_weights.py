@@ -109,9 +109,10 @@ def check_output_weights(choice: Any, ny: int) -> None:
 def weigh_outputs(choice: str | Sequence[float], deviation: Vector) -> OutputWeights:
     """Return W for outputs of these standard deviations (ny,).
 
-    Args: choice: "none" for the plain sum of squares, "std" for each output in its standard
-        deviation, numbers for the
-            weights of the squared errors. "auto" and "covariance" begin with "std".
+    Args:
+        choice: "none" for the plain sum of squares, "std" for each output in its standard
+            deviation, numbers for the weights of the squared errors. "auto" and "covariance" begin
+            with "std".
     """
     if len(deviation) == 1:  # one output: the weight changes nothing, penalties count in its unit
         scale = float(1 / deviation[0])

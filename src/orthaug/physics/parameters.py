@@ -142,10 +142,10 @@ class PhysicsMap:
     ) -> PhysicsMap:
         """Return the map in which `theta[name]` is an expression of parameters and `constants`.
 
-        Raises: InputError: a name, value or bound that cannot be; an expression that is not
-            arithmetic on
-                parameters and constants, uses no parameter, or is not finite at the initial values;
-                parameters that θ does not determine, at any point near the initial values.
+        Raises:
+            InputError: a name, value or bound that cannot be; an expression that is not arithmetic
+                on parameters and constants, uses no parameter, or is not finite at the initial
+                values; parameters that θ does not determine, at any point near the initial values.
         """
         constants = dict(constants or {})
         check_parameters(parameters, constants)

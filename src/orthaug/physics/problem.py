@@ -268,10 +268,10 @@ def pose(
         output_weights: as in `estimate`; "covariance" and "auto" begin with standard deviations.
         require_full_rank: raise where the data do not determine θ; `check` reports it instead.
 
-    Raises: InputError: unknown channels, outputs at lag 0, constant channels, values that are not
-        finite,
-            too few rows, initial values beyond their bounds, a constant `Ts` that is not the
-            sampling time; RankError for linearly dependent physics.
+    Raises:
+        InputError: unknown channels, outputs at lag 0, constant channels, values that are not
+            finite, too few rows, initial values beyond their bounds, a constant `Ts` that is not
+            the sampling time; RankError for linearly dependent physics.
     """
     outputs, inputs = (tuple(c.name for c in group) for group in (record.outputs, record.inputs))
     if not outputs:

@@ -158,9 +158,9 @@ def trained(
 ) -> Estimate:
     """Return one fit of an example by a pipeline; `which` names the paper's iterations.
 
-    Args: pipeline: "ours", Levenberg-Marquardt with `iterations` and `regularization`; "paper",
-        Adam and L-BFGS on
-            normalised data; "scripts", the published scripts' own.
+    Args:
+        pipeline: "ours", Levenberg-Marquardt with `iterations` and `regularization`; "paper", Adam
+            and L-BFGS on normalised data; "scripts", the published scripts' own.
     """
     if pipeline == "scripts":
         return published.train(example, structure, PIPELINES[which], seed)

@@ -109,9 +109,9 @@ def reproduce(
 ) -> list[StudyOutcome]:
     """Run the studies; what a store holds already is not run again.
 
-    Args: pipeline: "ours", "paper" for Adam and L-BFGS with the published iterations on normalised
-        data, or "scripts"
-            for what the published scripts do, un-normalised and from θ⁰.
+    Args:
+        pipeline: "ours", "paper" for Adam and L-BFGS with the published iterations on normalised
+            data, or "scripts" for what the published scripts do, un-normalised and from θ⁰.
         small: at the reduced size of the tests.
         store: where results are kept as they are made; None for the user's cache folder.
         client: a `distributed.Client` whose workers make the runs.

@@ -40,12 +40,16 @@ CasesProgress = Callable[[int, int], None]
 class Study:
     """A function and the grid that it runs over.
 
-    Args: name: of its folder in a store. one: takes one value of each axis as keyword arguments,
-        gives a mapping of plain values: numbers, texts, lists. grid: axes by name, each with its
-        values; all combinations run, the last axis fastest. Slow cases go first. version: raise it
-        when `one` computes something else, so that stored results no longer count. where: of all
-        combinations, those that run; takes what `one` takes. None for all. workers: cases at a
-        time; 1 for a study that measures time, None for the machine's cores.
+    Args:
+        name: of its folder in a store.
+        one: takes one value of each axis as keyword arguments, gives a mapping of plain values:
+            numbers, texts, lists.
+        grid: axes by name, each with its values; all combinations run, the last axis fastest. Slow
+            cases go first.
+        version: raise it when `one` computes something else, so that stored results no longer
+            count.
+        where: of all combinations, those that run; takes what `one` takes. None for all.
+        workers: cases at a time; 1 for a study that measures time, None for the machine's cores.
     """
 
     name: str
@@ -121,9 +125,11 @@ def run(
 ) -> pd.DataFrame:
     """Run what the store does not hold yet, several cases at a time; a row per case, axes first.
 
-    Args: store: a folder that keeps each result as it is made; None to keep nothing. workers: cases
-        at a time; by default the study's own number, or the machine's cores. client: a
-        `distributed.Client`; its workers make the cases of a study that does not measure time.
+    Args:
+        store: a folder that keeps each result as it is made; None to keep nothing.
+        workers: cases at a time; by default the study's own number, or the machine's cores.
+        client: a `distributed.Client`; its workers make the cases of a study that does not measure
+            time.
 
     Raises:
         InputError: a result that is not plain values; a store that cannot be written.

@@ -194,11 +194,12 @@ def descend(
 ) -> Descent:
     """Minimise `‖r‖² + α‖w‖²` from p.
 
-    Args: start: handed to the first trial. ridge: α; with `evidence` where it starts.
+    Args:
+        start: handed to the first trial.
+        ridge: α; with `evidence` where it starts.
         evidence_settled: whether α waits until the weights have lowered the loss and the objective
-        falls slowly, or no
-            longer; otherwise until the first accepted step. From weights that do nothing yet,
-            evidence would find that none are needed (w = 0 is its fixed point).
+            falls slowly, or no longer; otherwise until the first accepted step. From weights that
+            do nothing yet, evidence would find that none are needed (w = 0 is its fixed point).
         ceiling: a trial with a larger `‖r‖²` is rejected.
         bounds: of θ, each (physics,); the start is moved inside.
         kept: where pauses are kept; a descent goes on from the last one.

@@ -26,9 +26,9 @@ _ITERATIONS = 300  # the default limit
 class LevenbergMarquardt:
     """Declaration of the solver.
 
-    Args: iterations: trial steps at most. Only the default, 300, is a limit that a run passes where
-        the loss still falls
-            noticeably (`solvers/limit.py`), up to ten times.
+    Args:
+        iterations: trial steps at most. Only the default, 300, is a limit that a run passes where
+            the loss still falls noticeably (`solvers/limit.py`), up to ten times.
         tolerance: two successive steps that lower the objective by less than this fraction end the
             run.
         longest: trial steps at most where the loss still falls; None for what `iterations` says.

@@ -19,9 +19,11 @@ _PROLONGED = 10  # times the limit, at most
 class Limit(NamedTuple):
     """Trial steps that a run may take.
 
-    Args: iterations: the limit. longest: the limit while the loss still falls noticeably;
-        `iterations` for none beyond. noticeable: a relative fall of the loss over the last quarter
-        of the limit that is worth going on for.
+    Args:
+        iterations: the limit.
+        longest: the limit while the loss still falls noticeably; `iterations` for none beyond.
+        noticeable: a relative fall of the loss over the last quarter of the limit that is worth
+            going on for.
     """
 
     iterations: int
