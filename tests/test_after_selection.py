@@ -101,6 +101,7 @@ def test_where_the_rows_do_not_suffice_there_are_no_intervals():
     assert fit.std is None and fit.interval is None and fit.terms["std"].isna().all()
     assert fit.terms["coefficient"][TRUE] == pytest.approx(20 * 0.3 / np.sqrt(300), rel=0.3)
     assert "conditional_on_selection" in codes(fit.warnings) and fit.std_kind == "chosen"
+    assert "the terms were chosen on the rows that were fitted" in fit.report().html
     split = fit.split(oa.Uniform())  # another measure brings none back
     assert split.std is None and split.std_kind == "chosen"
 
@@ -248,6 +249,9 @@ def test_a_fit_of_the_rows_that_chose_has_no_intervals(write):
     path.write_text(path.read_text().replace("rows = [0, 800]", "rows = [400, 800]"))
     shown = run("fit", path, "--out", "again", "--force")
     assert shown.code == 0 and "had no say in the choice" in shown.out
+    pages = [Path(place, "report.html").read_text() for place in ("again", "wide")]
+    assert ["rows that had no say in the choice" in page for page in pages] == [True, False]
+    assert "the terms were chosen on the rows that were fitted" in pages[1]
 
 
 def test_short_data_have_no_intervals_from_the_shell(write):

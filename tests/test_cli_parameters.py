@@ -221,9 +221,9 @@ PHYSICS_ERRORS = [
     (
         f"-m / {GAMMA}",
         "-m / (m - 1.1)",
-        "is -inf at the initial values of m, cd, ks; expected a finite one",
+        "is -inf at the initial values of m, cd, ks; expected a finite value",
     ),
-    (f"-m / {GAMMA}", "-m*position[k-1]", "a signal such as y[k-1] is no part of it"),
+    (f"-m / {GAMMA}", "-m*position[k-1]", "a signal such as y[k-1] is not allowed here"),
     (
         '"theta1"',
         '"theta1"\nfixed = true\ninitial = 1',

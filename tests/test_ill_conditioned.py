@@ -90,7 +90,7 @@ def test_motion_at_the_limit_of_its_digits(tmp_path):
     write_csv(tmp_path / "run.csv", **driven(1e-6))
     (tmp_path / "spec.toml").write_text(MOTION)
     done = run("check", tmp_path / "spec.toml")
-    assert done.code == 2 and "b, c cannot be told apart" in done.err
+    assert done.code == 2 and "b, c cannot be distinguished" in done.err
     (warning,) = told(tmp_path, "fit", MOTION, 1e-6)
     assert "at least 1 part in" in warning
 

@@ -136,7 +136,7 @@ def test_a_file_is_seen_and_its_spec_runs(csv, tmp_path):
 REFUSED = [
     (
         (),
-        "the names of the columns do not tell inputs from outputs: force [N], position_mm. Say "
+        "the names of the columns do not show which are inputs and which outputs: force [N], position_mm. Say "
         "both",
     ),
     (("--inputs", "force"), "Say both"),
@@ -325,7 +325,7 @@ NOTHING = [
      'such as --inputs "a,c" --outputs "b" (--inputs "" for none)'),
     ("a,b,c\n1,2,4\n2,1,7\n", ("--inputs", "c"), '--inputs "c" --outputs "b"; columns'),
     ("a,b,c\n1,2,4\n2,1,7\n", ("--inputs", "A"), "no column 'A', did you mean 'a'?"),
-    ("-1.5,2\n1,2\n2,3\n", (), 'from outputs: x1, x2. Say both, separated by commas, such as --inputs "x1"'),
+    ("-1.5,2\n1,2\n2,3\n", (), 'which outputs: x1, x2. Say both, separated by commas, such as --inputs "x1"'),
     ("bench 3, May\nu\nnone\n", (), "expected one for each signal, under a header. The names that were found are "
      "'bench 3, May'; a line above the header must begin with #"),
 ]  # fmt: skip
@@ -434,13 +434,13 @@ STEPS = [
         "t [ms]",
         20.0,
         "sampling_time = 1.0",
-        "`sampling_time` is 1 s, but column 't [ms]' of a.csv tells 0.02 s",
+        "`sampling_time` is 1 s, but column 't [ms]' of a.csv gives 0.02 s",
     ),
     (
         "time",
         0.1,
         "",
-        "so 1 s is taken, but column 'time' of a.csv tells 0.1 s; perhaps time = \"time\" is meant",
+        "so 1 s is taken, but column 'time' of a.csv gives 0.1 s; perhaps time = \"time\" is meant",
     ),
     ("time", 0.1, "sampling_time = 0.1", ""),
     ("other", 0.1, "sampling_time = 1.0", ""),
@@ -682,7 +682,8 @@ def test_a_ramp_may_be_an_input_where_the_time_is_known(tmp_path, monkeypatch):
     out = tmp_path / "spec.toml"
     done = run("init", tmp_path / "a.csv", "--out", out)  # its name says input, its values time
     assert (
-        done.code == 2 and "the names of the columns do not tell inputs from outputs: y" in done.err
+        done.code == 2
+        and "the names of the columns do not show which are inputs and which outputs: y" in done.err
     )
     done = run("init", tmp_path / "a.csv", "--inputs", "u", "--outputs", "y", "--out", out)
     assert (

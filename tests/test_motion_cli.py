@@ -567,7 +567,9 @@ def test_check_tells_what_cannot_be_told_apart_and_which_hold_is_right(tmp_path)
     )
     code, out, err = orthaug("check", spec, "--json")
     assert code == 2
-    assert "rank 3 of 4): m, c, k, g cannot be told apart; give one of them as a constant." in err
+    assert (
+        "rank 3 of 4): m, c, k, g cannot be distinguished; give one of them as a constant." in err
+    )
     told = strict(out)
     assert told["excitation"]["rank"] == told["identifiability"]["rank"] == 3
     assert told["identifiability"]["inseparable"] == [["m", "c", "k", "g"]]
@@ -715,9 +717,9 @@ def test_an_analysis_that_fails_numerically_loses_no_training(folder, result, mo
     told = strict((folder / "fails" / "result.json").read_text())
     texts = [w["text"] for w in told["warnings"] if w["code"] == "analysis_failed"]
     assert texts == [
-        "the analysis of the modes failed numerically (Singular matrix): the result stands "
+        "the analysis of the modes failed numerically (Singular matrix): the result is given "
         "without it.",
-        "the bias by suspects failed numerically (Singular matrix): the result stands without it.",
+        "the bias by suspects failed numerically (Singular matrix): the result is given without it.",
     ]
     assert told["stability"] is None and told["bias"] is None and told["residuals"] is not None
     assert all(unfolded(text) in unfolded(out + err) for text in texts)
@@ -762,7 +764,7 @@ BAD = {
         "cc*v",
         "the equation of 'v' = (force - cc*v - k*x)/m: unknown name 'cc', did you mean 'c'?",
     ),
-    "lag": ("(force -", "(force[k] -", "a signal such as y[k-1] is no part of it"),
+    "lag": ("(force -", "(force[k] -", "a signal such as y[k-1] is not allowed here"),
     "no derivative": (
         'derivative = "v", ',
         "",
@@ -918,7 +920,8 @@ def test_rows_of_a_motion_are_all_usable(folder):
     (folder / "short.csv").write_text("\n".join(lines[:3]))
     spec.write_text(SPEC.replace("steps.csv", "short.csv"))
     with pytest.raises(
-        InputError, match=r"short.csv: data.tests.steps has 2 rows, too few; at least 3 tell where"
+        InputError,
+        match=r"short.csv: data.tests.steps has 2 rows, too few; at least 3 determine where",
     ):
         open_job(spec)
 

@@ -397,7 +397,7 @@ def test_white_errors_are_told_from_coloured_ones_and_make_robust_errors(
     assert (
         found is not None and found.verdict == "unmodelled" and found.predictable[0].own_past > 0.5
     )
-    assert "Intervals count noise alone" in dict(found.warnings)["coloured_residual"]
+    assert "Intervals cover noise only" in dict(found.warnings)["coloured_residual"]
     assert found.missing is not None and found.missing.p < 1e-4
     term = found.missing.terms[0]
     assert (term.equation, term.variable, term.shape) == ("v", "v", "jump") and term.share > 0.5

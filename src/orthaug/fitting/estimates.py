@@ -45,14 +45,17 @@ if TYPE_CHECKING:
 NOT_UNIQUE = "theta_not_unique"
 """The code of the warning that a split under a measure makes untrue."""
 STD_KINDS = {
-    "plain": "those of white errors of even size",
-    "hc3": "robust (HC3), for the errors are of uneven size",
-    "newey-west": "robust (Newey-West), for the one-step residual is coloured",
-    "batch-means": "robust (batch means), for the errors of the free run are coloured",
-    "autoregressive": "robust (an autoregressive model of the errors), for the errors of the free run are "
-    "coloured",
-    "batch-means-uneven": "robust (batch means), for the errors of the free run are of uneven size",
-    "none": "none: the errors of the free run remember each other for too long",
+    "plain": "for white errors of constant variance",
+    "hc3": "robust (HC3), because the variance of the errors is not constant",
+    "newey-west": "robust (Newey-West), because the one-step residual is coloured",
+    "batch-means": "robust (batch means), because the errors of the free run are coloured",
+    "autoregressive": (
+        "robust (autoregressive errors), because the errors of the free run are coloured"
+    ),
+    "batch-means-uneven": (
+        "robust (batch means), because the variance of the free run's errors is not constant"
+    ),
+    "none": "none: the errors of the free run are correlated over too many steps",
     "chosen": "none: the terms were chosen on the rows that were fitted",
 }
 """How standard errors were made, in words."""

@@ -63,7 +63,7 @@ def of_motion(problem: MotionProblem, gram: Matrix, q: Vector, noise: Matrix) ->
         noise: covariance of the errors in the outputs' units (ny, ny).
     """
     motion, weight = problem.motion, problem.weight
-    if not motion.names:
+    if not np.isfinite(gram).all() or not gram.any():
         return []
     size = np.sqrt(np.maximum(np.diag(gram), 0.0))
     unit = np.where(size > 0, size, 1.0)
@@ -104,7 +104,7 @@ def _warnings(
     spread = np.sum((vt @ contributions) * vt, axis=1)
     unclear = _CLEARLY * np.sqrt(np.diag(contributions)) > size * scale
     vague = vt[(small < _NEARLY) & (spread > moves)]
-    groups = []
+    groups: list[list[int]] = []
     for group in tied_columns(vague, _PART):
         independent = len(group) - np.sum(vague[:, group] ** 2)
         if independent < _FEW and np.sum(unclear[group]) > 1:

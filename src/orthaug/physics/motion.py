@@ -43,6 +43,7 @@ class State:
         start: a first guess, for starts are always estimated: a number, an output, "derivative of"
             one, or None.
         learned: whether the learner is added to this equation.
+        unit: of the state, such as "m/s".
     """
 
     name: str
