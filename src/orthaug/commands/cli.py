@@ -357,7 +357,7 @@ def reproduce(
     ] = None,
     force: Force = False,
 ) -> None:
-    """Compute the paper's figures and tables beside the published ones.
+    """Compute the paper's figures and tables again.
 
     Goes on where it was interrupted.
     """
