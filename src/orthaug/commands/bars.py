@@ -157,7 +157,7 @@ def study_bars() -> Iterator[Callable[[str, int, int], None]]:
     with (
         _deferred_interrupt() as interrupted,
         drawn_bar(MofNCompleteColumn(), TimeElapsedColumn(), transient=False) as bar,
-        WATCH.telling(lambda: reached, bar.stop, GO_ON),
+        WATCH.reporting(lambda: reached, bar.stop, GO_ON),
     ):
         tasks: dict[str, Any] = {}
 

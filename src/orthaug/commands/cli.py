@@ -377,7 +377,7 @@ def reproduce(
         reproduced = reproduction.reproduce(
             entries, pipeline=pipeline, small=small, progress=progress, client=client
         )
-    with WATCH.telling(lambda: "the writing of the page", then=GO_ON):
+    with WATCH.reporting(lambda: "the writing of the page", then=GO_ON):
         reproduction.write(reproduced, folder, pipeline, force=force)
     streams.echo(f"{reproduction.text(reproduced)}\n\nwritten to {folder}/index.html")
 
