@@ -1129,7 +1129,7 @@ def test_what_is_wrong_is_told_on_the_page(server, browser, csv, tmp_path):
     page.get_by_role("button", name="Take it as a test").click()
     page.wait_for_selector("text=tests.own")
     tab.go("Export")
-    page.wait_for_selector("text=The spec names own.csv: let the two stand in one folder")
+    page.wait_for_selector("text=The spec names own.csv: keep the two in one folder")
     added = tab.fetch("spec.toml").decode()
     assert (
         tomllib.loads(added)["data"]["tests"].pop("own") == {"files": ["own.csv"]}
