@@ -294,7 +294,7 @@ def test_check(project):
     assert "y[k-1], y[k-2], u[k-1]" in done.out
     assert "118" in done.out
     assert "rank 3 of 3" in done.out
-    assert "can be told apart" in done.out
+    assert "can be distinguished" in done.out
     assert listing(project.parent) == before
 
 

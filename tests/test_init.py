@@ -134,7 +134,7 @@ def test_a_file_is_seen_and_its_spec_runs(csv, tmp_path):
 REFUSED = [
     (
         (),
-        "the names of the columns do not tell inputs from outputs: force [N], position_mm. Say "
+        "the names of the columns do not show which are inputs and which outputs: force [N], position_mm. Say "
         "both",
     ),
     (("--inputs", "force"), "Say both"),
@@ -315,10 +315,10 @@ def test_columns_of_one_name_are_told_apart(tmp_path, monkeypatch):
 
 
 NOTHING = [
-    ("u,y\n1,2\n", (), "no column could be a channel, 1 row: u (constant), y (constant). A first model needs"),
+    ("u,y\n1,2\n", (), "no column can be a channel, 1 row: u (constant), y (constant). A first model needs"),
     ("u,y\n1,\n2,\n3,\n", (), '--inputs "" --outputs "u"; columns that are not named are left out. No channels: '
      "y (no numbers)."),
-    ("u,y\n1,\n2,\n3,\n", ("--inputs", "u"), "an input already (u), and none is left for an output; left out: y (no"),
+    ("u,y\n1,\n2,\n3,\n", ("--inputs", "u"), "already an input (u), so no column is left for an output; left out: y (no"),
     ("a,b,c\n1,2,4\n2,1,7\n", ("--outputs", "b"), 'only outputs are named: a, b, c. Say both, separated by commas, '
      'such as --inputs "a,c" --outputs "b" (--inputs "" for none)'),
     ("a,b,c\n1,2,4\n2,1,7\n", ("--inputs", "c"), '--inputs "c" --outputs "b"; columns'),
@@ -415,13 +415,13 @@ STEPS = [
         "t [ms]",
         20.0,
         "sampling_time = 1.0",
-        "`sampling_time` is 1 s, but column 't [ms]' of a.csv tells 0.02 s",
+        "`sampling_time` is 1 s, but column 't [ms]' of a.csv gives 0.02 s",
     ),
     (
         "time",
         0.1,
         "",
-        "so 1 s is taken, but column 'time' of a.csv tells 0.1 s; perhaps time = \"time\" is meant",
+        "so 1 s is used, but column 'time' of a.csv gives 0.1 s; perhaps time = \"time\" is meant",
     ),
     ("time", 0.1, "sampling_time = 0.1", ""),
     ("other", 0.1, "sampling_time = 1.0", ""),
@@ -456,7 +456,7 @@ THINNED = [
         "aika",
         0.05,
         5,
-        "column 'aika' of a.csv tells 0.01 s from row to row, so rows of which one in 5 is "
+        "column 'aika' of a.csv gives 0.01 s from row to row, so rows of which one in 5 is "
         "kept are 0.05 s",
     ),
     ("Ts", 0.05, 5, "Give sampling_time = 0.01, that of the file's rows.\n"),
@@ -520,7 +520,7 @@ def test_a_single_number_in_a_file_of_matlab_is_the_sampling_time(tmp_path, besi
         ["data_y"],
         step or 1.0,
     )
-    assert ("no column tells it" in done.out) == (step is None)
+    assert ("no column gives it" in done.out) == (step is None)
     np.savez(tmp_path / "a.npz", u=u, y=y, **beside)
     assert survey(tmp_path / "a.npz").clock.step == (step if beside else None)
 
@@ -554,7 +554,9 @@ def test_a_long_file_is_looked_at_in_windows_and_says_so(tmp_path, monkeypatch):
     pd.DataFrame({"u": u, "y": y}).to_csv(tmp_path / "a.csv", index=False)
     done = run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml")
     assert done.code == 0 and "reading a.csv" in done.err and "looking at signals" in done.err
-    assert "delays and orders are found on 500 of these rows" in done.out and "nk 3;" in done.out
+    assert (
+        "delays and orders are estimated from 500 of these rows" in done.out and "nk 3;" in done.out
+    )
 
 
 def frame_with(**columns) -> pd.DataFrame:
@@ -641,7 +643,7 @@ def test_why_a_column_is_not_the_time_is_said(tmp_path, header, values, reason):
         "--out",
         tmp_path / "spec.toml",
     )
-    assert done.code == 0 and "sampling time: no column tells it" in done.out, done.err
+    assert done.code == 0 and "sampling time: no column gives it" in done.out, done.err
     assert any(header in line and reason in line for line in done.out.splitlines()), done.out
     signals = [column.header for column in survey(tmp_path / "a.csv").signals]
     assert signals == (["u", "y"] if "signal" not in reason else [header, "u", "y"])
@@ -664,7 +666,8 @@ def test_a_ramp_may_be_an_input_where_the_time_is_known(tmp_path, monkeypatch):
     out = tmp_path / "spec.toml"
     done = run("init", tmp_path / "a.csv", "--out", out)  # its name says input, its values time
     assert (
-        done.code == 2 and "the names of the columns do not tell inputs from outputs: y" in done.err
+        done.code == 2
+        and "the names of the columns do not show which are inputs and which outputs: y" in done.err
     )
     done = run("init", tmp_path / "a.csv", "--inputs", "u", "--outputs", "y", "--out", out)
     assert (

@@ -520,7 +520,9 @@ def test_check_tells_what_cannot_be_told_apart_and_which_hold_is_right(tmp_path)
     )
     code, out, err = orthaug("check", spec, "--json")
     assert code == 2
-    assert "rank 3 of 4): m, c, k, g cannot be told apart; give one of them as a constant." in err
+    assert (
+        "rank 3 of 4): m, c, k, g cannot be distinguished; give one of them as a constant." in err
+    )
     told = strict(out)
     assert told["excitation"]["rank"] == told["identifiability"]["rank"] == 3
     assert told["identifiability"]["inseparable"] == [["m", "c", "k", "g"]]
@@ -670,7 +672,7 @@ def test_an_analysis_that_fails_numerically_loses_no_training(folder, result, mo
     assert texts == [
         "the analysis of the modes failed numerically (Singular matrix): the result stands "
         "without it.",
-        "the bias by suspects failed numerically (Singular matrix): the result stands without it.",
+        "the bias by suspects failed numerically (Singular matrix): the result is given without it.",
     ]
     assert told["stability"] is None and told["bias"] is None and told["residuals"] is not None
     assert all(unfolded(text) in unfolded(out + err) for text in texts)

@@ -251,7 +251,7 @@ def test_a_spec_prepares_every_part_and_the_result_tells(tmp_path, monkeypatch):
     told = run("export", "result", "--to", "numpy", "--out", "code")
     assert (
         told.code == 0
-        and "The code stands for data after these steps" in told.err
+        and "The code expects data after these steps" in told.err
         and "detrend" in told.err
     )
     for wrong, message in (

@@ -552,7 +552,7 @@ def _concluded(
 
 def _which(better: int, tried: int) -> str:
     if tried == 1:
-        return "which betters it" if better else "which does not better it"
+        return "which betters it" if better else "which does not improve it"
     return (
         "of which "
         f"{'none betters' if not better else 'one betters' if better == 1 else f'{better} better'} "

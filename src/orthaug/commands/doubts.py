@@ -90,8 +90,8 @@ def _unexplained(test: StructureTest | None, judged: bool) -> str:
         name = f"a further lag of {best.on}" if test.is_a_lag(best) else best.name
         what = (
             f"the model leaves more than noise: {name} in {best.equation} predicts "
-            f"{percent(best.share)} of the free run's error, beside the colour of its noise, "
-            "on rows that it was not fitted to"
+            f"{percent(best.share)} of the free run's error on rows not fitted, beside the "
+            "colour of its noise"
         )
     return (
         f"{what}. The 95 % intervals count noise only; what is missing may have moved the "
@@ -118,8 +118,8 @@ def _hidden_state(fit: Any, test: StructureTest) -> str:
     remedy += "; or let the learner see lags or a filtered copy of that signal"
     return (
         f"a state is missing: {best.name} in {best.equation} predicts {percent(best.share)} of "
-        "the free run's error on rows that it was not fitted to, which no function of the "
-        f"model's own states does{beside}.{_moved(fit, best)} Do this: {remedy}."
+        f"the free run's error on rows not fitted{beside}. No function of the model's own "
+        f"states does so.{_moved(fit, best)} Do this: {remedy}."
     )
 
 
@@ -205,10 +205,7 @@ def _withdrawn(shared: SharedResult, reason: str) -> SharedResult:
         return shared
     text = _DETERMINED.sub("", shared.text).rstrip(".")
     named = ", ".join(lost)
-    text = (
-        f"{text}. {named} would be determined by the fit beside such a learner, but not here: "
-        f"{reason}."
-    )
+    text = f"{text}. The fit would determine {named} beside such a learner, but not here: {reason}."
     physical = None if shared.physical is None else []
     update = {
         "text": text,

@@ -69,8 +69,8 @@ def _complaint() -> str | None:
     needed = _LEAST_MEMORY + _MEMORY_PER_CORE * (os.cpu_count() or 1)
     if limit() < needed and not {"--help", "--version"} & set(sys.argv):
         return (
-            f"the limit on memory (ulimit -v) is {in_words(limit())}; with its libraries "
-            f"orthaug takes {in_words(needed)} of addresses on this machine. Raise the limit."
+            f"the memory limit (ulimit -v) is {in_words(limit())}; with its libraries orthaug "
+            f"needs {in_words(needed)} of address space on this machine. Raise the limit."
         )
     return None
 

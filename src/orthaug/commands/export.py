@@ -35,7 +35,10 @@ def run(model: Path, to: str, out: Path, name: str, *, force: bool = False) -> t
     except InputError as error:
         own = str(error).startswith(str(out))
         raise InputError(str(error) if own else f"{model}: {error}") from None
-    what = "The code expects data after these steps: it does not contain a delay by `shift`, for example."
+    what = (
+        "The code expects data after these steps: it does not contain a delay by `shift`, for "
+        "example."
+    )
     return (
         prepared_notes(loaded, what=what)
         if any(done.step not in MENDING for done in loaded.prepared)

@@ -192,7 +192,7 @@ def keep_states(job: Job, folder: Path, *, resume: bool = False) -> Job:
         hosts.check_alike(job.fingerprint)
         if resume:
             raise InputError(
-                "--resume: a fit over several hosts keeps no states to go on from; leave it out."
+                "--resume: a fit over several hosts keeps no states to continue from; leave it out."
             )
         return job
     place = folder.with_name(f"{folder.name}.training")
@@ -219,8 +219,8 @@ def report_of(job: Job, fit: Any) -> FitReport:
     if job.checkpoints is not None and job.checkpoints.spoilt:
         text = (
             "a kept state of training is damaged "
-            f"({job.checkpoints.folder.name}/{job.checkpoints.spoilt[0]}), so training began "
-            "anew there; the result is that of a whole training."
+            f"({job.checkpoints.folder.name}/{job.checkpoints.spoilt[0]}), so that run began "
+            "anew; the result is complete."
         )
         warnings.append(Warning("checkpoint_spoilt", text))
     scores, responses = {}, {}

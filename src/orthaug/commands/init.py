@@ -99,9 +99,7 @@ def spec_text(
         )
     )
     document.add(
-        tomlkit.comment(
-            "Every key: orthaug schema keys. What is written here is a start, not a verdict."
-        )
+        tomlkit.comment("Every key: orthaug schema keys. This is a first draft to be improved.")
     )
     document.add("data", _data(found, roles, out, rows, cut, gaps, named))
     document.add(tomlkit.nl())
@@ -375,12 +373,11 @@ def _nothing_left(found: Survey, inputs: str | None) -> str:
     others = left_out(found, [*found.signals])
     if not found.signals:
         return (
-            f"no column could be a channel, {rows}: {others}. A first model needs an output "
-            "that varies, over some dozens of rows."
+            f"no column can be a channel, {rows}: {others}. A first model needs an output that "
+            "varies over some dozens of rows."
         )
     text = (
-        f"every column that could be a channel is an input already ({inputs}), and none is "
-        "left for an output"
+        f"every possible channel is already an input ({inputs}), so no column is left for an output"
     )
     return f"{text}; left out: {others}." if others else f"{text}."
 
@@ -501,7 +498,7 @@ def _account(
     """Return the description of the file, a line for each finding."""
     step = f"{roles.sampling_time:g} s, as given" if roles.sampling_time else str(found.clock)
     if roles.sampling_time is None and found.clock.step is None:
-        step += "; 1 s is written: change it"
+        step += "; the spec has 1 s: change it"
     horizon = f"; {found.note}" if found.note else ""
     lines = [
         f"{found.path.name}: {rows} rows, {len(found.columns)} columns{horizon}",
@@ -542,10 +539,11 @@ def _account(
     lines[-1] += f" on rows held out is {errors} of the output's standard deviation"
     if cut - missing > LOOKED_AT:
         lines.append(
-            f"delays and orders are found on {LOOKED_AT} of these rows, in windows spread over them"
+            f"delays and orders are estimated from {LOOKED_AT} of these rows, in windows "
+            "spread over them"
         )
     lines.append(
-        "test: " + (f"rows {cut} to {rows}" if cut < rows else "none, for there are few rows")
+        "test: " + (f"rows {cut} to {rows}" if cut < rows else "none, because there are few rows")
     )
     return "\n".join(lines)
 

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 _NOT_ANALYSED = Warning(
     "residual_not_analysed",
-    "the residual is not analysed: there are too few rows for that, or it is rounding only.",
+    "the residual is not analysed: there are too few rows, or it is rounding error only.",
 )
 _UNKNOWN = ("physical_parameters", "physical_consistency", "sensitivities", "bias")
 

@@ -158,7 +158,7 @@ def expanded(path: Path, entries: Sequence[str], name: str) -> list[str]:
             continue
         if not files:
             raise InputError(
-                f"{path}: 'data.{name}.files': no file fits '{entry}'; expected one of "
+                f"{path}: 'data.{name}.files': no file matches '{entry}'; expected one of "
                 f"{', '.join(KNOWN)}."
             )
         found += sorted(file for file in files if Path(file).suffix)
@@ -261,7 +261,7 @@ def _left(path: Path, spec: Spec, part: PartSection, name: str, files: Sequence[
         warnings = _other_step(path, spec, files, name, part.columns)
     if len(record) < total:
         text = (
-            f"{name}: findings and figures look at {len(record)} of {total} rows, in windows "
+            f"{name}: findings and figures use {len(record)} of {total} rows, in windows "
             "spread over them."
         )
         warnings += (Warning("witness", text),)
@@ -295,7 +295,7 @@ def _other_step(
         said = (
             f"`sampling_time` is {step:g} s"
             if given
-            else "the spec says no sampling time, so 1 s is taken"
+            else "the spec gives no sampling time, so 1 s is used"
         )
         header = clock.column.header
         remedy = f'time = "{header}"' if clock.instants else f"sampling_time = {clock.step:g}"

@@ -94,8 +94,8 @@ def _repeated(args: Sequence[str], lists: Set[str], valued: Set[str]) -> list[st
 app = typer.Typer(
     name="orthaug",
     cls=_Group,
-    help="Fit physics together with a learned correction, so that the physics keeps all that "
-    "physics can explain.",
+    help="Fit physics together with a learned correction, so that physics keeps what it can "
+    "explain.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
@@ -251,8 +251,8 @@ def print_result(result: Content, text: str, as_json: bool, place: object = None
     written = f"\n\nwritten to {place}" if place is not None else ""
     if place in PARTIALS.overtaken:
         streams.say(
-            f"warning: {place}: another run wrote a result here while this one ran, and this "
-            "one has replaced it; run it again with another --out to have both."
+            f"warning: {place}: another run wrote a result here meanwhile, and this one has "
+            "replaced it; run again with another --out to have both."
         )
     streams.echo(result.to_json() if as_json else f"{text}{written}")
 

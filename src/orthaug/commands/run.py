@@ -184,7 +184,7 @@ def open_run(
     elif held:
         missing = [c.name for c in loaded.outputs if c not in held]
         raise InputError(
-            f"{data}: has some of the model's outputs but not {', '.join(missing)}; give all "
+            f"{data}: has some of the model's outputs but lacks {', '.join(missing)}; give all "
             "or none."
         )
     try:
@@ -285,7 +285,7 @@ def read_initial(initial: str | None, opened: ModelOnData) -> str | Any:
         remedy = (
             "leave --initial out"
             if measured
-            else "a free run without measured outputs cannot go on behind them"
+            else "a free run without measured outputs cannot continue after them"
         )
         raise InputError(
             f"{opened.source}: has missing samples, and each stretch starts from its own "
@@ -400,9 +400,9 @@ def _of_band(found: Consistency, response: Response) -> list[str]:
         return []
     held, (low, high) = float(np.mean(np.abs(apart) <= BAND)), found.expected
     text = (
-        f"the innovations' squares are {found.nis:.3g} times what the observer expects (NIS, "
-        f"{low:.3g} to {high:.3g} where it knows its noise); its 95 % band holds "
-        f"{percent(held, 3)} of what was measured."
+        f"the squared innovations are {found.nis:.3g} times as large as the observer expects "
+        f"(NIS; {low:.3g} to {high:.3g} with the right noises). Its 95 % band contains "
+        f"{percent(held, 3)} of the measured values."
     )
     if found.consistent:
         return [f"note: {text}"]
@@ -412,7 +412,7 @@ def _of_band(found: Consistency, response: Response) -> list[str]:
         else "its noises are too large"
     )
     return [
-        f"warning: {text} Do not take the band for one of 95 %: {why}. "
+        f"warning: {text} Do not use the band as one of 95 %: {why}. "
         "oa.Observer(oa.load(MODEL)).tuned(record) finds noises by the likelihood of a record."
     ]
 
@@ -466,8 +466,9 @@ def explain_notes(model: Path) -> list[str]:
         with suppress(AttributeError, KeyError, TypeError):
             if content["spec"].get("physics"):
                 return [
-                    "note: the spec has [physics]: a term from here also takes a line of [physics.theta], such as "
-                    'drag = "drag", its parameter in [physics.parameters] with that `initial`, and none in the term.'
+                    "note: the spec has [physics]. For a term from here add a line to "
+                    '[physics.theta], such as drag = "drag". Declare its parameter in '
+                    "[physics.parameters] with that `initial`, not in the term."
                 ]
     return []
 

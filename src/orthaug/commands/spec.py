@@ -51,9 +51,9 @@ Regularization = (
 )
 
 _BESIDE_MOTION = {
-    "baseline": "expected one of them, for both are the physics",
-    "lags": "expected none, for a motion has states instead; `learner.inputs` says what its "
-    "learner sees",
+    "baseline": "expected one of them, because both are the physics",
+    "lags": "expected none, because a motion has states instead; `learner.inputs` declares the "
+    "inputs of its learner",
     "physics": "expected none, for the parameters of a motion are physical: [motion.parameters]",
 }
 
@@ -240,12 +240,13 @@ class Spec(Section):
                 found = (
                     "beside [motion]; expected `equation`"
                     if self.motion
-                    else "without [motion], whose key it is"
+                    else "without [motion], which it belongs to"
                 )
                 raise ValueError(f"`suspects[{i}].{key}`: found {found}")
         if self.motion is not None and self.training.ensemble:
             raise ValueError(
-                "`training.ensemble`: a motion has none, for medians of runs follow no equations"
+                "`training.ensemble`: a motion has none, because medians of runs follow no "
+                "equations"
             )
         return self
 

@@ -23,7 +23,7 @@ try:
     from matplotlib.figure import Figure
 except UnicodeDecodeError:
     raise InputError(
-        "matplotlibrc: found letters that are not UTF-8; mend that file, or remove it."
+        "matplotlibrc: found letters that are not UTF-8; correct that file, or remove it."
     ) from None
 
 # Okabe-Ito: told apart by every reader

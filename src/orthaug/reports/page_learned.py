@@ -28,7 +28,9 @@ def learned_blocks(part: LearnedPart, measure: str) -> list[Text | Grid | Plot]:
     blocks.append(Grid(plots))
     if len(ranked) > _MOST_CURVES:
         blocks.append(
-            Text(f"The {_MOST_CURVES} inputs that explain most, of {len(ranked)}, are drawn.", "note")
+            Text(
+                f"The {_MOST_CURVES} inputs that explain most, of {len(ranked)}, are drawn.", "note"
+            )
         )
     if len(ranked) > 1:
         blocks += [_surface_plot(part, k, *part.telling_pair()) for k in range(len(part.names))]
@@ -38,7 +40,7 @@ def learned_blocks(part: LearnedPart, measure: str) -> list[Text | Grid | Plot]:
 def _told(part: LearnedPart, ranked: list[str], shares: Any, measure: str) -> str:
     explained = shares.max(axis=1)
     text = f"The learner sees {', '.join(part.features)}, and adds to {', '.join(part.names)}"
-    text += f" what the {measure} measure does not give to the physics" if measure else ""
+    text += f" what the {measure} measure does not assign to the physics" if measure else ""
     if len(ranked) == 1:
         return f"{text}. The curve shows what it adds over that input."
     text += (
@@ -85,7 +87,7 @@ def _curve_plot(part: LearnedPart, k: int, feature: str, share: float) -> Plot:
             ", the one input of the learner" if one else ", all else at its median"
         ) + ": solid within the shaded"
         text += (
-            " reach of the data, dashed beyond; the dots are what it adds along the training data"
+            " range of the data, dashed beyond; the dots are what it adds along the training data"
         )
         text += ", and the band is its 95 % interval." if curve.half is not None else "."
     else:

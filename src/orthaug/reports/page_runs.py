@@ -108,8 +108,8 @@ def _compared(part: str, runs: Mapping[str, Response], most: int) -> Plot:
     lost = [name for name, run in runs.items() if any(t.diverged for t in run.trajectories)]
     samples = sum(len(t.model) for t in first.trajectories)
     caption = (
-        f"The free runs of {', '.join(runs)} on {part}, all {samples} samples, with what each "
-        "leaves of the measured output under them."
+        f"The free runs of {', '.join(runs)} on {part}, all {samples} samples, with their "
+        "residuals below."
     )
     caption += f" The run of {', '.join(lost)} diverges." if lost else ""
     return panels.plot(
@@ -456,21 +456,20 @@ def _caption(run: Run, most: int) -> str:
     ]
     if rows > most:
         sentences.append(
-            f"Of each curve {number(most, 3)} points are kept, the least and the largest value "
-            "of every stretch."
+            f"Each curve is drawn by {number(most, 3)} points, the minimum and maximum of "
+            "every stretch."
         )
     for t in response.trajectories:
         if t.diverged:
             sentences.append(
-                f"The run leaves all bounds in {t.diverged[1]} at row {t.diverged[0]}, where "
-                "it is cut off."
+                f"The run diverges in {t.diverged[1]} at row {t.diverged[0]}, where it is cut off."
             )
     outside = [t.outside for t in response.trajectories if t.outside is not None]
     beyond = float(np.concatenate(outside).mean()) if outside else 0.0
     if beyond > 0:
         sentences.append(
-            f"On {percent(beyond)} of the samples, shaded, the learner is outside what it was "
-            "trained on; `learner.beyond` says what its correction does there."
+            f"On {percent(beyond)} of the samples, shaded, the learner is outside its training "
+            "data; `learner.beyond` sets its correction there."
         )
     return " ".join(sentences)
 

@@ -64,9 +64,9 @@ def fit_verdict(result: FitResult) -> PageVerdict:
     )
     level = "bad" if bad else "care" if doubts else "good"
     opening = {
-        "good": "The model is to be trusted",
-        "care": "The model is to be trusted with care",
-        "bad": "Do not trust the model as it is",
+        "good": "The model is reliable",
+        "care": "Use the model with care",
+        "bad": "Do not use the model as it is",
     }[level]
     shown = "" if error is None else f": {_told_error(error, part)}"
     because = (
@@ -86,7 +86,7 @@ def compare_verdict(result: CompareResult) -> PageVerdict:
         return PageVerdict(
             "bad",
             "No model has a free run that could be scored.",
-            "None of them is of use as it is.",
+            "None of them can be used as it is.",
             "Look at the warnings below, and fit again.",
         )
     errors = {row.name: _worst(row.scores)[0] or 0.0 for row in rows}
@@ -114,7 +114,7 @@ def compare_verdict(result: CompareResult) -> PageVerdict:
     if doubts:
         trust = f"{trust[:-1]}. But {_joined(doubts[:_MOST_DOUBTS])}."
     alone = errors.get("physics alone")
-    use = "It is the physics alone: no learner earns its place beside it."
+    use = "It is the physics alone: no learner improves on it."
     if best != "physics alone" and alone is not None and error is not None:
         learns = error / alone if alone else 1.0
         use = (
@@ -142,7 +142,7 @@ def _after_comparison(result: CompareResult, row: RowResult) -> str:
     if row.residuals is not None and row.residuals.changes:
         return f"An option, not tried here: {_change(row.residuals.changes[0])}."
     if not result.data.tests and not result.data.validation:
-        return "Hold out a test part, on which the models can be judged."
+        return "Hold out a test part, so that the models can be judged."
     if not result.data.validation:
         return (
             "Hold out a validation part (`[data.validation]`), so that the choice is not made "
@@ -228,7 +228,7 @@ def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
         and not data.validation
         and not (result.validation and result.validation.trials)
     ):
-        yield "it was never tried on data that it was not fitted to"
+        yield "it was not tested on data that it was not fitted to"
     if (result.status if isinstance(result, RowResult) else result.status.code) in _STOPPED:
         yield "training stopped before it converged"
     if _warned(result, "spectral_radius_above_one"):
@@ -258,7 +258,7 @@ def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
             "sensor_noise": "noise on the measured output biases its one-step estimates",
         }[result.residuals.verdict]
     if _warned(result, "closed_loop"):
-        yield "its data look recorded under feedback, which biases it"
+        yield "its data were probably recorded under feedback, which biases the estimates"
     worse = _worse(result.scores)
     if worse is not None:
         times = number(worse[0], 2)
@@ -320,12 +320,11 @@ def _use(result: FitResult, level: str) -> str:
     predicts = ahead is not None and ahead <= (_GOOD if level == "bad" else _POOR)
     if level == "bad" and ahead is not None and ahead > _POOR:
         return (
-            "Use it for nothing but to look for what is missing: not even its prediction of "
-            f"the next sample holds, which leaves {percent(ahead)} of the output's deviation "
-            f"{_on(part)}."
+            "Use it only to look for what is missing: its one-step prediction, too, leaves "
+            f"{percent(ahead)} of the output's deviation {_on(part)}."
         )
     if level == "bad" and not (known and predicts):
-        return "Use it for nothing but to look for what is missing."
+        return "Use it only to look for what is missing."
     if level == "bad":
         text = "predict the next sample"
     else:
@@ -342,8 +341,8 @@ def _use(result: FitResult, level: str) -> str:
     )
     if shared:
         text += (
-            f"; {_joined(shared)} {_is(shared)} what the physics nearest to the data has, for "
-            "the learner could"
+            f"; {_joined(shared)} {_is(shared)} taken from the physics nearest to the data, "
+            "for the learner could"
         )
         text += f" imitate {'it' if len(shared) == 1 else 'them'}"
     return f"Use it to {text}."
@@ -383,12 +382,12 @@ def _then(result: FitResult) -> str:
         return f"An option, not tried here: {option}."
     if result.advice_trials is not None and result.advice_trials.tried:
         text = (
-            "None of the changes that were tried betters the free run; export it (`orthaug "
+            "None of the changes that were tried improves the free run; export it (`orthaug "
             "export`), or design the"
         )
         return f"{text} next experiment."
     return (
-        "Nothing further is predicted to help; export it (`orthaug export`) or design the next "
+        "No further change is predicted to help; export it (`orthaug export`) or design the next "
         "experiment."
     )
 
@@ -423,8 +422,8 @@ def _option(result: FitResult) -> str | None:
         )
     if _undecided(result):
         return (
-            "the learner (`training.fallback = false`), for cross-validation leaves undecided "
-            "if it helps"
+            "the learner (`training.fallback = false`), for cross-validation does not decide "
+            "whether it helps"
         )
     if result.residuals is not None and result.residuals.steps:
         steps = _joined(list(result.residuals.steps))
@@ -434,14 +433,14 @@ def _option(result: FitResult) -> str | None:
         )
     if not _noise_alone(result):
         return (
-            "physics of your own for what the residual still follows (residual tests; "
+            "your own physics for what the residual still depends on (residual tests; "
             "`[[suspects]]` tests a form)"
         )
     worse = _worse(result.scores)
     return (
         None
         if worse is None
-        else f"more training data of the kind of {worse[1]}, on which the error is larger"
+        else f"more training data like {worse[1]}, on which the error is larger"
     )
 
 

@@ -156,7 +156,7 @@ def _figure(value: float | None, std: float | None) -> str:
 def _learner(result: SelectResult) -> str:
     learner = result.learner
     if learner is None:
-        return "none: on the blocks that were held out nothing beside the physics lowers the error"
+        return "none: nothing beside the physics lowers the error on the held-out blocks"
     if learner["kind"] == "terms":
         return f"{len(learner['terms'])} terms"
     seen = ", ".join(learner.get("inputs") or ["all lags"])

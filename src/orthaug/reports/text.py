@@ -67,7 +67,10 @@ def _as_doubted(line: str, result: FitResult) -> str:
     if result.noise_only:
         line = line.replace(f"{'95 % interval':^29}", f"{'95 %, noise only':^29}")
     if result.shared is not None and result.shared.doubt and line.startswith("shared "):
-        line = f"{line.partition('; determined by the fit: ')[0]}; determined by the fit: none, see below"
+        line = (
+            f"{line.partition('; determined by the fit: ')[0]}; determined by the fit: none, "
+            "see below"
+        )
     return line
 
 
@@ -169,8 +172,8 @@ def split_text(result: SplitResult) -> str:
     detail = result.measure_detail
     support = "–" if detail.support is None else f"{100 * detail.support:.0f} %"
     lines = [
-        f"measure     {result.measure}, {detail.points} points, {support} of it within reach "
-        "of the data",
+        f"measure     {result.measure}, {detail.points} points, {support} of it within the "
+        "range of the data",
         *parameter_table("parameter", result.parameters),
     ]
     return "\n".join(fold([*lines, *warning_lines(result.warnings)]))
@@ -250,8 +253,8 @@ def _bias_lines(result: FitResult) -> list[str]:
     for (cause, share), own in causes.items():
         if result.learns and share < SURE_SHARE:
             lines.append(
-                f"What the {what} looks most like {cause}: {percent(share)} of it. The bias if "
-                "it is that:"
+                f"What the {what} looks most like {cause}: {percent(share)} of it. The bias in "
+                "that case:"
             )
         else:
             lines.append(

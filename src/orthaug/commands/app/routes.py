@@ -29,10 +29,7 @@ from orthaug.commands.app.view_training import TrainingView
 from orthaug.commands.app.widgets import sentence, text
 
 LARGEST = 2 * 2**30  # bytes of a file that is dropped: it lies once more in a temporary folder
-_TOO_LARGE = (
-    "the file is larger than {}, the most that this page takes in; name its path instead, and "
-    "it stays there."
-)
+_TOO_LARGE = "the file is larger than {}, the limit of this page; give its path instead."
 _OFTEN = 0.25  # s between looks at what has changed
 _PARTS = ("Data", "Model", "Training", "Report", "Export")
 MARK = (
@@ -170,7 +167,7 @@ def application(sessions: Sessions, spec: Path | None) -> FastAPI:
         session = sessions.find(key)
         try:
             if session is None:
-                raise InputError("this work is not open any more.")
+                raise InputError("this session has ended.")
             file = session.download(what)
         except InputError as error:
             return _told(str(error), 404)
@@ -183,7 +180,7 @@ def application(sessions: Sessions, spec: Path | None) -> FastAPI:
         session = sessions.find(key)
         if session is None:
             return _told(
-                "This work is not open any more. Its spec is offered where something new begins.",
+                "This session has ended. Its spec is offered at the start of a new one.",
                 404,
             )
         Page(session).draw()
@@ -207,7 +204,7 @@ async def _kept(sessions: Sessions, key: str, name: str, request: Request) -> Re
     """Return the answer to an upload: the file is written piece by piece, then examined."""
     session = sessions.find(key)
     if session is None:
-        return _refused("this work is not open any more; open the page anew.", 404)
+        return _refused("this session has ended; open the page anew.", 404)
     partial: Path | None = None
     declared = request.headers.get("content-length", "")
     if declared.isdecimal() and int(declared) > LARGEST:
@@ -224,7 +221,7 @@ async def _kept(sessions: Sessions, key: str, name: str, request: Request) -> Re
     except InputError as error:
         return _refused(str(error), 422)
     except ClientDisconnect:
-        return _refused("the file came only in part.", 400)
+        return _refused("only a part of the file arrived.", 400)
     except OSError as error:
         return _refused(f"the file cannot be kept ({error.strerror}).", 507)
     finally:

@@ -130,7 +130,7 @@ class Session:
         ending = Path(plain_name).suffix.lower()
         if ending not in KNOWN or not Path(plain_name).stem:
             raise InputError(
-                f"'{plain_name}': no data file that is known; known are {', '.join(KNOWN)}."
+                f"'{plain_name}': unknown type of data file; expected one of {', '.join(KNOWN)}."
             )
         return self.folder / plain_name
 
@@ -451,9 +451,7 @@ class Sessions:
         if len(self._open) >= _SESSIONS and untouched:
             del self._open[untouched[0].key]
         if len(self._open) >= _SESSIONS:
-            raise InputError(
-                f"{_SESSIONS} pieces of work are open; end orthaug app, and start it again."
-            )
+            raise InputError(f"{_SESSIONS} sessions are open; end orthaug app, and start it again.")
         key = secrets.token_urlsafe(12)
         self._made += 1
         folder = self.folder / f"work-{self._made}"

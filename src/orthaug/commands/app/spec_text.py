@@ -207,7 +207,8 @@ def changed(text: str, change: Callable[[Any], None]) -> str:
     written = tomlkit.dumps(document)
     if plain(written) != document.unwrap():
         raise InputError(
-            "a form cannot write this change into the spec in its present layout; make it in the text."
+            "a form cannot write this change into the spec in its present layout; make it in "
+            "the text."
         )
     return written
 

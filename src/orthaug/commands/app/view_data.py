@@ -157,7 +157,7 @@ class DataView:
                 if self._apart:
                     self._offer_test(found)
             elif not session.spec and (kept := spec_text.earlier()[:_OFFERED]):
-                text("Or go on with the spec of earlier work:", "p", "hint")
+                text("Or continue with an earlier spec:", "p", "hint")
                 with ui.element("div").classes("fields"):
                     for place in kept:
                         when = datetime.fromtimestamp(place.stat().st_mtime)
@@ -171,8 +171,8 @@ class DataView:
             message += f"; it trains on {', '.join(file.name for file in trained)}"
         if lacking:
             message += f". This file has no column {', '.join(lacking)}, which the spec reads"
-        note(f"{message}. Take this file as a test of it, or begin anew below.", "care")
-        button("Take it as a test", self.session.add_test, main=not lacking)
+        note(f"{message}. Use this file as a test of it, or begin anew below.", "care")
+        button("Use it as a test", self.session.add_test, main=not lacking)
 
     def _trained(self) -> list[Path]:
         """Return the files that the spec trains on."""
@@ -245,7 +245,7 @@ class DataView:
                 return
             if found["spec"] is None and not self._of_spec(found):
                 names = (
-                    "The names of the columns do not say which are inputs and outputs: choose "
+                    "The names of the columns do not show which are inputs and outputs: choose "
                     "them here."
                 )
                 note(found["open"] or names, "care")
@@ -377,9 +377,7 @@ class DataView:
                     unit, name = curve["unit"], channel
             if drawn:
                 rows.append((f"{name} [{unit}]" if unit else name, drawn))
-        other = (
-            f"; {session.data.name} is no part of them" if session.apart and session.data else ""
-        )
+        other = f"; {session.data.name} is not among them" if session.apart and session.data else ""
         state = (
             rows,
             cleaned,

@@ -173,7 +173,7 @@ class ModelView:
         moves = "motion" in content
         with redrawn(self.learner):
             if not content:
-                text("A learner finds what the physics does not say.", "p", "hint")
+                text("A learner finds what the physics lacks.", "p", "hint")
                 return
             kind = str(learner.get("kind", "mlp"))
             with ui.element("div").classes("fields"):
@@ -233,8 +233,8 @@ class ModelView:
         with redrawn(self.check):
             if not session.spec.strip():
                 text(
-                    "Rank, units, what the learner could take from the physics, and what would "
-                    "bias it.",
+                    "Rank, units, what the learner could imitate of the physics, and possible "
+                    "biases.",
                     "p",
                     "hint",
                 )
