@@ -30,7 +30,7 @@ from orthaug.commands.app.processes import Command, Run, WorkerPool
 from orthaug.commands.app.session import Session, Sessions
 from orthaug.commands.app.worker import thinned
 from orthaug.commands.bars import training_bar
-from orthaug.commands.job import ALONE, AS_DECLARED, Variant
+from orthaug.commands.job import AS_DECLARED, PHYSICS_ONLY, Variant
 from orthaug.commands.kinds import open_job
 from orthaug.commands.parts import expanded
 
@@ -312,7 +312,9 @@ def test_lines_of_progress_say_what_each_run_is(csv, tmp_path, monkeypatch, caps
             ("orthogonal", 2, "ard"),
         )
     ]
-    assert len(runs) == job.run_count and job.planned(Variant(ALONE)) == ({"structure": ALONE},)
+    assert len(runs) == job.run_count and job.planned(Variant(PHYSICS_ONLY)) == (
+        {"structure": PHYSICS_ONLY},
+    )
     penalised = job.planned(Variant("baseline-penalty"))
     assert {run["structure"] for run in penalised} == {"baseline-penalty"} and len(penalised) == 4
     monkeypatch.setenv("ORTHAUG_PROGRESS", "json")
@@ -332,7 +334,7 @@ def test_lines_of_progress_say_what_each_run_is(csv, tmp_path, monkeypatch, caps
 
 @served
 def test_curves_of_the_loss_are_named_by_start_or_by_structure():
-    from orthaug.commands.app.view_training import _runs_told
+    from orthaug.commands.app.view_training import _runs_caption
     from orthaug.commands.app.widgets import loss_figure
 
     def drawn(runs: list[Run]) -> tuple[list[str], list[str], dict[str, Any]]:
@@ -368,8 +370,10 @@ def test_curves_of_the_loss_are_named_by_start_or_by_structure():
         drawn([Run(1), Run(2)])[0] == ["run 1", "run 2"]
         and drawn([Run(1, "orthogonal", 1, "ard")])[0] == []
     )
-    assert "(ard, none)" in _runs_told(set(fit)) and "The colour tells" in _runs_told(set(compared))
-    assert _runs_told({Run(1)}) == "Each curve is a run: one training."
+    assert "(ard, none)" in _runs_caption(set(fit)) and "The colour tells" in _runs_caption(
+        set(compared)
+    )
+    assert _runs_caption({Run(1)}) == "Each curve is a run: one training."
 
 
 @served

@@ -1,6 +1,6 @@
 """Entry point of the program: signals first, then streams and environment, then the command line.
 
-The user's switches for libraries that orthaug uses within itself do not reach them.
+Environment variables of the user for libraries inside orthaug have no effect on them.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ from orthaug.export import exporting
 
 
 def check(model: Path, to: str, out: Path, name: str, *, force: bool = False) -> None:
-    """Raise InputError for an unknown target or place, or where the code would replace the model."""
+    """Raise InputError for an unknown target or place, or one that would replace the model."""
     exporting.check_export(to, out, name, force=force)
     try:
         inside = model.exists() and model.resolve().is_relative_to(out.resolve())

@@ -340,15 +340,15 @@ def question(found: Survey, inputs: Names | None = None, outputs: Names | None =
     }
     free = [c for c in found.signals if id(c) not in given]
     if not found.signals or (outputs is None and not free):
-        raise InputError(f"{found.path}: {_nothing_left(found, _joined(inputs))}")
+        raise InputError(f"{found.path}: {_no_output_reason(found, _join(inputs))}")
     some = _listed([c.header for c in found.signals])
     output = free.pop() if outputs is None else None
     rows = next((c.filled for c in (output, *given.values()) if c is not None), 0)
     alike = [c.header for c in free if c.filled == rows] or [c.header for c in free]
     named = ",".join(alike[:_LISTED]) if outputs is not None else alike[0] if alike else ""
-    into = named if inputs is None else _joined(inputs)
+    into = named if inputs is None else _join(inputs)
     proposed = (
-        f'--inputs "{into}" --outputs "{_joined(outputs) if output is None else output.header}"'
+        f'--inputs "{into}" --outputs "{_join(outputs) if output is None else output.header}"'
     )
     said = "the names of the columns do not show which are inputs and which outputs"
     if inputs is not None or outputs is not None:
@@ -362,12 +362,12 @@ def question(found: Survey, inputs: Names | None = None, outputs: Names | None =
     )
 
 
-def _joined(names: Names | None) -> str | None:
+def _join(names: Names | None) -> str | None:
     """Return the names as a person would write them."""
     return names if names is None or isinstance(names, str) else ",".join(names)
 
 
-def _nothing_left(found: Survey, inputs: str | None) -> str:
+def _no_output_reason(found: Survey, inputs: str | None) -> str:
     """Return the reason why no column is left for an output."""
     rows = counted(max(column.filled for column in found.columns), "row")
     others = left_out(found, [*found.signals])

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from orthaug.reports.drawing import Figure
 
 _UNKNOWN = ("physical_parameters", "physical_consistency", "sensitivities", "bias", "missing_lags")
-_STIFF = 20  # substeps from which a motion is told to be stiff for its sampling
+_STIFF = 20  # substeps from which a motion is called stiff for its sampling
 _NOT_ANALYSED = Warning(
     "residual_not_analysed",
     "the residual is not analysed: the free run diverged, has too few rows, or leaves rounding "
@@ -117,7 +117,7 @@ def checked(job: MotionJob) -> CheckResult:
 def _biases(job: MotionJob, trial: Trial) -> list[dict[str, Any]] | None:
     """Return the bias that each suspect would cause, with physics alone.
 
-    Of the usual ones those that do anything, where none is named.
+    Without suspects in the spec, the usual ones with an effect.
 
     None where physics alone has no run.
     """
@@ -334,7 +334,10 @@ def _about_steps(job: MotionJob, trial: Trial) -> tuple[str, list[Warning]]:
         )
     ]
     if trial.substeps >= _STIFF:
-        text = f'the motion is stiff for its sampling: {trial.substeps} substeps; `integrator = "exact"` may need fewer.'
+        text = (
+            f"the motion is stiff for its sampling: {trial.substeps} substeps; "
+            '`integrator = "exact"` may need fewer.'
+        )
         warnings.append(Warning("stiff", text))
     if len(trial.holds) > 1:
         shown = ", ".join(
@@ -348,6 +351,9 @@ def _about_steps(job: MotionJob, trial: Trial) -> tuple[str, list[Warning]]:
         if trial.best is None:
             sentences.append("No hold explains the data clearly better than the declared one.")
         else:
-            text = f'the data are explained better by hold = "{trial.best}" than by the declared "{motion.hold}".'
+            text = (
+                f'the data are explained better by hold = "{trial.best}" than by the '
+                f'declared "{motion.hold}".'
+            )
             warnings.append(Warning("other_hold", text))
     return " ".join(sentences), warnings

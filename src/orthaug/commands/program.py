@@ -63,11 +63,12 @@ class ListOptionCommand(typer.core.TyperCommand):
 def _repeated(args: Sequence[str], lists: Set[str], valued: Set[str]) -> list[str]:
     """Return arguments with the option of a list repeated before each of its values.
 
-    One value is left to be the argument of the command where there would be none: a file that
-    exists, or the last.
+    Where the command would have no argument, one value is left for it: a file that exists, or the
+    last.
 
     Examples:
-        >>> _repeated(["run.csv", "--inputs", "a", "b", "--out", "c"], {"--inputs"}, {"--inputs", "--out"})
+        >>> given = ["run.csv", "--inputs", "a", "b", "--out", "c"]
+        >>> _repeated(given, {"--inputs"}, {"--inputs", "--out"})
         ['run.csv', '--inputs', 'a', '--inputs', 'b', '--out', 'c']
     """
     found: list[list[str]] = []

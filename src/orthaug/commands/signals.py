@@ -33,7 +33,7 @@ def _nothing() -> str:
 class SignalWatch:
     """A watch that ends the program on a signal, once it is started.
 
-    Before that, signals do what they always do.
+    Before that, signals have their usual effect.
     """
 
     def __init__(self) -> None:
@@ -45,7 +45,7 @@ class SignalWatch:
     def start(self) -> None:
         """Begin to wait for signals.
 
-        Those that the program is to ignore, as `nohup` asks, are ignored.
+        Signals that `nohup` made the program ignore stay ignored.
         """
         if os.name != "posix":  # elsewhere Ctrl-C is an exception in the main thread
             return
@@ -72,7 +72,7 @@ class SignalWatch:
     def asking(self) -> Iterator[threading.Event]:
         """Yield an event that the first Ctrl-C sets, for work that can stop with a partial result.
 
-        The next ends the program.
+        A second one ends the program.
         """
         import threading
 

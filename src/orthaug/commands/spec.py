@@ -332,7 +332,7 @@ class Spec(Section):
     ) -> Structure:
         """Return the declared structure, or another kind with the same keys.
 
-        Under a measure where it splits θ by one.
+        It has a measure where it splits θ.
         """
         structure = resolve(self.structure.declared(STRUCTURES, kind or self.structure.kind))
         takes = any(field.name == "measure" for field in fields(structure))
@@ -363,7 +363,7 @@ class Spec(Section):
         """Return the kind of engine that sums over the rows of these files.
 
         Raises:
-            InputError: rows that are not in memory, for training that flies over them.
+            InputError: rows that are not in memory, for training by free runs over them.
         """
         if not self.brought:
             return self.engine.chosen(files)

@@ -25,8 +25,10 @@ from orthaug.reports.residual_tests import RegressorResult, ResidualTestResult
 from orthaug.reports.result import ParameterResult, PartScores, RestartResult, RowResult
 
 _ROW = 62  # pixels of a parameter
-_NAMED = 0.8  # height of its name on an axis from -1 to 1: above the numbers of its axis, and below those of the last
-_FAR = 6.0  # widths of an interval from which the initial value is not drawn: the interval would be a point
+_NAMED = (
+    0.8  # height of its name on an axis from -1 to 1: between the numbers of its axis and the last
+)
+_FAR = 6.0  # widths of an interval from which the initial value is not drawn
 _DECADES = 20.0  # ratio of scores from which their axis is logarithmic
 _BAD = 1.0  # NRMSE of the mean, from which it is too
 _KINDS = {"prediction": ("one step", "@physics"), "simulation": ("free run", "@model")}
@@ -454,5 +456,5 @@ def parameter_comparison(rows: Sequence[RowResult]) -> list[Plot]:
 
 
 def _band(half: float) -> dict[str, Any]:
-    told = {"name": "99 % of what noise gives", "showlegend": True}
-    return area("@reach", xref="paper", x0=0, x1=1, y0=-half, y1=half, **told)
+    style = {"name": "99 % of what noise gives", "showlegend": True}
+    return area("@reach", xref="paper", x0=0, x1=1, y0=-half, y1=half, **style)

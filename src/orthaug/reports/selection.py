@@ -46,7 +46,7 @@ class TermShareResult(Content):
 
 
 class ShiftResult(Content):
-    """A parameter without and with the chosen terms, and the share of its regressor that is left."""
+    """A parameter without and with the chosen terms, and the share of its regressor left."""
 
     parameter: str
     unit: str | None

@@ -38,7 +38,7 @@ def fit_text(fit: Estimate | MotionEstimate, result: FitResult) -> str:
     """Return parameters, scores on every part, residual tests, the verdict and warnings."""
     if not fit.status.ok:
         return ""
-    lines = [_as_doubted(line, result) for line in fit.lines()]
+    lines = [_mark_noise_only(line, result) for line in fit.lines()]
     blocks = [[w.text.capitalize() for w in result.warnings if w.code == "one_step_only"], lines]
     if result.focus is not None and result.focus.candidates:
         blocks.append([f"{result.focus.text[0].upper()}{result.focus.text[1:]}"])
@@ -59,7 +59,7 @@ def fit_text(fit: Estimate | MotionEstimate, result: FitResult) -> str:
     return "\n\n".join("\n".join(fold(lines)) for lines in blocks if lines)
 
 
-def _as_doubted(line: str, result: FitResult) -> str:
+def _mark_noise_only(line: str, result: FitResult) -> str:
     """Return a line of a fit whose intervals count noise only, without withdrawn claims.
 
     The line says so.
@@ -143,7 +143,7 @@ def _shared_lines(shared: SharedResult) -> list[str]:
 def compare_text(result: CompareResult, verdicts: Mapping[str, Verdict]) -> str:
     """Return two tables, parameters with standard errors and scores on every part.
 
-    Then the verdicts on each row.
+    The verdicts on each row follow.
     """
     lines = [*table(_parameter_cells(result)), "", *table(_score_cells(result.comparison))]
     if result.chosen:
@@ -354,7 +354,7 @@ def _residual_lines(result: FitResult) -> list[str]:
 def response_text(response: Response) -> str:
     """Return the scores of a response where its outputs were measured and every row has a value.
 
-    Otherwise nothing.
+    Otherwise empty.
     """
     if any(t.measured is None or t.diverged for t in response.trajectories):
         return ""

@@ -163,7 +163,7 @@ class WorkerPool:
         """Return the answer of a worker. A caller that is cancelled ends the worker.
 
         Raises:
-            InputError: what the question is refused with.
+            InputError: the question was refused.
         """
         async with self._room:
             process = await self._taken()

@@ -28,7 +28,7 @@ from orthaug.commands.app.view_results import ExportView, ReportView
 from orthaug.commands.app.view_training import TrainingView
 from orthaug.commands.app.widgets import sentence, text
 
-LARGEST = 2 * 2**30  # bytes of a file that is dropped: it lies once more in a temporary folder
+LARGEST = 2 * 2**30  # bytes of an upload: there is a second copy in a temporary folder
 _TOO_LARGE = "the file is larger than {}, the limit of this page; give its path instead."
 _OFTEN = 0.25  # s between looks at what has changed
 _PARTS = ("Data", "Model", "Training", "Report", "Export")
@@ -88,7 +88,7 @@ class Page:
                 tabs.set_value(event.args)
 
         def reopen(event: Any) -> None:
-            if tabs.value == start:  # else somebody was faster
+            if tabs.value == start:  # otherwise another page was faster
                 go(event)
 
         ui.on("part", go)
@@ -130,7 +130,7 @@ class Page:
         for look in looks:
             try:
                 look()
-            except Exception as error:  # a part that fails keeps no other from what is new
+            except Exception as error:  # a part that fails does not stop the others
                 LOG.exception("a part of the page failed")
                 self._complain(error)
 
@@ -155,7 +155,7 @@ def application(sessions: Sessions, spec: Path | None) -> FastAPI:
         try:
             session = sessions.new(spec)
         except InputError as error:
-            return _told(str(error), 503)
+            return _error_page(str(error), 503)
         return RedirectResponse(f"/session/{session.key}", 303)
 
     @app.put("/session/{key}/file/{name}")
@@ -170,7 +170,7 @@ def application(sessions: Sessions, spec: Path | None) -> FastAPI:
                 raise InputError("this session has ended.")
             file = session.download(what)
         except InputError as error:
-            return _told(str(error), 404)
+            return _error_page(str(error), 404)
         if show and file.suffix == ".html":  # else a spec could be read as a page of this origin
             return FileResponse(file, headers={"cache-control": "no-store"}, media_type="text/html")
         return FileResponse(file, filename=what, headers={"cache-control": "no-store"})
@@ -179,13 +179,13 @@ def application(sessions: Sessions, spec: Path | None) -> FastAPI:
     def work(key: str) -> Response | None:
         session = sessions.find(key)
         if session is None:
-            return _told(
+            return _error_page(
                 "This session has ended. Its spec is offered at the start of a new one.",
                 404,
             )
         Page(session).draw()
 
-    pages.on_exception(lambda error: None)  # each page tells of its own
+    pages.on_exception(lambda error: None)  # each page reports its own errors
     ui.run_with(
         app,
         title="orthaug",
@@ -236,7 +236,7 @@ def _refused(text: str, code: int) -> Response:
     return JSONResponse({"refused": text}, code)
 
 
-def _told(text: str, code: int) -> Response:
+def _error_page(text: str, code: int) -> Response:
     return HTMLResponse(
         f"{PLAIN}<p>{escape(text)}</p><p><a href='/'>Begin anew</a></p></body></html>", code
     )

@@ -37,8 +37,8 @@ _LISTED = 40  # columns
 _COLUMNS = (
     "input ",
     "output ",
-)  # begins of lines of an account that tell of columns, which stand by themselves
-_DRAFT = ("first physics", "test:")  # of lines that tell of a spec for the file
+)  # beginnings of lines on columns, which the page shows elsewhere
+_DRAFT = ("first physics", "test:")  # of lines on a spec for the file
 _OFFERED = 5  # specs of earlier work
 _USES = {"": "leave out", "input": "input", "output": "output"}
 _SUMMARIES = {
@@ -189,7 +189,7 @@ class DataView:
     def _of_spec(self, found: Mapping[str, Any]) -> dict[str, str]:
         """Return the use of each column in the spec.
 
-        Empty where there is none, or where the file lacks one of them.
+        Empty without a spec, or where the file lacks one of its columns.
         """
         return {} if self._lacking(found) else spec_text.columns(self.session.content())
 
@@ -354,7 +354,7 @@ class DataView:
     def follow_check(self) -> None:
         """Draw the curves of the file, and of the training data after preparation.
 
-        Why they cannot be drawn.
+        Where they cannot be drawn, it shows the reason.
         """
         session, checked = self.session, self.session.checked
         with redrawn(self.refusal):

@@ -28,8 +28,8 @@ from orthaug.commands.app.widgets import (
 _TERMS = ("baseline", "terms")
 _LEARNERS = {"mlp": "a network", "terms": "a sum of terms", "none": "none: physics alone"}
 _FOCUS = {"prediction": "one step ahead", "simulation": "the free run"}
-_MULTIPLE = 1e5  # % from which a change is checked in words
-_ROUNDING = 1e-7  # % below which it is none
+_MULTIPLE = 1e5  # % from which a change is given in words
+_ROUNDING = 1e-7  # % below which it counts as none
 _STRUCTURES = {
     "orthogonal": "orthogonal",
     "additive": "additive",
@@ -335,7 +335,7 @@ def _biases(percents: Mapping[str, float | None]) -> str:
 def _percent(value: float | None) -> str:
     """Return a change in per cent.
 
-    Of a parameter near zero no number says more than that it is a multiple.
+    Near zero the change is a multiple of the parameter, and no number is of use.
     """
     if value is None:
         return "–"
