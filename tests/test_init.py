@@ -323,7 +323,7 @@ NOTHING = [
      'such as --inputs "a,c" --outputs "b" (--inputs "" for none)'),
     ("a,b,c\n1,2,4\n2,1,7\n", ("--inputs", "c"), '--inputs "c" --outputs "b"; columns'),
     ("a,b,c\n1,2,4\n2,1,7\n", ("--inputs", "A"), "no column 'A', did you mean 'a'?"),
-    ("-1.5,2\n1,2\n2,3\n", (), 'from outputs: x1, x2. Say both, separated by commas, such as --inputs "x1"'),
+    ("-1.5,2\n1,2\n2,3\n", (), 'which outputs: x1, x2. Say both, separated by commas, such as --inputs "x1"'),
     ("bench 3, May\nu\nnone\n", (), "expected one for each signal, under a header. The names that were found are "
      "'bench 3, May'; a line above the header must begin with #"),
 ]  # fmt: skip
@@ -456,7 +456,7 @@ THINNED = [
         "aika",
         0.05,
         5,
-        "column 'aika' of a.csv gives 0.01 s from row to row, so rows of which one in 5 is "
+        "column 'aika' of a.csv tells 0.01 s from row to row, so rows of which one in 5 is "
         "kept are 0.05 s",
     ),
     ("Ts", 0.05, 5, "Give sampling_time = 0.01, that of the file's rows.\n"),
@@ -520,7 +520,7 @@ def test_a_single_number_in_a_file_of_matlab_is_the_sampling_time(tmp_path, besi
         ["data_y"],
         step or 1.0,
     )
-    assert ("no column gives it" in done.out) == (step is None)
+    assert ("no column tells it" in done.out) == (step is None)
     np.savez(tmp_path / "a.npz", u=u, y=y, **beside)
     assert survey(tmp_path / "a.npz").clock.step == (step if beside else None)
 
@@ -643,7 +643,7 @@ def test_why_a_column_is_not_the_time_is_said(tmp_path, header, values, reason):
         "--out",
         tmp_path / "spec.toml",
     )
-    assert done.code == 0 and "sampling time: no column gives it" in done.out, done.err
+    assert done.code == 0 and "sampling time: no column tells it" in done.out, done.err
     assert any(header in line and reason in line for line in done.out.splitlines()), done.out
     signals = [column.header for column in survey(tmp_path / "a.csv").signals]
     assert signals == (["u", "y"] if "signal" not in reason else [header, "u", "y"])

@@ -97,7 +97,7 @@ def test_a_refuted_model_is_of_use_for_the_next_sample_only_where_that_is_predic
     use = fit_verdict(fitted(18.0, 3.0)).use
     assert (
         "Use it only to look for" in use
-        and "which leaves 1800 % of the output's deviation on tests.far" in use
+        and "one-step prediction, too, leaves 1800 % of the output's deviation on tests.far" in use
     )
     assert "predict the next" not in fit_verdict(fitted(0.4, 3.0)).use
     assert "simulate within" in fit_verdict(fitted(0.7, 0.1)).use
