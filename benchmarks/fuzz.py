@@ -21,12 +21,11 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
-from fuzzing import SPEC, TYPES, try_file, try_model, try_spec, write_original
-from fuzzing_runs import model_of, try_command, try_export, try_folder, try_forged, try_state
 from machine import describe
 
+FILES = ("csv", "semicolons.csv", "tsv", "xlsx", "parquet", "npz", "v5.mat", "v73.mat", "h5")
 TRIALS = {
-    **dict.fromkeys(TYPES, 150),
+    **dict.fromkeys(FILES, 150),
     **{
         "specs": 400,
         "commands": 350,
@@ -53,6 +52,10 @@ def child(kind: str, start: int, stop: int) -> None:
 
 def _trial(kind: str, folder: Path) -> Callable[[int], str]:
     """The trial of a kind by its seed, with what it needs made in the folder."""
+    # imported here: under `--guided` what is imported before atheris instruments it is not seen
+    from fuzzing import SPEC, TYPES, try_file, try_model, try_spec, write_original
+    from fuzzing_runs import model_of, try_command, try_export, try_folder, try_forged, try_state
+
     write_original("csv", folder / "run.csv")
     if kind in TYPES:
         write_original(kind, folder / f"original.{kind}")

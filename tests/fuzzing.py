@@ -384,3 +384,23 @@ def model_files(folder: Path) -> dict[str, bytes]:
     return {
         path.name: path.read_bytes() for path in folder.iterdir() if path.name != "manifest.json"
     }
+
+
+def motion_files(folder: Path) -> dict[str, bytes]:
+    """A small fitted motion as it is saved."""
+    import orthaug as oa
+
+    u, y = signals()
+    motion = oa.Motion.from_equations(
+        [oa.State("x", "a*(u - d)", start="y", learned=True)],
+        [oa.Output("y", "x")],
+        [oa.PhysicalParameter("a", 1.0, "1/s", min=0)],
+        ["u"],
+        define={"d": "x/2"},
+    )
+    solver = oa.LevenbergMarquardt(iterations=2)
+    record = oa.Record.from_arrays(u, y, sampling_time=0.1)
+    oa.save(oa.estimate(record, motion, learner=oa.MLP(hidden=(2,)), solver=solver).model, folder)
+    return {
+        path.name: path.read_bytes() for path in folder.iterdir() if path.name != "manifest.json"
+    }

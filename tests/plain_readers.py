@@ -50,7 +50,10 @@ def plain(path: Path) -> Columns:
 
 
 def _text(content: bytes, separator: str | None) -> Columns:
-    text = content.decode("utf-8-sig")
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError:  # as files of old programs are; `fit` warns of it
+        text = content.decode("cp1252")
     lines = text.splitlines(keepends=True)
     top = next(i for i, line in enumerate(lines) if line.strip())
     if separator is None:

@@ -370,7 +370,7 @@ def test_curves_of_the_loss_are_named_by_start_or_by_structure():
         drawn([Run(1), Run(2)])[0] == ["run 1", "run 2"]
         and drawn([Run(1, "orthogonal", 1, "ard")])[0] == []
     )
-    assert "(ard, none)" in _runs_caption(set(fit)) and "The colour tells" in _runs_caption(
+    assert "(ard, none)" in _runs_caption(set(fit)) and "The colour shows" in _runs_caption(
         set(compared)
     )
     assert _runs_caption({Run(1)}) == "Each curve is a run: one training."

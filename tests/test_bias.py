@@ -314,9 +314,7 @@ def test_the_direction_of_friction_is_velocity(machine):
     (found,) = table(machine, [FRICTION])
     np.testing.assert_allclose(found.certificate.shares, [1.0, -1.0, 0.0], atol=5e-3)
     assert found.certificate.cosine == pytest.approx(0.7813, abs=1e-4)
-    assert found.sentence.startswith(
-        "friction: no weighting of these points leaves θ unbiased if it counts any of the"
-    )
+    assert found.sentence.startswith("friction: no weighting that counts any of")
     assert "a = +1 theta1 -1 theta2 (columns scaled" in found.sentence
 
 
@@ -327,7 +325,7 @@ def test_sentences():
         Projection.factor(phi), "ab", [replace(ANY, name="z"), replace(ANY, name="e")], deltas
     )
     assert [entry.sentence for entry in entries] == [
-        "z: φᵀδ is zero on all of these points, so that it biases nothing there.",
+        "z: φᵀδ is zero on all of these points, so this term biases nothing there.",
         "e: some weighting of these points leaves θ unbiased.",
     ]
     assert entries[0].cosine is None

@@ -142,7 +142,7 @@ def test_coloured_errors_have_robust_intervals_by_default(segment):
     np.testing.assert_array_equal(fit.theta, plain.theta)
     assert (fit.std > 1.2 * plain.std).any() and 19 <= fit.freedom < 100
     assert (
-        "std         robust (batch means), for the errors of the free run are coloured"
+        "std         robust (batch means), because the errors of the free run are coloured"
         in fit.summary()
     )
     assert default(fit).freedom == fit.freedom  # robust errors of robust errors are the same
@@ -174,10 +174,7 @@ def test_a_record_that_is_too_short_for_blocks_has_the_errors_of_its_colour():
             inside[i] += np.mean((fit.interval[:, 0] <= THETA) & (fit.interval[:, 1] >= THETA)) / 40
     assert inside[0] < 0.75 and 0.88 < inside[1] <= 0.99
     fit = default(flown(0, 0.9, 50))
-    assert (
-        fit.std_kind == "autoregressive"
-        and "an autoregressive model of the errors" in fit.summary()
-    )
+    assert fit.std_kind == "autoregressive" and "robust (autoregressive errors)" in fit.summary()
 
 
 def test_errors_that_remember_for_too_long_have_no_interval():
@@ -187,7 +184,7 @@ def test_errors_that_remember_for_too_long_have_no_interval():
     assert fit.std is None and fit.interval is None and fit.std_kind == "none"
     np.testing.assert_array_equal(fit.plain_covariance, plain.covariance)
     text = dict(fit.warnings)["too_long_memory"]
-    assert "no standard errors and no intervals" in text and "Longer segments" in text
+    assert "no standard errors and no intervals" in text and "longer segments" in text
     assert "std         none" in fit.summary() and fit.split(Training()).std is None
     assert default(fit) is fit
 
@@ -215,7 +212,7 @@ def test_for_white_errors_they_are_the_plain_ones():
 
 def test_errors_that_never_forget_are_refused():
     fit = flown(0, 0.97, 0, 200)
-    with pytest.raises(InputError, match="remember each other for too long"):
+    with pytest.raises(InputError, match="correlated over too many steps"):
         fit.robust()
     with pytest.raises(InputError, match="`lags`"):
         fit.robust(0)

@@ -329,7 +329,7 @@ def test_what_the_learner_could_imitate_is_told_of_the_others():
     fit = estimate(given, baseline, learner=learner, **OPTIONS)
     told = imitation(fit.problem, others=False, held=tuple(fit.at_bound))
     assert told.determined == ("gain1",) and told.directions == () and not fit.model.shared.size
-    assert told.text.startswith("loss1 stands at a bound: θ is not split off along it.")
+    assert told.text.startswith("loss1 is at a bound: the orthogonal split does not move it.")
     assert "imitate nothing of the other physics" in told.text
     (warning,) = (str(text) for text in fit.warnings if text.code == "at_a_bound")
     assert "is a known term" in warning and "the learner is not made orthogonal to it" in warning

@@ -11,7 +11,7 @@ import pytest
 from orthaug._base.errors import InputError
 from orthaug.analysis.budget import SURE_SHARE, budget_on, linearization_of, near_causes
 from orthaug.analysis.budgets import bias_budget
-from orthaug.analysis.measure_bias import Ground
+from orthaug.analysis.measure_bias import MeasureLinearization
 from orthaug.analysis.missing_lags import missing_lags
 from orthaug.analysis.suspects import Suspect, usual_suspects
 from orthaug.data.record import Record
@@ -67,7 +67,7 @@ def test_biases_beside_a_learner_that_sees_the_velocity_alone(text, seen):
         assert found.certificate is not None and found.certificate.shares is not None
         np.testing.assert_allclose(found.certificate.shares, [1, -1, 0], atol=0.05)
     else:
-        assert found.removed_by == "nothing" and "does not see all of it" in found.sentence
+        assert found.removed_by == "nothing" and "does not see all of this term" in found.sentence
 
 
 def test_what_nothing_is_shared_with_is_removed_by_the_learner():
@@ -79,7 +79,7 @@ def test_what_nothing_is_shared_with_is_removed_by_the_learner():
     problem = pose(
         fit.problem.record, Baseline.from_terms([Term("c", "u[k-1]")]), Lags(1, 1, 1), ("y[k-1]",)
     )
-    ground = Ground(
+    ground = MeasureLinearization(
         weigh_problem(Training(), problem),
         problem,
         problem.least_squares,
@@ -287,7 +287,7 @@ def test_a_missing_lag_is_named():
     fits = [system(text, noise=0.05) for text in ("u[k-1]**2", f"({VELOCITY})**3")]
     told, fine = map(missing_lags, fits)
     assert told is not None and told.missing[0].lag == "u[k-1]" and told.missing[0].p < 1e-10
-    assert told.warnings[0].code == "missing_lag" and "depends on u[k-1]" in told.text
+    assert told.warnings[0].code == "missing_lag" and "u[k-1] explains" in told.text
     assert fine is not None and not fine.missing and not fine.warnings
     assert [test.lag for test in fine.tests] == ["y[k-1]", "y[k-2]", "u[k-1]"]
     assert (

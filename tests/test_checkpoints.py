@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import errno
+import hashlib
 import os
+from functools import partial
 
 import numpy as np
 import pytest
+from safetensors.numpy import load, save
 from test_engine import Streaming, posed
 from test_engines import BASELINE, FLIGHT, SPEC, fitted, folder, from_files  # noqa: F401  (a fixture)
 from typer.testing import CliRunner
@@ -168,6 +171,49 @@ def test_a_spoilt_state_is_none(tmp_path):
         found = fit(posed(1), **options(Streaming()), checkpoints=kept)
         np.testing.assert_array_equal(found.theta, expected)
         assert kept.spoilt[:1] == [file.name], "and it is said"
+
+
+def forged(content, change):
+    """A state with changed arrays and the checksum that they ask for."""
+    head = content.index(b"\n") + 1
+    arrays = {name: np.array(values) for name, values in load(content[head:]).items()}
+    change(arrays)
+    body = save(arrays)
+    return content[:16] + hashlib.sha256(body).hexdigest().encode() + b"\n" + body
+
+
+def no_number(arrays, value=np.nan):
+    arrays["0"].flat[0] = value
+
+
+def other_shape(arrays):
+    arrays["0"] = np.append(arrays["0"], 1.0)
+
+
+def fewer(arrays):
+    del arrays[str(len(arrays) - 1)]
+
+
+@pytest.mark.parametrize(
+    "change", [no_number, partial(no_number, value=np.inf), other_shape, fewer]
+)
+@pytest.mark.parametrize("driven", [False, True], ids=["compiled", "driven"])
+def test_a_forged_state_with_its_checksum_is_none(tmp_path, change, driven):
+    chosen = options(InMemory()) | (
+        {"criterion": oa.Simulation(segment=20, washout=2)} if driven else {}
+    )
+    kept = Checkpoints(tmp_path / "kept", "this fit", every=0.0).opened(resume=False)
+    with pytest.raises(Killed):
+        fit(posed(1), **chosen, checkpoints=kept, progress=dies_at(5))
+    (file,) = (tmp_path / "kept").glob("*.safetensors")
+    whole = file.read_bytes()
+    file.write_bytes(forged(whole, lambda arrays: None))
+    expected = fit(posed(1), **chosen, checkpoints=kept)
+    assert kept.spoilt == [], "what is only copied is sound"
+    file.write_bytes(forged(whole, change))
+    found = fit(posed(1), **chosen, checkpoints=kept)
+    assert kept.spoilt[:1] == [file.name]
+    np.testing.assert_array_equal(found.theta, expected.theta)
 
 
 def test_states_of_another_fit_are_refused(tmp_path):

@@ -145,7 +145,7 @@ def test_an_output_column_that_stands_twice_is_not_taken_as_absent(
 ):
     monkeypatch.chdir(tmp_path)
     Path("twice.csv").write_text("u,y,y\n" + "1,2,3\n4,5,7\n" * 5)
-    assert "twice.csv: the column 'y' stands 2 times; names must differ" in refused(
+    assert "twice.csv: the header has the column 'y' 2 times; names must differ" in refused(
         command, fitted / "out", "twice.csv"
     )
 

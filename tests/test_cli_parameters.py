@@ -212,7 +212,7 @@ PHYSICS_ERRORS = [
     (
         f"(2*m + cd*Ts) / {GAMMA}",
         f"2*(m + cd*Ts + ks*Ts**2)/{GAMMA} - m/{GAMMA}",
-        "cannot be told apart",
+        "cannot be distinguished",
         "rank 2 of 3",
     ),
     ("min = 0", "min = 2", "the initial value of 'm' is 1.1; its bounds are 2 and inf"),
@@ -221,9 +221,9 @@ PHYSICS_ERRORS = [
     (
         f"-m / {GAMMA}",
         "-m / (m - 1.1)",
-        "is -inf at the initial values of m, cd, ks; expected a finite one",
+        "is -inf at the initial values of m, cd, ks; expected a finite value",
     ),
-    (f"-m / {GAMMA}", "-m*position[k-1]", "a signal such as y[k-1] is no part of it"),
+    (f"-m / {GAMMA}", "-m*position[k-1]", "a signal such as y[k-1] is not allowed here"),
     (
         '"theta1"',
         '"theta1"\nfixed = true\ninitial = 1',

@@ -128,7 +128,7 @@ def test_sensor_noise(seed):
     change = found.changes[0]
     assert (change.kind, change.what, change.of) == ("criterion", "simulation", "simulation")
     assert (
-        f"the error of the free run is predicted to fall by {100 * change.fall:.2g} %" in found.text
+        f"predicted to lower the error of the free run by {100 * change.fall:.2g} %" in found.text
     )
 
 
@@ -177,7 +177,7 @@ def test_a_lag_that_explains_hardly_anything_is_not_called_unmodelled():
     assert found.one_step[0].correlated_inputs == ("u",) and found.one_step[0].largest_cross > 0.05
     assert (found.verdict, found.changes) == ("equation_noise", ())
     assert 0.002 < found.predictable[0].inputs < 0.02
-    assert "is noise as far as it shows" in found.text and "it is the noise floor" in found.text
+    assert "is noise by all tests" in found.text and "it is the noise floor" in found.text
 
 
 def test_coloured_noise_on_the_sensor_is_not_unmodelled_on_the_free_run():
@@ -214,7 +214,7 @@ def test_a_free_run_that_follows_its_inputs_is_no_noise_however_white_one_step_i
         and "curved over u[k-1]" in found.text
         and "noise floor" not in found.text
     )
-    assert "what it follows (u[k-1]) has a form that was not tried" in found.text
+    assert "the effect of u[k-1] has a form that was not tried" in found.text
 
 
 def test_a_free_run_that_drifts_is_no_noise():
@@ -466,7 +466,9 @@ def test_trained_on_the_free_run_there_is_no_warning(given):
     """The noise of the sensor is white in the free run, once its start is forgotten."""
     found = SIMULATED[given]()
     assert found.verdict == "sensor_noise" and found.warnings == ()
-    assert "simulation criterion suits" in found.text and "inconsistent" not in found.text
+    assert (
+        "simulation criterion is the right one" in found.text and "inconsistent" not in found.text
+    )
 
 
 @pytest.mark.parametrize("missing", ["lag of u", "cubic"])
@@ -601,4 +603,6 @@ def test_shares_are_told_of_the_output_that_follows_something():
         own=[test_of("p", []), test_of("T", ["q"])],
         fit=SimpleNamespace(problem=SimpleNamespace(record=record)),
     )
-    assert _shares(seen).startswith("Of its variance of T 0 %") and "0 K at most" in _shares(seen)
+    assert _shares(seen).startswith(
+        "The predictable share of its variance of T is 0 %"
+    ) and "0 K at most" in _shares(seen)

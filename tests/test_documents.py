@@ -115,13 +115,18 @@ def test_what_functions_return_is_in_the_reference():
         "Budget",
         "Diagnosis",
         "Job",
-        "Fitted",
+        "FitReport",
     } <= returned and "SuspectedBias" in held
     told = re.findall(r"^::: orthaug\.(?:[\w.]+\.)?(\w+)$", REFERENCE, re.MULTILINE)
     assert (returned | held) - set(told) == set()
-    assert {"PhysicalEstimate", "Observations", "Tracking", "Alarm", "FitPlots", "Page"} <= set(
-        told
-    )
+    assert {
+        "PhysicalEstimate",
+        "Observations",
+        "ObserverState",
+        "Alarm",
+        "FitPlots",
+        "Page",
+    } <= set(told)
     for shown in ("Estimate", "MotionEstimate"):
         assert re.search(
             rf"^::: orthaug\.{shown}\n    options: .*plot, report", REFERENCE, re.MULTILINE

@@ -213,9 +213,7 @@ def test_files_as_a_record(folder):
         oa.InputError, match="`segment` is 0, whole experiments, which need their rows in memory"
     ):
         oa.estimate(source, BASELINE, criterion=oa.Simulation(0), **OPTIONS)
-    with pytest.raises(
-        oa.InputError, match="a motion takes a Record, whose segments an engine may share out"
-    ):
+    with pytest.raises(oa.InputError, match="a motion needs its rows in memory"):
         flown_motion(source)
 
 

@@ -425,7 +425,7 @@ def test_a_learner_that_was_regularised_to_nothing_says_so():
     told = {warning.code: warning.text for warning in silent.warnings}
     assert silent.effective_weights < 0.5
     assert re.search(
-        r"the learner is silent: the fit is that of physics alone .*compare", told["learner_silent"]
+        r"the learner is silent: the fit is that of physics alone .*Compare", told["learner_silent"]
     )
     heard = estimate(record_of(), PHYSICS, regularization="none", **options)
     assert "learner_silent" not in {warning.code for warning in heard.warnings}

@@ -96,7 +96,7 @@ def test_the_physics_with_the_term_leaves_the_learner_nothing(hardening):
     again = oa.estimate(again.problem.record, grown, learner=oa.MLP(hidden=(6,)))
     told = oa.explain(again)
     assert not told.found and told.physics is None and told.spec is None and told.share == 0.0
-    assert "does not stand out from its own errors" in told.text
+    assert "is not significant against its own errors" in told.text
     assert dict(zip(grown.names, again.theta, strict=True)) == pytest.approx(
         TRUE | {"cubic": -0.3}, abs=0.01
     )
@@ -230,7 +230,7 @@ def test_what_python_is_given(hardening):
     with pytest.raises(InputError, match="`functions` must be a list of names"):
         oa.explain(model, record, functions="abs")
     with pytest.raises(
-        InputError, match="no terms are made of the function 'asb', did you mean 'abs'"
+        InputError, match="a library has no terms of the function 'asb', did you mean 'abs'"
     ):
         oa.explain(model, record, functions=["asb"])
     with pytest.raises(InputError, match="candidate terms; at most 3000 are looked at"):

@@ -735,7 +735,7 @@ def refusals():
     yield 5, "`model` must be a fitted model"
     yield (
         moving(spring(hold="spline"), ("v", "w"), oa.MLP((2,))),
-        "a step knows no spline through the whole record",
+        "a step cannot interpolate by a spline over the whole record",
     )
     made = oa.Motion.from_functions(
         lambda x, u, p: x, lambda x, u, p: x, ["x"], ["y"], [oa.PhysicalParameter("a", 1.0)]

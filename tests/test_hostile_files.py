@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import struct
+import time
 import warnings
 import zipfile
 import zlib
@@ -15,6 +16,7 @@ import pytest
 from orthaug._base import memory
 from orthaug._base.errors import InputError
 from orthaug.data.readers import read_record
+from orthaug.data.survey import survey
 from orthaug.data.tables import read_table
 
 NS = 'xmlns="http://schemas.openxmlformats.org/spreadsheetml/2006/main"'
@@ -314,7 +316,7 @@ def test_time_columns_that_are_even_enough(tmp_path):
 def test_one_column_is_not_time_and_output(tmp_path):
     (tmp_path / "run.csv").write_text("t,u\n0,1\n1,2\n2,0\n")
     with pytest.raises(
-        InputError, match="the column 't' is `time` and the output 'y'; one of them is wrong"
+        InputError, match="the column 't' is both `time` and the output 'y'; correct one of them"
     ):
         read_record(tmp_path / "run.csv", inputs=["u"], outputs=["y"], columns={"y": "t"}, time="t")
 
@@ -365,7 +367,52 @@ def test_an_npz_that_is_made_to_fill_the_memory(tmp_path, monkeypatch):
     monkeypatch.setattr(variables, "_LARGE", 1e5)
     path = tmp_path / "run.npz"
     np.savez_compressed(path, u=np.zeros(100_000), y=np.random.default_rng(0).normal(size=20_000))
-    assert "'u' is 781 KiB in" in refusal(path, "u") and "store it uncompressed" in refusal(
+    assert "'u' is 781 KiB in" in refusal(path, "u") and "Store it uncompressed" in refusal(
         path, "u"
     )
     assert len(read_table(path, ("y",)).columns["y"]) == 20_000
+
+
+def put_zeros(path: Path, names: tuple[str, ...], head: bytes, size: int) -> None:
+    """An npz whose members go on with gigabytes of zeros, which are packed once a MiB and never held."""
+    block = zlib.compressobj(9, zlib.DEFLATED, -15)
+    packed = block.compress(bytes(2**20)) + block.flush(zlib.Z_FULL_FLUSH)
+    begin = zlib.compressobj(9, zlib.DEFLATED, -15)
+    first = begin.compress(head + bytes(size % 2**20)) + begin.flush(zlib.Z_FULL_FLUSH)
+    body = first + size // 2**20 * packed + b"\x03\x00"  # an empty last block
+    whole, central = io.BytesIO(), b""
+    for name in names:
+        told = struct.pack(
+            "<HHHHHIIIHH", 20, 0, 8, 0, 33, 0, len(body), len(head) + size, len(name) + 4, 0
+        )
+        member = f"{name}.npy".encode()
+        central += (
+            b"PK\x01\x02\x14\x00" + told + bytes(10) + struct.pack("<I", whole.tell()) + member
+        )
+        whole.write(b"PK\x03\x04" + told + member + body)
+    end = struct.pack("<HHHHIIH", 0, 0, len(names), len(names), len(central), whole.tell(), 0)
+    path.write_bytes(whole.getvalue() + central + b"PK\x05\x06" + end)
+
+
+def test_an_npz_of_some_megabytes_that_holds_two_arrays_of_3_gigabytes(tmp_path):
+    path = tmp_path / "run.npz"
+    put_zeros(path, ("u", "y"), npy("(400000000,)"), 3_200_000_000)
+    with (
+        zipfile.ZipFile(path) as archive,
+        archive.open("y.npy") as member,
+    ):  # a sound archive of true zeros
+        assert member.read(128) == npy("(400000000,)") and not any(member.read(2**22))
+    assert 5e6 < path.stat().st_size < 8e6
+    began = time.process_time()
+    assert "'u' is 2.98 GiB in" in refusal(path, "u", "y")
+    with pytest.raises(InputError, match="'u' is 2.98 GiB in"):
+        survey(path)
+    assert time.process_time() - began < 2
+
+
+def test_an_npz_whose_header_is_of_gigabytes(tmp_path):
+    path = tmp_path / "run.npz"
+    put_zeros(path, ("u",), b"\x93NUMPY\x02\x00" + struct.pack("<I", 3_200_000_000), 3_200_000_000)
+    began = time.process_time()
+    assert "'u' is unreadable" in refusal(path, "u")
+    assert time.process_time() - began < 2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import sys
 import tomllib
 
@@ -11,6 +12,7 @@ import pandas as pd
 import pytest
 import scipy.io
 import scipy.signal
+from helpers import unfolded
 from test_cli import run
 
 from orthaug.commands import cli, kinds
@@ -303,7 +305,7 @@ def test_columns_of_one_name_are_told_apart(tmp_path, monkeypatch):
     done = run("init", tmp_path / "a.csv", "--inputs", "y", "--outputs", "T [K]", "--out", out)
     assert (
         done.code == 2
-        and "the name 'T [K]' stands twice; from the left: T [K].0, T [K].1" in done.err
+        and "several columns are called 'T [K]'; from the left: T [K].0, T [K].1" in done.err
     )
     assert (
         run("init", tmp_path / "a.csv", "--inputs", "y", "--outputs", "T [K].0", "--out", out).code
@@ -346,9 +348,26 @@ def test_an_encoding_that_was_guessed_is_told(tmp_path):
     done = run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml")
     assert (
         done.code == 0
-        and "a.csv: 300 rows, 2 columns; no UTF-8, so read as Windows-1252" in done.out
+        and "a.csv: 300 rows, 2 columns; not UTF-8, so read as Windows-1252" in done.out
     )
-    assert run("check", tmp_path / "spec.toml").code == 0
+    warning = "line 1 of a.csv is no UTF-8, so the file is read as Windows-1252; save it as UTF-8."
+    assert warning in unfolded(run("check", tmp_path / "spec.toml").out)
+    done = run("fit", tmp_path / "spec.toml", "--out", tmp_path / "out", "--json")
+    told = [w["text"] for w in json.loads(done.out)["warnings"] if w["code"] == "encoding_guessed"]
+    assert told[0] == f"train: {warning}"
+
+
+def test_a_damaged_byte_in_a_column_that_is_not_used_is_told_with_its_line(tmp_path):
+    """Found by the fuzzer (.tsv, seed 110): the file was read as Windows-1252 without a word."""
+    u, y = plant(300)
+    rows = "".join(f"{a},{b},n{i}\n" for i, (a, b) in enumerate(zip(u, y, strict=True))).encode()
+    (tmp_path / "a.csv").write_bytes(b"u,y,note\n" + rows.replace(b"n7\n", b"n7\x7f\xff\n"))
+    spec = '[data]\nsampling_time = 0.1\ninputs = ["u"]\noutputs = ["y"]\ntrain = { files = ["a.csv"] }\n'
+    (tmp_path / "spec.toml").write_text(
+        spec + '[baseline]\nterms = [{ parameter = "b", regressor = "u[k-1]" }]\n'
+    )
+    done = run("check", tmp_path / "spec.toml")
+    assert done.code == 0 and "line 9 of a.csv is no UTF-8" in unfolded(done.out)
 
 
 def test_on_a_terminal_it_asks_again(tmp_path, monkeypatch):
@@ -456,8 +475,7 @@ THINNED = [
         "aika",
         0.05,
         5,
-        "column 'aika' of a.csv tells 0.01 s from row to row, so rows of which one in 5 is "
-        "kept are 0.05 s",
+        "the rows of a.csv are 0.01 s apart by column 'aika', and the rows that are kept 0.05 s",
     ),
     ("Ts", 0.05, 5, "Give sampling_time = 0.01, that of the file's rows.\n"),
     ("time", 0.01, 5, ""),
@@ -482,7 +500,7 @@ def test_a_sampling_time_that_is_thinned_already_is_refused(tmp_path, header, gi
     assert done.code == (2 if told else 0) and told in done.err, done.err
     multiplied = (
         f"data.train: every = {every} multiplies the sampling time {given:g} s to "
-        f"{every * given:g} s, but column"
+        f"{every * given:g} s. But the rows of"
     )
     assert (multiplied in done.err) == bool(told)
     if not told and every > 1:
@@ -520,7 +538,7 @@ def test_a_single_number_in_a_file_of_matlab_is_the_sampling_time(tmp_path, besi
         ["data_y"],
         step or 1.0,
     )
-    assert ("no column tells it" in done.out) == (step is None)
+    assert ("no column states it" in done.out) == (step is None)
     np.savez(tmp_path / "a.npz", u=u, y=y, **beside)
     assert survey(tmp_path / "a.npz").clock.step == (step if beside else None)
 
@@ -613,7 +631,7 @@ NO_TIMES = {
     "another unit": (
         "pos [mm]",
         EVEN,
-        "rises evenly, but its unit mm is none of time, so it is taken for a signal",
+        "rises evenly, but its unit mm is no unit of time, so it is taken for a signal",
     ),
     "a time that begins anew": (
         "time",
@@ -623,7 +641,7 @@ NO_TIMES = {
     "instants that repeat": (
         "time",
         np.floor(EVEN * 10),
-        "stands still at 0 in row 1, so it is not the time",
+        "stays at 0 in row 1, so it is not the time",
     ),
     "a temperature": ("t", np.cos(EVEN), "falls in many rows, so it is taken for a signal"),
     "a counter": ("row", np.arange(300), "counts the rows"),
@@ -643,7 +661,7 @@ def test_why_a_column_is_not_the_time_is_said(tmp_path, header, values, reason):
         "--out",
         tmp_path / "spec.toml",
     )
-    assert done.code == 0 and "sampling time: no column tells it" in done.out, done.err
+    assert done.code == 0 and "sampling time: no column states it" in done.out, done.err
     assert any(header in line and reason in line for line in done.out.splitlines()), done.out
     signals = [column.header for column in survey(tmp_path / "a.csv").signals]
     assert signals == (["u", "y"] if "signal" not in reason else [header, "u", "y"])

@@ -202,3 +202,15 @@ def test_options_that_a_motion_does_not_have_are_refused_in_words(
     with pytest.raises(oa.InputError) as error:
         oa.estimate(record(), motion(), **options)
     assert str(error.value).startswith(message)
+
+
+def test_definitions_may_need_each_other_in_a_long_chain():
+    chain = {"d0": "x"} | {f"d{i}": f"d{i - 1} + 1" for i in reversed(range(1, 3000))}
+    states, outputs, k = (
+        [oa.State("x", "-k*d2999")],
+        [oa.Output("y", "x")],
+        oa.PhysicalParameter("k", 2.0),
+    )
+    long = oa.Motion.from_equations(states, outputs, [k], define=chain)
+    assert long.rates(np.array([1.0]), np.zeros(0), long.initial, np) == pytest.approx(-2 * 3000.0)
+    assert long.observed(np.array([1.0]), np.zeros(0), long.initial, np) == 1.0

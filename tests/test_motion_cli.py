@@ -91,6 +91,53 @@ def test_a_channel_of_an_unlikely_size_is_named_where_the_free_run_fails(small, 
         assert "training failed" not in err
 
 
+@pytest.mark.parametrize(
+    ("equation", "words"),
+    [
+        (
+            "(force - c*v - 1e7*k*x)/m",
+            "oscillates with 3.16e+04 rad/s, 50.3 periods in a sample of 0.01 s",
+        ),
+        (
+            "(force - 1e6*c*v - k*x)/m",
+            '1e+06 1/s, also of `integrator = "exact"`: 1e+04 in a substep, at most 4096',
+        ),
+    ],
+    ids=["turns", "decays"],
+)
+def test_modes_beyond_what_samples_show_are_refused_of_an_exact_integrator(small, equation, words):
+    text = small.read_text().replace("(force - c*v - k*x)/m", equation)
+    small.write_text(
+        text.replace("[motion.states]", '[motion]\nintegrator = "exact"\n[motion.states]')
+    )
+    code, _, err = orthaug("fit", small, "--out", "out")
+    assert code == 2 and words in err and "leave the fast mode out" in err
+    small.write_text(small.read_text().replace('"exact"', '"exact"\nsubsteps = 8'))
+    assert orthaug("check", small)[0] == (2 if "1e7" in equation else 0)
+
+
+@pytest.mark.parametrize("substeps", [1, 3])
+def test_a_long_chain_of_definitions_is_what_it_stands_for(small, substeps):
+    """200 operations: such a motion has its stages in a loop; the short one has them one by one."""
+    text = small.read_text().replace(
+        "[motion.states]", f"[motion]\nsubsteps = {substeps}\n[motion.states]"
+    )
+    small.write_text(text)
+    assert orthaug("fit", small, "--out", "short")[0] == 0
+    chain = 'd1 = "x + 1"\n' + "".join(f'd{i} = "d{i - 1} + 1"\n' for i in range(2, 201))
+    text = text.replace("k*x)/m", "k*(d200 - 200))/m").replace(
+        "[motion.parameters]", f"[motion.define]\n{chain}[motion.parameters]"
+    )
+    small.write_text(text)
+    assert orthaug("fit", small, "--out", "long")[0] == 0
+    short, long = (
+        strict(Path(out, "result.json").read_text())["parameters"] for out in ("short", "long")
+    )
+    for one, other in zip(short, long, strict=True):
+        assert other["value"] == pytest.approx(one["value"], rel=1e-6)
+        assert other["std"] == pytest.approx(one["std"], rel=1e-4)
+
+
 def friction(rows: int, seed: int) -> np.ndarray:
     """Force and position of a mass with viscous and Coulomb friction under steps, 40 dB of noise."""
     random = np.random.default_rng(seed)
@@ -466,8 +513,8 @@ def test_an_angle_integrates_and_does_not_decay():
     shaft = told(oa.State("x", "v"), oa.State("v", "u - c*v - 12*i"), oa.State("i", "u - 3*i"))
     assert shaft.text == (
         "The linearised motion has an integrator and modes of 2 to 3 1/s along the free run. "
-        "All others decay everywhere: the largest real part is -2 1/s. What integrates neither "
-        "decays nor grows: it keeps its errors."
+        "All others decay everywhere: the largest real part is -2 1/s. The integrating mode "
+        "neither decays nor grows: errors in it stay."
     )
     assert (shaft.modes.integrators, shaft.modes.rightmost, shaft.modes.slowest) == pytest.approx(
         (1, -2, 2)
@@ -478,7 +525,7 @@ def test_an_angle_integrates_and_does_not_decay():
         and "decay everywhere" not in mass.text
     )
     swing = told(oa.State("x", "v"), oa.State("v", "c*u - 9*x"))
-    assert "has modes of 3 1/s" in swing.text and "None grows, and not all decay" in swing.text
+    assert "has modes of 3 1/s" in swing.text and "No mode grows, but not all decay" in swing.text
     runaway = told(oa.State("x", "v"), oa.State("v", "u + c*v"))
     assert (
         "has an integrator and modes of 2 1/s" in runaway.text
@@ -670,7 +717,7 @@ def test_an_analysis_that_fails_numerically_loses_no_training(folder, result, mo
     told = strict((folder / "fails" / "result.json").read_text())
     texts = [w["text"] for w in told["warnings"] if w["code"] == "analysis_failed"]
     assert texts == [
-        "the analysis of the modes failed numerically (Singular matrix): the result stands "
+        "the analysis of the modes failed numerically (Singular matrix): the result is given "
         "without it.",
         "the bias by suspects failed numerically (Singular matrix): the result is given without it.",
     ]
@@ -717,7 +764,7 @@ BAD = {
         "cc*v",
         "the equation of 'v' = (force - cc*v - k*x)/m: unknown name 'cc', did you mean 'c'?",
     ),
-    "lag": ("(force -", "(force[k] -", "a signal such as y[k-1] is no part of it"),
+    "lag": ("(force -", "(force[k] -", "a signal such as y[k-1] is not allowed here"),
     "no derivative": (
         'derivative = "v", ',
         "",
@@ -873,7 +920,8 @@ def test_rows_of_a_motion_are_all_usable(folder):
     (folder / "short.csv").write_text("\n".join(lines[:3]))
     spec.write_text(SPEC.replace("steps.csv", "short.csv"))
     with pytest.raises(
-        InputError, match=r"short.csv: data.tests.steps has 2 rows, too few; at least 3 tell where"
+        InputError,
+        match=r"short.csv: data.tests.steps has 2 rows, too few; at least 3 determine where",
     ):
         open_job(spec)
 

@@ -397,7 +397,7 @@ def test_white_errors_are_told_from_coloured_ones_and_make_robust_errors(
     assert (
         found is not None and found.verdict == "unmodelled" and found.predictable[0].own_past > 0.5
     )
-    assert "Intervals count noise alone" in dict(found.warnings)["coloured_residual"]
+    assert "Intervals cover noise only" in dict(found.warnings)["coloured_residual"]
     assert found.missing is not None and found.missing.p < 1e-4
     term = found.missing.terms[0]
     assert (term.equation, term.variable, term.shape) == ("v", "v", "jump") and term.share > 0.5
@@ -487,7 +487,7 @@ def test_traces_that_tests_see_beside_the_noise_are_told() -> None:
     told = _traces(analyse([e], [u], [x], *names), shares)
     assert (
         told
-        == " Tests still see traces (y follows u; z is not flat over v): 2 % of its square at most."
+        == " Tests still detect small effects (y follows u; z is not flat over v): 2 % of its square at most."
     )
 
 

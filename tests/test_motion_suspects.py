@@ -13,7 +13,7 @@ from orthaug._base.errors import InputError
 from orthaug._base.jax import jnp
 from orthaug.analysis.budget import AS_MUCH
 from orthaug.analysis.motion_bias import linearize_fit, softened_bias, usual_biases
-from orthaug.analysis.motion_budget import motion_budget, one_of_each, rivals_of, told_budget
+from orthaug.analysis.motion_budget import declared_budget, motion_budget, one_of_each, rivals_of
 from orthaug.analysis.motion_suspects import check_motion_suspects, usual_motion_suspects
 from orthaug.physics.motion_problem import MotionProblem, pose_motion
 
@@ -285,7 +285,7 @@ def test_a_learner_that_found_nothing_is_no_term() -> None:
     fit = oa.estimate(data(friction=0.0), spring(learned=True), **options)
     table, smooth = usual_biases(fit)
     assert max(entry.explained or 0.0 for entry in table) > 0.5  # of next to nothing
-    assert motion_budget(fit, table, smooth) is None and told_budget(fit, (), []) is None
+    assert motion_budget(fit, table, smooth) is None and declared_budget(fit, (), []) is None
 
 
 def test_a_declared_term_that_explains_half_hides_no_usual_one(learned: oa.MotionEstimate) -> None:
@@ -294,14 +294,14 @@ def test_a_declared_term_that_explains_half_hides_no_usual_one(learned: oa.Motio
     half = motion_budget(learned, table)
     assert half.cause.suspect is drag and half.share < 0.9 and half.of("c").value < 0
     assert "what the learner found looks most like drag of size" in half.warnings[0].text
-    found = told_budget(learned, [drag], table)
+    found = declared_budget(learned, [drag], table)
     assert (
         found.cause.suspect.name.startswith(("coulomb of v", "tanh(v"))
         and found.share > 0.9
         and found.of("c").value > 0
     )
     sure = [replace(table[0], explained=0.99)]
-    assert told_budget(learned, [drag], sure).cause is sure[0]
+    assert declared_budget(learned, [drag], sure).cause is sure[0]
 
 
 def test_the_interval_counts_what_the_next_term_makes_of_the_rest(
@@ -406,7 +406,7 @@ def masses() -> oa.MotionEstimate:
 def test_a_force_between_two_masses_is_named_in_both_equations(
     masses: oa.MotionEstimate, record_property
 ) -> None:
-    found = told_budget(masses, (), [])
+    found = declared_budget(masses, (), [])
     assert [str(cause.suspect.name) for cause in found.causes] == [
         "cubic of x1-x2 in v1",
         "cubic of x1-x2 in v2",

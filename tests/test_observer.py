@@ -97,7 +97,7 @@ def test_the_steady_gain_is_that_of_riccatis_equation(make):
         now = now.update(zeros, np.zeros(ny))
     np.testing.assert_allclose(now.belief.covariance, p, rtol=0, atol=1e-8 * np.abs(p).max())
     told = now.update(zeros, np.zeros(ny))
-    np.testing.assert_allclose(told.told.spread, c @ p @ c.T + r, rtol=1e-8)
+    np.testing.assert_allclose(told.latest.spread, c @ p @ c.T + r, rtol=1e-8)
     for i, unit in enumerate(np.eye(ny)):
         moved = np.asarray(now.update(zeros, unit).belief.state) - np.asarray(told.belief.state)
         np.testing.assert_allclose(moved, gain[:, i], rtol=0, atol=1e-8 * np.abs(gain).max())
@@ -440,7 +440,7 @@ def test_others_refuse_missing_outputs(verb):
     y = np.zeros(20)
     y[7] = np.nan
     with pytest.raises(
-        oa.InputError, match="row 7: an output is missing there, which only an Observer takes"
+        oa.InputError, match="row 7: an output is missing, which only an Observer accepts"
     ):
         getattr(model, verb)(record_of(model, np.zeros(20), y))
 
@@ -457,7 +457,7 @@ def test_a_fit_refuses_missing_outputs():
     )
     for physics in (PHYSICS, motion):
         with pytest.raises(
-            oa.InputError, match='row 7: an output is missing there, .*`missing = "skip"`'
+            oa.InputError, match='row 7: an output is missing, .*`missing = "skip"`'
         ):
             oa.estimate(record, physics, learner=None)
     with pytest.raises(oa.InputError, match="not finite at row 7"):

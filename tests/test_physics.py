@@ -235,8 +235,8 @@ def test_two_solutions_are_told():
     found = solve(one("(m - 2)**2", initial=3.5), np.array([1.0]), None, freedom=10)
     np.testing.assert_allclose(found.value, [3.0], rtol=1e-12)
     assert texts(found)[0] == (
-        "theta is explained as well by m = 1; bounds or better initial values choose between "
-        "the solutions."
+        "theta is explained equally well by m = 1; give bounds or better initial values to "
+        "choose a solution."
     )
     alone = solve(one("(m - 2)**2", initial=3.5, min=2.0), np.array([1.0]), None, freedom=10)
     assert not any("as well" in text for text in texts(alone))
@@ -261,7 +261,7 @@ def test_a_singular_solution_has_no_standard_errors():
     found = solve(physics, np.array([2.0, 0.0, 2.0]), np.eye(3), freedom=10)
     assert found.std == (None, None) and found.sensitivities is None
     assert (
-        "At the solution m, q cannot be told apart; the physical parameters have no standard "
+        "At the solution m, q cannot be distinguished; the physical parameters have no standard "
         "errors." in texts(found)
     )
 
@@ -418,7 +418,7 @@ def test_a_parameter_at_its_bound():
     np.testing.assert_array_equal(np.isnan(found.sensitivities), [[True, True], [False, False]])
     assert found.consistency.df == 1 and found.consistency.chi2 == pytest.approx(0.25 / 0.05)
     assert texts(found)[0] == (
-        "m stands at its bound 0 and has no standard error; those of the others hold with it there."
+        "m is at its bound 0 and has no standard error; those of the others hold with it there."
     )
     assert "own constraint, bounds included (chi2" in found.consistency.text
     json.dumps([row.content() for row in physical_rows(found)], allow_nan=False)
@@ -633,7 +633,7 @@ REFUSED = [
         [M],
         {"a": "m*y[k-1]"},
         {},
-        "physics.theta 'a' = m*y[k-1]: a signal such as y[k-1] is no part of it; known are m.",
+        "physics.theta 'a' = m*y[k-1]: a signal such as y[k-1] is not allowed here; known are m.",
     ),
     (
         [P("mass", 1.0)],
@@ -680,28 +680,28 @@ REFUSED = [
         [P("m", 0.0)],
         {"a": "1/m"},
         {},
-        "physics.theta 'a' = 1/m is inf at the initial values of m; expected a finite one: "
-        "start elsewhere.",
+        "physics.theta 'a' = 1/m is inf at the initial values of m; expected a finite value: "
+        "change the initial values.",
     ),
     (
         [P("m", 0.0), Q],
         {"a": "sqrt(m)", "b": "q"},
         {},
         "physics.theta 'a' = sqrt(m) has no finite derivative at the initial values of m, q; "
-        "expected a finite one: start elsewhere.",
+        "expected a finite value: change the initial values.",
     ),
     (
         [M, Q],
         {"a": "m*q"},
         {},
-        "theta does not determine the physical parameters: m, q cannot be told apart (1 theta, "
-        "rank 1 of 2). Make one of them a constant, or add a term that tells them apart.",
+        "theta does not determine the physical parameters: m, q cannot be distinguished (1 theta, "
+        "rank 1 of 2). Make one of them a constant, or add a term that distinguishes them.",
     ),
     (
         [M, Q, P("r", 1e3)],
         {"a": "m/q + r", "b": "(m/q)**2 - r", "c": "sin(r)*q/m"},
         {},
-        "theta does not determine the physical parameters: m, q cannot be told apart (3 theta, "
+        "theta does not determine the physical parameters: m, q cannot be distinguished (3 theta, "
         "rank 2 of 3). .*",
     ),
     (

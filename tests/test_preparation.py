@@ -198,9 +198,12 @@ REFUSED = [
     (lambda: oa.prepare(record(SLOW), oa.Resample(sampling_time=1e-9)), "take a longer one"),
     (
         lambda: oa.prepare(record(SLOW).rows(0, 9), oa.Lowpass(cutoff=1.0)),
-        "has 9 rows, a filter of zero phase",
+        "has 9 rows, but a filter of zero phase",
     ),
-    (lambda: oa.prepare(record(SLOW), "lowpass"), "preparation takes steps, which are Detrend"),
+    (
+        lambda: oa.prepare(record(SLOW), "lowpass"),
+        "preparation takes a list of steps with their arguments: Detrend",
+    ),
     (lambda: oa.prepare(SLOW, oa.Detrend()), "`record` must be a Record"),
     (lambda: oa.Lowpass(cutoff=0.0), "cutoff"),
     (lambda: oa.Lowpass(cutoff=1.0, order=11), "`order` must be at most 10"),

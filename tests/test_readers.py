@@ -247,7 +247,7 @@ TIMES = [
         "1.7e18 1.700000001e18 1.700000002e18",
         "instants of 1.7e.18 are no seconds; perhaps they are milli- or nano",
     ),
-    ("0", "one row is too few to tell the sampling time from column 't'"),
+    ("0", "one row is too few for a sampling time from column 't'"),
 ]
 
 
@@ -306,7 +306,7 @@ def test_a_sampling_time_that_every_thins_twice(tmp_path):
     options = {"inputs": ["x2"], "outputs": ["x3"], "every": 5}
     with pytest.raises(
         InputError,
-        match=r"run.txt: every = 5 multiplies the sampling time 0.05 s to 0.25 s, but col.* 'x1'",
+        match=r"run.txt: every = 5 multiplies the sampling time 0.05 s to 0.25 s. But .* 'x1'",
     ):
         read_record(path, sampling_time=0.05, **options)
     assert read_record(path, sampling_time=0.01, **options).sampling_time == pytest.approx(0.05)

@@ -223,7 +223,7 @@ def test_intervals_count_the_colour_of_the_errors():
 
 def test_a_saved_model_needs_its_training_data(fit):
     with pytest.raises(
-        oa.InputError, match="a saved model does not hold its training data; give them"
+        oa.InputError, match="a saved model does not contain its training data; give them"
     ):
         oa.Recursive(fit.model)
     with pytest.raises(oa.InputError, match="is not the least-squares estimate of these 398 rows"):
@@ -239,7 +239,7 @@ def test_a_saved_model_needs_its_training_data(fit):
 def test_what_cannot_be_followed_is_refused(fit):
     flown = fitted(learner=None, criterion=oa.Simulation(), structure=oa.Orthogonal())
     with pytest.raises(
-        oa.InputError, match="one of the free run, and recursive least squares looks one step ahead"
+        oa.InputError, match="the fit minimises the free run's error, but recursive least squares"
     ):
         oa.Recursive(flown)
     bounded = oa.estimate(
@@ -247,7 +247,7 @@ def test_what_cannot_be_followed_is_refused(fit):
         oa.Baseline.from_terms([*TERMS[:2], oa.Term("g", "u[k-1]", max=0.5)]),
         learner=None,
     )
-    with pytest.raises(oa.InputError, match="g stand at a bound, which new rows would leave"):
+    with pytest.raises(oa.InputError, match="g at a bound: new rows would move them across it"):
         oa.Recursive(bounded)
     with pytest.raises(oa.InputError, match=r"`fit` must be what `estimate` returned"):
         oa.Recursive(oa.Motion)  # type: ignore[arg-type]
@@ -299,5 +299,5 @@ def test_a_damaged_state_is_refused(fit, tmp_path):
         oa.Recursive(fit).save(place)
     oa.Recursive(fit).save(place, force=True)
     oa.save(fitted(learner=None).model, place / "model", force=True)
-    with pytest.raises(oa.InputError, match="its model is not the one that was followed"):
+    with pytest.raises(oa.InputError, match="its model is not that of the recursive estimate"):
         oa.Recursive.load(place)

@@ -16,6 +16,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from html import unescape
 from html.parser import HTMLParser
 from pathlib import Path
@@ -237,6 +238,12 @@ def by_quantity(found: list[StudyOutcome], name: str, start: str) -> Finding:
             True,
             None,
         ),
+        (
+            "covariance",
+            "P̂ between θ and the weights: share of entries below 10⁻⁶ in absolute value",
+            True,
+            None,
+        ),
         ("regularization_weight", "orthogonal: relative error", None, True),
         ("regularization_weight", "orthogonal-penalty, λ = 100", True, None),
         ("regularization_weight", "baseline-penalty, λ = 100", True, None),
@@ -335,6 +342,11 @@ def test_the_text_fits_a_terminal_and_counts(found):
         Counts.of(finding for one in found for finding in one.findings),
     )
     assert max(map(len, lines)) <= WIDTH == 100
+    made, whole_size = sum(len(one.runs) for one in found), sum(one.whole for one in found)
+    assert any(
+        line.startswith(f"small: {made} of {whole_size} runs. At this size differences")
+        for line in lines
+    )
     assert lines[-3:] == [
         f"met against the printed paper: {counts.published_met} of {counts.published}",
         f"met against its scripts, as measured: {counts.scripts_met} of {counts.scripts}",
@@ -343,6 +355,9 @@ def test_the_text_fits_a_terminal_and_counts(found):
     whole = " ".join(lines)
     assert all(one.entry.title in whole for one in found)
     assert whole.count("(met)") <= counts.published_met + counts.scripts_met
+    assert "(differs)" not in whole and all(
+        f"small: {len(o.runs)} of {o.whole} runs" in lines for o in found
+    )
     # a quantity is wrapped in its column, so that its first words are together
     assert all(finding.quantity[:12] in whole for one in found for finding in one.findings)
 
@@ -397,12 +412,21 @@ def test_the_page_holds_every_figure_and_finding(found, page):
         assert finding.quantity in plain and finding.verdict in plain and finding.ours in plain
     for statement in THEORY:
         assert all(part in plain for part in statement)
-    assert "reduced size" in html and "http" not in html.replace("charset", "")
+    assert (
+        "At this size differences from the paper and its scripts are expected" in plain
+        and "http" not in html.replace("charset", "")
+    )
     rows = [finding for one in found for finding in one.findings]
     marks = [
         mark for row in rows for mark in (row.as_published, row.as_scripts) if mark is not None
     ]
-    assert html.count("✓ met") == sum(marks) and html.count("≠ differs") == len(marks) - sum(marks)
+    assert html.count("✓ met") == sum(marks) and html.count("≠ differs at small size") == len(
+        marks
+    ) - sum(marks)
+    assert html.count("≠ differs") == len(marks) - sum(marks)
+    assert all(
+        f"small: {len(one.runs)} of {one.whole} runs of the full size." in plain for one in found
+    )
     counts = Counts.of(rows)
     assert f"<td>{counts.published_met} of {counts.published}</td>" in html
     assert f"<td>{counts.scripts_met} of {counts.scripts}</td><td>{counts.beyond}</td>" in html
@@ -421,6 +445,15 @@ def test_the_folder_holds_figures_runs_and_findings(found, page):
             assert content.startswith(b"\x89PNG") and len(content) > 10_000
     content = json.loads((page / "reproduction.json").read_text(encoding="utf-8"))
     assert content["findings"] == as_rows(found) and content["pipeline"] == "ours"
+    size = content["size"]
+    assert (
+        size["small"] is True
+        and "differences from the paper and its scripts are expected" in size["text"]
+    )
+    assert size["studies"] == {
+        one.entry.name: {"runs": len(one.runs), "of": one.whole} for one in found
+    }
+    assert all(part["runs"] < part["of"] for part in size["studies"].values())
     assert content["counts"]["beyond"] == sum(
         finding.beyond for one in found for finding in one.findings
     )
@@ -463,14 +496,43 @@ def test_an_unknown_pipeline_is_refused():
         reproduce([], pipeline="nonsense")
 
 
-def command(*arguments: str) -> list[str]:
-    return [
-        sys.executable,
-        "-c",
-        "import sys; from orthaug.commands.cli import main; sys.exit(main())",
-        "reproduce",
-        *arguments,
+def test_the_full_size_makes_no_excuse(found, tmp_path):
+    """The same runs as if they were all: nothing is called small."""
+    (one,) = (o for o in found if o.entry.name == "static_noise")
+    full = [replace(one, small=False)]
+    shown = " ".join(text(full).split())
+    assert "small:" not in shown and "at small size" not in shown and "differs)" in shown
+    write(full, tmp_path / "out", "ours")
+    content = json.loads((tmp_path / "out" / "reproduction.json").read_text(encoding="utf-8"))[
+        "size"
     ]
+    assert content["small"] is False and content["text"] is None
+    html = (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
+    assert "small:" not in html and "at small size" not in html and "≠ differs" in html
+
+
+def test_longer_training_is_named_where_the_papers_sum_is_missed(found):
+    """The row says what ours is when training stops early, and with how many effective weights."""
+    (one,) = (o for o in found if o.entry.name == "static_noise")
+    rows = one.table.query("regularization == 'stopping' and structure == 'orthogonal'")
+    finding = by_quantity(
+        found, "static_noise", "set 1, 30 dB, orthogonal: sum of squared test errors"
+    )
+    assert (
+        f"after 50 iterations ours is {1024 * (rows.test_rmse**2).mean():.3g} (" in finding.verdict
+    )
+    assert f"with {rows.effective_weights.mean():.3g} instead of " in finding.verdict
+    plain = one.table[one.table.regularization == "none"]  # as the other pipelines have it
+    assert not any("after 50" in finding.verdict for finding in one.entry.findings(plain))
+
+
+def command(*arguments: str) -> list[str]:
+    """The program as it is started; children of a background job would ignore Ctrl-C."""
+    program = (
+        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
+        "from orthaug.commands.entry import main; main()"
+    )
+    return [sys.executable, "-c", program, "reproduce", *arguments]
 
 
 @pytest.mark.parametrize(
@@ -486,8 +548,11 @@ def test_refusals_of_the_command(tmp_path, arguments, message):
     assert not (tmp_path / "out").exists()
 
 
-def test_ctrl_c_and_again(tmp_path, page, monkeypatch):
-    """Stopped by Ctrl-C, the next command goes on from what is kept."""
+@pytest.mark.parametrize(
+    ("number", "words"), [(signal.SIGINT, "interrupted"), (signal.SIGTERM, "terminated")]
+)
+def test_stopped_and_again(tmp_path, page, monkeypatch, number, words):
+    """Stopped by a signal it names no file of the cache; the next command goes on from what is kept."""
     if sys.platform != "linux":
         pytest.skip("the cache folder is elsewhere")
     whole = command("consistency", "--small", "--out", str(tmp_path / "out"))
@@ -499,11 +564,16 @@ def test_ctrl_c_and_again(tmp_path, page, monkeypatch):
     end = time.monotonic() + 60
     while not list(store.rglob("*.json")) and process.poll() is None and time.monotonic() < end:
         time.sleep(0.02)
-    process.send_signal(signal.SIGINT)
+    process.send_signal(number)
     _, errors = process.communicate(timeout=60)
     kept = {path: path.stat().st_mtime_ns for path in store.rglob("*.json")}
-    assert process.returncode != 0, "it was done before the signal came"
-    assert kept and "Traceback" not in errors and not (tmp_path / "out").exists()
+    assert process.returncode == 128 + number, "it was done before the signal came"
+    title, done = catalogue()["consistency"].title, r"\d+ of \d+ runs done"
+    then = "The runs that are done are kept: the same command goes on from there"
+    assert re.fullmatch(
+        f"{words} during '{title}', {done}; nothing is written. {then}\n", errors
+    ), errors
+    assert kept and not (tmp_path / "out").exists()
     monkeypatch.setenv("XDG_CACHE_HOME", environment["XDG_CACHE_HOME"])
     done = run_command(*whole[3:])
     assert done.code == 0, done.err

@@ -369,7 +369,7 @@ def test_what_sets_a_field_of_a_declaration_names_the_remedy():
     model = oa.AugmentedRegressor(learner=SMALL)
     with pytest.raises(
         oa.InputError,
-        match=r'give `learner` itself, in a grid \{"learner": \[oa.MLP\(hidden=…\), …\]\}',
+        match=r'set `learner` itself, in a grid \{"learner": \[oa.MLP\(hidden=…\), …\]\}',
     ):
         model.set_params(learner__hidden=(3,))
     with pytest.raises(ValueError, match="Invalid parameter"):

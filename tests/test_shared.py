@@ -356,9 +356,9 @@ def test_what_could_be_imitated_in_words():
     problem = pose(oscillator(), OSCILLATOR, None, VELOCITY.inputs)
     told = imitation(problem, PHYSICS)
     assert told.text == (
-        "The learner sees y[k-1]-y[k-2] and could imitate t1 - t2: there, and only there, θ is "
-        "split off. The fit determines t3 beside any learner of these inputs. Of the physical "
-        "parameters it determines ks so."
+        "The learner sees y[k-1]-y[k-2] and could imitate t1 - t2. The orthogonal split sets θ "
+        "along this direction only. The fit determines t3 beside any learner of these inputs. Of the physical "
+        "parameters it determines ks."
     )
     others = {other.inputs: (other.shared, other.physical) for other in told.alternatives}
     assert others[("u[k-1]",)][0] == 1 and ("y[k-1]-y[k-2]",) not in others

@@ -339,7 +339,7 @@ def test_bounds_hold_under_the_training_measure_only(coarser):
     assert fit.at_bound
     with pytest.raises(
         InputError,
-        match="theta1 stand at a bound, and a split under the uniform measure knows none",
+        match="theta1 at a bound: a split under the uniform measure has no bounds",
     ):
         fit.split(WIDE)
 

@@ -222,7 +222,7 @@ def test_a_fit_is_refused_before_anything_is_allocated():
         oa.estimate(record, baseline, learner=oa.MLP(hidden=(10**9,)))
     with pytest.raises(InputError, match="runs would take"):
         oa.estimate(record, baseline, learner=oa.MLP(hidden=(2,)), restarts=10**12)
-    with pytest.raises(InputError, match="`hidden` has 30 layers; at most 10 are taken"):
+    with pytest.raises(InputError, match="`hidden` has 30 layers; at most 10 are allowed"):
         oa.MLP(hidden=(8,) * 30)
 
 

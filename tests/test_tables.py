@@ -113,7 +113,7 @@ def test_encodings_of_windows(tmp_path, encoding):
     path = put(tmp_path, "run.csv", "Kraft [µN];Wärme [°C]\n1,5;2\n3;4\n".encode(encoding))
     assert values(path, "Kraft [µN]", "Wärme [°C]") == [[1.5, 3.0], [2.0, 4.0]]
     assert layout(path).note == (
-        "no UTF-8, so read as Windows-1252" if encoding == "cp1252" else ""
+        "not UTF-8, so read as Windows-1252" if encoding == "cp1252" else ""
     )
 
 
@@ -146,7 +146,7 @@ def test_columns_of_one_name_in_a_workbook(tmp_path):
     )
     assert values(tmp_path / "a.xlsx", "y.1", "y.0") == [[2.0, 4.0], [1.0, 3.0]]
     with pytest.raises(
-        InputError, match=r"stands 2 times; names must differ, or be told apart .* 'y.0', 'y.1'"
+        InputError, match=r"2 times; names must differ, or be numbered .* 'y.0', 'y.1'"
     ):
         read_table(tmp_path / "a.xlsx", ("y",))
 
@@ -317,7 +317,7 @@ def test_has_column(tmp_path):
     ("name", "content", "message"),
     [
         ("run.csv", "", "0 bytes"),
-        ("run.csv", "y,y\n1,2\n", "the column 'y' stands 2 times; names must differ"),
+        ("run.csv", "y,y\n1,2\n", "the header has the column 'y' 2 times; names must differ"),
         ("run.npz", "y", "cannot be read as .npz"),
         ("run.log", "y\n1\n", "unknown file type '.log'"),
     ],
@@ -354,7 +354,7 @@ REFUSED_TEXT = [
     ("run.csv", "U,y\n1,2\n", "no column 'u', did you mean 'U'.; the file has 'U', 'y'"),
     ("run.csv", "u (N),y\n1,2\n", r"no column 'u', did you mean 'u \(N\)'\?"),
     ("run.csv", ",,\n1,2,3\n", "no column 'u'; the file has no column names"),
-    ("run.csv", "u,y,y\n1,2,3\n", "column 'y' stands 2 times; names must differ"),
+    ("run.csv", "u,y,y\n1,2,3\n", "column 'y' 2 times; names must differ"),
     ("run.txt", "1 2\n3 4\n5 6 7\n", "no column 'u': the file has no header"),
     ("run.tsv", "u,y\n1,2\n", "no column 'u'.*the file has 'u,y'"),
     ("run.xml", "<a/>", r"unknown file type '.xml'; known are .csv, .tsv, .txt, .dat, .parquet"),

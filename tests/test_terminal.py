@@ -145,7 +145,7 @@ def test_the_log_tells_the_stages_of_a_fit(project, monkeypatch, caplog, no_log)
     assert told[0].startswith("training: 4 runs of LevenbergMarquardt, orthogonal")
     assert sum(
         "seed" in line and "iterations" in line for line in told
-    ) == 4 and "is chosen of 4" in " ".join(told)
+    ) == 4 and "run 1 of 4 is chosen" in " ".join(told)
 
 
 def test_the_log_is_silent_until_somebody_listens(capsys, no_log):

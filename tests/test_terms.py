@@ -58,7 +58,7 @@ def test_the_library_has_every_product_once():
         ({}, "needs `terms`, or a `degree` of 1 or more"),
         (
             {"degree": 2, "functions": ("tan",)},
-            "no terms are made of the function 'tan', did you mean 'tanh'",
+            "a library has no terms of the function 'tan', did you mean 'tanh'",
         ),
         ({"functions": ("abs",), "terms": ("u",)}, "need a `degree` of 1 or more"),
         ({"terms": "u[k-1]**2"}, "`terms` must be a tuple of texts"),

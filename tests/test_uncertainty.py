@@ -18,6 +18,7 @@ from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.structures import Additive, OrthogonalPenalty
 from orthaug.inference.covariance import (
     interval,
+    joint_covariance,
     newey_west,
     prediction_std,
     robust_split_covariance,
@@ -227,6 +228,23 @@ def test_the_whole_covariance_where_every_weight_is_estimable(convention):
     np.testing.assert_allclose(
         found / np.outer(size, size), expected / np.outer(size, size), rtol=0, atol=1e-8
     )
+
+
+def test_a_pseudo_inverse_in_own_units_leaves_out_what_is_rounding(noisy):
+    """It is the whole where every weight is estimable; elsewhere no variance is so large that rounding shows."""
+    fit = estimable()
+    found = joint_covariance(fit.problem, fit.model, "paper", own_units=True)
+    size = np.sqrt(np.diag(found))
+    np.testing.assert_allclose(
+        (found - fit.joint_covariance("paper")) / np.outer(size, size), 0.0, atol=1e-8
+    )
+    own, unit = (
+        joint_covariance(noisy.problem, noisy.model, "paper", own_units=units)
+        for units in (True, False)
+    )
+    assert np.diag(own).max() < 0.01 * np.diag(unit).max()
+    np.testing.assert_allclose(own[:2, :2], unit[:2, :2], rtol=1e-9)
+    assert np.abs(own[:2, 2:]).max() * len(noisy.problem.rows) < 1e-6
 
 
 def test_the_calibrated_convention_is_the_textbook(noisy):
@@ -439,9 +457,7 @@ def test_a_split_leaves_the_standard_errors_of_predictions(noisy):
 
 def test_predictions_without_statistics_are_refused():
     model = orthogonalize(EXAMPLE.train, EXAMPLE.baseline, lambda x: x + x**2).model
-    with pytest.raises(
-        InputError, match="the model has no statistics to take standard errors from"
-    ):
+    with pytest.raises(InputError, match="the model has no statistics for standard errors"):
         prediction_std(model, EXAMPLE.test)
 
 
@@ -545,7 +561,8 @@ def test_noise_of_uneven_size_has_hc3_by_default():
             inside[i] += (found.interval[:, 0] <= [1, -2]) & (found.interval[:, 1] >= [1, -2])
     assert inside[0, 0] < 80 and (inside[1] >= 90).all()
     assert (
-        fit.std_kind == "hc3" and "robust (HC3), for the errors are of uneven size" in fit.summary()
+        fit.std_kind == "hc3"
+        and "robust (HC3), because the variance of the errors is not constant" in fit.summary()
     )
     phi = np.column_stack([plain.problem.record.experiments[0].inputs[:, 0], np.ones(300)])
     e = plain.problem.record.experiments[0].outputs[:, 0] - phi @ plain.theta
@@ -596,9 +613,7 @@ def other(kind):
 
 @pytest.mark.parametrize("kind", ["additive", "penalty", "bound", "elsewhere"])
 def test_robust_errors_need_standard_errors(kind):
-    with pytest.raises(
-        InputError, match="robust standard errors are those of a fit that has standard errors"
-    ):
+    with pytest.raises(InputError, match="robust standard errors need a fit with standard errors"):
         other(kind).robust()
 
 

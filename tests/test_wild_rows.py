@@ -132,7 +132,7 @@ def test_a_wild_cell_is_named_before_the_fit_and_its_remedy_works(tmp_path, spec
         and f"{channel} = 1e+06" in text
         and "[[data.prepare]]" in text
     )
-    threshold = re.search(r"threshold = ([\d.e+]+)", text)
+    threshold = re.search(r"threshold = ([\d.e+]*\d)", text)
     assert threshold is not None
     step = f'[[data.prepare]]\nstep = "outliers"\nchannels = ["{channel}"]\nthreshold = {threshold[1]}\n'
     if spec == SPEC:

@@ -1,8 +1,6 @@
-"""What can go wrong because of what was asked, always with the remedy in the text, on one line.
+"""Errors of the user's input, with the remedy in the text, on one line; and warnings.
 
-And warnings.
-
-A warning is what the user must know about a result that stands all the same.
+A warning is what the user must know about a result that is valid all the same.
 """
 
 from __future__ import annotations
@@ -41,12 +39,15 @@ def shown(value: Any) -> str:
 
 
 def cut(text: str) -> str:
-    """At most `LONGEST` characters of a text."""
+    """Return at most `LONGEST` characters of a text."""
     return text if len(text) <= LONGEST else text[: LONGEST - 1] + "…"
 
 
 def message(text: str) -> str:
-    """Return a message as users see it: one line, its names, values and paths visible and cut where they are long."""
+    """Return a message as users see it, on one line.
+
+    Its names, values and paths are visible, and cut where they are long.
+    """
     text = visible(_ends(text, _SEARCHED))
     text = _QUOTED.sub(lambda found: f"{found[1]}{cut(found[2])}{found[1]}", text)
     text = _LISTED.sub(lambda found: f"[{cut(found[0][1:-1])}]", text)
@@ -77,8 +78,11 @@ class InputError(ValueError):
 class KeyedError(InputError):
     """Bad input in one key of a declaration.
 
-    Args: text: the whole sentence, for users of Python. key: the key at fault. words: what a spec's
-        or an option's message says after the key, such as `: found 3; expected less than 2`.
+    Args:
+        text: the whole sentence, for users of Python.
+        key: the key at fault.
+        words: what a spec's or an option's message says after the key, such as `: found 3; expected
+            less than 2`.
     """
 
     def __init__(self, text: str, key: str, words: str) -> None:

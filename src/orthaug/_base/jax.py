@@ -2,7 +2,7 @@
 
 A declaration of a learner or solver costs no import.
 
-`jax` and `jnp` stand for the modules. `jax.jit` compiles at the first call, so that a module with
+`jax` and `jnp` are lazy modules. `jax.jit` compiles at the first call, so that a module with
 compiled functions can be imported without JAX.
 
 Programs that it keeps on disk end with a checksum, and one that was cut, altered or exchanged is
@@ -39,7 +39,7 @@ __all__ = ["Array", "is_traced", "jax", "jnp", "padded_length", "starts", "use_c
 
 
 def _real_jax() -> Any:
-    """JAX, with double precision turned on.
+    """Return JAX, with double precision turned on.
 
     Raises:
         PrecisionError: the environment forbids double precision.
@@ -74,7 +74,7 @@ class _LazyModule:
 
 
 def _late_jit(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
-    """`jax.jit(function, **options)`, made at the first call."""
+    """Return `jax.jit(function, **options)`, made at the first call."""
     made: list[Callable[..., Any]] = []
     one_at_a_time = threading.Lock()
 
@@ -92,7 +92,7 @@ def _late_jit(function: Callable[..., Any], **options: Any) -> Callable[..., Any
 def starts() -> bool:
     """Return whether JAX finds a device to compute on.
 
-    What it raises where it does not depends on the platform asked for.
+    Otherwise its exception depends on the platform that is asked for.
     """
     try:
         return bool(_real_jax().devices())
@@ -101,14 +101,14 @@ def starts() -> bool:
 
 
 def is_traced(value: Any) -> bool:
-    """Return whether a value stands for numbers that are not there yet, because a program is being made of it."""
+    """Return whether a value is a tracer, whose numbers are not known yet."""
     from jax.core import Tracer
 
     return isinstance(value, Tracer)
 
 
 class _CompileTimes(threading.local):
-    """When this thread traced and compiled, as disjoint spans of time [s] in order."""
+    """Spans of time [s] in which this thread traced and compiled, disjoint and in order."""
 
     def __init__(self) -> None:
         self.spans: list[tuple[float, float]] = []
@@ -132,7 +132,10 @@ _compiling: list[_CompileTimes] = []
 
 
 def training_clock() -> float:
-    """Return a clock of this thread [s] that stands still while JAX compiles: its differences are what computing took."""
+    """Return a clock of this thread [s] without the time in which JAX compiles.
+
+    Its differences are the time of the computation.
+    """
     if not _compiling:
         _compiling.append(_CompileTimes())
         _real_jax().monitoring.register_event_duration_secs_listener(_compiling[0].note)
@@ -140,7 +143,9 @@ def training_clock() -> float:
 
 
 def padded_length(rows: int) -> int:
-    """Return what to pad a number of rows to: lengths grow by powers of two, so that few programs are compiled.
+    """Return the length that a number of rows is padded to.
+
+    Lengths grow by powers of two, so that few programs are compiled.
 
     To compile one takes longer than a thousand rows.
     """
@@ -156,9 +161,9 @@ if not TYPE_CHECKING:
 
 
 def use_compilation_cache() -> None:
-    """Keep compiled programs between processes (the command line does.
+    """Keep compiled programs between processes.
 
-    The library never on its own).
+    The command line does; the library never does on its own.
     """
     import platformdirs
 
@@ -202,9 +207,9 @@ def _digest(key: str, content: bytes) -> bytes:
 
 
 def _check_cached_programs() -> None:
-    """From now on JAX's cache is a checked one.
+    """Make JAX's cache a checked one from now on.
 
-    Where JAX is built otherwise than known, nothing is kept.
+    If this version of JAX has another cache, nothing is kept.
     """
     try:
         from jax._src import compilation_cache

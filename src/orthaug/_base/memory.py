@@ -1,4 +1,4 @@
-"""How much memory there is, and the refusal of what would not fit."""
+"""Available memory, and the refusal of arrays that do not fit."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ _ARENA_MAX = -8  # glibc's name for the number of arenas
 
 
 def available() -> float:
-    """Bytes that this process may still take; infinite where the system does not say."""
+    """Return the bytes that this process may still take; infinite where they are not known."""
     return min(_unused(), _allowed())
 
 
 def limit() -> float:
-    """Bytes of addresses that this process may take at most (`ulimit -v`).
+    """Return the bytes of addresses that this process may take at most (`ulimit -v`).
 
     Infinite where nothing says so.
     """
@@ -32,7 +32,10 @@ def limit() -> float:
 
 
 def check_limit(size: float, what: str) -> None:
-    """Raise InputError where a limit on the process, which ends it without a word, leaves less than `size` bytes."""
+    """Raise InputError where a limit on the process leaves less than `size` bytes.
+
+    The system would end the process without a message.
+    """
     there = _allowed()
     if size > there:
         raise InputError(
@@ -63,7 +66,7 @@ def few_arenas() -> None:
 
 
 def in_words(size: float) -> str:
-    """Bytes in the unit that suits them."""
+    """Return bytes in the unit that suits them."""
     step = max(0, min(int(math.log(max(size, 1), 1024)), 5))
     return f"{size / 1024**step:.3g} {('bytes', 'KiB', 'MiB', 'GiB', 'TiB', 'PiB')[step]}"
 
@@ -81,7 +84,7 @@ def _unused() -> float:
 
 
 def _allowed() -> float:
-    """Return what limits on the process (`ulimit -v`) leave."""
+    """Return the bytes that limits on the process (`ulimit -v`) leave."""
     most = limit()
     if math.isinf(most):
         return most

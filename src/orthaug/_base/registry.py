@@ -1,7 +1,9 @@
-"""Registries: the kinds of learners, structures, measures, criteria and solvers, each a declaration under a name.
+"""Registries of learners, structures, measures, criteria and solvers by name.
+
+Each kind is a declaration.
 
 A declaration is a frozen dataclass. Its fields are the keys of its section in a spec: name, type,
-limits (`Annotated[int, Ge(1)]`) and default. A declaration that stands for something else, such as
+limits (`Annotated[int, Ge(1)]`) and default. A declaration of something else, such as
 files that hold points, has a method `resolve(context)` that makes the real thing.
 """
 
@@ -68,7 +70,7 @@ class Key:
 
     @property
     def metadata(self) -> tuple[Any, ...]:
-        """Return what stands beside the type in `Annotated`."""
+        """Limits and marks next to the type in `Annotated`."""
         return getattr(self.annotation, "__metadata__", ())
 
     @property
@@ -78,13 +80,13 @@ class Key:
 
 
 class Registry(Mapping[str, Any]):
-    """The declarations of one axis by the name of their kind, in the order in which they were added.
+    """The declarations of one axis by the name of their kind, in the order of their addition.
 
     Args:
         axis: what the kinds are kinds of, for messages.
         entries: the first declarations.
         reserved: keys that the section has beside those of the declarations.
-        beside: another registry whose keys stand in the same section.
+        beside: another registry whose keys are in the same section.
     """
 
     def __init__(
@@ -117,14 +119,16 @@ class Registry(Mapping[str, Any]):
     def add(self, kind: str, declaration: type) -> None:
         """Register a declaration.
 
-        Raises: InputError: a name that is taken, no frozen dataclass, or a key that means something
-            else already.
+        Raises:
+            InputError: a name that is taken, no frozen dataclass, or a key that means something
+                else already.
         """
         if kind in self._entries:
             raise InputError(
                 f"the {self.axis} '{kind}' is registered already; give it another name."
             )
-        if not dataclasses.is_dataclass(declaration) or not declaration.__dataclass_params__.frozen:  # type: ignore[attr-defined]
+        parameters = getattr(declaration, "__dataclass_params__", None)
+        if parameters is None or not parameters.frozen:
             raise InputError(
                 f"the {self.axis} '{kind}' must be a frozen dataclass; got {declaration!r}."
             )
@@ -151,7 +155,7 @@ class Registry(Mapping[str, Any]):
 
     @contextmanager
     def added(self, kind: str, declaration: type) -> Iterator[None]:
-        """A declaration that is registered inside a `with` block only."""
+        """Register a declaration inside a `with` block only."""
         self.add(kind, declaration)
         try:
             yield
@@ -219,14 +223,14 @@ def keys_of(declaration: type) -> dict[str, Key]:
 
 
 def resolve(declared: Any, context: Any = None) -> Any:
-    """Return what a declaration stands for: itself, or what its `resolve(context)` makes."""
+    """Return a declaration itself, or the result of its `resolve(context)`."""
     return declared.resolve(context) if hasattr(declared, "resolve") else declared
 
 
 def check_fields(declared: Any) -> None:
-    """Raise InputError for a field outside of the limits of its type.
+    """Raise InputError for a field outside the limits of its type.
 
-    For the `__post_init__` of declarations.
+    It is called in the `__post_init__` of declarations.
     """
     for name, key in keys_of(type(declared)).items():
         value, metadata = getattr(declared, name), key.metadata
@@ -248,7 +252,7 @@ def _default(field: dataclasses.Field[Any]) -> Any:
 
 
 def frozen(value: Any) -> Any:
-    """Lists, as files hold them, as tuples."""
+    """Return lists, as files hold them, as tuples."""
     if isinstance(value, list | tuple):
         return tuple(frozen(item) for item in value)
     if isinstance(value, Mapping):

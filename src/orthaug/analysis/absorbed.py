@@ -1,4 +1,4 @@
-"""What a fit makes of a term that the physics lacks: how far it moves c, and what the learner holds of it (F8).
+"""Effect of a missing term on a fit: how far it moves c, and how much of it the learner holds (F8).
 
 With `Y = Φθ* + Δ` a learner that can be any function of its features z takes the mean of `Δ − Φd`
 given z, with `d = c − θ*` from the partially linear regression `d = ((I − M)Φ)⁺(I − M)Δ`, M the
@@ -24,7 +24,7 @@ from orthaug._base.parallel import one_blas_thread
 from orthaug.physics.output_weights import times
 from orthaug.physics.problem import Problem
 
-_MOST_WAVES = 100  # tanh functions of z that stand for any function of it
+_MOST_WAVES = 100  # tanh functions of z, for any function of it
 _ROWS_PER_WAVE = 20
 WAVES = 24  # the same, before there is a fit
 _STEEPEST = 30.0  # of their slopes, in units of 1 / range of z
@@ -38,7 +38,7 @@ class TermAfterFit:
     """A term of coefficient 1 after the fit.
 
     `moved` (nθ,) is what it adds to c. `held` (M, ny) is what the learner holds of it on a
-    measure's points. `seen` tells whether it is a function of what the learner sees; None where the
+    measure's points. `seen` is whether it is a function of what the learner sees; None where the
     learner could imitate all of the physics.
     """
 
@@ -49,7 +49,9 @@ class TermAfterFit:
 
 @dataclass(frozen=True, eq=False)
 class Smoother:
-    """The mean given the learner's features, over the training rows: least squares on many functions of these.
+    """Mean given the learner's features over the training rows, by least squares.
+
+    Squares are taken on many functions of the features.
 
     The functions are tanh waves with centres on the data, and the shared part of the physics. Of a
     learner that is linear in its features they are these.
@@ -72,7 +74,7 @@ class Smoother:
         return (low + high) / 2, np.where(high > low, (high - low) / 2, 1.0)
 
     def _z(self, x: Matrix) -> Matrix:
-        """z on rows of the regressor, over its range in the data.
+        """Return z on rows of the regressor, over its range in the data.
 
         Kept, for the same rows are asked for again.
         """
@@ -124,14 +126,16 @@ class Smoother:
         return self._z(self.problem.rows.x[self.every])
 
     def left(self, values: Float[np.ndarray, "n *m"]) -> Float[np.ndarray, "n *m"]:
-        """(I − M)v of values on the training rows that are used."""
+        """Return (I − M)v of values on the training rows that are used."""
         flat = values.reshape(len(values), -1)
         return (flat - self._basis @ (self._basis.T @ flat)).reshape(values.shape)
 
     def mean(self, values: Float[np.ndarray, "n ny"], x: Matrix) -> Matrix:
-        """Mv at rows of the regressor, of values on the training rows that are used: that at the nearest z of these.
+        """Return Mv at rows of the regressor, from values on the training rows that are used.
 
-        Of a linear combination of the features it is that combination.
+        A row takes the value of the training row with the nearest z.
+
+        A linear combination of the features is returned as it is.
         """
         if self.problem.features.linear:
             return self._z(x) @ (self._inverse @ values)
@@ -147,7 +151,7 @@ def absorbed(
     seen: Iterable[bool],
     x: Matrix,
 ) -> list[TermAfterFit]:
-    """Return what a fit makes of each term, to first order.
+    """Return the effect of each term on a fit, to first order.
 
     Args:
         terms: the value (M, ny) of each on rows of the regressor.
@@ -181,7 +185,7 @@ def _unseen(smoother: Smoother, term: Callable[[Matrix], Matrix], x: Matrix) -> 
 
 
 def completing(basis: Matrix) -> list[int]:
-    """Parameters whose directions complete the shared ones."""
+    """Return the parameters whose directions complete the shared ones."""
     if not basis.shape[1]:
         return list(range(len(basis)))
     order = scipy.linalg.qr(basis.T, mode="r", pivoting=True)[-1]
@@ -205,14 +209,14 @@ class Waves:
 
 @lru_cache(maxsize=16)
 def _drawn(nz: int) -> tuple[Matrix, Vector]:
-    """Slopes (WAVES, nz) and offsets: every wave has its centre among the features."""
+    """Return slopes (WAVES, nz) and offsets; every wave has its centre among the features."""
     rng = np.random.default_rng(_SEED)
     slopes, centres = _slopes(rng, WAVES, nz), rng.uniform(-1, 1, size=(WAVES, nz))
     return slopes, np.sum(slopes * centres, axis=1)
 
 
 def _slopes(rng: np.random.Generator, count: int, nz: int) -> Matrix:
-    """Of waves in random directions, gentle ones as often as steep ones (count, nz)."""
+    """Return slopes (count, nz) of waves in random directions, gentle and steep ones alike."""
     slopes = rng.normal(size=(count, nz))
     steep = np.exp(rng.uniform(0.0, np.log(_STEEPEST), size=(count, 1)))
     return slopes * (steep / np.linalg.norm(slopes, axis=1)[:, None])

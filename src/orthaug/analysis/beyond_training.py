@@ -1,4 +1,6 @@
-"""Is the free run bounded whatever bounded inputs come? A proof where the correction is held or fades.
+"""Proof that the free run stays bounded for any bounded inputs, far beyond the training data.
+
+It applies where the correction is constant far out, or fades.
 
 Far beyond its training the model is `x_{k+1} = A x_k + b(x_k, u_k)`. Where the correction is held,
 or gone, and the physics is linear in the state, A is one matrix and b is bounded: with all
@@ -53,7 +55,8 @@ def radius_beyond(model: Model | MotionModel, states: Matrix, inputs: Matrix) ->
         for kind in sorted({does, "hold"})
     ]
     every = np.concatenate(found)
-    # what fades must leave the same physics as what is held: else its share of the physics comes and goes, unbounded
+    # A correction that fades must leave the same physics as a constant one: else its share of the
+    # physics changes without bound.
     if not np.isfinite(every).all() or np.ptp(every, axis=0).max() > _SAME * max(
         np.abs(every).max(), 1.0
     ):
@@ -62,18 +65,17 @@ def radius_beyond(model: Model | MotionModel, states: Matrix, inputs: Matrix) ->
 
 
 def describe_beyond(model: Model | MotionModel, radius: float | None) -> str:
-    """Return what the radius says of the free run, in a sentence; nothing without one."""
+    """Return a sentence on what the radius says of the free run; empty without a radius."""
     if radius is None:
         return ""
-    does = "fades" if model.form.beyond == "fade" else "is held"
+    does = "fades" if model.form.beyond == "fade" else "stays constant"
     text = (
-        f"Beyond its training the learned correction {does}, so it is bounded; the physics "
-        "goes on alone there, with "
+        f"Beyond the training data the learned correction {does}, so it is bounded. The physics "
+        f"alone has a spectral radius of {radius:.4g} there"
     )
-    text += f"a spectral radius of {radius:.4g}"
     if radius < 1:
         return f"{text}: bounded inputs give a bounded free run. This is a proof, not a sample."
-    return f"{text}: nothing there bounds the free run."
+    return f"{text}, so the free run is not bounded."
 
 
 def _going_on(model: Model | MotionModel, kind: str) -> Model | MotionModel:

@@ -1,4 +1,4 @@
-"""What unmodelled terms do to θ: bias per unit of each suspect, and whether any measure can remove it.
+"""Bias of θ by unmodelled terms: per unit of each suspect, and whether a measure can remove it.
 
 With the truth `Y = Φθ* + Δ + E` (`eq:data_gen_sys_reformed_vect`) the estimate under a measure μ
 errs by `θ̂ − θ* = Φ_μ⁺(Δ_μ − ε_μ)` (eq:error_val), ε the misfit of the whole model. Here Φ_μ and
@@ -27,13 +27,12 @@ from orthaug.physics.excitation import excitation, require_rank
 from orthaug.physics.output_weights import times
 from orthaug.physics.projection import Projection
 
-NEGLIGIBLE = 1e-12  # rows whose ‖φᵀδ‖ is below this share of the largest ‖φ‖‖δ‖: only weights of 1e12 could use them
-SMALLEST_COSINE = (
-    1e-6  # between Φa and Δ; below it the optimum of the linear program counts as zero
-)
-VIOLATION = (
-    1e-9  # of (φᵀa)δ, rows and a of unit length; the linear program itself is solved to 1e-10
-)
+# Rows whose ‖φᵀδ‖ is below this share of the largest ‖φ‖‖δ‖: only weights of 1e12 could use them
+NEGLIGIBLE = 1e-12
+# Between Φa and Δ; below it the optimum of the linear program counts as zero
+SMALLEST_COSINE = 1e-6
+# Of (φᵀa)δ, rows and a of unit length; the linear program itself is solved to 1e-10
+VIOLATION = 1e-9
 WORKING_SET = 1000  # rows of the first linear program, and the most that are added at a time
 MOST_ROUNDS = 50
 IN_SPAN = 1e-10  # ‖P⊥Δ‖/‖Δ‖ below which Δ counts as physics
@@ -44,7 +43,7 @@ RemovedBy = Literal["learner", "learner and measure", "learner in part", "measur
 
 @dataclass(frozen=True)
 class Certificate:
-    """Whether a measure on the given points can make φ and δ orthogonal.
+    """Certificate that a measure on the given points can, or cannot, make φ and δ orthogonal.
 
     By Stiemke's lemma exactly one of the two holds: positive weights on all points with `Σ μ_k
     φ_kᵀδ_k = 0` (`removable`), or a direction a with `(φ_kᵀa)δ_k ≥ 0` on all points and `> 0` on
@@ -66,7 +65,7 @@ class Certificate:
 
 @dataclass(frozen=True)
 class SuspectedBias:
-    """What a suspect does to θ if it is there, per unit of its coefficient.
+    """Bias of θ by a suspect, per unit of the suspect's coefficient.
 
     `bias` (nt,) is `Φ_μ⁺Δ_μ`, in the unit of θ per unit of the coefficient; `relative` the same
     divided by θ (None where θ is 0); `physical` the same for physical parameters, to first order;
@@ -93,7 +92,7 @@ class SuspectedBias:
 
     @property
     def removed_by(self) -> RemovedBy | None:
-        """Return what leaves θ unbiased by it; None where that is not known.
+        """Change that removes this bias from θ; None where none is known.
 
         A learner that sees the term removes its bias from all that the learner could not imitate.
         Along the shared directions a measure may remove the rest.
@@ -116,15 +115,15 @@ class SuspectedBias:
         certificate = self.certificate
         if self.seen is False:
             return (
-                f"{self.suspect.name}: the learner does not see all of it, so that it biases "
-                "also what no measure changes."
+                f"{self.suspect.name}: the learner does not see all of this term, so the term "
+                "biases θ under every measure."
             )
         if certificate is None:
             return ""
         if certificate.verdict == "orthogonal":
             return (
-                f"{self.suspect.name}: φᵀδ is zero on all of these points, so that it biases "
-                "nothing there."
+                f"{self.suspect.name}: φᵀδ is zero on all of these points, so this term "
+                "biases nothing there."
             )
         if certificate.verdict == "removable":
             return f"{self.suspect.name}: some weighting of these points leaves θ unbiased."
@@ -140,14 +139,14 @@ class SuspectedBias:
             if abs(share) > 5e-3
         ]
         return (
-            f"{self.suspect.name}: no weighting of these points leaves θ unbiased if it counts "
-            f"any of the {percent(certificate.positive, 3)} where (φᵀa)δ is positive, for it "
-            f"is nowhere negative; a = {' '.join(terms)} (columns scaled to root mean square "
-            "1). Only the least bias can be asked for."
+            f"{self.suspect.name}: no weighting that counts any of "
+            f"{percent(certificate.positive, 3)} of these points leaves θ unbiased. There "
+            f"(φᵀa)δ is positive, and it is nowhere negative; a = {' '.join(terms)} (columns "
+            "scaled to root mean square 1). Only the least bias can be asked for."
         )
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain numbers, text and None, for JSON."""
+        """Return plain numbers, text and None, for JSON."""
         certificate = self.certificate
 
         def by_name(values: tuple[float | None, ...] | None) -> dict[str, float | None] | None:
@@ -194,20 +193,24 @@ def bias_table(
     directions: Matrix | None = None,
     absorbed: Sequence[TermAfterFit] | None = None,
 ) -> tuple[SuspectedBias, ...]:
-    """Return one `SuspectedBias` for each suspect, under the measure that `projection` was made with.
+    """Return one `SuspectedBias` for each suspect, under the measure of `projection`.
 
-    Args: projection: of the rows of φ, their outputs multiplied by `gain`. names: the nt
-        parameters. suspects: their forms; `deltas` (ns, N, ny) their values, as
-        `suspects.suspect_columns` gives them. gain: a matrix (ny, ny) for all rows, or one of each
-        row (N, ny, ny); None for none. theta: θ (nt,), for relative biases. physical: a row of
-        dp/dθ (nt,) for each physical parameter p, by name. learned: the learner's values (N, ny) in
-        the outputs' units, projected or not. certify: search for certificates, a linear program per
-        suspect. directions: (nt, s) along which θ is split; None for all. absorbed: what the fit
-        makes of each suspect, where `directions` are not all.
+    Args:
+        projection: of the rows of φ, their outputs multiplied by `gain`.
+        names: the nt parameters.
+        suspects: their forms; `deltas` (ns, N, ny) their values, as `suspects.suspect_columns`
+            gives them.
+        gain: a matrix (ny, ny) for all rows, or one of each row (N, ny, ny); None for none.
+        theta: θ (nt,), for relative biases.
+        physical: a row of dp/dθ (nt,) for each physical parameter p, by name.
+        learned: the learner's values (N, ny) in the outputs' units, projected or not.
+        certify: search for certificates, a linear program per suspect.
+        directions: (nt, s) along which θ is split; None for all.
+        absorbed: what the fit makes of each suspect, where `directions` are not all.
 
-    Raises: InputError: shapes that do not fit, values that are not finite, suspects of one name;
-        RankError for
-            physics that the points do not determine.
+    Raises:
+        InputError: shapes that do not fit, values that are not finite, suspects of one name;
+            RankError for physics that the points do not determine.
     """
     names = tuple(names)
     if not names:
@@ -256,9 +259,9 @@ def bias_table(
 def _overlaps(
     projection: Projection, delta: Matrix, tilde: Matrix | None, directions: Matrix | None
 ) -> tuple[float | None, float | None, float | None]:
-    """cos(Δ, span Φ); R² of the learner's P⊥F on P⊥Δ; the coefficient of that fit.
+    """Return cos(Δ, span Φ), R² of the learner's P⊥F on P⊥Δ, and the coefficient of that fit.
 
-    Along `directions` only.
+    All are taken along `directions` only.
     """
     size = np.abs(delta).max(initial=0.0)
     if size == 0:
@@ -278,7 +281,7 @@ def _overlaps(
 
 
 def orthogonal_part(projection: Projection, values: Matrix, directions: Matrix | None) -> Matrix:
-    """P⊥v, or what is left of v along some directions of θ."""
+    """Return P⊥v, or what is left of v along some directions of θ."""
     if directions is None:
         return projection.orthogonal_part(values)
     return values - projection.phi @ projection.solve_along(values, directions)
@@ -289,10 +292,10 @@ def find_certificate(
 ) -> Certificate:
     """Maximise `Σ (φᵀa)δ` subject to `(φᵀa)δ ≥ 0` on every point and `|a| ≤ 1`.
 
-    In the coordinates of Q, so that neither units nor conditioning of Φ matter; a row of several
-    outputs counts the sum over them, weighted as in `projection`. The linear program is solved on a
-    working set, to which the most violated rows are added until there are none: the optimum of a
-    subset bounds that of all.
+    The program is in the coordinates of Q, so that neither units nor conditioning of Φ matter; a
+    row of several outputs counts the sum over them, weighted as in `projection`. The linear program
+    is solved on a working set, to which the most violated rows are added until there are none: the
+    optimum of a subset bounds that of all.
 
     Args:
         projection: of the weighted rows of φ.
@@ -343,8 +346,8 @@ def find_certificate(
 
 
 def _certificate_along(projection: Projection, delta: Matrix, directions: Matrix) -> Certificate:
-    """Return the certificate among some directions, told in all parameters."""
-    directions = projection.told_of(directions)
+    """Return the certificate among some directions, as weights of all parameters."""
+    directions = projection.without_null(directions)
     if not directions.shape[1]:
         return Certificate("orthogonal")
     found = find_certificate(Projection.factor(projection.phi @ directions), delta)
@@ -381,7 +384,7 @@ def _numbers(values: Vector) -> tuple[float, ...]:
 
 
 def _row_gain(gain: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """`gain`, checked against rows of the shape (N, ny)."""
+    """Return `gain`, checked against rows of the shape (N, ny)."""
     gain, ny = np.asarray(gain, dtype=float), shape[1]
     if gain.shape not in ((ny, ny), (*shape, ny)):
         raise InputError(

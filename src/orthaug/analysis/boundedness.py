@@ -1,4 +1,4 @@
-"""Does the free run stay within bounds where its inputs grow? The factor from which it leaves them."""
+"""Bounds of the free run under growing inputs: the factor from which it leaves them."""
 
 from __future__ import annotations
 
@@ -20,9 +20,10 @@ from orthaug.models.model import Model
 from orthaug.models.motion_model import MotionModel
 from orthaug.models.on_records import RUNAWAY
 
-_LARGEST_FACTOR = 1e4  # outputs of a stable linear model grow with its inputs, and 10⁶ times the largest is "diverged"
+# Outputs of a stable linear model grow with its inputs, and 10⁶ times the largest is "diverged"
+_LARGEST_FACTOR = 1e4
 _SIDE_BY_SIDE = 16  # runs of one compiled call
-_MARGIN = 1.5  # a factor below is told as a warning
+_MARGIN = 1.5  # a factor below is a warning
 _CLOSE = 1.05  # ratio of two factors at which the bisection ends
 
 Diverging = Callable[[list[float]], np.ndarray]
@@ -31,7 +32,9 @@ Diverging = Callable[[list[float]], np.ndarray]
 def divergence_scaling(
     model: Model | MotionModel, record: Record, largest: float = 1024.0
 ) -> float | None:
-    """Factor on the inputs from which the free run leaves all bounds (10⁶ times the largest training output).
+    """Return the factor on the inputs from which the free run leaves all bounds.
+
+    The bounds are 10⁶ times the largest training output.
 
     It scales each input's deviation from its mean over the record; the measured outputs that the
     run starts from stay. Doubled until a run diverges, then bisected to 5 %; what is returned did
@@ -39,8 +42,9 @@ def divergence_scaling(
     experiment. None where no run up to `largest` diverges, as without a state; at most 1 where the
     record's own run does, and 0 where it does with its inputs at their means.
 
-    Raises: InputError: a record that does not fit the model, or a `largest` that is not above 1 and
-        at most 10⁴.
+    Raises:
+        InputError: a record that does not fit the model, or a `largest` that is not above 1 and at
+            most 10⁴.
     """
     if not 1 < check_number(largest, "largest", positive=True) <= _LARGEST_FACTOR:
         raise InputError(
@@ -60,9 +64,9 @@ def divergence_scaling(
 
 
 def margin(factor: float | None, searched: float, driven: bool) -> tuple[str, str]:
-    """Such a factor, or that there is none up to `searched`, in a sentence.
+    """Return a sentence on the factor, or that there is none up to `searched`.
 
-    With the code of a warning, or nothing.
+    The second text is the code of a warning, or empty.
 
     A model that is not `driven`, by inputs, has none to scale: its own run leaves the bounds or
     does not.
@@ -78,15 +82,15 @@ def margin(factor: float | None, searched: float, driven: bool) -> tuple[str, st
             "small_margin" if factor is not None else "",
         )
     stays, times = ("stays within", searched) if factor is None else ("leaves", factor)
-    told = (
+    text = (
         f"The free run {stays} all bounds with the inputs' deviations from their means "
         f"{times:.4g} times as large."
     )
-    return told, "small_margin" if factor is not None and factor < _MARGIN else ""
+    return text, "small_margin" if factor is not None and factor < _MARGIN else ""
 
 
 def _doubled(largest: float) -> list[float]:
-    """1, 2, 4, …, `largest`."""
+    """Return the factors 1, 2, 4, …, `largest`."""
     factors = [1.0]
     while factors[-1] < largest:
         factors.append(min(2 * factors[-1], largest))
@@ -94,7 +98,11 @@ def _doubled(largest: float) -> list[float]:
 
 
 def _below_one(diverges: Diverging) -> float:
-    """Return the factor where a run with the record's own inputs diverges: below 10⁻⁴ the last one tried, or 0."""
+    """Return the factor below 1 from which the run diverges.
+
+    The run diverges with the record's own inputs. Below 10⁻⁴ the factor is the last one tried, or
+    0.
+    """
     falling = [1.0]
     while falling[-1] >= 1 / _LARGEST_FACTOR:
         falling.append(falling[-1] / 2)
@@ -121,7 +129,10 @@ def _bisected(low: float, high: float, diverges: Diverging) -> float:
 
 
 def _middles(low: float, high: float) -> list[float]:
-    """Return all factors that a bisection between two, at most one double the other, can come to: 15 or fewer."""
+    """Return all factors that a bisection of an interval can reach: 15 or fewer.
+
+    The upper end is at most double the lower one.
+    """
     if not high > _CLOSE * low:
         return []
     middle = _middle(low, high)
@@ -135,7 +146,9 @@ def _middle(low: float, high: float) -> float:
 def _diverging(
     model: Model | MotionModel, record: Record, factors: Sequence[float]
 ) -> Bool[np.ndarray, "f"]:
-    """Return whether the free run diverges with the inputs' deviations from their means times each of up to 16 factors.
+    """Return whether the free run diverges with its inputs scaled by each of up to 16 factors.
+
+    A factor scales the inputs' deviations from their means.
 
     The runs start from the measured outputs of each experiment and go side by side.
 
@@ -181,7 +194,10 @@ def _side_by_side(
     factors: Float[Array, "f"],
     bound: Float[Array, "ny"],
 ) -> Bool[Array, "f"]:
-    """Return whether an output leaves `bound` within `steps` of free runs with `resting + factor (inputs − resting)`."""
+    """Return whether an output leaves `bound` within `steps` of each scaled free run.
+
+    The inputs of a run are `resting + factor (inputs − resting)`.
+    """
     one = jax.vmap(lambda state, row: form.step(numbers, state, row))
 
     def going_on(carry: tuple[Any, Any, Any]) -> Any:

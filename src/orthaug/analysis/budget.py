@@ -1,11 +1,11 @@
-"""What the learner found, explained by a cause, and the bias of every parameter that follows from it.
+"""Bias budget: the cause that explains the learner, and the bias of every parameter by it.
 
 With F the learner's values under the measure and Δ a cause's, the coefficient is that of P⊥F on P⊥Δ
 and the bias, estimate less truth, `Φ_μ⁺Δ` times it. One cause is named: the declared suspect that
 explains most of ‖P⊥F‖² if that is enough, else the usual suspect or product of lags that does, or
 the member of a family (`catalogue`) that explains clearly more; one of each output where none is
-sure to be all of it. The interval is the hull over all causes that noise cannot tell from it
-(`bias_hull`).
+sure to be all of it. The interval is the hull over all causes that noise cannot separate
+from it (`bias_hull`).
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ _MEASURED_ROWS = 50_000  # above which no other measure is tried
 def remedies(
     linearization: MeasureLinearization, cause: SuspectedBias, biased: Sequence[str]
 ) -> list[str]:
-    """Return sentences on what removes the bias by a cause from the parameters named, the easiest first."""
+    """Return sentences on how to remove the bias of the named parameters, the easiest first."""
     return [*_by_inputs(linearization, cause, biased), *_by_measure(linearization, cause, biased)]
 
 
@@ -121,7 +121,7 @@ def _bias(linearization: MeasureLinearization, suspect: Suspect) -> Vector:
 def _freed(
     linearization: MeasureLinearization, cause: SuspectedBias, left: Vector, biased: Sequence[str]
 ) -> tuple[str, ...]:
-    """Parameters, physical ones by their slopes, whose bias shrinks to a small part."""
+    """Return the parameters, physical ones by their slopes, whose bias shrinks to a small part."""
     names, before = linearization.problem.baseline.names, np.array(cause.bias)
     rows = dict(zip(names, np.eye(len(names)), strict=True)) | (
         linearization.slopes[0] if linearization.slopes else {}
@@ -134,17 +134,17 @@ def _freed(
 LEAST_SHARE = 0.5  # of the learner's energy that a cause must explain to be named
 _NOTHING = 0.01  # of the noise: a learner that is smaller found nothing that could be explained
 _FEWEST_LEFT = 5  # rows beyond what was fitted: where fewer are left any term explains the learner
-AS_MUCH = 0.98  # of what the cause explains: a rival cannot be told from it
-SURE_SHARE = 0.9  # from which on a cause is told without a doubt
+AS_MUCH = 0.98  # of what the cause explains: a rival is as good
+SURE_SHARE = 0.9  # from which on a cause is named without a doubt
 _NEAR = 0.5  # of what the cause explains: a rival that is named beside it
 _MOST_RIVALS = 3
 _ROUNDING = 1e-9  # of a parameter: a bias that no one can speak of
-_TOLD = 4  # parameters that a warning lists at most
+_LISTED = 4  # parameters that a warning lists at most
 
 
 @dataclass(frozen=True)
 class ParameterBias:
-    """The bias of a parameter, estimate less truth, and an interval that covers bias and noise together."""
+    """Bias of a parameter, estimate less truth, with an interval that covers bias and noise."""
 
     name: str
     value: float
@@ -154,7 +154,7 @@ class ParameterBias:
     errors: float | None
     """Its size in standard errors; None where there are none."""
     ci95: tuple[float, float] | None
-    """The hull over all causes that noise cannot tell apart; None where that determines nothing."""
+    """The hull over all causes that noise cannot separate; None where that determines nothing."""
     determined: bool = True
     """Whether the data determine the parameter beside this learner: the hull is no wider than the
     value itself.
@@ -163,7 +163,7 @@ class ParameterBias:
 
 @dataclass(frozen=True, eq=False)
 class Budget:
-    """The bias of every parameter by the causes that explain the learner, that of the largest part first."""
+    """Bias of every parameter by the causes that explain the learner, the largest part first."""
 
     causes: tuple[SuspectedBias, ...]
     parameters: tuple[ParameterBias, ...]
@@ -172,12 +172,12 @@ class Budget:
 
     @property
     def cause(self) -> SuspectedBias:
-        """Return what explains most."""
+        """Cause that explains most."""
         return self.causes[0]
 
     @property
     def share(self) -> float:
-        """Return how much of the learner that explains.
+        """Share of the learner that the causes explain.
 
         Where each output has a cause, of what is learned of its own.
         """
@@ -193,7 +193,7 @@ class Budget:
 def linearization_of(
     fit: Estimate, measure: Measure, physics: PhysicsMap | None = None
 ) -> MeasureLinearization:
-    """Return what biases of a fit are computed on; `measure` is the one that θ was split under."""
+    """Return the linearization of a fit for biases, under the measure that θ was split under."""
     weighed = weigh_problem(measure, fit.problem)
     learns = fit.model.form.bound is not None
     learned = fit.model.learner_at(weighed.points.x) if learns else None
@@ -222,7 +222,7 @@ def lagged_budget(
 def budget_on(
     linearization: MeasureLinearization, fit: Estimate, suspects: Sequence[Suspect]
 ) -> Budget | None:
-    """The same on a ground that is there already."""
+    """Return the budget of a fit on a given linearization."""
     if (
         not linearization.problem.baseline.names
         or linearization.learned is None
@@ -257,16 +257,16 @@ def budget_on(
     rows, warnings = (), []
     if linearization.physics is not None:
         rows, warnings = _physical_rows(linearization, fit, candidates, moved, causes, other)
-    told = (
+    raised = (
         _warning(own, cause, (*rows, *parameters), suspects, own is not linearization)
         for own, cause in found
     )
-    told = [warning for warning in told if warning is not None]
+    raised = [warning for warning in raised if warning is not None]
     open_ones = [row.name for row in (*rows, *parameters) if not row.determined]
     if open_ones:
         own, cause = found[0]
-        told.append(undetermined_warning(open_ones, candidates, remedies(own, cause, open_ones)))
-    return Budget(causes, parameters, rows, (*told, *warnings))
+        raised.append(undetermined_warning(open_ones, candidates, remedies(own, cause, open_ones)))
+    return Budget(causes, parameters, rows, (*raised, *warnings))
 
 
 def _norm(rows: Sequence[Vector]) -> Vector | float:
@@ -274,7 +274,10 @@ def _norm(rows: Sequence[Vector]) -> Vector | float:
 
 
 def noise_share(linearization: MeasureLinearization, fit: Estimate) -> float:
-    """ν: how much of what the learner holds beside the physics is noise, of which it takes σ² a weight that it uses."""
+    """Return ν, the share of noise in what the learner holds beside the physics.
+
+    Noise takes σ² for each weight that the learner uses.
+    """
     noise = fit.model.statistics.noise
     if noise is None:
         return 0.0
@@ -301,7 +304,7 @@ def _candidates(
     suspects: Sequence[Suspect],
     fit: Estimate,
 ) -> list[Candidate]:
-    """Return the named causes, and what may stand instead of one of them."""
+    """Return the named causes and their rivals."""
     several = " and ".join(cause.suspect.name for _, cause in found)
     kept: list[Candidate] = [
         NamedCause(several, min(explains(cause) for _, cause in found), bias, rest=rest)
@@ -329,7 +332,10 @@ def _physical_rows(
     causes: Sequence[SuspectedBias],
     other: Vector | float,
 ) -> tuple[tuple[ParameterBias, ...], list[Warning]]:
-    """Return the biases of the physical parameters: the hull over the causes that move any of them farthest."""
+    """Return the biases of the physical parameters: the hull over the causes that matter.
+
+    Those are the causes that move any of them farthest.
+    """
     assert linearization.physics is not None
     physical, slopes, bias = (
         fit.physical(linearization.physics),
@@ -371,7 +377,9 @@ def _causes(
     suspects: Sequence[Suspect],
     something: Bool[np.ndarray, "ny"],
 ) -> tuple[list[tuple[MeasureLinearization, SuspectedBias]], list[SuspectedBias]]:
-    """Return what explains the learner, with the ground that it does so on: all of it, or what is learned of one output.
+    """Return the causes that explain the learner, each with its linearization.
+
+    One cause explains all of it, or one cause each output's part.
 
     Args:
         something: whether anything is learned of an output.
@@ -404,7 +412,7 @@ def _causes(
 def _owners(
     causes: Sequence[SuspectedBias], moved: Float[np.ndarray, "k n"]
 ) -> list[tuple[str, float]]:
-    """Of each parameter the cause that moves it most, and its share."""
+    """Return for each parameter the cause that moves it most, and its share."""
     return [(causes[i].suspect.name, explains(causes[i])) for i in np.argmax(np.abs(moved), axis=0)]
 
 
@@ -415,8 +423,7 @@ def named_cause(
 
     None where that is less than `least`.
 
-    Of what no one declared only what the learner sees counts: the rest is no likely cause of what
-    it found.
+    Undeclared terms count only if the learner sees them: others are no likely cause.
     """
     for table, families in (
         (_declared(linearization, suspects), ()),
@@ -436,13 +443,13 @@ def named_cause(
 def _likeliest(
     linearization: MeasureLinearization, suspects: Sequence[Suspect]
 ) -> SuspectedBias | None:
-    """Return what explains most of the learner, however little, declared or not."""
+    """Return the suspect that explains most of the learner, however little, declared or not."""
     found = (*_declared(linearization, suspects), *_usual(linearization))
     return max((entry for entry in found if entry.explained), key=explains, default=None)
 
 
 def explains(entry: SuspectedBias | TermBias) -> float:
-    """Its share of the learner."""
+    """Return the share of the learner that an entry explains."""
     return entry.explained or 0.0
 
 
@@ -462,7 +469,7 @@ def _usual(linearization: MeasureLinearization) -> tuple[SuspectedBias, ...]:
 
 
 def _families(linearization: MeasureLinearization) -> tuple[SuspectedBias, ...]:
-    """Return what every member of the catalogue does that the learner sees."""
+    """Return the biases by every member of the catalogue that the learner sees."""
     table = linearization.table(catalogue(linearization.problem), certify=False, every=False)
     return tuple(
         entry
@@ -478,7 +485,8 @@ def rival_of(
 
     None where there is none.
 
-    As a dead zone and a saturation of what the physics has a term in: their sum is that term.
+    An example is a dead zone and a saturation where the physics has a linear term: their sum is
+    that term.
     """
     assert cause.explained
     if cause.suspect in suspects:
@@ -504,7 +512,7 @@ def rival_of(
 def near_causes(
     linearization: MeasureLinearization, cause: SuspectedBias, suspects: Sequence[Suspect]
 ) -> list[SuspectedBias]:
-    """Return the next best causes, one of each variable, beside one that no one declared and that is not sure."""
+    """Return the next best causes, one per variable, for a cause undeclared and unsure."""
     assert cause.explained
     if cause.suspect in suspects or cause.explained >= SURE_SHARE:
         return []
@@ -523,11 +531,12 @@ def near_causes(
 def left_over(
     linearization: MeasureLinearization, cause: SuspectedBias, suspects: Sequence[Suspect]
 ) -> Float[np.ndarray, "k nt"]:
-    """Return standard deviations of the bias of θ that the cause does not tell: k directions, each of one unknown size.
+    """Return the standard deviations of the bias of θ that the cause leaves open.
 
-    What it leaves of the learner counts as biased by as much for its size as the cause, of unknown
-    sign; beside that by what the next best cause makes of it. What may stand instead of the cause
-    is in the hull.
+    They are k directions, each of one unknown size.
+
+    The unexplained part of the learner is assumed to be as biased for its size as the cause, with
+    unknown sign; the next best cause adds its own bias. Rivals of the cause are in the hull.
     """
     assert cause.explained
     after = _likeliest(
@@ -538,7 +547,7 @@ def left_over(
 
 
 def _moved(cause: SuspectedBias) -> Vector:
-    """Return what a cause of the size found makes of θ."""
+    """Return θ moved by a cause of the size found."""
     return (cause.coefficient_found or 0.0) * np.array(cause.bias)
 
 
@@ -562,17 +571,24 @@ def parameter_biases(
         if np.isfinite(b):
             errors, relative = float(abs(b) / s) if s > 0 else None, float(b / v) if v else None
             limits = (float(ci[0]), float(ci[1])) if np.isfinite(ci).all() else None
-            told = limits is None or is_determined(float(v), float(s), freedom, *limits)
+            determined = limits is None or is_determined(float(v), float(s), freedom, *limits)
             found.append(
                 ParameterBias(
-                    name, float(b), cause, share, relative, errors, limits if told else None, told
+                    name,
+                    float(b),
+                    cause,
+                    share,
+                    relative,
+                    errors,
+                    limits if determined else None,
+                    determined,
                 )
             )
     return tuple(found)
 
 
 def _unbounded(names: Sequence[str], std: Vector, ends: Matrix) -> list[Warning]:
-    """Which physical parameters have an interval, but none with their bias."""
+    """Return a warning where physical parameters have an interval but no bounded bias."""
     none = [
         name
         for name, s, e in zip(names, std, ends, strict=True)
@@ -580,8 +596,10 @@ def _unbounded(names: Sequence[str], std: Vector, ends: Matrix) -> list[Warning]
     ]
     if not none:
         return []
-    told = f"no interval of {', '.join(none)} counts the bias: some theta within those that do have"
-    return [Warning("physics_not_met", f"{told} no physical parameters.")]
+    text = (
+        f"no interval of {', '.join(none)} includes the bias: some theta within the intervals that"
+    )
+    return [Warning("physics_not_met", f"{text} do belongs to no physical parameters.")]
 
 
 def _warning(
@@ -591,16 +609,16 @@ def _warning(
     suspects: Sequence[Suspect],
     of_one: bool,
 ) -> Warning | None:
-    """Return what a cause biases by more than the standard error: its size, remedies.
+    """Return the warning on biases above the standard error: cause, size and remedies.
 
-    And how sure the cause is.
+    The warning also says how sure the cause is.
     """
     own, name = [row for row in rows if row.cause == cause.suspect.name], cause.suspect.name
     large = [row for row in own if (row.errors or 0.0) > 1 and abs(row.relative or 1.0) > _ROUNDING]
     if not large:
         return None
     listed, share, there = (
-        told_biases(large),
+        list_biases(large),
         explains(cause),
         f" in {cause.suspect.output}" if of_one else "",
     )
@@ -630,14 +648,14 @@ def _warning(
     )
 
 
-def told_biases(large: Sequence[ParameterBias]) -> str:
+def list_biases(large: Sequence[ParameterBias]) -> str:
     """Return the largest biases in words."""
-    shown = sorted(large, key=lambda entry: -(entry.errors or 0.0))[:_TOLD]
+    shown = sorted(large, key=lambda entry: -(entry.errors or 0.0))[:_LISTED]
     more = f" and {len(large) - len(shown)} more" if len(large) > len(shown) else ""
-    return f"{', '.join(map(_told_bias, shown))}{more}"
+    return f"{', '.join(map(_describe_bias, shown))}{more}"
 
 
-def _told_bias(entry: ParameterBias) -> str:
+def _describe_bias(entry: ParameterBias) -> str:
     share = "" if entry.relative is None else f", {percent(entry.relative, sign='+')}"
     return (
         f"{entry.name} by {entry.value:+.2g} ({plain_number(entry.errors or 0.0)} standard "

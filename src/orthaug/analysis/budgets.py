@@ -1,4 +1,4 @@
-"""The verb `bias_budget`: what the learner found and the bias that follows, of lagged physics and of a motion."""
+"""The verb `bias_budget`: the cause that explains the learner and the bias that follows from it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from orthaug._base.checks import check_type
 from orthaug._base.errors import InputError
 from orthaug.analysis.budget import Budget, lagged_budget
 from orthaug.analysis.motion_bias import suspected_bias
-from orthaug.analysis.motion_budget import MotionBudget, told_budget
+from orthaug.analysis.motion_budget import MotionBudget, declared_budget
 from orthaug.analysis.motion_suspects import MotionSuspect
 from orthaug.analysis.suspects import Suspect
 from orthaug.fitting.estimates import Estimate
@@ -29,20 +29,23 @@ def bias_budget(
 
     None where no cause explains enough of it.
 
-    Args: fit: with a learner and the orthogonal structure; of others there is no budget. Of lagged
-        physics or a motion. suspects: terms that may be missing, looked at first; of a motion
-        `MotionSuspect`. physics: the map from physical parameters to θ, for their biases; a motion
-        has none. measure: what θ was split under, where that is not the training measure; a
-        motion's fit knows its own.
+    Args:
+        fit: with a learner and the orthogonal structure; of others there is no budget. Of lagged
+            physics or a motion.
+        suspects: terms that may be missing, looked at first; of a motion `MotionSuspect`.
+        physics: the map from physical parameters to θ, for their biases; a motion has none.
+        measure: what θ was split under, where that is not the training measure; a motion's fit
+            knows its own.
 
-    Returns: The `cause`, the `share` of the learner that it explains, and the bias of each of
+    Returns:
+        The `cause`, the `share` of the learner that it explains, and the bias of each of
         `parameters` and `physical`, estimate less truth, with an interval that covers bias and
-        noise together: the hull over all causes that noise cannot tell apart. Where `determined` is
+        noise together: the hull over all causes that noise cannot separate. Where `determined` is
         False that is wider than the value itself, and there is none.
 
-    Raises: InputError: arguments that the kind of physics does not take; another measure than that
-        of the fit; a suspect on
-            channels or lags that the data do not have.
+    Raises:
+        InputError: arguments that the kind of physics does not take; another measure than that of
+            the fit; a suspect on channels or lags that the data do not have.
 
     Examples:
         >>> import numpy as np
@@ -75,4 +78,4 @@ def bias_budget(
     if not fit.status.ok:
         return None
     declared = cast("Sequence[MotionSuspect]", suspects)
-    return told_budget(fit, declared, suspected_bias(fit, declared) if declared else [])
+    return declared_budget(fit, declared, suspected_bias(fit, declared) if declared else [])

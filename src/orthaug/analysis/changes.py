@@ -1,4 +1,6 @@
-"""Which change of a model would lower its error, and by how much: further lags, an offset, what a learner could find.
+"""Changes of a model that would lower its error, and by how much.
+
+They are further lags, an offset, and a learner's functions.
 
 A change adds columns h to the prediction. One step ahead the residual is regressed on them beside
 the physics' own; of a free run on what they become there, `S_k = h_k + Σ_i A_{k,i} S_{k−i}`, the
@@ -32,7 +34,8 @@ _INPUTS_FURTHER, _OUTPUTS_FURTHER = 10, 4  # lags beyond the largest of the mode
 _ROWS = 20_000  # that are looked at, spread over the record in stretches
 _STRETCHES = 8
 _ROWS_PER_COLUMN = 5
-_FAR = 0.3  # error of a free run, in the output's deviation, beyond which sensitivities along it say little
+# Error of a free run, in the output's deviation, beyond which sensitivities along it say little
+_FAR = 0.3
 _SURE = 3.0  # standard errors that a gain must exceed, for it is the largest of many
 _SIMPLER = 0.8  # of the gain of a learner, with which a single lag is as good
 
@@ -66,12 +69,12 @@ class Change:
 
     @property
     def gains(self) -> bool:
-        """Return whether the error is predicted to fall by enough to name it."""
+        """True if the error is predicted to fall by enough to name the change."""
         return self.fall >= fall_of(WORTH)
 
     @property
     def prediction(self) -> str:
-        """Return what it is predicted to gain, as a clause."""
+        """Predicted gain, as a clause."""
         if self.kind == "criterion" and not self.gains:
             return (
                 "the parameters would not be biased so; the error of its free run is not "
@@ -87,7 +90,7 @@ class Change:
 
 
 def fall_of(share: float) -> float:
-    """Of an RMS error, when a share of its square is gone."""
+    """Return the relative fall of an RMS error when a share of its square is gone."""
     return 1.0 - float(np.sqrt(1.0 - min(max(share, 0.0), 1.0)))
 
 
@@ -102,11 +105,14 @@ def model_changes(
 ) -> tuple[Change, ...]:
     """Return the best change of each kind that is worth making, the best one first.
 
-    Args: response: of the training data, whose errors are to be explained: the prediction, or with
-        `simulates` the free run. skip: its leading rows that do not count. one_step: the
-        prediction, for a free run that is far from what was measured; None to go along it all the
-        same. functions: what functions of the regressor are known to explain of the errors one step
-        ahead.
+    Args:
+        response: of the training data, whose errors are to be explained: the prediction, or with
+            `simulates` the free run.
+        skip: its leading rows that do not count.
+        one_step: the prediction, for a free run that is far from what was measured; None to go
+            along it all the same.
+        functions: what functions of the regressor are known to explain of the errors one step
+            ahead.
     """
     off = float(np.max(rms_errors(response, skip) / fit.problem.deviation))
     with one_blas_thread():
@@ -117,7 +123,10 @@ def model_changes(
 
 
 def own_share(fit: Estimate, one_step: Response) -> Share:
-    """Return what the physics' own columns explain of the one-step residual: nothing where they were fitted to it."""
+    """Return the share of the one-step residual that the physics' own columns explain.
+
+    It is zero where the columns were fitted to that residual.
+    """
     with one_blas_thread():
         candidates = Candidates(fit, one_step, False, 0, own=True)
         return (
@@ -129,7 +138,7 @@ def own_share(fit: Estimate, one_step: Response) -> Share:
 class Candidates:
     """Columns that a model might be given, over the rows of a response.
 
-    With `own` none beside the physics'.
+    With `own` there are only those of the physics.
     """
 
     fit: Estimate
@@ -144,7 +153,7 @@ class Candidates:
 
     @property
     def base(self) -> int:
-        """Return how many columns the physics has, its offsets with it."""
+        """Number of columns of the physics, its offsets included."""
         return len(self.fit.theta) + len(self.fit.problem.outputs)
 
     @cached_property
@@ -179,7 +188,7 @@ class Candidates:
     def stretches(self) -> list[tuple[Experiment, Trajectory, int, int]]:
         """Rows that are looked at, from the second number on.
 
-        From the first on the sensitivities are carried along.
+        Sensitivities are carried along from the first number on.
         """
         problem, first = self.fit.problem, self.first
         most = _ROWS // len(problem.outputs)
@@ -203,7 +212,7 @@ class Candidates:
 
     @cached_property
     def usable(self) -> bool:
-        """Return whether there are enough rows for all columns."""
+        """True if there are enough rows for all columns."""
         rows = sum(len(e) - self.first - skipped for e, _, _, skipped in self.stretches)
         return rows * len(self.fit.problem.outputs) >= _ROWS_PER_COLUMN * max(self._width, 8)
 
@@ -218,14 +227,14 @@ class Candidates:
 
     @cached_property
     def sums(self) -> BlockSums:
-        """Of all rows, each output in its deviation."""
+        """Block sums of all rows, each output in its deviation."""
         columns, targets = zip(*(self._rows(*stretch) for stretch in self.stretches), strict=True)
         return BlockSums.of(np.concatenate(columns), np.concatenate(targets))
 
     def _rows(
         self, piece: Experiment, run: Trajectory, begin: int, skip: int
     ) -> tuple[Matrix, Vector]:
-        """Columns (rows · ny, width) and errors of one stretch."""
+        """Return columns (rows · ny, width) and errors of one stretch."""
         problem, record, first = self.fit.problem, self.fit.problem.record, self.first
         there = slice(begin, begin + len(piece) - first)
         error = (piece.outputs[first:] - run.model[there])[:, :, None]
@@ -248,7 +257,10 @@ class Candidates:
         return scaled.reshape(-1, columns.shape[2]), error.reshape(-1)
 
     def _columns(self, piece: Experiment, record: Record) -> Float[np.ndarray, "N ny m"]:
-        """Physics, offsets, then unless `own` the lags and the functions, each of these for every output."""
+        """Return columns of physics and offsets, unless `own` also lags and functions.
+
+        Each of the latter is there for every output.
+        """
         problem = self.fit.problem
         x = lag_matrix(piece, problem.layout, record, self.first)
         phi = np.asarray(problem.baseline.phi(x, problem.layout, problem.outputs, np))
@@ -277,7 +289,7 @@ class Candidates:
         return np.array([means[lag.channel] for lag in self.lags])
 
     def _carried(self, columns: np.ndarray, piece: Experiment, record: Record) -> np.ndarray:
-        """Return what the columns become in the free run, from a start that does not depend on them."""
+        """Return the columns carried through the free run, from a start independent of them."""
         form, first, ny = self.fit.model.form, self.first, columns.shape[1]
         states = form.start(piece.outputs, np.arange(first, len(piece)))
         inputs = form.inputs(piece, record)[first - form.first_row :]
@@ -291,7 +303,7 @@ class Candidates:
     def changes(self, functions: float = 0.0) -> tuple[Change, ...]:
         """Return the best of each kind that is worth making, the best one first.
 
-        As `model_changes`.
+        See `model_changes`.
         """
         if not self.usable or not np.isfinite(self.sums.grams).all():
             return ()
@@ -334,7 +346,7 @@ class Candidates:
         return tuple(best.values())
 
     def _learner(self) -> str:
-        """Return what a learner could be given."""
+        """Return a clause on the inputs that a learner could be given."""
         model, problem = self.fit.model, self.fit.problem
         if model.form.bound is None:
             return "a learner"

@@ -1,6 +1,6 @@
-"""Were the inputs recorded under feedback? Whether past outputs tell an input beside its own past.
+"""Detection of feedback in the record: past outputs that predict an input beside its own past.
 
-In open loop an input is told by nothing but its own past. Under feedback, past outputs carry the
+In open loop only its own past predicts an input. Under feedback, past outputs carry the
 reference and the disturbances into it (Granger 1969; Söderström and Stoica 1989, ch. 10).
 """
 
@@ -19,8 +19,8 @@ from orthaug.analysis.predictability import BlockSums, Share
 from orthaug.data.record import Record
 
 _LEVEL = 0.001  # of the test, divided by the number of inputs
-_SHARE = 0.02  # of what the own past leaves of an input: what the outputs tell counts from there on
-_SURE = 4.0  # standard errors over blocks by which it stands out
+_SHARE = 0.02  # of what its own past leaves of an input: the share by outputs counts from there on
+_SURE = 4.0  # standard errors over blocks by which it is significant
 _INPUT_LAGS, _OUTPUT_LAGS = 40, 4
 _BESIDE = 10  # lags of the other inputs
 _LEVELS = 6  # of an input that is held: those before the last change that count as its past
@@ -31,12 +31,15 @@ _NOTHING = 1e-3  # of an input's deviation: what its own past leaves is then no 
 _RANK = 1e-10
 _JUMP = 8.0  # times the median size of what its own past leaves of an input
 _ROUNDS = 4
-_PERIODIC = 0.9  # autocorrelation at a period, beyond what short lags tell
+_PERIODIC = 0.9  # autocorrelation at a period, beyond what short lags explain
 
 
 @dataclass(frozen=True)
 class Feedback:
-    """That past outputs tell `share` of what the own past of the input `name` leaves, at the level `p`."""
+    """Feedback found on an input: past outputs predict a `share` of what its own past leaves.
+
+    `name` is the input, `p` the level of the test.
+    """
 
     name: str
     share: float
@@ -46,14 +49,14 @@ class Feedback:
 def feedback_in(record: Record) -> tuple[Feedback, ...]:
     """Return the inputs that surely follow past outputs.
 
-    Of an input that its own past tells, nothing can be said.
+    Nothing can be said of an input that its own past predicts.
     """
     found = []
     with one_blas_thread():
         for j, channel in enumerate(record.inputs):
-            told = _told(record, j)
-            if told is not None and told[1] < _LEVEL / len(record.inputs):
-                found.append(Feedback(channel.name, *told))
+            tested = _input_share(record, j)
+            if tested is not None and tested[1] < _LEVEL / len(record.inputs):
+                found.append(Feedback(channel.name, *tested))
     return tuple(found)
 
 
@@ -68,20 +71,19 @@ def closed_loop(record: Record) -> tuple[Warning, ...]:
     outputs = ", ".join(channel.name for channel in record.outputs)
     text = (
         f"past {outputs} predict{'s' if len(record.outputs) == 1 else ''} {named}: the data "
-        "look recorded under feedback. An estimate is then consistent only with the right "
-        "noise: one step ahead white noise in the equation, on the free run white noise on the "
-        "sensor, in both the whole physics; else what the feedback makes of noise and of "
-        "missing physics is taken for an effect of the input. Record the reference and model "
-        "the loop with it as the input, move the reference much more than the noise is, or "
-        "record without the controller."
+        "look recorded under feedback. An estimate is then consistent only with complete "
+        "physics and the right noise: white in the equation for one step ahead, white on the "
+        "sensor for the free run. Otherwise feedback of noise and of missing physics counts as "
+        "an effect of the input. Record the reference and model the loop with it as the input, "
+        "make the reference much larger than the noise, or record without the controller."
     )
     return (Warning("closed_loop", text),)
 
 
-def _told(record: Record, j: int) -> tuple[float, float] | None:
-    """Share and level by which past outputs tell input j.
+def _input_share(record: Record, j: int) -> tuple[float, float] | None:
+    """Return share and level of the prediction of input j by past outputs.
 
-    None where that is not enough, or cannot be told.
+    None where that is not enough, or cannot be tested.
     """
     every = (
         _rows(e.inputs[:, j], np.delete(e.inputs, j, axis=1), e.outputs) for e in record.experiments
@@ -99,11 +101,13 @@ def _told(record: Record, j: int) -> tuple[float, float] | None:
         )
         pieces = [p for p in pieces if (p[0].shape[1], p[1].shape[1]) == best]
     own, outputs, target = (np.concatenate(parts) for parts in zip(*pieces, strict=True))
-    return told_beside(own, outputs, target)
+    return predicted_share(own, outputs, target)
 
 
-def told_beside(own: Matrix, others: Matrix, target: Vector) -> tuple[float, float] | None:
-    """Cross-validated share of what `own` leaves of a target that `others` tell, and the level of a robust Wald test.
+def predicted_share(own: Matrix, others: Matrix, target: Vector) -> tuple[float, float] | None:
+    """Return the share of a target that `others` predict beside `own`, and its level.
+
+    The share is cross-validated, of what `own` leaves; the level is that of a robust Wald test.
 
     None where there are too few rows, `own` leaves nothing, or the share is not surely large
     enough.
@@ -129,7 +133,10 @@ def told_beside(own: Matrix, others: Matrix, target: Vector) -> tuple[float, flo
 
 
 def _usual(own: Matrix, target: Vector) -> np.ndarray:
-    """Return the rows on which an input does not jump: those of a reference would hide all that lies between them."""
+    """Return the rows on which an input does not jump.
+
+    Jumps of a reference would hide everything between them.
+    """
     base, kept = (
         np.column_stack([np.ones(len(target)), _scaled(own)]),
         np.ones(len(target), dtype=bool),
@@ -143,18 +150,18 @@ def _usual(own: Matrix, target: Vector) -> np.ndarray:
 
 
 def _wald(columns: Matrix, target: Vector) -> float:
-    """Level at which all coefficients are 0, robust against errors of unequal size (White 1980)."""
+    """Return the level at which all coefficients are 0, robust to unequal errors (White 1980)."""
     u, size, _ = np.linalg.svd(columns, full_matrices=False)
     u = u[:, size > 1e-9 * size.max(initial=0.0)]
-    told = u.T @ target
-    scores = u * (target - u @ told)[:, None]
+    moments = u.T @ target
+    scores = u * (target - u @ moments)[:, None]
     spread = scores.T @ scores * len(target) / max(len(target) - u.shape[1], 1)
-    statistic = float(told @ np.linalg.lstsq(spread, told, rcond=None)[0])
+    statistic = float(moments @ np.linalg.lstsq(spread, moments, rcond=None)[0])
     return float(scipy.special.chdtrc(max(u.shape[1], 1), statistic))
 
 
 def _rows(u: Vector, beside: Matrix, y: Matrix) -> tuple[Matrix, Matrix, Vector] | None:
-    """Past of an input and those `beside` it, past outputs, and the input's value, on the rows that are looked at."""
+    """Return an input's past and that of those `beside` it, past outputs, and the input."""
     u, beside, y = u[-_MOST:], beside[-_MOST:], y[-_MOST:]
     changes = np.flatnonzero(np.diff(u)) + 1
     if len(changes) < (1 - _HELD) * (len(u) - 1):
@@ -185,7 +192,7 @@ def _rows(u: Vector, beside: Matrix, y: Matrix) -> tuple[Matrix, Matrix, Vector]
 
 
 def _own_past(x: Vector, count: int, period: int | None, first: int) -> Matrix:
-    """So many lags, and those about a period."""
+    """Return the first `count` lags, and those about a period."""
     lags = [*range(1, count + 1), *(() if period is None else range(period - 1, period + 2))]
     rows = np.arange(first, len(x))
     return (

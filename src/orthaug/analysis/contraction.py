@@ -1,4 +1,7 @@
-"""Does a free run forget its start? The quadratic norm in which sampled A_k contract (Lohmiller and Slotine 1998)."""
+"""Contraction of a free run: a quadratic norm in which sampled A_k contract.
+
+After Lohmiller and Slotine (1998): a contracting run forgets its start.
+"""
 
 from __future__ import annotations
 
@@ -53,7 +56,9 @@ def contraction(
     along: Feedback | None = None,
     response: Response | None = None,
 ) -> Contraction | None:
-    """Return the quadratic norm in which the free run contracts on as many of at most 2000 sampled points as was reached.
+    """Return a quadratic norm in which the free run contracts on as many points as possible.
+
+    At most 2000 points are sampled.
 
     It minimises `max_k ‖T A_k T⁻¹‖₂`, P = TᵀT. Along `T(t) = exp(tX) T`, X symmetric, the logarithm
     of each norm is convex in t with the slope `uᵀXu − vᵀXv`, u and v its singular vectors: there
@@ -90,13 +95,13 @@ def contraction(
 
 
 def _sizes(t: Matrix, a: Float[np.ndarray, "m n n"]) -> Vector:
-    """‖T A T⁻¹‖₂ of each matrix."""
+    """Return ‖T A T⁻¹‖₂ of each matrix."""
     b = t @ a @ np.linalg.inv(t)
     return np.sqrt(np.linalg.eigvalsh(b.swapaxes(1, 2) @ b)[:, -1])
 
 
 def _best_metric(a: Float[np.ndarray, "m n n"]) -> Matrix:
-    """T (n, n) in which all of the matrices contract, or else as many as was reached.
+    """Return T (n, n) in which all of the matrices contract, or else as many as was reached.
 
     Deterministic.
     """
@@ -114,7 +119,7 @@ def _best_metric(a: Float[np.ndarray, "m n n"]) -> Matrix:
 
 
 def _metric(a: Float[np.ndarray, "m n n"]) -> Matrix:
-    """T (n, n) with a small largest `‖T A T⁻¹‖₂`, close to the least."""
+    """Return T (n, n) with a small largest `‖T A T⁻¹‖₂`, close to the least."""
     n, bound, active = a.shape[1], np.abs(np.linalg.eigvals(a)).max(), evenly(len(a), _ACTIVE)
     best = t = min([np.eye(n), *_lyapunov(a.mean(axis=0))], key=lambda t: _sizes(t, a).max())
     sizes, least = _sizes(t, a), max(_sizes(t, a).max(), 1e-9)
@@ -132,7 +137,10 @@ def _metric(a: Float[np.ndarray, "m n n"]) -> Matrix:
 
 
 def _lyapunov(mean: Matrix) -> Iterator[Matrix]:
-    """Factors T of P = TᵀT with `(A/c)ᵀ P (A/c) − P = −I`, so that `‖A‖_P < c`, for some c above the radius of A."""
+    """Yield factors T of P = TᵀT with `‖A‖_P < c`, for some c above the radius of A.
+
+    They solve `(A/c)ᵀ P (A/c) − P = −I`.
+    """
     radius = max(float(np.abs(np.linalg.eigvals(mean)).max()), 1e-3)
     for c in (radius**0.95, radius**0.8, radius**0.5, 1.1 * radius, 1.5 * radius):
         if c > radius:
@@ -143,7 +151,7 @@ def _lyapunov(mean: Matrix) -> Iterator[Matrix]:
 
 
 def _descend(a: Float[np.ndarray, "m n n"], sharpness: float) -> Matrix:
-    """Y that lowers `log Σ σ^sharpness / sharpness`, over all singular values σ of all Y A Y⁻¹, from Y = I."""
+    """Return Y that lowers `log Σ σ^sharpness / sharpness` over the σ of all Y A Y⁻¹, from I."""
     from scipy import optimize  # slow to import
 
     n = a.shape[1]

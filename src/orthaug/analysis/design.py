@@ -57,7 +57,7 @@ class Pattern(NamedTuple):
         return unit[np.arange(samples) // self.hold % len(unit)]
 
     def neighbours(self) -> list[Pattern]:
-        """Patterns with one level or the signs of a pair changed, or a level taken out or given twice."""
+        """Return patterns with one level or a pair's signs changed, or a level taken or doubled."""
         x, near = self.levels, set()
         for i, v in enumerate(x):
             near |= {
@@ -72,7 +72,10 @@ class Pattern(NamedTuple):
 
 
 def starting_patterns(period: int, seed: int) -> list[Pattern]:
-    """Squares of about this period cut at every length, short binary and four-level patterns, and some at random."""
+    """Return patterns to start from: cut squares of about this period, short ones, and random ones.
+
+    Squares are cut at every length; short patterns have two or four levels.
+    """
     rng, patterns = np.random.default_rng(seed), []
     for hold in sorted({1} if period <= 16 else {round(period / 6), round(period / 12)}):
         square = [1.0 if k * hold % period < period / 2 else -1.0 for k in range(LONGEST_PATTERN)]
@@ -93,7 +96,7 @@ def starting_patterns(period: int, seed: int) -> list[Pattern]:
 
 
 def families(samples: int, seed: int) -> tuple[dict[str, Vector], dict[str, int]]:
-    """Named signals of amplitude 1, and the periods of the square waves among them."""
+    """Return named signals of amplitude 1, and the periods of the square waves among them."""
     from orthaug.analysis import signals  # scipy.signal is slow to import
 
     def spaced(first: int, last: int) -> list[int]:
@@ -151,7 +154,7 @@ Factors = Float[
 
 @runtime_checkable
 class DesignPlant(Protocol):
-    """What is simulated for inputs side by side: `Plant`, or that of a motion.
+    """Simulated system for many inputs side by side: `Plant`, or that of a motion.
 
     `theta` are the parameters.
     """
@@ -167,7 +170,7 @@ class DesignPlant(Protocol):
     def rows(
         self, u: Float[np.ndarray, "N M"]
     ) -> tuple[Float[np.ndarray, "M R ny nt+1"], np.ndarray]:
-        """Rows `[Φ Δ]`, zero where they run away, and the weights of the outputs (M, 1, ny, 1)."""
+        """Return rows `[Φ Δ]`, zero where they run away, and the outputs' weights (M, 1, ny, 1)."""
         ...
 
 
@@ -186,7 +189,10 @@ class Candidate(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """An input (N,) and its prediction: `bias` and `std` (nt,) in θ's units, √cost, what else was tried, best first."""
+    """An input (N,) and its predicted `bias` and `std` (nt,) in θ's units, with √cost.
+
+    `tried` lists the other inputs, best first.
+    """
 
     signal: Vector
     kind: str
@@ -221,15 +227,22 @@ def design_input(
     initial_outputs: Any = 0.0,
     iterations: int = 30,
 ) -> Design:
-    """Return the input of least predicted error of θ within minimum ≤ u ≤ maximum and |u_k − u_{k−1}| ≤ rate · Ts.
+    """Return the input of least predicted error of θ within limits of amplitude and rate.
 
-    Args: baseline: made of terms; of channels with the names `outputs` and `inputs`. sampling_time:
-        Ts, s. samples: N. amplitude: the limits are ±amplitude, in the channel's unit; or `minimum`
-        and `maximum` instead. rate: in the channel's unit per second, counted from 0, or from the
-        limit next to it, before the first sample. suspects: with their coefficients; without any
-        the design has least variance (A-optimal for W θ). noise: standard deviation of the equation
-        noise in the output's unit, or one for each; 0 counts the bias alone.
-            Without suspects 0 means 1, and `std` is per unit of noise.
+    The limits are minimum ≤ u ≤ maximum and |u_k − u_{k−1}| ≤ rate · Ts.
+
+    Args:
+        baseline: made of terms; of channels with the names `outputs` and `inputs`.
+        sampling_time: Ts, s.
+        samples: N.
+        amplitude: the limits are ±amplitude, in the channel's unit; or `minimum` and `maximum`
+            instead.
+        rate: in the channel's unit per second, counted from 0, or from the limit next to it, before
+            the first sample.
+        suspects: with their coefficients; without any the design has least variance (A-optimal for
+            W θ).
+        noise: standard deviation of the equation noise in the output's unit, or one for each; 0
+            counts the bias alone. Without suspects 0 means 1, and `std` is per unit of noise.
         theta: θ to simulate with (nt,); None for the baseline's initial values.
         weights: W, (nt,) for a diagonal, or (m, nt), such as dp/dθ / p for physical parameters p;
             None for 1/|θ|.
@@ -239,9 +252,10 @@ def design_input(
         initial_outputs: before the first row, a number, (ny,) or (largest lag, ny).
         iterations: the most improvements of one pattern; `seed` is that of the random candidates.
 
-    Raises: InputError: numbers out of range, unknown channels, a suspect without coefficient, θ of
-        0 without `weights`,
-            a simulated output that runs away, no candidate within the cap on the condition number.
+    Raises:
+        InputError: numbers out of range, unknown channels, a suspect without coefficient, θ of 0
+            without `weights`, a simulated output that runs away, no candidate within the cap on the
+            condition number.
     """
     sampling_time = check_number(sampling_time, "sampling_time", positive=True)
     limits = input_limits(amplitude, minimum, maximum), rate, condition
@@ -274,7 +288,7 @@ def set_known(plant: DesignPlant, known_inputs: Mapping[str, Any] | None, sample
 
 
 def check_samples(samples: Any, plant: DesignPlant) -> int:
-    """Return how many samples are designed.
+    """Return the number of samples to design.
 
     Raises InputError for too few, too many, or more than fit into memory.
     """
@@ -323,7 +337,7 @@ def searched(
 
 
 def input_limits(amplitude: Any, minimum: Any, maximum: Any) -> tuple[float, float]:
-    """Lower and upper limit of the input."""
+    """Return the lower and upper limit of the input."""
     if (amplitude is None) == (minimum is None and maximum is None) or (minimum is None) != (
         maximum is None
     ):
@@ -367,7 +381,7 @@ def _numbers(values: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
 
 
 def _weights(weights: Any, plant: DesignPlant) -> Matrix:
-    """W, (m, nt)."""
+    """Return W, (m, nt)."""
     nt = len(plant.theta)
     if weights is None:
         if not plant.theta.all():
@@ -387,7 +401,7 @@ def _weights(weights: Any, plant: DesignPlant) -> Matrix:
 
 
 class _Scores(NamedTuple):
-    """Of M candidates: as in `Candidate`, then bias and std (M, nt)."""
+    """Scores of M candidates: as in `Candidate`, then bias and std (M, nt)."""
 
     cost: Vector
     relative_bias: Vector
@@ -400,7 +414,7 @@ class _Scores(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Search:
-    """What is asked for; see `design_input`."""
+    """Settings of a search; see `design_input`."""
 
     plant: DesignPlant
     weights: Matrix
@@ -444,7 +458,7 @@ class _Search:
     def measured(self, waves: Matrix, period: Vector | None = None) -> tuple[Matrix, Factors]:
         """Return the limited signals (N, M) of waves of amplitude 1, and their factors per row.
 
-        Of whole periods if given.
+        Factors are those of whole periods if given.
         """
         signals, factors, size = [], [], max(1, BATCH // len(waves))
         for first in range(0, waves.shape[1], size):
@@ -472,7 +486,7 @@ class _Search:
         return np.hstack(signals), np.concatenate(factors)
 
     def limited(self, waves: Matrix) -> Matrix:
-        """Signals within the limits to the last bit: steps are shortened by what rounding could add."""
+        """Return signals within the limits to the last bit, with steps shortened for rounding."""
         low, high = self.low, self.high
         u = np.clip((low + high) / 2 + (high - low) / 2 * waves, low, high)
         if self.step >= high - low:
@@ -486,7 +500,7 @@ class _Search:
         return np.stack([limit_rate(column, step, before) for column in u.T], axis=1)
 
     def scores(self, factors: Factors) -> _Scores:
-        """Bias, variance and cost over all N samples."""
+        """Return bias, variance and cost over all N samples."""
         nt = len(self.plant.theta)
         r = factors[:, 0, :nt, :nt]
         norms = np.where((norms := np.linalg.norm(r, axis=1)) > 0, norms, 1.0)

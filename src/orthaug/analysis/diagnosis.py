@@ -1,4 +1,4 @@
-"""What the residual says about the noise, which criterion the data ask for, and which change would help.
+"""Diagnosis of a fit by its residual: the kind of noise, the right criterion, and useful changes.
 
 Noise in the equation leaves a white one-step residual. Noise on the measured output leaves a
 coloured one. It makes one-step least squares inconsistent, and a free run then explains the data as
@@ -35,13 +35,14 @@ from orthaug.inference.covariance import by_experiment
 from orthaug.models.response import Response
 from orthaug.physics.problem import Problem
 
-_LITTLE_COLOUR = 0.2  # of a free run's errors that are noise, beside a start from noisy lags and a fit of finite length
+# Of a free run's errors that are noise, beside a start from noisy lags and a fit of finite length
+_LITTLE_COLOUR = 0.2
 _LITTLE_FOLLOWED = 0.1  # correlation of such errors with an input
 _AS_GOOD = 1.05  # free-run error / one-step error up to which measured lags add nothing
 _SMALL = 0.05  # of the residual's variance: what could be predicted below that is a small effect
 _SMALL_SIZE = 0.05  # of the output's deviation, beside it
-_SMALL_COLOUR = 0.2  # the same of what a free run's own past tells: more of it is hardly noise
-_HOLD = 0.5  # share of the squares that stands in wild rows
+_SMALL_COLOUR = 0.2  # the same of what a free run's own past explains: more is hardly noise
+_HOLD = 0.5  # share of the squares in wild rows
 _FEW, _LEAST = (
     0.005,
     6,
@@ -59,12 +60,12 @@ def diagnose(
 ) -> Diagnosis | None:
     """Analyse the residuals of a fit on its training data; None where they cannot be tested.
 
-    Of lagged physics those one step ahead and of the free run; of a motion those of the free run,
-    for its states are not measured, with a test of the terms that its equations could lack
-    (`missing`).
+    Lagged physics is tested one step ahead and on the free run; a motion on its free run, since its
+    states are not measured, with a test of the terms that its equations could lack (`missing`).
 
-    Args: one_step: the prediction of the training data, if it is there already; likewise their
-        `free_run`.
+    Args:
+        one_step: the prediction of the training data, if it is there already; likewise their
+            `free_run`.
 
     Raises:
         InputError: an estimate that is not usable.
@@ -90,7 +91,7 @@ def diagnose(
 def _of_lagged(
     fit: Estimate, one_step: Response | None, free_run: Response | None
 ) -> Diagnosis | None:
-    """By its one-step residual and its free run.
+    """Return the diagnosis of lagged physics by its one-step residual and its free run.
 
     A one-step fit whose residual is coloured is set beside the free run of the physics alone,
     trained on it: that is what sensor noise asks for, and it does not suffer from the bias of the
@@ -184,7 +185,7 @@ def _inconsistent(fit: Estimate, one_step: Response, free_run: Response | None) 
 
 
 def _steps(problem: Problem, tests: tuple[ResidualTest, ...]) -> dict[str, float]:
-    """Return the steps of the outputs that are measured in such as the one-step error has the size of."""
+    """Return the steps of outputs that are recorded in steps as large as the one-step error."""
     found = {}
     for i, test in enumerate(tests):
         step = quantum_of(np.concatenate([e.outputs[:, i] for e in problem.record.experiments]))
@@ -209,7 +210,7 @@ def _is_small(seen: Finding) -> bool:
 
 
 def _effects(fit: Estimate, one_step: Response, free_run: Response | None, simulates: bool) -> dict:
-    """Return what could be predicted of the error that was minimised, and which changes would do it."""
+    """Return the predictable shares of the minimised error, and the changes that would use them."""
     response, skip = (free_run, fit.criterion.washout) if simulates else (one_step, 0)
     several = fit.criterion.free_run is not None and not fit.criterion.simulates
     if response is None or several:  # it ran away, or is the error of some steps ahead
@@ -223,19 +224,22 @@ def _effects(fit: Estimate, one_step: Response, free_run: Response | None, simul
     functions = (
         0.0 if simulates else float(np.average([one.functions for one in shares], weights=squares))
     )
-    told: dict[str, Any] = {
+    known: dict[str, Any] = {
         "simulates": simulates,
         "skip": skip,
         "one_step": one_step,
         "functions": functions,
     }
-    return {"predictable": shares, "changes": model_changes(fit, response, **told)}
+    return {"predictable": shares, "changes": model_changes(fit, response, **known)}
 
 
 def _with_criterion(
     seen: Finding, free_run: Response | None, trained: list[tuple[Response, int]]
 ) -> tuple[Change, ...]:
-    """Return the changes of a one-step fit with that of the criterion: in front where it is sensor noise, else if alone."""
+    """Return the changes of a one-step fit, with the change of criterion.
+
+    It comes first where noise is on the sensor, else only if there is no other.
+    """
     if not trained:
         return seen.changes
     (run, skip), unit = trained[0], seen.fit.problem.deviation
@@ -259,7 +263,7 @@ def _toward_prediction(seen: Finding) -> tuple[Change, ...]:
 
 
 def _accounts(problem: Problem, free_run: Response, skip: int) -> bool:
-    """Return whether the errors of a free run look like noise on a sensor: white enough, and not following the inputs."""
+    """Return whether a free run's errors look like sensor noise: white, unrelated to inputs."""
     tests = _tests(problem, free_run, skip)
     return all(
         test.practically_white(_LITTLE_COLOUR) and not test.follows(_LITTLE_FOLLOWED)
@@ -300,7 +304,7 @@ def _lags_of(fit: Estimate) -> Lags | None:
 
 
 def _tests(problem: Problem, response: Response, skip: int = 0) -> tuple[ResidualTest, ...]:
-    """Return the tests of measured minus model on every usable row of the problem after the first `skip`."""
+    """Return the tests of measured minus model on every usable row after the first `skip`."""
     record, start = problem.record, problem.rows.start
     residuals, inputs = [], []
     for experiment, trajectory in zip(record.experiments, response.trajectories, strict=True):
@@ -317,7 +321,7 @@ def _tests(problem: Problem, response: Response, skip: int = 0) -> tuple[Residua
 
 
 def _ratio(free_run: Response, one_step: Response, skip: int) -> float | None:
-    """Geometric mean over outputs of the free run's RMS error against the one-step error."""
+    """Return the free run's RMS error over the one-step error, the geometric mean over outputs."""
     free, one = rms_errors(free_run, skip), rms_errors(one_step, skip)
     if not (np.isfinite(free).all() and np.all(one > 0) and np.all(free > 0)):
         return None
@@ -325,7 +329,7 @@ def _ratio(free_run: Response, one_step: Response, skip: int) -> float | None:
 
 
 def _noise_in_lags(problem: Problem, ratio: float | None, one_step: Response) -> float | None:
-    """Noise variance against the smallest variance among the lagged outputs that the other regressors do not explain.
+    """Return the noise variance over the least variance of lagged outputs beside other regressors.
 
     It is the share by which one-step least squares shrinks what it estimates in that direction.
     """
@@ -343,7 +347,7 @@ def _noise_in_lags(problem: Problem, ratio: float | None, one_step: Response) ->
 
 
 def wild_rows(response: Response, experiments: Sequence[Experiment]) -> tuple[Warning, ...]:
-    """Return a warning for each output whose error is mostly that of a few rows, far from all others."""
+    """Return a warning for each output whose error comes mostly from a few distant rows."""
     found = []
     errors = errors_of(response)
     starts = [t.start for t in response.trajectories]
@@ -363,9 +367,9 @@ def wild_rows(response: Response, experiments: Sequence[Experiment]) -> tuple[Wa
         named = [experiments[rows[k][0]].where(rows[k][1]) for k in wild[:_NAMED]]
         more = f" and {len(wild) - _NAMED} more" if len(wild) > _NAMED else ""
         text = (
-            f"{percent(held, 3)} of the squares of the one-step residual of {output.name} stand in "
-            f"{counted(len(wild), 'row')} of {len(error)}: {'; '.join(named)}{more}. If samples are wrong there, so is "
-            'θ: mark them (step = "outliers" of data.prepare), or leave them out.'
+            f"{counted(len(wild), 'row')} of {len(error)} make up {percent(held, 3)} of the "
+            f"squared one-step residual of {output.name}: {'; '.join(named)}{more}. Wrong samples "
+            'there bias θ: mark them (step = "outliers" of data.prepare), or leave them out.'
         )
         found.append(Warning("wild_rows", text))
     return tuple(found)

@@ -1,4 +1,4 @@
-"""How does a step depend on the one before? A_k = ∂x_{k+1}/∂x_k along a run, and its spectral radius.
+"""Dependence of a step on the one before: A_k = ∂x_{k+1}/∂x_k along a run, and spectral radius.
 
 A small change of the state obeys `δx_{k+1} = A_k δx_k` in a free run. The state of the lagged form
 is `x_k = (y_{k−1}, …, y_{k−na})`: its A_k is a companion matrix, with ∂g/∂y_{k−i} in the first ny
@@ -50,7 +50,7 @@ def linearised(
 def transitions(
     model: Model | MotionModel, states: Float[np.ndarray, "m n0"], inputs: Float[np.ndarray, "m nu"]
 ) -> Float[np.ndarray, "m n0 n0"]:
-    """A_k at m points; not finite where there is no derivative."""
+    """Return A_k at m points; not finite where there is no derivative."""
     n0 = states.shape[1]
     width = difference_width(states) if len(states) else np.ones(n0)
     batches = [np.zeros((0, n0, n0))]
@@ -64,12 +64,12 @@ def transitions(
 
 
 def difference_width(points: Float[np.ndarray, "m n"]) -> Vector:
-    """Return how far differences reach to each side of a point, in each entry."""
+    """Return the reach of differences to each side of a point, in each entry."""
     return _WIDTH * positive(points.std(axis=0))
 
 
 def by_differences(function: Any, point: Any, width: Any) -> Any:
-    """∂function/∂point (outputs, n) from differences of `width` (n,)."""
+    """Return ∂function/∂point (outputs, n) from differences of `width` (n,)."""
     aside, each = jnp.diag(width), jax.vmap(function)
     return ((each(point + aside) - each(point - aside)) / (2 * width[:, None])).T
 
@@ -82,7 +82,7 @@ def _transitions(
     inputs: Float[Array, "m nu"],
     width: Any,
 ) -> Float[Array, "m n0 n0"]:
-    """A_k at m points, by differences where a learner has no derivative."""
+    """Return A_k at m points, by differences where a learner has no derivative."""
 
     def at(state: Any, row: Any) -> Any:
         def following(state: Any) -> Any:
@@ -99,7 +99,7 @@ def _transitions(
 
 @dataclass(frozen=True, eq=False)
 class Feedback:
-    """How m of the `steps` of a run, spread evenly, depend on the state before.
+    """Dependence on the state before of m of the `steps` of a run, spread evenly.
 
     `transition` are the A_k in the units of the state, `radius` (m,) their spectral radii, and
     their summary is None where there are none. `skipped` points are left out because the model has
@@ -123,14 +123,16 @@ class Feedback:
 def feedback(
     model: Model, record: Record, *, along: str = "simulation", response: Response | None = None
 ) -> Feedback | None:
-    """A_k = ∂x_{k+1}/∂x_k and its spectral radius along a run; None for a model without a state.
+    """Return A_k = ∂x_{k+1}/∂x_k and its spectral radius along a run; None without a state.
 
     At most 20000 steps, spread evenly: fewer where the state is large, none where n0 is above 200.
     Radii below 1 do not make a nonlinear run stable, nor do some above 1 make it unstable. They say
     where to look.
 
-    Args: along: "simulation", states of the free run up to where it diverges, or "measured", as the
-        outputs give them. response: the model's free run of the record, if it is there already.
+    Args:
+        along: "simulation", states of the free run up to where it diverges, or "measured", as the
+            outputs give them.
+        response: the model's free run of the record, if it is there already.
 
     Raises:
         InputError: a record that does not fit the model, or another `along`.

@@ -1,4 +1,4 @@
-"""Does a model's free run stay bounded and forget its start? All checks together, and what they say in words.
+"""Stability of a free run: all checks of boundedness and contraction together, with their report.
 
 They are evidence from sampled points, no proof, but for the last: beyond the training a held
 correction is bounded, and stable linear physics keeps it so (`beyond_training`). Two of them look
@@ -58,9 +58,11 @@ def stability(
 ) -> Stability:
     """Return all checks of a model on a record, with a text that says what they mean.
 
-    Args: response: the model's free run of the record, if it is there already. x: the record's
-        usable regressors (N, nx) in the model's layout, if they are stacked already. box, largest:
-        as in `contraction` and `divergence_scaling`.
+    Args:
+        response: the model's free run of the record, if it is there already.
+        x: the record's usable regressors (N, nx) in the model's layout, if they are stacked
+            already.
+        box, largest: as in `contraction` and `divergence_scaling`.
 
     Raises:
         InputError: as the single checks.
@@ -100,14 +102,14 @@ def _sentences(checks: Stability, driven: bool) -> Iterator[tuple[str, str]]:
         )
     if run is None:
         yield (
-            "The model uses no past outputs: its free run cannot diverge, and keeps nothing of "
-            "its start.",
+            "The model uses no past outputs: its free run cannot diverge, and does not depend "
+            "on its start.",
             "",
         )
         return
     if run.diverged:
         yield (
-            f"The free run diverges ({'; '.join(run.diverged)}); it is looked at up to there.",
+            f"The free run diverges ({'; '.join(run.diverged)}); the checks end there.",
             "free_run_diverges",
         )
     if run.share_above_one is not None:
@@ -119,16 +121,16 @@ def _sentences(checks: Stability, driven: bool) -> Iterator[tuple[str, str]]:
         warns = "spectral_radius_above_one" if run.share_above_one > 0.01 else ""
         yield f"The local spectral radius is {above}; {peak}.", warns
     if run.skipped:
-        told = (
+        text = (
             f"At {run.skipped} points more the model has no finite derivative; they are left out."
         )
-        yield told, "derivative_not_finite"
+        yield text, "derivative_not_finite"
     if contracts is None:
-        told = (
+        text = (
             "Contraction could not be checked: no finite derivatives, or more than 200 past "
             "outputs."
         )
-        yield told, "contraction_not_checked"
+        yield text, "contraction_not_checked"
     elif contracts.rate < 1:
         how = (
             f"contracts in one metric (rate {contracts.rate:.4g}): evidence, not proof, that "

@@ -1,4 +1,4 @@
-"""Does the model leave structure that noise does not explain, and does the past beyond its states tell it?
+"""Test for structure in a free run's errors that noise does not explain, and for hidden states.
 
 The errors of the free run are regressed on how the outputs follow, to first order, the parameters,
 the starts and any function of what a learner sees (`output_response`). What is added to that are
@@ -45,9 +45,8 @@ _CENTRES = (
 )  # quantiles about which a function of a learner's feature bends
 _STATIC = 5
 _LEAST_LAG = 3.0  # samples: a faster state is a lag that is missing
-_CLEARLY = (
-    0.1  # of the filtered errors' square, by which memory predicts more than functions of one row
-)
+# Of the filtered errors' square, by which memory predicts more than functions of one row
+_CLEARLY = 0.1
 _SETTLING, _HALVINGS, _SETTLED = (
     8,
     4,
@@ -57,7 +56,9 @@ _SETTLING, _HALVINGS, _SETTLED = (
 
 @dataclass(frozen=True)
 class FamilyTest:
-    """A family of terms in one equation: `share` of the filtered errors' square that it predicts on held-out blocks.
+    """A family of terms in one equation, and the `share` of the errors that it predicts.
+
+    The share is of the filtered errors' square, on held-out blocks.
 
     `error` is the standard error of the share, `p` that of the F-test, times the number of
     families. `moves` is by how much each parameter moves once the best `term` is fitted beside it,
@@ -75,7 +76,7 @@ class FamilyTest:
 
     @property
     def name(self) -> str:
-        """Return what it is, in words."""
+        """Name of the family, in words."""
         return f"a function of {self.on}" if self.term is None else f"a {self.term.name}"
 
     def is_short(self, least: float) -> bool:
@@ -84,13 +85,13 @@ class FamilyTest:
 
     @property
     def sure(self) -> bool:
-        """Return whether it is surely there."""
+        """True if the family is surely present."""
         return self.p < _LEVEL and self.share > 2 * self.error
 
 
 @dataclass(frozen=True)
 class StructureTest:
-    """What the errors of a free run hold beside noise.
+    """Structure beside noise in the errors of a free run.
 
     `static` is the best family of functions of a state or an input, `memory` the best with memory,
     each beside what the model has; `hidden` the best with memory beside all static ones, too. None
@@ -107,7 +108,7 @@ class StructureTest:
 
     @property
     def found(self) -> bool:
-        """Return whether there is any structure."""
+        """True if there is any structure."""
         return self.static is not None or self.memory is not None
 
     def is_a_lag(self, one: FamilyTest) -> bool:
@@ -116,9 +117,11 @@ class StructureTest:
 
     @property
     def has_memory(self) -> bool:
-        """Return whether a hidden state is the likely cause: memory is sure beside static terms, and predicts clearly more.
+        """True if a hidden state is the likely cause.
 
-        Play and hysteresis of a position follow the sign of its speed, so they stand in for
+        Memory is sure beside static terms, and predicts clearly more.
+
+        Play and hysteresis of a position follow the sign of its speed, so they replace
         friction that is not quite right; a lag of a sample or two is a lag that the physics has too
         few of.
         """
@@ -155,7 +158,9 @@ def structure_test(model: Model | MotionModel, record: Record) -> StructureTest 
 
 
 def _settled(model: Model | MotionModel, record: Record) -> tuple[Vector, list[LinearRun]] | None:
-    """Move the parameters of the physics to where the filtered errors of the free run are least (Gauss-Newton).
+    """Return parameters of the physics with the least filtered free-run errors, and the runs.
+
+    They are found by Gauss-Newton steps.
 
     Noise on the sensor, or coloured noise, biases what was fitted one step ahead: its run is then
     far from the data even though nothing is missing.
@@ -206,7 +211,10 @@ def _left(columns: Matrix, target: Vector) -> float:
 
 
 def _signals(model: Model | MotionModel, run: LinearRun) -> dict[str, Vector]:
-    """Return what terms may be of: each channel of the regressor and its velocity, or states and inputs."""
+    """Return the signals that terms may depend on.
+
+    They are each channel of the regressor and its velocity, or states and inputs.
+    """
     form: Any = model.form
     if isinstance(model, MotionModel):
         names = (*model.form.motion.names_of_states, *model.form.motion.inputs)
@@ -233,7 +241,7 @@ def _signals(model: Model | MotionModel, run: LinearRun) -> dict[str, Vector]:
 
 
 def _features(model: Model | MotionModel, run: LinearRun) -> Matrix:
-    """Return what the learner sees along the run, (T, nz)."""
+    """Return the learner's inputs along the run, (T, nz)."""
     form: Any = model.form
     if form.bound is None:
         return np.zeros((len(run.error), 0))
@@ -245,7 +253,7 @@ def _features(model: Model | MotionModel, run: LinearRun) -> Matrix:
 
 
 def _equations(model: Model | MotionModel) -> tuple[tuple[int, str], ...]:
-    """Return the equations that may lack something: of outputs, or of states that have a parameter or a learner."""
+    """Return the equations that may lack a term: outputs, or states with parameter or learner."""
     if isinstance(model, MotionModel):
         motion = model.form.motion
         names, places = motion.names_of_states, set(motion.learned[0])
@@ -276,7 +284,10 @@ def _respond(model: Model | MotionModel, run: LinearRun, place: int, columns: Ma
 
 
 def _base_columns(model: Model | MotionModel, runs: list[LinearRun]) -> list[np.ndarray]:
-    """Return what the model explains, of every run (T, ny, k): starts, parameters, functions of what it sees."""
+    """Return the model's own columns of every run (T, ny, k).
+
+    They are starts, parameters, and functions of the learner's inputs.
+    """
     features = [_features(model, run) for run in runs]
     bends = _bends(np.concatenate(features))
     places = [i for i, _ in _equations(model)]
@@ -293,7 +304,7 @@ def _base_columns(model: Model | MotionModel, runs: list[LinearRun]) -> list[np.
 
 
 def _bends(z: Matrix):
-    """Return a flexible function of features: of each its bends at quantiles, and products of pairs."""
+    """Return a flexible function of features: their bends at quantiles, and products of pairs."""
     centre, size = z.mean(axis=0), np.where(z.std(axis=0) > 0, z.std(axis=0), 1.0)
     scaled = (z - centre) / size
     knots = [np.unique(np.quantile(column, _CENTRES)) for column in scaled.T]
@@ -328,7 +339,7 @@ def _static(values: Vector, size: float) -> list[Vector]:
 def _added_columns(
     model: Model | MotionModel, runs: list[LinearRun]
 ) -> tuple[list[_Family], list[np.ndarray]]:
-    """Return the families of terms, and of every run the responses to all their terms, (T, ny, K)."""
+    """Return the families of terms, and each run's responses to all their terms, (T, ny, K)."""
     step, signals = model.sampling_time, [_signals(model, run) for run in runs]
     names = [name for name in signals[0] if all(name in other for other in signals)]
     families, columns = [], [[] for _ in runs]
@@ -354,7 +365,7 @@ def _scale(runs: list[LinearRun]) -> Vector:
 
 
 def _pieces(runs: list[LinearRun], columns: list[np.ndarray], scale: Vector) -> list[np.ndarray]:
-    """Return columns and errors of every run (T, ny, k + 1), outputs divided by the size of their errors."""
+    """Return columns and errors of every run (T, ny, k + 1), in units of each output's errors."""
     joined = zip(columns, runs, strict=True)
     return [
         np.concatenate([one, run.error[..., None]], axis=2) / scale[:, None] for one, run in joined
@@ -364,7 +375,7 @@ def _pieces(runs: list[LinearRun], columns: list[np.ndarray], scale: Vector) -> 
 def _coloured(
     runs: list[LinearRun], base: list[np.ndarray]
 ) -> tuple[list[np.ndarray], list[Vector]]:
-    """Return columns and errors, and of each output the autoregression of what the columns leave of its errors."""
+    """Return columns and errors, and the autoregression of each output's remaining errors."""
     pieces = _pieces(runs, base, _scale(runs))
     rest = _beside([piece[..., :-1] for piece in pieces], [piece[..., -1] for piece in pieces])
     colours = [whitening([piece[:, o] for piece in rest]) for o in range(base[0].shape[1])]
@@ -378,7 +389,7 @@ def _tested(
     added: list[np.ndarray],
     shift: Vector,
 ) -> StructureTest | None:
-    """Filter rows and columns by the colour of the errors beside the model, and test every family."""
+    """Filter rows and columns by the colour of the remaining errors, and test every family."""
     nt, known, colours = len(shift), base[0].shape[2], _coloured(runs, base)[1]
     both = [np.concatenate(columns, axis=2) for columns in zip(base, added, strict=True)]
     whole = np.concatenate(
@@ -390,7 +401,7 @@ def _tested(
     q = _range(whole[:, starts])
     whole = whole - q @ (
         q.T @ whole
-    )  # they move a few rows of one run only: blocks would not tell them
+    )  # they move a few rows of one run only: blocks would not show them
     whole[:, starts] = 0.0
     size = np.linalg.norm(whole, axis=0)
     size = np.where(size > 0, size, 1.0)
@@ -417,7 +428,7 @@ def _best(entries: list[FamilyTest]) -> FamilyTest | None:
 
 
 def _beside(columns: list[np.ndarray], errors: list[np.ndarray]) -> list[np.ndarray]:
-    """Return what least squares on the columns leaves of errors, pieces of (T, ny)."""
+    """Return the errors that least squares on the columns leaves, pieces of (T, ny)."""
     flat, lengths = np.concatenate(columns), np.cumsum([len(piece) for piece in columns])[:-1]
     target, ny = np.concatenate(errors), errors[0].shape[1]
     q = _range(flat.reshape(len(flat) * ny, -1))
@@ -436,7 +447,7 @@ def _range(columns: Matrix) -> Matrix:
 
 
 def _filtered(piece: np.ndarray, colours: list[Vector]) -> Matrix:
-    """Return columns and errors (T, ny, k) filtered by the autoregression of each output, rows in their order."""
+    """Return columns and errors (T, ny, k), filtered by the autoregression of each output."""
     memory = max(map(len, colours)) - 1
     rows = np.stack(
         [lfilter(a, [1.0], piece[:, o], axis=0)[memory:] for o, a in enumerate(colours)], axis=1

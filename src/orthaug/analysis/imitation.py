@@ -1,4 +1,4 @@
-"""What a learner could imitate of the physics, in words, in physical parameters, and with other learner inputs (F8)."""
+"""Directions of the physics that a learner could imitate, also with other learner inputs (F8)."""
 
 from __future__ import annotations
 
@@ -22,14 +22,13 @@ from orthaug.physics.shared import Shared, shared_directions
 
 _STILL = 1e-8  # change of a physical parameter along a shared direction, relative: rounding
 _ALTERNATIVES = 8
-_NEARLY = (
-    0.05  # of a regressor's norm: what widens a standard error twenty times, as in `orthaug select`
-)
+# Of a regressor's norm: what widens a standard error twenty times, as in `orthaug select`
+_NEARLY = 0.05
 
 
 @dataclass(frozen=True)
 class Alternative:
-    """Other learner inputs: how many directions they share, and what is determined beside such a learner."""
+    """Other learner inputs: the directions they share, and the parameters they leave determined."""
 
     inputs: tuple[str, ...]
     shared: int
@@ -45,7 +44,7 @@ class Alternative:
 
 @dataclass(frozen=True)
 class Imitation:
-    """What a learner on these inputs could imitate.
+    """Parts of the physics that a learner on these inputs could imitate.
 
     `directions` are those of θ that it shares with the physics. `determined` are the parameters,
     and `physical` the physical parameters, that no shared direction moves: the fit determines them
@@ -69,7 +68,7 @@ class Imitation:
 
     @classmethod
     def of(cls, inputs: Sequence[str], shared: Shared, *others: Any) -> Self:
-        """Of the directions that a learner on these inputs shares; `others` are the last fields."""
+        """Return the imitation for the shared directions; `others` are the last fields."""
         return cls(tuple(inputs), shared.all, shared.directions, shared.untouched, *others)
 
     @property
@@ -80,44 +79,50 @@ class Imitation:
             sees = f"The learner is a sum of {len(self.inputs)} terms"
         if self.everything:
             return (
-                f"{sees} and could imitate all of the physics: θ is split off along every "
-                "direction."
+                f"{sees} and could imitate all of the physics: the orthogonal split sets θ along "
+                "every direction."
             )
         if self.held:
-            columns, them = ("stands", "it") if len(self.held) == 1 else ("stand", "them")
+            are, them = ("is", "it") if len(self.held) == 1 else ("are", "them")
             sees = (
-                f"{_listed(self.held)} {columns} at a bound: θ is not split off along {them}. "
-                f"{sees}"
+                f"{_listed(self.held)} {are} at a bound: the orthogonal split does not move "
+                f"{them}. {sees}"
             )
         if not self.directions:
             rest = " other" if self.held else ""
-            told = f"{sees} and could imitate nothing of the{rest} physics"
-            return f"{told}: the fit determines every{rest} parameter beside it.{self._nearly}"
+            text = f"{sees} and could imitate nothing of the{rest} physics"
+            return f"{text}: the fit determines every{rest} parameter beside it.{self._nearly}"
         could = _listed([_combination(direction) for direction in self.directions])
-        told = [f"{sees} and could imitate {could}: there, and only there, θ is split off."]
+        along = "this direction" if len(self.directions) == 1 else "these directions"
+        sentences = [
+            f"{sees} and could imitate {could}. The orthogonal split sets θ along {along} only."
+        ]
         if self.determined:
-            told.append(
+            sentences.append(
                 f"The fit determines {_listed(self.determined)} beside any learner of these inputs."
             )
         if self.physical:
-            told.append(f"Of the physical parameters it determines {_listed(self.physical)} so.")
-        return " ".join(told) + self._nearly
+            sentences.append(f"Of the physical parameters it determines {_listed(self.physical)}.")
+        return " ".join(sentences) + self._nearly
 
     @property
     def _nearly(self) -> str:
-        """A sentence where the terms leave so little of a regressor that its parameter rests on next to nothing."""
+        """A sentence on the parameter whose regressor is nearly spanned by the terms.
+
+        It is empty where none is.
+        """
         if self.weakest is None or self.weakest[1] >= _NEARLY:
             return ""
         name, left = self.weakest
         return (
-            f" On these rows, however, the terms leave {100 * left:.2g} % of what physics "
-            f"alone has to determine {name}: its value rests on that part, and the terms may "
-            "have taken over the rest."
+            f" On these rows, however, the terms span all but {100 * left:.2g} % of the regressor "
+            f"of {name}. Only that part determines its value; the terms may have taken over the "
+            "rest."
         )
 
 
 class MotionImitation(Imitation):
-    """The same of a motion.
+    """Parts of a motion that a learner on these inputs could imitate.
 
     Directions are those of the parameters' coordinates, logarithms of positive ones.
     """
@@ -128,8 +133,8 @@ class MotionImitation(Imitation):
         sees = f"The learner sees {', '.join(self.inputs)}"
         if self.everything:
             return (
-                f"{sees} and could imitate a change of every parameter: they are those of the "
-                "nearest physics."
+                f"{sees} and could imitate a change of every parameter: the nearest physics "
+                "sets them."
             )
         if not self.directions:
             return (
@@ -137,16 +142,16 @@ class MotionImitation(Imitation):
                 "them beside it."
             )
         moved = "; ".join(" with ".join(direction) for direction in self.directions)
-        told = (
-            f"{sees} and could imitate a change of {moved}: there, and only there, the nearest "
-            "physics decides."
+        text = (
+            f"{sees} and could imitate a change of {moved}. Only there the nearest physics sets "
+            "the parameters."
         )
         if self.determined:
-            told += (
+            text += (
                 f" The fit determines {', '.join(self.determined)} beside any learner of these "
                 "inputs."
             )
-        return told
+        return text
 
 
 def imitation(
@@ -156,7 +161,7 @@ def imitation(
     others: bool = True,
     held: Collection[str] = (),
 ) -> Imitation:
-    """Return what the problem's learner could imitate, and what `others`, other inputs, would make of it.
+    """Return the imitation for the problem's learner, and for `others`, other inputs.
 
     Args:
         held: parameters at a bound.
@@ -181,7 +186,10 @@ def imitation(
 
 
 def _weakest(problem: Problem, determined: Collection[str]) -> tuple[str, float] | None:
-    """Return the parameter whose regressor the others leave least of, relative to what they do without the terms."""
+    """Return the parameter whose regressor loses most of its norm to the terms.
+
+    It is measured relative to the regressor without the terms.
+    """
     if len(problem.outputs) > 1 or not determined or not problem.count:
         return None
     physics, terms = problem.projection.phi[:, 0], problem.feature_rows()
@@ -199,7 +207,7 @@ def _weakest(problem: Problem, determined: Collection[str]) -> tuple[str, float]
 
 
 def _slopes(problem: Problem, physics: PhysicsMap | None) -> dict[str, np.ndarray] | None:
-    """dp/dθ by name, at the spec's initial values or, without any, at least squares.
+    """Return dp/dθ by name, at the spec's initial values or, without any, at least squares.
 
     None where there is none.
     """
@@ -216,7 +224,7 @@ def _slopes(problem: Problem, physics: PhysicsMap | None) -> dict[str, np.ndarra
 
 
 def _untouched(shared: Shared, slopes: dict[str, np.ndarray] | None) -> tuple[str, ...] | None:
-    """Physical parameters that no shared direction moves."""
+    """Return the physical parameters that no shared direction moves."""
     if slopes is None:
         return None
     return tuple(
@@ -229,7 +237,7 @@ def _untouched(shared: Shared, slopes: dict[str, np.ndarray] | None) -> tuple[st
 
 
 def other_inputs(problem: Problem) -> Iterator[tuple[str, ...]]:
-    """Choices of learner inputs that an engineer would think of: velocities, outputs, inputs, single lags."""
+    """Return plausible choices of learner inputs: velocities, outputs, inputs, single lags."""
     for name in problem.outputs:
         lags = [str(lag) for lag in problem.layout if lag.channel == name]
         yield from ((f"{one}-{two}",) for one, two in zip(lags, lags[1:], strict=False))
@@ -260,7 +268,7 @@ def _listed(words: tuple[str, ...] | list[str]) -> str:
 
 
 def imitation_before(form: MotionDynamics, q: Vector, x: Matrix, u: Matrix) -> MotionImitation:
-    """Return what a learner on the form's features would share with the physics, and what others would.
+    """Return the imitation for a learner on the form's features, and for others.
 
     Args:
         x: states (M, nx) of a run at the coordinates q; `u` its inputs (M, nu).

@@ -1,6 +1,6 @@
-"""Is one-step θ inconsistent? A test of coloured errors in the equation, in standard errors of θ (Hausman 1978).
+"""Test for inconsistent one-step θ by coloured errors, in standard errors of θ (Hausman 1978).
 
-Coloured errors stand in the lagged outputs of the next rows, which moves θ̂ by an amount that more
+Coloured errors are in the lagged outputs of the next rows, which moves θ̂ by an amount that more
 rows do not lessen. With a model of the colour, `e_k = Σ_j ρ_j e_{k−j} + ν_k` with ν white, they do
 not. One Gauss-Newton step from ρ = 0 gives ρ̂ and what it moves θ̂ by (Durbin 1970, Breusch 1978,
 Godfrey 1978): with the past errors E and `E⊥` what the model's derivatives ψ leave of them, `ρ̂ =
@@ -37,7 +37,7 @@ _WORTH = 0.5  # standard errors of θ: by less, coverage falls from 95 to 92 % a
 _ORDERS = (1, 4)  # of the autoregressions that are tried
 _FEWEST = 100  # rows
 _STEPS, _CLOSE = 30, 1e-6  # of the iteration, and the relative fall of the squares at which it ends
-_VAGUE = 10.0  # times the standard errors of the fit: instruments that tell less are not shown
+_VAGUE = 10.0  # times the standard errors of the fit: less accurate instruments are not shown
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +61,7 @@ class Inconsistency:
 
     @property
     def found(self) -> bool:
-        """Return whether the errors are surely coloured, and θ is off by enough to spoil its intervals."""
+        """True if the errors are surely coloured and θ is off by enough to spoil its intervals."""
         return bool(self.p < LEVEL and np.abs(self.apart).max(initial=0.0) > _WORTH)
 
     @property
@@ -72,15 +72,15 @@ class Inconsistency:
 
     @property
     def warning(self) -> Warning:
-        """Return what to be warned of, with the values that the remedies give."""
+        """Warning on the inconsistency, with the values that the remedies give."""
         each = [
             f"{self.names[i]} is then {self.modelled[i]:.6g} (std {self.modelled_std[i]:.2g}) "
             f"instead of {self.theta[i]:.6g}, {abs(self.apart[i]):.1f} standard errors away"
             for i in self.moved
         ]
         text = (
-            "one-step θ is inconsistent: its errors are coloured, so they stand in the lagged "
-            "outputs of later rows, and more rows do not help. With a model of the colour "
+            "one-step θ is inconsistent: its errors are coloured and so correlated with "
+            "the lagged outputs, and more rows do not help. With a model of the colour "
             f"(autoregression of order {self.order}) {'; '.join(each)}."
         )
         if self.instruments is not None and self.instruments_std is not None:
@@ -90,8 +90,8 @@ class Inconsistency:
             ]
             text += f" Instruments (the outputs of the free run) give {', '.join(given)}."
         text += (
-            ' No interval of the one-step θ counts that, robust or not: train on the free run (focus = "simulation"), '
-            "which has no such bias."
+            " No interval of the one-step θ covers this bias. Train on the free run "
+            '(focus = "simulation"), which does not have it.'
         )
         return Warning("inconsistent", text)
 
@@ -119,7 +119,7 @@ class _Rows(NamedTuple):
         return float(np.sum(self.errors**2) / max(self.errors.size - used, 1.0))
 
     def past(self, errors: Matrix, order: int) -> Matrix:
-        """Return the errors 1 … `order` rows before (N ny, ny order), zero before the start of an experiment.
+        """Return the errors 1 … `order` rows before (N ny, ny order), zero before an experiment.
 
         Every output has coefficients of its own.
         """
@@ -135,7 +135,7 @@ class _Rows(NamedTuple):
         return columns.reshape(errors.size, ny * order)
 
     def filtered(self, columns: Matrix, rho: Matrix) -> Matrix:
-        """`x_k − Σ_j ρ_j x_{k−j}` of columns (N ny, r), ρ (ny, order)."""
+        """Return `x_k − Σ_j ρ_j x_{k−j}` of columns (N ny, r), ρ (ny, order)."""
         ny = len(rho)
         x = columns.reshape(-1, ny, columns.shape[1])
         result = x.copy()
@@ -235,7 +235,7 @@ def _plain_std(rows: _Rows) -> Vector:
 
 
 def _durbin(rows: _Rows, order: int) -> tuple[float, Vector]:
-    """p of white errors, and what one step of Gauss-Newton towards an autoregression moves θ by."""
+    """Return p of white errors, and the shift of θ by one Gauss-Newton step towards colour."""
     past, a, e = rows.past(rows.errors, order), rows.flat, rows.errors.ravel()
     across = a.T @ past
     beside = past - a @ across
@@ -255,7 +255,7 @@ def _durbin(rows: _Rows, order: int) -> tuple[float, Vector]:
 
 
 def _with_colour(rows: _Rows, order: int) -> tuple[Vector | None, Vector]:
-    """Return how θ moves with an autoregression of the errors beside it, and its standard errors.
+    """Return the shift of θ beside an autoregression of the errors, and its standard errors.
 
     None where it diverges.
     """
@@ -301,7 +301,7 @@ def _with_colour(rows: _Rows, order: int) -> tuple[Vector | None, Vector]:
 
 
 def _by_instruments(rows: _Rows, free_run: Response) -> tuple[Vector, Vector] | None:
-    """Return how θ moves with the free run's outputs in place of the measured ones, and its standard errors; or None."""
+    """Return the shift of θ with the free run's outputs as instruments, and its standard errors."""
     fit = rows.fit
     form, record = fit.model.form, fit.problem.record
     pieces: Sequence[Matrix] = [

@@ -1,4 +1,4 @@
-"""When the inputs of a motion act: physics alone, fitted under each hold between samples and with inputs delayed."""
+"""Timing of a motion's inputs: physics fitted under each hold, and with inputs delayed."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class HoldTrial:
 
 @dataclass(frozen=True)
 class Trial:
-    """Physics alone on the first rows of the longest experiment: its substeps, and every hold's residual."""
+    """Physics on the first rows of the longest experiment: substeps, and every hold's residual."""
 
     rows: int
     substeps: int | None
@@ -97,7 +97,7 @@ def on_longest(
     structure: Structure,
     learner: Learner | None = None,
 ) -> MotionTask:
-    """Physics alone trained on the first rows of the longest experiment.
+    """Return the physics trained on the first rows of the longest experiment.
 
     Arguments as in `try_holds`.
     """
@@ -120,7 +120,7 @@ def _under(hold: str, task: MotionTask, solver: Any) -> HoldTrial:
 def refitted(
     task: MotionTask, free_fit: FreeRunFit, motion: Motion, record: Record, solver: Any
 ) -> tuple[SegmentedMotion, FreeRunFit | None]:
-    """Physics alone, trained on from where a flight ended, with another motion or record.
+    """Return the physics trained on from the end of a fit, with another motion or record.
 
     None without a usable end.
 
@@ -141,7 +141,7 @@ def refitted(
 
 
 def residual_of(segmented: SegmentedMotion, free_fit: FreeRunFit | None) -> float:
-    """RMS of what a flight leaves, in deviations of the outputs; inf without a flight."""
+    """Return the RMS of a free run's error, in deviations of the outputs; inf without a run."""
     if free_fit is None:
         return float("inf")
     value = float(
@@ -165,7 +165,10 @@ def _held(segmented: SegmentedMotion, free_fit: FreeRunFit | None, *, declared: 
 
 @dataclass(frozen=True)
 class DeadTime:
-    """An input that acts `samples` later: what physics alone then leaves, and leaves without, in deviations."""
+    """An input that acts `samples` later, with the residuals of the physics with and without it.
+
+    Residuals are in deviations of the outputs.
+    """
 
     input: str
     samples: int
@@ -174,11 +177,11 @@ class DeadTime:
 
     @property
     def gain(self) -> str:
-        """Return what a delay explains, in words."""
+        """Gain by the delay, in words."""
         late = f"{self.samples} sample{'s' * (self.samples > 1)}"
         return (
-            f"with a delay of {late} physics alone leaves {self.residual:.3g} deviations of "
-            f"the output instead of {self.undelayed:.3g}"
+            f"with a delay of {late} the error of physics alone is {self.residual:.3g} "
+            f"standard deviations of the output instead of {self.undelayed:.3g}"
         )
 
     @property
@@ -186,14 +189,15 @@ class DeadTime:
         """With what to write into the spec."""
         return Warning(
             "dead_time",
-            f"{self.input} seems to act late: {self.gain}, and its parameters are others. If there is a dead time, "
-            f'delay the input by [[data.prepare]] with step = "shift", channel = "{self.input}", samples = '
-            f"{self.samples}; a lag of its drive belongs into the equations.",
+            f"{self.input} seems to act late: {self.gain}, with other parameters. If there is a "
+            'dead time, delay the input by [[data.prepare]] with step = "shift", '
+            f'channel = "{self.input}", samples = {self.samples}; if its drive is slow, '
+            "model that in the equations.",
         )
 
 
 def dead_times(task: MotionTask, solver: Any) -> tuple[DeadTime, ...]:
-    """Return the inputs that act clearly later than they do in the equations, and by how many samples.
+    """Return the inputs that act clearly later than in the equations, and by how many samples.
 
     Each input is delayed in turn, by 1, 2, 4, … samples while that explains the data better, then
     by what lies between; physics alone is refitted each time from where the last one ended.
@@ -225,7 +229,7 @@ class _Delays:
     """What each delay leaves, and where it ended; none is there from the start."""
 
     def leaves(self, samples: int) -> float:
-        """Return what physics alone leaves with the input so many samples later."""
+        """Return the residual of the physics with the input so many samples later."""
         if samples not in self.tried:
             near = self.tried[
                 min(self.tried, key=lambda known: (abs(known - samples), self.tried[known][0]))
@@ -238,7 +242,7 @@ class _Delays:
 
 
 def _least(leaves: Callable[[int], float], most: int) -> int:
-    """Where a function of whole numbers from 0 on that falls and rises is least."""
+    """Return the argument from 0 on at which a function that falls and then rises is least."""
     best, step = 0, 1
     while step <= most and leaves(step) < leaves(best):
         best, step = step, 2 * step
@@ -252,7 +256,7 @@ def _least(leaves: Callable[[int], float], most: int) -> int:
 def _delayed(record: Record, number: int, samples: int) -> Record:
     """Return an input later by so many samples.
 
-    What it was before the record is its first value.
+    Before the record it has its first value.
     """
 
     def moved(inputs: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""What a motion learned beside its physics: how sure it is at a point, and its share of each equation.
+"""Learned part of a motion: its uncertainty at a point, and its share of each equation.
 
 The learner's part `f(x, u; c) + g(x, u; w) − f(x, u; p̂)` follows (c, w) by itself and by p̂, which
 the split makes of them: both count in its intervals.
@@ -36,7 +36,7 @@ class EquationParts:
 
 
 def equation_parts(fit: MotionEstimate, x: Matrix, u: Matrix) -> tuple[EquationParts, ...]:
-    """Of every learned equation and output, over states (M, nx) and inputs (M, nu)."""
+    """Return the parts of every learned equation and output, over x (M, nx) and u (M, nu)."""
     physics, learner = parts_at(fit.model.form, fit.model.numbers, x, u)
     units, found = {channel.name: channel.unit for channel in fit.model.outputs}, []
     for (name, unit), own, beside in zip(
@@ -53,7 +53,7 @@ def equation_parts(fit: MotionEstimate, x: Matrix, u: Matrix) -> tuple[EquationP
 
 
 def learned_reach(fit: MotionEstimate, x: Matrix, u: Matrix) -> Matrix | None:
-    """Half the length of 95 % intervals of the learner's part (M, nl), point by point.
+    """Return half the length of 95 % intervals of the learner's part (M, nl), point by point.
 
     None without intervals, and where some parameter is not identified: the prior of the weights
     then holds both.
@@ -71,7 +71,7 @@ def learned_reach(fit: MotionEstimate, x: Matrix, u: Matrix) -> Matrix | None:
 def _slopes(
     form: MotionDynamics, numbers: Numbers, x: Float[Array, "m nx"], u: Float[Array, "m nu"]
 ) -> tuple[Float[Array, "m nl np"], Float[Array, "m nl n"]]:
-    """Return how the learner's part follows p̂, and (c, w)."""
+    """Return the derivatives of the learner's part by p̂, and by (c, w)."""
     c = numbers.theta - numbers.theta_aux
 
     def at(x: Any, u: Any) -> Any:

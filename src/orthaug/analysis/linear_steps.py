@@ -1,4 +1,4 @@
-"""A model's step as a function to linearise: of its own state and inputs, and what that state holds at rest.
+"""Step of a model as a function to linearise: of its state and inputs, and their rest.
 
 The state of a lagged model is its memory of outputs and inputs, that of a motion its states. At
 rest the first is made of the outputs, so that these are what is looked for.
@@ -65,14 +65,14 @@ class LaggedStep:
         return step_lagged(self.form, numbers, self.memory, state, inputs)
 
     def unrest(self, numbers: Numbers, rest: Any, inputs: Any) -> tuple[Any, Any]:
-        """Return what is zero at rest, and the outputs."""
+        """Return the residual of rest, zero at rest, and the outputs."""
         y = self.advance(numbers, self.state_at(rest, inputs), inputs)[1]
         return y - rest, y
 
     def seen(self, rest: Vector, inputs: Vector) -> Vector | None:
         """Return the learner's features at rest.
 
-        None where there is no telling what training reached of them.
+        None where it is unknown which of them training reached.
         """
         if self.form.bound is None or not self.form.differentiable:
             return None
@@ -116,7 +116,7 @@ class MotionStep:
         return following, parts.total
 
     def field(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Any]:
-        """Return the derivatives in time, or the next state of a discrete motion, and the outputs."""
+        """Return the derivatives in time, or a discrete motion's next state, and the outputs."""
         return sum(self.form.rates(numbers, state, inputs)), self.form.observed(
             numbers, state, inputs
         )
@@ -149,7 +149,7 @@ def step_of(model: Model | MotionModel) -> Step:
 
 
 def sizes_of(model: Model | MotionModel) -> Vector:
-    """Return how large what is looked for at rest is over the training data."""
+    """Return the sizes of the unknowns of rest over the training data."""
     if isinstance(model, Model):
         size = np.asarray(model.largest_output, dtype=float)
     else:
@@ -161,7 +161,10 @@ def sizes_of(model: Model | MotionModel) -> Vector:
 def at_rest(
     step: Step, numbers: Numbers, rest: Any, inputs: Any, width: Any
 ) -> tuple[Any, Any, Any]:
-    """Return what is zero at rest (ne,), the outputs (ny,), and how both follow rest and inputs (ne + ny, ne + nu)."""
+    """Return residual of rest (ne,), outputs (ny,), and slopes of both (ne + ny, ne + nu).
+
+    The slopes are those by rest and inputs.
+    """
     both, point = partial(_unrest, step, numbers), jnp.concatenate([rest, inputs])
     value = both(point)
     slope = (
@@ -187,7 +190,7 @@ def _moved(numbers: Numbers, unknowns: Any) -> Numbers:
 def unrest_along(
     step: Step, numbers: Numbers, rest: Any, inputs: Any, unknowns: Any, root: Any
 ) -> Float[Array, "m r"]:
-    """Return how what is zero at rest, and the outputs, move along the columns of `root` (n, r)."""
+    """Return the change of rest's residual and of the outputs along columns of `root` (n, r)."""
 
     def of(p: Any) -> Any:
         return _unrest(step, _moved(numbers, p), jnp.concatenate([rest, inputs]))
@@ -203,12 +206,12 @@ def _of_point(step: Step, field: bool, numbers: Numbers) -> Callable[[Any], Any]
 
 
 def _build_rows(step: Step, field: bool, rest: Any, inputs: Any) -> Any:
-    """State and inputs of a step in one vector; of the field the inputs stand at one instant."""
+    """Return state and inputs of a step in one vector; of the field the inputs at one instant."""
     return jnp.concatenate([step.state_at(rest, inputs), *([inputs] * (1 if field else step.ends))])
 
 
 def _slope(step: Step, field: bool, numbers: Numbers, rest: Any, inputs: Any, width: Any) -> Any:
-    """`[[A, B], [C, D]]` of a step, or of the field."""
+    """Return `[[A, B], [C, D]]` of a step, or of the field."""
     both, point = _of_point(step, field, numbers), _build_rows(step, field, rest, inputs)
     if step.form.differentiable:
         return jax.jacfwd(both)(point)
@@ -219,7 +222,7 @@ def _slope(step: Step, field: bool, numbers: Numbers, rest: Any, inputs: Any, wi
 
 @partial(jax.jit, static_argnames="step")
 def one_sided(step: Step, numbers: Numbers, rest: Any, inputs: Any, width: Any) -> tuple[Any, Any]:
-    """`[A B]` by differences to each side, (2, n, k), and how far these reach, (k,)."""
+    """Return `[A B]` by differences to each side, (2, n, k), and their reach, (k,)."""
     both, point = _of_point(step, False, numbers), _build_rows(step, False, rest, inputs)
     full = _build_rows(step, False, width[: len(rest)], width[len(rest) :])
     each, middle, n = jax.vmap(both), both(point), len(step.states)
@@ -233,7 +236,7 @@ def one_sided(step: Step, numbers: Numbers, rest: Any, inputs: Any, width: Any) 
 def slope_at(
     step: Step, field: bool, numbers: Numbers, rest: Any, inputs: Any, width: Any
 ) -> Float[Array, "m n"]:
-    """`[[A, B], [C, D]]` at a point of rest."""
+    """Return `[[A, B], [C, D]]` at a point of rest."""
     return _slope(step, field, numbers, rest, inputs, width)
 
 
@@ -247,7 +250,10 @@ def slope_along(
     unknowns: Any,
     along: tuple[Any, Any, Any],
 ) -> Float[Array, "r m n"]:
-    """Return how `[[A, B], [C, D]]` moves where (rest, inputs, unknowns) move along the columns of `along`."""
+    """Return the change of `[[A, B], [C, D]]` along each column of `along`.
+
+    The columns are directions of (rest, inputs, unknowns).
+    """
 
     def of(rest: Any, inputs: Any, p: Any) -> Any:
         return _slope(step, field, _moved(numbers, p), rest, inputs, None)
@@ -257,5 +263,5 @@ def slope_along(
 
 
 def difference_widths(size: Vector, inputs: Vector) -> Vector:
-    """Return how far differences reach, for rest and inputs."""
+    """Return the reach of differences, for rest and inputs."""
     return _WIDTH * np.concatenate([size, np.maximum(np.abs(inputs), 1.0)])

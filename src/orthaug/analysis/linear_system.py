@@ -1,4 +1,4 @@
-"""A linear system with what its matrices move along the directions of a covariance: poles, gains and responses of both.
+"""Linear system with uncertain matrices: poles, gains and responses, each with its covariance.
 
 The covariance of `vec [[A, B], [C, D]]` is `Σ_j m_j m_jᵀ` with the r matrices m_j of `moved`. A
 function of the matrices then has the variance `Σ_j δ_j²`, δ_j its derivative along m_j (delta
@@ -78,7 +78,7 @@ class System:
         )
 
     def response(self, z: Complex[np.ndarray, "m"]) -> Response:
-        """`C (zI − A)⁻¹ B + D` at m points of the plane."""
+        """Return `C (zI − A)⁻¹ B + D` at m points of the plane."""
         n = self.states
         inverse = z[:, None, None] * np.eye(n) - self.a
         right = _solved(inverse, np.broadcast_to(self.b.astype(complex), (len(z), *self.b.shape)))
@@ -96,7 +96,7 @@ class System:
 
     @property
     def integrates(self) -> bool:
-        """Return whether a pole stands where the static gain is asked for."""
+        """True if there is a pole where the static gain is evaluated."""
         rest = 1.0 if self.step is not None else 0.0
         size = (
             1.0
@@ -128,9 +128,11 @@ class Response(NamedTuple):
 
 
 class Modes(NamedTuple):
-    """Eigenvalues other than 0, how each moves along the covariance (None where it has no derivative), how many are 0.
+    """Eigenvalues other than 0, their derivatives along the covariance, and the number of zeros.
 
-    In the order of decreasing magnitude, the upper one of a conjugate pair first.
+    A derivative is None where it does not exist.
+
+    They are in the order of decreasing magnitude, the upper one of a conjugate pair first.
     """
 
     values: Complex[np.ndarray, "k"]
@@ -139,7 +141,7 @@ class Modes(NamedTuple):
 
 
 def modes_of(a: Matrix, moved: Float[np.ndarray, "r n n"] | None) -> Modes:
-    """Eigenvalues of A; `dλ = wᴴ dA v / wᴴv` with its eigenvectors.
+    """Return the eigenvalues of A; `dλ = wᴴ dA v / wᴴv` with its eigenvectors.
 
     Those at 0, which shift registers have, are split off before: a chain of k of them is moved by
     rounding as far as `ε^(1/k)`.
@@ -200,7 +202,7 @@ def _right(a: Matrix, value: complex, start: Any) -> Any:
 
 
 def _solved(left: Any, right: Any) -> Any:
-    """`left⁻¹ right`; NaN where a pole stands at the point."""
+    """Return `left⁻¹ right`; NaN at a pole."""
     if not left.shape[-1]:
         return np.zeros(right.shape, dtype=complex)
     try:
@@ -252,9 +254,9 @@ def converted(
     values: Any = poles.values
     negative = values[(values.real < 0) & (np.abs(values.imag) < 1e-9 * np.abs(values))]
     if len(negative):
-        told = ", ".join(f"{value.real:.4g}" for value in negative)
+        listed = ", ".join(f"{value.real:.4g}" for value in negative)
         return (
-            f"a real pole below 0 ({told}) alternates from sample to sample, which no real "
+            f"a real pole below 0 ({listed}) alternates from sample to sample, which no real "
             "system does under a hold; tustin gives one."
         )
     found = _logarithm(system, step)
@@ -269,7 +271,7 @@ def converted(
 def observer_form(system: System, memory: Memory) -> tuple[System, Any]:
     """Return a lagged system with `Σ n_i` states, n_i the largest lag in the equation of output i.
 
-    And dead samples (nu,).
+    The dead samples (nu,) come with it.
 
     `s_i,l⁺ = s_i,l+1 + Σ_j a_ij,l y_j + Σ_j b_ij,l u_j`, `y_i = s_i,1 + Σ_j d_ij u_j`.
     """

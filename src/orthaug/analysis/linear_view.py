@@ -1,4 +1,4 @@
-"""A model near a point of rest as a linear system: matrices, poles, static gain and frequency response with intervals.
+"""Linear view of a model at a point of rest: matrices, poles, gain and response with intervals.
 
 All intervals are 95 % by the delta method from Cov(c, w), the joint covariance of parameters and
 learner weights that training left, with the quantile of Student's t. The point of rest moves with
@@ -70,7 +70,9 @@ class Pole:
 
 @dataclass(frozen=True, eq=False)
 class Bode:
-    """The frequency response at `frequency` [Hz], (m, ny, nu): `value`, and intervals of magnitude and phase [deg].
+    """Frequency response at `frequency` [Hz], (m, ny, nu), with intervals of magnitude and phase.
+
+    Phases are in degrees.
 
     Phases are unwrapped along the frequency. None where there is no covariance.
     """
@@ -92,7 +94,7 @@ class Bode:
 
 
 def phase_of(value: Complex[np.ndarray, "m ny nu"]) -> Float[np.ndarray, "m ny nu"]:
-    """arg G [deg], unwrapped over what is finite."""
+    """Return arg G [deg], unwrapped over what is finite."""
     found = np.full(value.shape, np.nan)
     for i in np.ndindex(value.shape[1:]):
         there = np.isfinite(value[:, *i])
@@ -102,7 +104,9 @@ def phase_of(value: Complex[np.ndarray, "m ny nu"]) -> Float[np.ndarray, "m ny n
 
 @dataclass(frozen=True, eq=False)
 class LinearView:
-    """A model as a linear system about a point of rest: `δx⁺ = A δx + B δu`, `δy = C δx + D δu`, in physical units.
+    """Linear model about a point of rest: `δx⁺ = A δx + B δu`, `δy = C δx + D δu`.
+
+    All are in physical units.
 
     `continuous` is the same in continuous time, or the sentence why there is none. `gain` (ny, nu)
     is ∂y/∂u at rest, None for a system that integrates. `freedom` are the degrees of freedom of the
@@ -132,7 +136,7 @@ class LinearView:
 
     @property
     def responding(self) -> System:
-        """The system whose response `bode` is: the sampled one, or under smooth inputs that in continuous time."""
+        """System whose response is `bode`: sampled, or under smooth inputs in continuous time."""
         return (
             self.continuous.system
             if self.smooth and isinstance(self.continuous, Continuous)
@@ -167,14 +171,14 @@ class LinearView:
 
     @property
     def stable(self) -> bool:
-        """Return whether all poles lie inside the unit circle."""
+        """True if all poles lie inside the unit circle."""
         return all(pole.magnitude < 1 for pole in self.poles)
 
     @cached_property
     def matrix_ci95(self) -> Float[np.ndarray, "m k 2"] | None:
         """Intervals of [[A, B], [C, D]].
 
-        Of entries that are no estimates both ends are the entry.
+        Both ends of an entry that is no estimate are the entry.
         """
         std = self.system.std
         return None if std is None else interval(self.system.matrix, std, self.freedom)
@@ -182,11 +186,13 @@ class LinearView:
     def to_control(self, time: str = "discrete") -> control.StateSpace:
         """Return the system for python-control, with the names of states, inputs and outputs.
 
-        Args: time: "discrete" at the sampling time, or "continuous". Dead time is no part of a
-            continuous system.
+        Args:
+            time: "discrete" at the sampling time, or "continuous". Dead time is no part of a
+                continuous system.
 
-        Raises: InputError: python-control is not installed, another `time`, or no system in
-            continuous time.
+        Raises:
+            InputError: python-control is not installed, another `time`, or no system in continuous
+                time.
         """
         check_choice(time, ("discrete", "continuous"), "`time`")
         try:
@@ -219,14 +225,17 @@ class LinearView:
 
 
 def about(value: Any, relative: Any, freedom: float) -> Any:
-    """Intervals of positive values whose logarithms are normal, (…, 2)."""
+    """Return intervals (…, 2) of positive values whose logarithms are normal."""
     with np.errstate(all="ignore"):
         times = np.exp(reach(freedom) * relative)
         return np.stack([value / times, value * times], axis=-1)
 
 
 def bode_of(system: System, frequency: Vector, freedom: float) -> Bode:
-    """Return the response on a grid, with bands of `ln G`: `δ ln|G| = Re(δG/G)`, `δ arg G = Im(δG/G)`."""
+    """Return the response on a grid, with bands of `ln G`.
+
+    They follow from `δ ln|G| = Re(δG/G)` and `δ arg G = Im(δG/G)`.
+    """
     found = system.at(frequency)
     if found.moved is None:
         return Bode(frequency, found.value, None, None)
@@ -249,7 +258,7 @@ def gain_of(system: System, freedom: float) -> tuple[Matrix | None, Any]:
 
 
 def poles_of(system: System, own: System | None, freedom: float) -> tuple[Pole, ...]:
-    """Poles of a sampled system.
+    """Return the poles of a sampled system.
 
     `own` are a motion's equations, whose poles are matched to these.
     """
@@ -285,7 +294,7 @@ def _matched(z: Any, own: System, step: float) -> list[tuple[complex, Any]]:
 
 
 def _pole(z: complex, relative: Any, s: complex, moved: Any, exact: bool, freedom: float) -> Pole:
-    """With `relative` = δz/z and `moved` = δs along the covariance."""
+    """Return a pole with `relative` = δz/z and `moved` = δs along the covariance."""
     size = lambda part: float(np.sqrt(np.sum(part**2)))  # noqa: E731
     magnitude = float(abs(z))
     radius = None if relative is None else _pair(about(magnitude, size(relative.real), freedom))
@@ -324,7 +333,10 @@ def _pair(ends: Any) -> Interval:
 
 
 class Agreement(NamedTuple):
-    """Medians of the differences in magnitude [dB] and phase [deg] over so many `points` of frequencies and pairs."""
+    """Medians of the differences in magnitude [dB] and phase [deg], over so many `points`.
+
+    A point is a frequency of a pair of input and output.
+    """
 
     decibel: float
     degrees: float
@@ -333,7 +345,7 @@ class Agreement(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Linearization:
-    """What `linearize` returns: a `LinearView` for each point of rest, and what data alone say of the response.
+    """Result of `linearize`: a `LinearView` for each point of rest, and the measured response.
 
     It has a length and is indexed and iterated over as the tuple of its `views`.
     """
@@ -356,7 +368,7 @@ class Linearization:
         return iter(self.views)
 
     def agreement(self, view: LinearView) -> Agreement | None:
-        """Return how near a view comes to what data alone say, where coherence is at least a half.
+        """Return the differences of a view from the measured response, at coherence ≥ 0.5.
 
         None without any.
         """
@@ -375,7 +387,7 @@ class Linearization:
         )
 
     def to_control(self, time: str = "discrete") -> control.StateSpace:
-        """That of its only view.
+        """Return the state space of the only view.
 
         Raises:
             InputError: several points of rest; as `LinearView.to_control`.

@@ -34,7 +34,7 @@ _POINTS = 400  # of the frequency grid
 _DECADES = 3  # below Nyquist's frequency at least
 _BELOW = 10  # times below the slowest pole
 _LOWEST = 1e-5  # of Nyquist's frequency
-_STEEP = 0.1  # of its matrix: what differences may change before a kink is told
+_STEEP = 0.1  # of its matrix: what differences may change before a kink is reported
 _WIDE = 0.5  # standard error of ln G beyond which the delta method is rough
 
 
@@ -54,19 +54,21 @@ def linearize(
     frequencies: Any = None,
     continuous: str = "zoh",
 ) -> Linearization:
-    """Return the model about its points of rest as linear systems, with 95 % intervals from its joint covariance.
+    """Return the model about its points of rest as linear systems, with 95 % intervals.
 
-    Args: model: a fitted model; of a fit the record is that of training. at: inputs that are held,
-        and outputs or states that are fixed, `"force=0, position=1"` or a mapping. Inputs
-            that nobody names are 0, or their means over the record; with outputs or states fixed,
-            they are looked for.
+    Args:
+        model: a fitted model; of a fit the record is that of training.
+        at: inputs that are held, and outputs or states that are fixed, `"force=0, position=1"` or a
+            mapping. Inputs that nobody names are 0, or their means over the record; with outputs or
+            states fixed, they are looked for.
         record: measured data whose own frequency response is put beside.
         frequencies: of the frequency response [Hz]; by default 400 up to Nyquist's, on a
             logarithmic grid.
         continuous: how a lagged model is converted to continuous time, zoh or tustin.
 
-    Raises: InputError: no point of rest, a name that the model does not have, a record that does
-        not fit.
+    Raises:
+        InputError: no point of rest, a name that the model does not have, a record that does not
+            fit.
 
     Examples:
         >>> import orthaug as oa
@@ -95,8 +97,8 @@ def linearize(
     outputs = [channel.name for channel in model.outputs]
     search = Search.of(step, model, outputs, given, held)
     points, warnings = operating_points(search)
-    spread, told = _spread(model, fit)
-    warnings += told
+    spread, of_spread = _spread(model, fit)
+    warnings += of_spread
     if _smooth(model):
         text = (
             "a spline through the record has no step: the sampled system is that of straight "
@@ -109,7 +111,7 @@ def linearize(
 
 
 def _held(search: Search, given: Mapping[str, float], record: Record | None) -> str:
-    """Where inputs come from that nobody named."""
+    """Return a clause on the source of inputs that nobody fixed."""
     if all(name in given for name in search.step.inputs):
         return "given"
     if search.free[len(search.step.rest) :].any():
@@ -142,8 +144,8 @@ def _spread(model: Model | MotionModel, fit: Any) -> tuple[_Spread | None, list[
     joint, nt = model.statistics.joint(len(model.theta)), len(model.theta)
     if not model.form.differentiable:
         text = (
-            "the learner has no derivatives (a function from another toolbox): differences "
-            "stand in, no intervals."
+            "the learner has no derivatives (a function from another toolbox): finite "
+            "differences replace them, and there are no intervals."
         )
         return None, [Warning("no_intervals", text)]
     if joint is not None and model.numbers.tilt is None:
@@ -155,7 +157,7 @@ def _spread(model: Model | MotionModel, fit: Any) -> tuple[_Spread | None, list[
         values, vectors = np.linalg.eigh(covariance)
         text = (
             "there is no joint covariance with the learner's weights; intervals are those of "
-            "θ, the learner frozen."
+            "θ, with the learner frozen."
         )
         spread = _Spread(vectors * np.sqrt(np.maximum(values, 0.0)), float(fit.freedom), True)
         return spread, [Warning("learner_frozen", text)]
@@ -221,7 +223,7 @@ def _view(
 def _system(
     search: Search, point: OperatingPoint, spread: _Spread | None, time: float | None
 ) -> System:
-    """Return the matrices of a step of `time`, or of the equations, and how they move along the covariance."""
+    """Return the matrices of a step of `time`, or of the equations, and their covariance."""
     step, numbers, field = search.step, search.numbers, time is None
     width = difference_widths(search.size, point.inputs)
     matrix = np.asarray(slope_at(step, field, numbers, point.rest, point.inputs, width))
@@ -260,10 +262,10 @@ def _smooth(model: Model | MotionModel) -> bool:
 
 
 def _without_next(system: System) -> System:
-    """Return a step that reads the inputs of the next sample as one that does not: `z = x − B₁ u` (first-order hold)."""
+    """Return the system without inputs of the next sample: `z = x − B₁ u` (first-order hold)."""
 
     def rewritten(matrix: Any, moved: Any = None) -> Any:
-        """Of the matrices, or of their change `moved`."""
+        """Return the matrices, or their change `moved`, in the new state."""
         n = system.states
         nu = (matrix.shape[1] - n) // 2
         a, b1, c = matrix[:n, :n], matrix[:n, n + nu :], matrix[n:, :n]
@@ -289,7 +291,10 @@ def _shape(system: System) -> tuple[int, int]:
 
 
 def _kinks(search: Search, point: OperatingPoint, system: System) -> list[Warning]:
-    """Return whether differences tell of another slope than the derivative: then the view holds in no neighbourhood."""
+    """Return warnings where differences give another slope than the derivative.
+
+    The view then holds in no neighbourhood of the point.
+    """
     if not search.step.form.differentiable:
         return []
     width, n = difference_widths(search.size, point.inputs), system.states

@@ -1,4 +1,4 @@
-"""How steep is the one-step predictor? Gradients over measured regressors (`cond:pred_stab`)."""
+"""Steepness of the one-step predictor: gradients over measured regressors (`cond:pred_stab`)."""
 
 from __future__ import annotations
 
@@ -52,7 +52,9 @@ class Lipschitz:
 
 
 def lipschitz(model: Model, record: Record, *, x: Matrix | None = None) -> Lipschitz | None:
-    """Gradients of the one-step predictor g, of ∂g/∂θ = φ and of ∂g/∂w, over measured regressors (`cond:pred_stab`).
+    """Return gradients of the one-step predictor g, of ∂g/∂θ = φ and of ∂g/∂w, over the regressors.
+
+    The regressors are measured ones (`cond:pred_stab`).
 
     The predictor γ_k = g(x_k) reads the last n samples only. With ‖∂g/∂x‖ ≤ L on a convex set of
     all regressors, `|γ − γ̃| ≤ L Σ_{i≥k−n} (|u_i − ũ_i| + |y_i − ỹ_i|) ≤ L λ⁻ⁿ Γ_k` for every λ in
@@ -63,12 +65,13 @@ def lipschitz(model: Model, record: Record, *, x: Matrix | None = None) -> Lipsc
 
     The bounds are those of at most 20000 measured rows, fewer for many weights, and of these θ and
     w, where the condition asks for all; they may be larger elsewhere. A kink, as of relu, makes
-    ∂g/∂w jump between rows and is not seen. None of it tells about the free run: y_k = 2 y_{k−1}
+    ∂g/∂w jump between rows and is not seen. None of it is about the free run: y_k = 2 y_{k−1}
     fulfils the condition. A model whose state is not made of measured signals has no such
     predictor: None.
 
-    Args: x: the record's usable regressors (N, nx) in the model's layout, if they are stacked
-        already.
+    Args:
+        x: the record's usable regressors (N, nx) in the model's layout, if they are stacked
+            already.
 
     Raises:
         InputError: a record that does not fit the model, or has no outputs.
@@ -111,7 +114,7 @@ def lipschitz(model: Model, record: Record, *, x: Matrix | None = None) -> Lipsc
 
 
 def _measured(model: Model, record: Record, x: Matrix | None) -> tuple[Matrix, RowIndex, Vector]:
-    """Regressors of measured outputs, where each stands, and deviations of these outputs (ny,)."""
+    """Return measured regressors, the row of each, and deviations of the outputs (ny,)."""
     form, record = model.form, usable(model, record)
     lengths = [len(e) - form.first_row for e in record.experiments]
     if x is None:
@@ -125,7 +128,7 @@ def _measured(model: Model, record: Record, x: Matrix | None) -> tuple[Matrix, R
 
 
 def _gradients(form: Lagged, numbers: Numbers, x: Matrix) -> Iterator[list[Any]]:
-    """∂g/∂x and ∂φ/∂x at regressors (m, nx), in batches that are computed at one shape."""
+    """Yield ∂g/∂x and ∂φ/∂x at regressors (m, nx), in batches of one shape."""
     width = difference_width(x)
     for begin in range(0, len(x), _BATCH):
         rows = np.minimum(np.arange(begin, begin + _BATCH), len(x) - 1)  # the last one again
@@ -138,7 +141,7 @@ def _gradients(form: Lagged, numbers: Numbers, x: Matrix) -> Iterator[list[Any]]
 def _gradient_rows(
     form: Lagged, numbers: Numbers, x: Float[Array, "m nx"], width: Any
 ) -> tuple[Array, Array]:
-    """∂g/∂x (m, ny, nx), by differences of `width` (nx,) where a learner has no derivative, and ∂φ/∂x."""
+    """Return ∂g/∂x (m, ny, nx) and ∂φ/∂x, by differences of `width` (nx,) without a derivative."""
 
     def g(row: Any) -> Any:
         return form.at(numbers, row).total
@@ -153,7 +156,7 @@ def _gradient_rows(
 def _weight_sizes(
     form: Lagged, numbers: Numbers, x: Matrix, x_scale: Vector, y_scale: Vector
 ) -> tuple[Int[np.ndarray, "r"], Vector, Vector]:
-    """Which rows of x (m, nx) are looked at, as many as are affordable, and ‖∂²g/∂w∂x‖ there: plain (r,), scaled."""
+    """Return the affordable rows of x (m, nx), and ‖∂²g/∂w∂x‖ there: plain (r,), scaled."""
     cells, directions = len(form.outputs) * np.size(numbers.weights), np.eye(x.shape[1])
     if not form.differentiable or not cells * len(directions):
         return np.arange(0), np.zeros(0), np.zeros(0)
@@ -177,7 +180,7 @@ def _weight_sizes(
 def _weight_squares(
     form: Lagged, numbers: Numbers, x: Float[Array, "m nx"], direction: Float[Array, "nx"]
 ) -> Float[Array, "m ny"]:
-    """Σ_w (∂²g/∂w∂x)² along one direction of x."""
+    """Return Σ_w (∂²g/∂w∂x)² along one direction of x."""
 
     def slopes(row: Any) -> Any:
         return jax.jacrev(lambda w: form.at(numbers._replace(weights=w), row).total)(

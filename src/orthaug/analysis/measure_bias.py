@@ -1,4 +1,4 @@
-"""What each suspect does to θ and to the physical parameters, under the measure that a spec declares."""
+"""Bias of θ and of physical parameters by each suspect, under the measure of a spec."""
 
 from __future__ import annotations
 
@@ -21,17 +21,21 @@ from orthaug.physics.parameters import PhysicsMap
 from orthaug.physics.problem import Problem
 from orthaug.physics.shared import seen
 
-CERTIFIED_ROWS = 200_000  # of a measure at most, over which certificates are sought for suspects that no one named
+# Of a measure at most, over which certificates are sought for suspects that no one named
+CERTIFIED_ROWS = 200_000
 _ROUNDING = 1e-9  # of a parameter: an end of its interval that lies so little on the wrong side
 
 
 @dataclass(frozen=True, eq=False)
 class MeasureLinearization:
-    """What biases are computed on.
+    """Linearization that biases under a measure are computed on.
 
-    Args: weighed: the measure's points and the physics there, of one parameter or more. physics:
-        the map from physical parameters to θ. theta: θ̂ for relative biases and for dp/dθ. learned:
-        f at the measure's points (M, ny) after a fit, to tell how much of it a suspect explains.
+    Args:
+        weighed: the measure's points and the physics there, of one parameter or more.
+        physics: the map from physical parameters to θ.
+        theta: θ̂ for relative biases and for dp/dθ.
+        learned: f at the measure's points (M, ny) after a fit, to find how much of it a suspect
+            explains.
         directions: (nθ, s) along which θ is split; None for all.
     """
 
@@ -50,7 +54,7 @@ class MeasureLinearization:
     def table(
         self, suspects: Sequence[Suspect], *, certify: bool, every: bool = True
     ) -> tuple[SuspectedBias, ...]:
-        """Return what every suspect does to θ.
+        """Return the bias by every suspect.
 
         Args:
             every: also what is zero on all points.
@@ -76,7 +80,7 @@ class MeasureLinearization:
         )
 
     def without(self, entry: SuspectedBias) -> MeasureLinearization:
-        """The same with what a suspect explains of the learner taken off it."""
+        """Return the linearization less the part of the learner that a suspect explains."""
         held = (
             entry.suspect.values(self.weighed.points.x, self.problem.layout, self.problem.outputs)
             if self.directions is None
@@ -106,11 +110,14 @@ def bias_under(
     *,
     certify_usual: bool = True,
 ) -> list[dict[str, Any]]:
-    """Return the bias of every suspect under a measure, for θ and, to first order, for the physical parameters; for JSON.
+    """Return the bias by every suspect under a measure, as plain data for JSON.
 
-    Args: suspects: those that were named; without any, the usual ones that have an effect.
+    It is that of θ and, to first order, of the physical parameters.
+
+    Args:
+        suspects: those that were named; without any, the usual ones that have an effect.
         certify_usual: seek certificates, a linear program each, for suspects that no one named,
-        too.
+            too.
     """
     named, problem, points = bool(suspects), linearization.problem, linearization.weighed.points
     table = linearization.table(
@@ -135,7 +142,10 @@ def bias_under(
 def _expected(
     entry: SuspectedBias, physics: PhysicsMap | None, problem: Problem, theta: Vector
 ) -> dict[str, dict[str, float | None]] | None:
-    """Return what the guessed coefficient does to each physical parameter: p of θ̂ less p without the bias."""
+    """Return the shift of each physical parameter by the guessed coefficient.
+
+    It is p of θ̂ less p without the bias.
+    """
     if physics is None or entry.expected is None:
         return None
     biased, true = (
@@ -162,7 +172,7 @@ def _relative(
 def physical_slopes(
     physics: PhysicsMap | None, problem: Problem, theta: Vector
 ) -> tuple[dict[str, Vector], Vector] | None:
-    """dp/dθ, in the order of the baseline's θ, at the p that θ gives; and that p."""
+    """Return dp/dθ, in the order of the baseline's θ, at the p that θ gives; and that p."""
     if physics is None:
         return None
     p = physical_of(physics, problem, theta)
@@ -179,7 +189,7 @@ def physical_slopes(
 def physical_of(
     physics: PhysicsMap, problem: Problem, theta: Vector, covariance: Matrix | None = None
 ) -> Vector:
-    """p of θ, weighted by its covariance where that is given."""
+    """Return p of θ, weighted by its covariance where that is given."""
     return _solved(physics, problem, theta, covariance).value
 
 
@@ -198,13 +208,17 @@ def physical_with_bias(
     spread: Matrix,
     freedom: float,
 ) -> tuple[Vector, Matrix]:
-    """Biases of the physical parameters (np,), and ends (np, 2) of 95 % intervals that cover bias and noise.
+    """Return biases of the physical parameters (np,), and ends (np, 2) of 95 % intervals.
+
+    The intervals cover bias and noise.
 
     The interval of p is that of θ in the direction in which p moves most, mapped: p of both of its
     ends, or p's bound where an end has none. Biases are NaN where θ̂ less its bias has no p.
 
-    Args: bias: of θ̂. covariance: of θ̂, by which p is weighted; `spread` counts also what is not
-        known of the bias.
+    Args:
+        bias: of θ̂.
+        covariance: of θ̂, by which p is weighted; `spread` counts also what is not known of the
+            bias.
     """
     physics, problem = linearization.physics, linearization.problem
     assert physics is not None

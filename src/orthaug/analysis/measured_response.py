@@ -1,4 +1,4 @@
-"""A frequency response from data alone: Welch's spectra with coherence, or the periods of a periodic input.
+"""Frequency response from data: Welch's spectra with coherence, or periods of a periodic input.
 
 Welch: `Ĝ = S_yu S_uu⁻¹` of Hann windows that overlap by half; the multiple coherence of an output
 is the share of its spectrum that the inputs explain. Where an input repeats itself exactly, the
@@ -46,7 +46,7 @@ class MeasuredResponse:
 
 
 def measured_response(record: Record) -> MeasuredResponse | None:
-    """Of a record with inputs and outputs; None where it is too short for any."""
+    """Return the response of a record with inputs and outputs; None where it is too short."""
     if not record.inputs or not record.outputs or max(map(len, record.experiments)) < _FEWEST_ROWS:
         return None
     period = _period(record)
@@ -94,7 +94,7 @@ def _welch(record: Record) -> MeasuredResponse:
 
 
 def _period(record: Record) -> int | None:
-    """Return the rows after which the only input of the only experiment repeats itself exactly, twice at least."""
+    """Return the period in rows of a record's only input; None without exact repetition."""
     if len(record.inputs) != 1 or len(record.experiments) != 1:
         return None
     u = record.experiments[0].inputs[:, 0] - record.experiments[0].inputs[:, 0].mean()

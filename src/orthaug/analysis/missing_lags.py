@@ -1,4 +1,4 @@
-"""Is the unmodelled part a function of what the learner sees? The residual against every lag that it does not see.
+"""Test of the residual against every lag that the learner does not see.
 
 Under that hypothesis the residual is `(I − P)ε`, P the projection onto the physics and the
 functions of z. So it has no mean product with any function h of a lag from which P is taken off:
@@ -36,7 +36,7 @@ _RESOLVED = 1e-6  # of a function, its part that neither the physics nor the lea
 
 @dataclass(frozen=True)
 class LagTest:
-    """The residual against a lag that the learner does not see: p-value, and share of its variance explained."""
+    """Residual against a lag that the learner does not see: p-value, explained variance share."""
 
     lag: str
     p: float
@@ -65,8 +65,8 @@ class MissingLags:
         tested = ", ".join(test.lag for test in self.tests)
         if not self.missing:
             return (
-                f"The residual does not depend on what the learner does not see ({tested}), as "
-                "far as it shows."
+                f"The residual shows no dependence on lags that the learner does not see "
+                f"({tested})."
             )
         first = self.missing[0]
         others = (
@@ -75,14 +75,14 @@ class MissingLags:
             else ""
         )
         return (
-            "What the physics lacks is no function of what the learner sees: the residual also "
-            f"depends on {first.lag}{others}, by {percent(first.share)} of its variance, so "
-            "that θ beside the learner is biased; add that lag to learner.inputs."
+            "The learner cannot express all that the physics lacks, which biases θ: "
+            f"{first.lag} explains {percent(first.share)} of the residual's variance{others}. "
+            "Add that lag to learner.inputs."
         )
 
     @property
     def warnings(self) -> tuple[Warning, ...]:
-        """Where a lag is missing."""
+        """Warnings on missing lags."""
         return (Warning("missing_lag", self.text),) if self.missing else ()
 
 
@@ -137,7 +137,7 @@ def lag_tests(problem: Problem, residual: Matrix, hidden: Sequence[int]) -> tupl
 
 
 def _functions(lag: Vector, z: Matrix) -> Float[np.ndarray, "N h"]:
-    """Functions of a lag, and its products with learner inputs, each of mean square about 1."""
+    """Return functions of a lag and its products with learner inputs, of mean square about 1."""
     size = lag.std()
     s = np.clip((lag - lag.mean()) / (size if size > 0 else 1.0), -_FARTHEST, _FARTHEST)
     forms = [s, s**2, s**3, np.abs(s), np.sign(s), *(s * column for column in z.T[:_PRODUCTS])]
@@ -149,7 +149,7 @@ def _functions(lag: Vector, z: Matrix) -> Float[np.ndarray, "N h"]:
 def _score_test(
     h: Float[np.ndarray, "N ny q"], e: Matrix, cuts: list[int]
 ) -> tuple[float, float] | None:
-    """p-value of `Σ h e = 0` and the share of e that h explains, chance taken off."""
+    """Return the p-value of `Σ h e = 0`, and the share of e that h explains, less chance."""
     scores = np.einsum("koq,ko->kq", h, e)
     rows, rank = scores.shape
     if rank == 0:
@@ -177,7 +177,7 @@ def _without(basis: Matrix, values: np.ndarray) -> np.ndarray:
 
 
 def _experiments(problem: Problem, rows: int, step: int) -> list[int]:
-    """Where experiments end among every `step`-th usable row."""
+    """Return the ends of experiments among every `step`-th usable row."""
     ends = np.cumsum(
         [len(experiment) - problem.rows.start for experiment in problem.record.experiments]
     )[:-1]

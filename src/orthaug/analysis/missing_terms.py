@@ -1,14 +1,14 @@
-"""Which equation of a motion lacks what: a test of terms that could be added, of which each is tried at weight 0.
+"""Test for missing terms in a motion's equations: each is tried at weight 0.
 
-What the free run leaves is regressed on its sensitivities to simple functions of every state and
+The error of the free run is regressed on its sensitivities to simple functions of every state and
 input, added to one equation each, beside the sensitivities to all that was estimated: parameters,
 weights and the segments' starts. That is the score test of Rao (1948) of `b = 0`. To first order
 the errors are `S_p δ + S_b b + e`, so that the F-test of b is right whatever the parameters' own
 errors δ are. Coloured errors are `e = H ε` with the autoregression `H = 1/A`: rows and columns are
 filtered by A (Cochrane and Orcutt 1949). For the test A is that of the errors beside what was
 estimated; beside all terms it would be found too white, and the test would reject too often. To
-tell terms from each other it is that beside all terms, so that what the missing one leaves does not
-pass for colour.
+distinguish terms from each other A is that beside all terms, so that what the missing one leaves
+does not pass for colour.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from orthaug.models.moving import MotionDynamics
 from orthaug.physics.motion import Motion
 
 _ROWS = 20_000  # that are looked at, in segments spread over the record
-_NUMBERS = 8_000_000  # that stand in memory at most
+_NUMBERS = 8_000_000  # that are in memory at most
 
 Terms = Callable[[Float[np.ndarray, "n r"]], Float[np.ndarray, "t r"]]
 """Makes terms of states and inputs."""
@@ -40,7 +40,7 @@ Terms = Callable[[Float[np.ndarray, "n r"]], Float[np.ndarray, "t r"]]
 
 @dataclass(frozen=True, eq=False)
 class Sensitivities:
-    """Of some segments (m): errors, and how the outputs follow starts, unknowns and added terms, in this order.
+    """Errors of m segments, and their slopes by starts, unknowns and added terms, in this order.
 
     `columns` (m, T, ny, n0 + n + q), `errors` (m, T, ny), `scored` (m, T); q counts equations times
     terms, those of the first equation in front. `points` (n, M) are the states and inputs that were
@@ -63,7 +63,7 @@ def _slopes(
     states: Float[Array, "n0 m"],
     inputs: Float[Array, "nu m"],
 ) -> Any:
-    """∂x⁺/∂(x, c, w), the outputs, and ∂y/∂(x, c, w) at every point."""
+    """Return ∂x⁺/∂(x, c, w), the outputs, and ∂y/∂(x, c, w) at every point."""
     numbers = form.prepared(numbers)
     return form.tangents(numbers, states, form.first_slopes(states.shape[1]), inputs)[1:]
 
@@ -71,7 +71,7 @@ def _slopes(
 def sensitivities(
     fit: MotionEstimate, equations: Sequence[int], terms: Callable[[Matrix], Terms], count: int
 ) -> Sensitivities | None:
-    """Along the segments that were trained on; None where something is not finite.
+    """Return the sensitivities along the training segments; None where a value is not finite.
 
     Args:
         equations: states whose equations the terms are added to.
@@ -107,7 +107,10 @@ def sensitivities(
 
 
 def _at_rows(form: MotionDynamics, numbers: Numbers, x: Any, u: Any) -> tuple[Any, Any, Any]:
-    """Slopes at every row: (m, T, n0, n0 + n), outputs (m, T, ny), and their slopes (m, T, ny, n0 + n)."""
+    """Return slopes (m, T, n0, n0 + n), outputs (m, T, ny) and their slopes at every row.
+
+    Slopes of outputs are (m, T, ny, n0 + n).
+    """
     m, steps = x.shape[:2]
     flat = [part.reshape(m * steps, -1).T for part in (x, u)]
     length = padded_length(m * steps)
@@ -159,7 +162,8 @@ _MEANINGS = (
     "odd in {} and growing faster than it, as a hardening spring",
 )
 _ONE_SIDED = ("linear in {}", "", "", "curved in {}", "curved in {}, most where that is large")
-_OWN = 0.02  # of a column's size: what remains of it beside all that was estimated, so that it is one of its own
+# Of a column's size: what remains of it beside all that was estimated, so that it is one of its own
+_OWN = 0.02
 _RANK = 1e-6  # of the largest singular value of such columns, each of size 1
 _ROWS_PER_COLUMN = 5
 _PROBED = 20  # points at which an equation is looked at
@@ -169,7 +173,7 @@ _RIVAL = 0.9  # of the best term's share, with which another one is named beside
 
 @dataclass(frozen=True)
 class MissingTerm:
-    """A term that could be added: to which equation, of which state or input, its shape, and what it would explain.
+    """A term that could be added: its equation, its variable, its shape, and what it would explain.
 
     `coefficient` is in the units of equation and variable, `share` that of the errors' variance,
     less what chance explains.
@@ -209,7 +213,7 @@ class MissingTerm:
 
 @dataclass(frozen=True)
 class MissingTest:
-    """Whether terms that could be added explain the errors of a free run: `p` of none, F-distributed.
+    """Test that added terms explain the free run's errors: `p` of none, F-distributed.
 
     `share` is what all of them together explain of the variance, `terms` the best single one and
     its near rivals.
@@ -237,7 +241,7 @@ class _Regression(NamedTuple):
 
 
 def missing_terms(fit: MotionEstimate) -> MissingTest | None:
-    """Try terms of every state and input in every equation that has parameters or a learner.
+    """Try terms of every state and input in every equation with parameters or a learner.
 
     None where the runs have no slopes, or there are too few rows.
     """
@@ -268,7 +272,7 @@ def missing_terms(fit: MotionEstimate) -> MissingTest | None:
 
 
 def doubted(fit: MotionEstimate) -> tuple[int, ...]:
-    """Equations with a parameter or a learner; others, such as ẋ = v, say what a state is.
+    """Return the equations with a parameter or a learner; others, such as ẋ = v, define a state.
 
     All, if there is none.
     """
@@ -292,8 +296,8 @@ def doubted(fit: MotionEstimate) -> tuple[int, ...]:
 def _values(z: Matrix, one_sided: list[bool]) -> Any:
     """Return a constant, then the shapes of each variable: (1 + 5 n, r) of z (n, r).
 
-    Where a variable keeps its sign a jump at zero is a constant, and its size itself: zeros stand
-    for them.
+    Where a variable keeps its sign a jump at zero is a constant, and its size is itself: zeros take
+    their places.
     """
     shaped = [
         [one, np.tanh(one / _EDGE) * both, np.abs(one) * both, one**2, one**3]
@@ -328,9 +332,9 @@ def _term(
 def _tested(
     found: Sensitivities,
 ) -> tuple[float, tuple[int, int], float, Vector, Vector, Vector] | None:
-    """p, degrees of freedom and share of all terms.
+    """Return p, degrees of freedom and share of all terms.
 
-    Of each its gain in filtered rows, its share and coefficient.
+    Each term has its gain in filtered rows, its share and its coefficient.
     """
     plain = _regression(found, None)
     null = None if plain is None else _regression(found, _filters(found, plain.errors))
@@ -354,14 +358,14 @@ def _tested(
 
 
 def _share(plain: _Regression, basis: Matrix) -> float:
-    """Of the errors' variance that all terms explain, less what chance does."""
+    """Return the share of the errors' variance that all terms explain, less that of chance."""
     total = float(plain.errors @ plain.errors)
     rest = total - float(np.sum((basis.T @ plain.errors) ** 2))
     return max(1 - rest / max(plain.left - basis.shape[1], 1) / (total / plain.left), 0.0)
 
 
 def _shares(plain: _Regression) -> Vector:
-    """The same of each term by itself."""
+    """Return the share of the errors' variance that each term explains by itself."""
     total, size = (
         float(plain.errors @ plain.errors),
         np.einsum("rj,rj->j", plain.terms, plain.terms),
@@ -373,7 +377,7 @@ def _shares(plain: _Regression) -> Vector:
 def _regression(
     found: Sensitivities, filters: tuple[list[Vector], Vector] | None
 ) -> _Regression | None:
-    """Terms and errors with starts and all unknowns projected out, of rows that are filtered first."""
+    """Return filtered terms and errors, with starts and all unknowns projected out."""
     rows = [_filtered(found, i, filters) for i in range(len(found.scored))]
     parts, used = [], 0
     for block in rows:  # the starts move their own segment only
@@ -408,7 +412,7 @@ def _range(columns: Matrix, rank: float = 1e-10) -> Matrix:
 def _filtered(
     found: Sensitivities, segment: int, filters: tuple[list[Vector], Vector] | None
 ) -> Matrix:
-    """Columns and errors of one segment, all outputs below each other, filtered by their autoregressions."""
+    """Return columns and errors of one segment, outputs stacked, filtered by their colours."""
     there = found.scored[segment]
     both = np.concatenate([found.columns[segment], found.errors[segment][..., None]], axis=-1)[
         there
@@ -433,7 +437,7 @@ def _filtered(
 
 
 def _filters(found: Sensitivities, left: Vector) -> tuple[list[Vector], Vector]:
-    """Return the autoregression of what is left of each output's errors, and the size of its innovations."""
+    """Return the autoregression of each output's remaining errors, and their innovations' size."""
     ny = found.errors.shape[2]
     pieces: list[list[Vector]] = [[] for _ in range(ny)]
     for one in _cut(found, left):

@@ -1,4 +1,4 @@
-"""What terms that a motion's equations may lack do to its parameters, and what tells of them.
+"""Bias of a motion's parameters by terms that its equations may lack, and the evidence for them.
 
 The free run answers for what the fit determines: a term moves these parameters as `motion_response`
 says. Along the directions that the learner could imitate the nearest physics decides, so that there
@@ -46,14 +46,13 @@ from orthaug.physics.projection import Projection
 from orthaug.physics.shared import Shared, moves
 
 _SAME = 1e-6  # of its size: what a term may change over a move that the learner does not see
-CERTIFIED_POINTS = (
-    20_000  # of a measure at most, over which certificates and terms of each equation are sought
-)
+# Of a measure at most, over which certificates and terms of each equation are sought
+CERTIFIED_POINTS = 20_000
 
 
 @dataclass(frozen=True)
 class ResidualStep:
-    """What the free run's residual tells of a term beside all that was fitted: one Gauss-Newton step.
+    """Effect of a term on the free run's residual beside the fit, by one Gauss-Newton step.
 
     `share` is by how much of the residual's squares it falls, `left` what stays of them beyond
     white noise.
@@ -68,7 +67,7 @@ class ResidualStep:
 
 @dataclass(frozen=True, eq=False)
 class TermBias:
-    """What a term of a motion does to its parameters if it is there.
+    """Bias of a motion's parameters by a term.
 
     `moved` (np,) are the coordinates of p̂ less those without the term, per unit of its
     coefficient.
@@ -93,16 +92,16 @@ class TermBias:
 
     @property
     def removed_by(self) -> str | None:
-        """Return what leaves the parameters unbiased by it.
+        """Change that removes this bias from the parameters.
 
         None where that is not known, or nothing is to remove.
         """
         if self.seen is None:
             return "nothing" if self.moved.any() else None
-        return self._told.removed_by
+        return self._as_suspected.removed_by
 
     @property
-    def _told(self) -> SuspectedBias:
+    def _as_suspected(self) -> SuspectedBias:
         relative = [b / v if v else None for b, v in zip(self.per_unit, self.value, strict=True)]
         shown: Any = self.suspect
         own = (
@@ -115,8 +114,8 @@ class TermBias:
         return SuspectedBias(shown, *own, None, *found)
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain numbers, text and None, for JSON."""
-        return self._told.as_dict() | {
+        """Return plain numbers, text and None, for JSON."""
+        return self._as_suspected.as_dict() | {
             "removed_by": self.removed_by,
             "equation": self.equation,
             "unit": self.suspect.unit,
@@ -129,13 +128,13 @@ class TermBias:
 
 @dataclass(frozen=True, eq=False)
 class MotionLinearization:
-    """What biases of a motion are computed on: where it is linearised, and the points that p̂ was split over.
+    """Linearization of a motion for biases: the linearized free run, and the points of p̂'s split.
 
     Args:
-        q: coordinates of p̂; those in `shared` directions are told by the nearest physics.
+        q: coordinates of p̂; those in `shared` directions come from the nearest physics.
         field: the measure's points.
         learned: the learner (M, nl) there beside p̂; None before a fit, and without one.
-        unknown: parameters that no output tells: a term does anything to them.
+        unknown: parameters that no output determines: a term does anything to them.
     """
 
     place: FreeRunPoint
@@ -153,12 +152,15 @@ class MotionLinearization:
 
     @property
     def learns(self) -> bool:
-        """Return whether there is a learner."""
+        """True if there is a learner."""
         return self.place.segmented.bound is not None
 
     @cached_property
     def phi(self) -> Projection:
-        """∂f/∂q of the learned equations over the points, rows times the root of their weights over their sizes."""
+        """∂f/∂q of the learned equations over the points, with rows weighted.
+
+        A row is multiplied by the root of its weight over its size.
+        """
         slopes = np.asarray(
             slopes_at(self.place.segmented.dynamics.alone, self.q, self.field.x, self.field.u)
         )
@@ -170,7 +172,7 @@ class MotionLinearization:
         return rows * np.sqrt(self.field.weight)[:, None] / self.field.size
 
     def usual(self) -> tuple[MotionSuspect, ...]:
-        """Return what is often missing, with widths by where its run goes."""
+        """Return the usual suspects, with widths from the range of the run."""
         place = self.place
         segmented = place.segmented if len(place.w) else place.segmented.alone
         x, u = segmented.trajectory(place.c, place.w, place.states)
@@ -181,11 +183,11 @@ class MotionLinearization:
     def table(
         self, suspects: Sequence[MotionSuspect], used: float | None = None, steps: int | None = None
     ) -> list[TermBias]:
-        """Return what every suspect does; nothing where the free run has no sensitivities.
+        """Return the bias by every suspect; empty where the free run has no sensitivities.
 
-        Args: used: weights that a fit used, where it is asked what its residual tells; `steps` of a
-            block, where its
-                errors are coloured.
+        Args:
+            used: weights that a fit used, where its residual is to be used; `steps` of a
+                block, where its errors are coloured.
         """
         added = tuple(suspect.term(self.motion) for suspect in suspects)
         response = respond_to(self.place, added)
@@ -196,7 +198,7 @@ class MotionLinearization:
         if used is not None and not all(
             seen
         ):  # what the learner sees it has taken from the residual
-            residuals = told_by_residual(response, used, steps)
+            residuals = residual_steps(response, used, steps)
         rows = enumerate(zip(suspects, seen, residuals, strict=True))
         return [self._entry(response, k, *row) for k, row in rows]
 
@@ -240,11 +242,11 @@ class MotionLinearization:
         if suspect.coefficient is not None:
             expected = suspect.coefficient * per_unit
         own = (suspect, equations_of(motion)[place], names, moved, per_unit, value, expected)
-        told = (response.cosine(k), response.size(k), seen, explained, found, certificate)
-        return TermBias(*own, *told, None if seen else residual)
+        effect = (response.cosine(k), response.size(k), seen, explained, found, certificate)
+        return TermBias(*own, *effect, None if seen else residual)
 
     def after(self, causes: Sequence[TermBias], table: Sequence[TermBias]) -> list[TermBias]:
-        """Return what terms that the learner sees explain of it without causes that it sees.
+        """Return the suspects that the learner sees, by their shares beside given causes.
 
         Nothing of other causes.
         """
@@ -267,7 +269,7 @@ class MotionLinearization:
         return self.weighed(self._rows(suspect, suspect.place(self.motion)))
 
     def physics_cosine(self, suspect: MotionSuspect) -> float:
-        """Return the cosine of a term that the learner sees with what the shared directions move."""
+        """Return the cosine between a term that the learner sees and the shared directions."""
         held = self.held(suspect)
         size = float(np.linalg.norm(held))
         return (
@@ -277,7 +279,7 @@ class MotionLinearization:
         )
 
     def seen_entry(self, suspect: MotionSuspect) -> TermBias:
-        """Return what a term that the learner sees does, by the measure alone: the free run need not be asked."""
+        """Return the bias by a term that the learner sees, by the measure without the free run."""
         motion, held = self.motion, self.held(suspect)
         moved = self.phi.solve_along(held, self.shared.basis)
         moved = np.where(np.isin(motion.names, self.unknown), np.nan, moved)
@@ -288,12 +290,12 @@ class MotionLinearization:
         own = (suspect, equation, motion.names, moved, per_unit, value, None)
         return TermBias(*own, None, size, True, explained, found, None, None)
 
-    def told(self) -> Matrix:
+    def learned_beside(self) -> Matrix:
         """Return the learner (M, nl), weighed, beside the shared directions."""
         return self.beside(self.weighed(np.asarray(self.learned)))
 
     def beside(self, values: Matrix) -> Matrix:
-        """Return what the shared directions leave of values (M, nl) that are weighed."""
+        """Return the part of weighted values (M, nl) outside the shared directions."""
         basis = self.shared.basis
         return (
             values - self.phi.phi @ self.phi.solve_along(values, basis)
@@ -313,10 +315,13 @@ class MotionLinearization:
         return np.where(np.isfinite(rows), rows, 0.0)
 
     def _explained(self, held: Matrix) -> tuple[float | None, float | None]:
-        """Return how much of the learner a term explains, and with which coefficient, beside the shared directions."""
+        """Return the share of the learner that a term explains, and its coefficient.
+
+        Both are taken beside the shared directions.
+        """
         if self.learned is None:
             return None, None
-        rest, tilde, size = self.beside(held), self.told(), np.linalg.norm(held)
+        rest, tilde, size = self.beside(held), self.learned_beside(), np.linalg.norm(held)
         norm = np.linalg.norm(rest)
         if not np.any(tilde) or norm <= IN_SPAN * size:
             return None, None
@@ -324,7 +329,7 @@ class MotionLinearization:
         return float(min((product / np.linalg.norm(tilde)) ** 2, 1.0)), float(product / norm)
 
     def sees(self, suspect: MotionSuspect) -> bool:
-        """Return whether the learner is added where the term acts, and the term is a function of what the learner sees."""
+        """Return whether the term acts where the learner does, and is a function of its inputs."""
         if suspect.place(self.motion) not in learned_places(self.motion):
             return False
         start, end = self._moves
@@ -339,7 +344,7 @@ class MotionLinearization:
 
     @cached_property
     def _moves(self) -> tuple[Matrix, Matrix]:
-        """Pairs of points that the learner does not tell apart."""
+        """Pairs of points that the learner does not distinguish."""
         form, nx = self.place.segmented.dynamics, len(self.motion.states)
         points = np.concatenate([self.field.x, self.field.u], axis=1)
         return moves(
@@ -347,10 +352,12 @@ class MotionLinearization:
         )
 
 
-def told_by_residual(
+def residual_steps(
     response: TermsResponse, used: float, steps: int | None
 ) -> list[ResidualStep | None]:
-    """Return what the residual tells of every term, with standard errors that hold for coloured errors where `steps` is given.
+    """Return the effect of every term on the residual, with standard errors.
+
+    They hold for coloured errors where `steps` is given.
 
     Args:
         used: weights that the fit used.
@@ -381,7 +388,7 @@ def told_by_residual(
 
 
 def suspected_bias(fit: MotionEstimate, suspects: Sequence[MotionSuspect]) -> list[TermBias]:
-    """Return what terms that the equations of a fitted motion may lack do to its parameters, and what tells of them.
+    """Return the bias of a fitted motion's parameters by terms that its equations may lack.
 
     Raises:
         InputError: suspects that the motion cannot have, or a fit of difference equations.
@@ -390,7 +397,7 @@ def suspected_bias(fit: MotionEstimate, suspects: Sequence[MotionSuspect]) -> li
         fit,
         MotionEstimate,
         "fit",
-        "a fit of equations of motion (of difference equations `bias_budget` tells it)",
+        "a fit of equations of motion (for difference equations use `bias_budget`)",
     )
     check_motion_suspects(suspects, fit.problem)
     linearization = linearize_fit(fit)
@@ -401,7 +408,9 @@ def suspected_bias(fit: MotionEstimate, suspects: Sequence[MotionSuspect]) -> li
 
 
 def softened_bias(fit: MotionEstimate, suspects: Sequence[MotionSuspect]) -> list[TermBias]:
-    """Return what friction among the suspects does that turns round smoothly, of widths by the size of what it acts on.
+    """Return the biases by smooth forms of the friction among the suspects.
+
+    Widths follow the size of the variable.
 
     Nothing without a learner: it alone shows the shape of what is missing.
     """
@@ -413,10 +422,10 @@ def softened_bias(fit: MotionEstimate, suspects: Sequence[MotionSuspect]) -> lis
 
 
 def usual_biases(fit: MotionEstimate) -> tuple[list[TermBias], list[TermBias]]:
-    """Return what usual terms do that nobody declared, and their smooth forms.
+    """Return the biases by usual terms that nobody declared, and by their smooth forms.
 
-    Of these only what the learner sees counts: the rest is no likely cause of what it found.
-    Nothing where it could imitate no change of a parameter.
+    Only terms that the learner sees count: others are no likely cause. There is none where the
+    learner could imitate no change of a parameter.
     """
     linearization = linearize_fit(fit)
     if linearization is None or not linearization.learns or not fit.shared.basis.shape[1]:
@@ -430,7 +439,7 @@ def usual_biases(fit: MotionEstimate) -> tuple[list[TermBias], list[TermBias]]:
 
 
 def linearize_fit(fit: MotionEstimate) -> MotionLinearization | None:
-    """Of a fitted motion under the measure that it was split under.
+    """Return the linearization of a fitted motion under the measure that it was split under.
 
     None where it has no normal equations.
     """
@@ -450,7 +459,7 @@ def linearize_fit(fit: MotionEstimate) -> MotionLinearization | None:
 
 
 def linearize_physics(task: MotionTask, structure: Structure) -> MotionLinearization | None:
-    """Of physics alone, with what a learner of the task's features could hold.
+    """Return the linearization of physics without a learner, for a learner of the task's features.
 
     None where it has no run.
     """

@@ -1,8 +1,8 @@
-"""What a motion's learner found, or its free run leaves, explained by a term, and the bias that follows from it.
+"""Bias budget of a motion: the term that explains the learner or the free run, and its bias.
 
-With a learner as of difference equations (`budget`), over the points of the measure. Without one
-only terms that someone suspects are looked at; their size is what the free run's residual tells:
-one Gauss-Newton step.
+With a learner it is computed as for difference equations (`budget`), over the points of the
+measure. Without one only declared suspects are tried; their size follows from the free run's
+residual by one Gauss-Newton step.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from orthaug.analysis.budget import (
     SURE_SHARE,
     ParameterBias,
     explains,
+    list_biases,
     parameter_biases,
-    told_biases,
 )
 from orthaug.analysis.catalogue import motion_catalogue
 from orthaug.analysis.learned_part import learned_reach
@@ -46,20 +46,19 @@ from orthaug.analysis.motion_suspects import MotionSuspect
 from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.inference.covariance import reach
 
-_AS_CLOSE = 2.0  # times what a cause leaves of the learner: a rival that leaves no more cannot be told from it
+_AS_CLOSE = 2.0  # times what a cause leaves of the learner: a rival leaves no more
 _CLOSE = 0.005  # of the learner: what leaves no more is as good as any
-_SURE = 3.3  # standard errors of a coefficient that the residual tells: one in a thousand is so large by chance
+_SURE = 3.3  # standard errors of a coefficient: one in a thousand is so large by chance
 _ELSEWHERE = 0.5  # of a bias, from which that of a rival is another one
-_NOTHING = (
-    0.01  # of the learned equations: a learner that is smaller, and biases nothing, found nothing
-)
+# Of the learned equations: a learner that is smaller, and biases nothing, found nothing
+_NOTHING = 0.01
 _SAME = 1e-6  # of a term's squares: what others leave of it is none
 _UNMOVED = 0.1  # standard errors of every parameter
 
 
 @dataclass(frozen=True, eq=False)
 class MotionBudget:
-    """The bias of every parameter by the terms that explain the learner, or what the free run leaves."""
+    """Bias of every parameter by the terms that explain the learner or the free run's errors."""
 
     causes: tuple[TermBias, ...]
     """One, or one of each learned equation that explain `share` together."""
@@ -82,10 +81,10 @@ class MotionBudget:
         return next((entry for entry in self.parameters if entry.name == name), None)
 
 
-def told_budget(
+def declared_budget(
     fit: MotionEstimate, declared: Sequence[MotionSuspect], table: Sequence[TermBias]
 ) -> MotionBudget | None:
-    """By the declared suspects.
+    """Return the budget by the declared suspects.
 
     Where these are not sure to be it, by the usual ones too that the learner sees.
 
@@ -107,7 +106,7 @@ def told_budget(
 
 
 def families_of(linearization: MotionLinearization) -> list[TermBias]:
-    """Return what every member of the catalogue does that the learner sees.
+    """Return the biases by every member of the catalogue that the learner sees.
 
     Nothing where it could imitate no parameter.
     """
@@ -125,11 +124,11 @@ def families_of(linearization: MotionLinearization) -> list[TermBias]:
 
 
 def noise_share(fit: MotionEstimate, linearization: MotionLinearization) -> float:
-    """ν: how much of what the learner holds beside the physics is noise, by the band of the learned curve."""
+    """Return ν, the share of noise in what the learner holds, by the band of the learned curve."""
     half = learned_reach(fit, linearization.field.x, linearization.field.u)
     if half is None or not np.isfinite(half).all():
         return 0.0
-    own = np.sum(linearization.told() ** 2)
+    own = np.sum(linearization.learned_beside() ** 2)
     return float(
         np.sum(linearization.weighed(half / reach(fit.freedom)) ** 2)
         / max(own, np.finfo(float).tiny)
@@ -143,13 +142,14 @@ def motion_budget(
     families: Sequence[TermBias] = (),
     declared: Sequence[MotionSuspect] | None = None,
 ) -> MotionBudget | None:
-    """By the suspect that explains most, or one in each learned equation.
+    """Return the budget by the suspect that explains most, or by one in each learned equation.
 
     None where none explains enough.
 
-    Args: table: what every suspect does to the fit. smooth: the same of terms that stand beside
-        those of the table (`softened_bias`), named where they explain
-            clearly more of a learner.
+    Args:
+        table: what every suspect does to the fit.
+        smooth: the same of terms that go with those of the table (`softened_bias`), named
+            where they explain clearly more of a learner.
         families: the same of members of the catalogue (`families_of`).
         declared: the suspects that were declared; by default those of the table.
     """
@@ -187,7 +187,7 @@ def motion_budget(
 def _instead(
     fit: MotionEstimate, table: Sequence[TermBias], declared: set[MotionSuspect]
 ) -> list[Candidate]:
-    """Return what may be the cause as well as the one that is named."""
+    """Return the rivals of the named cause."""
     linearization = linearize_fit(fit)
     assert linearization is not None
     likely = [
@@ -204,7 +204,10 @@ def _instead(
 
 @dataclass(frozen=True, eq=False)
 class _Causes:
-    """Causes, what they move the parameters by (np,), standard deviations (k, np) of what they leave, and rivals."""
+    """Causes, their shifts of the parameters (np,), rivals, and what the causes leave open.
+
+    The last are standard deviations (k, np).
+    """
 
     causes: tuple[TermBias, ...]
     share: float
@@ -214,7 +217,7 @@ class _Causes:
 
 
 def _is_clearly_less(share: float, other: float) -> bool:
-    """Return whether a term with a plain name gives way to a member of a family, which has a width to fit as well."""
+    """Return whether a plain term gives way to a member of a family, which also fits a width."""
     return share < AS_MUCH * other and 1 - share > max(_AS_CLOSE * (1 - other), _CLOSE)
 
 
@@ -226,13 +229,13 @@ def _size(cause: TermBias) -> float:
 
 
 def rivals_of(cause: TermBias, table: Sequence[TermBias]) -> list[TermBias]:
-    """Terms that explain about as much of the learner as a cause, which cannot be told from it."""
+    """Return the terms that explain about as much of the learner as a cause does."""
     most = min(max(_AS_CLOSE * (1 - explains(cause)), _CLOSE), 1 - LEAST_SHARE)
     return [entry for entry in table if entry is not cause and 1 - explains(entry) <= most]
 
 
 def _moved(entry: TermBias) -> Vector:
-    """Return what a term of the size found makes of the parameters."""
+    """Return the parameters moved by a term of the size found."""
     return (entry.coefficient_found or 0.0) * entry.per_unit
 
 
@@ -242,7 +245,10 @@ def _of_learner(
     smooth: Sequence[TermBias],
     families: Sequence[TermBias] = (),
 ) -> _Causes | None:
-    """Return the term that explains most of the learner, or one of each equation that together leave much less of it."""
+    """Return the term that explains most of the learner, or one of each equation.
+
+    One of each is taken where these leave much less of it.
+    """
     best, other = (
         max(table, key=explains, default=None),
         max((*smooth, *families), key=explains, default=None),
@@ -271,7 +277,9 @@ def _of_learner(
 def one_of_each(
     linearization: MotionLinearization, table: Sequence[TermBias]
 ) -> list[list[TermBias]]:
-    """Terms of each learned equation by what they explain of the learner beside the first of the others, best first.
+    """Return terms of each learned equation, ordered by their joint share of the learner.
+
+    The share of a term is that beside the first of the other equations.
 
     The first ones explain most together, over 20,000 points at most. Nothing where terms of one
     equation alone explain any of it.
@@ -283,14 +291,14 @@ def one_of_each(
         return []
     values = (
         *(linearization.beside(linearization.held(entry.suspect)) for entry in seen),
-        linearization.told(),
+        linearization.learned_beside(),
     )
     rows = np.stack([row[:: 1 + len(row) // CERTIFIED_POINTS].ravel() for row in values])
     sizes = np.linalg.norm(rows, axis=1)
     cosines = (rows @ rows.T) / np.outer(sizes, sizes)
 
     def beside(others: list[int]) -> tuple[Vector, Vector]:
-        """Return the share of the learner that others explain with each term, and its coefficient."""
+        """Return the share of the learner that others explain with each term, and coefficients."""
         rest = (
             cosines
             - cosines[:, others] @ np.linalg.pinv(cosines[np.ix_(others, others)]) @ cosines[others]
@@ -300,7 +308,7 @@ def one_of_each(
         return 1 - rest[-1, -1] + fitted * product, fitted * sizes[-1] / sizes[:-1]
 
     def best_from(first: int) -> tuple[float, list[int]]:
-        """From one term on: the best of each equation beside the others, until each was chosen beside them."""
+        """Return the best term of each equation beside the others, iterated from a first term."""
         now, share = [first], 0.0
         for k in (*range(1, len(groups)), *range(len(groups)), *range(len(groups))):
             shares = beside(now[:k] + now[k + 1 :])[0][groups[k]]
@@ -310,11 +318,11 @@ def one_of_each(
     chosen, found = max(best_from(first) for first in groups[0].tolist())[1], []
     for k, group in enumerate(groups):
         shares, fitted = beside(chosen[:k] + chosen[k + 1 :])
-        told = [
+        members = [
             replace(seen[i], explained=float(shares[i]), coefficient_found=float(fitted[i]))
             for i in group
         ]
-        found.append(sorted(told, key=explains, reverse=True))
+        found.append(sorted(members, key=explains, reverse=True))
     return found
 
 
@@ -324,7 +332,7 @@ def _weighed(
     share: float,
     table: Sequence[TermBias],
 ) -> _Causes:
-    """Causes with how unsure their sizes are, what the next one makes of the rest, and what they cannot be told from.
+    """Return causes with the uncertainty of their sizes, and with their rivals.
 
     Args:
         each: of an equation, or of all, its cause and then what may be it instead.
@@ -348,9 +356,11 @@ def _weighed(
 
 
 def _of_residual(table: Sequence[TermBias]) -> _Causes | None:
-    """Return the term that lowers the residual most, where that is no chance and most of what is no white noise.
+    """Return the term that lowers the residual most, if it is significant and explains most of it.
 
-    What stays beyond white noise counts as biased by as much for its size, of unknown sign.
+    Most is of the part that is no white noise.
+
+    The rest beyond white noise is assumed to be as biased for its size, with unknown sign.
     """
     sure = [
         entry
@@ -362,27 +372,27 @@ def _of_residual(table: Sequence[TermBias]) -> _Causes | None:
     )
     if best is None or best.residual is None or best.residual.std is None:
         return None
-    told, std = best.residual, best.residual.std
-    if told.share < LEAST_SHARE * (told.share + told.left):
+    step, std = best.residual, best.residual.std
+    if step.share < LEAST_SHARE * (step.share + step.left):
         return None
-    unsure = np.hypot(std, told.coefficient * np.sqrt(told.left / told.share))
+    unsure = np.hypot(std, step.coefficient * np.sqrt(step.left / step.share))
     return _Causes(
-        (best,), told.share, told.coefficient * best.per_unit, np.array([unsure * best.per_unit])
+        (best,), step.share, step.coefficient * best.per_unit, np.array([unsure * best.per_unit])
     )
 
 
 def _motion_warning(
     found: _Causes, rows: Sequence[ParameterBias], *, learns: bool
 ) -> Warning | None:
-    """Return one sentence on what is biased by more than its standard error: causes and their sizes."""
+    """Return one sentence on biases above the standard error: causes and their sizes."""
     large = [entry for entry in rows if (entry.errors or 0.0) > 1]
     if not large:
         return None
     several, first = len(found.causes) > 1, sorted(found.rivals, key=explains, reverse=True)[:2]
     named = " and ".join(f"{rival.suspect.name}, {percent(explains(rival))}" for rival in first)
     other = f" (near it: {named}, and would move them elsewhere)" if first else ""
-    what = "the learner" if learns else "the squares that the free run leaves"
-    told = " and ".join(
+    what = "the learner" if learns else "the free run's squared error"
+    listed = " and ".join(
         f"{c.suspect.name} of size {_size(c):.3g} {c.suspect.unit}".rstrip()
         + f" in the equation of {c.equation}"
         for c in found.causes
@@ -390,13 +400,13 @@ def _motion_warning(
     if learns and found.share < SURE_SHARE:
         return Warning(
             "biased",
-            f"what the learner found looks most like {told} ({percent(found.share)} of it), "
-            f"which would move {told_biases(large)}, and the standard errors do not cover "
+            f"what the learner found looks most like {listed} ({percent(found.share)} of it), "
+            f"which would move {list_biases(large)}, and the standard errors do not cover "
             f"that{other}.",
         )
     return Warning(
         "biased",
-        f"{told} explain{'' if several else 's'} {100 * found.share:.0f} % of {what} and "
-        f"move{'' if several else 's'} {told_biases(large)}, which the standard errors do not "
+        f"{listed} explain{'' if several else 's'} {100 * found.share:.0f} % of {what} and "
+        f"move{'' if several else 's'} {list_biases(large)}, which the standard errors do not "
         f"cover{other}.",
     )

@@ -1,6 +1,6 @@
-"""Experiment design for a motion: an input under which sensor noise and suspected terms disturb its parameters least.
+"""Experiment design for a motion: an input under which noise and suspects bias p least.
 
-As `design_input`, with the sensitivities of the free run for Φ: `[∂y/∂p]` less what the unknown
+This is `design_input` with the sensitivities of the free run for Φ: `[∂y/∂p]` less what the unknown
 start could do, so that `Cov p̂ = σ²(ΦᵀΦ)⁻¹` for white noise σ on the outputs. All inputs that are
 tried run side by side.
 """
@@ -30,7 +30,7 @@ _WIDTH = 64  # inputs that run side by side: every number of them by the same pr
 
 
 class MotionPlant:
-    """What a design needs of a motion at p (np,): rows of sensitivities of its outputs, the start eliminated.
+    """A motion at p (np,) for a design: rows of sensitivities of its outputs, without the start.
 
     A run starts from the declared numbers, and from zero where none is declared.
     """
@@ -83,9 +83,9 @@ class MotionPlant:
     def rows(
         self, u: Float[np.ndarray, "N M"]
     ) -> tuple[Float[np.ndarray, "M N ny np+1"], np.ndarray]:
-        """Rows `[∂y/∂p Δ]` without what the start could do, zero for an input under which the run runs away.
+        """Return rows `[∂y/∂p Δ]` without the start's effect; zero where the run runs away.
 
-        And the weights of the outputs (M, 1, ny, 1).
+        The weights of the outputs (M, 1, ny, 1) come with them.
         """
         pieces = [
             self._piece(u[:, first : first + _WIDTH]) for first in range(0, u.shape[1], _WIDTH)
@@ -130,7 +130,7 @@ class MotionPlant:
 
 
 def _without(start: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Rows (m, N, ny, k) less what unknown starts (m, N, ny, nx) could do."""
+    """Return rows (m, N, ny, k) less the effect of unknown starts (m, N, ny, nx)."""
     shape, flat = rows.shape, start.reshape(len(start), -1, start.shape[-1])
     size = np.linalg.norm(flat, axis=1, keepdims=True)
     basis = np.linalg.svd(flat / np.where(size > 0, size, 1.0), full_matrices=False)
@@ -178,21 +178,27 @@ def design_motion_input(
     seed: int = 0,
     iterations: int = 30,
 ) -> Design:
-    """Return the input of least predicted error of p within minimum ≤ u ≤ maximum and |u_k − u_{k−1}| ≤ rate · Ts.
+    """Return the input of least predicted error of p within limits of amplitude and rate.
 
-    Args: sampling_time: Ts, s. samples: N. amplitude: the limits are ±amplitude, in the channel's
-        unit; or `minimum` and `maximum` instead. rate: in the channel's unit per second. suspects:
-        with their coefficients; without any the design has least variance. noise: standard
-        deviation of the sensor's noise, or one of each output; 0 counts the bias alone. Without
-            suspects 0 means 1.
+    The limits are minimum ≤ u ≤ maximum and |u_k − u_{k−1}| ≤ rate · Ts.
+
+    Args:
+        sampling_time: Ts, s.
+        samples: N.
+        amplitude: the limits are ±amplitude, in the channel's unit; or `minimum` and `maximum`
+            instead.
+        rate: in the channel's unit per second.
+        suspects: with their coefficients; without any the design has least variance.
+        noise: standard deviation of the sensor's noise, or one of each output; 0 counts the bias
+            alone. Without suspects 0 means 1.
         parameters: p to simulate with; None for the initial values.
         substeps: of the integrator in a sample; None for the motion's, 1 where that has none.
         weights: W, (np,) for a diagonal, or (m, np); None for 1/|p|.
         condition, channel, known_inputs, seed, iterations: as in `design_input`.
 
-    Raises: InputError: numbers out of range, a suspect without coefficient, a motion that runs
-        away, no candidate within
-            the cap on the condition number.
+    Raises:
+        InputError: numbers out of range, a suspect without coefficient, a motion that runs away, no
+            candidate within the cap on the condition number.
     """
     sampling_time = check_number(sampling_time, "sampling_time", positive=True)
     limits = input_limits(amplitude, minimum, maximum), rate, condition

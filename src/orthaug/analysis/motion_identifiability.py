@@ -1,7 +1,7 @@
-"""Which parameters of a motion the outputs tell apart, before training.
+"""Parameters of a motion that the outputs can distinguish, before training.
 
-They are told apart on the record's inputs, or on inputs that excite everything, by the rank of the
-free run's sensitivities to the parameters' coordinates, the starts of all segments eliminated, at
+The record's inputs, or inputs that excite everything, distinguish them by the rank of the free
+run's sensitivities to the parameters' coordinates, the starts of all segments eliminated, at
 the initial parameters and some near them. A direction that only rounding or one particular value
 hides has full rank there.
 """
@@ -14,15 +14,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
+from orthaug._base.errors import Warning
 from orthaug.data.record import Record
 from orthaug.fitting.initial_states import Start
+from orthaug.fitting.motion_task import MotionTask
 from orthaug.fitting.segmented_motion import SegmentedMotion
+from orthaug.physics import ill_conditioned
 from orthaug.physics.excitation import Excitation, of_gram
 
 _DRAWS = 3  # parameters near the initial ones
 _NEAR = 0.1  # of a logarithm, or of the value
 _SHORTER = (512, 128, 32, 8)  # steps of segments, where physics runs away over longer ones
-_LOOSER = 1e3  # times as free as in training: a start that costs something tells parameters from it
+_LOOSER = 1e3  # times as free as in training: a start that costs something separates parameters
 _WIDTHS = (2.0, 1.0, 0.5)  # times the range of the data, until a run is finite
 _LONGEST_LEVEL = 60  # steps for which a random input stays
 _SEED = 20_250_117
@@ -30,9 +33,9 @@ _SEED = 20_250_117
 
 @dataclass(frozen=True, eq=False)
 class RankReport:
-    """What the record's own inputs tell apart, and what rich ones do.
+    """Parameters that the record's own inputs can distinguish, and those that rich inputs can.
 
-    With points of a run at the initial parameters.
+    Points of a run at the initial parameters come with them.
 
     `by_any` is None where no run with rich inputs is finite. `states` (M, nx) and `inputs` (M, nu)
     are where physics alone goes on the record.
@@ -45,7 +48,7 @@ class RankReport:
 
 
 def identified(segmented: SegmentedMotion) -> RankReport | None:
-    """Of the physics alone of a course, over shorter segments where it runs away.
+    """Return the ranks of the physics without a learner, over shorter segments where runs diverge.
 
     None where no run is finite.
     """
@@ -75,26 +78,26 @@ def _rank(segmented: SegmentedMotion) -> Excitation | None:
 
     None where no run is finite.
 
-    Of several of that rank the one that ties most: of `a*b` with a = 0 it looks as if b alone were
-    idle.
+    Of several with that rank it is the one that ties most parameters: of `a*b` with a = 0 it looks
+    as if b alone were idle.
     """
     best: Excitation | None = None
     for q in _near(segmented):
         gram = information(segmented, q)
         if gram is not None:
             found = of_gram(gram, segmented.problem.motion.names)
-            best = found if best is None else max(best, found, key=_telling)
+            best = found if best is None else max(best, found, key=_ranks)
         if best is not None and best.full_rank:
             break
     return best
 
 
-def _telling(found: Excitation) -> tuple[int, int]:
+def _ranks(found: Excitation) -> tuple[int, int]:
     return found.rank, sum(map(len, found.collinear))
 
 
 def information(segmented: SegmentedMotion, q: Vector) -> Matrix | None:
-    """Gram matrix (np, np) of the outputs' sensitivities to the parameters' coordinates.
+    """Return the Gram matrix (np, np) of the outputs' sensitivities to the parameters' coordinates.
 
     None where a run diverges.
     """
@@ -108,6 +111,24 @@ def information(segmented: SegmentedMotion, q: Vector) -> Matrix | None:
     return gram if np.isfinite(gram).all() else None
 
 
+def ill_conditioned_alone(task: MotionTask) -> list[Warning]:
+    """Return the warning `ill_conditioned` of physics alone as a task trained it.
+
+    None where it has no run.
+    """
+    free_fit, segmented = task.physics, task.plan.alone
+    if free_fit is None or not free_fit.ending.usable:
+        return []
+    q = free_fit.end.point.theta
+    gram = information(segmented.from_states(free_fit.end.point.states), q)
+    noise = segmented.noise(free_fit.objective, free_fit.end)
+    if gram is None or noise is None:
+        return []
+    return ill_conditioned.of_motion(
+        segmented.problem, segmented.rms**2 * gram, np.asarray(q), noise
+    )
+
+
 def _near(segmented: SegmentedMotion) -> Iterator[Vector]:
     coordinates, random = segmented.problem.motion.coordinates, np.random.default_rng(_SEED)
     low, high = coordinates.bounds
@@ -119,7 +140,10 @@ def _near(segmented: SegmentedMotion) -> Iterator[Vector]:
 
 
 def _richly_excited(segmented: SegmentedMotion, wide: float) -> SegmentedMotion:
-    """The same rows with inputs of random levels, each for a random time, and starts a little off their guesses."""
+    """Return the same rows with random inputs, and starts a little off their guesses.
+
+    Inputs have random levels, each for a random time.
+    """
     record, random = segmented.record, np.random.default_rng(_SEED)
     every = np.concatenate([e.inputs for e in record.experiments])
     low, high = every.min(axis=0), every.max(axis=0)
@@ -137,7 +161,7 @@ def _richly_excited(segmented: SegmentedMotion, wide: float) -> SegmentedMotion:
 
 
 def _on(segmented: SegmentedMotion, record: Record) -> SegmentedMotion:
-    """The same segments on another record."""
+    """Return the same segments on another record."""
     whole = SegmentedMotion.of(segmented.problem.on(record), None, segmented.criterion)
     return (
         whole
@@ -147,6 +171,6 @@ def _on(segmented: SegmentedMotion, record: Record) -> SegmentedMotion:
 
 
 def _levels(count: int, random: np.random.Generator) -> Vector:
-    """Levels in [-1, 1] that stay for 1 to some steps, short ones as often as long ones."""
+    """Return levels in [-1, 1] with durations from 1 to a few steps, log-uniform."""
     lengths = np.exp(random.uniform(0, np.log(_LONGEST_LEVEL), count)).astype(int)
     return np.repeat(random.uniform(-1, 1, count), lengths)[:count]

@@ -1,11 +1,11 @@
-"""How a motion's estimate answers to further terms in its equations: normal equations of the free run with them in it.
+"""Response of a motion's estimate to further terms in its equations, by normal equations.
 
 With S the sensitivities of the free run to the parameters' coordinates c, the terms' coefficients κ
 and a learner's weights w, the starts eliminated, a term of size κ that the fit does not know moves
-(c, w) by `(SᵀS + ridge)⁻¹SᵀS_κ κ`: estimate less truth. What the free run leaves, r, tells κ itself
+(c, w) by `(SᵀS + ridge)⁻¹SᵀS_κ κ`: estimate less truth. What the free run leaves, r, determines κ
 by one Gauss-Newton step, beside all that was fitted.
 
-Before any training waves stand for the learner. They can be any function of what it sees.
+Before any training waves take the learner's place. They can be any function of what it sees.
 
 How much of the estimate is an error of its integrator follows likewise. With Δy what twice as many
 substeps add to the outputs, a fit with them ends at `(c, w) − (SᵀS + ridge)⁻¹SᵀΔy`. S is that of
@@ -39,7 +39,8 @@ from orthaug.physics.motion import MOST_SUBSTEPS
 from orthaug.physics.suspected_motion import SuspectedMotion, SuspectedTerm
 
 LOOSER = 1e-4  # times the weight of the guesses of the starts, as where standard errors are made
-_UNSEEN = 1e-9  # of the largest eigenvalue of normal equations with unit columns: directions that nothing tells
+# Directions without information: below so much of the largest eigenvalue, with unit columns.
+_UNSEEN = 1e-9
 ALIKE = 1e-6  # of a term's effect on the outputs: less than this beside what was fitted is rounding
 _LARGE = 0.1  # standard errors
 _LARGE_SHARE = 1e-3  # of a parameter that has no standard error
@@ -47,7 +48,7 @@ _LARGE_SHARE = 1e-3  # of a parameter that has no standard error
 
 @dataclass(frozen=True, eq=False)
 class FreeRunPoint:
-    """Where a free run is linearised: a course with its coordinates, its learner's weights and its segments' starts."""
+    """Point of a free run's linearization: segments, coordinates, learner's weights, starts."""
 
     segmented: SegmentedMotion
     c: Vector
@@ -85,7 +86,7 @@ class TermsResponse:
     def moved(
         self, k: int, apart: Bool[np.ndarray, "np"]
     ) -> tuple[Vector, Float[np.ndarray, "nw"]]:
-        """Return what a unit of term k adds to c (np,), and to the weights.
+        """Return the changes of c (np,) and of the weights by a unit of term k.
 
         Parameters in `apart` stay.
 
@@ -108,11 +109,11 @@ class TermsResponse:
         return self.information + np.diag(ridge)
 
     def held(self, dw: Vector, x: Matrix, u: Matrix) -> Matrix:
-        """Return what a change of the weights adds to the learner (M, nl) at states (M, nx) and inputs (M, nu)."""
+        """Return the learner's change (M, nl) by a change of weights, at x (M, nx), u (M, nu)."""
         return np.asarray(_along(self.form, self.numbers, dw, x, u))
 
     def cosine(self, k: int) -> float | None:
-        """Return how much of the term's effect on the outputs the fit takes up, in [0, 1].
+        """Return the share of the term's effect on the outputs that the fit takes up, in [0, 1].
 
         None where it has none.
         """
@@ -120,7 +121,7 @@ class TermsResponse:
         return float(np.sqrt(np.clip(1 - self._beside(k)[1] / own, 0.0, 1.0))) if own > 0 else None
 
     def size(self, k: int) -> float:
-        """RMS effect of a unit of the term on the outputs, in their deviations."""
+        """Return the RMS effect of a unit of the term on the outputs, in their deviations."""
         segmented, weight = self.place.segmented, self.place.weight
         whole = segmented.segments.count * float(np.sum((weight * segmented.deviation) ** 2))
         return float(
@@ -128,7 +129,7 @@ class TermsResponse:
         )
 
     def step(self, k: int) -> tuple[float, float, Vector] | None:
-        """Return the coefficient that lowers what is left most, by how much that falls, and the row (n,) of scores it is.
+        """Return a term's best coefficient, the decrease of squares, and its row (n,) of scores.
 
         None where the fit could hold the term as well.
         """
@@ -141,7 +142,7 @@ class TermsResponse:
         return coefficient, coefficient**2 * left, row / left
 
     def squares(self) -> tuple[float, float]:
-        """Return the sum of squares that the free run leaves, and as much of it as neighbouring steps do not share.
+        """Return the free run's sum of squares, and the part that neighbouring steps do not share.
 
         The second is half the sum of squared differences (von Neumann 1941): all of white noise,
         little of what physics leaves out.
@@ -166,7 +167,7 @@ class TermsResponse:
         return FreeRunScores(*made, 1.0, self.slope, missed @ prior)
 
     def _beside(self, k: int) -> tuple[Vector, float]:
-        """Return the row (n,) that takes what was fitted off the term, and what information on it is left."""
+        """Return the row (n,) that removes the fit from the term, and the remaining information."""
         i = self.parameters + k
         row = np.zeros(len(self.fitted))
         row[i] = 1.0
@@ -196,7 +197,7 @@ def respond_to(place: FreeRunPoint, added: tuple[SuspectedTerm, ...]) -> TermsRe
 
 
 def solved(matrix: Matrix, right: Vector) -> Vector:
-    """Least squares with unit columns; what nothing tells stays at 0."""
+    """Return least squares with unit columns; unknowns without information stay 0."""
     if not len(matrix):
         return np.zeros(0)
     scale = 1 / np.sqrt(np.where(np.diag(matrix) > 0, np.diag(matrix), 1.0))
@@ -232,7 +233,7 @@ class SubstepBias:
     warnings: tuple[Warning, ...] = ()
 
     def as_dict(self) -> dict[str, float]:
-        """By parameter."""
+        """Return the biases by parameter."""
         return dict(zip(self.names, map(float, self.value), strict=True))
 
 
@@ -244,8 +245,9 @@ def substep_bias(fit: MotionEstimate) -> SubstepBias | None:
     Args:
         fit: of a motion, from `estimate`.
 
-    Returns: p̂ less what a fit with twice the substeps would give, to first order, in the units of
-        p and in standard errors.
+    Returns:
+        p̂ less what a fit with twice the substeps would give, to first order, in the units of p and
+        in standard errors.
     """
     motion, segmented, numbers = fit.problem.motion, fit.segmented, fit.model.numbers
     slope, substeps = fit.split_by.slope, segmented.dynamics.substeps
@@ -284,28 +286,28 @@ def substep_bias(fit: MotionEstimate) -> SubstepBias | None:
 
 def _warnings(found: SubstepBias, fit: MotionEstimate) -> tuple[Warning, ...]:
     """Return one sentence on the parameters that finer steps would move."""
-    told = []
+    shifts = []
     for name, moved, errors, value in zip(
         found.names, found.value, found.errors, fit.values, strict=True
     ):
         share = f", {percent(moved / value, sign='+')}" if value else ""
         if np.isfinite(errors) and errors > _LARGE:
-            told.append(f"{name} by {moved:+.2g} ({errors:.2g} standard errors{share})")
+            shifts.append(f"{name} by {moved:+.2g} ({errors:.2g} standard errors{share})")
         elif (
             np.isnan(errors)
             and name not in fit.unidentified
             and abs(moved) > _LARGE_SHARE * abs(value)
         ):
-            told.append(
+            shifts.append(
                 f"{name} by "
                 f"{moved:+.2g}{share.replace(',', ' (', 1).replace('( ', '(')}{')' if share else ''}"
             )
-    if not told:
+    if not shifts:
         return ()
     steps = f"{found.substeps} substep{'s' * (found.substeps > 1)} in a sample"
     text = (
         f"the integrator is too coarse for the parameters: with {steps} instead of "
-        f"{2 * found.substeps} it moves {', '.join(told)}; give substeps = "
+        f"{2 * found.substeps} it moves {', '.join(shifts)}; give substeps = "
         f"{2 * found.substeps} or more."
     )
     return (Warning("too_few_substeps", text),)

@@ -1,4 +1,4 @@
-"""Suspected terms of a motion: what its equations may lack, as expressions of states, inputs and parameters.
+"""Suspected terms of a motion's equations, as expressions of states, inputs and parameters.
 
 A suspect adds `coefficient * expression` to the derivative of a state, or to an output. With a
 `factor` such as -1/m the coefficient is a force in N though the equation is one of m/s².
@@ -88,8 +88,9 @@ class MotionSuspect:
             width: in the unit of `on`.
             factor: an expression that multiplies the kind's.
 
-        Raises: InputError: an unknown kind, an argument that is missing, or that the kind does not
-            take.
+        Raises:
+            InputError: an unknown kind, an argument that is missing, or that the kind does not
+                take.
         """
         text, label, _ = written(kind, on, width, _balanced, "v")
         if factor is not None:
@@ -128,23 +129,23 @@ class MotionSuspect:
         return likely[0]
 
     def term(self, motion: Motion) -> SuspectedTerm:
-        """It as a term of the motion."""
+        """Return the suspect as a term of the motion."""
         return SuspectedTerm(self.name, self.place(motion), self.parsed(motion))
 
     def values(self, motion: Motion, p: Vector, x: Matrix, u: Matrix) -> Vector:
-        """Return the expression (M,) at states (M, nx) and inputs (M, nu), also where it is not finite."""
+        """Return the expression (M,) at states (M, nx) and inputs (M, nu), finite or not."""
         with np.errstate(all="ignore"):
             found = self.parsed(motion).value(motion.values(x.T, u.T, p, np), np)
         return np.broadcast_to(np.asarray(found, dtype=float), (len(x),))
 
 
 def equations_of(motion: Motion) -> tuple[str, ...]:
-    """Whose equations there are, outputs after states."""
+    """Return the names of all equations, outputs after states."""
     return (*motion.names_of_states, *(output.name for output in motion.outputs))
 
 
 def usual_places(motion: Motion) -> tuple[int, ...]:
-    """Return the equations of states that a term is likely to lack in: the learned ones, else those that have parameters."""
+    """Return the state equations likely to lack a term: learned ones, else with parameters."""
     if motion.learned[0]:
         return motion.learned[0]
     if motion.functions is not None:
@@ -153,7 +154,7 @@ def usual_places(motion: Motion) -> tuple[int, ...]:
 
 
 def check_motion_suspects(suspects: Sequence[MotionSuspect], problem: MotionProblem) -> None:
-    """Raise InputError for suspects that the motion cannot have, or that have no value at some guessed state."""
+    """Raise InputError for suspects that the motion cannot have, or without a value somewhere."""
     motion, (x, u) = problem.motion, problem.looked_at
     check_unique((suspect.name for suspect in suspects), "suspect")
     for suspect in suspects:
@@ -169,7 +170,9 @@ def check_motion_suspects(suspects: Sequence[MotionSuspect], problem: MotionProb
 
 
 def motion_width(on: str, motion: Motion, x: Matrix, u: Matrix) -> float:
-    """Return a width from states x (M, nx) and inputs u (M, nu): the median of |on| where it is not zero, to six digits.
+    """Return a width from states x (M, nx) and inputs u (M, nu): the median of nonzero |on|.
+
+    It is rounded to six digits.
 
     Raises:
         InputError: an expression that cannot be read, that is not finite, or zero everywhere.
@@ -199,10 +202,11 @@ def _balanced(text: str) -> None:
 def softened(
     suspects: Sequence[MotionSuspect], motion: Motion, p: Vector, x: Matrix, u: Matrix
 ) -> tuple[MotionSuspect, ...]:
-    """Friction as it is where it turns round smoothly: each suspect that jumps as tanh(v/width), of several widths.
+    """Return smooth forms of friction: each suspect that jumps as tanh(v/width), of several widths.
 
-    Args: p: parameters (np,); with states x (M, nx) and inputs u (M, nu) they tell the widths, in
-        median sizes.
+    Args:
+        p: parameters (np,); with states x (M, nx) and inputs u (M, nu) they give the widths, in
+            median sizes.
     """
     found = []
     for suspect in suspects:
@@ -224,10 +228,10 @@ def softened(
 def usual_motion_suspects(
     motion: Motion, x: Matrix, u: Matrix, on: Sequence[str] = ()
 ) -> tuple[MotionSuspect, ...]:
-    """Return what is often missing: friction, drag and hardening of every state, what bends an input, an offset.
+    """Return the usual suspects: friction, drag, hardening, bent inputs, an offset.
 
     Args:
-        x: states (M, nx) that it is about; with inputs u (M, nu) they tell the widths.
+        x: states (M, nx) that it is about; with inputs u (M, nu) they give the widths.
         on: expressions that the learner sees, such as the distance of two masses.
     """
     names, inputs = motion.names_of_states, motion.inputs

@@ -1,4 +1,4 @@
-"""What an observer tells along a record: outputs and states with bands, innovations, and whether those are noise."""
+"""Result of an observer along a record: outputs, states, bands, and tests of the innovations."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Consistency:
-    """Whether the innovations are what the filter expects of them.
+    """Consistency of the innovations with the filter's own covariance.
 
     `nis` is the mean of `νᵀS⁻¹ν` per output that was measured: 1 for a filter that knows its noise.
     `expected` is the interval that holds it in 95 % of records where that is so (χ², Bar-Shalom
@@ -40,7 +40,7 @@ class Consistency:
 class ObserverRun:
     """An observer along one experiment of N rows; NaN on rows before `start`.
 
-    `predicted` (N, ny) are the outputs as the rows before tell them, `spread` (N, ny, ny) the
+    `predicted` (N, ny) are the outputs as the rows before predict them, `spread` (N, ny, ny) the
     covariance of measured less predicted ones. `outputs` (N, ny) are estimates without the sensors'
     noise, with the row's own measurement; `outputs_std` their standard deviations. `states` (N, n),
     `states_std` are those of a motion at the row; a lagged model's are what goes into the next
@@ -83,14 +83,14 @@ class Observations:
     """Of a motion; a lagged model's states are its outputs."""
     sampling_time: float
     settled: int
-    """Rows of each experiment that tell where it started."""
+    """Rows of each experiment that determine where it started."""
 
     def __repr__(self) -> str:
         rows = sum(len(one.square) for one in self.experiments)
         return f"Observations({', '.join(c.name for c in self.outputs)}, {rows} samples)"
 
     def consistency(self, skip: int | None = None) -> Consistency:
-        """Return whether the innovations are white and of the expected size, without the first `skip` rows (`settled`)."""
+        """Return the test of whiteness and size of innovations, after `skip` rows (`settled`)."""
         skip = self.settled if skip is None else skip
         pieces = [(one, slice(max(one.start, skip), None)) for one in self.experiments]
         total = float(sum(np.sum(one.square[rows]) for one, rows in pieces))
@@ -107,7 +107,7 @@ class Observations:
         return Consistency(total / count, (ends[0], ends[1]), tuple(tests))
 
     def to_frame(self, experiment: int = 0) -> pd.DataFrame:
-        """`time` and, per output, measured and estimated with its 95 % band.
+        """Return `time` and, per output, measured and estimated values with the 95 % band.
 
         The same of a motion's states.
         """

@@ -1,4 +1,4 @@
-"""An observer: the state of a fitted model from what is measured, by an extended Kalman filter, with bands."""
+"""Observer: the state of a fitted model from measurements, by an extended Kalman filter."""
 
 from __future__ import annotations
 
@@ -35,16 +35,16 @@ from orthaug.models.stepping import checked_row, one_experiment
 class Observer:
     """An extended Kalman filter of a fitted model, lagged or a motion.
 
-    Args: model: the model, or the fit: of a fit the residual tells how large the noises are
-        (`diagnose`), and where both
-            are there the likelihood of its data does; a model that `orthaug fit` saved carries what
-            they told.
+    Args:
+        model: the model, or the fit: of a fit the residual determines how large the noises are
+            (`diagnose`), and where both are there the likelihood of its data does; a model that
+            `orthaug fit` saved carries them.
         noise: the covariances, where they are known better: of the disturbances in a sample, of the
             sensors.
 
-    Raises: InputError: a model whose learner cannot be differentiated, or that has no estimate of
-        its noise; covariances
-            that are none, or of other sizes.
+    Raises:
+        InputError: a model whose learner cannot be differentiated, or that has no estimate of its
+            noise; covariances that are none, or of other sizes.
     """
 
     model: Any
@@ -75,7 +75,7 @@ class Observer:
         return f"Observer({self.model!r})"
 
     def tuned(self, record: Record) -> Observer:
-        """Return the observer whose noises, each times a factor, are the most likely ones for a record.
+        """Return the observer with its noises scaled to be the most likely ones for a record.
 
         A noise that is zero stays so.
 
@@ -85,7 +85,9 @@ class Observer:
         return replace(self, noise=most_likely(self.model, self.noise, record))
 
     def start(self, record: Record, row: int | None = None) -> ObserverState:
-        """Where to begin, before a row of a record of one experiment, by default the first that is estimated.
+        """Return the state before a row of a record of one experiment.
+
+        By default that is the first row that is estimated.
 
         A motion's state is guessed from the outputs about the row, and unknown by the size of the
         states.
@@ -101,24 +103,25 @@ class Observer:
         return ObserverState(self, form.start(experiment, record, row, self.noise, size))
 
     def run(self, record: Record) -> Observations:
-        """Return outputs and states along a record, each row told by what was measured up to it.
+        """Return outputs and states along a record, each row estimated from measurements up to it.
 
         Raises:
             InputError: other channels, too few rows, or an estimate that leaves all bounds.
         """
         record = self._record(record)
-        told = tuple(self._along(experiment, record)[0] for experiment in record.experiments)
+        runs = tuple(self._along(experiment, record)[0] for experiment in record.experiments)
         form = self.model.filtering[0]
         names = form.names if form.hidden else ()
-        return Observations(told, self.model.outputs, names, record.sampling_time, self._settled)
+        return Observations(runs, self.model.outputs, names, record.sampling_time, self._settled)
 
     def predict(self, record: Record, horizon: int = 1) -> Response:
-        """Return each row from the state that was estimated `horizon` samples before it, with its standard deviation.
+        """Return the prediction of each row from `horizon` samples before it, with its deviation.
 
-        A motion's first rows, which tell its state, have no value, as in its `predict`.
+        A motion's first rows, which determine its state, have no value, as in its `predict`.
 
-        Raises: InputError: other channels, a horizon below 1, too few rows, or an estimate that
-            leaves all bounds.
+        Raises:
+            InputError: other channels, a horizon below 1, too few rows, or an estimate that leaves
+                all bounds.
         """
         horizon = check_count(horizon, "horizon", of="steps")
         record = self._record(record)
@@ -129,7 +132,7 @@ class Observer:
 
     @property
     def _settled(self) -> int:
-        """Rows that tell where an experiment starts."""
+        """Rows that determine the start of an experiment."""
         form = self.model.filtering[0]
         return self.model.window if form.hidden else form.first_row
 
@@ -139,23 +142,23 @@ class Observer:
     def _along(
         self, experiment: Experiment, record: Record
     ) -> tuple[ObserverRun, StateEstimate, Matrix]:
-        """Return what an experiment tells, what is believed before its rows, and what their steps read."""
+        """Return the observed run of an experiment, the predicted states, and the steps' inputs."""
         form, numbers, size = self.model.filtering
         first = form.first_row
         self.model.check_rows(experiment, first)
         begun = form.start(experiment, record, first, self.noise, size)
         inputs = form.inputs(experiment, record)
-        before, told = filtered(
+        before, rows = filtered(
             form, numbers, self.noise, begun, inputs, experiment.outputs[first:]
         )
-        finite = np.isfinite(told.predicted).all(axis=1) & np.isfinite(before.state).all(axis=1)
+        finite = np.isfinite(rows.predicted).all(axis=1) & np.isfinite(before.state).all(axis=1)
         if not finite.all():
             raise InputError(
                 f"{experiment.where(first + int(np.argmin(finite)))}: the estimate leaves all "
                 "bounds there; the model does not hold on this record, or the noise of the "
                 "observer is wrong."
             )
-        return _observed(told, experiment, first), before, inputs
+        return _observed(rows, experiment, first), before, inputs
 
     def _ahead(self, experiment: Experiment, record: Record, horizon: int) -> Trajectory:
         form, numbers, _ = self.model.filtering
@@ -170,12 +173,12 @@ class Observer:
                 known = ahead(alone[0], alone[1], self.noise, before, inputs, horizon)[0]
             parts = Parts(known.total, parts.total - known.total, parts.total - known.total)
         skip = first - form.first_row - horizon + 1
-        told = trajectory(
+        predicted = trajectory(
             Parts(*(part[skip:] for part in parts)), experiment, experiment.outputs, first
         )
         whole = np.full(experiment.outputs.shape, np.nan)
         whole[first:] = std[skip:]
-        return replace(told, std=whole)
+        return replace(predicted, std=whole)
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,8 +201,8 @@ class ObserverState:
     observer: Observer
     belief: StateEstimate
     """The state before the next sample and its covariance."""
-    told: FilterRow | None = None
-    """What the last sample told; None before the first."""
+    latest: FilterRow | None = None
+    """The filter's row of the last sample; None before the first."""
 
     @property
     def state_names(self) -> tuple[str, ...]:
@@ -209,46 +212,46 @@ class ObserverState:
     def state(self) -> Vector:
         """The state (n,) at the last sample of a motion.
 
-        Of a lagged model that which the next step starts from.
+        For a lagged model it is the state that the next step starts from.
         """
-        return np.asarray(self.belief.state if self.told is None else self.told.state)
+        return np.asarray(self.belief.state if self.latest is None else self.latest.state)
 
     @property
     def state_band(self) -> Matrix:
         """Its 95 % limits (2, n)."""
-        covariance = self.belief.covariance if self.told is None else self.told.state_covariance
+        covariance = self.belief.covariance if self.latest is None else self.latest.state_covariance
         return _band(self.state, covariance)
 
     @property
     def predicted(self) -> Vector:
-        """The outputs (ny,) at the last sample as those before it told them."""
-        return np.asarray(self._told.predicted)
+        """Outputs (ny,) at the last sample, predicted from those before it."""
+        return np.asarray(self._update.predicted)
 
     @property
     def predicted_band(self) -> Matrix:
         """The limits (2, ny) within which 95 % of measurements lie."""
-        return _band(self.predicted, self._told.spread)
+        return _band(self.predicted, self._update.spread)
 
     @property
     def outputs(self) -> Vector:
         """The outputs (ny,) at the last sample, without the sensors' noise."""
-        return np.asarray(self._told.outputs)
+        return np.asarray(self._update.outputs)
 
     @property
     def outputs_band(self) -> Matrix:
         """Their 95 % limits (2, ny)."""
-        return _band(self.outputs, self._told.outputs_covariance)
+        return _band(self.outputs, self._update.outputs_covariance)
 
     @property
     def square(self) -> float:
-        """`νᵀS⁻¹ν` of the last sample: χ² with as many degrees of freedom as outputs were measured."""
-        return float(self._told.square)
+        """`νᵀS⁻¹ν` of the last sample: χ² with one degree of freedom per measured output."""
+        return float(self._update.square)
 
     @property
-    def _told(self) -> FilterRow:
-        if self.told is None:
+    def _update(self) -> FilterRow:
+        if self.latest is None:
             raise InputError("no sample has been measured yet; `update` first.")
-        return self.told
+        return self.latest
 
     def update(self, inputs: Any, outputs: Any) -> ObserverState:
         """Return one sample later.
@@ -264,10 +267,10 @@ class ObserverState:
         row = _row(inputs, "inputs", len(model.step_inputs))
         measured = _row(outputs, "outputs", len(model.outputs), gaps=True)
         form, numbers, _ = model.filtering
-        belief, told = one_row(form, numbers, self.observer.noise, self.belief, row, measured)
-        if not (np.isfinite(told.predicted).all() and np.isfinite(belief.state).all()):
+        belief, latest = one_row(form, numbers, self.observer.noise, self.belief, row, measured)
+        if not (np.isfinite(latest.predicted).all() and np.isfinite(belief.state).all()):
             raise InputError("the estimate leaves all bounds; the model does not hold here.")
-        return replace(self, belief=belief, told=told)
+        return replace(self, belief=belief, latest=latest)
 
 
 def _band(mean: Vector, covariance: Any) -> Matrix:
@@ -290,21 +293,21 @@ def _row(values: Any, name: str, count: int, *, gaps: bool = False) -> Vector:
     return row
 
 
-def _observed(told: FilterRow, experiment: Experiment, first: int) -> ObserverRun:
-    """With NaN before the first row that is estimated."""
+def _observed(rows: FilterRow, experiment: Experiment, first: int) -> ObserverRun:
+    """Return the run, with NaN before the first row that is estimated."""
 
     def whole(values: Any) -> Any:
         return np.concatenate([np.full((first, *values.shape[1:]), np.nan), values])
 
     return ObserverRun(
         measured=experiment.outputs,
-        predicted=whole(told.predicted),
-        spread=whole(told.spread),
-        outputs=whole(told.outputs),
-        outputs_std=whole(spread_of(told.outputs_covariance)),
-        states=whole(told.state),
-        states_std=whole(spread_of(told.state_covariance)),
-        square=whole(told.square),
+        predicted=whole(rows.predicted),
+        spread=whole(rows.spread),
+        outputs=whole(rows.outputs),
+        outputs_std=whole(spread_of(rows.outputs_covariance)),
+        states=whole(rows.state),
+        states_std=whole(spread_of(rows.state_covariance)),
+        square=whole(rows.square),
         start=first,
         start_time=experiment.start_time,
     )

@@ -1,6 +1,6 @@
-"""How large the noises of an observer are: by what the residual says of them, or by the likelihood of a record.
+"""Noises of an observer, from the verdict on the residual or by the likelihood of a record.
 
-Noise in the equations moves the state; noise on a sensor does not. The residual tells which
+Noise in the equations moves the state; noise on a sensor does not. The residual shows which
 (`diagnose`): a white one one step ahead is the equation's, R = 0 and Q its covariance; a white one
 of a free run is the sensors', R its covariance, and Q so small that it makes 3 % of the free run's
 variance: that is for a model that is not exact. Otherwise both are there.
@@ -24,7 +24,7 @@ from orthaug.models.model import Model
 from orthaug.models.motion_model import MotionModel
 
 _LITTLE, _MOST = 0.03, 0.9  # shares of a free run's variance that disturbances make
-BOTH = ("equation_noise", "unmodelled")  # verdicts on a free run that tell of disturbances
+BOTH = ("equation_noise", "unmodelled")  # verdicts on a free run that mean disturbances
 _STEPS = 400  # that a disturbance is followed
 _TUNED_ROWS = 4000
 _KEPT_ROWS, _KEPT_STATES = (
@@ -37,9 +37,9 @@ _LARGE = 1e12
 
 
 def by_verdict(model: Model | MotionModel, verdict: str | None = None) -> Noise:
-    """Return the noises of a fitted model as the verdict on its residual says, by default what it carries.
+    """Return the noises of a fitted model by a verdict, by default the noises that it carries.
 
-    That are noises which the likelihood of its training data told, else those of its verdict.
+    Those are noises by the likelihood of its training data, else those of its verdict.
 
     Raises:
         InputError: a model without an estimate of its noise.
@@ -63,7 +63,7 @@ def _known(noise: Matrix | None) -> TypeGuard[Matrix]:
 
 
 def with_share(model: Model | MotionModel, noise: Matrix, share: float) -> Noise:
-    """Disturbances that make a share of a free run's variance `noise`, about the origin.
+    """Return disturbances that make up a share of a free run's variance `noise`, about the origin.
 
     The sensors make the rest.
     """
@@ -100,7 +100,7 @@ def of_fit(fit: Estimate | MotionEstimate) -> Noise:
 
 
 def to_keep(fit: Estimate | MotionEstimate, verdict: str) -> Noise | None:
-    """Return what a fit keeps with its model, by the likelihood of some of its rows, where its residual has both noises.
+    """Return the noises that a fit keeps with its model, by likelihood, if both kinds are present.
 
     None where the verdict's rule is as good, without an estimate of the noise, and where a filter
     takes long.

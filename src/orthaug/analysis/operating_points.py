@@ -1,4 +1,4 @@
-"""Points where a model rests: its equilibria with inputs held constant, found, or given and checked.
+"""Points of rest of a model: its equilibria under constant inputs, found or given and checked.
 
 Inputs that nobody fixes are 0, or their means over a record. Where outputs or states are fixed,
 inputs that nobody fixes are looked for with the rest.
@@ -24,14 +24,17 @@ _STARTS = 32  # points of a Halton sequence in the box of the training data, bes
 _SOLVED = 1e-9  # of what is zero at rest over the starts
 _SAME = 1e-6  # of sizes: points that are as near are one
 _SINGULAR = 1e-10  # of singular values: directions along which rest does not end
-_FAR = 2.0  # times what the training data reached: an equilibrium beyond is told only where there is no other
+_FAR = 2.0  # times the training range: an equilibrium beyond is given only if there is no other
 _NOTHING = 1e-13  # of sizes: rounding of 0
 _POLISH = 5  # Newton steps
 
 
 @dataclass(frozen=True, eq=False)
 class Slopes:
-    """How the equations of a point follow (rest, inputs), (m, ne + nu), which of these are `free`, and their values."""
+    """Slopes of a point's equations by (rest, inputs), (m, ne + nu), and the `free` unknowns.
+
+    `value` holds the unknowns.
+    """
 
     matrix: Matrix
     free: Bool[np.ndarray, "k"]
@@ -39,7 +42,7 @@ class Slopes:
     """Numbers of the outputs whose values are equations too."""
 
     def following(self, change: Float[np.ndarray, "m r"]) -> Float[np.ndarray, "k r"]:
-        """Return how (rest, inputs) follow where the equations change (implicit function theorem)."""
+        """Return the change of (rest, inputs) by changed equations (implicit function theorem)."""
         moved = np.zeros((len(self.free), change.shape[1]))
         if self.free.any():
             moved[self.free] = -np.linalg.pinv(self.matrix[:, self.free], rcond=_SINGULAR) @ change
@@ -50,7 +53,7 @@ class Slopes:
 class OperatingPoint:
     """A point of rest: `values` of states or outputs and inputs by name, `outputs` likewise.
 
-    `outside` tells whether it lies beyond what training reached, or the learner's features do;
+    `outside` is whether it lies beyond what training reached, or the learner's features do;
     `line` whether it is one of a continuum.
     """
 
@@ -68,7 +71,7 @@ class OperatingPoint:
 
 
 def parse_point(at: str | Mapping[str, float] | None) -> dict[str, float]:
-    """`"force=0, position=1"` as a mapping.
+    """Return `"force=0, position=1"` as a mapping.
 
     Raises:
         InputError: no pairs of names and finite numbers, or a name twice.
@@ -104,7 +107,10 @@ def _number(text: str) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Search:
-    """What is looked for: `given` values of rest and inputs, NaN where free, and of outputs by their number."""
+    """Search for a point of rest: `given` values of rest and inputs, NaN where free, and outputs.
+
+    `outputs` are by their number.
+    """
 
     step: Step
     numbers: Numbers
@@ -126,7 +132,7 @@ class Search:
         at: Mapping[str, float],
         held: Vector,
     ) -> Search:
-        """`held` (nu,) are the inputs that nobody fixes.
+        """Return the search; `held` (nu,) are the inputs that nobody fixes.
 
         Raises:
             InputError: a name that the model does not have.
@@ -155,16 +161,16 @@ class Search:
 
     @property
     def free(self) -> Bool[np.ndarray, "k"]:
-        """Return what is looked for, of rest and inputs."""
+        """Mask of the unknowns among rest and inputs."""
         return np.isnan(self.given)
 
     @property
     def scale(self) -> Vector:
-        """Return what counts as one, of rest and inputs."""
+        """Scale of rest and inputs."""
         return np.concatenate([self.size, np.maximum(np.abs(self.middle[len(self.size) :]), 1.0)])
 
     def equations(self, point: Vector) -> tuple[Vector, Matrix, Vector]:
-        """Return what must be zero (m,), how it follows rest and inputs (m, k), and the outputs."""
+        """Return the residuals (m,), their slopes by rest and inputs (m, k), and the outputs."""
         ne = len(self.step.rest)
         width = difference_widths(self.size, point[ne:])
         value, outputs, slope = map(
@@ -228,27 +234,24 @@ def _within_reach(
         :1
     ]
     if len(near) < len(found):
-        told = (
-            f"{len(found) - len(near)} more equilibria lie far outside of the training data; "
-            "they are left out."
+        text = (
+            f"{len(found) - len(near)} more equilibria lie far outside of the training data "
+            "and are left out."
         )
-        warnings.append(Warning("equilibria_left_out", told))
+        warnings.append(Warning("equilibria_left_out", text))
     if len(near) > 1:
-        told = f"{len(near)} equilibria belong to these inputs; fix an output to choose one."
-        warnings.append(Warning("several_equilibria", told))
+        text = f"{len(near)} equilibria belong to these inputs; fix an output to choose one."
+        warnings.append(Warning("several_equilibria", text))
     if any(one.line for one in near):
-        told = (
+        text = (
             "the equilibrium is one of a continuum (the model integrates, or too little is "
             "fixed); one is taken."
         )
-        warnings.append(Warning("continuum_of_equilibria", told))
+        warnings.append(Warning("continuum_of_equilibria", text))
     if any(one.outside for one in near):
         where = "the operating point lies" if len(near) == 1 else "operating points so marked lie"
-        told = (
-            f"{where} outside of the training data, which do not tell what the model is worth "
-            "there."
-        )
-        warnings.append(Warning("outside_training", told))
+        text = f"{where} outside of the training data, where the model is not validated."
+        warnings.append(Warning("outside_training", text))
     return near, warnings
 
 
@@ -307,7 +310,7 @@ def _point(search: Search, point: Vector) -> OperatingPoint:
 
 
 def _nothing(search: Search, starts: Matrix, unit: Vector) -> str:
-    """Why there is no point."""
+    """Return the reason why there is no point."""
     names = (*search.step.rest, *search.step.inputs)
     fixed = [
         f"{name} = {value:.6g}"

@@ -1,4 +1,4 @@
-"""How the outputs of a free run follow a signal that is added to an equation, to first order, of any dynamics.
+"""First-order response of a free run's outputs to a signal added to an equation.
 
 With `x⁺, y = step(x)` and a signal c in an equation: `s⁺ = A s + b c`, `Δy = C s + d c`, A and C
 the slopes of the step along the run. The signal acts on the newest output of lagged physics, and on
@@ -24,7 +24,10 @@ from orthaug.models.motion_model import MotionModel
 
 @dataclass(frozen=True, eq=False)
 class LinearRun:
-    """A free run of one experiment of T rows, linearised: `states` (T, n0), `error` (T, ny) measured less run."""
+    """Linearised free run of one experiment of T rows, with states, slopes and errors.
+
+    `states` are (T, n0), `error` (T, ny) is measured less run.
+    """
 
     states: Matrix
     inputs: Matrix
@@ -43,7 +46,7 @@ class LinearRun:
         into_output: Float[np.ndarray, "T ny k"],
         start: Matrix,
     ) -> Float[np.ndarray, "T ny k"]:
-        """Compute Δy of k columns that are added to the state and the output of every step, from s (n0, k) = start."""
+        """Return Δy of k columns added to state and output of each step, from s (n0, k) = start."""
         found = np.array(into_output, dtype=float)
         if not self.states.shape[1]:
             return found
@@ -114,7 +117,10 @@ def _linearize(
 
 @partial(jax.jit, static_argnames="form")
 def _along(form: Any, numbers: Any, start: Any, rows: Any) -> Any:
-    """States, outputs, and the slopes of both by state and parameters, at every row of a free run."""
+    """Return states, outputs, and the slopes of both, at every row of a free run.
+
+    The slopes are those by state and parameters.
+    """
 
     def step(state: Any, theta: Any, row: Any) -> tuple[Any, Any]:
         own = form.prepared(numbers._replace(theta=theta))

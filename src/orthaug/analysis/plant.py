@@ -1,4 +1,4 @@
-"""The physics with the suspected terms, simulated without noise for many inputs side by side, by a tape.
+"""Noise-free simulation of physics and suspects for many inputs side by side, by a tape.
 
 The tape records once what NumPy does with the expressions and then repeats it, each common part
 once.
@@ -33,7 +33,7 @@ class Node(np.lib.mixins.NDArrayOperatorsMixin):
 
 
 class Tape:
-    """Stands for NumPy while expressions are evaluated once, and then repeats what they did, each part once."""
+    """Tape of the NumPy operations of expressions, recorded once and repeated, each part once."""
 
     def __init__(self) -> None:
         self.values: list[Any] = []
@@ -72,7 +72,7 @@ class Tape:
         return self.known[key]
 
     def replay(self, columns: Iterable[Any], wanted: Sequence[int]) -> list[Any]:
-        """Values of the wanted slots for one column for each of `lags`, in their order."""
+        """Return values of the wanted slots from one column for each of `lags`, in their order."""
         values = self.values
         for slot, column in zip(self.lags.values(), columns, strict=True):
             values[slot] = column
@@ -141,7 +141,7 @@ class Plant:
     def rows(
         self, u: Float[np.ndarray, "N M"]
     ) -> tuple[Float[np.ndarray, "M R ny nt+1"], np.ndarray]:
-        """Rows `[Φ Δ]`, zero for an input under which they run away, and the weights of the outputs (M, 1, ny, 1)."""
+        """Return rows `[Φ Δ]`, zero where they run away, and outputs' weights (M, 1, ny, 1)."""
         (length, count), start, half = u.shape, self.start, len(u) // 2
         y = np.zeros((len(self.outputs), length, count))
         y[:, :start] = self.before.T[:, :, None]

@@ -1,4 +1,4 @@
-"""How much of a signal could be predicted from others: cross-validated shares of its variance, from Gram sums.
+"""Share of a signal's variance that others predict, cross-validated from Gram sums.
 
 Rows are cut into contiguous blocks. Each is predicted by least squares on the others, so that the
 share is what a model with these columns would gain on rows that it has not seen; chance counts
@@ -33,13 +33,16 @@ _RIDGE = 1e-6  # of a column's sum of squares, so that columns that repeat each 
 
 @dataclass(frozen=True, eq=False)
 class SimpleFunctions:
-    """Directions of the regressor, of each channel its first lag and differences of lags, with mean and deviation."""
+    """Directions of the regressor: each channel's first lag and differences, with mean and size."""
 
     variables: tuple[tuple[Vector, float, float], ...]
 
     @classmethod
     def of(cls, problem: Problem) -> SimpleFunctions:
-        """Of what the physics and the learner read, the first lags and differences of all channels in front."""
+        """Return the functions for the regressors of physics and learner.
+
+        First lags and differences of all channels come first.
+        """
         layout, x, each = problem.layout, problem.rows.x, np.eye(len(problem.layout))
         places: dict[str, list[int]] = {}
         for j, lag in enumerate(layout):
@@ -57,7 +60,7 @@ class SimpleFunctions:
         return 5 * n + 3 * n * (n - 1) // 2
 
     def __call__(self, x: Matrix) -> Matrix:
-        """On rows of the regressor, (N, functions)."""
+        """Return the functions on rows of the regressor, (N, functions)."""
         columns = []
         scaled = [
             np.clip((x @ d - mean) / size, -_FARTHEST, _FARTHEST)
@@ -80,7 +83,7 @@ class Share:
 
     @classmethod
     def of(cls, without: Vector, together: Vector) -> Share:
-        """By how much a sum of squares over blocks (blocks,) is smaller than another one."""
+        """Return the relative decrease of a sum of squares over blocks (blocks,)."""
         total, gained = float(without.sum()), without - together
         if not (total > 0 and np.isfinite(gained).all()):
             return cls(0.0, 0.0)
@@ -104,7 +107,7 @@ class BlockSums:
 
     @classmethod
     def of(cls, columns: Matrix, target: Vector, blocks: int = BLOCKS) -> BlockSums:
-        """From rows in their order."""
+        """Return the sums of rows in their order."""
         both = np.column_stack([columns, target])
         edges = np.linspace(0, len(both), blocks + 1).astype(int)
         return cls(
@@ -112,11 +115,11 @@ class BlockSums:
         )
 
     def share(self, columns: Sequence[int], beside: Sequence[int] = ()) -> Share:
-        """Return what `columns` explain of the target beyond those `beside` which they stand."""
+        """Return the share of the target that `columns` explain beyond those in `beside`."""
         return Share.of(self._missed(list(beside)), self._missed([*beside, *columns]))
 
     def _missed(self, columns: list[int]) -> Vector:
-        """Sum of squared errors on every block of the regression on the others, (blocks,)."""
+        """Return each block's sum of squared errors (blocks,), by regression on the others."""
         own = np.ix_(range(len(self.grams)), columns, columns)
         inner, moment, total = self.grams[own], self.grams[:, columns, -1], self.grams[:, -1, -1]
         if not columns:
@@ -133,12 +136,12 @@ class BlockSums:
 
 
 def from_own_past(signal: Pieces, lags: int) -> Share:
-    """Return what a short autoregression explains of a signal less its mean."""
+    """Return the share of a signal less its mean that a short autoregression predicts."""
     return from_lags(signal, [signal], range(1, lags + 1))
 
 
 def from_lags(signal: Pieces, others: Sequence[Pieces], lags: Sequence[int]) -> Share:
-    """Return what lags of other signals explain of a signal, beside a constant."""
+    """Return the share of a signal that lags of other signals predict, beside a constant."""
     if not others or not len(lags):
         return Share(0.0, 0.0)
     target, columns = [], []
@@ -160,7 +163,7 @@ def from_lags(signal: Pieces, others: Sequence[Pieces], lags: Sequence[int]) -> 
 
 
 def from_neighbours(x: Matrix, signal: Vector) -> Share:
-    """Return what a smooth function of the rows x explains of a signal (N,), whatever its form.
+    """Return the share of a signal (N,) that any smooth function of the rows x could explain.
 
     Where two rows lie close to each other, their values differ by the rest alone: half the mean
     square of that is the variance of the rest (Rice 1984). Where they lie far apart, as in many
@@ -185,12 +188,12 @@ def from_neighbours(x: Matrix, signal: Vector) -> Share:
 
 @dataclass(frozen=True)
 class Predictable:
-    """Of one output's error, in the output's unit: its RMS, and which shares of its square could be predicted.
+    """RMS of an output's error, in the output's unit, and its predictable shares.
 
-    From its own past, from lagged inputs, each cross-validated, and from functions of the
-    regressors: products and curves, cross-validated as well, or one step ahead whatever lets
-    neighbours have like errors. Two standard errors are taken off; 0 where that is not surely more
-    than nothing.
+    It is predicted from its own past and from lagged inputs, both cross-validated, and from
+    functions of the regressors: products and curves, cross-validated as well, or one step ahead
+    whatever lets neighbours have like errors. Two standard errors are taken off; 0 where that is
+    not surely more than nothing.
     """
 
     name: str
@@ -210,7 +213,7 @@ class Predictable:
 def predictable(
     problem: Problem, response: Response, skip: int = 0, *, simulates: bool = False
 ) -> tuple[Predictable, ...]:
-    """Return what could be predicted of a response's errors on the training data, after the first `skip` rows.
+    """Return the predictable shares of a response's errors on training data, after `skip` rows.
 
     Args:
         simulates: a free run, whose errors are no function of the regressor.

@@ -1,8 +1,8 @@
-"""Residual analysis: is what a model leaves over white, independent of the inputs, and flat over the regressors?
+"""Residual analysis: whiteness, independence of the inputs, and flatness over the regressors.
 
 The tests are those of Ljung, System Identification (1999), sect. 16.6. Experiments are pooled. On a
-large record every test rejects. The sizes of the effects stand beside the p-values for that reason.
-There is no verdict here.
+large record every test rejects. The sizes of the effects are given beside the p-values for that
+reason. There is no verdict here.
 """
 
 from __future__ import annotations
@@ -31,9 +31,8 @@ from orthaug.data.record import Experiment
 from orthaug.models.response import Response
 
 LAGS = 25  # as MATLAB's `resid`
-PRACTICALLY_WHITE = (
-    0.05  # correlations below this are no matter, however sure a long record makes them
-)
+# Correlations below this are no matter, however sure a long record makes them
+PRACTICALLY_WHITE = 0.05
 ROUNDING = 1e-14  # of the output's deviation: a residual that says nothing
 
 Channels = dict[str, list[Vector]]
@@ -57,7 +56,7 @@ class ResidualTest:
     white: bool | None
     """Whether Ljung-Box does not reject at `level`."""
     order: int | None
-    """Order of the autoregression that stands for the residual's colour."""
+    """Order of the autoregression that models the residual's colour."""
     cross: Mapping[str, CrossTest | None]
     correlated_inputs: tuple[str, ...]
     """Inputs whose joint test is below `level`, divided by the number of inputs tested
@@ -78,17 +77,20 @@ class ResidualTest:
     """
 
     def practically_white(self, small: float = PRACTICALLY_WHITE) -> bool:
-        """White by Ljung-Box, or with correlations too small to matter."""
+        """Return whether it is white by Ljung-Box, or its correlations are too small to matter."""
         return self.white is not False or self.largest_acf is None or self.largest_acf < small
 
     def follows(self, small: float = PRACTICALLY_WHITE) -> list[str]:
-        """Return inputs that the residual follows: surely, by enough to matter, and beyond the band of the figure."""
+        """Return inputs that the residual follows significantly, and by enough to matter.
+
+        The correlation is also beyond the band of the figure.
+        """
         band = max([small, *(test.band for test in self.cross.values() if test is not None)])
         named = [(name, self.cross[name]) for name in self.correlated_inputs]
         return [name for name, test in named if test is not None and test.largest > band]
 
     def curved_over(self, share: float) -> list[str]:
-        """Regressors over which it is surely curved, by more than a share of its variance."""
+        """Return regressors over which it is surely curved, by more than a share of variance."""
         named = [(name, self.regressors[name]) for name in self.curved_regressors]
         return [name for name, test in named if test is not None and test.share > share]
 
@@ -119,8 +121,9 @@ def analyse(
         level: of every test; the bands hold one value with probability 1 − level.
         fitted: dynamic parameters whose fit has used up degrees of freedom of Ljung-Box.
 
-    Raises: InputError: experiments, rows or columns that do not match, a name twice, or a setting
-        out of range.
+    Raises:
+        InputError: experiments, rows or columns that do not match, a name twice, or a setting out
+            of range.
 
     Examples:
         >>> e, u = np.random.default_rng(0).normal(size=(2, 500, 1))
@@ -206,12 +209,12 @@ def _channels(
 
 
 def errors_of(response: Response, skip: int = 0) -> list[Matrix]:
-    """Measured less model of each experiment, over the rows with a value, without the first `skip` of them."""
+    """Return measured less model of each experiment, on rows with a value, after `skip` of them."""
     return [(t.measured - t.model)[t.start :][skip:] for t in response.trajectories]  # type: ignore[operator]
 
 
 def rms_errors(response: Response, skip: int = 0) -> Vector:
-    """RMS error of every output."""
+    """Return the RMS error of every output."""
     with np.errstate(all="ignore"):
         return np.sqrt(np.mean(np.concatenate(errors_of(response, skip)) ** 2, axis=0))
 
@@ -250,7 +253,7 @@ class RunningResidual:
         self._ended = ("", -1)
 
     def add(self, residual: Matrix, inputs: Matrix, *, begins: bool) -> None:
-        """Rows (m, ny) and (m, nu) that follow those before, unless an experiment `begins`."""
+        """Add rows (m, ny) and (m, nu) that follow those before, unless an experiment `begins`."""
         values = np.concatenate([residual, inputs], axis=1)
         if not len(values):
             return
@@ -269,13 +272,13 @@ class RunningResidual:
         self._before = joined[max(len(joined) - self.lags, 0) :]
 
     def watch(self, piece: Experiment, first: int, residual: Matrix) -> None:
-        """The residual of a piece from its row `first` on."""
+        """Add the residual of a piece from its row `first` on."""
         follows = self._ended == (piece.source, piece.offset + first)
         self.add(residual, piece.inputs[first:], begins=not follows)
         self._ended = piece.source, piece.offset + len(piece)
 
     def tests(self, level: float = 0.01) -> tuple[RunningTest, ...]:
-        """Of every output whose residual is finite and moves."""
+        """Return the tests of every output whose residual is finite and not constant."""
         n = int(self._pairs[0])
         if n <= self.lags or not np.abs(self._products[0]).max() < LARGEST:
             return ()

@@ -1,4 +1,4 @@
-"""Which standard errors a fit has by default: plain ones, robust ones against colour or uneven size, or none."""
+"""Default standard errors of a fit: plain, robust against colour or uneven size, or none."""
 
 from __future__ import annotations
 
@@ -22,8 +22,10 @@ _FEWEST_ROWS, _ROWS_PER_TERM = (
     100,
     10,
 )  # rows that a sum of autocovariances needs, in all and for each of its lags
-_FEWEST_BLOCKS = 12  # of which the variance of a sum can be told, Student's t counting them; shorter blocks held 85 %
-_FEWEST_INDEPENDENT = 10  # errors less one, by which an autoregressive model tells a variance: Student's t counts them
+# A variance of a sum needs so many blocks, which Student's t counts; shorter ones covered 85 %.
+_FEWEST_BLOCKS = 12
+# An autoregressive model needs so many independent errors, less one; Student's t counts them.
+_FEWEST_INDEPENDENT = 10
 _FEWEST_TESTED = 40  # rows from which White's test is asked
 _SHORT = 5  # steps of a block of errors that are white and of uneven size
 UNEVEN = 0.05  # level of White's test
@@ -32,7 +34,9 @@ _LEVEL = 0.01  # of the test whether a residual is white
 
 
 def robust_where_asked(fit: Estimate, response: Response) -> Estimate:
-    """Return the fit with the standard errors that its errors ask for: plain, or robust against colour or uneven size.
+    """Return the fit with standard errors that suit its errors: plain, or robust.
+
+    Robust ones hold under colour or uneven size.
 
     One step ahead that is HC3 where White's test finds that the size of the errors goes with what
     moves θ, and Newey and West where they are coloured and the rows suffice. `response` is the
@@ -56,7 +60,7 @@ def robust_where_asked(fit: Estimate, response: Response) -> Estimate:
 
 
 def robust_free_run(fit: Any) -> Any:
-    """Return the fit of a free run, of lagged physics or of a motion, with batch means where its errors ask for them.
+    """Return the fit of a free run with standard errors by batch means, where errors are coloured.
 
     Where they are coloured and the record holds too few stretches that do not remember each other
     for blocks, a model of their colour takes the place of these; where it says that the record is
@@ -110,7 +114,7 @@ def _has_rows(fit: Any, rows: int) -> bool:
 
 
 def _is_uneven(fit: Any, slopes: Any, errors: Matrix) -> bool:
-    """Return whether White's test rejects errors whose size has nothing to do with what moves the parameters."""
+    """Return whether White's test finds the errors' size related to the parameters' slopes."""
     made = fit.moves_by()
     if made is None or not np.isfinite(slopes).all() or not np.isfinite(errors).all():
         return False
@@ -133,28 +137,28 @@ def _withheld(fit: Any) -> Any:
     known = [length for length in lengths if length is not None]
     if len(known) == len(lengths) and max(known) <= fit.scores.longest:
         why = (
-            f"for {max(known)} steps, and the {segments.count} that were trained on hold too "
-            "few stretches of that"
+            f"over {max(known)} steps, and the {segments.count} steps of training hold too few "
+            "stretches of that length"
         )
     else:
         why = (
-            f"for longer than the segments that were trained on ({fit.scores.longest} steps) "
-            "or a good part of the data"
+            f"over more than the segments of training ({fit.scores.longest} steps) or a good "
+            "part of the data"
         )
     each = (
         ""
         if fit.std is None
-        else "; for white errors it would be "
+        else " White errors would give standard errors of "
         + ", ".join(
             f"{std:.2g} of {name}"
             for name, std in zip(_names(fit), fit.std, strict=True)
             if np.isfinite(std)
         )
+        + ", which is too small."
     )
     text = (
-        "no standard errors and no intervals: the errors of the free run remember each other "
-        f"{why}, so their number does not say how well they average out{each}, which is too "
-        "small. Longer segments, a longer record, or physics that leaves less may tell."
+        "there are no standard errors and no intervals: the errors of the free run are correlated "
+        f"{why}.{each} Use longer segments, a longer record, or physics with smaller errors."
     )
     return replace(
         fit,
@@ -170,7 +174,7 @@ def _names(fit: Any) -> tuple[str, ...]:
 
 
 def _memory(fit: Estimate, response: Response) -> int | None:
-    """Lags for the one-step residual; None where it is white, or rounding."""
+    """Return lags for the one-step residual; None where it is white, or rounding."""
     memory = 0
     if np.all(rms_errors(response) / fit.problem.deviation < ROUNDING):
         return None
@@ -210,7 +214,7 @@ def _coloured_run(fit: Any) -> bool:
 
 
 def _is_coloured(pieces: list[Vector]) -> bool:
-    """Return whether Ljung-Box rejects a white residual and a correlation is large enough to matter."""
+    """Return whether Ljung-Box rejects a white residual and a correlation is sizable."""
     box, acf = (
         ljung_box(pieces, LAGS),
         autocorrelation(pieces, sum(map(len, pieces)) // ROWS_PER_LAG),

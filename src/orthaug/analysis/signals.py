@@ -1,4 +1,4 @@
-"""Excitation signals: pure functions that return (N,) samples within ±amplitude, in the channel's unit.
+"""Excitation signals: functions that return (N,) samples within ±amplitude, in channel units.
 
 Which one to use is the paper's remark after `cond:special_PE`: one under which physics and
 suspected terms are orthogonal. `odd=True`, `sign_symmetric` and `space_filling` serve that; the
@@ -23,7 +23,7 @@ _MOST_ORDER = 20  # lags that `space_filling` fills
 
 
 def crest_factor(u: Vector) -> float:
-    """Largest magnitude over root mean square: 1 for a binary signal, 1.41 for a sine.
+    """Return the largest magnitude over root mean square: 1 for a binary signal, 1.41 for a sine.
 
     Raises:
         InputError: a signal that is not finite, or zero everywhere.
@@ -48,7 +48,9 @@ def multisine(
     odd: bool = False,
     periods: int = 1,
 ) -> Vector:
-    """Equal cosines at all harmonics in a band, Schroeder's phases `−π i(i−1)/n` for a low crest factor.
+    """Return equal cosines at all harmonics in a band, with Schroeder's phases `−π i(i−1)/n`.
+
+    Such phases give a low crest factor.
 
     `u_k = A Σ_i cos(2π h_i k/P + φ_i)` over harmonics h_i of the period of P samples, scaled so
     that the largest sample is `amplitude` (Schroeder 1970). With `odd` the second half of a period
@@ -104,12 +106,13 @@ def multisine(
 
 
 def prbs(samples: int, *, amplitude: float, hold: int = 1, bits: int | None = None) -> Vector:
-    """Maximum-length pseudo-random binary sequence ±amplitude, each bit held for `hold` samples.
+    """Return a maximum-length pseudo-random binary sequence ±amplitude, `hold` samples a bit.
 
-    Args: samples: N. hold: samples a bit: the sequence is flat up to about 0.4/(hold · Ts) Hz.
+    Args:
+        samples: N.
+        hold: samples a bit: the sequence is flat up to about 0.4/(hold · Ts) Hz.
         bits: of the shift register, whose period is (2^bits − 1) · hold samples; None for the
-        shortest that
-            does not repeat within N.
+            shortest that does not repeat within N.
 
     Raises:
         InputError: numbers out of range, more samples than the longest register gives.
@@ -140,7 +143,9 @@ def swept_sine(
     sampling_time: float = 1.0,
     logarithmic: bool = False,
 ) -> Vector:
-    """Return a sine whose frequency runs through `band` (Hz, from first to second) once in N samples, from zero on.
+    """Return a sine whose frequency sweeps through `band` (Hz) once in N samples, from zero on.
+
+    It sweeps from the first frequency to the second.
 
     Raises:
         InputError: numbers out of range, a frequency above half the sampling frequency.
@@ -173,7 +178,7 @@ def swept_square(
 
 
 def square(samples: int, *, amplitude: float, period: int) -> Vector:
-    """+amplitude for half a period, −amplitude for the other.
+    """Return +amplitude for half a period, −amplitude for the other.
 
     `period` is an even number of samples.
 
@@ -191,7 +196,7 @@ def square(samples: int, *, amplitude: float, period: int) -> Vector:
 def binary_pattern(
     samples: int, pattern: Sequence[int] | np.ndarray, *, amplitude: float, hold: int = 1
 ) -> Vector:
-    """Return a pattern of 0 and 1 as ∓amplitude, each held for `hold` samples, repeated until there are N.
+    """Return a pattern of 0 and 1 as ∓amplitude, each for `hold` samples, repeated to N samples.
 
     Raises:
         InputError: numbers out of range, a pattern that is empty or holds anything but 0 and 1.
@@ -219,7 +224,9 @@ def binary_pattern(
 def white_gaussian(
     samples: int, *, amplitude: float, seed: int, deviation: float | None = None
 ) -> Vector:
-    """Independent normal samples of standard deviation `deviation` (amplitude/3 by default), clipped to ±amplitude.
+    """Return independent normal samples of size `deviation`, clipped to ±amplitude.
+
+    `deviation` is their standard deviation, amplitude/3 by default.
 
     Raises:
         InputError: numbers out of range.
@@ -234,7 +241,7 @@ def white_gaussian(
 
 
 def white_uniform(samples: int, *, amplitude: float, seed: int) -> Vector:
-    """Independent samples, uniform on [−amplitude, amplitude].
+    """Return independent samples, uniform on [−amplitude, amplitude].
 
     Raises:
         InputError: numbers out of range.
@@ -245,7 +252,7 @@ def white_uniform(samples: int, *, amplitude: float, seed: int) -> Vector:
 
 
 def white_binary(samples: int, *, amplitude: float, seed: int, hold: int = 1) -> Vector:
-    """Independent ±amplitude with equal chances, each held for `hold` samples.
+    """Return independent ±amplitude with equal chances, each held for `hold` samples.
 
     Raises:
         InputError: numbers out of range.
@@ -259,7 +266,7 @@ def white_binary(samples: int, *, amplitude: float, seed: int, hold: int = 1) ->
 
 
 def sign_symmetric(u: Vector) -> Vector:
-    """u followed by −u, (2N,): the paper's symmetric data (Sect. 5.1 and 5.2).
+    """Return u followed by −u, (2N,): the paper's symmetric data (Sect. 5.1 and 5.2).
 
     On a static model with odd physics it makes every even unmodelled term orthogonal exactly
     (`cond:special_PE`); with lags it does so up to the rows that reach across the seam, and up to
@@ -273,16 +280,17 @@ def sign_symmetric(u: Vector) -> Vector:
 
 
 def limit_rate(u: Vector, largest_step: float, start: float | None = None) -> Vector:
-    """Return the signal that follows u with steps of at most `largest_step` a sample, (N,): what a slow actuator does.
+    """Return u with steps limited to `largest_step` a sample, (N,), as by a slow actuator.
 
     `v_k = v_{k−1} + clip(u_k − v_{k−1}, ±largest_step)`; it stays within the range of u and
     `start`.
 
-    Args: u: the wanted signal (N,). largest_step: in the unit of u, per sample (rate limit times
-        the sampling time). start: the value before the first sample; None for `u[0]`. Symmetries of
-        u survive only up to the
-            run-in, so limit the rate of a signal before `sign_symmetric`, not after, where the seam
-            may jump.
+    Args:
+        u: the wanted signal (N,).
+        largest_step: in the unit of u, per sample (rate limit times the sampling time).
+        start: the value before the first sample; None for `u[0]`. Symmetries of u survive only up
+            to the run-in, so limit the rate of a signal before `sign_symmetric`, not after, where
+            the seam may jump.
 
     Raises:
         InputError: a signal that is not finite, a step that is not positive.
@@ -305,17 +313,21 @@ def limit_rate(u: Vector, largest_step: float, start: float | None = None) -> Ve
 def space_filling(
     samples: int, order: int, *, amplitude: float, seed: int, spread: float = 1.0
 ) -> Vector:
-    """Return a sequence whose vectors of `order` successive samples fill the box [−amplitude, amplitude]^order evenly.
+    """Return a sequence whose vectors of `order` successive samples fill their box evenly.
+
+    The box is [−amplitude, amplitude]^order.
 
     A de Bruijn sequence (a random Eulerian circuit of the graph whose nodes are order − 1 symbols)
     over `m = ⌊(N − order + 1)^(1/order)⌋` levels meets each of the m^order cells of the box exactly
     once; within its level the successive visits take the van der Corput numbers. Use it where the
     regressor is `u[k-nk] … u[k-nk-nb+1]`, with order = nb: nk is only a delay.
 
-    Args: samples: N, at least 2^order + order − 1; what is left after one circuit runs through it
-        again. order: lags to fill, 1 to 20. What it gains over white noise shrinks with every lag:
-        the fill distance is 0.63
-            of the white median at 1000 samples of 2 lags, 0.72 at 1500 of 3, 0.84 at 4000 of 5.
+    Args:
+        samples: N, at least 2^order + order − 1; what is left after one circuit runs through it
+            again.
+        order: lags to fill, 1 to 20. What it gains over white noise shrinks with every lag: the
+            fill distance is 0.63 of the white median at 1000 samples of 2 lags, 0.72 at 1500 of 3,
+            0.84 at 4000 of 5.
         seed: of the circuit.
         spread: share of a level's width that is used; 1 for all, the most uniform; 0 for the m
             levels alone, the smallest fill distance and, over one circuit, exact symmetry.
@@ -352,7 +364,9 @@ def space_filling(
 
 
 def fill_distance(u: Vector, order: int, *, amplitude: float) -> float:
-    """Return how far a point of the box [−amplitude, amplitude]^order can be from all lag vectors of u, in units of amplitude.
+    """Return the largest distance of a point of the box from all lag vectors of u, over amplitude.
+
+    The box is [−amplitude, amplitude]^order.
 
     Euclidean, over 4096 points of a Sobol sequence: a lower bound of the true one, the same on
     every call.
@@ -369,7 +383,7 @@ def fill_distance(u: Vector, order: int, *, amplitude: float) -> float:
 
 
 def lag_vectors(u: Vector, order: int) -> Matrix:
-    """Rows `u[k], u[k-1], …, u[k-order+1]`, (N − order + 1, order).
+    """Return rows `u[k], u[k-1], …, u[k-order+1]`, (N − order + 1, order).
 
     Raises:
         InputError: a signal that is not finite or shorter than `order`.
@@ -381,7 +395,7 @@ def lag_vectors(u: Vector, order: int) -> Matrix:
 
 
 def _de_bruijn(levels: int, order: int, rng: np.random.Generator) -> np.ndarray:
-    """Return a cyclic sequence of `levels**order` symbols in which every word of `order` symbols stands once.
+    """Return a cyclic sequence of `levels**order` symbols that holds every word of `order` once.
 
     Hierholzer's algorithm on the graph of words of order − 1 symbols. The branches are shuffled, so
     that a part of the sequence is even too: the usual lexicographic sequence spends its first part
@@ -403,14 +417,14 @@ def _de_bruijn(levels: int, order: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def _van_der_corput(count: int) -> Vector:
-    """Return the first `count` radical inverses in base 2, spread to the multiples of 1/count in [0, 1)."""
+    """Return the first `count` radical inverses in base 2, as multiples of 1/count in [0, 1)."""
     from scipy.stats import qmc
 
     return np.argsort(np.argsort(qmc.Halton(1, scramble=False).random(count)[:, 0])) / count
 
 
 def _held(bits: Any, hold: int, samples: int) -> Vector:
-    """0 as -1, 1 as 1."""
+    """Return the samples of held bits, 0 as -1 and 1 as 1."""
     return np.repeat(2.0 * bits - 1.0, hold)[:samples]
 
 

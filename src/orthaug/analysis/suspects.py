@@ -1,4 +1,4 @@
-"""Suspected unmodelled terms δ(x): friction, drag, hardening and the like, as expressions of raw lags.
+"""Suspected unmodelled terms δ(x): friction, drag, hardening, as expressions of raw lags.
 
 They are the "suspected unmodeled terms" of the paper's remark after `cond:special_PE`: what the
 physics leaves out by intention, known in form though not in size.
@@ -21,7 +21,7 @@ from orthaug.physics.problem import Problem
 
 
 class _Kind(NamedTuple):
-    """How a kind writes its expression: `text(x, w)` of the channel expression x and the width w."""
+    """Expression of a kind: `text(x, w)` of the channel expression x and the width w."""
 
     text: Callable[[str, str], str]
     width: bool = False
@@ -59,9 +59,8 @@ _SINGLE = (
     "coulomb",
 )  # of an output read at one lag only, which may be a velocity
 _CLEARLY = 0.05  # of the largest value
-_BELOW = (
-    0.05  # of the largest value: what is only so far below 0 counts as positive, for it is noise
-)
+# Of the largest value: what is only so far below 0 counts as positive, for it is noise
+_BELOW = 0.05
 _MULTIPLIED = 6  # lags at most, of which products are tried
 _INPUT = ("cubic", "dead_zone", "saturation")
 
@@ -77,8 +76,9 @@ class Suspect:
     its size, in the output's unit per unit of the expression, None where there is none. `output`
     may be left out where there is only one. `on` is what a known kind acts on.
 
-    Raises: InputError: an expression that is not arithmetic on lagged channels, a name or a number
-        that is none.
+    Raises:
+        InputError: an expression that is not arithmetic on lagged channels, a name or a number that
+            is none.
 
     Examples:
         >>> Suspect("drag", "v[k-1]*abs(v[k-1])", coefficient=-0.1).lags
@@ -123,7 +123,7 @@ class Suspect:
         | kind | δ | width |
         |---|---|---|
         | `coulomb` | sign(x) | |
-        | `stribeck` | sign(x) exp(−abs(x)/width), the paper's decay from static to Coulomb friction | v_S |
+        | `stribeck` | sign(x) exp(−abs(x)/width), the paper's decay to Coulomb friction | v_S |
         | `stribeck_gauss` | sign(x) exp(−(x/width)²) | v_S |
         | `quadratic_drag` | x abs(x) | |
         | `cubic` | x³ | |
@@ -140,9 +140,9 @@ class Suspect:
             output, coefficient, constants: as in `Suspect`.
             name: default the kind with its arguments, such as `coulomb(v[k-1])`.
 
-        Raises: InputError: an unknown kind, an argument that is missing, that the kind does not
-            take, or that
-                does not parse.
+        Raises:
+            InputError: an unknown kind, an argument that is missing, that the kind does not take,
+                or that does not parse.
 
         Examples:
             >>> Suspect.of("dead_zone", on="u[k-1]", width=0.5).expression
@@ -160,7 +160,7 @@ class Suspect:
             raise InputError(f"suspect '{self.name}': {error}") from None
 
     def sampled(self, sampling_time: float) -> Suspect:
-        """Return the suspect with this value [s] of `Ts`, where its expression reads that without declaring it."""
+        """Return the suspect with this value [s] of `Ts`, if its expression reads it undeclared."""
         if not self.parsed.unsampled:
             return self
         return replace(
@@ -173,14 +173,17 @@ class Suspect:
         return self.parsed.lags
 
     def values(self, x: Matrix, layout: Layout, outputs: Sequence[str]) -> Matrix:
-        """δ(x) (N, ny) for a coefficient of 1: the expression in its output's column, zero in the others.
+        """Return δ(x) (N, ny) for a coefficient of 1: the expression in its output's column.
+
+        Other columns are zero.
 
         Args:
             x: regressors (N, nx) in the order of `layout`.
             outputs: names of the ny outputs.
 
-        Raises: InputError: lags that the layout lacks, an output that is missing or unknown, a
-            value that is not finite.
+        Raises:
+            InputError: lags that the layout lacks, an output that is missing or unknown, a value
+                that is not finite.
         """
         values, column = np.zeros((len(x), len(outputs))), self.form(x, layout)
         bad = np.flatnonzero(~np.isfinite(column))
@@ -228,7 +231,7 @@ def check_coefficient(suspect: str, coefficient: Any) -> None:
 def written(
     kind: str, on: str | None, width: float | None, read: Callable[[str], Any], example: str
 ) -> tuple[str, str, str | None]:
-    """Expression and label of a known kind, and what it acts on in plain spaces.
+    """Return expression and label of a known kind, and its variable in plain spaces.
 
     Args:
         read: raises for what is no expression.
@@ -266,7 +269,9 @@ def written(
 def suspect_columns(
     suspects: Sequence[Suspect], x: Matrix, layout: Layout, outputs: Sequence[str]
 ) -> Float[np.ndarray, "ns N ny"]:
-    """δ(x) of every suspect for a coefficient of 1, (ns, N, ny), in each output's unit per unit of coefficient.
+    """Return δ(x) of every suspect for a coefficient of 1, (ns, N, ny).
+
+    The unit is that of the output per unit of the coefficient.
 
     Raises:
         InputError: two suspects of one name; as `Suspect.values`.
@@ -279,13 +284,14 @@ def suspect_columns(
 def data_width(
     on: str, x: Matrix, layout: Layout, constants: Mapping[str, float] | None = None
 ) -> float:
-    """Return a width from the data's own scale: the median of |x| where x is not zero, to six digits, in the unit of `on`.
+    """Return a width from the data: the median of nonzero |x|, to six digits, in the unit of `on`.
 
     Half of the moving samples then lie inside a dead zone, a saturation or a Stribeck peak, so that
     the data show both sides of it.
 
-    Raises: InputError: an expression that does not parse, that is not finite, or that is zero on
-        all rows.
+    Raises:
+        InputError: an expression that does not parse, that is not finite, or that is zero on all
+            rows.
     """
     with np.errstate(all="ignore"):
         size = np.abs(_evaluate(parse(on, constants), x, layout, f"'{on}'"))
@@ -299,7 +305,7 @@ def data_width(
 
 
 def usual_suspects(problem: Problem) -> tuple[Suspect, ...]:
-    """Return what is often missing: friction, drag, hardening, dead zone, saturation, an offset, the root of a level."""
+    """Return the usual suspects: friction, drag, hardening, dead zone, saturation, offset, root."""
     layout, outputs = problem.layout, problem.outputs
     pairs: list[tuple[str, str]] = []
     for channel in dict.fromkeys(lag.channel for lag in layout):
@@ -328,7 +334,10 @@ def usual_suspects(problem: Problem) -> tuple[Suspect, ...]:
 
 
 def saturations(suspects: Sequence[Suspect]) -> list[Suspect]:
-    """Return what is left of the channel beside each dead zone: data of a physics with that channel cannot tell the two."""
+    """Return a saturation for each dead zone, the rest of its channel.
+
+    Data of a physics with that channel cannot distinguish the two.
+    """
     zones = [suspect for suspect in suspects if suspect.name.startswith("dead_zone")]
     return [
         replace(
@@ -350,12 +359,12 @@ def changes_sign(values: Vector) -> bool:
 
 
 def is_level(values: Vector) -> bool:
-    """Return whether values (N,) are positive but for noise, so that a root of them may be missing."""
+    """Return whether values (N,) are positive but for noise, so that their root may be missing."""
     return bool(np.min(values) >= -_BELOW * np.max(values))
 
 
 def usual_terms(problem: Problem) -> tuple[Suspect, ...]:
-    """Products of two lags that the physics or the learner reads, for what no usual suspect explains."""
+    """Return products of two lags of physics or learner, for effects beyond the usual suspects."""
     lags, outputs = problem.used[:_MULTIPLIED], problem.outputs
     pairs = [(one, other) for i, one in enumerate(lags) for other in lags[i:]]
     texts = [f"{one}**2" if one == other else f"{one}*{other}" for one, other in pairs]

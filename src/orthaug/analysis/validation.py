@@ -1,4 +1,4 @@
-"""Does the learner earn its place? Free runs of the model and of physics alone on data that were not fitted."""
+"""Validation of a learner: free runs of the model and of physics alone on unfitted data."""
 
 from __future__ import annotations
 
@@ -33,12 +33,11 @@ from orthaug.models.response import Response
 _BEYOND, _FAR = (
     0.01,
     0.1,
-)  # of the training range: an excursion that is told, and one that counts on any row
+)  # of the training range: an excursion that is reported, and one that counts on any row
 _OFTEN = 0.01  # of the rows: a smaller excursion counts from there on
 _MUCH = 0.1  # of a part's rows outside: what is wrong there may be that
-_LIKELY = (
-    0.9  # ratio of errors below which an interval that holds 1 leaves undecided what is not shown
-)
+# Ratio of errors below which an interval that holds 1 leaves undecided what is not shown
+_LIKELY = 0.9
 
 
 @dataclass(frozen=True)
@@ -61,7 +60,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class Extrapolation:
-    """How far a part leaves the training data in one entry of the regressor."""
+    """Distance of a part beyond the training data in one entry of the regressor."""
 
     part: str
     lag: str
@@ -95,7 +94,7 @@ class Verdict:
 
     @property
     def text(self) -> str:
-        """Why, and where the training range is left."""
+        """Reason for the verdict, and channels outside the training range."""
         return " ".join([self.summary, *(f"{e}." for e in self.extrapolation)])
 
     @property
@@ -112,7 +111,9 @@ def free_run_error(
     *,
     response: Response | None = None,
 ) -> float:
-    """RMS of the free run's error, each output in its `unit`, by default its own deviation.
+    """Return the RMS of the free run's error, each output in its `unit`.
+
+    By default that is its own deviation.
 
     Inf where it diverges.
 
@@ -159,7 +160,7 @@ def trials_of(held_out: HeldOutErrors) -> list[Trial]:
 
 
 def _trial(label: str, alone: Pieces, model: Pieces) -> Trial:
-    """Of squared errors in deviations of the training output."""
+    """Return a trial of squared errors, in deviations of the training output."""
     block = label.startswith("block ")
     return Trial(
         label, math.sqrt(mean_square(alone)), math.sqrt(mean_square(model)), block, (alone, model)
@@ -174,7 +175,7 @@ def cross_validate(
     start: int,
     runner: Any = Threads(),  # noqa: B008  (it holds nothing)
 ) -> list[list[Pieces]]:
-    """Squared free-run errors of every way of fitting on every held-out block, in training deviations.
+    """Return squared free-run errors of every fit on every held-out block, in training deviations.
 
     Args:
         fits: each fits a training record; a failed training counts as runs that diverge.
@@ -193,11 +194,11 @@ def cross_validate(
     return list(runner.map(_on_block, (tuple(fits), unit), folds))
 
 
-def _on_block(given: Any, pair: tuple[Record, Record], tell: Callable[..., None]) -> list[Pieces]:
-    """Errors on a block of every way of fitting the rest."""
+def _on_block(given: Any, pair: tuple[Record, Record], report: Callable[..., None]) -> list[Pieces]:
+    """Return the errors on a block of every fit of the rest."""
     (fits, unit), (training, held), errors = given, pair, []
     for fit in fits:
-        tell()
+        report()
         found: Pieces = [None] * len(held.experiments)
         with suppress(InputError):  # the block took away what the physics needs
             trained = fit(training)
@@ -209,7 +210,7 @@ def _on_block(given: Any, pair: tuple[Record, Record], tell: Callable[..., None]
 
 
 def block_trials(errors: Sequence[Sequence[Pieces]], fit: int) -> list[Trial]:
-    """Trials of one way of fitting against the first one, from `cross_validate`."""
+    """Return the trials of one fit against the first one, from `cross_validate`."""
     return [
         _trial(f"block {i + 1} of {len(errors)}", block[0], block[fit])
         for i, block in enumerate(errors)
@@ -237,15 +238,15 @@ def judge(trials: Sequence[Trial], extrapolation: Sequence[Extrapolation] = ()) 
         ran_away = any(math.isinf(t.model) and not math.isinf(t.alone) for t in group)
         ratio = _ratio(group, alone, model)
         sure = f" ({ratio})" if str(ratio) and ratio.low < ratio.high else ""
-        told = _told(alone, model) + sure
+        sentence = _comparison(alone, model) + sure
         if len(group) > 1:
-            told = (
+            sentence = (
                 f"In {where} ({len(group)} blocks, {sum(t.model < t.alone for t in group)} of "
-                f"them better): {told}"
+                f"them better): {sentence}"
             )
         else:
-            told = f"On {where}: {told}"
-        sentences.append(told)
+            sentence = f"On {where}: {sentence}"
+        sentences.append(sentence)
         codes.append("hurts" if ran_away else ratio.code)
         ratios.append(ratio)
     worst = next(code for code in ("hurts", "no_help", "helps") if code in codes)
@@ -270,7 +271,7 @@ def judge(trials: Sequence[Trial], extrapolation: Sequence[Extrapolation] = ()) 
 
 
 def _ratio(group: Sequence[Trial], alone: float, model: float) -> Ratio:
-    """Of a group's errors, with its interval where errors along the runs are there."""
+    """Return the ratio of a group's errors, with its interval where errors along runs are known."""
     pieces = [t.pieces for t in group]
     if any(piece is None for piece in pieces):
         return Ratio.exactly(model, alone)
@@ -280,28 +281,30 @@ def _ratio(group: Sequence[Trial], alone: float, model: float) -> Ratio:
     )
 
 
-def _told(alone: float, model: float) -> str:
+def _comparison(alone: float, model: float) -> str:
     """Return both errors in words."""
     errors = {"with the learner": model, "with physics alone": alone}
     if not any(map(math.isinf, errors.values())):
         return f"free-run NRMSE {model:.4g} with the learner, {alone:.4g} with physics alone"
-    told = (
+    clauses = (
         f"diverges {who}" if math.isinf(e) else f"has an NRMSE of {e:.4g} {who}"
         for who, e in errors.items()
     )
-    return f"the free run {' and '.join(told)}"
+    return f"the free run {' and '.join(clauses)}"
 
 
 def extrapolation(part: str, x: Matrix, training: Matrix, layout: Layout) -> list[Extrapolation]:
-    """Entries of the regressor in which a part leaves the range of the training data.
+    """Return entries of the regressor in which a part leaves the range of the training data.
 
-    One lag a channel.
+    There is one lag for each channel.
 
-    Not told is what noise does to extreme values: excursions by less than a hundredth of the range,
-    or on few rows.
+    Effects of noise on extreme values are not reported: excursions by less than a hundredth of the
+    range, or on few rows.
 
-    Args: part: its name. x: its regressors (N, nx), in the order of the layout; `training` those of
-        the training data.
+    Args:
+        part: its name.
+        x: its regressors (N, nx), in the order of the layout; `training` those of the training
+            data.
     """
     leaving: dict[str, Extrapolation] = {}
     for j, lag in enumerate(layout):
@@ -318,7 +321,7 @@ def extrapolation(part: str, x: Matrix, training: Matrix, layout: Layout) -> lis
 
 
 def dominance(fit: Estimate, *, one_step: Response | None = None) -> float | None:
-    """‖F̃‖ / ‖Φθ̂‖ over the training rows, the learner's part against the physics'.
+    """Return ‖F̃‖ / ‖Φθ̂‖ over the training rows, the learner's part against the physics'.
 
     None where the physics gives 0.
 
@@ -339,16 +342,18 @@ def verdict(
     *,
     skip: int = 0,
 ) -> Verdict:
-    """Return whether the learner helps: free runs of a fit and of physics alone on records that neither was fitted to.
+    """Return whether the learner helps, by free runs of a fit and of physics alone on new records.
 
-    Args: fit: with a learner. alone: the same physics without, `estimate(…, learner=None)`, trained
-        on the same record. tests: a record, or several by name. A free run starts from the measured
-        outputs before its first row, that
-            of a motion from the state by which it follows its first rows.
+    Args:
+        fit: with a learner.
+        alone: the same physics without, `estimate(…, learner=None)`, trained on the same record.
+        tests: a record, or several by name. A free run starts from the measured outputs before its
+            first row, that of a motion from the state by which it follows its first rows.
         skip: leading samples of each experiment that are not scored.
 
-    Returns: `code` is helps, no_help or hurts; `text` says why, with the errors of both and where
-        the training range is left; `trials` are the errors.
+    Returns:
+        `code` is helps, no_help or hurts; `text` says why, with the errors of both and where the
+        training range is left; `trials` are the errors.
 
     Raises:
         InputError: a record without outputs or with other channels; an estimate that is not usable.

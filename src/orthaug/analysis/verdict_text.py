@@ -1,4 +1,4 @@
-"""The verdict on a residual: what it holds, its words, and the warnings that intervals of θ must carry."""
+"""Verdict on a residual: its content, its words, and the warnings for intervals of θ."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from orthaug.fitting.estimates import Estimate
 from orthaug.models.response import Response
 
 SHARE = 0.01  # of the residual's variance: what a regressor explains of it counts from there
-_SLOW = 0.9  # of a free run's variance: what its own past tells from there on is a drift rather than noise
-_TOLD = 5  # findings that a text lists at most
+_SLOW = 0.9  # of a free run's variance: a share by its own past from there on is a drift
+_LISTED = 5  # findings that a text lists at most
 _TOO_FAST = 0.05  # noise variance / smallest variance among the lagged outputs
 
 _BIASED = Warning(
@@ -28,16 +28,15 @@ _BIASED = Warning(
 )
 _INCONSISTENT = Warning(
     "coloured_residual",
-    "the one-step residual is coloured: what disturbs one row is in the lagged outputs of the next, which biases the "
-    'one-step θ, and its intervals do not cover that bias. Training on the free run (focus = "simulation") has none.',
+    "the one-step residual is coloured: a disturbance of one row is in the lagged outputs of the "
+    "next. That biases the one-step θ, and its intervals do not cover that bias. Training on the "
+    'free run (focus = "simulation") has none.',
 )
 _OFF = (
     "The errors are coloured by enough to make the one-step θ inconsistent (warning "
     "`inconsistent`)."
 )
-_COLOUR = (
-    0.1  # of the residual's variance that its own past tells: from there on that bias may matter
-)
+_COLOUR = 0.1  # of the residual's variance by its own past: from there on that bias may matter
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +72,7 @@ class Diagnosis:
 
 @dataclass(frozen=True, eq=False)
 class Finding:
-    """What was found out about a fit's residuals. `ratio` and `noise` are those of `Diagnosis`."""
+    """Findings on a fit's residuals. `ratio` and `noise` are those of `Diagnosis`."""
 
     fit: Estimate
     simulated: bool
@@ -98,7 +97,7 @@ class Finding:
 
     @property
     def lacks(self) -> bool:
-        """Return whether a change of the model itself is worth making."""
+        """True if a change of the model itself is worth making."""
         return any(change.kind != "criterion" for change in self.changes)
 
     @property
@@ -112,12 +111,12 @@ class Finding:
 
     @property
     def drifts(self) -> bool:
-        """Return whether a free run's error is slow, and white noise in the equation does not explain that."""
+        """True if a free run's error is slow, and white equation noise does not explain it."""
         slow = any(one.own_past > _SLOW for one in self.predictable)
         return self.simulated and slow and not self.white and not self.sensor
 
     def follows(self, share: float = SHARE) -> tuple[str, ...]:
-        """Return what the error that was minimised still follows: surely, and by more than a share of its variance."""
+        """Return inputs that the error surely follows, by more than a share of its variance."""
         inputs = (name for test in self.own for name in test.follows(float(np.sqrt(share))))
         return tuple(
             dict.fromkeys(
@@ -147,7 +146,7 @@ def words(verdict: str, seen: Finding) -> tuple[str, tuple[Warning, ...]]:
         warnings = (
             *warnings,
             _INCONSISTENT,
-        )  # where the physics lacks something, a model of the colour tells no θ
+        )  # where the physics lacks something, a model of the colour gives no θ
     elif verdict != "sensor_noise" and seen.inconsistent is not None:
         return f"{text} {_OFF}", (*warnings, seen.inconsistent)
     plain = seen.fit.std is not None and seen.fit.plain_covariance is None
@@ -173,15 +172,15 @@ def _inconsistent(seen: Finding) -> bool:
 
 def _white(seen: Finding) -> tuple[str, tuple[Warning, ...]]:
     if seen.complete and seen.inconsistent is not None:
-        return "The one-step residual is hardly coloured, by enough to move θ.", ()
+        return "The one-step residual is slightly coloured, but enough to move θ.", ()
     if seen.complete:
-        told = (
+        so = (
             "the intervals hold"
             if seen.fit.model.form.bound is None
-            else "it is noise as far as it shows"
+            else "the tests find only noise"
         )
         return (
-            f"The one-step residual is white: {told}, and no criterion is better than this one.",
+            f"The one-step residual is white: {so}, and no criterion is better than this one.",
             (),
         )
     return _small(seen), ()
@@ -222,42 +221,42 @@ def _sensor_noise(seen: Finding) -> tuple[str, tuple[Warning, ...]]:
     text = f"The one-step residual is coloured: {how}. That is noise on the measured output"
     if seen.simulated:
         more = f" {_sentence(seen.changes[0])}" if seen.changes else ""
-        return f"{text}, which the simulation criterion suits.{more}", ()
+        return f"{text}: the simulation criterion is the right one.{more}", ()
     text += '. One-step estimates of θ are then inconsistent, those of focus = "simulation" are not'
     if seen.changes and seen.changes[0].kind == "criterion":
         fall = seen.changes[0].fall
         text += (
-            f"; the error of the free run is predicted to fall by {percent(fall)} with it"
+            f"; that focus is predicted to lower the error of the free run by {percent(fall)}"
             if seen.changes[0].gains
-            else "; the error of the free run is not predicted to fall with it"
+            else "; that focus is not predicted to lower the error of the free run"
         )
     if seen.noise is not None and seen.noise > _TOO_FAST:
         text += (
-            f". The noise is {100 * seen.noise:.0f} % of what tells the lagged outputs apart: "
-            "the sampling is too fast for one-step estimation"
+            f". The noise is {100 * seen.noise:.0f} % of the least variance among the lagged "
+            "outputs: the sampling is too fast for one-step estimation"
         )
     steps = f" {_quantised(seen)}" if seen.steps else ""
     return f"{text}.{steps}", (_BIASED,) if seen.fit.std is not None else ()
 
 
 def _unmodelled(seen: Finding) -> tuple[str, tuple[Warning, ...]]:
-    told = [
+    findings = [
         f"its largest autocorrelation is {max((t.largest_acf or 0.0) for t in seen.own):.2f} "
         "in size"
     ]
     for test in seen.own:
-        told += [f"the residual of {test.name} still follows {name}" for name in test.follows()]
-        told += [
+        findings += [f"the residual of {test.name} still follows {name}" for name in test.follows()]
+        findings += [
             f"the residual of {test.name} is curved over {name}" for name in test.curved_over(SHARE)
         ]
-    told = [*told[:_TOLD], *(["and more"] if len(told) > _TOLD else [])]
-    opening = f"The {seen.what}, {_size(seen)}, is not noise alone: {'; '.join(told)}."
+    findings = [*findings[:_LISTED], *(["and more"] if len(findings) > _LISTED else [])]
+    opening = f"The {seen.what}, {_size(seen)}, is not noise alone: {'; '.join(findings)}."
     advice = "" if seen.steps and not seen.changes else _advice(seen, _cause(seen))
     return " ".join(part for part in (opening, _shares(seen), _quantised(seen), advice) if part), ()
 
 
 def _quantised(seen: Finding) -> str:
-    """That the steps of an output colour the residual one step ahead, and what to do."""
+    """Return sentences on an output's quantisation that colours the one-step residual."""
     if not seen.steps:
         return ""
     units = {c.name: f" {c.unit}".rstrip() for c in seen.fit.problem.record.outputs}
@@ -267,29 +266,27 @@ def _quantised(seen: Finding) -> str:
     trained = "" if seen.simulated else 'training on the free run (focus = "simulation"), '
     return (
         f"{'; '.join(each.values())}: such steps colour it as noise on the output does, and "
-        f"bias one-step estimates of θ. Against that help {trained}fewer samples (`decimate` "
-        "of data.prepare), or a finer measurement."
+        f"bias one-step estimates of θ. Remedies: {trained}fewer samples (`decimate` of "
+        "data.prepare), or a finer measurement."
     )
 
 
 def _cause(seen: Finding) -> str:
-    """Return what may stand behind a residual that none of the changes that were tried lowers, and what to do."""
+    """Return likely causes of a residual that none of the tried changes lowers, and remedies."""
     followed = [name for test in seen.own for name in (*test.follows(), *test.curved_over(SHARE))]
     if followed:
         return (
-            f"what it follows ({_joined(followed[:_TOLD])}) has a form that was not tried, or "
-            "comes with dynamics that the lags do not hold; suspects of your own "
-            "(`[[suspects]]`) test a form"
+            f"the effect of {_joined(followed[:_LISTED])} has a form that was not tried, or "
+            "dynamics beyond the lags; test a form by your own `[[suspects]]`"
         )
     if seen.drifts:
         return (
-            "the error drifts, which neither white noise in the equation nor noise on the "
-            "sensor explains; a disturbance that was not recorded, or slow dynamics that the "
-            "physics lacks, would: record it as an input"
+            "the error drifts, which no white noise explains. An unrecorded disturbance would, or "
+            "slow dynamics that the physics lacks: record the disturbance as an input"
         )
     return (
-        "its colour is that of a disturbance or of noise on the output that neither criterion "
-        "describes; its own past predicts it, an input that was not recorded might"
+        "its colour is that of a disturbance or of sensor noise that neither criterion describes. "
+        "Its own past predicts it; an unrecorded input might, too"
     )
 
 
@@ -298,13 +295,11 @@ def _joined(names: Sequence[str]) -> str:
 
 
 def _small(seen: Finding) -> str:
-    """Return what is said where the tests reject, but hardly anything could be predicted."""
+    """Return sentences on a residual that the tests reject but hardly anything predicts."""
     colour = " Its colour is that of the noise." if seen.simulated and not seen.white else ""
     followed = seen.follows()
     shown = (
-        f"noise for the most part, but still follows {_joined(followed)}"
-        if followed
-        else "noise as far as it shows"
+        f"mostly noise, but still follows {_joined(followed)}" if followed else "noise by all tests"
     )
     advice = _advice(
         seen, "what it follows is a small effect" if followed else "it is the noise floor"
@@ -320,21 +315,21 @@ def _size(seen: Finding) -> str:
 
 
 def _shares(seen: Finding) -> str:
-    """Return how much could be predicted, of the output of which most could.
+    """Return the predictable shares, of the output with the largest one.
 
-    Of equal ones that which follows something.
+    Among equal ones it is the one that follows something.
     """
     if not seen.predictable:
         return ""
-    told = {test.name for test in seen.own if test.follows() or test.curved_over(SHARE)}
-    one = max(seen.predictable, key=lambda entry: (entry.largest(), entry.name in told))
+    named = {test.name for test in seen.own if test.follows() or test.curved_over(SHARE)}
+    one = max(seen.predictable, key=lambda entry: (entry.largest(), entry.name in named))
     of = f" of {one.name}" if len(seen.predictable) > 1 else ""
     unit = next((c.unit for c in seen.fit.problem.record.outputs if c.name == one.name), "")
     size = float(np.sqrt(one.largest())) * one.rms
     past, driven, curved = (percent(share) for share in (one.own_past, one.inputs, one.functions))
     return (
-        f"Of its variance{of} {past} could be predicted from its own past, {driven} from the "
-        f"inputs, {curved} from functions of the regressors: "
+        f"The predictable share of its variance{of} is {past} from its own past, {driven} from "
+        f"the inputs, {curved} from functions of the regressors: "
         f"{size:.2g}{f' {unit}' if unit else ''} at most."
     )
 
@@ -342,12 +337,12 @@ def _shares(seen: Finding) -> str:
 def _advice(seen: Finding, otherwise: str) -> str:
     """Return the change that is predicted to help most.
 
-    Or that none of them is, and what follows.
+    Where none helps, say so, and what follows.
     """
     if seen.changes:
         return _sentence(seen.changes[0])
     if not seen.predictable:
-        return "Options that were not tried are more lags, other learner inputs or neurons."
+        return "Try more lags, other learner inputs or more neurons."
     limit = 100 * fall_of(WORTH)
     return (
         "No further lag, offset or learner is predicted to lower it by "
@@ -361,8 +356,8 @@ def _sentence(change: Change) -> str:
 
 
 def _coloured(what: str) -> Warning:
-    told = (
-        f"standard errors of θ are those of a white residual, but the {what} coloured: take "
-        "them for a rough guide."
+    text = (
+        f"standard errors of θ assume a white residual, but the {what} coloured: they are "
+        "only a rough guide."
     )
-    return Warning("coloured_residual", told)
+    return Warning("coloured_residual", text)

@@ -1,4 +1,4 @@
-"""States and inputs that a run visits, each with its row in the record, and the place where a quantity is largest."""
+"""States and inputs along a run, with their rows in the record, and the place of a maximum."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ MOST_STEPS = 20_000  # rows that a check looks at, spread evenly
 
 @dataclass(frozen=True)
 class RunPoint:
-    """A point by its entries, and where it stands: experiment, row in it, and both in words.
+    """A point by its entries and its place: experiment, row in it, and both in words.
 
     `experiment` and `row` are None for a point that no run has visited.
     """
@@ -49,7 +49,7 @@ class RowIndex:
 
     @classmethod
     def of(cls, lengths: Sequence[int], first: int) -> RowIndex:
-        """So many rows of each experiment, from the row `first` on."""
+        """Return `count` rows of each experiment, from the row `first` on."""
         experiment = [np.full(length, i) for i, length in enumerate(lengths)]
         return cls(
             np.concatenate(experiment),
@@ -64,7 +64,7 @@ class RowIndex:
         return RowIndex(self.experiment[which], self.row[which])
 
     def and_nowhere(self, count: int) -> RowIndex:
-        """With `count` points more that no run has visited."""
+        """Return the rows with `count` further points that no run has visited."""
         return RowIndex(
             *(np.concatenate([known, np.full(count, -1)]) for known in (self.experiment, self.row))
         )
@@ -89,7 +89,7 @@ class RowIndex:
 
 @dataclass(frozen=True, eq=False)
 class RunPoints:
-    """Points of a run: states (m, n0) and the inputs (m, nu) of a step from there, and where they stand."""
+    """Points of a run: states (m, n0), inputs (m, nu) of a step from there, and their places."""
 
     states: Matrix
     inputs: Matrix
@@ -105,7 +105,7 @@ class RunPoints:
         )
 
     def with_box(self, of: RunPoints, count: int) -> RunPoints:
-        """With `count` points more, uniform in the box that others span.
+        """Return the points and `count` more, uniform in the box that other points span.
 
         The same ones on every call.
         """
@@ -139,7 +139,7 @@ class RunSample:
     """At most so many `points` of a run of `steps` steps, and where it `diverged`.
 
     `unit` (n0,) is what counts as one in each entry of the state: the deviation of the measured
-    output it stands for, or else its own over the points.
+    output it is a lag of, or else its own over the points.
     """
 
     points: RunPoints
@@ -161,7 +161,7 @@ def usable(model: Model | MotionModel, record: Record) -> Record:
 
 
 def visited_by(model: Model, record: Record, free_run: Response, most: int) -> RunSample:
-    """States of a free run from measured outputs, up to where it diverged."""
+    """Return states of a free run from measured outputs, up to where it diverged."""
     form: Dynamics = model.form
     record, start, runs = usable(model, record), form.first_row, free_run.trajectories
     ends = [t.diverged[0] + 1 if t.diverged else len(t.model) for t in runs]
@@ -182,7 +182,7 @@ def visited_by(model: Model, record: Record, free_run: Response, most: int) -> R
 
 
 def measured_by(model: Model, record: Record, most: int) -> RunSample:
-    """States as the measured outputs give them."""
+    """Return states as the measured outputs give them."""
     form: Dynamics = model.form
     record = usable(model, record)
     ends = [len(e) for e in record.experiments]
@@ -196,7 +196,7 @@ def _visits(
     most: int,
     states: Callable[[int, Experiment, Any, Any], Matrix],
 ) -> RunSample:
-    """Points spread evenly over all experiments, up to the end of each."""
+    """Return points spread evenly over all experiments, up to the end of each."""
     every = RowIndex.of([end - form.first_row for end in ends], form.first_row)
     some = every.take(evenly(len(every), most))
     pieces = []
@@ -226,7 +226,7 @@ def _units(form: Dynamics, points: RunPoints, outputs: Matrix) -> Vector:
 
 
 def evenly(count: int, most: int) -> Int[np.ndarray, "m"]:
-    """At most `most` of `count` indices, spread evenly."""
+    """Return at most `most` of `count` indices, spread evenly."""
     return (
         np.arange(count) if count <= most else np.linspace(0, count - 1, most).round().astype(int)
     )

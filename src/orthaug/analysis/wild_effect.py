@@ -1,4 +1,4 @@
-"""What samples that are no measurements do to θ: least squares of physics alone with their rows and without."""
+"""Effect of wild samples on θ: least squares of physics with and without their rows."""
 
 from __future__ import annotations
 
@@ -17,7 +17,10 @@ _MOVED = 0.01  # of a value: less is none
 
 
 def fit_without(problem: Problem, samples: Sequence[WildSample]) -> str:
-    """Return the parameters of physics alone that move where the rows that read these samples are left out."""
+    """Return a clause on the parameters that move where the rows of these samples are left out.
+
+    They are those of physics without a learner.
+    """
     record, names = problem.record, problem.baseline.names
     marked = []
     for i, experiment in enumerate(record.experiments):

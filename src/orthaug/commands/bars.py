@@ -30,7 +30,9 @@ ENOUGH = threading.Event()
 """Event of the process: it ends training with the result so far and the warning `stopped`.
 """
 ENOUGH_LINE = b"enough\n"
-"""The line on the standard input of a child of the page that sets this event."""
+"""What sets it, on the standard input of a child of the page."""
+GO_ON = "The runs that are done are kept: the same command goes on from there"
+"""What an interrupted `reproduce` says last."""
 _OFTEN = 0.02  # s between such lines
 _MANY = 1_000_000  # rows from which the rate is shown
 _LONG = 5.0  # s of a search from which its duration is announced
@@ -154,18 +156,18 @@ def study_bars() -> Iterator[Callable[[str, int, int], None]]:
     with (
         _deferred_interrupt() as interrupted,
         drawn_bar(MofNCompleteColumn(), TimeElapsedColumn(), transient=False) as bar,
-        WATCH.reporting(lambda: reached, bar.stop),
+        WATCH.reporting(lambda: reached, bar.stop, GO_ON),
     ):
         tasks: dict[str, Any] = {}
 
         def show(title: str, done: int, total: int) -> None:
             nonlocal reached
-            reached = f"'{title}', {done} of {total} runs done and kept for the next time"
+            reached = f"'{title}', {done} of {total} runs done"
             if title not in tasks:
                 tasks[title] = bar.add_task(title, total=total)
             bar.update(tasks[title], completed=done)
             if interrupted.is_set():
-                raise KeyboardInterrupt(reached)
+                raise KeyboardInterrupt(reached, GO_ON)
 
         yield show
 

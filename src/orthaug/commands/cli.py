@@ -18,7 +18,7 @@ import typer
 from orthaug._base.checks import check_choice
 from orthaug._base.errors import TrainingError
 from orthaug.commands import streams
-from orthaug.commands.bars import on_terminal, study_bars, training_bar
+from orthaug.commands.bars import GO_ON, on_terminal, study_bars, training_bar
 from orthaug.commands.program import (
     AsJson,
     Force,
@@ -32,6 +32,7 @@ from orthaug.commands.program import (
     prepare_jax,
     print_result,
 )
+from orthaug.commands.signals import WATCH
 
 __all__ = ["main"]
 _LARGE = 20e6  # bytes of a data file from which on `init` reports its stage
@@ -356,7 +357,7 @@ def reproduce(
     ] = None,
     force: Force = False,
 ) -> None:
-    """Compute the paper's figures and tables beside the published ones.
+    """Compute the paper's figures and tables again.
 
     An interrupted run continues where it stopped.
     """
@@ -376,7 +377,8 @@ def reproduce(
         reproduced = reproduction.reproduce(
             entries, pipeline=pipeline, small=small, progress=progress, client=client
         )
-    reproduction.write(reproduced, folder, pipeline, force=force)
+    with WATCH.reporting(lambda: "the writing of the page", then=GO_ON):
+        reproduction.write(reproduced, folder, pipeline, force=force)
     streams.echo(f"{reproduction.text(reproduced)}\n\nwritten to {folder}/index.html")
 
 

@@ -16,6 +16,7 @@ from orthaug._base.parallel import one_blas_thread
 from orthaug._base.progress import SILENT, Progress
 from orthaug._base.views import MAKERS
 from orthaug.commands.attempt import attempt
+from orthaug.commands.chosen_rows import after_choice
 from orthaug.commands.doubts import with_doubts
 from orthaug.commands.folder import PHYSICS
 from orthaug.commands.job import AS_DECLARED, DEFAULT_BLOCKS, PHYSICS_ONLY, Job, Variant, origin_of
@@ -210,6 +211,7 @@ def fit_variant(job: Job, variant: Variant, progress: Progress = SILENT) -> FitR
 
 def report_of(job: Job, fit: Any) -> FitReport:
     """Score a fit on every part of its job, and fill its result up to the verdict."""
+    fit, intervals = after_choice(job, fit)
     warnings: list[Any] = [*job.warnings, *fit.warnings]
     if job.checkpoints is not None and job.checkpoints.lost:
         warnings.append(
@@ -257,6 +259,7 @@ def report_of(job: Job, fit: Any) -> FitReport:
         "focus": fit.focus,
         "physics_alone": {"scores": alone} if alone else None,
         "validation": None,
+        "intervals": intervals,
         "warnings": warnings,
     }
     terms = learned_terms(fit.model) if fit.status.ok else ()

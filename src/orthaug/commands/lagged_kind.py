@@ -18,6 +18,7 @@ from orthaug.commands.suspects import declared
 from orthaug.fitting.elimination import directions
 from orthaug.inference.measures import weigh_problem
 from orthaug.inference.nearly_shared import shared_warnings
+from orthaug.physics import ill_conditioned
 from orthaug.physics.baseline import derived_units
 from orthaug.physics.excitation import identifiability, require_rank
 from orthaug.reports.result import (
@@ -56,7 +57,12 @@ def checked(job: LaggedJob) -> CheckResult:
             ),
             "shared": _shared_of(job),
             "bias": _bias_of(job) if problem.excitation.full_rank else None,
-            "warnings": [*job.warnings, *_shared_warnings(job), *closed_loop(job.train.record)],
+            "warnings": [
+                *job.warnings,
+                *ill_conditioned.of_physics(problem),
+                *_shared_warnings(job),
+                *closed_loop(job.train.record),
+            ],
         }
     )
 

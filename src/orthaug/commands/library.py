@@ -30,7 +30,7 @@ from orthaug.commands.kinds import open_job
 from orthaug.commands.lagged_job import LaggedJob
 from orthaug.commands.motion_job import MotionJob
 from orthaug.commands.parts import Part
-from orthaug.commands.spec import TrainingSection, ValidationSection
+from orthaug.commands.spec import SelectionSection, TrainingSection, ValidationSection
 from orthaug.data.record import Record
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.kinds import STRUCTURES
@@ -153,6 +153,7 @@ class FitFacts:
     motion: None = None
     training: TrainingSection = field(default_factory=lambda: TrainingSection(fallback=False))
     validation: ValidationSection = field(default_factory=lambda: ValidationSection(blocks=0))
+    selection: SelectionSection = field(default_factory=SelectionSection)
 
     def declared_learner(self) -> Any:
         """Return the learner; None without one."""

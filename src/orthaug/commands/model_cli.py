@@ -85,7 +85,7 @@ def predict(
     which: Which = "fitted",
     force: Force = False,
 ) -> None:
-    """Predict a data file with a saved model, a number of steps ahead."""
+    """Predict a data file with a saved model, some steps ahead."""
     from orthaug.commands import run
     from orthaug.commands.folder import check_file, chosen_model
 
@@ -132,7 +132,7 @@ def split(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Split the parameters of a saved model under another measure.
+    """Split the parameters of a saved model by another measure.
 
     The model is not trained again.
     """
@@ -302,7 +302,7 @@ def track(
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
-    """Track the parameters of a saved model over new data, with an alarm.
+    """Track the parameters of a saved model over new data.
 
     It uses recursive least squares with forgetting.
     """

@@ -46,7 +46,7 @@ def checked(job: MotionJob) -> CheckResult:
     from orthaug.analysis.absorbed import Waves
     from orthaug.analysis.imitation import imitation_before
     from orthaug.analysis.input_timing import dead_times, try_holds
-    from orthaug.analysis.motion_identifiability import identified
+    from orthaug.analysis.motion_identifiability import identified, ill_conditioned_alone
     from orthaug.fitting.motion_estimation import without_learner
     from orthaug.fitting.segmented_motion import SegmentedMotion
     from orthaug.inference.motion_split import shared_of_motion
@@ -109,7 +109,13 @@ def checked(job: MotionJob) -> CheckResult:
                 "best_hold": trial.best,
                 "text": text,
             },
-            "warnings": [*job.warnings, *on_rows, *warnings, *closed_loop(job.train.record)],
+            "warnings": [
+                *job.warnings,
+                *(ill_conditioned_alone(trial.task) if identification.on_data.full_rank else ()),
+                *on_rows,
+                *warnings,
+                *closed_loop(job.train.record),
+            ],
         }
     )
 
@@ -214,14 +220,14 @@ def _analysed(
     """
     from orthaug.analysis.learned_part import equation_parts
     from orthaug.analysis.motion_bias import suspected_bias
-    from orthaug.analysis.motion_budget import told_budget
+    from orthaug.analysis.motion_budget import declared_budget
     from orthaug.analysis.motion_diagnosis import diagnose_motion
     from orthaug.analysis.motion_modes import motion_stability
     from orthaug.analysis.motion_response import substep_bias
 
     def biases() -> Any:
         table = suspected_bias(fit, job.suspects) if job.suspects else []
-        budget = told_budget(fit, job.suspects, table)
+        budget = declared_budget(fit, job.suspects, table)
         warnings.extend(budget.warnings if budget else ())
         listed = {entry.suspect for entry in table}
         usual = [

@@ -14,13 +14,13 @@ from orthaug._base.lines import counted
 from orthaug._base.memory import few_arenas
 from orthaug.commands.data_sections import PartSection
 from orthaug.commands.spec import Spec
-from orthaug.data.clock import DRIFT, thinned_twice, told_clock
+from orthaug.data.clock import DRIFT, read_clock, thinned_twice
 from orthaug.data.parquet_source import open_parquet
 from orthaug.data.preparation import warnings_of
 from orthaug.data.readers import read_record
 from orthaug.data.record import Record, same_step
 from orthaug.data.sources import Source, witness
-from orthaug.data.tables import KNOWN, PLAIN_TEXT
+from orthaug.data.tables import KNOWN, PLAIN_TEXT, guessed_encoding
 from orthaug.reports.result import FileResult
 
 
@@ -220,6 +220,7 @@ def _load(path: Path, spec: Spec, part: PartSection, name: str, *, stays: bool =
         warnings = (
             Warning("thinned", f"{kept}; content above the new Nyquist frequency folds back."),
         )
+    warnings += _guessed_encoding(path, files, name)
     if spec.data.time is None:
         warnings += _other_step(path, spec, files, name, part.columns)
     if name == "train":
@@ -284,6 +285,22 @@ def _used_columns(spec: Spec, columns: Mapping[str, str]) -> set[str]:
     return {columns.get(c.name, c.file_column) for c in channels} | {spec.data.experiment or ""}
 
 
+def _guessed_encoding(path: Path, files: Sequence[str], name: str) -> tuple[Warning, ...]:
+    """Return a warning for the first file that is not UTF-8.
+
+    Apparent text in an old encoding may be damaged.
+    """
+    for file in files:
+        line = guessed_encoding(path.parent / file)
+        if line is not None:
+            text = (
+                f"{name}: line {line} of {file} is no UTF-8, so the file is read as "
+                "Windows-1252; save it as UTF-8."
+            )
+            return (Warning("encoding_guessed", text),)
+    return ()
+
+
 def _other_step(
     path: Path, spec: Spec, files: Sequence[str], name: str, columns: Mapping[str, str]
 ) -> tuple[Warning, ...]:
@@ -291,7 +308,7 @@ def _other_step(
     used = _used_columns(spec, columns)
     step, given = spec.data.sampling_time or 1.0, spec.data.sampling_time is not None
     for file in files:
-        clock = told_clock(path.parent / file, used)
+        clock = read_clock(path.parent / file, used)
         if clock.column is None or clock.step is None or abs(clock.step - step) <= DRIFT * step:
             continue
         said = (

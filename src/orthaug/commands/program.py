@@ -17,7 +17,7 @@ from orthaug._base.checks import check_choice
 from orthaug._base.errors import InputError, TrainingError
 from orthaug._base.folders import PARTIALS
 from orthaug.commands import streams
-from orthaug.commands.signals import WATCH
+from orthaug.commands.signals import WATCH, ending
 
 if TYPE_CHECKING:
     from orthaug.reports.fields import Content
@@ -166,11 +166,8 @@ def main() -> None:
     except TrainingError as error:
         _fail(f"training failed: {error}", 1)
     except (Interrupted, KeyboardInterrupt) as interrupt:
-        _fail(
-            f"interrupted{''.join(f' during {text}' for text in interrupt.args)}; nothing is "
-            "written",
-            130,
-        )
+        during, then = (*map(str, interrupt.args), "", "")[:2]
+        _fail(ending("interrupted", during, then=then), 130)
     except (OutputClosed, BrokenPipeError):
         streams.silence(sys.stdout)
         sys.exit(0)

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import tomlkit
 
 from orthaug._base.errors import InputError
 from orthaug._base.folders import whole_folder
+from orthaug.commands.chosen_rows import cut, parts_of
 from orthaug.commands.data_sections import EngineSection, engine_of
 from orthaug.commands.folder import relative
 from orthaug.commands.lagged_job import LaggedJob, open_lagged
@@ -20,9 +21,10 @@ from orthaug.data.regressors import Lags
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.kinds import CRITERIA
 from orthaug.models.kinds import LEARNERS
-from orthaug.models.learners import Learner
+from orthaug.models.learners import MLP, Learner
 from orthaug.models.terms import Terms
 from orthaug.reports.selection import SelectResult
+from orthaug.selection.parts import CONDITIONAL, Parts
 
 if TYPE_CHECKING:
     from orthaug.selection.kept_physics import Shift
@@ -77,7 +79,7 @@ def select_for(job: LaggedJob, spec: Spec, folder: Path, report_model: OnStage) 
     Raises:
         InputError: data or physics that selection does not support.
     """
-    from orthaug.selection.selecting import MOST, WIDTHS, select
+    from orthaug.selection.selecting import MOST, WIDTHS, lagged_rows, select
 
     section, began = spec.selection, time.monotonic()
     options: dict[str, Any] = {
@@ -87,23 +89,22 @@ def select_for(job: LaggedJob, spec: Spec, folder: Path, report_model: OnStage) 
         "widths": section.hidden or WIDTHS,
         "most": MOST if section.terms is None else section.terms,
         "blocks": section.blocks,
-        "halves": section.halves,
         "collinear": section.collinear,
+        "level": section.level,
     }
-    if section.halves and len(job.train.record.experiments) != 1:
-        raise InputError(
-            f"{job.path}: 'selection.halves' needs training data of one experiment, to be cut "
-            "in two."
-        )
+    halves = None if section.halves == "auto" else section.halves
+    network = isinstance(options["learner"], MLP)
+    lags = lagged_rows(job.problem, options["lags"])
+    parts = parts_of(job, job.problem.baseline, lags, halves, network=network)
     options["engine"] = engine_of(spec.engine, "dask") if spec.engine.kind == "dask" else None
     try:
-        selection = select(job.train.record, job.problem.baseline, **options, progress=report_model)
+        selection = select(
+            job.train.record, job.problem.baseline, **options, halves=parts, progress=report_model
+        )
     except InputError as error:
         raise InputError(f"{job.path}: {error}") from None
     result = _result(job, selection, time.monotonic() - began)
-    return SelectionReport(
-        job, selection, result, _new_spec(job, folder, selection, halved=section.halves)
-    )
+    return SelectionReport(job, selection, result, _new_spec(job, folder, selection, parts))
 
 
 def steps_at_most(terms: int | None) -> int:
@@ -158,7 +159,8 @@ def _criterion(spec: Spec) -> Criterion:
 
 def _result(job: LaggedJob, selection: Selection, seconds: float) -> SelectResult:
     orders, test, learner = selection.orders.chosen, selection.nonlinearity, selection.learner
-    shares, physics = selection.shares, selection.physics
+    shares, physics, confirmed = selection.shares, selection.physics, selection.confirmed
+    rates = {} if selection.terms is None else selection.terms.rates()
     terms = learner.terms if isinstance(learner, Terms) else ()
     content = {
         "data": job.data,
@@ -175,10 +177,20 @@ def _result(job: LaggedJob, selection: Selection, seconds: float) -> SelectResul
         "learner": _declared(learner),
         "focus": CRITERIA.kind_of(selection.criterion),
         "terms": [
-            {"term": t, "chosen": shares.get(t), "left": physics and physics.left.get(t)}
+            {
+                "term": t,
+                "chosen": shares.get(t),
+                "left": physics and physics.left.get(t),
+                "rate": rates.get(t),
+                "p": confirmed[t].p if t in confirmed else None,
+                "q": confirmed[t].q if t in confirmed else None,
+                "rivals": list(selection.rivals.get(t, ())),
+            }
             for t in terms
         ]
         or None,
+        "intervals": selection.intervals,
+        "level": selection.level,
         "physics": physics and [_moved(shift) for shift in physics.shifts],
         "condition": physics and physics.condition,
         "models": selection.table.to_dict("records"),
@@ -215,7 +227,7 @@ def _declared(learner: Learner | None) -> dict[str, Any] | None:
     return {"kind": "mlp", "hidden": list(learner.hidden), "activation": learner.activation} | seen  # type: ignore[attr-defined]
 
 
-def _new_spec(job: LaggedJob, folder: Path, selection: Selection, *, halved: bool) -> str:
+def _new_spec(job: LaggedJob, folder: Path, selection: Selection, parts: Parts) -> str:
     """Return the spec with the choice in it.
 
     Comments and order are kept, paths made relative to the new folder.
@@ -223,12 +235,6 @@ def _new_spec(job: LaggedJob, folder: Path, selection: Selection, *, halved: boo
     path = job.path
     document: Any = tomlkit.parse(path.read_text(encoding="utf-8-sig"))
     _rebase(document, path.parent, folder)
-    if halved:  # the half that the choice was not made on
-        train = document["data"]["train"]
-        every, rows = train.get("every", 1), np.ravel(train.get("rows") or [0])
-        first = int(rows[0])
-        cut = first + every * (len(job.train.record) - len(selection.record))
-        train["rows"] = [cut, first + every * len(job.train.record)]
     learner, orders = _declared(selection.learner), selection.reach or selection.orders.chosen
     document["lags"] = tomlkit.item({"na": orders.na, "nb": list(orders.nb), "nk": list(orders.nk)})
     document["learner"] = tomlkit.item(learner or {"kind": "none"})
@@ -244,8 +250,34 @@ def _new_spec(job: LaggedJob, folder: Path, selection: Selection, *, halved: boo
         training["fallback"] = False  # physics alone was judged beside it
     elif training.get("regularization") is None:
         training["regularization"] = "evidence"
+    _say_rows(document, job, folder, selection, parts)
     head = f"# Selected by orthaug from {path.name}: {orders}. The other models are in table.csv.\n"
     return head + tomlkit.dumps(document)
+
+
+def _say_rows(
+    document: Any, job: LaggedJob, folder: Path, selection: Selection, parts: Parts
+) -> None:
+    """Write which rows chose the terms, and have the others fitted."""
+    section = document.setdefault("selection", tomlkit.table())
+    section.pop("chosen_on", None)
+    if selection.learner is None or parts.intervals is CONDITIONAL:
+        return
+    chosen, fitted = (
+        {**one.declared, "files": _from(folder, job, one.files)} for one in cut(job, parts)
+    )
+    if parts.fitted is not parts.chooses:
+        document["data"]["train"].update(fitted)
+    table = tomlkit.inline_table()
+    table.update(chosen)
+    section["chosen_on"] = table
+    section["chosen_on"].comment("where `data.train` has rows of these, a fit has no intervals")
+
+
+def _from(folder: Path, job: LaggedJob, files: Sequence[str]) -> list[str]:
+    """Return files of the job's spec as seen from another folder."""
+    old = job.path.parent
+    return [file if Path(file).is_absolute() else relative(old / file, folder) for file in files]
 
 
 def _rebase(table: Any, old: Path, new: Path) -> None:

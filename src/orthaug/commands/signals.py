@@ -30,6 +30,14 @@ def _nothing() -> str:
     return ""
 
 
+def ending(words: str, during: str, kept: str = "", then: str = "") -> str:
+    """Return the message of an early end: what was stopped, what is written, how to continue."""
+    return (
+        f"{words}{during and f' during {during}'}; {kept or 'nothing'} is "
+        f"written{then and f'. {then}'}"
+    )
+
+
 class SignalWatch:
     """A watch that ends the program on a signal, once it is started.
 
@@ -40,6 +48,7 @@ class SignalWatch:
         self.active = self.ending = False
         self._during: Callable[[], str] = _nothing
         self._stop: Callable[[], Any] = _nothing
+        self._then = ""
         self._asked: threading.Event | None = None
 
     def start(self) -> None:
@@ -60,13 +69,16 @@ class SignalWatch:
         _thread.start_new_thread(self._wait, (reader,))
 
     @contextmanager
-    def reporting(self, during: Callable[[], str], stop: Callable[[], Any]) -> Iterator[None]:
-        """Report what a signal stopped, and stop drawing before that."""
-        self._during, self._stop = during, stop
+    def reporting(
+        self, during: Callable[[], str], stop: Callable[[], Any] = _nothing, then: str = ""
+    ) -> Iterator[None]:
+        """Say what a signal stopped and how to go on, `then`, and stop drawing before that."""
+        self._during, self._stop, self._then = during, stop, then
         try:
             yield
         finally:
             self._during = self._stop = _nothing
+            self._then = ""
 
     @contextmanager
     def asking(self) -> Iterator[threading.Event]:
@@ -105,9 +117,7 @@ class SignalWatch:
                 partials.discard_all()
             kept = ", ".join(str(path) for path in getattr(partials, "placed", ()) if path.exists())
             self._stop_drawing()
-            line = (
-                f"{words}{f' during {during}' if during else ''}; {kept or 'nothing'} is written\n"
-            )
+            line = ending(words, during, kept, self._then) + "\n"
             with suppress(OSError):
                 os.write(
                     2,

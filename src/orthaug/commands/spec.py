@@ -18,7 +18,7 @@ from pydantic import Field, ValidationError, create_model, model_validator
 
 from orthaug._base.errors import InputError
 from orthaug._base.registry import resolve
-from orthaug.commands.data_sections import Data, EngineSection, MotionSection
+from orthaug.commands.data_sections import Data, EngineSection, MotionSection, Range
 from orthaug.commands.sections import (
     Count,
     Finite,
@@ -189,6 +189,13 @@ class TrainingSection(KindSection):
         return "prediction" if ahead else self.focus
 
 
+class ChosenOnSection(Section):
+    """The rows that `orthaug select` chose terms on, which it writes."""
+
+    files: Annotated[list[str], Field(min_length=1)]
+    rows: Range | Annotated[list[Range], Field(min_length=1)] | None = None
+
+
 class SelectionSection(Section):
     """Limits of `orthaug select`: the largest orders, terms at most, widths, blocks held out."""
 
@@ -198,8 +205,10 @@ class SelectionSection(Section):
     terms: Count | None = None
     hidden: Annotated[list[Positive], Field(min_length=1)] | None = None
     blocks: Annotated[int, Field(ge=2, strict=True)] = 5
-    halves: bool = False
+    halves: Literal["auto"] | bool = "auto"
     collinear: Annotated[float, Field(ge=0, lt=1)] = 0.05
+    level: Annotated[float, Field(gt=0, le=1)] = 0.05
+    chosen_on: ChosenOnSection | None = None
 
 
 class ValidationSection(Section):

@@ -1,4 +1,4 @@
-"""A column of a data file: its values, the channel that it would be, and what is odd about it."""
+"""A column of a data file: its values, the channel that it would be, and its peculiarities."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ _OUTPUT = re.compile(r"^(y|y_?\d+|out|output|output_?\d+)$", re.IGNORECASE)
 _HELD = 6  # rows at the largest or smallest value from which on it is suspected to be a limit
 _OFTEN = 5.0  # times the rows that a value usually has
 _LONGER = 3.0  # times the rows for which other values are usually held
-_LEVELS = 20  # of a signal at least, for one with fewer stands at its extremes anyway
+_LEVELS = 20  # of a signal at least, for one with fewer is often at its extremes anyway
 _FINEST = 1e5  # steps within the range from which on rounding of the numbers could make them
-_COARSE = 0.02  # steps of a signal over its standard deviation that are told
+_COARSE = 0.02  # steps of a signal over its standard deviation that are reported
 SPIKE = 15.0
-"""Deviations from its neighbours that a sample is a spike from on."""
+"""Deviations from its neighbours from which on a sample is a spike."""
 _LOWER = (
     SPIKE,
     10.0,
     7.0,
     5.0,
     4.0,
-)  # tried where a sample stands far outside the range of all others
+)  # tried where a sample is far outside the range of all others
 _BEYOND = 0.5  # of that range
 _OUTSIDE = 2.5  # interquartile ranges from the middle
 _FEW = 0.01  # share of samples that spikes are at most
@@ -49,7 +49,7 @@ class Column:
     unit: str
     values: Vector
     unusable: str = ""
-    """Why it can be no channel, in words."""
+    """Reason why it can be no channel."""
 
     @property
     def finite(self) -> Vector:
@@ -69,14 +69,14 @@ class Column:
 
     @property
     def constant(self) -> bool:
-        """Return whether all values are the same."""
+        """True if all values are the same."""
         return len(self.finite) > 0 and bool(np.ptp(self.finite) == 0)
 
     @property
     def limits(self) -> tuple[tuple[float, int], ...]:
-        """Extreme values where the signal stands much more often than elsewhere, with the rows.
+        """Extreme values that the signal has much more often than others, with the rows.
 
-        Perhaps saturated.
+        Such a signal may be saturated.
         """
         levels, counts = np.unique(self.finite, return_counts=True)
         if len(levels) < _LEVELS:
@@ -96,12 +96,15 @@ class Column:
 
     @property
     def spikes(self) -> int:
-        """Samples far from all their neighbours and from what the signal usually is, where they are few."""
+        """Samples far from all their neighbours and from the usual values, where they are few."""
         return self._spiky[1]
 
     @property
     def threshold(self) -> float:
-        """The step `outliers` takes the spikes away with it: `SPIKE`, lower where they need it."""
+        """Threshold with which the step `outliers` takes the spikes away.
+
+        It is `SPIKE`, or lower where the spikes need it.
+        """
         return self._spiky[0]
 
     @cached_property
@@ -122,7 +125,10 @@ class Column:
 
     @property
     def quantum(self) -> float | None:
-        """The step of which all values are multiples, where it is coarse beside deviation or movement of a sample."""
+        """Step of which all values are multiples, where it is coarse.
+
+        It is coarse if it is large beside the deviation or the movement of a sample.
+        """
         step = quantum_of(self.finite)
         if step is None or step <= min(_COARSE * float(self.finite.std()), self.movement):
             return None
@@ -130,12 +136,12 @@ class Column:
 
     @property
     def movement(self) -> float:
-        """By how much the signal moves between two rows, on the average."""
+        """Mean absolute change of the signal between two rows."""
         return float(np.abs(np.diff(self.finite)).mean()) if len(self.finite) > 1 else 0.0
 
     @property
     def kind(self) -> str:
-        """'input' or 'output' where the name says so, otherwise ''."""
+        """'input' or 'output' where the name shows it, otherwise ''."""
         name = channel_name(last_part(split_header(self.header)[0]))
         return "input" if _INPUT.match(name) else "output" if _OUTPUT.match(name) else ""
 

@@ -33,16 +33,16 @@ class FramePartition:
     held: tuple[Any, ...]
 
     def on(self, frame: Any, before: Any) -> FramePartitionData:
-        """The same where the rows are."""
+        """Return the partition with its rows, on the worker that holds them."""
         return FramePartitionData(replace(self, held=()), frame, before)
 
     def head(self, rows: int) -> FramePartition:
-        """Its first rows, taken where they are."""
+        """Return its first rows, taken on the worker that holds them."""
         first = self.held[0].client.submit(_rows, self.held[0], 0, rows, pure=False)
         return replace(self, rows=min(rows, self.rows), held=(first, self.held[1]))
 
     def pieces(self, lead: int) -> Iterator[Experiment]:
-        """Brings the rows here; an engine of the cluster reads them where they are."""
+        """Yield its rows, brought here; an engine of the cluster reads them on the workers."""
         frame, before = (future.result() for future in self.held)
         return self.on(frame, before).pieces(lead)
 
@@ -64,7 +64,7 @@ class FramePartitionData:
         return self.of.rows
 
     def pieces(self, lead: int) -> Iterator[Experiment]:
-        """See `Partition.pieces`."""
+        """Yield its rows; see `Partition.pieces`."""
         own = self.of
         known = 0 if self.before is None else len(self.before)
         if known < min(lead, own.first_row):
@@ -127,7 +127,7 @@ class FrameSource:
     time_column: str | None = None
 
     def window(self, start: int, stop: int) -> list[Experiment]:
-        """Rows `[start, stop)`, brought here."""
+        """Return rows `[start, stop)`, brought here."""
         found = []
         for partition in self.partitions:
             a, b = (
@@ -158,7 +158,7 @@ def open_frame(
         frame: a `dask.dataframe.DataFrame`.
         inputs, outputs: channel names, or `Channel`s with column, unit, scale and offset.
         sampling_time: seconds between rows.
-        experiment: the column, of numbers, that tells experiments apart; each is in one piece.
+        experiment: the column of numbers that labels the experiments; each is in one piece.
         columns: the frame's column for a channel.
         missing: "error", or "skip" to end a stretch at rows with a missing sample.
         client: a `distributed.Client`; None for the one at hand.

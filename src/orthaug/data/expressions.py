@@ -1,4 +1,4 @@
-"""Expressions of lagged signals, such as `"sign(v[k-1])*v[k-1]**2"`: a whitelisted parser, no `eval`.
+"""Expressions of lagged signals, such as `"sign(v[k-1])*v[k-1]**2"`, parsed without `eval`.
 
 Python's own grammar reads the text into a syntax tree. A node that is not on the list below is
 refused by name, so an expression can only do arithmetic. NumPy evaluates the tree on whole records,
@@ -94,7 +94,7 @@ class Expression:
 
     @cached_property
     def unsampled(self) -> bool:
-        """Return whether it reads `Ts`, and has no value for that yet."""
+        """True if it reads `Ts`, and has no value for that yet."""
         named = any(
             isinstance(node, ast.Name) and node.id == SAMPLING_TIME
             for node in _free_names(self.tree)
@@ -113,7 +113,9 @@ class Expression:
         )
 
     def evaluate(self, columns: Mapping[Lag, Any], xp: Any) -> Any:
-        """Value for `columns[lag]` (scalars or arrays of one shape), computed by `xp` (numpy or jax.numpy).
+        """Return the value for `columns[lag]`, computed by `xp` (numpy or jax.numpy).
+
+        The columns are scalars or arrays of one shape.
 
         Raises:
             InputError: the sampling time is asked for and not known here.
@@ -126,11 +128,11 @@ class Expression:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The names that stand for numbers in it."""
+        """The names of numbers in it."""
         return tuple(name for name, _ in self.constants)
 
     def value(self, values: Mapping[str, Any], xp: Any) -> Any:
-        """Value where its names stand for `values`; of an expression without channels."""
+        """Return its value for `values` of its names; of an expression without channels."""
         return _evaluate(self.tree, {}, values, xp, self.text)
 
     def term_without_value(self, values: Mapping[str, Any]) -> tuple[str, tuple[str, ...]]:
@@ -155,7 +157,10 @@ class Expression:
 
 
 def is_name(name: str, taken: Container[str] = RESERVED) -> bool:
-    """Return whether expressions can use `name`: Python reads an identifier in its normal form only."""
+    """Return whether expressions can use `name`.
+
+    Python reads an identifier in its normal form only.
+    """
     return (
         is_identifier(name)
         and not keyword.iskeyword(name)
@@ -165,7 +170,10 @@ def is_name(name: str, taken: Container[str] = RESERVED) -> bool:
 
 
 def is_identifier(name: Any) -> bool:
-    """Return whether `name` is made of letters, digits and underscores, does not start with a digit and is not too long."""
+    """Return whether `name` is an identifier: letters, digits and underscores.
+
+    It does not start with a digit and is not too long.
+    """
     return isinstance(name, str) and name.isidentifier() and len(name) <= LONGEST
 
 
@@ -175,8 +183,9 @@ def parse(text: str, constants: Mapping[str, float] | None = None) -> Expression
     It may also use `Ts`, the sampling time of the record that it will be read on
     (`Expression.sampled`).
 
-    Raises: InputError: anything that is not arithmetic on lagged channels, with the offending piece
-        named.
+    Raises:
+        InputError: anything that is not arithmetic on lagged channels, with the offending piece
+            named.
     """
     constants = dict(constants or {})
     if not isinstance(text, str):
@@ -207,9 +216,7 @@ def parse(text: str, constants: Mapping[str, float] | None = None) -> Expression
             f"'{text}' is not an expression ({reason}); allowed are {_ALLOWED}."
         ) from None
     except (RecursionError, MemoryError):
-        raise InputError(
-            f"'{text[:40]}…' is nested too deeply; write it in simpler terms."
-        ) from None
+        raise InputError(f"'{text[:40]}…' is nested too deeply; write it more simply.") from None
 
 
 def parse_named(
@@ -232,7 +239,7 @@ def parse_named(
         )
     if "[" in text:
         raise InputError(
-            f"{where} = {text}: a signal such as y[k-1] is no part of it; known are "
+            f"{where} = {text}: a signal such as y[k-1] is not allowed here; known are "
             f"{', '.join(known)}."
         )
     for word in re.findall(r"\b[^\W\d]\w*", unicodedata.normalize("NFKC", text)):
@@ -259,7 +266,7 @@ def _read(text: str, constants: Mapping[str, float]) -> Expression:
 
 
 def _suggest(text: str, constants: Mapping[str, float]) -> None:
-    """Raise InputError with the text as it is written here, where it is one in the habits of MATLAB."""
+    """Raise InputError with the correct text for one that is written as in MATLAB."""
 
     def lagged(found: re.Match[str]) -> str:
         name, lag = found[1] or found[3], found[2] or found[4] or ""
@@ -341,7 +348,7 @@ def _check_call(node: ast.Call, text: str) -> None:
 
 
 def _free_names(node: ast.AST) -> Iterator[ast.Name]:
-    """Yield the names that stand for numbers: neither channels nor functions."""
+    """Yield the names of numbers: neither channels nor functions."""
     if isinstance(node, ast.Name):
         yield node
     elif isinstance(node, ast.Call):
@@ -353,7 +360,7 @@ def _free_names(node: ast.AST) -> Iterator[ast.Name]:
 
 
 def _lag(node: ast.Subscript, text: str) -> Lag:
-    """Return the raw lag that `name[k]` or `name[k-3]` stands for."""
+    """Return the raw lag that `name[k]` or `name[k-3]` denotes."""
     if not isinstance(node.value, ast.Name):
         raise InputError(
             f"'{text}': '{ast.unparse(node)}' is not a channel at a lag such as y[k-1]."
@@ -418,7 +425,7 @@ def _evaluate(
 def _unknown_name(name: str, text: str, constants: Mapping[str, float]) -> str:
     if name == "k":
         return (
-            f"'{text}': k is the time index and cannot stand alone; write a channel at a lag, "
+            f"'{text}': k is the time index and no value by itself; write a channel at a lag, "
             "y[k-1]."
         )
     if name in FUNCTIONS:

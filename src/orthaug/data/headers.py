@@ -1,6 +1,6 @@
-"""What the header of a column says: name, unit, whether it is the time.
+"""Name and unit in the header of a column, and whether it is the time.
 
-And instants in s, of numbers or dates.
+Instants in s are made of numbers or dates.
 """
 
 from __future__ import annotations
@@ -18,12 +18,13 @@ from orthaug._base.checks import Vector
 from orthaug._base.errors import InputError
 
 _UNITS = re.compile(
-    r"A|mA|V|mV|kV|W|kW|N|kN|mN|Nm|m|mm|cm|km|um|s|ms|us|rad|mrad|deg|rpm|Hz|kHz|Pa|kPa|MPa|bar|mbar|K|degC|degF|kg|J|"
-    r"kJ|ohm|percent|m_s2?|rad_s2?|l_min|kg_s"
+    r"A|mA|V|mV|kV|W|kW|N|kN|mN|Nm|m|mm|cm|km|um|s|ms|us|rad|mrad|deg|rpm|Hz|kHz|Pa|kPa|MPa|"
+    r"bar|mbar|K|degC|degF|kg|J|kJ|ohm|percent|m_s2?|rad_s2?|l_min|kg_s"
 )
 _BRACKETS = re.compile(r"^(.*?)\s*[\[(]\s*([^\[\]()]+?)\s*[\])]$")
 _TIME = re.compile(
-    r"^(t|times?|time[ _]?stamp|zeit|zeitstempel|uhrzeit|datum|date([ _/]?time)?|elapsed([ _]?time)?|sec|seconds)$",
+    r"^(t|times?|time[ _]?stamp|zeit|zeitstempel|uhrzeit|datum|date([ _/]?time)?|"
+    r"elapsed([ _]?time)?|sec|seconds)$",
     re.IGNORECASE,
 )
 _STEP = re.compile(r"^(ts|dt|t_s|sampling_?time|sample_?time)$", re.IGNORECASE)
@@ -43,11 +44,11 @@ _COMMA = r"(:\d\d),(\d+)"
 
 
 def split_header(header: str) -> tuple[str, str]:
-    """Name and unit of a header: `force [N]`, `force (N)`, `force_N`.
+    """Return name and unit of a header: `force [N]`, `force (N)`, `force_N`.
 
     An index, as in `U[2]`, is no unit.
 
-    The number that tells columns of one name apart stays with the name: `force [N].1` is `force.1`
+    The number that follows columns of one name stays with the name: `force [N].1` is `force.1`
     in N.
     """
     numbered = re.fullmatch(r"(.*)(\.\d+)", header)
@@ -71,7 +72,10 @@ def last_part(name: str) -> str:
 
 
 def unit_of_time(header: str) -> tuple[str, float | None]:
-    """Name of a column, and what its unit is in s: 1 without one, None for a unit that is none of time."""
+    """Return the name of a column, and its unit in s.
+
+    The unit is 1 where the header has none, None where it is none of time.
+    """
     base, unit = split_header(header)
     own = _OF_TIME.fullmatch(header)
     if not unit and own and _TIME.match(last_part(own[1])):
@@ -102,7 +106,7 @@ def step_of(header: str, value: float) -> float | None:
 
 
 def in_seconds(values: Vector, header: str) -> Vector:
-    """Numbers of a time column in s, by the unit in its header.
+    """Return the numbers of a time column in s, by the unit in its header.
 
     A unit that is none of time is no unit.
     """
@@ -113,15 +117,18 @@ def in_seconds(values: Vector, header: str) -> Vector:
 
 
 def dated(cells: Sequence[Any] | np.ndarray, where: str) -> Vector | None:
-    """Dates as seconds since the first of them, NaN where a cell is none.
+    """Return dates as seconds since the first of them, NaN where a cell is none.
 
     None where they are no dates.
 
-    Args: cells: texts, or what a library makes of a date, a time of the day or a duration; None or
-        "" where empty. where: begins messages.
+    Args:
+        cells: texts, or what a library makes of a date, a time of the day or a duration; None or ""
+            where empty.
+        where: begins messages.
 
-    Raises: InputError: dates that may begin with the day or with the month, where that makes a
-        difference.
+    Raises:
+        InputError: dates that may begin with the day or with the month, where that makes a
+            difference.
     """
     import pandas as pd
 
@@ -154,7 +161,7 @@ def _since_first(instants: Any) -> Vector:
 
 
 def _parsed(cells: Any, where: str) -> Any:
-    """ISO 8601, then day, month and year as people write them.
+    """Read ISO 8601, then day, month and year as people write them.
 
     None where most cells are neither.
     """

@@ -1,6 +1,6 @@
-"""What stands where in a table: encoding, line of the header and separator of a text.
+"""Layout of a table: encoding, line of the header and separator of a text.
 
-The cells of a workbook.
+The cells of a workbook are read here as well.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _NUMBER = re.compile(r'[\s"]*[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?[\s"]*
 _COMMA = re.compile(r"(\d*),(\d+)")
 _DATE = re.compile(r"\d[\d.:/+ T-]*[.:/-][\d.:/+ T-]*\dZ?")
 _MISSING = ("", "nan", "na", "n/a", "null", "none")
-_BLANK = " "  # the separator that stands for any run of spaces and tabs
+_BLANK = " "  # the separator that means any run of spaces and tabs
 _SEPARATORS = ("\t", ";", ",", _BLANK)
 _WITH_UNIT = re.compile(r'"[^"]*"|[^\s"]+(?:\s+(?:\[[^\]]*\]|\([^)]*\)))?')
 _DECIMAL_COMMA = {
@@ -45,13 +45,15 @@ _CONTROL = re.compile(r"[\x00-\x08\x0b\x0e-\x19\x1b-\x1f]")  # what no text hold
 _FALLBACK = "cp1252"  # of Windows, where a file is no UTF-8
 _ROWS, _COLUMNS = 1_048_576, 16_384  # of a sheet at most
 Place = Callable[[Sequence[str]], Sequence[int]]
-_PROLOGUE = 4096  # bytes of a part in which a document type would stand
+_PROLOGUE = 4096  # bytes of a part in which a document type would be
 
 
 class Layout(NamedTuple):
-    """Column names, the number of lines above the first row, the separator, the encoding, and whether names were read.
+    """Layout of a text table: names, lines above the first row, separator, encoding.
 
-    The separator `" "` stands for any run of spaces and tabs. Columns without names are `x1`, `x2`,
+    It also holds whether names were read.
+
+    The separator `" "` means any run of spaces and tabs. Columns without names are `x1`, `x2`,
     …
     """
 
@@ -63,8 +65,8 @@ class Layout(NamedTuple):
 
     @property
     def note(self) -> str:
-        """Return what to know of the encoding and of the names; mostly nothing."""
-        notes = ["no UTF-8, so read as Windows-1252"] if self.encoding == _FALLBACK else []
+        """Note on the encoding and the names; mostly empty."""
+        notes = ["not UTF-8, so read as Windows-1252"] if self.encoding == _FALLBACK else []
         if not self.headed:
             named = [name for name in self.names if name]
             called = (
@@ -90,16 +92,17 @@ class Layout(NamedTuple):
 
 
 def layout(path: Path, columns: Sequence[str] = ()) -> Layout:
-    """Return the layout of a text table; remarks above its header are skipped.
+    """Find the layout of a text table; remarks above its header are skipped.
 
-    Args: columns: names that are asked for. A first line of numbers is a header only where it holds
-        all of them.
+    Args:
+        columns: names that are asked for. A first line of numbers is a header only where it holds
+            all of them.
 
     Raises:
         InputError: what is no text, or only blank lines.
     """
     try:
-        encoding = _encoding(path)
+        encoding = encoding_of(path)
         return _layout(path, encoding, columns)
     except (UnicodeError, csv.Error):
         raise InputError(
@@ -107,7 +110,7 @@ def layout(path: Path, columns: Sequence[str] = ()) -> Layout:
         ) from None
 
 
-def _encoding(path: Path) -> str:
+def encoding_of(path: Path) -> str:
     """By the byte-order mark; otherwise UTF-8, or Windows-1252 where it is none.
 
     Raises:
@@ -127,6 +130,22 @@ def _encoding(path: Path) -> str:
             raise
     _check_text(path, _FALLBACK, strict=True)
     return _FALLBACK
+
+
+def guessed_at(path: Path) -> int | None:
+    """Return the first line of a text that is no UTF-8, so that it is read as Windows-1252.
+
+    None where none is.
+    """
+    if encoding_of(path) != _FALLBACK:
+        return None
+    with path.open("rb") as file:
+        for number, line in enumerate(file, start=1):
+            try:
+                line.decode()
+            except UnicodeDecodeError:
+                return number
+    return None
 
 
 def _check_text(path: Path, encoding: str, *, strict: bool = False) -> None:
@@ -150,7 +169,7 @@ def _layout(path: Path, encoding: str, columns: Sequence[str]) -> Layout:
             after, further = _next_line(file, number)
             if not after or _has_numbers(
                 after
-            ):  # the names themselves stand behind the sign, right above the numbers
+            ):  # the names themselves follow the sign, right above the numbers
                 ahead += [(after, further)] if after else []
                 break
             line, number = after, further
@@ -178,7 +197,10 @@ def _layout(path: Path, encoding: str, columns: Sequence[str]) -> Layout:
 
 
 def _has_numbers(line: str) -> bool:
-    """Return whether a line is one of a table and no remark: a cell between separators is a number, or each between spaces."""
+    """Return whether a line is one of a table and no remark.
+
+    One cell between separators is a number, or each cell between spaces.
+    """
     if line.lstrip().startswith(_REMARK):
         return False
     return any(map(_NUMBER.fullmatch, re.split(r"[,;\t]", line))) or all(
@@ -187,10 +209,10 @@ def _has_numbers(line: str) -> bool:
 
 
 def _first_unnamed(rows: list[tuple[list[str], int]], separator: str, line: str) -> int | None:
-    """Index of the first row of a table without a header, None where it has one.
+    """Return the index of the first row of a table without a header, None where it has one.
 
     Args:
-        line: the first of the lines as it stands, which may be a remark.
+        line: the first of the lines unchanged, which may be a remark.
     """
     cells = rows[0][0]
     if _is_row(cells, separator):
@@ -201,7 +223,7 @@ def _first_unnamed(rows: list[tuple[list[str], int]], separator: str, line: str)
 
 
 def _is_row(cells: list[str], separator: str) -> bool:
-    """Return whether cells hold numbers, dates or nothing, and at least one of the former."""
+    """Return whether cells hold numbers, dates or nothing, and at least one of the first two."""
     found = [
         _is_number(cell, separator) or _DATE.fullmatch(cell.strip()) is not None for cell in cells
     ]
@@ -211,7 +233,7 @@ def _is_row(cells: list[str], separator: str) -> bool:
 
 
 def _counts_columns(rows: list[tuple[list[str], int]], separator: str) -> bool:
-    """Return whether the first line, 0, 1, 2, …, stands for columns without names, as pandas writes it.
+    """Return whether the first line, 0, 1, 2, …, counts columns without names, as pandas writes it.
 
     It does not where the table has one column, or where the first column goes on evenly from it, as
     time does.
@@ -228,7 +250,7 @@ def _counts_columns(rows: list[tuple[list[str], int]], separator: str) -> bool:
 
 
 def _unnamed(rows: list[list[str]]) -> list[str]:
-    """Names x1, x2, … for the columns of rows.
+    """Return the names x1, x2, … for the columns of rows.
 
     None for those behind the last that holds anything.
     """
@@ -241,7 +263,7 @@ def _unnamed(rows: list[list[str]]) -> list[str]:
 
 
 def _below_remarks(rows: list[tuple[list[str], int]], separator: str) -> tuple[list[str], int]:
-    """Return the first line with as many cells as the rows below, or simply the first."""
+    """Return the first line with as many cells as the rows below, or else the first line."""
     for at, (cells, _) in enumerate(rows[1:], start=1):
         if len(cells) > 1 and any(_is_number(cell, separator) for cell in cells):
             count = len(cells)
@@ -258,7 +280,7 @@ def _is_number(cell: str, separator: str) -> bool:
 
 
 def _count(cells: list[str]) -> int:
-    """Return how many there are, empty ones at the end too.
+    """Return the number of cells, with empty ones at the end.
 
     0 where one of the others is a number or empty: no header.
     """
@@ -269,7 +291,10 @@ def _count(cells: list[str]) -> int:
 
 
 def _separator(lines: list[str]) -> str:
-    """Return what separates the cells: of what splits most rows alike, what fits the header and leaves most numbers."""
+    """Return the separator of the cells.
+
+    Of those that split most rows alike, it fits the header and leaves most numbers.
+    """
     best, found = (False, 0.0), ""
     for separator in _SEPARATORS:
         split = [_cells(line, separator) for line in lines]
@@ -298,7 +323,10 @@ def _cells(line: str, separator: str) -> list[str]:
 
 
 def _next_line(file: TextIO, number: int) -> tuple[str, int]:
-    """Return the next line that is not blank, empty at the end of the file, and its number, after line `number`."""
+    """Return the next line that is not blank, and its number, after line `number`.
+
+    The line is empty at the end of the file.
+    """
     for line in iter(file.readline, ""):
         number += 1
         if line.strip():
@@ -307,7 +335,7 @@ def _next_line(file: TextIO, number: int) -> tuple[str, int]:
 
 
 def numbers_only(names: list[str]) -> bool:
-    """Return whether a header is a row of numbers; 0, 1, 2, … stand for columns without names."""
+    """Return whether a header is a row of numbers; 0, 1, 2, … count columns without names."""
     found = [name for name in names if name]
     if not found or not all(map(_NUMBER.fullmatch, found)):
         return False
@@ -315,12 +343,15 @@ def numbers_only(names: list[str]) -> bool:
 
 
 def read_sheet(path: Path, place: Place) -> tuple[int, list[list[Any]]]:
-    """Return the row of the header, counted from 1, and the cells below it in the columns that `place` finds in the header.
+    """Return the row of the header, counted from 1, and the cells below it.
+
+    The cells are those of the columns that `place` finds in the header.
 
     The first row that holds anything is the header. A cell that is not there is None.
 
-    Raises: InputError: no openpyxl, an encrypted file, no worksheet, an empty one, entities, more
-        than fits into memory.
+    Raises:
+        InputError: no openpyxl, an encrypted file, no worksheet, an empty one, entities, more than
+            fits into memory.
     """
     try:
         import openpyxl
@@ -362,7 +393,10 @@ def _check_parts(path: Path, file: Any) -> None:
 
 
 def _check_order(path: Path, sheet: Any) -> None:
-    """Raise InputError unless rows and cells follow each other: openpyxl would leave out what does not."""
+    """Raise InputError unless rows and cells are in order.
+
+    openpyxl would leave out the others.
+    """
     row, column = 0, 0
     with sheet._get_source() as source:
         for event, element in iterparse(source, ("start", "end")):
@@ -386,7 +420,7 @@ def _check_order(path: Path, sheet: Any) -> None:
 
 
 def _place(name: str) -> tuple[int, int]:
-    """Row and column, counted from 1, of a cell such as `B7`; of no cell (0, 0)."""
+    """Return row and column, counted from 1, of a cell such as `B7`; (0, 0) of no cell."""
     found = re.fullmatch(r"([A-Z]{1,3})([1-9][0-9]{0,6})", name)
     if found is None:
         return 0, 0
@@ -396,7 +430,7 @@ def _place(name: str) -> tuple[int, int]:
 
 
 class _Strings(tuple[str, ...]):
-    """The shared texts, of which a negative index names none."""
+    """The shared texts; a negative index names none."""
 
     def __getitem__(self, index: Any) -> Any:
         if index < 0:

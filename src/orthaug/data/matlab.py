@@ -1,4 +1,7 @@
-"""MATLAB's v5 files, every length in them checked: SciPy's reader ends the process on some that are corrupt."""
+"""MATLAB's v5 files, every length in them checked.
+
+SciPy's reader ends the process on some files that are corrupt.
+"""
 
 from __future__ import annotations
 
@@ -27,8 +30,15 @@ _NUMBERS = {
 _INT32, _UINT32, _MATRIX, _COMPRESSED = 5, 6, 14, 15
 _CELL, _STRUCT, _OBJECT = 1, 2, 3
 MOST_ELEMENTS = 1000  # of an array of structs or a cell that is looked into
-_NO_NUMBERS = {_CELL: "a cell", _STRUCT: "a struct", _OBJECT: "an object", 4: "text", 5: "a sparse matrix",
-               16: "a function", 17: "an opaque object"}  # fmt: skip
+_NO_NUMBERS = {
+    _CELL: "a cell",
+    _STRUCT: "a struct",
+    _OBJECT: "an object",
+    4: "text",
+    5: "a sparse matrix",
+    16: "a function",
+    17: "an opaque object",
+}
 _COMPLEX_FLAG = 0x0800
 _HEADER, _PREFIX = (
     128,
@@ -52,7 +62,7 @@ class Variable:
     _body: Callable[[], memoryview]
 
     def numbers(self) -> np.ndarray:
-        """Return the values, of the variable's shape."""
+        """Read the values, in the variable's shape."""
         kind, data, at = _element(body := self._body(), self._begin, self._order)
         values = self._values(kind, data)
         if self._flags & _COMPLEX_FLAG:
@@ -61,7 +71,7 @@ class Variable:
         return values
 
     def text(self) -> str:
-        """Return the characters of a text."""
+        """Read the characters of a text."""
         kind, data, _ = _element(self._body(), self._begin, self._order)
         utf_16 = "utf-16-le" if self._order == "<" else "utf-16-be"
         return bytes(data).decode({4: utf_16, 17: utf_16, 16: "utf-8"}.get(kind, "latin-1"))
@@ -75,7 +85,7 @@ class Variable:
         return values.reshape(self.shape, order="F")
 
     def parts(self) -> Iterator[Variable]:
-        """Yield what is in a struct, an object or a cell, by its path; nothing of anything else.
+        """Yield the contents of a struct, an object or a cell, by path; nothing of anything else.
 
         Elements of arrays are counted from 0: `runs[1].u`, `c[0]`. The only element of a cell has
         the cell's own name.
@@ -98,7 +108,7 @@ class Variable:
             for name in names:
                 type_, data, at = _element(body, at, self._order)
                 if type_ != _MATRIX:
-                    raise ValueError("what is in a struct or cell is no matrix")
+                    raise ValueError("the content of a struct or cell is not a matrix")
                 if data:
                     path = f"{self.name}{f'[{i}]' if count > 1 else ''}{name}"
                     yield _variable(data, self._order, lambda data=data: data, path)
@@ -127,7 +137,7 @@ def read_mat5(content: bytes, path: object) -> dict[str, Variable]:
 
 
 def _element(data: memoryview, at: int, order: str) -> tuple[int, memoryview, int]:
-    """Type and content of the element at a place, and the place behind it."""
+    """Return type and content of the element at a place, and the place behind it."""
     kind, size = struct.unpack_from(order + "II", data, at)
     if kind >> 16:  # a small one: type and size share a word, the data have the other
         kind, size, begin, end = kind & 0xFFFF, kind >> 16, at + 4, at + 8
@@ -144,7 +154,7 @@ def _element(data: memoryview, at: int, order: str) -> tuple[int, memoryview, in
 def _inflated(
     data: memoryview, order: str, path: object
 ) -> tuple[int, memoryview, Callable[[], memoryview]]:
-    """Type, first bytes, and how to get all bytes of a compressed element."""
+    """Return type, first bytes, and a function for all bytes of a compressed element."""
     first = zlib.decompressobj().decompress(data, _PREFIX)
     kind, size = struct.unpack_from(order + "II", first)
 

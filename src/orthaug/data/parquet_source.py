@@ -1,6 +1,6 @@
 """Parquet files as a source: a partition is a run of row groups, read batch by batch.
 
-A file is an experiment, or several where a column tells them apart. Lags are exact at the borders
+A file is an experiment, or several where a column distinguishes them. Lags are exact at the borders
 of batches, row groups and partitions: each reads the rows before it too.
 """
 
@@ -30,14 +30,14 @@ from orthaug.data.record import (
 from orthaug.data.sources import joined, stretches
 from orthaug.data.tables import check_present, check_readable, parquet_file
 
-BATCH_ROWS = 32_768  # what is laid out at once: several such blocks are in memory
-_FEWEST_STEPS = 1000  # that tell the rate of a batch
+BATCH_ROWS = 32_768  # rows that are built at once: several such blocks are in memory
+_FEWEST_STEPS = 1000  # from which the rate of a batch is determined
 PARTITION_ROWS = 1_000_000
-"""Rows of a partition at least, where the file has as many: row groups are never cut."""
+"""Least number of rows of a partition, where the file has as many: row groups are never cut."""
 
 
 class Stamp(NamedTuple):
-    """What changes when a file is written again: its size [B], its time [ns], and a checksum of its footer."""
+    """Size [B], time [ns] and checksum of the footer, which change if a file is written again."""
 
     size: int
     modified: int
@@ -51,19 +51,19 @@ class Runs(NamedTuple):
     began: tuple[float, ...]
 
     def within(self, start: int, stop: int) -> Runs:
-        """Return those with a row in `[start, stop)`."""
+        """Return the ranges with a row in `[start, stop)`."""
         kept = [i for i, (a, b) in enumerate(self.ranges) if a < stop and b > start]
         return Runs(tuple(self.ranges[i] for i in kept), tuple(self.began[i] for i in kept))
 
 
 @dataclass(frozen=True)
 class ChannelColumns:
-    """How the channels stand in the files."""
+    """Columns of the channels in the files."""
 
     inputs: tuple[Channel, ...]
     outputs: tuple[Channel, ...]
     columns: tuple[str, ...]
-    """Of the outputs, then of the inputs."""
+    """File columns of the outputs, then of the inputs."""
     missing: str
 
     @property
@@ -94,7 +94,7 @@ class RowGroups:
         yield from self.between(self.start, self.stop, lead)
 
     def between(self, start: int, stop: int, lead: int) -> Iterator[Experiment]:
-        """Pieces of the rows `[start, stop)`; see `Partition.pieces`."""
+        """Yield the pieces of the rows `[start, stop)`; see `Partition.pieces`."""
         self.check_unchanged()
         runs = self.runs.within(start, stop)
         if not runs.ranges:
@@ -122,7 +122,7 @@ class RowGroups:
         first: int,
         lead: int,
     ) -> Iterator[Experiment]:
-        """Rows of a buffer that begins at row `begin` of the file.
+        """Return rows of a buffer that begins at row `begin` of the file.
 
         Their experiment begins at `first`.
         """
@@ -199,19 +199,21 @@ def open_parquet(
     missing: str = "error",
     partition_rows: int = PARTITION_ROWS,
 ) -> ParquetSource:
-    """Look at the files without reading their channels: rows, columns and their types, experiments, sampling time.
+    """Look at the files without reading their channels.
+
+    Rows, columns and their types, experiments and the sampling time are read.
 
     Args: paths: of the files, in order; none of them reaches into the next. inputs, outputs:
         channel names, or `Channel`s with column, unit, scale and offset. sampling_time: seconds
         between rows; or `time`, the column that holds the instants. experiment: a column of whole
-        numbers that tells experiments apart within a file; None for one a file. columns: the files'
+        numbers that labels the experiments within a file; None for one a file. columns: the files'
         column for a channel, `{"position": "yVal"}`. missing: "error", or "skip" to end a stretch
         at rows with a missing sample. partition_rows: rows of a partition at least; row groups are
         never cut.
 
-    Raises: InputError: a file that cannot be read, has no rows, lacks a column or holds another
-        type in it; experiments
-            that are not in one piece; time that does not rise evenly within one.
+    Raises:
+        InputError: a file that cannot be read, has no rows, lacks a column or holds another type in
+            it; experiments that are not in one piece; time that does not rise evenly within one.
     """
     given, groups = (
         dict(columns or {}),
@@ -252,7 +254,7 @@ def open_parquet(
 
 
 def stamp_of(path: Path) -> Stamp:
-    """Size, time and footer of a Parquet file.
+    """Return size, time and footer of a Parquet file.
 
     Raises:
         InputError: a file that is gone or too short to be one.
@@ -276,7 +278,10 @@ def _check_types(
     types: dict[str, tuple[Any, Path]],
     time: str | None,
 ) -> None:
-    """Raise InputError for a column that holds no numbers (or dates, in that of time), or others than before."""
+    """Raise InputError for a column without numbers, or with another type than before.
+
+    The column of time may hold dates.
+    """
     for name in names:
         found = schema.field(name).type
         known_kinds = ("int", "uint", "float", "double", "halffloat", "bool")
@@ -293,7 +298,7 @@ def _check_types(
 def _look(
     file: Any, path: Path, total: int, time: str | None, experiment: str | None
 ) -> tuple[Runs, float | None]:
-    """Return the file's experiments and its sampling time [s], by a pass over the two columns that tell them."""
+    """Return the file's experiments and its sampling time [s], by a pass over two columns."""
     if time is None and experiment is None:
         return Runs(((0, total),), (0.0,)), None
     wanted = [name for name in (time, experiment) if name]
@@ -309,7 +314,7 @@ def _look(
 
 
 class _BatchScan:
-    """Where experiments begin and how time steps, batch by batch.
+    """Begins of experiments and steps of time, batch by batch.
 
     Each batch is joined to the last row before it.
     """
@@ -332,8 +337,10 @@ class _BatchScan:
         return (instants - self.origin) / np.timedelta64(1, "s")
 
     def add(self, instants: np.ndarray | None, labels: np.ndarray | None) -> None:
-        instants, labels = (np.zeros(len(b if a is None else a)) if a is None else a  # type: ignore[arg-type]
-                            for a, b in ((instants, labels), (labels, instants)))  # fmt: skip
+        instants, labels = (
+            np.zeros(len(b if a is None else a)) if a is None else a  # type: ignore[arg-type]
+            for a, b in ((instants, labels), (labels, instants))
+        )
         for values, name in ((instants, self.time), (labels, self.experiment)):
             bad = np.flatnonzero(~np.isfinite(values))
             if len(bad):
@@ -364,7 +371,7 @@ class _BatchScan:
     def _follow(self, steps: np.ndarray, first: int) -> None:
         """Raise InputError for a step of time that is not the usual one of this file.
 
-        NaN between experiments.
+        Steps between experiments are NaN.
         """
         inside = np.isfinite(steps)
         if not inside.any():
@@ -377,7 +384,7 @@ class _BatchScan:
                 f"{self.path}: row {first + int(odd[0])}, column '{self.time}': a step of "
                 f"{steps[odd[0]]:g} s where {self.usual:g} s is usual; expected evenly "
                 "sampled, rising time within an experiment. Resample, sort, or name the column "
-                "that tells experiments apart."
+                "that labels the experiments."
             )
         self.steps, self.counted = (
             self.steps + float(np.nansum(steps)),
@@ -392,8 +399,7 @@ class _BatchScan:
             return Runs(ranges, (0.0,) * len(ranges)), None
         if not self.counted:
             raise InputError(
-                f"{self.path}: one row is too few to tell the sampling time from column "
-                f"'{self.time}'."
+                f"{self.path}: one row is too few for a sampling time from column '{self.time}'."
             )
         step = self.steps / self.counted
         if self.rates and max(self.rates) - min(self.rates) > DRIFT * step:
@@ -405,7 +411,7 @@ class _BatchScan:
 
 
 def _grouped(groups: Sequence[int], least: int) -> Iterator[tuple[int, int]]:
-    """Row ranges of partitions: row groups taken together until there are `least` rows."""
+    """Return row ranges of partitions: row groups joined until there are `least` rows."""
     start = stop = 0
     for rows in groups:
         stop += rows
@@ -419,7 +425,7 @@ def _grouped(groups: Sequence[int], least: int) -> Iterator[tuple[int, int]]:
 def _batches(
     path: Path, start: int, stop: int, reading: ChannelColumns
 ) -> Iterator[tuple[int, np.ndarray]]:
-    """Rows `[start, stop)` of a file as (first row, matrix of its columns)."""
+    """Yield rows `[start, stop)` of a file as (first row, matrix of its columns)."""
     with parquet_file(path) as file:
         ends = np.cumsum(
             [file.metadata.row_group(i).num_rows for i in range(file.metadata.num_row_groups)]

@@ -26,7 +26,7 @@ Phase = Annotated[str, OneOf(("zero", "causal"))]
 
 
 def _filtered(values: Matrix, sections: Matrix, phase: str, what: str) -> Matrix:
-    """Return every stretch without a gap through a filter; those too short for it are missing."""
+    """Filter every stretch without a gap; samples of stretches that are too short are missing."""
     from scipy.signal import sosfilt, sosfilt_zi, sosfiltfilt
 
     result, pad = np.full_like(values, np.nan), 3 * (2 * len(sections) + 1)
@@ -40,8 +40,9 @@ def _filtered(values: Matrix, sections: Matrix, phase: str, what: str) -> Matrix
     if not np.isfinite(result).all(axis=1).any():
         longest = max((b - a for a, b in unbroken(values)), default=0)
         raise InputError(
-            f"{what}: the longest stretch without a gap has {longest} rows, a filter of zero phase needs {pad + 1}: "
-            'fill gaps before, take a lower order, or phase = "causal".'
+            f"{what}: the longest stretch without a gap has {longest} rows, but a filter of "
+            f"zero phase needs {pad + 1}. Fill gaps before it, take a lower order, or "
+            'phase = "causal".'
         )
     return result
 
@@ -50,7 +51,7 @@ def _filtered(values: Matrix, sections: Matrix, phase: str, what: str) -> Matrix
 class _Butterworth:
     """A Butterworth filter.
 
-    Of zero phase it goes forth and back, which squares its gain: −6 dB at the cutoff.
+    With zero phase it runs forward and backward, which squares its gain: −6 dB at the cutoff.
     """
 
     cutoff: Annotated[float, Gt(0)]
@@ -85,10 +86,12 @@ class _Butterworth:
 class Lowpass(_Butterworth):
     """A Butterworth low-pass over all channels alike; `cutoff` in Hz.
 
-    Args: cutoff: Hz, below half the sampling frequency. order: 1 to 10. phase: "zero" goes forth
-        and back: nothing is delayed, the gain is squared (−6 dB at the cutoff), and a sample
-            depends on later ones, which a loop does not have. "causal" goes forth once and delays
-            what it filters.
+    Args:
+        cutoff: Hz, below half the sampling frequency.
+        order: 1 to 10.
+        phase: "zero" goes forth and back: nothing is delayed, the gain is squared (−6 dB at the
+            cutoff), and a sample depends on later ones, which a loop does not have. "causal" goes
+            forth once and delays what it filters.
         channels: names; None for all. Inputs and outputs that are filtered alike keep the linear
             relation between them; filter some alone, and the filter becomes part of the model.
 
@@ -105,10 +108,12 @@ class Lowpass(_Butterworth):
 class Highpass(_Butterworth):
     """A Butterworth high-pass over all channels alike; `cutoff` in Hz.
 
-    Args: cutoff: Hz, below half the sampling frequency. order: 1 to 10. phase: "zero" goes forth
-        and back: nothing is delayed, the gain is squared (−6 dB at the cutoff), and a sample
-            depends on later ones, which a loop does not have. "causal" goes forth once and delays
-            what it filters.
+    Args:
+        cutoff: Hz, below half the sampling frequency.
+        order: 1 to 10.
+        phase: "zero" goes forth and back: nothing is delayed, the gain is squared (−6 dB at the
+            cutoff), and a sample depends on later ones, which a loop does not have. "causal" goes
+            forth once and delays what it filters.
         channels: names; None for all. Inputs and outputs that are filtered alike keep the linear
             relation between them; filter some alone, and the filter becomes part of the model.
     """
@@ -119,16 +124,20 @@ class Highpass(_Butterworth):
 
 @dataclass(frozen=True)
 class Decimate:
-    """Keeps each `factor`-th row behind a Chebyshev low-pass of order 8 at 0.8 of the new Nyquist frequency.
+    """Step that keeps each `factor`-th row behind a low-pass.
 
-    Args: factor: 2 or more; the sampling time is multiplied by it. phase: of the low-pass, over all
-        channels: "zero" (forth and back, no delay, looks at later samples) or
-            "causal" (delays all channels alike).
+    The low-pass is a Chebyshev filter of order 8 at 0.8 of the new Nyquist frequency.
+
+    Args:
+        factor: 2 or more; the sampling time is multiplied by it.
+        phase: of the low-pass, over all channels: "zero" (forth and back, no delay, looks at later
+            samples) or "causal" (delays all channels alike).
 
     Examples:
         >>> import numpy as np
         >>> from orthaug.data import Record, prepare
-        >>> prepare(Record.from_arrays(u=np.ones(400), y=np.ones(400), sampling_time=0.01), Decimate(4))
+        >>> record = Record.from_arrays(u=np.ones(400), y=np.ones(400), sampling_time=0.01)
+        >>> prepare(record, Decimate(4))
         Record(1 experiment, 100 samples, Ts = 0.04 s, inputs: u; outputs: y)
     """
 
@@ -174,7 +183,7 @@ SAMPLING = ("decimate", "resample")
 def prepare(record: Record, *steps: Any) -> Record:
     """Return a record after steps such as `Detrend()` and `Lowpass(cutoff=10.0)`, in this order.
 
-    `.prepared` tells of them.
+    `.prepared` lists them.
 
     Every step acts within an experiment, never across. Samples that are missing afterwards split
     experiments. Gaps that were left out when the record was read are not seen: to fill them give
@@ -206,21 +215,22 @@ def prepare(record: Record, *steps: Any) -> Record:
 
 
 def check_steps(steps: Any) -> None:
-    """Raise InputError for what are no steps."""
+    """Raise InputError for an argument that is no list of steps."""
     if not isinstance(steps, list | tuple) or not all(
         type(step) in STEPS.values() for step in steps
     ):
         known = ", ".join(kind.__name__ for kind in STEPS.values())
         raise InputError(
-            f"preparation takes steps, which are {known}, each with its arguments; got "
-            f"{steps!r:.80}."
+            f"preparation takes a list of steps with their arguments: {known}; got {steps!r:.80}."
         )
 
 
 def prepared_experiments(
     runs: Iterable[tuple[Run, Experiment]], steps: Sequence[Step], *, keep: bool = False
 ) -> tuple[tuple[Experiment, ...], float, tuple[Prepared, ...], int]:
-    """Experiments after the steps, their sampling time, what was done, and how many rows are left out as missing.
+    """Return the experiments after the steps, with their sampling time and an account.
+
+    The account is what was done, and how many rows are left out as missing.
 
     Args:
         runs: with the experiment that each was, for its place in the file.
@@ -250,14 +260,14 @@ def prepared_experiments(
     if not all(same_step(step, sampling[0]) for step in sampling):
         apart = f"{min(sampling):g} to {max(sampling):g} s"
         raise InputError(
-            f"after preparation samples are {apart} apart; say one `sampling_time` in `resample`."
+            f"after preparation samples are {apart} apart; give one `sampling_time` in `resample`."
         )
-    return tuple(found), sampling[0], tuple(account.told() for account in done), lost
+    return tuple(found), sampling[0], tuple(account.prepared() for account in done), lost
 
 
 @dataclass(eq=False)
 class _Account:
-    """How many samples a step marked as missing or filled."""
+    """Number of samples that a step marked as missing or filled."""
 
     kind: str
     step: Any
@@ -270,7 +280,7 @@ class _Account:
             self.marked += int((old & ~new).sum())
             self.filled += int((new & ~old).sum())
 
-    def told(self) -> Prepared:
+    def prepared(self) -> Prepared:
         return Prepared(self.kind, _options_of(self.step), self.marked + self.filled)
 
 
@@ -288,7 +298,7 @@ def _kind(step: Any) -> str:
 
 
 def _pieces(run: Run, place: Experiment, keep: bool) -> list[Experiment]:
-    """Return the stretches of rows that have all that is needed."""
+    """Return the stretches of rows without a missing sample."""
     stride = place.stride * run.stride
     line = None if run.moved else place.first_line
     pieces = []
@@ -310,7 +320,9 @@ def _pieces(run: Run, place: Experiment, keep: bool) -> list[Experiment]:
 def steps_again(
     prepared: Sequence[Prepared], names: Sequence[str], sampling_time: float
 ) -> tuple[tuple[Step, ...], float]:
-    """Return the steps that prepare a new record as another one was, and its sampling time [s] before them.
+    """Return the steps that prepare a new record as another one was.
+
+    The second result is its sampling time [s] before the steps.
 
     Args:
         names: channels that the new record has; the steps leave out others.
@@ -334,7 +346,7 @@ def steps_again(
 
 
 def warnings_of(prepared: Sequence[Prepared], names: Sequence[str]) -> tuple[Warning, ...]:
-    """Return what must be known of a fit to data that were prepared so."""
+    """Return warnings about a fit to data that were prepared so."""
     found = []
     for done in prepared:
         channels = done.options.get("channels")
@@ -349,13 +361,14 @@ def warnings_of(prepared: Sequence[Prepared], names: Sequence[str]) -> tuple[War
             )
         if done.step not in _FILTERS:
             continue
-        late = ", and delays all that it acts on" if done.options.get("phase") == "causal" else ""
+        late = ", and delays its channels" if done.options.get("phase") == "causal" else ""
         found.append(
             Warning(
                 "filtered_noise",
-                f"{done.step} colours the noise{late}: residuals follow from one another, and one step ahead θ is "
-                "biased by that. What is nonlinear in physics or learner is not the same of filtered signals. Compare "
-                'with a fit to the data as they are, and with training.focus = "simulation".',
+                f"{done.step} colours the noise{late}: residuals are correlated, which biases θ "
+                "one step ahead. Nonlinear terms are not the same of filtered signals. Compare "
+                "with a fit to the data as they are, and with training.focus = "
+                '"simulation".',
             )
         )
     return tuple(found)

@@ -1,6 +1,6 @@
 """Records from files: rows, ranges and sampling time of named channels.
 
-Rows count from 0 behind the header; messages name the file's own line, column and what stands
+Rows count from 0 behind the header; messages name the file's own line, column and what is
 there.
 """
 
@@ -74,12 +74,13 @@ def read_record(
         missing: "error", or "skip" to leave out rows with empty or NaN cells. Each stretch between
             them is then an experiment of its own, so that no lag reaches across a gap. "keep" does
             so where inputs are missing, and keeps missing outputs as NaN: an `Observer` takes them.
-        experiment: the column, of numbers, that tells experiments apart; each is in one piece.
+        experiment: the column, of numbers, that labels the experiments; each is in one piece.
         prepare: steps such as `Fill()` or `Lowpass(cutoff=10.0)`, in order, before missing samples
             are looked at; with `Resample()` the instants of `time` may be uneven.
 
-    Raises: InputError: no such file, wrong type, missing columns, cells that are empty or no finite
-        numbers.
+    Raises:
+        InputError: no such file, wrong type, missing columns, cells that are empty or no finite
+            numbers.
 
     Examples:
         >>> import tempfile
@@ -144,8 +145,8 @@ def read_record(
         )
     step = steps[0] if time else (1.0 if sampling_time is None else float(sampling_time))
     if others := [other for other in steps if not same_step(other, step)]:
-        told = f"steps by {step:g} s in one row range and by {others[0]:g} s in another"
-        raise InputError(f"{path}: column '{time}' {told}.")
+        steps_text = f"steps by {step:g} s in one row range and by {others[0]:g} s in another"
+        raise InputError(f"{path}: column '{time}' {steps_text}.")
     left_out = recorded - sum(len(experiment) for experiment in experiments)
     step *= min(every, 10**15)  # what is longer is refused
     return Record(tuple(channels[0]), tuple(channels[1]), step, tuple(experiments), time, left_out)
@@ -153,7 +154,7 @@ def read_record(
 
 @dataclass(frozen=True, eq=False)
 class _RawRanges:
-    """Ranges of a table as they are, missing samples too, for steps that may mend them."""
+    """Ranges of a table with their missing samples, for steps that may mend them."""
 
     table: Table
     channels: list[tuple[Channel, ...]]
@@ -173,17 +174,18 @@ class _RawRanges:
             runs, steps, keep=self.missing == "keep"
         )
         if lost and self.missing == "error":
-            told = (
+            lacking = (
                 f"{counted(lost, 'row')} {'lacks' if lost == 1 else 'lack'} a sample after "
                 "preparation"
             )
             raise MissingSampleError(
-                f'{self.table.path}: {told}. Let `fill` reach over longer gaps, or leave them out (missing = "skip").'
+                f"{self.table.path}: {lacking}. Let `fill` reach over longer gaps, or leave them "
+                'out (missing = "skip").'
             )
         return Record(self.channels[0], self.channels[1], step, experiments, self.time, lost, done)
 
     def _run(self, begin: int, end: int, *, mends: bool, uneven: bool) -> tuple[Run, Experiment]:
-        """Return the rows of a range, and where they stand."""
+        """Return the rows of a range, and their place in the file."""
         table, pick, both = (
             self.table,
             slice(begin, end, self.every),
@@ -221,7 +223,9 @@ class _RawRanges:
 def read_samples(
     paths: Sequence[str | Path], lags: Sequence[str], *, rows: Any = None, every: int = 1
 ) -> tuple[dict[str, Vector], Vector | None]:
-    """Points from files: a column per raw lag, named as in expressions, and their `weight` where there is one.
+    """Read points from files: a column per raw lag, named as in expressions, and their `weight`.
+
+    Files need no column `weight`.
 
     Raises:
         InputError: no such file, missing columns, cells that are no finite numbers.
@@ -249,7 +253,10 @@ def read_samples(
 
 
 def _trim(table: Table, *, uneven: bool = False) -> Table:
-    """Return the table without its last rows where every used column is empty (blank lines, longer unused columns)."""
+    """Return the table without its last rows where every used column is empty.
+
+    Such are blank lines, and the ends of longer unused columns.
+    """
     longest = max(table.filled.values())
     if longest == 0:
         raise InputError(f"{table.path}: there are no data rows in {', '.join(table.columns)}.")
@@ -283,7 +290,7 @@ def _columns(channels: Sequence[Sequence[Channel]], columns: Any) -> dict[str, s
 
 
 def _check_time(time: Any, sampling_time: Any, outputs: Mapping[str, str]) -> None:
-    """Raise InputError for instants that are no column, given twice, or an output as well."""
+    """Raise InputError for instants that are no column, given twice, or also an output."""
     check_type(time, str | None, "time", "a column's name")
     if sampling_time is not None and time is not None:
         raise InputError("give `sampling_time` or `time`, not both.")
@@ -292,7 +299,7 @@ def _check_time(time: Any, sampling_time: Any, outputs: Mapping[str, str]) -> No
     for name, column in outputs.items():
         if column == time:
             raise InputError(
-                f"the column '{time}' is `time` and the output '{name}'; one of them is wrong."
+                f"the column '{time}' is both `time` and the output '{name}'; correct one of them."
             )
 
 
@@ -307,7 +314,7 @@ def _whole(value: Any) -> bool:
 def _ranges(
     rows: RowRange | Sequence[RowRange] | None, total: int, path: Path
 ) -> list[tuple[int, int]]:
-    """Half-open ranges of rows, each checked against the file."""
+    """Return half-open ranges of rows, each checked against the file."""
     if rows is None:
         return [(0, total)]
     pairs: list = list(rows) if _listed(rows) else []
@@ -366,7 +373,7 @@ def _stretches(
     every: int,
     missing: str,
 ) -> list[tuple[int, int]]:
-    """Half-open row ranges without missing cells in the needed columns.
+    """Return half-open row ranges without missing cells in the needed columns.
 
     The whole range where they are errors.
     """
@@ -410,11 +417,14 @@ def _check_cells(table: Table, columns: Sequence[str], start: int, stop: int) ->
 
 
 def _uniform_step(table: Table, time: str, start: int, stop: int) -> float:
-    """Mean step of the time column, checked to be even: no sample is missing, and the rate stays the same."""
+    """Return the mean step of the time column, checked to be even.
+
+    No sample is missing, and the rate stays the same.
+    """
     instants = table.columns[time][start:stop]
     if len(instants) < 2:
         raise InputError(
-            f"{table.path}: one row is too few to tell the sampling time from column '{time}'."
+            f"{table.path}: one row is too few for a sampling time from column '{time}'."
         )
     steps = np.diff(instants)
     mean, usual = float(steps.mean()), float(np.sort(steps)[(len(steps) - 1) // 2])

@@ -32,7 +32,7 @@ def same_step(step: float, other: float) -> bool:
 
 
 def unbroken(values: Matrix) -> list[tuple[int, int]]:
-    """Half-open ranges of rows without a missing sample."""
+    """Return half-open ranges of rows without a missing sample."""
     there = np.isfinite(values).all(axis=1)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], there, [False]]).astype(int))).tolist()
     return list(zip(edges[::2], edges[1::2], strict=True))
@@ -40,7 +40,9 @@ def unbroken(values: Matrix) -> list[tuple[int, int]]:
 
 @dataclass(frozen=True)
 class Channel:
-    """A named signal with its unit, and how files hold it: `value = scale * cell + offset` of `column`.
+    """A named signal with its unit, and its form in files.
+
+    A file holds `value = scale * cell + offset` of `column`.
 
     Examples:
         >>> Channel("force", "N", column="F (kN)", scale=1000.0).label
@@ -75,7 +77,7 @@ class Channel:
 
     @property
     def label(self) -> str:
-        """`name [unit]`, as it stands at an axis."""
+        """`name [unit]`, the label of an axis."""
         return f"{self.name} [{self.unit}]" if self.unit else self.name
 
 
@@ -84,7 +86,7 @@ def _quoted(name: Any) -> str:
 
 
 def as_channels(given: Any, what: str) -> tuple[Channel, ...]:
-    """Channels of names or `Channel`s.
+    """Return the channels of names or `Channel`s.
 
     Raises:
         InputError: one text instead of several, or anything else that names no channels.
@@ -114,7 +116,10 @@ def check_step(value: Any) -> float:
 
 
 def check_channels(inputs: Sequence[Channel], outputs: Sequence[Channel]) -> None:
-    """Raise InputError for a name that stands twice, or an output named like a column of result tables."""
+    """Raise InputError for a name that is given twice, or that result tables use.
+
+    Outputs must not be named like a column of result tables.
+    """
     check_unique((channel.name for channel in (*inputs, *outputs)), "channel")
     derived = [f"{c.name}_{part}" for c in outputs for part in _DERIVED]
     for channel in outputs:
@@ -126,7 +131,9 @@ def check_channels(inputs: Sequence[Channel], outputs: Sequence[Channel]) -> Non
 
 @dataclass(frozen=True, eq=False)
 class Experiment:
-    """One uninterrupted run: `inputs` (N, nu) and `outputs` (N, ny), row k taken at the same instant.
+    """One uninterrupted run: `inputs` (N, nu) and `outputs` (N, ny).
+
+    Row k of both was taken at the same instant.
 
     Messages say where a row came from: `source`, `first_row`, `stride` and `first_line`, the file's
     line of its row 0. `start_time` [s] is the instant of the first row. A stretch between missing
@@ -150,7 +157,7 @@ class Experiment:
         return f"Experiment({visible(self.source) + ': ' if self.source else ''}{shapes})"
 
     def check(self, inputs: int, outputs: int) -> None:
-        """Raise InputError unless there are as many columns, and as many rows of both."""
+        """Raise InputError unless the columns fit the channels, and both have as many rows."""
         wanted = (len(self), inputs), (len(self), outputs)
         found = np.shape(self.inputs), np.shape(self.outputs)
         if found != wanted:
@@ -161,7 +168,7 @@ class Experiment:
             )
 
     def where(self, row: int) -> str:
-        """`run.csv: line 17 (row 15)` for a row of this experiment, as much of it as is known."""
+        """Return the place of a row: `run.csv: line 17 (row 15)`, as much of it as is known."""
         row = self.first_row + self.stride * row
         place = (
             f"row {row}" if self.first_line is None else f"line {self.first_line + row} (row {row})"
@@ -185,7 +192,8 @@ class Record(NotebookView):
 
     Examples:
         >>> import numpy as np
-        >>> record = Record.from_arrays(u=np.arange(5.0), y=np.ones(5), sampling_time=0.1, inputs=["force"])
+        >>> u, y = np.arange(5.0), np.ones(5)
+        >>> record = Record.from_arrays(u=u, y=y, sampling_time=0.1, inputs=["force"])
         >>> record
         Record(1 experiment, 5 samples, Ts = 0.1 s, inputs: force; outputs: y)
         >>> [len(part) for part in record.split(0.6)]
@@ -205,7 +213,7 @@ class Record(NotebookView):
     `missing="skip"` or prepared.
     """
     prepared: tuple[Prepared, ...] = ()
-    """What was done to the samples, in order."""
+    """Preparation of the samples, in order."""
 
     def __post_init__(self) -> None:
         for name in ("inputs", "outputs"):
@@ -247,7 +255,8 @@ class Record(NotebookView):
             InputError: lengths that differ, cells that are not finite, names that do not fit.
 
         Examples:
-            >>> Record.from_arrays([0.0, 1.0], [[0, 1], [2, 3]], outputs=[Channel("angle", "rad"), "speed"])
+            >>> outputs = [Channel("angle", "rad"), "speed"]
+            >>> Record.from_arrays([0.0, 1.0], [[0, 1], [2, 3]], outputs=outputs)
             Record(1 experiment, 2 samples, Ts = 1 s, inputs: u; outputs: angle, speed)
         """
         if u is None and y is None:
@@ -342,12 +351,16 @@ class Record(NotebookView):
         return self.outputs + self.inputs
 
     def check_measured(self) -> None:
-        """Raise InputError where an output is missing, as a record for an `Observer` may have it."""
+        """Raise InputError where an output is missing.
+
+        A record for an `Observer` may miss outputs.
+        """
         for experiment in self.experiments:
             bad = np.flatnonzero(np.isnan(experiment.outputs).any(axis=1))
             if bad.size:
                 raise InputError(
-                    f"{experiment.where(int(bad[0]))}: an output is missing there, which only an Observer takes; leave "
+                    f"{experiment.where(int(bad[0]))}: an output is missing, which only an "
+                    "Observer accepts; leave "
                     'such rows out (`missing = "skip"`), or split the experiment there.'
                 )
 
@@ -367,16 +380,18 @@ class Record(NotebookView):
     def split(self, fraction: float, by: str = "rows") -> tuple[Record, Record]:
         """Return two records: the first `fraction` and the rest.
 
-        Args: fraction: between 0 and 1, rounded to whole rows or experiments. by: "rows" cuts every
-            experiment, the first `fraction` of its rows into the first record; "experiments"
-                leaves each whole, and puts the first `fraction` of them into the first record.
+        Args:
+            fraction: between 0 and 1, rounded to whole rows or experiments.
+            by: "rows" cuts every experiment, the first `fraction` of its rows into the first
+                record; "experiments" leaves each whole, and puts the first `fraction` of them into
+                the first record.
 
         Raises:
             InputError: a part that would be empty.
 
         Examples:
             >>> import numpy as np
-            >>> both = Record.join([Record.from_arrays(y=np.ones(10)), Record.from_arrays(y=np.ones(20))])
+            >>> both = Record.join([Record.from_arrays(y=np.ones(n)) for n in (10, 20)])
             >>> both.split(0.8)[1]
             Record(2 experiments, 6 samples, Ts = 1 s, inputs: none; outputs: y)
             >>> both.split(0.5, by="experiments")[1]
@@ -407,7 +422,7 @@ class Record(NotebookView):
         return replace(self, experiments=first), replace(self, experiments=second)
 
     def _piece(self, experiment: Experiment, start: int | None, stop: int | None) -> Experiment:
-        """Rows of an experiment, with the instant of their first."""
+        """Return rows of an experiment, with the instant of their first."""
         first = range(len(experiment))[start:stop].start
         return replace(
             experiment.rows(start, stop),

@@ -1,4 +1,4 @@
-"""Regressors: which lags of which channels, their matrix over a record, and the learner's view of it.
+"""Regressors: lags of channels, their matrix over a record, and the learner's features.
 
 Order, everywhere: outputs in order, each k-1 … k-na; then inputs in order, each k-nk … k-nk-nb+1.
 """
@@ -21,7 +21,9 @@ Layout = tuple[Lag, ...]
 
 @dataclass(frozen=True)
 class Lags:
-    """Orders as in MATLAB: `y[k-1..k-na]` and `u[k-nk..k-nk-nb+1]`; one number, or one per channel.
+    """Lags as orders in MATLAB: `y[k-1..k-na]` and `u[k-nk..k-nk-nb+1]`.
+
+    One number, or one per channel.
 
     The paper's `u_k … u_{k-n_b}` is `nk = 0, nb = n_b + 1`.
 
@@ -73,8 +75,9 @@ def _per_channel(
 def in_order(lags: Iterable[Lag], outputs: Sequence[str], inputs: Sequence[str]) -> Layout:
     """Return the distinct lags in regressor order.
 
-    Raises: InputError: an unknown channel, or an output at lag 0 (the model would look at what it
-        predicts).
+    Raises:
+        InputError: an unknown channel, or an output at lag 0 (the model would look at what it
+            predicts).
     """
     place = {name: i for i, name in enumerate((*outputs, *inputs))}
     for lag in lags:
@@ -96,7 +99,9 @@ def largest_lag(layout: Layout) -> int:
 
 
 def lag_matrix(experiment: Experiment, layout: Layout, record: Record, start: int) -> Matrix:
-    """Rows `start … N-1` of the regressor, (N - start, len(layout)), column by column in memory.
+    """Return rows `start … N-1` of the regressor, (N - start, len(layout)).
+
+    The matrix is column by column in memory.
 
     Never reaches before the experiment.
     """
@@ -109,7 +114,10 @@ def lag_matrix(experiment: Experiment, layout: Layout, record: Record, start: in
 
 
 def lag_rows(record: Record, layout: Layout) -> Matrix:
-    """Return the regressors of all rows from the largest lag on, experiment after experiment, (N, len(layout))."""
+    """Return the regressors of all rows from the largest lag on, (N, len(layout)).
+
+    The rows of all experiments follow each other.
+    """
     start = largest_lag(layout)
     return np.concatenate(
         [lag_matrix(experiment, layout, record, start) for experiment in record.experiments]
@@ -118,7 +126,10 @@ def lag_rows(record: Record, layout: Layout) -> Matrix:
 
 @dataclass(frozen=True, eq=False)
 class UsableRows:
-    """The usable rows of a record, stacked over experiments: regressors `x` (N, nx), outputs `y` (N, ny)."""
+    """The usable rows of a record: regressors `x` (N, nx), outputs `y` (N, ny).
+
+    The rows of all experiments follow each other.
+    """
 
     x: Matrix
     y: Matrix
@@ -150,9 +161,9 @@ def stack_rows(record: Record, layout: Layout) -> UsableRows:
 
 @dataclass(frozen=True)
 class Features:
-    """What the learner sees: expressions of the regressor, most often single raw lags.
+    """Features of the learner: expressions of the regressor, most often single raw lags.
 
-    `linear` tells that the learner can be their linear combinations only.
+    With `linear` the learner can be their linear combinations only.
     """
 
     entries: tuple[Expression, ...]
@@ -173,7 +184,7 @@ class Features:
         return Features(tuple(entry.sampled(sampling_time) for entry in self.entries), self.linear)
 
     def evaluate(self, x: Any, layout: Layout, xp: Any) -> Any:
-        """Features (…, nz) of regressors (…, nx), by `xp` (numpy or jax.numpy)."""
+        """Return features (…, nz) of regressors (…, nx), computed by `xp` (numpy or jax.numpy)."""
         if not self.entries:
             return xp.zeros((*x.shape[:-1], 0))
         columns = {lag: x[..., j] for j, lag in enumerate(layout)}

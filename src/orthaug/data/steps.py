@@ -1,4 +1,7 @@
-"""Steps of preparing data, each within one experiment: what a step is, trends, sampling, outliers, gaps, delays."""
+"""Steps of preparation, each within one experiment.
+
+They are trends, sampling, outliers, gaps and delays.
+"""
 
 from __future__ import annotations
 
@@ -24,13 +27,13 @@ Method = Annotated[str, OneOf(("linear", "pchip"))]
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """An experiment on its way through the steps: `values` (N, n), NaN where a sample is missing, at `instants` [s]."""
+    """An experiment between two steps: `values` (N, n) at `instants` [s]; NaN is missing."""
 
     values: Matrix
     instants: Vector
     names: tuple[str, ...]
     inputs: int
-    """How many of the channels, the first ones, are inputs."""
+    """Number of inputs, which are the first channels."""
     step: float
     """Sampling time [s]; of uneven instants the usual one."""
     even: bool = True
@@ -41,7 +44,10 @@ class Run:
     """Whether the samples are no rows of the file any more."""
 
     def columns(self, channels: Channels, usual: range | None = None) -> list[int]:
-        """Return indices of channels; without names the usual ones, which are all unless given."""
+        """Return indices of channels.
+
+        Without names they are those given as usual, by default all.
+        """
         if channels is None:
             return list(range(len(self.names)) if usual is None else usual)
         check_type(channels, tuple | list, "channels", "a list of channel names")
@@ -55,7 +61,7 @@ class Run:
         return [self.names.index(name) for name in channels]
 
     def holding(self, columns: list[int], values: Matrix) -> Run:
-        """The same with other values in some columns."""
+        """Return the experiment with other values in some columns."""
         changed = self.values.copy()
         changed[:, columns] = values
         return replace(self, values=changed)
@@ -81,7 +87,7 @@ class Step(Protocol):
 
 @dataclass(frozen=True)
 class Detrend:
-    """Takes the mean (`degree` 0) or the straight line (1) out of each channel, of each experiment its own.
+    """Step that removes the mean or the straight line of each channel, per experiment.
 
     Args:
         degree: 0 for the mean, 1 for a straight line.
@@ -116,18 +122,21 @@ class Detrend:
 
 @dataclass(frozen=True)
 class Resample:
-    """Uneven time stamps onto an even grid, from the first on.
+    """Step that interpolates samples at uneven instants onto an even grid.
+
+    The grid begins at the first instant.
 
     Nothing across more than three steps.
 
-    Args: sampling_time: s; None for the median of the steps. method: "linear" between neighbours,
-        or "pchip", a smooth cubic without overshoot. Both look at the next
-            sample, and neither removes what is faster than the new grid: put a `Lowpass` before it
-            where that matters.
+    Args:
+        sampling_time: s; None for the median of the steps.
+        method: "linear" between neighbours, or "pchip", a smooth cubic without overshoot. Both look
+            at the next sample, and neither removes what is faster than the new grid: put a
+            `Lowpass` before it where that matters.
     """
 
     sampling_time: float | None = None
-    """s; None for the median of the steps."""
+    """Sampling time in s; None for the median of the steps."""
     method: Method = "linear"
 
     def __post_init__(self) -> None:
@@ -159,7 +168,10 @@ class Resample:
 
 
 def _measured(t: Vector, grid: Vector, near: float) -> Vector:
-    """Return the grid, with the measured instant itself where one lies that near: a sample is not lost by rounding."""
+    """Return the grid, with a measured instant in place of one that is near it.
+
+    Then no sample is lost by rounding.
+    """
     after = np.clip(np.searchsorted(t, grid), 1, len(t) - 1)
     closest = np.where(grid - t[after - 1] < t[after] - grid, t[after - 1], t[after])
     return np.where(np.abs(closest - grid) <= near, closest, grid)
@@ -192,7 +204,9 @@ def _between(t: Vector, column: Vector, grid: Vector, method: str, most: float) 
 
 @dataclass(frozen=True)
 class Outliers:
-    """Hampel's: samples over `threshold` deviations off the median of `window` rows on either side are missing.
+    """Step that marks samples far from the median of their window as missing (Hampel).
+
+    They are over `threshold` deviations off the median of `window` rows on either side.
 
     The deviation is 1.4826 times the median absolute one.
 
@@ -203,7 +217,8 @@ class Outliers:
 
     Examples:
         >>> from orthaug.data import Record, prepare
-        >>> record = Record.from_arrays(u=[0.0] * 9, y=[0.0, 0.1, 0.0, 0.1, 50.0, 0.1, 0.0, 0.1, 0.0])
+        >>> y = [0.0, 0.1, 0.0, 0.1, 50.0, 0.1, 0.0, 0.1, 0.0]
+        >>> record = Record.from_arrays(u=[0.0] * 9, y=y)
         >>> prepare(record, Outliers(), Fill()).experiments[0].outputs[4]
         array([0.1])
     """
@@ -227,7 +242,7 @@ class Outliers:
         return distance > self.threshold * deviation
 
     def distances(self, x: Vector) -> tuple[Vector, Vector]:
-        """Return how far each sample is from the median of its window, and the deviation there.
+        """Return the distance of each sample from the median of its window, and the deviation.
 
         NaN where one is missing.
         """
@@ -252,7 +267,9 @@ class Outliers:
 
 @dataclass(frozen=True)
 class Fill:
-    """Reconstructs gaps of at most `most` samples between measured ones; longer ones stay.
+    """Step that reconstructs gaps of at most `most` samples between measured ones.
+
+    Longer ones stay.
 
     Args:
         most: samples of a gap that is filled.
@@ -283,7 +300,7 @@ class Fill:
 
 @dataclass(frozen=True)
 class Shift:
-    """Delays an input by `samples`: row k gets what was at row k − samples.
+    """Step that delays an input by `samples`: row k gets the value of row k − samples.
 
     The rows without one are cut off.
 
@@ -293,7 +310,8 @@ class Shift:
 
     Examples:
         >>> from orthaug.data import Record, prepare
-        >>> moved = prepare(Record.from_arrays(u=[1.0, 2.0, 3.0], y=[4.0, 5.0, 6.0]), Shift("u", 1)).experiments[0]
+        >>> record = Record.from_arrays(u=[1.0, 2.0, 3.0], y=[4.0, 5.0, 6.0])
+        >>> moved = prepare(record, Shift("u", 1)).experiments[0]
         >>> moved.inputs.T, moved.outputs.T
         (array([[1., 2.]]), array([[5., 6.]]))
     """

@@ -1,6 +1,6 @@
 """Named columns of floats from files, by the file's ending.
 
-What is no number is kept, so that messages can name it.
+Cells that are no numbers are kept, so that messages can name it.
 """
 
 from __future__ import annotations
@@ -20,7 +20,15 @@ from orthaug._base.errors import InputError, MissingColumnError
 from orthaug._base.memory import check_memory
 from orthaug._base.progress import LOG
 from orthaug.data.headers import dated, in_seconds
-from orthaug.data.layouts import Layout, as_number, layout, numbers_only, read_sheet, text_number
+from orthaug.data.layouts import (
+    Layout,
+    as_number,
+    guessed_at,
+    layout,
+    numbers_only,
+    read_sheet,
+    text_number,
+)
 from orthaug.data.variables import ENDINGS, foreign, read_variables, short, variable_names
 
 _SMALL = 4_000_000  # bytes of a text file that NumPy reads sooner than pandas is imported
@@ -47,7 +55,7 @@ class Table:
     dated: str = ""
 
     def where(self, row: int) -> str:
-        """`line 17 (row 15)` in a text file, `row 15` otherwise."""
+        """Return `line 17 (row 15)` of a text file, `row 15` of others."""
         return (
             f"row {row}" if self.first_line is None else f"line {self.first_line + row} (row {row})"
         )
@@ -58,11 +66,14 @@ def read_table(
 ) -> Table:
     """Return the named columns of a file.
 
-    Args: time: the one of them that holds instants, numbers in the unit of its header or dates: it
-        comes in s. most: rows that are enough, where a file can be read in part; None for all.
+    Args:
+        time: the one of them that holds instants, numbers in the unit of its header or dates: it
+            comes in s.
+        most: rows that are enough, where a file can be read in part; None for all.
 
-    Raises: InputError: no such file, an unknown ending, content that does not fit it, or missing
-        columns.
+    Raises:
+        InputError: no such file, an unknown ending, content that does not fit it, or missing
+            columns.
     """
     check_readable(path)
     reader = _READERS.get(path.suffix.lower())
@@ -114,12 +125,20 @@ def column_names(path: Path) -> list[str]:
             read_sheet(path, lambda header: found.extend(header) or [])
         else:
             found = layout(path).names
-    return [name for name in told_apart(found) if name]
+    return [name for name in numbered(found) if name]
 
 
 def reading_note(path: Path) -> str:
-    """Return what to know of how a file is read: an encoding that was guessed; mostly nothing."""
+    """Return a note on how a file is read, such as a guessed encoding; mostly empty."""
     return layout(path).note if _READERS.get(path.suffix.lower()) is _read_text else ""
+
+
+def guessed_encoding(path: Path) -> int | None:
+    """Return the first line that is no UTF-8 of a text that is read all the same.
+
+    None of any other file.
+    """
+    return guessed_at(path) if _READERS.get(path.suffix.lower()) is _read_text else None
 
 
 def check_readable(path: Path) -> None:
@@ -144,7 +163,11 @@ def check_readable(path: Path) -> None:
 def _read_text(
     path: Path, columns: Sequence[str], time: str | None, most: int | None = None
 ) -> Table:
-    """Text tables as they occur: byte-order mark, trailing separators, units in headers, decimal commas, no header."""
+    """Read a text table as it occurs in practice.
+
+    It may have a byte-order mark, trailing separators, units in headers, decimal commas or no
+    header.
+    """
     found = layout(path, columns)
     header, header_line = found.names, found.header_line
     if found.note:
@@ -192,7 +215,9 @@ def _read_text(
 def _cells(
     path: Path, found: Layout, used: list[str], commas: bool, apart: str | None, most: int | None
 ) -> tuple[Any, Any, Any]:
-    """Return the used columns as numbers, as text (None where all are numbers or empty), and what is not empty.
+    """Return the used columns as numbers and as text, and which cells are not empty.
+
+    The text is None where all cells are numbers or empty.
 
     The one `apart` may hold text, so that it is looked at by itself.
     """
@@ -250,7 +275,9 @@ def _cells(
 
 
 def _plain_numbers(path: Path, found: Layout) -> Matrix | None:
-    """Return the columns (count, rows) of a small file with a finite number in every cell of every line; None for all others.
+    """Return the columns (count, rows) of a small file in which every cell is a finite number.
+
+    The result is None for all other files.
 
     NumPy reads it before pandas would be imported.
     """
@@ -277,7 +304,7 @@ def _plain_numbers(path: Path, found: Layout) -> Matrix | None:
 
 
 def _comma_number(text: str) -> float:
-    """Return a number where decimals are commas.
+    """Return a number with a decimal comma.
 
     A point would be one of thousands, and is refused.
     """
@@ -315,7 +342,7 @@ def _read_parquet(path: Path, columns: Sequence[str], time: str | None) -> Table
 
 @contextmanager
 def parquet_file(path: Path) -> Iterator[Any]:
-    """The file, opened by pyarrow.
+    """Yield the file, opened by pyarrow.
 
     Raises:
         InputError: without pyarrow, and for a file that is none or breaks off.
@@ -403,7 +430,7 @@ def check_present(
     named_apart: bool = False,
     headed: bool = True,
 ) -> None:
-    """Raise InputError for a column that is not there, or stands twice."""
+    """Raise InputError for a column that is missing, or is in the header twice."""
     for name in columns:
         if name not in header:
             if not headed:
@@ -424,10 +451,11 @@ def check_present(
             )
         if list(header).count(name) > 1:
             twice = (
-                f"the column '{name}' stands {list(header).count(name)} times; names must differ"
+                f"the header has the column '{name}' {list(header).count(name)} times; "
+                "names must differ"
             )
             apart = (
-                f", or be told apart from the left as '{name}.0', '{name}.1'" if named_apart else ""
+                f", or be numbered from the left as '{name}.0', '{name}.1'" if named_apart else ""
             )
             raise InputError(f"{path}: {twice}{apart}.")
 
@@ -435,14 +463,14 @@ def check_present(
 def places(
     path: Path, columns: Sequence[str], header: Sequence[str], *, headed: bool = True
 ) -> list[int]:
-    """Where the columns stand in a header.
+    """Return the places of columns in a header.
 
     Columns of one name are `name.0`, `name.1`, ... from the left.
 
     Raises:
-        InputError: a column that is not there, or a name that stands twice.
+        InputError: a column that is not there, or a name that is there twice.
     """
-    apart = told_apart(header)
+    apart = numbered(header)
     check_present(
         path,
         [name for name in columns if name not in apart],
@@ -453,8 +481,11 @@ def places(
     return [apart.index(name) for name in columns]
 
 
-def told_apart(header: Sequence[str]) -> list[str]:
-    """Names with a number behind those that stand more than once, as pandas counts them: `u.1` is the second `u`."""
+def numbered(header: Sequence[str]) -> list[str]:
+    """Return names with a number behind those that occur more than once.
+
+    They are counted as in pandas: `u.1` is the second `u`.
+    """
     often, seen, apart = Counter(header), Counter[str](), []
     for name in header:
         number = seen[name]

@@ -1,4 +1,6 @@
-"""Libraries of terms: products of signals and of functions of them, such as `v[k-1]**2*abs(v[k-2])`, written as text.
+"""Libraries of terms, written as text: products of signals and of functions of them.
+
+For example `v[k-1]**2*abs(v[k-2])`.
 
 A term is a product of factors. So a library of many thousand terms is evaluated from few factors,
 and its terms are chosen by numbers while a program runs, without compiling anew.
@@ -28,7 +30,7 @@ OF_SIGNALS = {
     "cos": "cos({})",
     "exp": "exp({})",
 }
-"""The functions that a library makes factors of, and how they are written of a signal."""
+"""Functions that a library makes factors of, as text of a signal."""
 MOST_TERMS = 200_000
 CONSTANT = "1"
 
@@ -57,7 +59,9 @@ class TermLibrary:
         terms: Sequence[str] = (),
         exclude: Iterable[str] = (),
     ) -> TermLibrary:
-        """Return all products of up to `degree` signals, of which one may be a function of a signal instead; and `terms`.
+        """Return all products of up to `degree` signals, and `terms`.
+
+        One signal of a product may be replaced by a function of a signal.
 
         Args:
             signals: as expressions can read them, `y[k-1]` or the name of a state.
@@ -66,13 +70,14 @@ class TermLibrary:
             terms: further ones by hand, any expressions.
             exclude: texts of terms to leave out; factors in any order.
 
-        Raises: InputError: an unknown function, an excluded term that is none, or more terms than
-            can be weighed.
+        Raises:
+            InputError: an unknown function, an excluded term that is none, or more terms than can
+                be weighed.
         """
         unknown = [name for name in functions if name not in OF_SIGNALS]
         if unknown:
             hint = nearest(unknown[0], OF_SIGNALS) or f"; known are {', '.join(OF_SIGNALS)}"
-            raise InputError(f"no terms are made of the function '{unknown[0]}'{hint}.")
+            raise InputError(f"a library has no terms of the function '{unknown[0]}'{hint}.")
         signals = tuple(dict.fromkeys(signals))
         made = [
             OF_SIGNALS[name].format(signal)
@@ -84,7 +89,7 @@ class TermLibrary:
         if count > MOST_TERMS:
             raise InputError(
                 f"{len(signals)} signals to the degree {degree} make {count} terms; at most "
-                f"{MOST_TERMS} are weighed. Lower the degree, or give fewer signals."
+                f"{MOST_TERMS} are allowed. Lower the degree, or give fewer signals."
             )
         numbers = range(len(signals))
         products = (
@@ -121,7 +126,7 @@ class TermLibrary:
     def numbers(self) -> Int[np.ndarray, "terms order"]:
         """The factors of each term.
 
-        The number of all factors, one more than the last, stands for 1.
+        The number of all factors, one more than the last, is 1.
         """
         table = np.full((len(self), max(self.order, 1)), len(self.factors))
         for row, product in zip(table, self.products, strict=True):
@@ -167,7 +172,7 @@ class TermLibrary:
 def products_of(factors: Any, numbers: Any, xp: Any) -> Any:
     """Return the terms (K, …) of factors (nf, …) by their factors' numbers (K, order).
 
-    Number nf stands for 1.
+    Number nf is 1.
     """
     with_one = xp.concatenate([factors, xp.ones((1, *factors.shape[1:]))])
     value = with_one[numbers[:, 0]]
@@ -177,7 +182,7 @@ def products_of(factors: Any, numbers: Any, xp: Any) -> Any:
 
 
 def outside_brackets(text: str, marks: str) -> bool:
-    """Return whether one of some marks stands in a text outside of all brackets."""
+    """Return whether one of some marks is outside all brackets of a text."""
     depth = 0
     for character in text:
         depth += (character in "([") - (character in ")]")
@@ -187,7 +192,7 @@ def outside_brackets(text: str, marks: str) -> bool:
 
 
 def _factors_of(text: str) -> tuple[str, ...]:
-    """Return the factors of a product as it is written, in order; `v**2` is v and v."""
+    """Return the factors of a product in order; `v**2` is v and v."""
     text, pieces, depth, begin = text.replace(" ", ""), [], 0, 0
     for i, character in enumerate(text):
         depth += (character in "([") - (character in ")]")

@@ -5,6 +5,7 @@ A channel is a vector or a matrix column.
 
 from __future__ import annotations
 
+import io
 import math
 import re
 import warnings
@@ -43,7 +44,9 @@ _ELEMENT = re.compile(
 
 @dataclass(frozen=True)
 class FileVariable:
-    """A variable of a file: what it is, in words, and how to read it (None where it holds no numbers).
+    """A variable of a file: its description, and a function that reads it.
+
+    The function is None where the variable holds no numbers.
 
     `text` reads a text. `named` is the name that the file itself gives to the signal, beside its
     path.
@@ -62,16 +65,16 @@ def read_variables(path: Path, names: Sequence[str]) -> dict[str, Vector]:
     A column is written `"U[2]"`, a row `"U[2,:]"`; what is in MATLAB's structs or in groups of HDF5
     `"data.u"`.
 
-    Raises: InputError: a missing variable, a struct, text, complex numbers, a corrupt file; the
-        message lists
-            what the file holds.
+    Raises:
+        InputError: a missing variable, a struct, text, complex numbers, a corrupt file; the message
+            lists what the file holds.
     """
     with foreign(path):
         return _FORMATS[path.suffix.lower()](path, names)
 
 
 def variable_names(path: Path) -> list[str]:
-    """Return the names under which a file's channels are read: vectors, and every line along a narrow matrix.
+    """Return the names of a file's channels: vectors, and every line along a narrow matrix.
 
     Raises:
         InputError: a corrupt file.
@@ -81,7 +84,7 @@ def variable_names(path: Path) -> list[str]:
 
 
 def scalars(path: Path, wanted: Callable[[str], bool]) -> dict[str, float]:
-    """Single numbers that a file holds beside its channels, by name, of the names that are wanted.
+    """Return the wanted single numbers that a file holds beside its channels, by name.
 
     Raises:
         InputError: a corrupt file.
@@ -95,7 +98,7 @@ def scalars(path: Path, wanted: Callable[[str], bool]) -> dict[str, float]:
 
 @contextmanager
 def foreign(path: Path) -> Iterator[None]:
-    """Inside, libraries read a file's bytes: what they raise is an InputError, and what they remark is not told."""
+    """Turn errors of libraries that read a file into InputError, and suppress their warnings."""
     try:
         with warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore")
@@ -103,9 +106,9 @@ def foreign(path: Path) -> Iterator[None]:
     except InputError:
         raise
     except MemoryError:
-        raise InputError(f"{path}: reading the file takes more memory than there is.") from None
+        raise InputError(f"{path}: reading the file needs more memory than is available.") from None
     except Exception as error:  # there is no list of what they raise for corrupt files
-        reason = "no archive of plain arrays" if path.suffix.lower() == ".npz" else short(error)
+        reason = "not an archive of plain arrays" if path.suffix.lower() == ".npz" else short(error)
         raise InputError(
             f"{path}: cannot be read as {path.suffix.lower()} ({reason}); is it cut or corrupt?"
         ) from None
@@ -124,6 +127,7 @@ def _from_npz(path: Path, names: Wanted) -> dict[str, Vector]:
         return _taken(path, names, held)
 
 
+_LONGEST_HEAD = 2**16  # bytes of a member that are unpacked to know what it is
 _LARGE, _DENSEST = (
     2**28,
     300,
@@ -133,13 +137,16 @@ _LARGE, _DENSEST = (
 def _member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> FileVariable:
     """Return an array of an archive by its header; Python objects are never opened."""
     with archive.open(info) as member:
-        version = np.lib.format.read_magic(member)
-        read = {
-            (1, 0): np.lib.format.read_array_header_1_0,
-            (2, 0): np.lib.format.read_array_header_2_0,
-        }[version]
-        shape, _, kind = read(member)
-        begin = member.tell()
+        head = io.BytesIO(
+            member.read(_LONGEST_HEAD)
+        )  # a header may declare a length of its own, in gigabytes
+    version = np.lib.format.read_magic(head)
+    read = {
+        (1, 0): np.lib.format.read_array_header_1_0,
+        (2, 0): np.lib.format.read_array_header_2_0,
+    }[version]
+    shape, _, kind = read(head)
+    begin = head.tell()
     if kind.hasobject:
         return FileVariable("Python objects", None)
     if kind.kind not in "fiubc":
@@ -147,16 +154,15 @@ def _member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> File
     size = math.prod(shape) * kind.itemsize
     if size != info.file_size - begin:
         return FileVariable(f"cut: {in_words(info.file_size - begin)} of {in_words(size)}", None)
-
-    if size > _LARGE and size > _DENSEST * info.compress_size:
-        packed = in_words(info.compress_size)
-        return FileVariable(
-            f"{in_words(size)} in {packed} of the file, denser than measurements; store it "
-            "uncompressed",
-            None,
-        )
+    dense = size > _LARGE and size > _DENSEST * info.compress_size
 
     def load() -> np.ndarray:
+        if dense:  # by its header: nothing of it is unpacked
+            raise InputError(
+                f"{path}: '{info.filename.removesuffix('.npy')}' is {in_words(size)} in "
+                f"{in_words(info.compress_size)} of the file, denser than measurements are. "
+                "Store it uncompressed (`numpy.savez`) if it is true."
+            )
         with archive.open(info) as member:
             return np.lib.format.read_array(member, allow_pickle=False)
 
@@ -179,7 +185,7 @@ def _from_mat(path: Path, names: Wanted) -> dict[str, Vector]:
 
 
 def _held(path: Path, variable: Variable, *, deep: bool) -> dict[str, FileVariable]:
-    """Return a variable, with what is in it if wanted, by their paths."""
+    """Return a variable and, if wanted, its contents, by their paths."""
     if not variable.what:
         return {variable.name: _lazy(path, variable.shape, 8, variable.numbers)}
     text = variable.text if variable.what == "text" else None
@@ -190,7 +196,7 @@ def _held(path: Path, variable: Variable, *, deep: bool) -> dict[str, FileVariab
 
 
 def _from_hdf5(path: Path, names: Wanted) -> dict[str, Vector]:
-    """Datasets by their path; MATLAB's v7.3 files hold every matrix transposed."""
+    """Return datasets by their path; MATLAB's v7.3 files hold every matrix transposed."""
     try:
         import h5py
     except ImportError:
@@ -206,7 +212,7 @@ def _from_hdf5(path: Path, names: Wanted) -> dict[str, Vector]:
 
 @dataclass(frozen=True, eq=False)
 class _Datasets:
-    """What an HDF5 file holds, by path.
+    """Contents of an HDF5 file, by path.
 
     MATLAB keeps cells and arrays of structs as references to `#refs#`.
     """
@@ -217,7 +223,7 @@ class _Datasets:
     held: dict[str, FileVariable]
 
     def add(self, name: str, item: Any) -> None:
-        """Note what stands at a path of groups; `#refs#` is reached by its references only."""
+        """Note the contents of a path of groups; `#refs#` is reached by its references only."""
         if not name.startswith("#"):
             self._note(name, item, 0)
 
@@ -245,14 +251,17 @@ class _Datasets:
         elif item.dtype.kind not in "fiubc" and item.dtype.names is None:
             self.held[key] = FileVariable(f"{item.dtype} values", None)
         elif item.dtype.kind in "fiu" and item.id.get_type() != h5py.h5t.py_create(item.dtype):
-            self.held[key] = FileVariable("numbers in a format of their own", None)
+            self.held[key] = FileVariable("numbers in an unknown format", None)
         else:
             shape = item.shape[::-1] if self.matlab else item.shape
             load = lambda: item[()].T if self.matlab else item[()]  # noqa: E731
             self.held[key] = _lazy(self.path, shape, item.dtype.itemsize, load)
 
     def _note_elements(self, name: str, item: Any, cell: bool, depth: int) -> None:
-        """Note what the elements of a cell, or of a field of an array of structs, point at: `c[0]`, `runs[0].u`."""
+        """Note the elements that a cell or a field of an array of structs refers to.
+
+        Their names are `c[0]` and `runs[0].u`.
+        """
         count = math.prod(item.shape)
         parent, _, field = name.rpartition("/")
         if cell:
@@ -270,7 +279,10 @@ def _word(text: Any) -> str:
 
 
 def _with_names(held: Mapping[str, FileVariable]) -> dict[str, FileVariable]:
-    """Add the signals that a file names in a field beside their values, each under its name where no other has it."""
+    """Add the signals that a file names in a field beside their values.
+
+    Each gets its name unless another has it.
+    """
     named: dict[str, str] = {}
     for path, variable in held.items():
         parent, _, field = path.rpartition(".")
@@ -298,7 +310,7 @@ ENDINGS = tuple(_FORMATS)
 
 
 def short(error: Exception) -> str:
-    """Return what a library says, on one line."""
+    """Return the message of a library on one line."""
     if isinstance(error, LookupError) or any(isinstance(part, bytes) for part in error.args):
         return "unknown bytes"
     return " ".join(str(error).split())[:120] or type(error).__name__
@@ -388,7 +400,8 @@ def _pick(path: Path, name: str, held: Mapping[str, FileVariable]) -> Vector:
         array = array.ravel()
     if array.ndim != 1:
         raise InputError(
-            f"{path}: '{name}' is no vector; write a column of a matrix as \"{variable}[0]\", a row as "
+            f"{path}: '{name}' is no vector; write a column of a matrix as "
+            f'"{variable}[0]", a row as '
             f'"{variable}[0,:]". The file holds {listing}.'
         )
     return np.asarray(array, dtype=float)
@@ -404,7 +417,7 @@ def _known_as(name: str, held: Mapping[str, FileVariable]) -> str:
 
 
 def _line(path: Path, name: str) -> tuple[str, int, int]:
-    """Variable, axis and index of a column `U[2]` or a row `U[2,:]`."""
+    """Return variable, axis and index of a column `U[2]` or a row `U[2,:]`."""
     if not (name.endswith("]") and "[" in name):
         return name, 0, 0
     variable, _, place = name[:-1].rpartition("[")
@@ -415,7 +428,8 @@ def _line(path: Path, name: str) -> tuple[str, int, int]:
         comma and ":" not in (first, second)
     ):
         raise InputError(
-            f'{path}: \'{name}\': a column of a matrix is written "{variable}[0]", a row "{variable}[0,:]", '
+            f"{path}: '{name}': a column of a matrix is written "
+            f'"{variable}[0]", a row "{variable}[0,:]", '
             "counted from 0."
         )
     return variable, axis, int(index)

@@ -1,4 +1,4 @@
-"""Samples of a record that are no measurements: wild ones, rows that stand there twice, a sensor that has frozen.
+"""Samples of a record that are no measurements: wild samples, doubled rows, a frozen sensor.
 
 A sample is wild if it is many times farther from the median than all others of its channel, and
 nothing answers for it: an input's has no response in an output, an output's no cause in an input.
@@ -19,7 +19,8 @@ from orthaug._base.lines import counted, percent
 from orthaug.data.record import Record
 from orthaug.data.steps import Outliers
 
-_APART = 8.0  # times the distance of the farthest other sample; Student's t with 4 degrees of freedom: 1 in 4000
+# Times the distance of the farthest other sample: 1 in 4000 of Student's t, 4 degrees of freedom.
+_APART = 8.0
 _FEW, _LEAST = (
     0.005,
     1,
@@ -29,19 +30,19 @@ _ANSWERS = 3.0  # times what it was before
 _FIRST = 10  # rows before which nothing was seen to compare with
 _NAMED = 3
 _FEWEST = 20  # samples of a channel
-_FROZEN, _FROZEN_SHARE = 20, 0.02  # rows for which a sensor stands still, at least
+_FROZEN, _FROZEN_SHARE = 20, 0.02  # rows for which a frozen sensor does not move, at least
 _STILL = 0.02  # share of equal neighbours elsewhere, at most
 _TWICE = 0.98  # share of rows that equal the one before, of those that should
 
 
 @dataclass(frozen=True)
 class WildSample:
-    """A sample of the record: where it stands, and the channel."""
+    """A sample of the record: experiment, row and channel."""
 
     experiment: int
     row: int
     column: int
-    """Of inputs, then outputs."""
+    """Column among the inputs, then the outputs."""
     name: str
     value: float
     apart: float
@@ -49,7 +50,7 @@ class WildSample:
 
 
 def wild_samples(record: Record) -> tuple[WildSample, ...]:
-    """Return the samples of a record that nothing answers for, channel by channel."""
+    """Return the samples that no other channel explains, channel by channel."""
     values = [np.hstack([e.inputs, e.outputs]) for e in record.experiments]
     names = [c.name for c in (*record.inputs, *record.outputs)]
     inputs = len(record.inputs)
@@ -76,7 +77,7 @@ def _distance(column: Vector) -> Vector:
 
 
 def _far(distance: Vector) -> tuple[list[int], float]:
-    """Return the few samples that lie many times farther than all others, and how many times."""
+    """Return the few samples that are many times farther than all others, and how many times."""
     if len(distance) < _FEWEST:
         return [], 0.0
     most = max(_LEAST, int(_FEW * len(distance)))
@@ -91,20 +92,23 @@ def _far(distance: Vector) -> tuple[list[int], float]:
 
 
 def _explained(distance: Matrix, rows: list[int], j: int, inputs: int, starts: np.ndarray) -> bool:
-    """Return whether other channels answer for these samples: outputs by a response, an input as the cause."""
+    """Return whether other channels explain these samples.
+
+    Outputs do by a response, an input as the cause.
+    """
     first = rows[0]
     if j < inputs:
         if first - starts[np.searchsorted(starts, first, side="right") - 1] < _FIRST:
             return True
         return any(
-            _stands_out(distance[:, i], first, first + _RESPONSE)
+            _is_farther(distance[:, i], first, first + _RESPONSE)
             for i in range(inputs, distance.shape[1])
         )
-    return any(_stands_out(distance[:, i], first - _RESPONSE, first + 1) for i in range(inputs))
+    return any(_is_farther(distance[:, i], first - _RESPONSE, first + 1) for i in range(inputs))
 
 
-def _stands_out(distance: Vector, begin: int, end: int) -> bool:
-    """Return whether a channel goes in these rows where it never was before them, or outside of them at all."""
+def _is_farther(distance: Vector, begin: int, end: int) -> bool:
+    """Return whether a channel is farther out in these rows than before them, or elsewhere."""
     begin = max(begin, 0)
     within = float(distance[begin:end].max(initial=0.0))
     before = (
@@ -116,7 +120,7 @@ def _stands_out(distance: Vector, begin: int, end: int) -> bool:
 
 
 def threshold_for(record: Record, samples: tuple[WildSample, ...]) -> float:
-    """Return the threshold with which the step `outliers` marks these samples of a channel and hardly another."""
+    """Return the threshold with which `outliers` marks these samples and hardly another."""
     least, others = np.inf, 0.0
     for i, experiment in enumerate(record.experiments):
         values = np.hstack([experiment.inputs, experiment.outputs])
@@ -136,7 +140,7 @@ def threshold_for(record: Record, samples: tuple[WildSample, ...]) -> float:
 def data_warnings(
     record: Record, effect: Callable[[tuple[WildSample, ...]], str] | None = None
 ) -> list[Warning]:
-    """Return warnings of wild samples, of rows that stand there twice, and of outputs that stand still.
+    """Return warnings of wild samples, of doubled rows, and of outputs that are constant.
 
     Args:
         effect: says in a sentence what a fit without some samples gives.
@@ -169,10 +173,11 @@ def _wild_text(record: Record, own: tuple[WildSample, ...], effect: str) -> str:
         else "apart from"
     )
     return (
-        f"{'; '.join(where)}{more}{of}, {far} every other sample, and {answer}: a wild "
-        f"sample, {percent(_share_of(record, own), 3)} of the squares of {name}.{effect} Mark it with a step of "
-        f'[[data.prepare]], step = "outliers", channels = ["{name}"], threshold = {threshold_for(record, own):g}, with '
-        'missing = "skip" in [data] or a step "fill" behind it.'
+        f"{'; '.join(where)}{more}{of}, {far} every other sample, and {answer}: a wild sample "
+        f"with {percent(_share_of(record, own), 3)} of the squares of {name}.{effect} Mark it by "
+        f'[[data.prepare]], step = "outliers", channels = ["{name}"], '
+        f"threshold = {threshold_for(record, own):g}. Add "
+        'missing = "skip" in [data], or a step "fill" behind it.'
     )
 
 
@@ -199,17 +204,20 @@ def _twice(record: Record) -> list[Warning]:
             if pairs.mean() > _TWICE and between.mean() < 1 - _TWICE:
                 where = experiment.where(first)
                 text = (
-                    f"{where}: from here on each row stands there twice, in all channels: the "
-                    "file was written at twice the rate of the measurement. Standard errors "
-                    "count every sample twice, and over one step nothing moves. Give `every = "
-                    "2` for these files, with the sampling time of the measurement."
+                    f"{where}: from here on each row is there twice, in all channels: the file was "
+                    "written at twice the rate of the measurement. Standard errors count every "
+                    "sample twice, and over one step nothing moves. Give `every = 2` for these "
+                    "files, with the sampling time of the measurement."
                 )
                 return [Warning("rows_twice", text)]
     return []
 
 
 def _frozen(record: Record) -> list[Warning]:
-    """Return outputs that stand still for many rows while an input moves, and hardly ever for two rows elsewhere."""
+    """Return warnings of frozen outputs: constant for many rows while an input moves.
+
+    Elsewhere hardly two neighbouring rows are equal.
+    """
     found = []
     for j, output in enumerate(record.outputs):
         for experiment in record.experiments:
@@ -226,8 +234,8 @@ def _frozen(record: Record) -> list[Warning]:
             text = (
                 f"{experiment.where(begin)}: {output.name} is {y[begin]:.6g} for "
                 f"{counted(rows + 1, 'row')} from here on ({percent((rows + 1) / n)} of them), "
-                "and moves from row to row everywhere else: a sensor or a recorder that has "
-                "frozen. Leave these rows out (`rows` of the data)."
+                "and changes from row to row elsewhere: a sensor or a recorder was frozen. "
+                "Leave these rows out (`rows` of the data)."
             )
             found.append(Warning("frozen_output", text))
             break

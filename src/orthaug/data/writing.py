@@ -1,4 +1,4 @@
-"""Expressions written for others: their unit, and as LaTeX."""
+"""Units and LaTeX of expressions."""
 
 from __future__ import annotations
 
@@ -36,7 +36,9 @@ Unit = Counter[str]
 
 
 def coefficient_unit(unit: str, term: Expression, units: Mapping[str, str]) -> str | None:
-    """Return the unit of a term's coefficient, where the sum has `unit` and channels or states theirs; None if not told.
+    """Return the unit of a term's coefficient; None where a unit is missing.
+
+    The sum has `unit`; channels and states have theirs.
 
     Examples:
         >>> from orthaug.data.expressions import parse
@@ -138,7 +140,7 @@ def _latex(node: ast.AST) -> str:
 
 
 def _tight(node: ast.AST) -> str:
-    """In brackets where it is a sum."""
+    """Return LaTeX in brackets where it is a sum."""
     loose = isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add | ast.Sub)
     return f"({_latex(node)})" if loose else _latex(node)
 
@@ -171,7 +173,7 @@ def tex_text(text: str) -> str:
 
 
 def symbol(name: str, index: str = "") -> str:
-    """Return a name: one letter as it stands, with digits behind it as an index, words upright."""
+    """Return a name in LaTeX: letters, digits behind one letter as an index, words upright."""
     letters = name.rstrip("0123456789")
     if len(letters) == 1:
         base, below = letters, ",".join(filter(None, (name[1:], index)))

@@ -1,4 +1,4 @@
-"""The arithmetic of a program in C: constants, activations, blocks with their networks, and integrators."""
+"""The arithmetic of a program in C: constants, activations, blocks, networks, integrators."""
 
 from __future__ import annotations
 
@@ -45,13 +45,14 @@ _NAMES = {name: f"{name}_" for name in _MATH} | {
     "max": "largest",
 }
 _WORDS = """
-auto break case char const continue default do double else enum extern float for goto if inline int long register
-restrict return short signed sizeof static struct switch typedef union unsigned void volatile while flag
-class bool true false new delete this template operator private public protected namespace try catch throw using
+auto break case char const continue default do double else enum extern float for goto if
+inline int long register restrict return short signed sizeof static struct switch typedef
+union unsigned void volatile while flag class bool true false new delete this template
+operator private public protected namespace try catch throw using
 typename virtual friend explicit export mutable and or not xor real
 """
 FIELD_WORDS = frozenset(_WORDS.split())
-"""What cannot name a field of the state, in C or in C++."""
+"""Names that a field of the state cannot have, in C or in C++."""
 
 
 def _language(entry: Callable[[str, int], str]) -> Language:
@@ -73,7 +74,7 @@ def _plain(vector: str, index: int) -> str:
 
 
 def arithmetic(program: Program) -> str:
-    """Everything before the functions that the header declares."""
+    """Return the code before the functions that the header declares."""
     parts = [_functions(program)]
     parts += [
         "\n".join(
@@ -96,13 +97,13 @@ def _safe(text: str) -> str:
 
 
 def _used(program: Program) -> list[Constant]:
-    """Constants that some block reads: an unused one would be warned of."""
+    """Return constants that some block reads: compilers warn of an unused one."""
     read = set[str]().union(*(names_in(node) for block in program.blocks for node in block.nodes))
     return [constant for constant in program.constants if constant.name in read]
 
 
 def _functions(program: Program) -> str:
-    """Names of the mathematical functions for either precision, and those that C lacks."""
+    """Return names of mathematical functions for either precision, and those that C lacks."""
     wanted = program.functions | set[str]().union(
         *(functions_in(ACTIVATIONS[name]) for name in program.activations)
     )

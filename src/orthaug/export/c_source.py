@@ -30,7 +30,8 @@ class CSource:
 cc -std=c99 -O2 -Wall -Wextra -pedantic {name}.c check.c -lm -o check && ./check
 ```
 
-says the largest difference from the test vectors. With `-D{name.upper()}_FLOAT` all numbers are `float`.
+says the largest difference from the test vectors. With `-D{name.upper()}_FLOAT` all numbers are
+`float`.
 
 ```c
 {name}_state state;
@@ -39,14 +40,19 @@ says the largest difference from the test vectors. With `-D{name.upper()}_FLOAT`
 {name}_step(&state, u, y);     /* one sample: y, and the state goes on */
 ```
 
-`{name}_run` takes many samples at once. Where an input or a result is NaN or infinite, `state.flag` is 1 after the
-step and the state is left as it was; otherwise it is 0. There is no allocation, no input or output and no global that
-changes, so that several instances need a state each and nothing else. Not to be compiled with `-ffast-math`, which
+`{name}_run` takes many samples at once. Where an input or a result is NaN or infinite,
+`state.flag` is 1 after the step and the state is left as it was; otherwise it is 0. There is no
+allocation, no input or output, and no global that changes, so that several instances need only a
+state each. Do not compile with `-ffast-math`, which
+DELETE
 takes NaN for impossible."""
 
 
 def fields_of(program: Program) -> list[tuple[str, Signal, int]]:
-    """Return the fields of the state: its name in C, what it holds, and how many samples, 0 for a number by itself."""
+    """Return the fields of the state: C name, signal, and number of samples.
+
+    The number is 0 for a field that is one number.
+    """
     if program.scheme is None:
         wanted = [(signal.identifier, signal, depth) for signal, depth in program.lines if depth]
     else:
@@ -90,8 +96,9 @@ def _header(program: Program, fields: list[tuple[str, Signal, int]]) -> str:
         f"\n *   y[{i}]  {comment(signal.label)}" for i, signal in enumerate(program.outputs)
     )
     done = comment(program.preparation)
-    prepared = f" * Inputs and outputs stand for data after {done}.\n" if done else ""
-    return f"""/* {name}: one step of a fitted model, every {program.sampling_time!r} s. Written by orthaug.
+    prepared = f" * Inputs and outputs are data after {done}.\n" if done else ""
+    return f"""/* {name}: one step of a fitted model, every {program.sampling_time!r} s.
+ * Written by orthaug.
  * Model sha256 {program.digest}
 {prepared} *{inputs}{outputs}
  */
@@ -137,7 +144,7 @@ size_t {name}_run({name}_state *state, const {name}_real u[], {name}_real y[], s
 
 
 def comment(text: str) -> str:
-    """Text that cannot end a comment."""
+    """Return text that cannot end a comment."""
     return text.replace("*/", "* /").replace("/*", "/ *").replace("??", "? ?").replace("\\", "/")
 
 
@@ -153,7 +160,7 @@ def _source(program: Program, fields: list[tuple[str, Signal, int]]) -> str:
         else:
             zeros.append(f"    state->{identifier} = 0;")
     counter = ["    int i;"] if any(depth for *_, depth in fields) else []
-    return f"""/* {name}: one step of a fitted model. Written by orthaug; the header says what it is. */
+    return f"""/* {name}: one step of a fitted model (see the header). Written by orthaug. */
 #include "{name}.h"
 
 #include <math.h>
@@ -199,7 +206,7 @@ def _checks(program: Program, following: bool) -> list[str]:
 
 
 def _lagged_step(program: Program, fields: list[tuple[str, Signal, int]]) -> str:
-    """Return the block in place on the state's fields, then every line moved on by one sample."""
+    """Return the block on the state's fields, and the lines that shift the state by one sample."""
     place = [f"state->{place}" for place in places_of(fields)]
     lines = [*_step_head(program), "    int i, ok = 1;"]
     lines += c_arithmetic.body(
@@ -250,7 +257,7 @@ def _check(program: Program, fields: list[tuple[str, Signal, int]], vectors: Vec
         for i, place in enumerate(places_of(fields))
     )
     states = vectors.states.tolist() if program.states else [[0.0]] * rows
-    return f"""/* Runs the test vectors: `cc -std=c99 -O2 {name}.c check.c -lm -o check && ./check`. */
+    return f"""/* Test vectors: `cc -std=c99 -O2 {name}.c check.c -lm -o check && ./check`. */
 #include "{name}.h"
 
 #include <math.h>
@@ -284,7 +291,8 @@ int main(void)
             if (size > largest) largest = size;
         }}
     }}
-    printf("%d steps: largest difference %.3g, largest output %.3g, %d flagged\\n", (int)ROWS, worst, largest, flagged);
+    printf("%d steps: largest difference %.3g, largest output %.3g, %d flagged\\n",
+           (int)ROWS, worst, largest, flagged);
     return flagged || !(worst <= allowed * (largest > 1e-300 ? largest : 1));
 }}
 """

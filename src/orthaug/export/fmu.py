@@ -1,4 +1,4 @@
-"""An FMU 2.0 for co-simulation: the C export behind the functions of that standard, compiled where it is made."""
+"""An FMU 2.0 for co-simulation: the C export behind that standard, compiled here."""
 
 from __future__ import annotations
 
@@ -66,14 +66,15 @@ step = {program.sampling_time!r}
 result = simulate_fmu("{program.name}.fmu", output_interval=step, stop_time=100 * step)
 ```
 
-It was compiled for {_target()[0]}; for other platforms compile its `sources/`. A communication step is the sampling
-time or a multiple of it. Inputs are held during a step; an output is that of the current instant, of the state there
-and the inputs that are set. The entries of the state are variables that can be set before the run. Where NaN or
+It was compiled for {_target()[0]}; for other platforms compile its `sources/`. A communication
+step is the sampling time or a multiple of it. Inputs are held during a step. An output is that of
+the current instant, of the state there and the inputs that are set. The entries of the state are
+variables that can be set before the run. Where NaN or
 infinity comes in, a step is discarded."""
 
 
 def _target() -> tuple[str, str]:
-    """Folder and ending of the library for this machine.
+    """Return folder and ending of the library for this machine.
 
     Raises:
         InputError: a machine that this is not made for.
@@ -88,7 +89,7 @@ def _target() -> tuple[str, str]:
 
 
 def _compiled(sources: Mapping[str, str]) -> tuple[str, str, bytes]:
-    """Folder, ending and content of the shared library.
+    """Return folder, ending and content of the shared library.
 
     Raises:
         InputError: no C compiler, or one that fails.
@@ -129,7 +130,7 @@ def _compiled(sources: Mapping[str, str]) -> tuple[str, str, bytes]:
 
 
 def _variables(program: Program) -> str:
-    """Return what the wrapper has to know of the model."""
+    """Return the data that the wrapper needs of the model."""
     cases = "\n".join(
         f"    case {i}: return &state->{place};"
         for i, place in enumerate(places_of(fields_of(program)))
@@ -174,7 +175,8 @@ def _description(program: Program) -> str:
             start = ' start="0"' if causality != "output" else ""
             exact = f' initial="{initial}"' if initial else ""
             variables.append(
-                f'    <ScalarVariable name={quoteattr(name)} valueReference="{len(variables)}" causality="{causality}" '
+                f"    <ScalarVariable name={quoteattr(name)} "
+                f'valueReference="{len(variables)}" causality="{causality}" '
                 f'variability="{variability}"{exact} description={quoteattr(signal.label)}>'
                 f"<Real{start}/></ScalarVariable>"
             )

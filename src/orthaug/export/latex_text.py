@@ -109,7 +109,7 @@ def _matrix(values: np.ndarray) -> str:
 
 
 def number(value: float) -> str:
-    """Six digits, with a power of ten where that is shorter."""
+    """Return six digits, with a power of ten where that is shorter."""
     mantissa, _, power = f"{value:.6g}".partition("e")
     return rf"{mantissa} \cdot 10^{{{int(power)}}}" if power else mantissa
 
@@ -119,7 +119,7 @@ def _constant(name: str, program: Program) -> str:
 
 
 def _letters(text: str) -> list[str]:
-    """Return what Greek letters and the micro sign are, so that pdflatex reads them."""
+    """Return declarations of Greek letters and the micro sign for pdflatex."""
     lines = []
     for letter in sorted(set(text)):
         kind, _, name = unicodedata.name(letter, "").partition(" LETTER ")

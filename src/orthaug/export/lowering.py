@@ -26,7 +26,10 @@ from orthaug.models.motion_model import MotionModel
 
 @dataclass(frozen=True, eq=False)
 class FadeNodes:
-    """Named intermediate results: features on the range of training, the point x̄ there, and what fading leaves."""
+    """Nodes of the intermediate results of a limited correction.
+
+    They are the features on the range of training, the point x̄ there, and the factor of fading.
+    """
 
     locals: tuple[tuple[str, Node], ...]
     features: tuple[Node, ...]
@@ -44,7 +47,7 @@ class FadeNodes:
         features: Sequence[Node],
         points: Sequence[Node],
     ) -> FadeNodes:
-        """Return the intermediate results for features z (nz,) of the entries of a point x (nx,)."""
+        """Return the intermediate results for features z (nz,) of a point x (nx,)."""
         low, high = np.asarray(numbers.limits).tolist()
         found: dict[str, Node] = {}
 
@@ -77,16 +80,16 @@ class FadeNodes:
 
     @property
     def symbols(self) -> dict[str, str]:
-        """Names of the intermediate results as a reader sees them, counted from 1 as the features are listed."""
+        """Names of the intermediate results for a reader, numbered from 1 like the features."""
         return {key: _read(key) for key, _ in self.locals}
 
     def faded(self, correction: Node) -> Node:
-        """Return what is left of a correction."""
+        """Return a correction multiplied by the factor of fading."""
         return correction if self.share is None else apply("mul", self.share, correction)
 
 
 def _read(key: str) -> str:
-    """`h_inside_0` as `inside_1`."""
+    """Return `h_inside_0` as `inside_1`."""
     _, kind, *number = key.split("_")
     return "_".join([kind, *(str(int(i) + 1) for i in number)])
 
@@ -100,8 +103,9 @@ _OWN_FUNCTION = (
 def program_of(model: Model | MotionModel, name: str = "model", digest: str = "") -> Program:
     """Return the step of a model in the intermediate form.
 
-    Raises: InputError: physics or a learner that is a Python function, an ensemble, a hold that
-        needs the whole record.
+    Raises:
+        InputError: physics or a learner that is a Python function, an ensemble, a hold that needs
+            the whole record.
     """
     check_type(model, Model | MotionModel, "model", "a fitted model")
     numbers = model.numbers
@@ -197,7 +201,10 @@ def _lagged(model: Model, name: str, digest: str) -> Program:
 def _weighted_terms(
     model: Model, constants: _Constants, written: Callable[..., Node], held: FadeNodes | None
 ) -> tuple[list[list[Node]], list[list[Node]]]:
-    """Of each output the terms of the physics, and those that the learner's correction takes back where it is held."""
+    """Return the terms of the physics of each output, and those of the learner's correction.
+
+    The latter are what the correction takes back where it is held.
+    """
     form = model.form
     values = np.asarray(model.theta if held is not None else model.theta - model.theta_aux).tolist()
     effective = dict(zip(form.baseline.names, values, strict=True))
@@ -223,7 +230,7 @@ def _weighted_terms(
 
 
 def _motion_names(model: MotionModel, constants: _Constants) -> dict[str, Node]:
-    """Return what the names of constants, parameters, states and inputs stand for."""
+    """Return the meaning of the names of constants, parameters, states and inputs."""
     form, numbers, motion = model.form, model.numbers, model.form.motion
     values = np.asarray(
         motion.coordinates.physical(np.asarray(numbers.theta) - np.asarray(numbers.theta_aux))
@@ -256,7 +263,7 @@ def _with_correction(
 
 
 def _split_parameters(model: MotionModel, constants: _Constants) -> dict[str, Node]:
-    """Return the estimated parameters, with which the physics goes on beyond the data."""
+    """Return the estimated parameters, with which the physics continues beyond the data."""
     motion = model.form.motion
     values = np.asarray(motion.coordinates.physical(np.asarray(model.numbers.theta))).tolist()
     return {
@@ -388,7 +395,7 @@ def _needed(defined: Mapping[str, Node], roots: Sequence[Node]) -> tuple[tuple[s
 
 
 def _network(bound: Bound, numbers: Numbers, features: Sequence[Node], rows: Vector) -> Network:
-    """Return the learner with its scaling; `rows` are those of its values that are wanted."""
+    """Return the learner with its scaling; `rows` are the indices of its wanted values."""
     declared = getattr(bound.learner, "layers", None)
     if declared is None:
         raise InputError(

@@ -1,4 +1,6 @@
-"""Scalar expressions in the intermediate form: numbers, names, entries of vectors, functions of them, and activations.
+"""Scalar expressions in the intermediate form.
+
+They are numbers, names, entries of vectors, functions of them, and activations.
 
 Targets write them, those in languages that write sums and products as C and Python do by a
 `Language`; nothing of Python's syntax tree, of NumPy or of JAX is left in them.
@@ -27,12 +29,12 @@ ARITHMETIC: dict[str, Callable[..., float]] = {
     "power": lambda a, b: a**b,
     "whole_power": lambda a, b: a**b,
 }
-"""Beside these a node may hold every function of expressions."""
+"""A node may also hold every function of expressions."""
 
 
 @dataclass(frozen=True)
 class Number:
-    """A number as it stands."""
+    """A number."""
 
     value: float
 
@@ -81,7 +83,7 @@ def apply(function: str, *arguments: Node) -> Node:
 
 
 def total(summands: list[Node]) -> Node:
-    """Their sum, from the left; 0 of none."""
+    """Return the sum of nodes, from the left; 0 of none."""
     if not summands:
         return Number(0.0)
     value = summands[0]
@@ -100,8 +102,8 @@ def node_of(
 
     Args:
         expression: from the parser.
-        names, lags: what its names and its channels at a lag stand for.
-        numbers: names of constants, whose values tell whether a power is a whole one.
+        names, lags: nodes of its names and of its channels at a lag.
+        numbers: names of constants, whose values show whether a power is a whole one.
     """
     return _node(expression.tree, names, lags, numbers)
 
@@ -140,7 +142,7 @@ def _node(
 
 
 def _constant(tree: ast.expr, numbers: Mapping[str, float]) -> float | None:
-    """Return the number that an exponent is, where it is one."""
+    """Return the number that an exponent is, None where it is none."""
     if isinstance(tree, ast.Constant):
         return float(tree.value)  # type: ignore[arg-type]
     if isinstance(tree, ast.Name):
@@ -199,8 +201,9 @@ ACTIVATIONS: dict[str, Node] = {
     ),
     "identity": _A,
 }
-"""The activations of networks as nodes of `a`, so that no target needs a table of them; the names are those of
-`models.learners`."""
+"""The activations of networks as nodes of `a`, so that no target needs a table of them. Names are
+those of `models.learners`.
+"""
 
 
 _INFIX = {"add": (1, "+"), "sub": (1, "-"), "mul": (2, "*"), "div": (2, "/")}
@@ -209,7 +212,7 @@ _ATOM = 9
 
 @dataclass(frozen=True)
 class Language:
-    """How a language writes what is no sum or product.
+    """Syntax of a language beyond sums and products.
 
     Args:
         functions: the function's name by ours.
@@ -230,7 +233,7 @@ class Language:
         return self._level(node)[1]
 
     def _level(self, node: Node) -> tuple[int, str]:
-        """Return how strongly the text binds, and the text."""
+        """Return the binding strength of the text, and the text."""
         if isinstance(node, Number):
             return (0 if node.value < 0 else _ATOM), self.number(node.value)
         if isinstance(node, Name):
@@ -263,7 +266,7 @@ def decimal(value: float) -> str:
 
 
 def wrapped(items: list[str], indent: str, width: int = 110) -> str:
-    """Items with commas, in lines."""
+    """Return items with commas, in lines."""
     lines, line = [], ""
     for item in items:
         piece = f"{item}, "

@@ -1,4 +1,4 @@
-"""A Python module that needs NumPy alone, and the same with a nonlinear system of python-control."""
+"""A Python module that needs only NumPy, and one with a nonlinear system of python-control."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ import numpy as np
 import {program.name} as model
 
 state = model.start()                             # zeros, in the order of model.STATES
-state, outputs = model.step(state, np.zeros({len(program.inputs)}))  # inputs in the order of model.INPUTS
+state, outputs = model.step(state, np.zeros({len(program.inputs)}))  # inputs as model.INPUTS
 outputs = model.run(state, np.zeros((100, {len(program.inputs)})))   # a free run
 ```
 
@@ -59,7 +59,7 @@ def module(program: Program) -> str:
     """Return the text of the module."""
     return "\n".join(
         [
-            f'"""{program.name}: one step of a fitted model. Written by orthaug; needs NumPy alone."""',
+            f'"""{program.name}: one step of a fitted model. Written by orthaug."""',
             "",
             "import numpy as np",
             "",
@@ -120,7 +120,8 @@ time = np.arange(100) * model.SAMPLING_TIME
 response = control.input_output_response(plant, time, np.zeros(({len(program.inputs)}, 100)))
 ```
 
-It needs `control` (python-control) and NumPy. The system runs in discrete time with the model's sampling time; its
+It needs `control` (python-control) and NumPy. The system runs in discrete time with the model's
+sampling time; its
 states are named `y_1` for `y[k-1]`. `step` and `run` work without python-control."""
 
 

@@ -145,12 +145,14 @@ class NumpyStep:
 
 
 def numpy_step(model: Model | MotionModel) -> NumpyStep:
-    """Return the step of a fitted model in NumPy alone, for loops in Python and where JAX is too slow to call.
+    """Return the step of a fitted model in NumPy, for loops in Python.
+
+    It is for places where JAX is too slow to call.
 
     Args:
         model: as `estimate` or `load` gives it.
 
-    Returns: `state, outputs = step(state, inputs)`; `step.state_names` and `step.step_inputs` tell
+    Returns: `state, outputs = step(state, inputs)`; `step.state_names` and `step.step_inputs` list
         what is in both.
 
     Raises:
@@ -159,7 +161,8 @@ def numpy_step(model: Model | MotionModel) -> NumpyStep:
     Examples:
         >>> import orthaug as oa
         >>> u = [1.0, 2.0, 0.0, 3.0, 1.0, 0.0]
-        >>> record = oa.Record.from_arrays(u=u, y=[0.0, 0.5, 1.25, 0.625, 1.8125, 1.40625])  # 0.5 (y[k-1] + u[k-1])
+        >>> y = [0.0, 0.5, 1.25, 0.625, 1.8125, 1.40625]  # 0.5 (y[k-1] + u[k-1])
+        >>> record = oa.Record.from_arrays(u=u, y=y)
         >>> physics = oa.Baseline.from_terms([oa.Term("a", "y[k-1]"), oa.Term("b", "u[k-1]")])
         >>> step = numpy_step(oa.estimate(record, physics, learner=None).model)
         >>> step.state_names, step.step_inputs
@@ -174,7 +177,7 @@ def numpy_step(model: Model | MotionModel) -> NumpyStep:
 def _advancing(
     rate: Callable[[Vector, Vector], Vector], scheme: Scheme, held: int, ends: int
 ) -> Callable[[Vector, Vector], Vector]:
-    """x one sample later, of x and the step's inputs."""
+    """Return x one sample later, of x and the step's inputs."""
     if scheme.kind == "discrete":
         return rate
     h, halves = scheme.step, 2 * scheme.substeps

@@ -35,7 +35,10 @@ _OPSET = 18
 
 @dataclass(frozen=True)
 class OnnxGraph:
-    """`NAME.onnx`: (state, inputs) → (next_state, outputs), vectors of doubles, without empty ones."""
+    """`NAME.onnx`: (state, inputs) → (next_state, outputs), vectors of doubles.
+
+    Empty vectors are left out.
+    """
 
     summary = "an ONNX graph in double precision"
 
@@ -101,7 +104,7 @@ class _Graph:
         return model.SerializeToString()
 
     def add(self, operator: str, *inputs: str, out: str | None = None, **attributes: Any) -> str:
-        """Return a node; its result."""
+        """Add a node and return its result."""
         out = out or f"n{len(self.nodes)}"
         self.nodes.append(self.onnx.helper.make_node(operator, list(inputs), [out], **attributes))
         return out
@@ -140,7 +143,7 @@ class _Graph:
         return self.joined([self.node(node, known) for node in block.results])
 
     def product(self, weight: Matrix, z: str) -> str:
-        """W z.
+        """Return W z.
 
         Of one entry it is no matrix product: runtimes would draw its scaling in, in single
         precision.
@@ -170,7 +173,10 @@ class _Graph:
         return self.add(_OPERATORS[node.function], *inner)
 
     def arctangent(self, x: str) -> str:
-        """atan(x) from that in single precision, which is all that runtimes have: what it lacks is a small angle."""
+        """Return atan(x) from that in single precision, which is all that runtimes have.
+
+        What it lacks is a small angle.
+        """
         types = self.onnx.TensorProto
         near = self.add("Atan", self.add("Cast", x, to=types.FLOAT))
         near = self.add("Cast", near, to=types.DOUBLE)
@@ -180,7 +186,7 @@ class _Graph:
         return self.add("Add", near, self.add("Div", across, along))
 
     def angle(self, y: str, x: str) -> str:
-        """atan2(y, x), which ONNX lacks: by the half plane of x."""
+        """Return atan2(y, x), which ONNX lacks, by the half plane of x."""
         zero, turned = self.real(0.0), self.real(np.pi)
         right = self.arctangent(self.add("Div", y, x))
         up = self.add("Where", self.add("Less", y, zero), self.add("Neg", turned), turned)
@@ -210,7 +216,7 @@ class _Graph:
         return x
 
     def combined(self, x: str, *terms: tuple[float, str]) -> str:
-        """x plus multiples of vectors."""
+        """Return x plus multiples of vectors."""
         for factor, vector in terms:
             x = self.add("Add", x, self.add("Mul", self.real(factor), vector))
         return x

@@ -1,4 +1,4 @@
-"""A program as a Python module, for NumPy and for libraries of symbols alike, such as CasADi for optimal control."""
+"""A program as a Python module, for NumPy and for symbolic libraries such as CasADi."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from orthaug.export.program import Block, Program, Vectors
 
 @dataclass(frozen=True)
 class Dialect:
-    """How a library writes what Python has no sign for.
+    """Syntax of a library for operations that Python has no sign for.
 
     Args:
         language: of scalar expressions.
@@ -31,7 +31,7 @@ class Dialect:
 
 
 def python_language(functions: dict[str, str]) -> Language:
-    """Python with these functions."""
+    """Return Python with these functions."""
     return Language(
         functions, decimal, lambda base, n: f"{base}**{n}" if n >= 0 else f"{base}**({n})"
     )
@@ -50,7 +50,7 @@ def declarations(program: Program) -> str:
 
 
 def arithmetic(program: Program, dialect: Dialect) -> str:
-    """Constants, activations, blocks and `advance(x, u, y)`, which gives the next state."""
+    """Return constants, activations, blocks and `advance(x, u, y)`, which gives the next state."""
     constants = [
         f"{c.name} = {dialect.constant.format(decimal(c.value))}  # {c.meaning}"
         for c in program.constants
@@ -197,7 +197,8 @@ class CasadiModule:
     summary = "a Python module that makes a CasADi Function"
 
     def files(self, program: Program, vectors: Vectors) -> Mapping[str, str]:
-        head = f'"""{program.name}: one step of a fitted model as a CasADi Function. Written by orthaug."""'
+        title = f"{program.name}: one step of a fitted model as a CasADi Function."
+        head = f'"""{title} Written by orthaug."""'
         step = _STEP.replace("NAME", program.name)
         text = [
             head,
@@ -220,8 +221,9 @@ state, outputs = step({[0] * len(program.states)}, {[0] * len(program.inputs)})
 run = step.mapaccum(100)           # a free run of 100 steps, inputs in columns
 ```
 
-It needs `casadi` (`pip install casadi`; the extra `orthaug[casadi]` installs it too). `step` takes symbols as well as
-numbers, so that it can stand in an optimal control problem: one call for each step of the horizon."""
+It needs `casadi` (`pip install casadi`; the extra `orthaug[casadi]` installs it too).
+`step` takes symbols as well as
+numbers, so that an optimal control problem can call it once for each step of the horizon."""
 
 
 _STEP = '''
@@ -232,5 +234,6 @@ def step(name="NAME"):
     outputs = output(state, inputs)
     following = ca.densify(ca.SX(advance(state, inputs, outputs)))
     results = [following, ca.densify(ca.SX(outputs))]
-    return ca.Function(name, [state, inputs], results, ["state", "inputs"], ["next_state", "outputs"])
+    names = ["state", "inputs"], ["next_state", "outputs"]
+    return ca.Function(name, [state, inputs], results, *names)
 '''

@@ -1,4 +1,4 @@
-"""Scores of a free run in blocks of steps: what its standard errors are made of where its errors are coloured.
+"""Scores of a free run in blocks of steps, for standard errors under coloured errors.
 
 θ and weights p minimise a sum of squares, so that `p̂ − p ≈ M⁻¹ Σ_k s_kᵀe_k` with M the information
 and s_k the sensitivities of step k. Coloured errors make the products s_kᵀe_k of neighbours
@@ -12,7 +12,7 @@ The state that a segment starts from is an unknown too. It is eliminated from ev
 steps, so it can follow the sum over a block. What the measured state adds counts to the first block
 of its segment. No block crosses the end of a segment.
 
-A record that is too short for blocks may still tell the colour by few numbers: with e an
+A record that is too short for blocks may still show the colour by few numbers: with e an
 autoregressive process of autocovariance γ, `Ω = Σ_jk s_jᵀ γ_{j−k} s_k`, for s follows the inputs
 and not the noise (`fitting/colour.py`).
 """
@@ -43,7 +43,7 @@ class FreeRunScores:
     `slope` and `pull` are how the best states follow p and the measured states; None where the
     states are no unknowns. `unit` scales the information of p to the Gram matrix that the model
     keeps. `share` is how many times more was trained on than these segments, which are then a
-    witness of it.
+    subsample of it.
     """
 
     dynamics: Dynamics
@@ -67,7 +67,9 @@ class FreeRunScores:
         return np.moveaxis(errors, 3, 1).reshape(-1, *errors.shape[1:3]).transpose(2, 0, 1)
 
     def block(self) -> int | None:
-        """Return steps of a block: three times as many as the correlation of the errors lasts, at most those of a segment.
+        """Return the steps of a block: three times the correlation length of the errors.
+
+        At most those of a segment.
 
         None where the correlation has no end, or lasts longer than a segment.
         """
@@ -78,7 +80,10 @@ class FreeRunScores:
         return min(_MEMORIES * max(known), self.longest)
 
     def blocks(self, steps: int) -> Float[np.ndarray, "b n"]:
-        """Return the score of every block of about `steps` scored steps, no fewer where the segment has as many."""
+        """Return the score of every block of about `steps` scored steps.
+
+        No block is shorter where the segment has as many steps.
+        """
         scored = np.asarray(self.segments.scored)
         first = int(np.argmax(scored.any(axis=(0, 2))))
         count = max(self.longest // steps, 1)
@@ -99,7 +104,9 @@ class FreeRunScores:
         return scores[counts > 0]
 
     def slopes(self) -> Float[np.ndarray, "N ny n"]:
-        """Return the sensitivities of p on every scored step, the starts eliminated, in the units of the model's Gram matrix.
+        """Return the sensitivities of p on every scored step, the starts eliminated.
+
+        In the units of the model's Gram matrix.
 
         They are the scores of errors of 1 in one whitened output after the other.
         """
@@ -136,7 +143,7 @@ class FreeRunScores:
         return np.sqrt(self.unit) * there @ self.weight.T
 
     def middle(self, steps: int, used: float) -> tuple[Matrix, int]:
-        """Ω of p in the units of the model's Gram matrix, and the number of blocks that it is made of.
+        """Return Ω of p in the units of the model's Gram matrix, and its number of blocks.
 
         Args:
             used: parameters of the fit, by which its errors are too small.
@@ -147,7 +154,9 @@ class FreeRunScores:
         return self.share * correction * self.unit**2 * scores.T @ scores, blocks
 
     def coloured_middle(self, used: float) -> tuple[Matrix, float]:
-        """Ω of p under autoregressive errors, in the units of the model's Gram matrix, and their independent number.
+        """Return Ω of p under autoregressive errors, and their independent number.
+
+        In the units of the model's Gram matrix.
 
         Errors of several outputs are whitened against each other; each has a colour of its own.
 
@@ -186,7 +195,7 @@ class FreeRunScores:
         *,
         modelled: bool = False,
     ) -> Statistics:
-        """Return the model's statistics for coloured errors, from blocks of so many steps.
+        """Return the model's statistics for coloured errors, from blocks of `steps` steps.
 
         None for as many as `block` says.
 
@@ -207,8 +216,8 @@ class FreeRunScores:
         steps = self.block() if steps is None else steps
         if steps is None:
             raise InputError(
-                "the errors of the free run remember each other for too long to take them in "
-                "blocks."
+                "the errors of the free run are correlated over too many steps for blocks; use "
+                "a longer record."
             )
         middle, blocks = self.middle(steps, used)
         return replace(statistics, middle=middle, freedom=min(freedom, blocks - 1.0))

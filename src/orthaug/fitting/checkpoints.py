@@ -1,4 +1,4 @@
-"""States of training that outlive the process: written every so often, whole or not at all, and taken up again.
+"""States of training on disk, from which an interrupted fit resumes.
 
 A state is that of the Levenberg-Marquardt loop between two steps, so a resumed run takes the same
 steps, bit by bit.
@@ -65,7 +65,7 @@ class Checkpoints:
     """Why the last state could not be written; the one before it stays."""
 
     def opened(self, *, resume: bool) -> Checkpoints:
-        """Ready to keep states: emptied, or with `resume` with those that are there.
+        """Return a folder ready for states: emptied, or with `resume` as it is.
 
         Raises:
             InputError: states of another fit, or something else in the folder.
@@ -84,7 +84,10 @@ class Checkpoints:
         return self
 
     def of_run(self, *parts: Any, form: Any = _LEAVES) -> RunCheckpoint:
-        """Return what is kept of a run that begins with these weights and choices, in the form of the solver's states."""
+        """Return the checkpoint of a run that begins with these weights and choices.
+
+        States have the form of the solver's.
+        """
         digest = hashlib.sha256(self.fingerprint.encode())
         for part in parts:
             digest.update(
@@ -114,8 +117,14 @@ class RunCheckpoint:
     form: Any
     written: float = field(default_factory=time.monotonic)
 
-    def state(self) -> Any:
-        """Return the last one that was written whole; None where there is none."""
+    def state(self, *shapes: tuple[int, ...]) -> Any:
+        """Return the last one that was written whole, finite and with first arrays of these shapes.
+
+        None where there is none.
+
+        A checksum tells what was damaged, not what was made: a run does not go on from what it
+        cannot have written.
+        """
         from safetensors import SafetensorError
         from safetensors.numpy import load
 
@@ -130,6 +139,10 @@ class RunCheckpoint:
                 raise ValueError
             held = load(content[_HEAD:])
             leaves = [held[str(i)] for i in range(len(held))]
+            if any(np.shape(leaf) != shape for leaf, shape in zip(leaves, shapes, strict=False)):
+                raise ValueError
+            if not all(np.isfinite(leaf).all() for leaf in leaves):
+                raise ValueError
             state = jax.tree.unflatten(jax.tree.structure(self.form), leaves)
         except (KeyError, ValueError, SafetensorError):
             self.checkpoints.spoilt.append(self.path.name)
@@ -137,7 +150,7 @@ class RunCheckpoint:
         return state
 
     def keep(self, state: Any, *, ended: bool = False) -> None:
-        """Write the state, or what makes it, if it is time or the run `ended`.
+        """Write the state, or the result of a call that makes it, if due or if the run `ended`.
 
         A full disk leaves the one before.
         """
@@ -162,20 +175,27 @@ class RunCheckpoint:
             _replace(
                 folder / _ABOUT, json.dumps({"fingerprint": self.checkpoints.fingerprint}).encode()
             )
-        leaves = jax.tree.leaves(state)
+        leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(state)]
+        if not all(
+            np.isfinite(leaf).all() for leaf in leaves
+        ):  # a run that failed: nothing goes on from there
+            return
         content = save(
-            {str(i): np.atleast_1d(leaf).reshape(np.shape(leaf)) for i, leaf in enumerate(leaves)}
+            {
+                str(i): np.ascontiguousarray(leaf).reshape(leaf.shape)
+                for i, leaf in enumerate(leaves)
+            }
         )
         _replace(self.path, _head(content) + content)
 
 
 def _head(content: bytes) -> bytes:
-    """Return what stands before a state: its format and its checksum."""
+    """Return the bytes before a state: its format and its checksum."""
     return _FORMAT + hashlib.sha256(content).hexdigest().encode() + b"\n"
 
 
 def _replace(path: Path, content: bytes) -> None:
-    """Write a file whole: it stands on the disk before it takes its place."""
+    """Write a file whole: it is on the disk before it takes its place."""
     partial = path.with_suffix(".partial")
     try:
         with partial.open("wb") as file:

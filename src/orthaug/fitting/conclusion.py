@@ -39,8 +39,8 @@ from orthaug.models.lagged import Lagged
 from orthaug.models.learners import Bound, External, Function, Scaling
 from orthaug.models.model import Model
 from orthaug.models.statistics import JointCovariance, Statistics
+from orthaug.physics import ill_conditioned
 from orthaug.physics.baseline import Baseline
-from orthaug.physics.excitation import ILL_CONDITIONED
 from orthaug.physics.problem import Problem, pose
 
 _UNDETERMINED = (
@@ -57,10 +57,10 @@ def conclude(task: OneStepTask, structure: Structure, learned: TrainedLearner) -
         learned: of these rows, or of a free run on the same problem.
     """
     problem = task.problem
-    told: list[Warning] = []
+    warnings: list[Warning] = []
     if unfinished(learned) and follows_training(structure, problem, learned):
         learned = withheld(learned)
-        told += (
+        warnings += (
             [not_converged(learned)] if learned.tilt is None else []
         )  # longer training gives an ensemble none
     share = task.share(learned)
@@ -77,22 +77,22 @@ def conclude(task: OneStepTask, structure: Structure, learned: TrainedLearner) -
     noise = errors.noise if ending.usable else None
     identified = structure.projects or (learned.bound is None and structure.identifies)
     known = noise is not None and identified and not learned.elsewhere
-    told += [] if learned.elsewhere else learner_silent(learned)
-    told += _warnings(problem, structure, learned, identified, noise, fixed)
-    if any(warning.code == NOT_CONVERGED for warning in told):
+    warnings += [] if learned.elsewhere else learner_silent(learned)
+    warnings += ill_conditioned.of_physics(
+        problem, theta, errors.covariance if ending.usable else None
+    )
+    warnings += _warnings(problem, structure, learned, identified, noise, fixed)
+    if any(warning.code == NOT_CONVERGED for warning in warnings):
         pass
     elif known and errors.covariance is None and learned.errors is None:
-        text = (
-            "no standard errors: beside a learner that sees only some features, an ensemble "
-            "leaves none."
-        )
-        told.append(Warning("no_standard_errors", text))
+        text = "no standard errors: an ensemble has none where its learner sees only some features."
+        warnings.append(Warning("no_standard_errors", text))
     elif (
         known
         and errors.covariance is not None
         and np.isnan(np.diag(errors.covariance)).sum() > len(fixed)
     ):
-        told.append(Warning("no_standard_errors", _UNDETERMINED))
+        warnings.append(Warning("no_standard_errors", _UNDETERMINED))
     reason = ALONE.get(ending, "") if learned.bound is None else ""
     reason = reason or ending_in_words(ending, learned.tail)
     model = _model(problem, structure, learned, ThetaSplit(theta, theta_aux, fixed), errors, noise)
@@ -112,7 +112,7 @@ def conclude(task: OneStepTask, structure: Structure, learned: TrainedLearner) -
         problem=problem,
         criterion=task.criterion,
         at_bound={problem.baseline.names[i]: value for i, value in fixed.items()},
-        warnings=tuple(told),
+        warnings=tuple(warnings),
         scores=learned.scores,
     )
 
@@ -166,7 +166,10 @@ def _model(
 
 
 def _limits(problem: Problem, form: Lagged) -> tuple[Matrix | None, Matrix | None]:
-    """Return the range of the features, beyond which the correction is held or fades, and how x follows it there."""
+    """Return the range of the features, and how x follows its limits.
+
+    Beyond the range the correction stays constant or fades.
+    """
     limits = None if form.beyond == "free" else limits_of(problem.feature_range)
     if limits is None:
         return None, None
@@ -201,7 +204,9 @@ def _one_step_errors(
 def _beside_the_learner(
     problem: Problem, structure: Structure, learned: TrainedLearner, whitened: Matrix, fixed: Fixed
 ) -> Matrix | None:
-    """Cov θ̂ where only some directions are split off: `K Cov(c, w) Kᵀ` with `K = [I, ∂θ_aux/∂w]` (F8).
+    """Return Cov θ̂ where only some directions are split off (F8).
+
+    It is `K Cov(c, w) Kᵀ` with `K = [I, ∂θ_aux/∂w]`.
 
     Entries at a bound are no unknowns: they have NaN.
     """
@@ -222,14 +227,14 @@ def _beside_the_learner(
 
 
 def _beside(fixed: Fixed, gram: Matrix) -> Matrix:
-    """Return a Gram matrix of (c, w) in which what stands at a bound is no unknown."""
+    """Return a Gram matrix of (c, w) in which entries at a bound are no unknowns."""
     unknown = np.ones(len(gram))
     unknown[list(fixed)] = 0.0
     return gram * np.outer(unknown, unknown)
 
 
 def _middle(problem: Problem, learned: TrainedLearner, noise: Matrix | None) -> Matrix | None:
-    """ΣψᵀΣ_eψ in whitened outputs, for the intervals of later splits and of predictions."""
+    """Return ΣψᵀΣ_eψ in whitened outputs, for intervals of later splits and predictions."""
     if noise is None or learned.gram is None:
         return None
     whitened = problem.weight.whitened(noise)
@@ -245,7 +250,7 @@ def _defect(
     parameters: ThetaSplit,
     learned: TrainedLearner,
 ) -> float | None:
-    """‖QᵀF̃‖ / ‖F‖ with F̃ = F − Φ θ_aux (eq:orth_property), along the shared directions.
+    """Return ‖QᵀF̃‖ / ‖F‖ with F̃ = F − Φ θ_aux (eq:orth_property), along the shared directions.
 
     None for F = 0.
     """
@@ -257,12 +262,12 @@ def _defect(
 
 
 def without_loss(mean_square: float) -> list[Warning]:
-    """Return what is told of a free run whose mean square over whole experiments does not exist."""
+    """Return the warning that a free run over whole experiments has no mean square."""
     if np.isfinite(mean_square):
         return []
     text = (
         "the free run diverges over whole experiments of the training data, so it has no loss; "
-        "train with longer segments, or bound what makes it run away."
+        "train with longer segments, or bound the parameters that make it diverge."
     )
     return [Warning("free_run_diverges", text)]
 
@@ -275,25 +280,18 @@ def _warnings(
     noise: Matrix | None,
     fixed: Fixed,
 ) -> list[Warning]:
-    told = []
-    condition = problem.excitation.condition
-    if condition is not None and condition > ILL_CONDITIONED:
-        text = (
-            f"the physics is ill-conditioned on the data (condition {condition:.1e} of the "
-            "scaled columns): θ is determined, but small changes of the data move it far."
-        )
-        told.append(Warning("ill_conditioned", text))
+    warnings: list[Warning] = []
     if learned.ending is Ending.SPANNED:
         text = (
             "the learner lies in the span of the physics (P⊥J = 0): there is nothing for it to "
             "learn that the physics does not express already. Give it another form or other "
             "inputs, or leave it out."
         )
-        told.append(Warning("learner_spanned", text))
+        warnings.append(Warning("learner_spanned", text))
     if learned.errors is not None:
-        told += without_loss(learned.errors.mean_square)
+        warnings += without_loss(learned.errors.mean_square)
     if learned.elsewhere:
-        told.append(
+        warnings.append(
             Warning("no_standard_errors", "no standard errors: the function was trained elsewhere.")
         )
     elif not identified:
@@ -302,19 +300,19 @@ def _warnings(
             "start or on the penalty), so it has no standard error; use the orthogonal "
             "structure for parameters."
         )
-        told.append(Warning(NOT_UNIQUE, text))
+        warnings.append(Warning(NOT_UNIQUE, text))
     elif noise is None:
         text = (
             f"no standard errors: {problem.count} rows leave no degrees of freedom for "
             f"{len(problem.baseline.names)} parameters and {learned.effective:.1f} effective "
             "weights; use more data or a smaller learner."
         )
-        told.append(Warning("no_standard_errors", text))
+        warnings.append(Warning("no_standard_errors", text))
     if fixed:
         names = ", ".join(f"{problem.baseline.names[i]} = {value:g}" for i, value in fixed.items())
         text = (
-            f"at a bound: {names}. What stands at a bound is a known term, as with `fixed = "
-            "true`: it has no standard error, and the others and theirs hold with it there; "
+            f"at a bound: {names}. A parameter at a bound is a known term, as with `fixed = "
+            "true`: it has no standard error, and the other estimates hold with it there; "
         )
         if (
             structure.projects
@@ -323,8 +321,8 @@ def _warnings(
         ):
             text += "the learner is not made orthogonal to it; "
         text += "data that contradict a bound contradict the physics or the bound."
-        told.append(Warning("at_a_bound", text))
-    return told
+        warnings.append(Warning("at_a_bound", text))
+    return warnings
 
 
 def orthogonalize(
@@ -332,13 +330,16 @@ def orthogonalize(
 ) -> Estimate:
     """Split a model trained elsewhere into physics and an orthogonal rest (F2).
 
-    Args: record: the rows over which the rest is made orthogonal, usually the training data.
-        baseline: the physics. function: `g(x)` on NumPy regressors (N, nx) in `Lags` order, giving
-        (N, ny); from any toolbox. lags: the regressor that `function` expects; None for the raw
-        lags of the baseline.
+    Args:
+        record: the rows over which the rest is made orthogonal, usually the training data.
+        baseline: the physics.
+        function: `g(x)` on NumPy regressors (N, nx) in `Lags` order, giving (N, ny); from any
+            toolbox.
+        lags: the regressor that `function` expects; None for the raw lags of the baseline.
 
-    Returns: An estimate whose model predicts what `function` does, with `θ = Φ⁺G` and the learner
-        `g − φθ`. There are no standard errors: they belong to how `function` was trained.
+    Returns:
+        An estimate whose model predicts what `function` does, with `θ = Φ⁺G` and the learner `g −
+        φθ`. There are no standard errors: they belong to how `function` was trained.
     """
     problem = pose(record, baseline, lags)
     ny, nz = len(problem.outputs), len(problem.features.entries)

@@ -1,4 +1,4 @@
-"""The one verb: fit physics and learner to a record."""
+"""`estimate`: fit physics and learner to a record."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def reweighted(first: Estimate, again: Callable[[Problem, Estimate], Estimate]) 
         again: the fit of a problem with other weights, begun from an earlier estimate.
 
     Returns: The last fit, with the restarts of the first one. It stays at the weights it has where
-        the errors' covariance is singular; a warning tells that the turns did not settle.
+        the errors' covariance is singular; a warning says that the turns did not settle.
     """
     estimate, problem = first, first.problem
     covariance = problem.target_covariance
@@ -77,8 +77,8 @@ def reweighted(first: Estimate, again: Callable[[Problem, Estimate], Estimate]) 
         f"the weights of the outputs still change by {change:.1g} after {_TURNS} fits; θ "
         "depends on where they stopped."
     )
-    told = (*estimate.warnings, Warning("output_weights_unsettled", text))
-    return replace(estimate, restarts=first.restarts, warnings=told)
+    warnings = (*estimate.warnings, Warning("output_weights_unsettled", text))
+    return replace(estimate, restarts=first.restarts, warnings=warnings)
 
 
 Regularization = str | float
@@ -133,21 +133,24 @@ def estimate(
     progress: ProgressCallback = SILENT,
     engine: Engine | None = None,
 ) -> Estimate | MotionEstimate:
-    """Fit `y_k = φ(x_k)θ + learner(x_k) + e_k` by prediction error (eq:cost_fun) or by the error of a free run.
+    """Fit `y_k = φ(x_k)θ + learner(x_k) + e_k` to a record.
+
+    The criterion is the prediction error (eq:cost_fun), or the error of a free run.
 
     θ is solved, never iterated (F1): with the orthogonal structure it is `Φ⁺Y` whatever the learner
     does. Equations of motion (`Motion`) are fitted on their free run, and their parameters are the
     physics nearest to the fitted motion.
 
-    Args: record: measured inputs and outputs; or `open_parquet(…)`, `open_frame(…)`, whose rows
-        stay where they are. baseline: the physics; a `Motion` has no `lags`, `ensemble` and
-        `initial`. lags: the learner's regressor; None for the raw lags that the baseline's
-        expressions use. learner: a declaration such as `MLP(hidden=(16,))`; None for physics alone.
+    Args:
+        record: measured inputs and outputs; or `open_parquet(…)`, `open_frame(…)`, whose rows stay
+            where they are.
+        baseline: the physics; a `Motion` has no `lags`, `ensemble` and `initial`.
+        lags: the learner's regressor; None for the raw lags that the baseline's expressions use.
+        learner: a declaration such as `MLP(hidden=(16,))`; None for physics alone.
         structure: `Orthogonal()`, `Additive()`, `OrthogonalPenalty(λ)` or `BaselinePenalty(λ)`.
         criterion: `Prediction(horizon)`, 1 step by default, or `Simulation(segment, washout)`, the
-        free run: then θ is
-            trained with the weights and split off at the end (F2). A motion takes the latter, by
-            default without washout.
+            free run: then θ is trained with the weights and split off at the end (F2). A motion
+            takes the latter, by default without washout.
         solver: `LevenbergMarquardt(…)`, or `AdamLBFGS(…)`, the paper's pipeline from θ⁰.
         regularization: "none"; "evidence" (MacKay; the weights' prior is estimated too); "ard"
             (automatic relevance determination: the prior of each neuron, one step ahead); or a
@@ -186,7 +189,8 @@ def estimate(
         >>> from orthaug.physics.baseline import Term
         >>> u = np.linspace(-1, 1, 200)
         >>> record = Record.from_arrays(u=u, y=2 * u + u**2)
-        >>> fit = estimate(record, Baseline.from_terms([Term("gain", "u[k]")]), learner=MLP(hidden=(4,)))
+        >>> physics = Baseline.from_terms([Term("gain", "u[k]")])
+        >>> fit = estimate(record, physics, learner=MLP(hidden=(4,)))
         >>> f"{fit.theta[0]:.3f}"
         '2.000'
     """
@@ -262,13 +266,14 @@ def fit(
     engine: Engine = InMemory(),  # noqa: B008  (frozen)
     checkpoints: Checkpoints | None = None,
 ) -> Estimate:
-    """`estimate` for a problem that is posed already.
+    """Fit a problem that is posed already; arguments as of `estimate`.
 
-    Args: problem: record, physics and learner inputs; the other arguments as of `estimate`.
-        learner: None for physics alone, on the rows of the problem. engine: where the rows are, or
-        segments of a free run, and who sums over them. On a cluster several runs over
-            rows that are in memory are tasks, each whole on one worker, and so are their held-out
-            blocks.
+    Args:
+        problem: record, physics and learner inputs; the other arguments as of `estimate`.
+        learner: None for physics alone, on the rows of the problem.
+        engine: where the rows are, or segments of a free run, and who sums over them. On a cluster
+            several runs over rows that are in memory are tasks, each whole on one worker, and so
+            are their held-out blocks.
         checkpoints: where the states of its runs are kept, to go on from; None to keep none.
 
     Raises:
@@ -277,7 +282,7 @@ def fit(
     _check_types(learner=learner, structure=structure, criterion=criterion, solver=solver)
     _check_types(initial=initial, validation=validation)
     _check_splittable(structure, problem.baseline, learner)
-    if criterion.automatic and _undecided(
+    if criterion.automatic and _may_decide(
         problem, solver, structure, warm=initial is not None, ensemble=ensemble
     ):
         options: dict[str, Any] = {
@@ -299,7 +304,7 @@ def fit(
             "checkpoints": checkpoints,
         }
         return choose_focus(problem, fit, options, criterion)
-    criterion = _settled(criterion, problem)
+    criterion = _settle(criterion, problem)
     blocks = _check_blocks(blocks)
     given = {
         "linear": problem.baseline.linear,
@@ -311,13 +316,13 @@ def fit(
     restarts, seed = checked_starts(restarts, seed, warm=initial is not None, ensemble=ensemble)
     check_solver(solver, criterion, () if learner is None else choices)
     engine = _for_runs(engine, problem, len(choices) * (restarts if initial is None else 1))
-    warm, told = None, ()
+    warm, warnings = None, ()
     if initial is not None:
         task, weights, warm = _warm_start(problem, initial, engine)
         starts = [PlannedRun(0, weights, choice) for choice in choices]
     else:
         _check_cost(problem, learner, solver, restarts * len(choices), engine)
-        problem, learner, told = independent_terms(problem, learner)
+        problem, learner, warnings = independent_terms(problem, learner)
         task = OneStepTask.of(problem, learner, engine=engine)
         starts = planned(task.bound, range(seed, seed + restarts), choices)
     solved = criterion.one_step and problem.baseline.linear
@@ -335,7 +340,7 @@ def fit(
         estimate = train(trained, starts, structure, solver, chosen, progress, runner=engine)
         if _splits(structure) and estimate.status.ok and estimate.model.form.bound is not None:
             estimate = estimate.split(structure.measure)
-    estimate = replace(estimate, warnings=(*told, *estimate.warnings))
+    estimate = replace(estimate, warnings=(*warnings, *estimate.warnings))
     if problem.weight.choice != "covariance" or problem.weight.kind == "covariance" or not solved:
         return estimate
     more = {
@@ -349,24 +354,27 @@ def fit(
 
 
 def _again(problem: Problem, last: Estimate, **options: Any) -> Estimate:
-    """Return the fit to other weights of the outputs, from where the last one ended."""
+    """Return the fit to other weights of the outputs, from the end of the last fit."""
     chosen = next((r.regularization for r in last.restarts if r.chosen), "none")
     start = None if last.model.form.bound is None else last.model
     return fit(problem, initial=start, regularization=chosen, **options)
 
 
-def _undecided(
+def _may_decide(
     problem: Problem, solver: Solver, structure: Structure, *, warm: bool, ensemble: bool
 ) -> bool:
-    """Return whether the data may decide for the free run: not where nothing but one step ahead can be trained."""
+    """Return whether the data may decide for the free run.
+
+    They may not where only one step ahead can be trained.
+    """
     able = (
         solver.gauss_newton and problem.baseline.linear and not isinstance(problem, StreamedProblem)
     )
     return able and not (warm or ensemble or structure.from_initial)
 
 
-def _settled(criterion: Criterion, problem: Problem) -> Criterion:
-    """Return the criterion with what it left to the record.
+def _settle(criterion: Criterion, problem: Problem) -> Criterion:
+    """Return the criterion with its open choices made for the record.
 
     One step ahead where nothing else can be trained.
     """
@@ -377,12 +385,12 @@ def _settled(criterion: Criterion, problem: Problem) -> Criterion:
 
 
 def _for_runs(engine: Engine, problem: Problem, runs: int) -> Engine:
-    """With a cluster several runs over rows in memory are its tasks."""
+    """Return the engine by which several runs over rows in memory are tasks of a cluster."""
     return runs_on(engine) if runs > 1 and not isinstance(problem, StreamedProblem) else engine
 
 
 def _physics_alone(task: OneStepTask, structure: Structure) -> Estimate:
-    """Physics alone, which is solved: it ends at the loss where it starts."""
+    """Return physics alone, which is solved: it ends at the loss where it starts."""
     estimate = conclude(task, structure, task.physics_learned())
     return replace(estimate, status=replace(estimate.status, start_loss=estimate.status.loss))
 
@@ -390,7 +398,7 @@ def _physics_alone(task: OneStepTask, structure: Structure) -> Estimate:
 def _check_cost(
     problem: Problem, learner: Learner | None, solver: Solver, runs: int, engine: Engine
 ) -> None:
-    """Raise InputError for what would take more memory or time than there is."""
+    """Raise InputError for a fit that would take more memory or time than there is."""
     sizes = {
         "rows": problem.count,
         "features": len(problem.features.entries),
@@ -419,7 +427,7 @@ def _check_blocks(blocks: int) -> int:
 
 
 def _check_ensemble(ensemble: bool, problem: Problem) -> bool:
-    """Return whether there is one.
+    """Return whether an ensemble is asked for, and check the request.
 
     Raise InputError for a median of outputs that are mixed with each other.
     """
@@ -451,7 +459,7 @@ def _splits(structure: Structure) -> bool:
 def _warm_start(
     problem: Problem, model: Model, engine: Engine
 ) -> tuple[OneStepTask, Vector, Vector]:
-    """Return the task of going on from an earlier model's weights, in its scaling.
+    """Return the task of training on from an earlier model's weights, in its scaling.
 
     And the model's c.
     """
@@ -492,7 +500,7 @@ def _check_types(**given: Any) -> None:
 
 
 def _check_regularizations(given: Any, choices: Sequence[Any], chosen: bool) -> bool:
-    """Return whether "auto" was given.
+    """Return whether "auto" was given, and check the regularizations.
 
     Raise InputError for what is none, or for several that nothing chooses between.
     """
@@ -521,8 +529,9 @@ def posed_on(
 ) -> tuple[Problem, Engine]:
     """Return the problem with the engine that sums over its rows; further arguments as of `pose`.
 
-    Args: engine: None for what suits the record: memory, a stream of its files, the cluster that
-        holds it.
+    Args:
+        engine: None for what suits the record: memory, a stream of its files, the cluster that
+            holds it.
 
     Raises:
         InputError: as `pose`.
@@ -545,11 +554,11 @@ def _engine_of(source: Source) -> Engine:
 
 
 def check_record(record: Any, *, moves: bool = False) -> None:
-    """Raise InputError for what holds no rows, or none in memory where a motion needs them."""
+    """Raise InputError for a record without rows, or with none in memory for a motion."""
     if not isinstance(record, Source):
         check_type(record, Record, "record", "a Record")
     elif moves and not isinstance(record, Record):
         raise InputError(
-            "a motion takes a Record, whose segments an engine may share out; read these rows "
-            "into memory (read_record, Record.join), or fit the physics in its lagged form."
+            "a motion needs its rows in memory: read them with read_record or Record.join, or "
+            "fit the physics in its lagged form."
         )

@@ -1,4 +1,4 @@
-"""Training on the free run: θ and the weights together, from physics alone (the criterion `Simulation`).
+"""Training on the free run (criterion `Simulation`): θ and the weights together.
 
 Here θ is an unknown beside the weights (F1 does not hold). The split at the end is over the
 *measured* regressors (F2), which keeps the orthogonal structure exact.
@@ -38,24 +38,24 @@ _LONGER = (
     2.0,
     1.4,
     1.15,
-)  # times, from one length of the segments to the next: the first that flies
-_SHRUNK = (0.99, 0.9, 0.5, 0.0)  # of the one-step θ: less feedback flies longer
+)  # times, from one length of the segments to the next: the first with a finite run
+_SHRUNK = (0.99, 0.9, 0.5, 0.0)  # of the one-step θ: less feedback diverges later
 
 
 def train_physics_only(
     plan: SegmentedLagged,
     solver: LevenbergMarquardt,
     structure: Structure,
-    tell: RunProgress = quiet,
+    progress: RunProgress = quiet,
 ) -> FreeRunFit | None:
-    """θ of physics alone under the plan's criterion and the structure's rows and bounds.
+    """Return θ of physics alone under the criterion and the structure's rows and bounds.
 
-    None where none can fly.
+    None where no run is finite.
 
-    Training starts at the one-step solution, or at the initial values where these fly better. Where
-    neither flies, or the end runs away over whole experiments, it goes over segments that lengthen.
-    Of all ends the best over whole experiments is kept; where a start was better than them, whole
-    experiments are trained on too.
+    Training starts at the one-step solution, or at the initial values where these run better. Where
+    neither run is finite, or the end diverges over whole experiments, it goes over segments that
+    lengthen. Of all ends the best over whole experiments is kept; where a start was better than
+    them, whole experiments are trained on too.
     """
     plan = plan.alone
     objective = plan.objective(structure)
@@ -68,9 +68,9 @@ def train_physics_only(
     losses = [objective.evaluate(p, Start(objective.initial.measured)).loss for p in starts]
     ends: list[FreeRunFit] = []
     if np.isfinite(losses).any():
-        ends.append(plan.descend(objective, starts[int(np.argmin(losses))], solver, tell))
+        ends.append(plan.descend(objective, starts[int(np.argmin(losses))], solver, progress))
     if not np.isfinite(losses[0]) or not ends or not np.isfinite(ends[0].mean_square):
-        ends += _lengthening(plan, solver, structure, starts)
+        ends += _lengthen(plan, solver, structure, starts)
     if plan.whole is not plan.segments and plan.lengthens:
         ends += _over_whole(plan, solver, structure, starts, ends)
     best = _best(ends)
@@ -78,13 +78,16 @@ def train_physics_only(
     return None if best is None else best._replace(**spent)
 
 
-def _lengthening(
+def _lengthen(
     plan: SegmentedLagged,
     solver: LevenbergMarquardt,
     structure: Structure,
     starts: Sequence[Vector],
 ) -> list[FreeRunFit]:
-    """Return the end over the plan's own segments, reached over shorter ones, from the first start that flies over them."""
+    """Return the end over the plan's own segments, by way of shorter ones.
+
+    It begins at the first start whose run over them is finite.
+    """
     p, segment, shortest = None, _SHORTEST, plan.over(_SHORTEST)
     for start in starts:
         end = shortest.descend(shortest.objective(structure), start, solver.within_limit)
@@ -117,7 +120,10 @@ def _over_whole(
     starts: Sequence[Vector],
     ends: Sequence[FreeRunFit],
 ) -> list[FreeRunFit]:
-    """Return the end over whole experiments, where no end over segments is as good there as every start."""
+    """Return the end over whole experiments, where ends over segments are worse there.
+
+    That is, where none is as good over whole experiments as every start.
+    """
     places = [(end.mean_square, end.end.point.p) for end in ends]
     objective = plan.objective(structure)
     begun = [(plan.mean_square(objective.place(p)[1], np.zeros(0)), p) for p in starts]
@@ -141,7 +147,7 @@ def _over_whole(
 
 
 def _best(ends: Sequence[FreeRunFit]) -> FreeRunFit | None:
-    """Return the lowest over whole experiments; where all run away, the lowest over segments."""
+    """Return the lowest end over whole experiments, or over segments where all diverge."""
     usable = [end for end in ends if end.ending.usable]
     flying = [end for end in usable if np.isfinite(end.mean_square)]
     if flying:
@@ -151,7 +157,7 @@ def _best(ends: Sequence[FreeRunFit]) -> FreeRunFit | None:
 
 @dataclass(frozen=True, eq=False)
 class FreeRunTask(SimulationTask):
-    """A plan of segments, what physics alone does on it, and where an earlier model stands."""
+    """Training on the free run: segments, physics alone on them, an earlier model."""
 
     plan: SegmentedLagged
     warm: Vector | None = None
@@ -159,7 +165,7 @@ class FreeRunTask(SimulationTask):
 
     @classmethod
     def of(cls, task: OneStepTask, criterion: Criterion, warm: Vector | None = None) -> FreeRunTask:
-        """Lay the problem's record out as a criterion of several steps declares.
+        """Lay out the problem's record as a criterion of several steps declares.
 
         Raises:
             InputError: nothing would be scored; whole experiments of rows that are not in memory.
@@ -172,9 +178,9 @@ class FreeRunTask(SimulationTask):
         return self.plan.task
 
     def physics_alone(self) -> tuple[OneStepTask, TrainedLearner]:
-        """Return the rows without a learner, and what physics alone leaves on them.
+        """Return the task without a learner, and the residual of physics alone.
 
-        Least squares where it cannot fly.
+        Least squares where no run of it is finite.
         """
         if self.physics is None:
             return self.rows_task.physics_alone()
@@ -182,14 +188,14 @@ class FreeRunTask(SimulationTask):
         return plan.task, replace(self, plan=plan).learned(self.physics)
 
     def on(self, record: Record) -> FreeRunTask:
-        """The same problem on another record."""
+        """Return the task on another record."""
         like = None if isinstance(self.plan, SegmentedStreamed) else self.plan
         return FreeRunTask(SegmentedLagged.of(self.rows_task.on(record), self.criterion, like))
 
     def train_physics_only(
-        self, solver: LevenbergMarquardt, structure: Structure, tell: RunProgress
+        self, solver: LevenbergMarquardt, structure: Structure, progress: RunProgress
     ) -> tuple[SegmentedLagged, FreeRunFit | None]:
-        return self.plan, train_physics_only(self.plan, solver, structure, tell)
+        return self.plan, train_physics_only(self.plan, solver, structure, progress)
 
     def run(
         self,
@@ -199,10 +205,10 @@ class FreeRunTask(SimulationTask):
         regularization: str | float = "none",
         progress: RunProgress = quiet,
     ) -> FreeRunFit:
-        """As any run on the free run, with an orthogonal θ at a bound a known term beside the learner.
+        """Run, with an orthogonal θ at a bound as a known term beside the learner.
 
-        What stands at a bound where physics alone ends is held there from the start. The run is
-        made again, from there too, where other entries stand at one at its end; what was held once
+        Entries at a bound where physics alone ends are fixed there from the start. The run is
+        made again, from there too, where other entries are at one at its end; what was fixed once
         before is not released again.
         """
         alone: Any = self.physics
@@ -236,7 +242,10 @@ class FreeRunTask(SimulationTask):
         structure: Structure,
         regularization: str | float,
     ) -> list[StartPoint]:
-        """Where a run may start: physics alone, an earlier model, the solution one step ahead where it flies well."""
+        """Return possible starts: physics alone, an earlier model, the one-step solution.
+
+        The last one only where its free run is good.
+        """
         plan, measured = self.plan, objective.initial.measured
         places: list[StartPoint] = []
 
@@ -263,14 +272,14 @@ class FreeRunTask(SimulationTask):
         return places
 
     def _simulates_better(self, objective: StructuredObjective, p: Vector) -> bool:
-        """Return whether over whole experiments the loss at p is no higher than that of physics alone."""
+        """Return whether the loss at p over whole experiments is at most that of physics."""
         square = self.plan.mean_square(*objective.place(p)[1:])
         return bool(np.isfinite(square)) and (
             self.physics is None or square <= self.physics.mean_square
         )
 
     def median(self, members: list[TrainedLearner], best: int) -> TrainedLearner:
-        """Return the median of several, with the error of its own free run."""
+        """Return the median of several runs, with the error of its own free run."""
         learned = self.rows_task.median(members, best)
         assert learned.errors is not None and learned.coefficients is not None
         own = self.plan.mean_square(learned.coefficients, learned.weights, learned.tilt)

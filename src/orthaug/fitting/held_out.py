@@ -1,4 +1,4 @@
-"""Errors on rows that were not fitted, and the one rule by which two models are compared there.
+"""Errors on held-out rows, and the one rule by which two models are compared there.
 
 Starts, regularizations, the fallback to physics alone and every verdict rest on it. Blocked
 cross-validation leaves out one contiguous block after another, with gaps of the lag length, so that
@@ -33,7 +33,9 @@ Pieces = Sequence[Vector | None]
 
 @dataclass(frozen=True)
 class Ratio:
-    """RMS error of a model over that of another on the same rows, with a 95 % interval by the block bootstrap.
+    """RMS error of a model over that of another on the same rows.
+
+    The 95 % interval is by the block bootstrap.
 
     Where only one of them diverges it is 0 or infinite, and the interval with it; where both do
     there is none.
@@ -45,7 +47,7 @@ class Ratio:
 
     @classmethod
     def of(cls, model: Pieces, other: Pieces) -> Ratio:
-        """Return the model against the other.
+        """Return the ratio of one model's errors to the other's.
 
         Runs that diverge count first; then those that both survive.
         """
@@ -70,7 +72,7 @@ class Ratio:
 
     @classmethod
     def exactly(cls, model: float, other: float) -> Ratio:
-        """Of two errors that are all that is known."""
+        """Return the ratio of two known errors, without an interval."""
         if math.isinf(model) and math.isinf(other):
             value = math.nan
         else:
@@ -91,7 +93,10 @@ class Ratio:
 
 
 def _tail(count: int) -> float:
-    """Level of the percentiles of `count` stretches: 2.5 %, expanded as they are few (Hesterberg 2015, sect. 5)."""
+    """Return the level of the percentiles of `count` stretches.
+
+    2.5 %, expanded for few stretches (Hesterberg 2015, sect. 5).
+    """
     if count < 2:
         return 0.0
     return float(special.ndtr(np.sqrt(count / (count - 1)) * special.stdtrit(count - 1, 0.025)))
@@ -109,7 +114,7 @@ def _stretches(model: Vector, other: Vector, rows: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Candidate:
-    """One of the models that were compared: how it was trained, `prediction` or `simulation`, and its free run's error.
+    """A compared model: its criterion `prediction` or `simulation`, its free run's error.
 
     `error` is the RMS error where nothing was fitted, in standard deviations of the training
     output; infinite where the run diverges, NaN where it was not tried.
@@ -131,7 +136,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Focus:
-    """What `Auto` chose: `prediction` or `simulation`, why, and what was compared."""
+    """The choice of `Auto`, `prediction` or `simulation`, with reason and candidates."""
 
     chosen: str
     text: str
@@ -140,7 +145,9 @@ class Focus:
 
 @dataclass(frozen=True, eq=False)
 class HeldOutErrors:
-    """Squared errors where nothing was fitted: of physics alone and of every run, in `Estimate.restarts`' order.
+    """Squared errors on held-out rows, of physics alone and of every run.
+
+    Runs are in the order of `Estimate.restarts`.
 
     In deviations of the training output, of the criterion's own response; by pieces, None for one
     that diverged. `chosen` is the number of the run of the lowest error.
@@ -155,12 +162,12 @@ class HeldOutErrors:
 
     @property
     def ratio(self) -> Ratio:
-        """The chosen run against physics alone."""
+        """Ratio of the chosen run's error to that of physics alone."""
         return Ratio.of(self.runs[self.chosen], self.alone)
 
 
 def mean_square(pieces: Pieces) -> float:
-    """Over all rows of all runs; infinite where one diverged."""
+    """Return the mean over all rows of all runs; infinite where one diverged."""
     if any(piece is None for piece in pieces):
         return math.inf
     return float(np.mean(np.concatenate([piece for piece in pieces if piece is not None])))
@@ -169,7 +176,9 @@ def mean_square(pieces: Pieces) -> float:
 def squared_errors(
     response: Response, unit: Any, skip: int | tuple[int, ...] = 0
 ) -> list[Vector | None]:
-    """Squared errors of a response along each experiment, each output in its `unit`, mean over the outputs.
+    """Return the squared errors of a response along each experiment.
+
+    Each output counts in its `unit`; the mean is over the outputs.
 
     Args:
         skip: leading samples of each experiment that do not count, as in `Response.scores`.
@@ -190,7 +199,9 @@ def squared_errors(
 
 
 def blocked(record: Record, blocks: int, start: int) -> list[tuple[Record, Record]]:
-    """(training, held out) for each of `blocks` contiguous blocks of about equal length, `start` rows of gap around.
+    """Return (training, held out) for each of `blocks` contiguous blocks of similar length.
+
+    `start` rows around a block are left out.
 
     All training records have the same number of usable rows after the first `start` of each
     experiment.
@@ -231,7 +242,7 @@ def blocked(record: Record, blocks: int, start: int) -> list[tuple[Record, Recor
 
 
 def _cut(experiments: list[Experiment], usable: int, start: int) -> tuple[Experiment, ...]:
-    """Return the experiments without the last rows of the longest ones, so that `usable` rows remain."""
+    """Return the experiments less the last rows of the longest, so that `usable` remain."""
     cut = list(experiments)
     while (surplus := sum(len(e) - start for e in cut) - usable) > 0:
         longest = max(range(len(cut)), key=lambda i: len(cut[i]))

@@ -1,4 +1,4 @@
-"""The states that segments start from: unknowns of their own, eliminated from the normal equations.
+"""Initial states of segments: unknowns that are eliminated from the normal equations.
 
 A state is scored against the measured one, `‖L (x − measured)‖²`, because past outputs have errors
 like all others. A state acts on its own segment only, so a Schur complement per segment removes it.
@@ -19,7 +19,7 @@ from orthaug.fitting.segments import Sensitivity
 
 
 class Start(NamedTuple):
-    """States to start a trial from, (k, n0, m), and how the best ones follow (c, w) to first order."""
+    """Start states of a trial (k, n0, m), and their derivative by (c, w)."""
 
     values: Float[np.ndarray, "k n0 m"]
     misfit: float = np.inf
@@ -33,7 +33,7 @@ class Start(NamedTuple):
 
     @property
     def follows(self) -> bool:
-        """Return whether it is known how the best states follow (c, w)."""
+        """True where the derivative of the best states by (c, w) is known."""
         return self.slope is not None or self.there is not None
 
     def at(self, unknowns: Vector) -> Float[np.ndarray, "k n0 m"] | None:
@@ -55,7 +55,7 @@ class InitialStates:
     free: bool
 
     def loss(self, values: Float[np.ndarray, "k n0 m"], rows: Matrix) -> float:
-        """`‖L (measured − x)‖²`, L = `rows` (n0, n0)."""
+        """Return `‖L (measured − x)‖²`, L = `rows` (n0, n0)."""
         with np.errstate(all="ignore"):
             return float(np.sum(np.einsum("oi,kim->kom", rows, self.measured - values) ** 2))
 
@@ -64,7 +64,9 @@ class InitialStates:
     ) -> tuple[
         Matrix, Vector, Float[np.ndarray, "k m n0"] | None, Float[np.ndarray, "k m n0 n"] | None
     ]:
-        """Return normal matrix and right-hand side of (c, w) with the states at their best, and how these follow (c, w).
+        """Return the normal equations of (c, w) with the states at their best.
+
+        And the derivative of these states by (c, w).
 
         The best states are `values + offset − slope · step` for a small step of (c, w).
         """
@@ -85,7 +87,9 @@ class InitialStates:
 def without_states(
     shared: Any, own: Any, missed: Any, prior: Any, xp: Any
 ) -> tuple[Any, Any, Any, Any]:
-    """Return normal matrix and right-hand side of (c, w), offset and slope of the states: a Schur complement per segment.
+    """Return the normal equations of (c, w), and offset and slope of the states.
+
+    By a Schur complement per segment.
 
     Args:
         own: (…, n0, n0 + n + 1), of the segments in front.

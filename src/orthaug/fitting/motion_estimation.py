@@ -1,4 +1,4 @@
-"""Fitting a motion to a record, with a learner beside some of its equations: training, and the estimate after it."""
+"""Training of a motion, with a learner in some of its equations, and its estimate."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ left out.
 def pose_for(
     record: Record, motion: Motion, learner: Learner | None, output_weights: str | Sequence[float]
 ) -> MotionProblem:
-    """Return the problem of a motion with what a learner sees.
+    """Return the problem of a motion with the inputs of a learner.
 
     Raises:
         InputError: as `pose_motion`.
@@ -73,7 +73,7 @@ def fit_motion(
     engine: Engine = InMemory(),  # noqa: B008  (frozen)
     checkpoints: Checkpoints | None = None,
 ) -> MotionEstimate:
-    """`estimate` for a motion that is posed already; arguments as there.
+    """Fit a motion that is posed already; arguments as of `estimate`.
 
     Raises:
         InputError: what a motion cannot be trained with.
@@ -96,7 +96,7 @@ def fit_motion(
 
 
 def without_learner(problem: MotionProblem) -> MotionProblem:
-    """The same problem with no state and no output learned."""
+    """Return the problem with no state and no output learned."""
     motion = problem.motion
     states = tuple(replace(state, learned=False) for state in motion.states)
     outputs = tuple(replace(output, learned=False) for output in motion.outputs)
@@ -127,7 +127,7 @@ def conclude_motion(
     model = replace(_model(plan, structure, learned), trained=trained)
     reason = ALONE.get(learned.ending, "") if learned.bound is None or task.physics is None else ""
     if reason and not learned.ending.usable and (where := task.problem.without_value(np.any)):
-        reason = f"{where}; mend it, or bound what it reads"
+        reason = f"{where}; correct it, or bound its parameters"
     silent = learner_silent(learned, _learner_values(plan, learned))
     reason = reason or ending_in_words(learned.ending, learned.tail)
     fit = MotionEstimate(
@@ -158,7 +158,7 @@ def conclude_motion(
 
 
 def _learner_values(plan: SegmentedMotion, learned: TrainedLearner) -> Matrix | None:
-    """Return the values (N, nl) of a learner with few effective weights along the training runs.
+    """Return the values (N, nl) of a nearly silent learner along the training runs.
 
     None of others.
     """
@@ -204,12 +204,15 @@ def _model(plan: SegmentedMotion, structure: Structure, learned: TrainedLearner)
     return (
         model
         if model.form.bound is None
-        else _limited(replace(model, seen=_seen(model, record)), record)
+        else _with_limits(replace(model, seen=_feature_range(model, record)), record)
     )
 
 
-def _limited(model: MotionModel, record: Record) -> MotionModel:
-    """Return the model with the range beyond which its correction is held or fades: of the features over the fitted run."""
+def _with_limits(model: MotionModel, record: Record) -> MotionModel:
+    """Return the model with the range of its features over the fitted run.
+
+    Beyond that range the correction stays constant or fades.
+    """
     limits = None if model.form.beyond == "free" or model.seen is None else limits_of(model.seen)
     if limits is None:
         return model
@@ -222,8 +225,8 @@ def _limited(model: MotionModel, record: Record) -> MotionModel:
     return replace(model, numbers=model.numbers._replace(limits=limits, pull=pull))
 
 
-def _seen(model: MotionModel, record: Record) -> Matrix | None:
-    """Least and largest (2, nz) of the learner's features over the free run.
+def _feature_range(model: MotionModel, record: Record) -> Matrix | None:
+    """Return the least and largest (2, nz) of the learner's features over the free run.
 
     None where it has no finite ones.
     """
@@ -235,7 +238,10 @@ def _seen(model: MotionModel, record: Record) -> Matrix | None:
 
 
 def _best_window(model: MotionModel, record: Record) -> int:
-    """Return the rows to predict from that give the least error one step ahead, on some of the training data."""
+    """Return the window of rows that predicts one step ahead best.
+
+    On some of the training data.
+    """
     longest = max(record.experiments, key=len).rows(0, _TRIED_ROWS)
     tried = [n * (model.form.states + 1) for n in _WINDOWS]
     best, least = tried[0], np.inf
@@ -260,14 +266,18 @@ def _best_window(model: MotionModel, record: Record) -> int:
 
 
 def reopened(model: MotionModel, record: Record) -> MotionEstimate:
-    """Return the estimate of a saved model with its training data, to split again, less what was told of its training.
+    """Return the estimate of a saved model with its training data, to split again.
+
+    It lacks the results of its training.
 
     Raises:
         InputError: other data than the model was trained on.
     """
     kept, form, numbers = model.trained, model.form, model.numbers
     if kept is None:
-        raise InputError("the model was saved without what a split needs; fit it again.")
+        raise InputError(
+            "the model was saved without the statistics that a split needs; fit it again."
+        )
     record = model.fitting(record, need_outputs=True)
     problem = pose_motion(record, form.motion, [entry.text for entry in form.features] or None)
     problem = replace(problem, weight=replace(problem.weight, matrix=model.weight))
@@ -285,9 +295,9 @@ def reopened(model: MotionModel, record: Record) -> MotionEstimate:
         kept.states
     ):
         raise InputError(
-            f"the model was trained on other rows: on {kept.rows} where these have "
-            f"{segmented.segments.count}, or in other experiments. Give the files, and --rows, "
-            "that it was trained on."
+            f"the model was trained on other rows: {kept.rows} instead of "
+            f"{segmented.segments.count}, or other experiments. Give the files and --rows of "
+            "its training."
         )
     c = np.asarray(numbers.theta - numbers.theta_aux)
     return MotionEstimate(

@@ -1,4 +1,4 @@
-"""Measures over the states and inputs of a motion: the points on which physics and learner are told apart."""
+"""Measures over the states and inputs of a motion, on which physics is split from learner."""
 
 from __future__ import annotations
 
@@ -25,10 +25,13 @@ if TYPE_CHECKING:
 def field_under(
     measure: Measure, segmented: SegmentedMotion, numbers: Numbers, states: Any
 ) -> tuple[Field, float, tuple[Warning, ...]]:
-    """Points of a measure with the sizes of the learned equations, its support by the data, and what to tell.
+    """Return the points of a measure, its support by the data, and warnings.
 
-    Raises: InputError: a measure that does not fit the motion, or points at which the motion has no
-        value.
+    With the sizes of the learned equations.
+
+    Raises:
+        InputError: a measure that does not fit the motion, or points at which the motion has no
+            value.
     """
     motion, form = segmented.problem.motion, segmented.dynamics
     c, w = np.asarray(numbers.theta - numbers.theta_aux), numbers.weights
@@ -48,14 +51,14 @@ def field_under(
     finite = np.isfinite(found).all(axis=0)
     weight = np.where(finite, points.weight, 0.0)
     share = support.share(points)
-    told = ()
+    warnings = ()
     if share < SUPPORTED and form.bound is not None:
         text = (
             f"only {100 * share:.0f} % of the {measure.name} measure lies within reach of the "
-            "training data: elsewhere the parameters rest on how the learner extrapolates."
+            "training data: elsewhere the parameters depend on the learner's extrapolation."
         )
-        told = (Warning("measure_beyond_data", text),)
-    return Field(at[finite], beside[finite], weight[finite] / weight.sum(), size), share, told
+        warnings = (Warning("measure_beyond_data", text),)
+    return Field(at[finite], beside[finite], weight[finite] / weight.sum(), size), share, warnings
 
 
 def sizes_learned(segmented: SegmentedMotion, c: Any, x: Any, u: Any) -> Any:
@@ -81,7 +84,9 @@ def wobble(
     size: Vector,
     q: Vector,
 ) -> Matrix:
-    """Return how the points of a motion's own measure follow its unknowns: they are where the fitted run goes.
+    """Return the derivative of the points of a motion's own measure by its unknowns.
+
+    These points are states of the fitted run.
 
     A split under the training measure depends on the unknowns twice, through the fitted field and
     through these points. Intervals that leave the second out cover too little. `Σ φ_qx dx/d(c, w)`
@@ -97,14 +102,14 @@ def wobble(
         states, *map(np.asarray, segments[1:]), slope, strict=True
     ):
         n0 = start.shape[0]
-        found = np.asarray(_summed(form, numbers, start, inputs, scored, q, size))
+        found = np.asarray(_sum_over(form, numbers, start, inputs, scored, q, size))
         of_start = np.moveaxis(found[:, :n0], -1, 0)  # (m, np, n0)
         total += found[:, n0:].sum(axis=-1) - np.einsum("mqi,min->qn", of_start, own)
     return total / segments.count
 
 
 @partial(jax.jit, static_argnames="form")
-def _summed(
+def _sum_over(
     form: MotionDynamics,
     numbers: Numbers,
     state: Float[Array, "n0 m"],

@@ -1,4 +1,4 @@
-"""Training of a motion on its free run: the parameters' coordinates, the weights and the segments' starts together.
+"""Training of a motion on its free run: parameters, weights and initial states together.
 
 Physics alone is where every learner starts, and what it has to beat. It is trained over segments
 that lengthen: first the starts of short ones are found, then the parameters over them, then over
@@ -45,15 +45,15 @@ _SETTLING = (
     200  # steps at most by which starts follow the outputs: a descent damps no step of theirs
 )
 _FINE = 0.01  # of the residual: how much the outputs may move when the substeps are doubled
-_LOOSER = 1e-4  # times the weight of the guesses, where it is asked what the outputs tell
+_LOOSER = 1e-4  # times the weight of the guesses, to see what the outputs determine
 
 
 def train_motion_physics(
-    segmented: SegmentedMotion, solver: LevenbergMarquardt, tell: RunProgress = quiet
+    segmented: SegmentedMotion, solver: LevenbergMarquardt, progress: RunProgress = quiet
 ) -> tuple[SegmentedMotion, FreeRunFit | None]:
-    """Parameters of the physics alone, and the course with segments that start where its runs do.
+    """Return parameters of physics alone, and segments that start at its states.
 
-    None: none flies.
+    None where no run is finite.
     """
     own, initial = segmented.alone, segmented.problem.motion.coordinates.initial
     steps = own.segments.steps
@@ -63,7 +63,7 @@ def train_motion_physics(
     q, rows = initial, None
     for length in lengths:
         short = own.over(length)
-        end = _descended(short, solver.at_most(_SHORT_ITERATIONS), [q, initial], rows)
+        end = _descend(short, solver.at_most(_SHORT_ITERATIONS), [q, initial], rows)
         if end is None:
             q, rows = initial, None
             continue
@@ -73,7 +73,7 @@ def train_motion_physics(
     for start, known in ((q, rows), (initial, None)):
         if start is initial and ends and (q is initial or _follows(own, ends[0])):
             continue
-        end = _descended(own, solver, [start], known, tell)
+        end = _descend(own, solver, [start], known, progress)
         if end is not None:
             ends.append(end)
             iterations, seconds = iterations + end.iterations, seconds + end.seconds
@@ -90,16 +90,18 @@ def train_motion_physics(
     return segmented, best._replace(mean_square=mean_square, iterations=iterations, seconds=seconds)
 
 
-def _descended(
+def _descend(
     segmented: SegmentedMotion,
     solver: LevenbergMarquardt,
     starts: list[Vector],
     rows: list[np.ndarray] | None,
-    tell: RunProgress = quiet,
+    progress: RunProgress = quiet,
 ) -> FreeRunFit | None:
-    """From the best of the starts, whose segments begin at states that follow the outputs.
+    """Return the end of a descent from the best of the starts.
 
-    None where none flies.
+    Its segments begin at states that follow the outputs.
+
+    None where no run is finite.
     """
     if rows is not None:
         segmented = segmented.starting_from(rows)
@@ -111,12 +113,12 @@ def _descended(
     loss, q, states = min(places, key=lambda place: place[0])
     if not np.isfinite(loss):
         return None
-    free_fit = segmented.descend(objective, q, solver, tell, states)
+    free_fit = segmented.descend(objective, q, solver, progress, states)
     return free_fit if free_fit.ending.usable else None
 
 
 def _follows(segmented: SegmentedMotion, free_fit: FreeRunFit) -> bool:
-    """Return whether the runs follow most of what the outputs do."""
+    """Return whether the runs follow most of the outputs' variation."""
     return bool(_left(segmented, free_fit) < _POOR**2 * segmented.residuals)
 
 
@@ -132,7 +134,10 @@ def _left(segmented: SegmentedMotion, free_fit: FreeRunFit) -> float:
 def _fine_enough(
     segmented: SegmentedMotion, free_fit: FreeRunFit, solver: LevenbergMarquardt
 ) -> tuple[SegmentedMotion, FreeRunFit]:
-    """Twice the substeps until they move the outputs by less than 1 % of what the physics leaves."""
+    """Return segments with substeps fine enough for the outputs.
+
+    Doubling them moves the outputs by less than 1 % of the residual of the physics.
+    """
     motion = segmented.problem.motion
     while (
         motion.substeps is None
@@ -142,7 +147,7 @@ def _fine_enough(
         finer = segmented.refined(2 * segmented.dynamics.substeps)
         if moved_by(segmented.alone, finer.alone, free_fit) <= _FINE:
             break
-        again = _descended_on(finer.alone, solver, free_fit)
+        again = _descend_on(finer.alone, solver, free_fit)
         if again is None:
             break
         segmented, free_fit = finer, again
@@ -150,7 +155,7 @@ def _fine_enough(
 
 
 def moved_by(segmented: SegmentedMotion, finer: SegmentedMotion, free_fit: FreeRunFit) -> float:
-    """By how much of the residual the outputs move when the steps of the integrator are finer."""
+    """Return by what share of the residual finer integrator steps move the outputs."""
     point = free_fit.end.point
     runs = []
     for one in (segmented, finer):
@@ -166,7 +171,7 @@ def moved_by(segmented: SegmentedMotion, finer: SegmentedMotion, free_fit: FreeR
     return float(ratio) if np.isfinite(ratio) else 0.0
 
 
-def _descended_on(
+def _descend_on(
     segmented: SegmentedMotion, solver: LevenbergMarquardt, free_fit: FreeRunFit
 ) -> FreeRunFit | None:
     point = free_fit.end.point
@@ -176,7 +181,7 @@ def _descended_on(
 
 @dataclass(frozen=True, eq=False)
 class MotionTask(SimulationTask):
-    """A motion's course, and what its physics alone does on it."""
+    """A motion in segments, and the run of its physics alone."""
 
     plan: SegmentedMotion
 
@@ -188,7 +193,7 @@ class MotionTask(SimulationTask):
         criterion: Criterion,
         engine: Engine | None = None,
     ) -> MotionTask:
-        """Bind a learner to the equations and outputs that it is added to, and lay the record out.
+        """Bind a learner to its equations and outputs, and cut the record into segments.
 
         Raises:
             InputError: nothing would be scored.
@@ -210,7 +215,7 @@ class MotionTask(SimulationTask):
         return self
 
     def on(self, record: Record) -> MotionTask:
-        """The same motion on another record."""
+        """Return the task on another record."""
         sums = None if self.plan.sums is None else SegmentSums.of(self.plan.sums.engine)
         segmented = SegmentedMotion.of(
             self.problem.on(record), self.bound, self.criterion, self.plan, sums
@@ -218,9 +223,9 @@ class MotionTask(SimulationTask):
         return MotionTask(segmented)
 
     def physics_alone(self) -> tuple[MotionTask, TrainedLearner]:
-        """Return the task without a learner, and what physics alone leaves.
+        """Return the task without a learner, and the residual of physics alone.
 
-        Without an end where it cannot fly.
+        Without an end where no run of it is finite.
         """
         alone = replace(self, plan=self.plan.alone)
         if self.physics is not None:
@@ -238,13 +243,13 @@ class MotionTask(SimulationTask):
         )
 
     def median(self, members: list[TrainedLearner], best: int) -> TrainedLearner:
-        """Return the best member: a motion has no ensemble, for medians of outputs follow no equations."""
+        """Return the best member: medians of outputs follow no equations of motion."""
         return members[best]
 
     def learned(self, run: FreeRunFit) -> TrainedLearner:
         """Return the learner as a run left it.
 
-        The information counts what the outputs tell, hardly what the guesses do.
+        The information counts the outputs, and hardly the guesses.
         """
         end, objective = run.end, run.objective
         if end.linear is None:
@@ -255,12 +260,15 @@ class MotionTask(SimulationTask):
         )
 
     def train_physics_only(
-        self, solver: LevenbergMarquardt, structure: Structure, tell: RunProgress
+        self, solver: LevenbergMarquardt, structure: Structure, progress: RunProgress
     ) -> tuple[SegmentedMotion, FreeRunFit | None]:
-        return train_motion_physics(self.plan, solver, tell)
+        return train_motion_physics(self.plan, solver, progress)
 
     def scaled(self, plan: SegmentedMotion, physics: FreeRunFit) -> SegmentedMotion:
-        """Return the learner's features over the runs of physics alone, and the size of what it is added to."""
+        """Return the size of the learner's features and of the quantities it is added to.
+
+        Over the runs of physics alone.
+        """
         if plan.bound is None:
             return plan
         point = physics.end.point
@@ -281,13 +289,13 @@ class MotionTask(SimulationTask):
         structure: Structure,
         regularization: str | float,
     ) -> list[StartPoint]:
-        """Physics alone with a silent learner.
+        """Return the start at physics alone with a silent learner.
 
         A learner that cannot be silenced starts as it is.
         """
         silenced = (
             w if self.bound is None else self.bound.silent(w)
-        )  # no learner: physics alone did not fly
+        )  # no learner: physics alone had no finite run
         q = (
             self.problem.motion.coordinates.initial
             if self.physics is None

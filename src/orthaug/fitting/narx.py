@@ -1,4 +1,4 @@
-"""Records as arrays, experiments by groups, as an estimator of scikit-learn: physics in lags, and a correction."""
+"""Time series as an estimator of scikit-learn: physics in lags, and a correction."""
 
 from __future__ import annotations
 
@@ -34,7 +34,9 @@ class Group(NamedTuple):
 
 
 class AugmentedNARX(Augmented):
-    """`y_k = φ(x_k)θ + learner(x_k) + e_k`, x_k past outputs and inputs, in the manners of scikit-learn.
+    """`y_k = φ(x_k)θ + learner(x_k) + e_k`, as an estimator of scikit-learn.
+
+    x_k are past outputs and inputs; records are arrays, experiments are groups.
 
     The rows of X are inputs at successive samples and those of y the outputs measured with them.
     `groups` labels the experiments; rows of one label belong together in their order, and lags
@@ -123,10 +125,10 @@ class AugmentedNARX(Augmented):
             y: outputs.
             groups: the experiment of every row (n,); None for one.
 
-        Raises: InputError (a ValueError): data and physics that do not fit together, a signal that
-            does not move, too short
-                an experiment; RankError where the rows do not determine θ. TrainingError where
-                training gives no finite model.
+        Raises:
+            InputError (a ValueError): data and physics that do not fit together, a signal that does
+                not move, too short an experiment; RankError where the rows do not determine θ.
+                TrainingError where training gives no finite model.
         """
         check_choice(self.score_on, SCORED_ON, "`score_on`")
         given = y
@@ -141,7 +143,9 @@ class AugmentedNARX(Augmented):
         return self
 
     def predict(self, X: Any, y: Any, groups: Any = None) -> np.ndarray:
-        """ŷ one step ahead from measured inputs and outputs, (n,) or (n, n_outputs) as y was in the fit.
+        """Return ŷ one step ahead from measured inputs and outputs.
+
+        Its shape, (n,) or (n, n_outputs), is that of y in the fit.
 
         Raises:
             InputError (a ValueError): other columns than in the fit, too short an experiment.
@@ -152,19 +156,23 @@ class AugmentedNARX(Augmented):
         found = np.full(y.shape, np.nan)
         for group in _groups(groups, len(X)):
             found[group.rows] = model.predict(self._record(X, y, [group])).model
-        return self._shaped(found)
+        return self._shape(found)
 
     def simulate(self, X: Any, initial: Any = None, groups: Any = None) -> np.ndarray:
-        """ŷ of the free run, whose past outputs are the model's own, (n,) or (n, n_outputs) as y was in the fit.
+        """Return ŷ of the free run, whose past outputs are the model's own.
 
-        Args: X: inputs. initial: outputs before the first prediction: y itself, (n,) or (n,
-            n_outputs), of which only the first
-                `first_row_` rows of each experiment are looked at; or these rows alone, the same
-                for every experiment; None for zero.
+        Its shape, (n,) or (n, n_outputs), is that of y in the fit.
+
+        Args:
+            X: inputs.
+            initial: outputs before the first prediction: y itself, (n,) or (n, n_outputs), of which
+                only the first `first_row_` rows of each experiment are looked at; or these rows
+                alone, the same for every experiment; None for zero.
             groups: the experiment of every row (n,); None for one.
 
-        Raises: InputError (a ValueError): other columns than in the fit, too short an experiment or
-            `initial`.
+        Raises:
+            InputError (a ValueError): other columns than in the fit, too short an experiment or
+                `initial`.
         """
         model = self._fitted().model
         X = checked_again(self, X)
@@ -176,10 +184,12 @@ class AugmentedNARX(Augmented):
                 given = np.asarray(initial)[group.rows] if whole else initial
                 begin = as_signal(given[: self.first_row_] if np.ndim(given) else given, "initial")
             found[group.rows] = model.simulate(self._record(X, None, [group]), initial=begin).model
-        return self._shaped(found)
+        return self._shape(found)
 
     def score(self, X: Any, y: Any, groups: Any = None) -> float:
-        """R² on all rows that have a prediction, the mean over outputs: of the free run, or as `score_on` says.
+        """Return R² on all rows that have a prediction, the mean over outputs.
+
+        Of the free run, or as `score_on` says.
 
         The free run starts from the measured outputs; one that leaves all bounds scores −inf.
 
@@ -204,12 +214,12 @@ class AugmentedNARX(Augmented):
         return float(r2_score(measured[scored], found[scored]))
 
     def _layout(self, names: tuple[str, ...]) -> Layout:
-        """Return the regressor, for physics that are made of it."""
+        """Return the regressor, for physics that depend on it."""
         lags = _FIRST if self.lags is None else self.lags
         return lags.layout(self.output_names_, names) if isinstance(lags, Lags) else ()
 
     def _record(self, x: np.ndarray, y: np.ndarray | None, groups: list[Group]) -> Record:
-        """Return the experiments, with their outputs where they are given."""
+        """Return the experiments, with outputs where they are given."""
         outputs = np.empty((len(x), 0)) if y is None else y
         experiments = [
             Experiment(
@@ -223,7 +233,7 @@ class AugmentedNARX(Augmented):
         return Record(input_names(self), named, self.sampling_time, tuple(experiments))  # type: ignore[arg-type]
 
     def _outputs(self, y: Any, rows: int) -> np.ndarray:
-        """Measured outputs (rows, n_outputs)."""
+        """Return measured outputs (rows, n_outputs)."""
         y = as_signal(y, "y")
         if y.shape != (rows, len(self.output_names_)):
             raise InputError(

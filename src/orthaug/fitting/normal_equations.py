@@ -1,4 +1,4 @@
-"""The prediction criterion over the learner's weights, as normal equations from one pass over rows (F1, F4).
+"""Normal equations of the one-step criterion over the weights, in one pass over rows (F1, F4).
 
 Rows are whitened: each output is divided by its standard deviation, and all rows by the RMS of the
 baseline's residual. So a residual of 1 is as large as the baseline's own.
@@ -20,14 +20,14 @@ from orthaug.models.rows import Chunk, Engine, Overlap, gram, row_sum
 
 
 class Hold(NamedTuple):
-    """`‖target − matrix QᵀF‖²`: the structure's hold on the learner's share in the span of the physics."""
+    """`‖target − matrix QᵀF‖²`: the structure's term on the learner's share in the physics."""
 
     matrix: Float[Array | np.ndarray, "nt nt"]
     target: Float[Array | np.ndarray, "nt"]
 
 
 class Normal(NamedTuple):
-    """Gauss-Newton quantities of `‖r‖²`: `hessian` = JᵀJ, `gradient` = Jᵀr (downhill), `loss` = ‖r‖²."""
+    """Gauss-Newton quantities of `‖r‖²`: `hessian` JᵀJ, `gradient` Jᵀr (downhill), `loss` ‖r‖²."""
 
     hessian: Float[Array, "nw nw"]
     gradient: Float[Array, "nw"]
@@ -57,7 +57,10 @@ class Blocks:
 
 
 def collect(total: Float[Array, "n n"], hold: Hold, before: Overlap) -> Normal:
-    """Return the normal equations from the sum of all `Blocks`: `JᵀP⊥J = JᵀJ − (QᵀJ)ᵀ(QᵀJ)`, plus the structure's `Hold`."""
+    """Return the normal equations from the sum of all `Blocks`, plus the structure's `Hold`.
+
+    `JᵀP⊥J = JᵀJ − (QᵀJ)ᵀ(QᵀJ)`.
+    """
     nt = before.values.shape[0]
     g_qr, g_qj = total[:nt, nt], total[:nt, nt + 1 :]
     g_rr, g_jr, g_jj = total[nt, nt], total[nt + 1 :, nt], total[nt + 1 :, nt + 1 :]
@@ -94,7 +97,10 @@ def one_pass(
     arguments: tuple[Any, ...],
     overlap: Overlap,
 ) -> Normal:
-    """Return the criterion at w. The programs around it trace it once, together."""
+    """Return the criterion at w.
+
+    The programs around it trace it once, together.
+    """
     return criterion(w, *arguments, overlap)
 
 

@@ -24,7 +24,7 @@ _LARGEST_ERROR = 1e120
 
 
 class TrialPoint(NamedTuple):
-    """A trial at p: the unknown θ, c and w, the states that its segments started from, and the errors (k, T, ny, m).
+    """A trial at p: the unknown θ, c and w, its initial states, and its errors (k, T, ny, m).
 
     Where an engine keeps the segments, their `squares` Σ e eᵀ (ny, ny) are known instead of the
     errors.
@@ -44,7 +44,7 @@ class TrialPoint(NamedTuple):
 
 
 class LinearisedFreeRun(NamedTuple):
-    """A trial linearised: normal equations of p, and what the next trial starts from."""
+    """A linearised trial: normal equations of p, and the start of the next trial."""
 
     hessian: Matrix
     gradient: Vector
@@ -82,7 +82,7 @@ class FreeRunObjective:
         return self.dynamics.start_rows(self.weight)
 
     def place(self, p: Vector) -> tuple[Vector, Vector, Vector]:
-        """(unknown θ, c, w) of p."""
+        """Return (unknown θ, c, w) of p."""
         return p[: self.physics], p[: self.physics], p[self.physics :]
 
     def evaluate(self, p: Vector, start: Start) -> TrialPoint:
@@ -93,7 +93,7 @@ class FreeRunObjective:
         theta, c, w = self.place(p)
         trials: list[TrialPoint] = []
         for follows in (True, False) if self.initial.free and start.follows else (False,):
-            total, states, errors, squares = self._tried(c, w, start, follows)
+            total, states, errors, squares = self._try(c, w, start, follows)
             misfit = total if total < self._largest else np.inf
             trials.append(TrialPoint(p, theta, c, w, states, errors, misfit, misfit, squares))
             if total < start.misfit:
@@ -105,10 +105,12 @@ class FreeRunObjective:
             )
         return best
 
-    def _tried(
+    def _try(
         self, c: Vector, w: Vector, start: Start, follows: bool
     ) -> tuple[float, Any, Any, Matrix | None]:
-        """`‖r‖²`, states, errors and their squares from the start's states, or from those that follow (c, w).
+        """Return `‖r‖²`, states, errors and their squares from the start's states.
+
+        Or from states that follow (c, w).
 
         An engine's states stay where they are: given are those of the start.
         """
@@ -134,12 +136,12 @@ class FreeRunObjective:
         return LinearisedFreeRun(information, gradient, information, start)
 
     def kept(self, point: TrialPoint) -> tuple[Any, ...]:
-        """Return what `again` makes the trial of, bit by bit."""
+        """Return the values from which `again` makes the trial, bit by bit."""
         squares = np.zeros((0, 0)) if point.squares is None else point.squares
         return point.p, np.asarray(point.states), point.misfit, point.loss, squares
 
     def again(self, kept: tuple[Any, ...]) -> TrialPoint:
-        """Return the trial that was `kept`."""
+        """Return the trial of values that were `kept`."""
         p, states, misfit, loss, squares = kept
         theta, c, w = self.place(p)
         known = self.sums is not None
@@ -149,7 +151,10 @@ class FreeRunObjective:
         )
 
     def eliminated(self, point: TrialPoint, rows: Matrix) -> tuple[Matrix, Vector, dict[str, Any]]:
-        """Return normal matrix and right-hand side of (c, w), L = `rows`, and how the states follow, as `Start` has it."""
+        """Return the normal equations of (c, w), L = `rows`, and how the states follow.
+
+        The latter in the form of `Start`.
+        """
         numbers, states = self.numbers(point.c, point.w), point.states
         if self.sums is not None:
             made = (self.dynamics, numbers, self.segments, self.initial, states, self.weight, rows)
@@ -160,7 +165,7 @@ class FreeRunObjective:
         return information, gradient, {"offset": offset, "slope": slope}
 
     def slope(self, start: Start) -> Float[np.ndarray, "k m n0 n"] | None:
-        """Return how the best states follow (c, w)."""
+        """Return the derivative of the best states by (c, w)."""
         return (
             start.slope
             if self.sums is None or start.there is None
@@ -174,14 +179,17 @@ class FreeRunObjective:
     def errors(
         self, c: Vector, w: Vector, states: Any, segments: Segments
     ) -> Float[np.ndarray, "k T ny m"]:
-        """Errors of every segment from its state, in the outputs' units.
+        """Return the errors of every segment from its state, in the outputs' units.
 
         0 where they are not scored.
         """
         return errors_of(self.dynamics, self.numbers(c, w), states, segments)
 
     def samples(self, point: TrialPoint) -> tuple[float, float]:
-        """Return number of residuals less the physics' own parameters, and the share of them that is independent."""
+        """Return the number of residuals, and the share of them that is independent.
+
+        The physics' own parameters are subtracted from the number.
+        """
         ny, errors = len(self.weight), point.errors
         segments, states = self.segments, point.states
         if self.colour is not None:
@@ -200,7 +208,7 @@ class FreeRunObjective:
         return self.segments.count * ny - self.physics, float(np.mean(shares))
 
     def _colour_errors(self, point: TrialPoint) -> Any:
-        """Errors of the longer segments.
+        """Return the errors of the longer segments.
 
         None where they are not in memory, or the run is lost there.
         """
@@ -209,7 +217,7 @@ class FreeRunObjective:
         return self.errors(point.c, point.w, self.colour.start, self.colour)
 
     def _shares(self, point: TrialPoint, segments: Any, states: Any) -> list[float]:
-        """Independent shares of each output's errors, from sums.
+        """Return the independent shares of each output's errors, from sums.
 
         Of the own segments where a longer run is lost.
         """
@@ -224,7 +232,7 @@ class FreeRunObjective:
         return [1.0] * len(self.weight)
 
     def squares(self, point: TrialPoint) -> Matrix | None:
-        """Σ e eᵀ (ny, ny) of a trial's errors, in the outputs' units.
+        """Return Σ e eᵀ (ny, ny) of a trial's errors, in the outputs' units.
 
         None where they are too large to square.
         """
@@ -247,7 +255,7 @@ class FreeRunObjective:
 def errors_of(
     dynamics: Dynamics, numbers: Numbers, states: Any, segments: Segments
 ) -> Float[np.ndarray, "k T ny m"]:
-    """Errors of every segment from its state, in the outputs' units.
+    """Return the errors of every segment from its state, in the outputs' units.
 
     0 where they are not scored.
     """

@@ -1,4 +1,4 @@
-"""Training one step ahead: the learner scaled, rows laid out for an engine, one run of a solver (F1, F5)."""
+"""Training one step ahead: the learner scaled, rows prepared, one run of a solver (F1, F5)."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ docs/design.md.
 
 @dataclass(frozen=True, eq=False)
 class OneStepTask(TrainingRows):
-    """Training on rows that are laid out: what physics alone does on them, and where states of runs are kept."""
+    """Training on prepared rows, with physics alone on them and checkpoints of runs."""
 
     criterion: Criterion = Prediction()  # noqa: RUF009  (frozen)
     physics_loss: float | None = None
@@ -63,7 +63,10 @@ class OneStepTask(TrainingRows):
         unit: Vector | None = None,
         engine: Engine = InMemory(),  # noqa: B008  (frozen)
     ) -> OneStepTask:
-        """Scale features to [-1, 1] and the learner's output to the baseline's residual, unless both are given."""
+        """Scale the features to [-1, 1] and the learner's output to the residual of the physics.
+
+        Unless both scalings are given.
+        """
         bound = (
             None
             if learner is None
@@ -98,12 +101,12 @@ class OneStepTask(TrainingRows):
 
     @property
     def seconds(self) -> float:
-        """Return what physics alone took."""
+        """Seconds that physics alone took."""
         return 0.0
 
     @property
     def warnings(self) -> tuple[Warning, ...]:
-        """None: least squares has nothing to tell here."""
+        """No warnings: least squares has none."""
         return ()
 
     @property
@@ -112,7 +115,7 @@ class OneStepTask(TrainingRows):
 
     @property
     def alone(self) -> OneStepTask:
-        """The same rows without a learner."""
+        """The task without a learner."""
         problem, scaling = (
             replace(self.problem, features=Features(())),
             Scaling(np.zeros(0), np.ones(0)),
@@ -122,11 +125,11 @@ class OneStepTask(TrainingRows):
         )
 
     def physics_alone(self) -> tuple[OneStepTask, TrainedLearner]:
-        """Return the rows without a learner, and least squares on them."""
+        """Return the task without a learner, and least squares on its rows."""
         return self.alone, self.alone.physics_learned()
 
     def on(self, record: Record) -> OneStepTask:
-        """The same problem on another record."""
+        """Return the task on another record."""
         return OneStepTask.of(
             self.problem.on(record), self.bound and self.bound.learner, engine=self.engine
         )
@@ -134,7 +137,7 @@ class OneStepTask(TrainingRows):
     def prepared(
         self, solver: Any, structure: Structure, progress: RunProgress = quiet
     ) -> OneStepTask:
-        """The same with the loss of physics alone under the structure's rows and bounds.
+        """Return the task with the loss of physics alone under the structure's rows and bounds.
 
         It is solved (F1).
         """
@@ -148,7 +151,7 @@ class OneStepTask(TrainingRows):
         return replace(self, physics_loss=loss, few=few and few.prepared(solver, structure))
 
     def _few(self) -> OneStepTask | None:
-        """On a witness of the rows, the weights in the same units.
+        """Return the end of training on a subsample of the rows, weights in the same units.
 
         None where it lacks what the physics needs.
         """
@@ -219,21 +222,23 @@ class OneStepTask(TrainingRows):
         regularization: str | float,
         progress: RunProgress,
     ) -> compiled.TrainingRun:
-        """Return one run with θ inside its bounds, which an active set meets (they reach into training, F1).
+        """Return one run with θ inside its bounds, by an active set.
 
-        Entries at a bound are known terms: they are held there from the first step on, as if they
-        were `fixed`. Where others stand there at the end, the run is made again.
+        Bounds reach into training (F1).
+
+        Entries at a bound are known terms: they are fixed there from the first step on, as if they
+        were `fixed`. Where others are at a bound at the end, the run is made again.
         """
 
-        def tell(iteration: int, loss: float) -> None:
+        def report(iteration: int, loss: float) -> None:
             progress(iteration, self.mean_square(loss))
 
         runs: list[compiled.TrainingRun] = []
 
         def share(fixed: Fixed) -> Vector | None:
-            """QᵀF at the end of a run with these held; None where nothing follows from it."""
+            """Return QᵀF at the end of a run with these fixed; None where the run failed."""
             runs.append(
-                self._run_held(solver, w, structure, elimination, fixed, regularization, tell)
+                self._run_held(solver, w, structure, elimination, fixed, regularization, report)
             )
             reach = elimination.bounded and not elimination.decoupled
             return self.coordinates(runs[-1]) if reach and runs[-1].ending.usable else None
@@ -244,7 +249,7 @@ class OneStepTask(TrainingRows):
         return runs[-1]._replace(seconds=sum(run.seconds for run in runs), held=held, fixed=known)
 
     def coordinates(self, run: compiled.TrainingRun) -> Vector:
-        """QᵀF (nθ,) in whitened outputs, at the end of a run."""
+        """Return QᵀF (nθ,) in whitened outputs, at the end of a run."""
         return np.asarray(run.normal.overlap.values) * self.rms
 
     def _run_held(
@@ -282,7 +287,7 @@ class OneStepTask(TrainingRows):
         else:
             joint = PaperCriterion(self.bound, structure.projects)
             end = solver.minimise(joint, w, self.rows, physics, progress=progress)
-        normal = linearise(OneStep(self.bound), end.w, (self.rows, hold), self._nothing)
+        normal = linearise(OneStep(self.bound), end.w, (self.rows, hold), self._no_overlap)
         coordinates = np.asarray(physics.start + physics.basis @ end.v) * self.rms
         coefficients = (
             None if structure.projects else self.problem.projection.from_coordinates(coordinates)
@@ -295,7 +300,7 @@ class OneStepTask(TrainingRows):
     def _joint_least_squares(
         self, solver: Any, w: Any, physics: Physics, progress: RunProgress
     ) -> GradientRun:
-        """Levenberg-Marquardt over θ, from θ⁰, and the weights together."""
+        """Run Levenberg-Marquardt over θ, from θ⁰, and the weights together."""
         assert self.bound is not None
         nt = len(physics.outputs)
         nothing = Overlap(np.zeros((nt, nt + self.bound.size)), np.zeros(nt))
@@ -310,23 +315,23 @@ class OneStepTask(TrainingRows):
     def _least_squares(
         self, solver: Any, w: Any, hold: Hold, options: dict[str, Any]
     ) -> compiled.TrainingRun:
-        """Levenberg-Marquardt: compiled whole where the rows are in memory, otherwise driven by the host."""
+        """Run Levenberg-Marquardt, compiled whole for rows in memory, else driven by the host."""
         assert self.bound is not None
         samples = self.problem.samples - len(self.problem.baseline.names)
         if self.engine.resident:
             criterion, arguments = OneStep(self.bound), (self.rows, hold)
             return solver.minimise(
-                criterion, w, arguments, self._nothing, samples=samples, **options
+                criterion, w, arguments, self._no_overlap, samples=samples, **options
             )
         summed = SummedOneStep(self.engine, self.bound, self.rows, hold)
-        return solver.drive(summed, jnp.asarray(w), self._nothing, samples=samples, **options)
+        return solver.drive(summed, jnp.asarray(w), self._no_overlap, samples=samples, **options)
 
     def loss(self, run: compiled.TrainingRun) -> float:
-        """Mean of squared errors of a run, with each output in its standard deviation."""
+        """Return the mean of squared errors of a run, each output in its standard deviation."""
         return self.mean_square(run.normal.loss)
 
     def learned(self, run: compiled.TrainingRun) -> TrainedLearner:
-        """Return what a run left."""
+        """Return the learner as a run left it."""
         return TrainedLearner(
             bound=self.bound,
             weights=np.asarray(run.w),
@@ -345,7 +350,7 @@ class OneStepTask(TrainingRows):
         )
 
     def physics_learned(self) -> TrainedLearner:
-        """Physics alone, which is solved and not trained."""
+        """Return the result of physics alone, which is solved and not trained."""
         change = self.problem.projection.to_coordinates
         none = np.zeros(0)
         return TrainedLearner(
@@ -358,7 +363,9 @@ class OneStepTask(TrainingRows):
         )
 
     def median(self, members: list[TrainedLearner], best: int) -> TrainedLearner:
-        """Return the median of several: `g = φ c̄ + median_i(f_i + φ (c_i − c̄))`, each with its own c_i (F2).
+        """Return the median `g = φ c̄ + median_i(f_i + φ (c_i − c̄))` of several runs (F2).
+
+        Each run has its own c_i.
 
         The median is one function of the regressor again, and split like any other. It lacks some
         statistics: those are taken from the `best` member.
@@ -383,7 +390,7 @@ class OneStepTask(TrainingRows):
         )
 
     def gram(self, run: compiled.TrainingRun) -> Matrix:
-        """Gram matrix of `[Φ J]` in whitened outputs, from the run's last pass.
+        """Return the Gram matrix of `[Φ J]` in whitened outputs, from the run's last pass.
 
         Of a held run without the hold.
         """

@@ -1,4 +1,4 @@
-"""The paper's own criterion: of θ and the learner's weights together, as a value and as normal equations."""
+"""The paper's own criterion over θ and weights together: value and normal equations."""
 
 from __future__ import annotations
 
@@ -17,7 +17,10 @@ from orthaug.physics.problem import Problem
 
 
 class Physics(NamedTuple):
-    """θ as an unknown beside w: its coordinates `q = start + basis v` in whitened rows, and the structure's rows."""
+    """θ as an unknown beside w, by its coordinates, with the structure's rows.
+
+    The coordinates are `q = start + basis v` in whitened rows.
+    """
 
     start: Float[Array, "nt"]
     basis: Float[Array, "nt nt"]
@@ -40,11 +43,11 @@ class Physics(NamedTuple):
         *,
         solved: bool,
     ) -> Physics:
-        """θ that starts at θ⁰. A free entry has a column, scaled to the size of a row.
+        """Return θ that starts at θ⁰; a free entry has a column, scaled to the size of a row.
 
         A fixed one has none.
 
-        Where θ is `solved` (F1), it stands at its end and has no columns: the learner's path does
+        Where θ is `solved` (F1), it is at its end and has no columns: the learner's path does
         not depend on it.
         """
         to_rows = elimination.to_coordinates / rms
@@ -100,7 +103,7 @@ class PaperCriterion:
     def _sums(
         self, w: Float[Array, "nw"], chunk: Chunk
     ) -> tuple[Float[Array, ""], Float[Array, "nt"]]:
-        """‖P⊥Y − F‖² and QᵀF of one chunk."""
+        """Return ‖P⊥Y − F‖² and QᵀF of one chunk."""
         row_values = jax.vmap(self.bound.values, in_axes=(None, -1), out_axes=-1)
         values = jnp.sum(chunk.gain * row_values(w, chunk.z), axis=1)
         return jnp.sum((chunk.e - values) ** 2), jnp.einsum("ytm,ym->t", chunk.q, values)
@@ -108,7 +111,10 @@ class PaperCriterion:
 
 @dataclass(frozen=True)
 class JointOneStep:
-    """One-step prediction error `‖Y − Φθ − F‖²` over p = (v, w), θ's unknowns and the weights, as normal equations."""
+    """Normal equations of the one-step error `‖Y − Φθ − F‖²` over p = (v, w).
+
+    v are θ's unknowns, w the weights.
+    """
 
     bound: Bound
 

@@ -1,4 +1,4 @@
-"""θ followed online: recursive least squares with the learner fixed, intervals, and an alarm.
+"""Recursive estimation of θ with the learner fixed: intervals and an alarm.
 
 With f and θ_aux fixed, the fitted model is linear in θ: `y − known − (f − φθ_aux) = φθ + e`. Over
 the training rows its least-squares solution is the fit's θ, whatever the structure's split: `Φ⁺(Y −
@@ -57,7 +57,7 @@ _LEAST_FACTOR = 0.3  # of forgetting: a memory of one row
 
 
 class Alarm(NamedTuple):
-    """The residual has left its band at `row` of all rows handed in, `time` [s] after the first."""
+    """An alarm: residuals left their band at `row` of all rows, `time` [s] after the first."""
 
     row: int
     time: float
@@ -67,17 +67,21 @@ class Alarm(NamedTuple):
 
 
 class Recursive:
-    """A fitted model whose θ follows new rows, the learner fixed.
+    """A fitted model whose θ is updated by new rows, the learner fixed.
 
-    Args: fit: of `estimate`, one step ahead, or a saved model. training: the record that a saved
-        model was trained on; an `Estimate` knows it. forgetting: λ in (0, 1], the weight of a row
-        against the next one; 1 (default) forgets nothing. memory: the same in seconds, `λ = exp(−Ts
-        / memory)`. start: "fit" begins with the training rows, at most as many as one memory holds;
-        "empty" without them. quiet: rows between false alarms, at least on average, while nothing
-        changes.
+    Args:
+        fit: of `estimate`, one step ahead, or a saved model.
+        training: the record that a saved model was trained on; an `Estimate` knows it.
+        forgetting: λ in (0, 1], the weight of a row against the next one; 1 (default) forgets
+            nothing.
+        memory: the same in seconds, `λ = exp(−Ts / memory)`.
+        start: "fit" begins with the training rows, at most as many as one memory holds; "empty"
+            without them.
+        quiet: rows between false alarms, at least on average, while nothing changes.
 
-    Raises: InputError: a motion, a fit of the free run, a θ that is not the least squares of its
-        rows (a bound, a penalty).
+    Raises:
+        InputError: a motion, a fit of the free run, a θ that is not the least squares of its rows
+            (a bound, a penalty).
 
     Examples:
         >>> import numpy as np
@@ -86,7 +90,8 @@ class Recursive:
         >>> u = np.sin(np.arange(300.0) ** 1.1)
         >>> noise = 0.1 * np.cos(37 * np.arange(300.0) ** 1.3)
         >>> record = Record.from_arrays(u, 2 * u + noise)
-        >>> online = Recursive(estimate(record, Baseline.from_terms([Term("gain", "u[k]")]), learner=None), memory=50)
+        >>> fit = estimate(record, Baseline.from_terms([Term("gain", "u[k]")]), learner=None)
+        >>> online = Recursive(fit, memory=50)
         >>> alarms = online.update(u=u[:200], y=2.4 * u[:200] + noise[:200])
         >>> f"{online.theta[0]:.1f}"
         '2.4'
@@ -131,7 +136,7 @@ class Recursive:
     def load(
         cls, folder: str | Path, *, baseline: Baseline | None = None, learner: Learner | None = None
     ) -> Recursive:
-        """Go on from where `save` was called.
+        """Return the estimate that `save` wrote, to go on from there.
 
         Args:
             baseline, learner: the Python callables again, where the model had such.
@@ -175,20 +180,21 @@ class Recursive:
     def update(
         self, record: Record | None = None, *, u: Any = None, y: Any = None, gap: bool = False
     ) -> Sequence[Alarm]:
-        """Follow new rows, one or many; they follow on the last ones.
+        """Update θ by new rows, one or many, that follow on the last ones.
 
-        Args: record: with the model's channels. Every experiment after the first begins after a
-            gap. u, y: instead of a record inputs and outputs, one row or many; NaN is a missing
-            sample. Rows that read one
-                are left out.
+        Args:
+            record: with the model's channels. Every experiment after the first begins after a gap.
+            u, y: instead of a record inputs and outputs, one row or many; NaN is a missing sample.
+                Rows that read one are left out.
             gap: whether these rows do not follow on the last ones: then the first lags are history
                 only.
 
         Returns:
             The alarms that these rows raised.
 
-        Raises: InputError: other channels or sampling time, values that are infinite; nothing is
-            changed then.
+        Raises:
+            InputError: other channels or sampling time, values that are infinite; nothing is
+                changed then.
         """
         check_type(gap, bool, "gap", "true or false")
         begins: list[bool] = []
@@ -200,18 +206,18 @@ class Recursive:
                 self._lagging.nothing if begins[-1] else tail, rows
             )
             prepared.append(self._whitened(x, complete, rows))
-        told = []
+        alarms = []
         for begun, (used, whitened, count) in zip(begins, prepared, strict=True):
             if begun:
                 self._watch.gap()
-            told += self._follow(used, whitened)
+            alarms += self._follow(used, whitened)
             self.rows += count
         self._tail = tail
-        self.alarms = (*self.alarms, *told)
-        return told
+        self.alarms = (*self.alarms, *alarms)
+        return alarms
 
     def _parts(self, record: Record | None, u: Any, y: Any) -> list[Matrix]:
-        """Rows (n, ny + nu) without gaps among them."""
+        """Yield rows (n, ny + nu) without gaps among them."""
         model = self._fitted
         if record is None:
             return [joined_rows(u, y, len(model.inputs), len(model.outputs))]
@@ -223,7 +229,7 @@ class Recursive:
     def _whitened(
         self, x: Matrix, complete: Any, rows: Matrix
     ) -> tuple[Any, WhitenedRows | None, int]:
-        """Which rows are used, and what θ is least squares of in them."""
+        """Return the usable rows and their least-squares problem in θ."""
         used = np.flatnonzero(complete)
         if not len(used):
             return used, None, len(rows)
@@ -232,9 +238,9 @@ class Recursive:
 
     def _follow(self, used: Any, whitened: WhitenedRows | None) -> list[Alarm]:
         recursion, watch, kept_rows = self._recursion, self._watch, self._rows_kept
-        told: list[Alarm] = []
+        alarms: list[Alarm] = []
         if whitened is None:
-            return told
+            return alarms
         for i, (k, phi, target, inside) in enumerate(zip(used, *whitened, strict=True)):
             if i and k != used[i - 1] + 1:
                 watch.gap()
@@ -244,14 +250,17 @@ class Recursive:
                 watch.skip()
                 self.outside += 1
             elif watch.step(error, spread):
-                told.append(Alarm(row, row * self._fitted.sampling_time))
+                alarms.append(Alarm(row, row * self._fitted.sampling_time))
             if row % kept_rows.stride == 0:
                 kept_rows.add(kept_rows.line(row, watch.level, self._freedom, error, recursion))
-        return told
+        return alarms
 
     @property
     def _freedom(self) -> float:
-        """Degrees of freedom of s²: effective rows less what parameters and, as long as its rows count, learner use."""
+        """Degrees of freedom of s²: effective rows less those used by parameters and learner.
+
+        The learner's count as long as its training rows do.
+        """
         recursion = self._recursion
         used = self._used * recursion.oldest
         return max(
@@ -267,14 +276,14 @@ class Recursive:
     def covariance(self) -> Matrix | None:
         """Cov θ now (nθ, nθ): of noise, the learner fixed.
 
-        None where the fit has none or the rows do not tell θ.
+        None where the fit has none or the rows do not determine θ.
         """
         recursion = self._recursion
         if self._inflation is None or not recursion.determined:
             return None
-        level, told = np.array([recursion.level]), np.array([True])
+        level, determined = np.array([recursion.level]), np.array([True])
         return covariances(
-            recursion.factor_now[None], recursion.squared[None], level, told, self._inflation
+            recursion.factor_now[None], recursion.squared[None], level, determined, self._inflation
         )[0]
 
     @property
@@ -291,7 +300,7 @@ class Recursive:
 
     @property
     def alarmed(self) -> bool:
-        """Return whether the residual is out of its band now."""
+        """True while the residual is out of its band."""
         return self.alarm_level > 1
 
     @property
@@ -311,7 +320,7 @@ class Recursive:
 
     @property
     def effective_rows(self) -> float:
-        """As many rows of equal weight say as much as the weighted ones."""
+        """The number of equally weighted rows with the same information."""
         return self._recursion.effective_rows
 
     @property
@@ -332,7 +341,9 @@ class Recursive:
 
     @property
     def history(self) -> pd.DataFrame:
-        """A row per row that was used: time [s], residual of each output, each θ with its interval, alarm level.
+        """A row per row that was used.
+
+        Time [s], residual of each output, each θ with its interval, alarm level.
 
         `alarm` is the largest sum over its limit: above 1 the residual is out of its band. Of more
         than 10 000 rows every second one is kept, every fourth, and so on.
@@ -355,14 +366,14 @@ class Recursive:
         return pd.DataFrame(columns, index=pd.Index(rows[:, 0].astype(int), name="row"))
 
     def physical(self, physics: PhysicsMap) -> PhysicalEstimate:
-        """Return the physical parameters that θ is made of now, with intervals by the delta method."""
+        """Return the physical parameters of the present θ, with intervals (delta method)."""
         order = self._in_order_of(physics)
         covariance = self.covariance
         covariance = None if covariance is None else covariance[np.ix_(order, order)]
         return solve(physics, self.theta[order], covariance, freedom=self._freedom)
 
     def physical_history(self, physics: PhysicsMap, points: int = 100) -> pd.DataFrame:
-        """Return the physical parameters at some instants of `history`, the last one among them.
+        """Return the physical parameters at some instants of `history` and at the last.
 
         Args:
             points: how many, at most.
@@ -410,18 +421,19 @@ class Recursive:
         memory = (
             "everything" if self.forgetting == 1 else f"{-step / math.log(self.forgetting):.4g} s"
         )
+        alarms = "; ".join(map(str, self.alarms)) or "none"
         lines = [
             f"rows        {self.rows}, {self.rows * step:g} s",
             f"memory      {memory} (forgetting {self.forgetting:.8g}), worth "
             f"{self.effective_rows:.0f} rows",
-            "alarms      "
-            f"{'; '.join(map(str, self.alarms)) or 'none'}{' (it stands)' if self.alarmed else ''}",
+            f"alarms      {alarms}{' (still raised)' if self.alarmed else ''}",
         ]
         if self.outside:
             lines.append(f"outside     {outside_text(self.outside, self.rows)}")
         if self.std is None:
             lines.append(
-                "intervals   none: the fit has no standard errors, or the rows do not tell θ yet"
+                "intervals   none: the fit has no standard errors, or the rows do not determine "
+                "θ yet"
             )
         rows = parameter_lines(
             self._fitted.form.baseline.parameters, self.theta, self.std, self.interval
@@ -430,16 +442,16 @@ class Recursive:
 
 
 def outside_text(outside: int, rows: int) -> str:
-    """Return how many rows the learner extrapolates on."""
+    """Return a sentence on the number of rows on which the learner extrapolates."""
     share = f"{percent(outside / rows)} of the rows"
     return (
-        f"the learner's inputs leave those of training on {share}: it extrapolates there, "
-        "which raises no alarm"
+        f"the learner's inputs leave their training range on {share}: it extrapolates there, "
+        "without an alarm"
     )
 
 
 def forgetting_factor(forgetting: Any, memory: Any, sampling_time: float) -> float:
-    """λ of either.
+    """Return λ from either a factor or a memory.
 
     Raises:
         InputError: both given, or values that are none.

@@ -1,4 +1,4 @@
-"""Rows of a fitted lagged model, learner fixed: new ones across calls, and those of training to start from."""
+"""Rows of a fitted lagged model with its learner fixed: new ones, and those of training."""
 
 from __future__ import annotations
 
@@ -31,8 +31,11 @@ _RIM = 1e-9  # the largest of training is no extrapolation
 
 
 @partial(jax.jit, static_argnames="form")
-def _evaluated(form: Lagged, numbers: Numbers, x: Float[Array, "m nx"]) -> Float[Array, "m ny ntp"]:
-    """`[φ, known + f − φθ_aux]` of every row, and the largest of its scaled features: 1 at the rim of training."""
+def _evaluate(form: Lagged, numbers: Numbers, x: Float[Array, "m nx"]) -> Float[Array, "m ny ntp"]:
+    """Return `[φ, known + f − φθ_aux]` of every row, and the largest of its scaled features.
+
+    That is 1 at the limit of the training data.
+    """
 
     def one(row: Any) -> Any:
         phi = form.baseline.phi(row, form.layout, form.outputs, jnp)
@@ -48,7 +51,9 @@ def _evaluated(form: Lagged, numbers: Numbers, x: Float[Array, "m nx"]) -> Float
 
 
 class WhitenedRows(NamedTuple):
-    """φ (n, ny, nθ) and `y − known − (f − φθ_aux)` (n, ny) in whitened outputs: what θ is least squares of.
+    """φ (n, ny, nθ) and `y − known − (f − φθ_aux)` (n, ny) in whitened outputs.
+
+    θ is the least squares of these.
 
     `inside` (n,) is where the learner's features lie within those of training.
     """
@@ -61,7 +66,7 @@ class WhitenedRows(NamedTuple):
 def whitened_rows(
     model: Model, x: Matrix, y: Matrix, numbers: Numbers | None = None
 ) -> WhitenedRows:
-    """Rows of measured regressors x (n, nx) and outputs y (n, ny).
+    """Return rows of measured regressors x (n, nx) and outputs y (n, ny), whitened.
 
     Args:
         numbers: the model's, where JAX has them already: a call with few rows is faster.
@@ -78,7 +83,7 @@ def whitened_rows(
             if len(rows) < size
             else rows
         )
-        pieces.append(np.asarray(_evaluated(model.form, numbers, padded))[: len(rows)])
+        pieces.append(np.asarray(_evaluate(model.form, numbers, padded))[: len(rows)])
     values = np.concatenate(pieces) if len(pieces) > 1 else pieces[0]
     bad = ~np.isfinite(values).all(axis=(1, 2))
     if bad.any():
@@ -87,8 +92,8 @@ def whitened_rows(
             f"{lag} = {value:.6g}" for lag, value in zip(model.form.layout, row, strict=True)
         )
         raise InputError(
-            f"physics or learner has no finite value at {at}; give NaN for such a row, or mend "
-            "the data."
+            f"physics or learner has no finite value at {at}; give NaN for such a row, or "
+            "correct the data."
         )
     inside = np.asarray(values[:, 0, -1] <= 1 + _RIM)
     return WhitenedRows(
@@ -98,7 +103,7 @@ def whitened_rows(
 
 @dataclass(frozen=True, eq=False)
 class RegressorStream:
-    """Regressors of rows that are handed in a few at a time, from the rows before them."""
+    """Regressors of rows that arrive a few at a time, from the rows before them."""
 
     model: Model
 
@@ -121,7 +126,7 @@ class RegressorStream:
     def regressors(
         self, tail: Matrix, rows: Matrix
     ) -> tuple[Matrix, Bool[np.ndarray, "n"], Matrix]:
-        """x (n, nx) of new rows (n, ny + nu), which of them are complete, and the tail after them."""
+        """Return x (n, nx) of new rows (n, ny + nu), which are complete, and the new tail."""
         whole = np.concatenate([tail, rows])
         lag, column = self._read
         x = whole[(len(tail) + np.arange(len(rows)))[:, None] - lag, column]
@@ -156,7 +161,7 @@ def as_rows(values: Any, channels: int, name: str) -> Matrix:
 
 
 def joined_rows(u: Any, y: Any, inputs: int, outputs: int) -> Matrix:
-    """Return outputs and inputs side by side (n, ny + nu), as they are handed in.
+    """Return outputs and inputs side by side (n, ny + nu), as they were given.
 
     Raises:
         InputError: one of them missing, or of another length.
@@ -177,11 +182,11 @@ def joined_rows(u: Any, y: Any, inputs: int, outputs: int) -> Matrix:
 
 
 _SOLVED = 1e-6  # of the residual's norm: how far Φθ may be from that of least squares
-_LENGTHS, _ROWS_PER_LAG = 3, 20  # of the correlation of errors; of what tells it
+_LENGTHS, _ROWS_PER_LAG = 3, 20  # of the correlation of errors; of rows that determine it
 _SMALLEST = 1e-10  # of an output's deviation: a residual is at least rounding
 MOTION = (
-    "equations of motion cannot be followed by least squares: their outputs are not linear in "
-    "the parameters. Write the physics as terms of lagged signals and fit one step ahead, or "
+    "recursive least squares cannot estimate equations of motion: their outputs are not linear "
+    "in the parameters. Write the physics as terms of lagged signals and fit one step ahead, or "
     "fit the motion again on new data."
 )
 
@@ -219,25 +224,25 @@ def trained(fit: Any, training: Record | None) -> TrainingRowsModel:
     if isinstance(fit, Estimate):
         if fit.criterion.free_run is not None:
             raise InputError(
-                "the fit is one of the free run, and recursive least squares looks one step "
-                "ahead: its θ would leave this one. Fit with criterion = Prediction()."
+                "the fit minimises the free run's error, but recursive least squares that of "
+                "one step ahead, so θ would move away. Fit with criterion = Prediction()."
             )
         if fit.at_bound:
             names = ", ".join(fit.at_bound)
             raise InputError(
-                f"{names} stand at a bound, which new rows would leave; fit without the bound."
+                f"{names} at a bound: new rows would move them across it; fit without the bound."
             )
         model, covariance, record = fit.model, fit.covariance, fit.problem.record
     else:
         model = fit
         if training is None:
             raise InputError(
-                "a saved model does not hold its training data; give them, Recursive(model, "
+                "a saved model does not contain its training data; give them, Recursive(model, "
                 "training=…)."
             )
         record = model.fitting(training, need_outputs=True)
     if not len(model.theta):
-        raise InputError("the physics has no parameter to follow.")
+        raise InputError("the physics has no parameter to estimate.")
     rows = stack_rows(record, model.form.layout)
     phi, target, _ = whitened_rows(model, rows.x, rows.y)
     lengths = tuple(len(experiment) - rows.start for experiment in record.experiments)
@@ -254,7 +259,10 @@ def trained(fit: Any, training: Record | None) -> TrainingRowsModel:
 
 
 def _check_solved(began: TrainingRowsModel) -> None:
-    """Raise InputError where θ is not the least squares of the rows: then new rows would not go on from it."""
+    """Raise InputError where θ is not the least squares of the rows.
+
+    New rows could not continue from it.
+    """
     count, ny, nt = began.phi.shape
     stacked = began.phi.reshape(-1, nt)
     left = (began.target - began.phi @ began.model.theta).ravel()
@@ -262,15 +270,18 @@ def _check_solved(began: TrainingRowsModel) -> None:
     rounding = 1e-10 * np.linalg.norm(began.target)
     if np.linalg.norm(basis.T @ left) > _SOLVED * np.linalg.norm(left) + rounding:
         raise InputError(
-            f"θ of the {began.model.structure} model is not the least-squares estimate of "
-            f"these {count} rows beside its learner: they are not those of its training, or a "
-            "penalty, a bound, the free run or the paper's pipeline has moved it. Give the "
+            f"θ of the {began.model.structure} model is not the least-squares estimate of these "
+            f"{count} rows with its learner. Either they are not its training rows, or a "
+            "penalty, a bound, the free run or the paper's pipeline changed θ. Give the "
             "training data, or fit with the orthogonal structure one step ahead."
         )
 
 
 def _saved_covariance(began: TrainingRowsModel) -> Matrix | None:
-    """Cov θ of a saved model under its training measure: `K Cov(c, w) Kᵀ`, K = [I, ∂θ_aux/∂w] from the Gram matrix."""
+    """Return Cov θ of a saved model under its training measure.
+
+    `K Cov(c, w) Kᵀ`, K = [I, ∂θ_aux/∂w] from the Gram matrix.
+    """
     model, nt = began.model, len(began.model.theta)
     joint = model.statistics.joint(nt)
     if joint is None or model.structure != "orthogonal":
@@ -287,14 +298,18 @@ def _saved_covariance(began: TrainingRowsModel) -> Matrix | None:
 def begin(
     began: TrainingRowsModel, forgetting: float, quiet: float, *, empty: bool
 ) -> tuple[Recursion, Reference, Matrix | None]:
-    """Return the state before new rows, what residuals were like, and by what intervals are wider than `s²(ΦᵀΦ)⁻¹`."""
+    """Return the state before new rows, reference residuals, and the inflation.
+
+    The inflation is the factor by which intervals are wider than `s²(ΦᵀΦ)⁻¹`.
+    """
     phi, target, model = began.phi, began.target, began.model
     count, ny, nt = phi.shape
     residual = target - phi @ model.theta
     freedom = count * ny - nt - began.used
     if freedom < 1:
         raise InputError(
-            f"{count} training rows leave no degrees of freedom to tell noise from; use more data."
+            f"{count} training rows leave no degrees of freedom to estimate the noise; use more "
+            "data."
         )
     noise = residual.T @ residual * (ny / freedom)
     least = (_SMALLEST * model.deviation * np.diag(model.weight)) ** 2
@@ -325,7 +340,7 @@ def begin(
 
 
 def _sandwich(r: Matrix, middle: Matrix) -> Matrix:
-    """`(RᵀR)⁻¹ Ω (RᵀR)⁻¹`."""
+    """Return `(RᵀR)⁻¹ Ω (RᵀR)⁻¹`."""
     unit = np.linalg.norm(r, axis=0)
     inverse = np.linalg.inv(r / unit) / unit[:, None]
     return inverse @ (inverse.T @ middle @ inverse) @ inverse.T
@@ -337,7 +352,7 @@ def _root(matrix: Matrix) -> Matrix:
 
 
 def _memory(stretches: list[Matrix], white: Matrix) -> int:
-    """Return how many lags the colour of the errors takes: three times as many as their correlation lasts."""
+    """Return three times the correlation length of the errors, in lags."""
     longest, rows = max(map(len, stretches)), sum(map(len, stretches))
     padded = [
         np.pad(stretch @ white.T, ((0, longest - len(stretch)), (0, 0))) for stretch in stretches

@@ -1,4 +1,4 @@
-"""Recursive estimates on disk: the model in a folder below, `recursive.json` and `recursive.safetensors`."""
+"""Storage of recursive estimates: the model in a folder, JSON and safetensors beside it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _REFERENCE = ("white", "colour", "deviation", "variance", "limit")
 
 
 class RecursiveState(NamedTuple):
-    """All that a recursive estimate goes on from."""
+    """The complete state of a recursive estimate."""
 
     model: Model
     recursion: Recursion
@@ -78,7 +78,7 @@ def _arrays(kept: RecursiveState) -> dict[str, Any]:
 
 
 def load(folder: Any, baseline: Baseline | None, learner: Learner | None) -> RecursiveState:
-    """Return what `save` wrote.
+    """Return the estimate that `save` wrote.
 
     Raises:
         InputError: no saved state there; a file that is cut, altered, or from a newer version.
@@ -102,7 +102,7 @@ def load(folder: Any, baseline: Baseline | None, learner: Learner | None) -> Rec
     model = storage.load(folder / _MODEL, baseline=baseline, learner=learner)
     if not isinstance(model, Model) or declared.get("model") != storage.digest(model):
         raise InputError(
-            f"{folder}: its model is not the one that was followed; copy the folder again."
+            f"{folder}: its model is not that of the recursive estimate; copy the folder again."
         )
     try:
         return _rebuilt(model, arrays)

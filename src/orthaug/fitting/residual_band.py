@@ -1,4 +1,6 @@
-"""An alarm when residuals leave their band: cumulative sums of the likelihood of a doubled variance, at several scales.
+"""An alarm for residuals that leave their band, by cumulative sums at several scales.
+
+The sums are likelihood ratios of a doubled variance.
 
 Residuals are whitened by their covariance and colour over the training rows, then summed over
 blocks of 1, 4, 16 and 64 rows, since what a changed system adds is slow beside noise. Of each
@@ -37,7 +39,7 @@ _LEAST_EXPONENT = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """What residuals were like in training.
+    """The statistics of residuals in training.
 
     `white` (ny, ny) whitens whitened outputs' errors, `colour` (p, ny) are autoregressive
     coefficients of each, and `deviation` (ny,) is that of what they leave. Of each scale `variance`
@@ -53,17 +55,18 @@ class Reference:
 
     @classmethod
     def of(cls, stretches: Sequence[Matrix], white: Matrix, used: float, quiet: float) -> Reference:
-        """From training errors.
+        """Return the reference of training errors.
 
-        Args: stretches: whitened outputs' errors of each experiment, (N, ny). white: their
-            whitening. used: share of the rows' degrees of freedom that parameters and learner have
-            used up: by as much their
-                errors move new residuals, and slowly.
+        Args:
+            stretches: whitened outputs' errors of each experiment, (N, ny).
+            white: their whitening.
+            used: share of the rows' degrees of freedom that parameters and learner have used up: by
+                as much their errors move new residuals, and slowly.
             quiet: rows between false alarms.
         """
         given = [stretch @ white.T for stretch in stretches]
         colour = _colour(given)
-        left = [_filtered(stretch, colour) for stretch in given]
+        left = [_innovations(stretch, colour) for stretch in given]
         rows = np.concatenate(left)
         deviation = np.sqrt(np.mean(rows**2, axis=0))
         deviation = np.where(deviation > 0, deviation, 1.0)
@@ -104,19 +107,22 @@ class ResidualMonitor:
         self.gap()
 
     def gap(self) -> None:
-        """The next row does not follow on the last one."""
+        """Note that the next row does not follow on the last one."""
         ny = len(self.reference.white)
         self.past = np.full((len(self.reference.colour), ny), np.nan)
         self.sums = np.zeros((len(self.reference.scales), ny))
         self.counts = [0] * len(self.reference.scales)
 
     def skip(self) -> None:
-        """A row whose residual says nothing about the band."""
+        """Pass over a row whose residual carries no information about the band."""
         if len(self.past):
             self.past = np.concatenate([np.full_like(self.past[:1], np.nan), self.past[:-1]])
 
     def step(self, error: Vector, spread: float) -> bool:
-        """Add whitened outputs' errors (ny,) of a row, of `spread` times training's variance: is it a new alarm?"""
+        """Add a row's errors (ny,) in whitened outputs; return whether this is a new alarm.
+
+        Their variance is `spread` times that of training.
+        """
         reference = self.reference
         residual = reference.white @ error / math.sqrt(spread)
         expected = np.sum(reference.colour * self.past, axis=0)
@@ -153,7 +159,7 @@ def _steps(blocks: Matrix) -> Vector:
 
 
 def _exponent(steps: Vector) -> float:
-    """κ with a mean of `exp(κ x)` of one, at most 1 as for normal blocks."""
+    """Return κ with mean `exp(κ x)` = 1, at most 1 as for normal blocks."""
     low, high = _LEAST_EXPONENT, 1.0
     if not len(steps) or np.mean(np.exp(steps)) <= 1:
         return high
@@ -170,8 +176,8 @@ def _blocks(stretch: Matrix, scale: int) -> Matrix:
     return clipped.reshape(count, scale, -1).sum(axis=1) / math.sqrt(scale)
 
 
-def _filtered(stretch: Matrix, colour: Matrix) -> Matrix:
-    """Return what an autoregression leaves of residuals."""
+def _innovations(stretch: Matrix, colour: Matrix) -> Matrix:
+    """Return the innovations of residuals under an autoregression."""
     lags = len(colour)
     left = stretch[lags:].copy()
     for i, row in enumerate(colour, start=1):
@@ -180,7 +186,7 @@ def _filtered(stretch: Matrix, colour: Matrix) -> Matrix:
 
 
 def _colour(stretches: Sequence[Matrix]) -> Matrix:
-    """Autoregressive coefficients (p, ny).
+    """Return autoregressive coefficients (p, ny).
 
     The order p by Schwarz's criterion, the same for all outputs.
     """
@@ -194,10 +200,9 @@ def _colour(stretches: Sequence[Matrix]) -> Matrix:
     for order in range(most + 1):
         colour, cost = np.zeros((order, ny)), ny * order * math.log(rows)
         for i in range(ny):
-            past = np.concatenate(
-                [np.stack([s[_MOST_LAGS - j : len(s) - j, i] for j in range(1, order + 1)], 1) if order else
-                 np.zeros((len(s) - _MOST_LAGS, 0)) for s in long]
-            )  # fmt: skip
+            past = np.zeros((rows, order))
+            for j in range(1, order + 1):
+                past[:, j - 1] = np.concatenate([s[_MOST_LAGS - j : len(s) - j, i] for s in long])
             now = np.concatenate([s[_MOST_LAGS:, i] for s in long])
             colour[:, i] = np.linalg.lstsq(past, now, rcond=None)[0]
             cost += rows * math.log(max(float(np.mean((now - past @ colour[:, i]) ** 2)), 1e-300))

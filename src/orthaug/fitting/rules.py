@@ -1,4 +1,4 @@
-"""Rules between restarts, solver, criterion, regularization and data, and the refusal of what would cost too much."""
+"""Rules between restarts, solver, criterion, regularization and data; limits of cost."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _FEWEST = 50  # iterations that are counted on where more are allowed: most runs
 
 
 def checked_starts(restarts: int, seed: int, *, warm: bool, ensemble: bool) -> tuple[int, int]:
-    """Return how many starts and from which seed, as whole numbers; a `warm` start is one."""
+    """Return the number of starts and the first seed as whole numbers; `warm` means one start."""
     restarts, seed = check_count(restarts, "restarts"), check_count(seed, "seed", least=0)
     check_starts(1 if warm else restarts, seed, ensemble=ensemble)
     return restarts, seed
@@ -66,7 +66,7 @@ def check_scored(criterion: Criterion, longest: int) -> None:
 
 
 def check_solver(solver: Solver, criterion: Criterion, regularizations: Sequence[object]) -> None:
-    """Raise InputError where a solver without normal equations is asked for what needs them."""
+    """Raise InputError where a solver without normal equations cannot do what is asked."""
     if "ard" in regularizations and not criterion.one_step:
         raise KeyedError(
             "ard regularization is for training one step ahead; take evidence on the free run.",
@@ -105,7 +105,9 @@ def tried(
     motion: bool = False,
     learner: Learner | None = None,
 ) -> tuple[Any, ...]:
-    """Return the regularizations of every start: those given, or what "auto" stands for (docs/design.md has the table).
+    """Return the regularizations of every start: those given, or those of "auto".
+
+    docs/design.md has the table.
 
     Args:
         linear: whether the physics is linear in θ, which is then solved.
@@ -173,7 +175,7 @@ def check_motion_choices(
 
 
 def check_joint(solver: Any, ridge: float, evidence: bool, *, resident: bool) -> None:
-    """Raise InputError for what needs θ to be solved, or the solver to see normal equations, one step ahead."""
+    """Raise InputError for options that need θ solved, or normal equations, one step ahead."""
     if solver.gauss_newton and (ridge or not resident):  # evidence starts with a ridge
         what = "regularization" if ridge else "training on rows that are not in memory"
         raise InputError(
@@ -195,9 +197,9 @@ def check_cost(
     held: int | None = None,
     room: Room | None = None,
 ) -> None:
-    """Raise InputError where the normal equations do not fit into memory, or training takes longer than a month.
+    """Raise InputError for normal equations beyond memory, or more than a month of training.
 
-    Args: learner: None for physics alone, which costs nothing; one that cannot tell its `weights`
+    Args: learner: None for physics alone, which costs nothing; one that does not know its `weights`
         is let pass. rows: usable ones. features, outputs: of the learner. iterations: of a run at
         most. runs: restarts times regularizations. held: rows that are in memory; None for all.
         room: of the workers or devices that add up; None where that is this process.

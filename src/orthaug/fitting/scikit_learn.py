@@ -1,4 +1,4 @@
-"""What the estimators for scikit-learn share: its base classes, columns as channels, physics written in columns."""
+"""Common parts of the scikit-learn estimators: base classes, columns as channels."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ try:
 except ImportError:  # the names are there without the extra, and say so when they are used
 
     class MultiOutputMixin:
-        """Stands for the one of scikit-learn."""
+        """Replaces the class of scikit-learn where that is not installed."""
 
     class RegressorMixin:
-        """Stands for the one of scikit-learn."""
+        """Replaces the class of scikit-learn where that is not installed."""
 
     class BaseEstimator:
-        """Stands for the one of scikit-learn."""
+        """Replaces the class of scikit-learn where that is not installed."""
 
         def __new__(cls, *_: Any, **__: Any) -> Any:
-            """Refuse.
+            """Raise MissingDependency: scikit-learn is not installed.
 
             Raises:
                 InputError: scikit-learn is not there.
@@ -53,7 +53,7 @@ _TAKEN = ("time",)  # no name of an output
 
 
 class Augmented(MultiOutputMixin, RegressorMixin, BaseEstimator):
-    """Physics with a learned correction, in the manners of scikit-learn."""
+    """Physics with a learned correction, as an estimator of scikit-learn."""
 
     physics: Any
     learner: Any
@@ -125,10 +125,11 @@ class Augmented(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return None if noise is None else np.sqrt(np.diag(noise))
 
     def set_params(self, **params: Any) -> Any:
-        """As of scikit-learn.
+        """Set parameters, as scikit-learn does.
 
-        Raises: InputError (a ValueError): a field of a declaration, which is exchanged whole: no
-            `learner__hidden`.
+        Raises:
+            InputError (a ValueError): a field of a declaration, which is exchanged whole: no
+                `learner__hidden`.
         """
         for name in params:
             own, field, rest = name.partition("__")
@@ -136,13 +137,13 @@ class Augmented(MultiOutputMixin, RegressorMixin, BaseEstimator):
             if field and is_dataclass(value) and not isinstance(value, type):
                 kind = type(value).__name__
                 raise InputError(
-                    f"`{name}`: {kind} is a declaration that is exchanged whole; give `{own}` itself, in a grid "
-                    f'{{"{own}": [oa.{kind}({rest}=…), …]}}.'
+                    f"`{name}`: {kind} is one object, without parameters of its own; set "
+                    f'`{own}` itself, in a grid {{"{own}": [oa.{kind}({rest}=…), …]}}.'
                 )
         return super().set_params(**params)  # type: ignore[misc]
 
-    def _shaped(self, values: np.ndarray) -> np.ndarray:
-        """Values (n, n_outputs) with as many axes as y had."""
+    def _shape(self, values: np.ndarray) -> np.ndarray:
+        """Return values (n, n_outputs) with as many axes as y had."""
         return values[:, 0] if self._one_column else values
 
     def _fitted(self) -> Estimate:
@@ -154,7 +155,7 @@ class Augmented(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
 
 def checked(estimator: Augmented, x: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:
-    """X (n, n_features) and y (n, n_outputs) for a fit, by scikit-learn's own checks.
+    """Return X (n, n_features) and y (n, n_outputs) for a fit, by scikit-learn's checks.
 
     Raises:
         ValueError: anything but finite real numbers of two samples or more.
@@ -169,7 +170,7 @@ def checked(estimator: Augmented, x: Any, y: Any) -> tuple[np.ndarray, np.ndarra
 
 
 def checked_again(estimator: Augmented, x: Any) -> np.ndarray:
-    """X (n, n_features) with the columns that the fit had.
+    """Return X (n, n_features) with the columns that the fit had.
 
     Raises:
         ValueError: other columns, anything but finite real numbers.
@@ -184,19 +185,24 @@ def check_there(values: np.ndarray) -> None:
     bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
     if bad.size:
         raise InputError(
-            f"the model has no finite value at row {bad[0]} of X; look at the physics there."
+            f"the model has no finite value at row {bad[0]} of X; check the physics there."
         )
 
 
 def input_names(estimator: Any) -> tuple[str, ...]:
-    """Return the columns of X as expressions name them: their own names, or x0, x1, … where they cannot be used."""
+    """Return the columns of X as expressions name them: own names, or x0, x1, ….
+
+    The latter where the own names cannot be used.
+    """
     given = getattr(estimator, "feature_names_in_", [""] * estimator.n_features_in_)
     good = [str(name) if is_name(str(name)) else "" for name in given]
     return tuple(name or _free(f"x{j}", good) for j, name in enumerate(good))
 
 
 def output_names(y: Any, columns: int, inputs: Sequence[str]) -> tuple[str, ...]:
-    """Return the outputs as expressions name them: those of a Series or DataFrame, or y (y0, y1, … of several).
+    """Return the outputs as expressions name them.
+
+    Names of a Series or DataFrame, or y (y0, y1, … of several).
 
     Args:
         y: as the user gave it.
@@ -227,7 +233,7 @@ def at_now(text: str, names: Sequence[str]) -> str:
 
 
 def learner_of(given: Any, names: Sequence[str] = ()) -> Any:
-    """Return the learner of a parameter, "auto" for `MLP()`.
+    """Return the learner of an estimator's argument; `MLP()` for "auto".
 
     The columns `names` in its expressions become channels.
     """
@@ -246,12 +252,12 @@ def learner_of(given: Any, names: Sequence[str] = ()) -> Any:
 def baseline_of(
     physics: Any, layout: Layout, outputs: Sequence[str], names: Sequence[str] = ()
 ) -> Baseline:
-    """Return the physics of a parameter.
+    """Return the physics of an estimator's argument.
 
     Args: physics: "linear", expressions, `Term`s, a mapping of parameters to expressions, a
         Baseline, or a JAX function. layout: the regressor, for "linear" and for a function.
         outputs: with several, every expression has a parameter of its own for each, `gain_y0`.
-        names: columns that may stand in expressions without an instant.
+        names: columns that expressions may use without an instant.
 
     Raises:
         InputError: none of these.
@@ -300,7 +306,7 @@ def baseline_of(
 
 
 def _check_columns(text: Any, names: Sequence[str]) -> None:
-    """Raise InputError for a name in an expression of columns that is none of them."""
+    """Raise InputError for a name in an expression that is not a column."""
     found = (
         re.findall(r"(?<![\w.])[A-Za-z_]\w*\b(?!\s*[\[(])", text)
         if names and isinstance(text, str)

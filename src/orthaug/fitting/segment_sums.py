@@ -1,4 +1,4 @@
-"""Free runs over segments that an engine keeps: what training needs of them is a sum over their chunks.
+"""Sums over chunks of segments that an engine keeps, for training on free runs.
 
 A trial is the sum of the errors' squares, a linearisation that of the normal equations from which
 the states of each segment are eliminated where the segment is. How these states follow (c, w) stays
@@ -25,7 +25,7 @@ _KEPT = 4  # layouts of a record: its own, and lengths of the segments on the wa
 
 
 class Best(NamedTuple):
-    """States of the segments of a chunk, and how the best ones follow (c, w) to first order."""
+    """States of a chunk's segments, and the derivative of the best ones by (c, w)."""
 
     values: Float[Any, "n0 m"]
     offset: Float[Any, "m n0"]
@@ -37,7 +37,7 @@ class Best(NamedTuple):
 
 
 class Squares(NamedTuple):
-    """Of a trial: `‖r‖²` of errors and states, and Σ e eᵀ (ny, ny) in the outputs' units."""
+    """Sums of a trial: `‖r‖²` of errors and states, and Σ e eᵀ (ny, ny) in outputs' units."""
 
     misfit: Any
     errors: Any
@@ -52,7 +52,7 @@ def _errors(
 
 @dataclass(frozen=True)
 class TrialSquares:
-    """`Squares` of one chunk, from its states or from where they moved to with (c, w)."""
+    """`Squares` of one chunk, from its states or from those moved with (c, w)."""
 
     dynamics: Dynamics
     moves: bool
@@ -68,7 +68,10 @@ class TrialSquares:
 
 @dataclass(frozen=True)
 class SegmentEquations:
-    """Of one chunk: how its best states follow (c, w), which it keeps, and its share of the normal equations."""
+    """A chunk's share of the normal equations, and the derivative of its states.
+
+    The derivative, by (c, w), stays with the chunk.
+    """
 
     dynamics: Dynamics
     free: bool
@@ -89,7 +92,7 @@ class SegmentEquations:
 
 @dataclass(frozen=True)
 class MovedStates:
-    """The states of a chunk after a step of (c, w), and nothing to add up."""
+    """The states of a chunk after a step of (c, w); this adds nothing to a sum."""
 
     def __call__(self, best: Best, step: Any) -> tuple[Any, Any]:
         return best.moved(step), ()
@@ -97,7 +100,7 @@ class MovedStates:
 
 @dataclass(frozen=True)
 class Spectra:
-    """Σ |DFT|² (ny, …) of the errors along the segments of a chunk, and how many errors of each are not 0."""
+    """Σ |DFT|² (ny, …) of the errors along a chunk's segments, and the number of nonzero errors."""
 
     dynamics: Dynamics
     size: int
@@ -119,11 +122,14 @@ class SegmentSums:
 
     @classmethod
     def of(cls, engine: Engine) -> SegmentSums | None:
-        """None where the engine's rows are in memory: then whole runs are compiled."""
+        """Return the sums of an engine; None where its rows are in memory.
+
+        Whole runs are compiled then.
+        """
         return None if engine.resident else cls(engine)
 
     def rows(self, segments: Any) -> Any:
-        """Return the segments where the engine keeps them."""
+        """Return the segments as the engine keeps them."""
         with self.one_at_a_time:
             known = self.placed.get(id(segments))
             if known is None:
@@ -149,7 +155,9 @@ class SegmentSums:
         step: Vector | None,
         *made: Matrix,
     ) -> tuple[float, Matrix]:
-        """`‖r‖²` and Σ e eᵀ from the states of a start, or with `step` from where they moved to.
+        """Return `‖r‖²` and Σ e eᵀ from the states of a start.
+
+        With `step`, from the states to which they moved.
 
         Args:
             made: weight (ny, ny) and L (n0, n0), of errors and of states.
@@ -166,7 +174,7 @@ class SegmentSums:
         return float(found.misfit), np.asarray(found.errors)
 
     def squares(self, dynamics: Dynamics, numbers: Numbers, segments: Any) -> Matrix:
-        """Σ e eᵀ (ny, ny) from the measured states."""
+        """Return Σ e eᵀ (ny, ny) from the measured states."""
         ny, n0 = len(dynamics.outputs), dynamics.states
         start = Start(np.asarray(segments.start))
         return self.tried(dynamics, numbers, segments, start, None, np.eye(ny), np.eye(n0))[1]
@@ -184,7 +192,10 @@ class SegmentSums:
         states: Any,
         *made: Matrix,
     ) -> tuple[Matrix, Vector, Any]:
-        """Return normal matrix and right-hand side of (c, w) with the states at their best, and `Best` where it stays."""
+        """Return the normal equations of (c, w) with the states at their best, and `Best`.
+
+        `Best` stays where the segments are.
+        """
         rows = self.with_states(segments, states)
         kept, (hessian, gradient) = self.engine.keep(
             SegmentEquations(dynamics, initial.free), rows, numbers, *made
@@ -192,13 +203,13 @@ class SegmentSums:
         return np.asarray(hessian), np.asarray(gradient), kept if initial.free else None
 
     def slope(self, there: Any) -> Float[np.ndarray, "k m n0 n"]:
-        """Return how the best states follow (c, w), brought here."""
+        """Return the derivative of the best states by (c, w), fetched from the engine."""
         return np.asarray(self.engine.fetch(there).slope)
 
     def spectra(
         self, dynamics: Dynamics, numbers: Numbers, segments: Any, states: Any, size: int
     ) -> tuple[Matrix, Vector]:
-        """`Spectra` over all segments."""
+        """Return `Spectra` over all segments."""
         found = self.engine.sum(
             Spectra(dynamics, size), self.with_states(segments, states), numbers
         )

@@ -1,4 +1,4 @@
-"""The course of a lagged model, its problem laid out in segments, and the criterion over them with its structure."""
+"""A lagged model's problem in segments, and the criterion over them with its structure."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ from orthaug.models.lagged import Lagged
 from orthaug.models.learners import Bound
 from orthaug.physics.problem import Problem
 
-_SMALL = 4096  # steps: a run over more of them than are needed takes less time than to compile for their number
+# steps: a run over more of them than are needed takes less time than to compile for their number
+_SMALL = 4096
 
 
 def lagged(task: OneStepTask) -> Lagged:
@@ -33,7 +34,10 @@ def lagged(task: OneStepTask) -> Lagged:
 
 
 def declared(task: OneStepTask, criterion: Criterion) -> dict[str, Any]:
-    """Return what a plan has of its task and its criterion, wherever the segments are."""
+    """Return the settings of a segmented problem that come from task and criterion.
+
+    They are the same wherever the segments are.
+    """
     problem = task.problem
     return {
         "record": problem.record,
@@ -50,18 +54,20 @@ def declared(task: OneStepTask, criterion: Criterion) -> dict[str, Any]:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SegmentedLagged(SegmentedProblem):
-    """A problem laid out in segments, beside its rows laid out for one step."""
+    """A problem in segments, beside its rows for one step."""
 
     dynamics: Lagged
     task: OneStepTask
     fixed: Fixed = field(default_factory=dict)
-    """Entries of an orthogonal θ that are known to stand at a bound beside the learner."""
+    """Entries of an orthogonal θ that are known to be at a bound beside the learner."""
 
     @classmethod
     def of(
         cls, task: OneStepTask, criterion: Criterion, like: SegmentedLagged | None = None
     ) -> SegmentedLagged:
-        """Lay the problem's record out as a criterion of several steps declares, in the shapes of a plan that is small.
+        """Lay out the problem's record in segments as a criterion declares.
+
+        In the shapes of a layout for fewer rows, if one is given.
 
         Raises:
             InputError: nothing would be scored.
@@ -81,7 +87,7 @@ class SegmentedLagged(SegmentedProblem):
 
     @cached_property
     def alone(self) -> SegmentedLagged:
-        """The same rows and segments without a learner."""
+        """The problem without a learner."""
         alone, task = self.dynamics.alone, self.task.alone
         return replace(
             self, task=task, dynamics=alone, scaling=task.scaling, unit=task.unit, fixed={}
@@ -89,11 +95,11 @@ class SegmentedLagged(SegmentedProblem):
 
     @property
     def lengthens(self) -> bool:
-        """Return whether whole experiments can be segments to train on."""
+        """True where whole experiments can be segments to train on."""
         return True
 
     def over(self, segment: int) -> SegmentedLagged:
-        """The same over segments of another length; 0 for whole experiments."""
+        """Return the problem in segments of another length; 0 for whole experiments."""
         washout = min(self.free_run.washout, segment // 2) if segment else self.free_run.washout
         free_run = replace(self.free_run, segment=segment, washout=washout)
         return replace(self, segments=self._build_segments(segment, washout), free_run=free_run)
@@ -145,24 +151,27 @@ class StructuredObjective(FreeRunObjective):
 
     @property
     def follows(self) -> bool:
-        """Return whether c follows θ, `c = θ − θ_aux(w)`."""
+        """True where c follows θ, `c = θ − θ_aux(w)`."""
         return (
             self.elimination.projects and self.elimination.bounded and self.task.bound is not None
         )
 
     @property
     def apart(self) -> bool:
-        """Return whether what stands at a bound becomes a known term beside the learner."""
+        """True where entries at a bound become known terms beside the learner."""
         return self.follows and self.elimination.shared is not None
 
     def begin(self, w: Vector) -> Vector:
-        """p of the one-step θ for the weights w."""
+        """Return p of the one-step θ for the weights w."""
         f = self.task.share_of(w)
         theta = self.elimination.theta(f, self.fixed or self.elimination.active(f))
         return np.concatenate([theta if self.follows else theta - self._taken(f), w])
 
     def place(self, p: Vector) -> tuple[Vector, Vector, Vector]:
-        """(unknown θ, c, w) of p; without bounds on an orthogonal θ the unknown is c itself."""
+        """Return (unknown θ, c, w) of p.
+
+        Without bounds on an orthogonal θ the unknown is c itself.
+        """
         theta, w = p[: self.physics], p[self.physics :]
         c = theta - self._taken(self.task.share_of(w)) if self.follows else theta
         return theta, c, w
@@ -195,20 +204,23 @@ class StructuredObjective(FreeRunObjective):
         return linear._replace(hessian=hessian, gradient=gradient)
 
     def theta_information(self, linear: LinearisedFreeRun, w: Vector) -> Matrix:
-        """Return the information of (θ, w): of an orthogonal θ that the learner's share was taken from."""
+        """Return the information of (θ, w).
+
+        That of an orthogonal θ is without the learner's share.
+        """
         if not (self.elimination.projects and self.task.bound is not None):
             return linear.information
         change = self.change(w)
         return change.T @ linear.information @ change
 
     def change(self, w: Vector) -> Matrix:
-        """∂(c, w)/∂(θ, w) for `c = θ − θ_aux(w)`."""
+        """Return ∂(c, w)/∂(θ, w) for `c = θ − θ_aux(w)`."""
         slope = self._taken(self.task.share_slope(w))
         nt, nw = slope.shape
         return np.block([[np.eye(nt), -slope], [np.zeros((nw, nt)), np.eye(nw)]])
 
     def _taken(self, share: Any) -> Any:
-        """θ_aux of the learner's share QᵀF, or of its slope."""
+        """Return θ_aux of the learner's share QᵀF, or of its derivative."""
         return self.task.problem.projection.from_coordinates(self._projector @ share)
 
     @cached_property
@@ -216,7 +228,9 @@ class StructuredObjective(FreeRunObjective):
         return self.elimination.taken_beside(self.fixed)
 
     def held(self, end: Descent) -> Fixed:
-        """Return what stands at a bound at the end of a run: entries that got there, and the fixed ones that would stay.
+        """Return the entries at a bound at the end of a run.
+
+        Those that reached one, and the fixed ones that would stay.
 
         Those that the learner could imitate stay where the nearest θ in the bounds does, the others
         where descent would leave the bounds.

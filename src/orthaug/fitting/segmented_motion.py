@@ -1,4 +1,4 @@
-"""The course of a motion: its record laid out in segments whose starts are unknown states."""
+"""A motion's record in segments whose initial states are unknowns."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from orthaug.physics.motion_problem import MotionProblem
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MotionObjective(FreeRunObjective):
-    """`‖r‖²` of the free run, with starts that hardly cost anything."""
+    """`‖r‖²` of the free run, with initial states that have almost no prior."""
 
     loose: Vector
 
@@ -39,7 +39,7 @@ class MotionObjective(FreeRunObjective):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SegmentedMotion(SegmentedProblem):
-    """A motion's record laid out in segments.
+    """A motion's record in segments.
 
     `loose` (nx,) is how far a start may be from its guess.
     """
@@ -57,9 +57,9 @@ class SegmentedMotion(SegmentedProblem):
         like: SegmentedMotion | None = None,
         sums: SegmentSums | None = None,
     ) -> SegmentedMotion:
-        """Lay a record out as a criterion of several steps declares, for the motion with a learner of unit scaling.
+        """Lay out a record as a criterion declares, for a motion and a learner of unit scaling.
 
-        With `like` in the shapes of another course, and with its substeps.
+        With `like` in the shapes of another layout, and with its substeps.
 
         Raises:
             InputError: nothing would be scored.
@@ -93,19 +93,22 @@ class SegmentedMotion(SegmentedProblem):
 
     @property
     def alone(self) -> SegmentedMotion:
-        """The same segments without a learner."""
+        """The problem without a learner."""
         nothing = Scaling(np.zeros(0), np.ones(0))
         return replace(self, dynamics=self.dynamics.alone, scaling=nothing, unit=np.ones(0))
 
     def over(self, segment: int) -> SegmentedMotion:
-        """The same over segments of another length, without washout; 0 for whole experiments."""
+        """Return the problem in segments of another length, without washout.
+
+        0 for whole experiments.
+        """
         segments = build_segments(self.record, self.dynamics, segment, 0, shares=self.shares)
         return replace(
             self, segments=segments, free_run=replace(self.free_run, segment=segment, washout=0)
         )
 
     def refined(self, substeps: int) -> SegmentedMotion:
-        """The same with other substeps of the integrator."""
+        """Return the problem with other substeps of the integrator."""
         dynamics = replace(self.dynamics, substeps=substeps)
         finer = replace(self, dynamics=dynamics)
         if (
@@ -124,7 +127,7 @@ class SegmentedMotion(SegmentedProblem):
         )
 
     def from_states(self, states: Float[np.ndarray, "k n0 m"]) -> SegmentedMotion:
-        """The same with segments that start there."""
+        """Return the problem with segments that start at these states."""
         return replace(self, segments=self.segments._replace(start=np.asarray(states)))
 
     def objective(self, structure: Structure | None = None) -> MotionObjective:
@@ -146,13 +149,13 @@ class SegmentedMotion(SegmentedProblem):
 
     @property
     def weight(self) -> Matrix:
-        """(ny, ny), multiplies errors: they are then in the unit of what physics alone leaves."""
+        """The matrix (ny, ny) that gives errors in the unit of the residual of physics alone."""
         return self.problem.weight.matrix / self.rms
 
     def settled(
         self, c: Vector, w: Any = (), segments: Segments | None = None, iterations: int = 12
     ) -> np.ndarray:
-        """Return the starts (k, n0, m) by which the segments follow the outputs best."""
+        """Return the initial states (k, n0, m) by which segments follow the outputs best."""
         segments = self.segments if segments is None else segments
         numbers, states = self.numbers(c, np.asarray(w)), []
         for start, inputs, target, scored in zip(*map(np.asarray, segments), strict=True):
@@ -162,7 +165,9 @@ class SegmentedMotion(SegmentedProblem):
         return np.stack(states)
 
     def mean_square(self, c: Vector, w: Any, tilt: Any = None) -> float:
-        """Mean of squared errors over whole experiments, in deviations of the outputs.
+        """Return the mean of squared errors over whole experiments.
+
+        Outputs in their deviations.
 
         NaN where it diverges.
 
@@ -183,14 +188,14 @@ class SegmentedMotion(SegmentedProblem):
         return np.asarray(_states(self.dynamics, self.numbers(c, w), self.segments, states))
 
     def trajectory(self, c: Vector, w: Any, states: Any) -> tuple[Matrix, Matrix]:
-        """States (N, nx) and inputs (N, nu) of the segments' runs from these starts, on the rows that are scored."""
+        """Return states (N, nx) and inputs (N, nu) of the segments' runs, on scored rows."""
         runs = self.runs(c, w, states)
         scored = np.moveaxis(np.asarray(self.segments.scored), -1, 1)
         inputs = np.moveaxis(np.asarray(self.segments.inputs), -1, 1)[scored]
         return np.moveaxis(runs, -1, 1)[scored], self.dynamics.now(inputs)
 
     def states_by_row(self, c: Vector, w: Any, states: Any) -> list[Matrix]:
-        """Return the states (N, nx) of every experiment, put together from the segments' runs."""
+        """Return the states (N, nx) of every experiment, joined from the segments' runs."""
         runs = np.moveaxis(self.runs(c, w, states), -1, 1)
         rows, place, found = runs.reshape(-1, *runs.shape[2:]), 0, []
         steps, washout = self.segments.steps, min(self.free_run.washout, self.segments.steps - 1)
@@ -205,7 +210,7 @@ class SegmentedMotion(SegmentedProblem):
         return found
 
     def starting_from(self, rows: list[Matrix]) -> SegmentedMotion:
-        """The same with segments that start at the states (N, nx) given for every row of every experiment."""
+        """Return the problem with segments that start at given states (N, nx) of all rows."""
         steps, washout = self.segments.steps, min(self.free_run.washout, self.segments.steps - 1)
         starts = []
         for experiment, own in zip(self.record.experiments, rows, strict=True):
@@ -218,7 +223,7 @@ class SegmentedMotion(SegmentedProblem):
 
 
 def sizes(problem: MotionProblem) -> Vector:
-    """Return how large each state is (nx,): of its guesses; 1 where nothing is known."""
+    """Return the size of each state (nx,), from its guesses; 1 where none is known."""
     size = np.abs(problem.looked_at[0]).max(axis=1)
     return np.where(size > 0, size, 1.0)
 

@@ -1,4 +1,4 @@
-"""A record laid out in segments for a criterion of several steps, and a descent over them, of any dynamics."""
+"""A record in segments for a criterion of several steps, and a descent over them."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class FreeRunFit(NamedTuple):
 
 
 class TrialInMemory(NamedTuple):
-    """A trial whose segments are in memory, to be looked at, and how its states follow (c, w)."""
+    """A trial with segments in memory, and the derivative of its states by (c, w)."""
 
     objective: FreeRunObjective
     point: TrialPoint
@@ -57,7 +57,7 @@ class TrialInMemory(NamedTuple):
 
 
 class Layout(NamedTuple):
-    """Segments of a record: to train on, to compare runs over, and to see the colour of the errors by."""
+    """Segments of a record: for training, for comparing runs, for the colour of errors."""
 
     segments: Segments
     whole: Segments
@@ -72,9 +72,9 @@ class Layout(NamedTuple):
         like: SegmentedProblem | None = None,
         shares: int = 1,
     ) -> Layout:
-        """As a criterion of several steps declares.
+        """Return the layout that a criterion of several steps declares.
 
-        Padded to the shapes of another course where that is larger.
+        Padded to the shapes of another layout where that is larger.
 
         Raises:
             InputError: nothing would be scored.
@@ -100,7 +100,7 @@ class Layout(NamedTuple):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SegmentedProblem:
-    """A record laid out in segments for a criterion.
+    """A record in segments for a criterion.
 
     `rms` is the unit of the errors. `deviation` (ny,) is that of the outputs, `output_weights` how
     they are weighed against each other; `scaling` and `unit` are the learner's.
@@ -129,12 +129,12 @@ class SegmentedProblem:
 
     @property
     def shares(self) -> int:
-        """Return how many sum over segments at a time."""
+        """Number of parts that sum over segments at a time."""
         return 1 if self.sums is None else self.sums.engine.shares
 
     @property
     def residuals(self) -> int:
-        """Return how many errors are scored."""
+        """Number of scored errors."""
         return self.segments.count * len(self.dynamics.outputs)
 
     def numbers(self, c: Vector, w: Any, tilt: Any = None) -> Numbers:
@@ -149,11 +149,11 @@ class SegmentedProblem:
         objective: FreeRunObjective,
         p: Vector,
         solver: LevenbergMarquardt,
-        tell: RunProgress = quiet,
+        progress: RunProgress = quiet,
         states: Any = None,
         **options: Any,
     ) -> FreeRunFit:
-        """From p to the end.
+        """Descend from p to the end of the run.
 
         Several outputs are weighted by their errors' covariance in a second leg.
 
@@ -170,8 +170,8 @@ class SegmentedProblem:
         two_legs = ny > 1 and self.output_weights in ("auto", "covariance")
         first = solver.at_most(solver.iterations // 2) if two_legs else solver
         start = Start(objective.initial.measured if states is None else states)
-        kept = self._kept(objective, p, start, options)
-        end = first.descend(objective, p, start, progress=tell, kept=kept, **options)
+        kept = self._checkpoint(objective, p, start, options)
+        end = first.descend(objective, p, start, progress=progress, kept=kept, **options)
         noise = self.noise(objective, end) if two_legs and end.ending.usable else None
         white = None if noise is None else whitening(noise)
         if noise is not None and white is not None:
@@ -188,8 +188,8 @@ class SegmentedProblem:
                 objective,
                 end.point.p,
                 begun,
-                progress=lambda i, loss: tell(done + i, loss),
-                kept=self._kept(objective, end.point.p, begun, options),
+                progress=lambda i, loss: progress(done + i, loss),
+                kept=self._checkpoint(objective, end.point.p, begun, options),
                 **options,
             )
             path = (*end.path, *again.path)
@@ -201,10 +201,10 @@ class SegmentedProblem:
         mean_square = self.mean_square(end.point.c, end.point.w)
         return FreeRunFit(objective, end, mean_square, end.iterations, end.seconds)
 
-    def _kept(
+    def _checkpoint(
         self, objective: FreeRunObjective, p: Vector, start: Start, options: dict[str, Any]
     ) -> RunCheckpoint | None:
-        """Where the pauses of a descent from there are kept."""
+        """Return the checkpoint of a descent from this start."""
         if self.checkpoints is None:
             return None
         chosen = [
@@ -221,12 +221,12 @@ class SegmentedProblem:
         )
 
     def looked_at(self, objective: FreeRunObjective, end: Descent) -> TrialInMemory:
-        """Where a run ended, on segments in memory; its end has a derivative."""
+        """Return the end of a run with segments in memory; it has a derivative."""
         assert end.linear is not None
         return TrialInMemory(objective, end.point, objective.slope(end.linear.start))
 
     def noise(self, objective: FreeRunObjective, end: Descent) -> Matrix | None:
-        """Covariance (ny, ny) of the errors, in the outputs' units."""
+        """Return the covariance (ny, ny) of the errors, in the outputs' units."""
         squares, ny = objective.squares(end.point), len(objective.weight)
         used = (objective.physics + end.effective) / ny
         return (
@@ -236,7 +236,9 @@ class SegmentedProblem:
         )
 
     def mean_square(self, c: Vector, w: Any, tilt: Any = None) -> float:
-        """Mean of squared errors over whole experiments, in deviations of the outputs.
+        """Return the mean of squared errors over whole experiments.
+
+        Outputs in their deviations.
 
         NaN where it diverges.
         """

@@ -1,4 +1,4 @@
-"""The course of a lagged model over rows that stay in a source: its segments, and runs along whole experiments.
+"""A lagged model over rows in a source: its segments, and runs along whole experiments.
 
 Segments are those of the same rows in memory, cut anew at every pass, or once where the rows are. A
 segment belongs to the partition in which the first row that it needs is, and is read on from the
@@ -34,14 +34,14 @@ from orthaug.models.dynamics import Dynamics, Numbers
 from orthaug.models.rows import Engine
 from orthaug.physics.streamed import StreamedProblem
 
-_SETTLING = 4  # Gauss-Newton steps of a witness's states
+_SETTLING = 4  # Gauss-Newton steps of a subsample's states
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SegmentedStreamed(SegmentedLagged):
     """A source's rows cut into segments where an engine reads or keeps them.
 
-    `record` is a witness of them.
+    `record` is a subsample of them.
     """
 
     source: Source
@@ -52,8 +52,9 @@ class SegmentedStreamed(SegmentedLagged):
     def of(cls, task: OneStepTask, criterion: Criterion) -> SegmentedStreamed:
         """Cut the problem's source as a criterion of several steps declares.
 
-        Raises: InputError: nothing would be scored; whole experiments as segments, which would have
-            to fit into memory.
+        Raises:
+            InputError: nothing would be scored; whole experiments as segments, which would have to
+                fit into memory.
         """
         problem, free_run, sums = task.problem, criterion.free_run, SegmentSums(task.engine)
         assert free_run is not None and isinstance(problem, StreamedProblem)
@@ -103,7 +104,7 @@ class SegmentedStreamed(SegmentedLagged):
         return mean if mean < RUNAWAY else np.nan
 
     def looked_at(self, objective: FreeRunObjective, end: Descent) -> TrialInMemory:
-        """Return the segments of the witness.
+        """Return the segments of the subsample.
 
         Where that is all rows, with the states that were trained.
         """
@@ -128,7 +129,7 @@ class SegmentedStreamed(SegmentedLagged):
 
 
 class RunState(NamedTuple):
-    """A run that ended somewhere: its state, the squares of its errors (ny,), and where it has to go on."""
+    """A run at some row: its state, the squares of its errors (ny,), and its next row."""
 
     state: Any = None
     squares: Any = 0.0
@@ -139,7 +140,7 @@ class RunState(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PartitionRuns:
-    """A partition's part of the runs, which start from what was measured.
+    """A partition's part of the runs, which start at measured values.
 
     Picklable if the physics is.
     """
@@ -186,7 +187,7 @@ def _along(
     scored: Any,
     rows: Any,
 ) -> tuple[Any, Any]:
-    """Return the state after so many rows, and the squares (ny,) of the errors on the scored ones."""
+    """Return the state after some rows, and the squares (ny,) of the scored errors."""
     numbers = dynamics.prepared(numbers)
 
     def step(carry: Any, row: Any) -> tuple[Any, None]:
@@ -216,14 +217,14 @@ class WholeRuns:
     count: int
 
     def squares(self, dynamics: Dynamics, numbers: Numbers) -> Vector:
-        """Σ e² (ny,) of the errors, in the outputs' units."""
+        """Return Σ e² (ny,) of the errors, in the outputs' units."""
         running = PartitionRuns(dynamics, numbers, self.empty, self.washout)
         return np.asarray(self.engine.along(running, self.partitions, RunState()).squares)
 
 
 @dataclass(frozen=True)
 class PieceShape:
-    """A piece of a partition without its rows: what `Experiment` has beside them."""
+    """A piece of a partition without its rows: the other fields of `Experiment`."""
 
     source: str
     first_row: int
@@ -244,7 +245,7 @@ def look(partition: Any) -> list[PieceShape]:
 
 @dataclass(frozen=True, eq=False)
 class ExperimentStarts:
-    """Where the experiments of a source begin, counted over the rows of all partitions, and how many rows they have."""
+    """The first rows of a source's experiments, over all partitions, and their lengths."""
 
     begins: tuple[int, ...]
     rows: tuple[int, ...]
@@ -253,7 +254,7 @@ class ExperimentStarts:
 
     @classmethod
     def of(cls, seen: Sequence[Sequence[PieceShape]]) -> ExperimentStarts:
-        """From the pieces of all partitions."""
+        """Return the starts from the pieces of all partitions."""
         begins, rows, total = [], [], 0
         last: PieceShape | None = None
         for piece in (piece for pieces in seen for piece in pieces):
@@ -281,13 +282,13 @@ class Part:
         return cls(span, np.asarray(rows), span.held)
 
     def on(self, *held: Any) -> Part:
-        """The same where the rows are."""
+        """Return the part where the rows are."""
         return Part(self.span.on(*held), self.rows)
 
 
 @dataclass(frozen=True, eq=False)
 class SegmentCutter:
-    """How rows become segments, in chunks of `width`; picklable if the physics is."""
+    """Rules by which rows become segments, in chunks of `width`; picklable if the physics is."""
 
     dynamics: Dynamics
     empty: Record
@@ -337,7 +338,7 @@ def _slices(part: Part) -> Iterator[Experiment]:
 
 @dataclass(frozen=True)
 class SegmentStarts:
-    """The measured states of a chunk and which of its segments are any, and how many steps are scored."""
+    """The measured states of a chunk, a mask of its segments, and the number of scored steps."""
 
     def __call__(self, segments: Segments) -> tuple[Any, Any]:
         return (segments.start, jnp.any(segments.scored, axis=0)), jnp.sum(segments.scored)
@@ -371,7 +372,10 @@ class SourceSegments:
         washout: int,
         most: int | None = None,
     ) -> SourceSegments:
-        """Segments of `segment` steps, 0 for whole experiments, of which the first `most` rows count."""
+        """Return segments of `segment` steps, the first `most` rows of each in use.
+
+        0 for whole experiments.
+        """
         lag = dynamics.first_row
         usable = [(rows if most is None else min(rows, most)) - lag for rows in found.rows]
         steps = min(segment, max(usable)) if segment else max(usable)

@@ -54,7 +54,7 @@ def build_segments(
     like: Segments | None = None,
     shares: int = 1,
 ) -> Segments:
-    """Segments of `segment` steps; 0 for whole experiments.
+    """Return segments of `segment` steps; 0 for whole experiments.
 
     The number of chunks is a multiple of `shares`.
 
@@ -89,7 +89,7 @@ def build_segments(
 
 
 def begins_of(rows: int, steps: int, washout: int) -> list[int]:
-    """Where the segments of an experiment begin."""
+    """Return the first rows of the segments of an experiment."""
     return [
         begin for begin in range(0, rows, steps - washout) if begin == 0 or begin + washout < rows
     ]
@@ -98,7 +98,7 @@ def begins_of(rows: int, steps: int, washout: int) -> list[int]:
 def segment_of(
     experiment: Experiment, inputs: Any, begin: int, steps: int, washout: int, dynamics: Dynamics
 ) -> Segments:
-    """Return one segment. Where the experiment is shorter, its end is repeated."""
+    """Return one segment. Where the experiment is shorter, its last row is repeated."""
     rows = np.arange(begin, begin + steps)
     there = np.minimum(rows, len(inputs) - 1)
     first = dynamics.first_row + begin
@@ -151,7 +151,10 @@ def sensitivity(
     states: Float[Array, "k n0 m"],
     weight: Float[Array, "ny ny"],
 ) -> Sensitivity:
-    """Gram matrices of the sensitivities `∂ŷ/∂(start, c, w)` and the error, rows multiplied by `weight`."""
+    """Return Gram matrices of the sensitivities `∂ŷ/∂(start, c, w)` and the error.
+
+    Rows are multiplied by `weight`.
+    """
     numbers = dynamics.prepared(numbers)
     n = dynamics.unknowns
 
@@ -166,7 +169,7 @@ def sensitivity(
 def chunk_sensitivity(
     dynamics: Dynamics, numbers: Numbers, chunk: tuple[Any, ...], weight: Any
 ) -> Sensitivity:
-    """The same of one chunk (states, inputs, target, scored), of prepared numbers."""
+    """Return the Gram matrices of one chunk (states, inputs, target, scored)."""
     state, *rows = chunk
     n0, width = state.shape
     n = dynamics.unknowns
@@ -180,7 +183,10 @@ def chunk_sensitivity(
 
 
 def _columns(scored: Any, slope: Any, error: Any, weight: Any) -> Any:
-    """Slopes and error of scored steps side by side (ny, n0 + n + 1, …), rows multiplied by `weight`."""
+    """Return derivatives and error of scored steps side by side (ny, n0 + n + 1, …).
+
+    Rows are multiplied by `weight`.
+    """
     columns = jnp.where(scored, jnp.concatenate([slope, error[:, None]], axis=1), 0.0)
     return (
         jnp.einsum("oi,in...->on...", weight, columns)
@@ -192,7 +198,7 @@ def _columns(scored: Any, slope: Any, error: Any, weight: Any) -> Any:
 def _step_by_step(
     dynamics: Dynamics, numbers: Numbers, carry: Any, rows: Any, weight: Any
 ) -> tuple[Any, Any]:
-    """Gram matrices of one chunk, for dynamics that know how to carry slopes."""
+    """Return Gram matrices of one chunk, for dynamics that can carry derivatives."""
     n0 = dynamics.states
 
     def step(carry: tuple[Any, ...], row: tuple[Any, ...]) -> tuple[Any, None]:
@@ -210,7 +216,9 @@ def _step_by_step(
 def _steps_at_once(
     most: int, dynamics: Any, numbers: Numbers, carry: Any, rows: Any, weight: Any
 ) -> tuple[Any, Any]:
-    """The same a block of steps at a time: it is run, then differentiated at all its points, which are then known.
+    """Return Gram matrices of one chunk, a block of steps at a time.
+
+    A block is run first, then differentiated at all its points, which are then known.
 
     Only the product of the slopes has to go from step to step. A block is bounded, so nothing has
     the size of the data.
@@ -268,7 +276,9 @@ def block_scores(
     place: Int[Array, "T"],
     blocks: int,
 ) -> Float[Array, "k blocks n0+n m"]:
-    """`Σ sᵀe` over the scored steps of every block: s the sensitivities to (start, c, w), rows times `weight`.
+    """Return `Σ sᵀe` over the scored steps of every block.
+
+    s are the sensitivities to (start, c, w), rows times `weight`.
 
     Args:
         place: the block of each step, the same in every segment.

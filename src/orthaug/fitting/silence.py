@@ -1,4 +1,4 @@
-"""Learners that their regularization silenced: the warning, and runs with weaker regularizations beside them.
+"""Learners silenced by their regularization: the warning, and runs with weaker ones.
 
 Evidence starts from a learner that does nothing yet. A learner that first finds a constant, since
 the physics has no offset, lowers the loss by that, and evidence may then find that one weight is
@@ -27,7 +27,7 @@ _FLAT = 0.01  # of the learner's RMS: a smaller standard deviation is that of a 
 
 
 def silenced(effective: float, outputs: int) -> bool:
-    """Return whether a regularization left no more than a constant of each output of the learner."""
+    """Return whether a regularization left at most a constant of each output of the learner."""
     return effective < _CONSTANT * outputs
 
 
@@ -37,7 +37,9 @@ def add_retries(
     outputs: int,
     make: Callable[[list[Any]], tuple[list[Any], list[Any]]],
 ) -> tuple[list[Any], list[Any]]:
-    """Return the planned runs with their ends, and where evidence silenced all of them those of weaker ones.
+    """Return the planned runs with their ends, and runs that were added.
+
+    The latter have weaker regularizations, where evidence silenced all others.
 
     Args:
         starts, runs: planned runs and how they ended.
@@ -58,14 +60,14 @@ def add_retries(
     return starts + free + more, runs + ends + others
 
 
-def tell_retries(
+def retry_warnings(
     planned: int,
     starts: Sequence[Any],
     runs: Sequence[Any],
     held_out: HeldOutErrors | None,
     best: int,
 ) -> list[Warning]:
-    """Return the warning that evidence silenced the learner and what was tried then.
+    """Return the warning that evidence silenced the learner, and the retries.
 
     None where nothing was.
 
@@ -93,14 +95,14 @@ def tell_retries(
     text = (
         f"evidence left {counted_weights(effective)} of the learner, no more than a constant, "
         f"so training was tried again with {tried}. Errors in {held_out.where}, in deviations "
-        f"of the output: {found}, physics alone "
-        f"{_error(np.sqrt(mean_square(held_out.alone)))}. Kept is {kept}."
+        f"of the output: {found}, physics alone {_error(np.sqrt(mean_square(held_out.alone)))}. "
+        f"The result is {kept}."
     )
     return [Warning("evidence_retried", text)]
 
 
 def learner_silent(learned: TrainedLearner, values: Matrix | None = None) -> list[Warning]:
-    """Return the warning that a learner does nothing, or no more than a constant; none otherwise.
+    """Return the warning that a learner is zero or constant; none otherwise.
 
     Args:
         learned: a trained learner.
@@ -122,9 +124,10 @@ def learner_silent(learned: TrainedLearner, values: Matrix | None = None) -> lis
         return []
     left = f"training left {counted_weights(learned.effective)} of {bound.size}"
     text = (
-        f"{does} ({left}). Either there is nothing to learn from what it sees, and it can be left out, or its "
-        'regularization was too strong: compare `regularization = "none"` and a small ridge such as 0.01 on held-out '
-        "data. A constant that the physics lacks belongs into the physics."
+        f"{does} ({left}). Either its inputs explain nothing more, and it can be left out, or "
+        'its regularization was too strong. Compare `regularization = "none"` and a small ridge '
+        "such as 0.01 on held-out data. A constant that the physics lacks belongs into the "
+        "physics."
     )
     return [Warning("learner_silent", text)]
 

@@ -33,7 +33,7 @@ _LOOKED_AT = 8  # iterates of a run that ended above physics alone
 
 
 class StartPoint(NamedTuple):
-    """Where a run may start: p and the segments' states, the loss there, and whether the learner is silent."""
+    """A possible start of a run: p, the segments' states, the loss, a silent learner or not."""
 
     p: Vector
     states: Any
@@ -41,8 +41,11 @@ class StartPoint(NamedTuple):
     silent: bool
 
 
-def _learned(free_fit: FreeRunFit, first_loss: float) -> bool:
-    """Return whether the weights lowered the loss: evidence may also have found too early that none are needed."""
+def _lowers_loss(free_fit: FreeRunFit, first_loss: float) -> bool:
+    """Return whether the weights lowered the loss.
+
+    If not, evidence may have found too early that none are needed.
+    """
     return bool(free_fit.end.point.loss < LEARNED * first_loss)
 
 
@@ -53,7 +56,10 @@ Task = TypeVar(
 
 @dataclass(frozen=True, eq=False)
 class SimulationTask(ABC):
-    """A course, and what physics alone does on it: None before `prepared`, and where physics alone cannot fly."""
+    """A problem in segments, and the run of physics alone on it.
+
+    The run is None before `prepared`, and where no run of physics alone is finite.
+    """
 
     plan: Any
     """The `SegmentedProblem`."""
@@ -61,12 +67,12 @@ class SimulationTask(ABC):
 
     @abstractmethod
     def train_physics_only(
-        self, solver: LevenbergMarquardt, structure: Structure, tell: RunProgress
+        self, solver: LevenbergMarquardt, structure: Structure, progress: RunProgress
     ) -> tuple[Any, FreeRunFit | None]:
-        """Return the plan and physics alone trained on it; None where it cannot fly."""
+        """Return the problem and physics alone trained on it; None where no run is finite."""
 
     def scaled(self, plan: Any, physics: FreeRunFit) -> Any:
-        """Return the plan with its learner scaled by what physics alone does."""
+        """Return the problem with its learner scaled by the run of physics alone."""
         return plan
 
     @abstractmethod
@@ -78,22 +84,22 @@ class SimulationTask(ABC):
         structure: Structure,
         regularization: str | float,
     ) -> list[StartPoint]:
-        """Where a run from the weights w may start; arguments as in `estimate`."""
+        """Return possible starts of a run from the weights w; arguments as in `estimate`."""
 
     def prepared(
         self: Task, solver: LevenbergMarquardt, structure: Structure, progress: RunProgress = quiet
     ) -> Task:
-        """The same with physics alone trained.
+        """Return the task with physics alone trained.
 
         Its errors are then the unit of the criterion, in which a ridge counts. Where it runs away
         over whole experiments, runs are compared over segments.
         """
         own = self.plan
 
-        def tell(iteration: int, loss: float) -> None:
+        def report(iteration: int, loss: float) -> None:
             progress(iteration, loss * own.rms**2 / own.residuals)
 
-        plan, physics = self.train_physics_only(solver, structure, tell)
+        plan, physics = self.train_physics_only(solver, structure, report)
         if physics is None:
             return self
         rms = plan.rms * float(np.sqrt(physics.end.point.misfit / plan.residuals))
@@ -104,12 +110,12 @@ class SimulationTask(ABC):
         return replace(self, plan=self.scaled(plan, physics), physics=physics)
 
     def keeping(self: Task, checkpoints: Checkpoints | None) -> Task:
-        """The same with the states of its descents kept."""
+        """Return the task with checkpoints of its descents."""
         return replace(self, plan=replace(self.plan, checkpoints=checkpoints))
 
     @property
     def problem(self) -> Any:
-        """Return what is estimated, with its record."""
+        """The estimation problem, with its record."""
         return self.plan.problem
 
     @property
@@ -122,25 +128,25 @@ class SimulationTask(ABC):
 
     @property
     def start_loss(self) -> float | None:
-        """Loss of physics alone, in the units of `loss`; None where it cannot fly."""
+        """Loss of physics alone, in the units of `loss`; None where no run of it is finite."""
         return None if self.physics is None else self.physics.mean_square
 
     @property
     def seconds(self) -> float:
-        """Return what physics alone took."""
+        """Seconds that physics alone took."""
         return 0.0 if self.physics is None else self.physics.seconds
 
     @property
     def warnings(self) -> tuple[Warning, ...]:
-        """One where runs cannot be compared over whole experiments."""
+        """A warning where runs cannot be compared over whole experiments."""
         if self.physics is None or self.plan.whole is not self.plan.segments:
             return ()
         if not self.criterion.simulates or not self.plan.free_run.steps:
             return ()
         text = (
             "the free run of physics alone diverges over whole experiments of the training "
-            "data, so `loss` counts its segments; bound what makes it run away, or trust "
-            "predictions a segment ahead only."
+            "data, so `loss` counts its segments; bound the parameters that make it diverge, or "
+            "use predictions at most a segment ahead."
         )
         return (Warning("free_run_diverges", text),)
 
@@ -152,7 +158,7 @@ class SimulationTask(ABC):
         regularization: str | float = "none",
         progress: RunProgress = quiet,
     ) -> FreeRunFit:
-        """Return one run from the weights `w`, silenced, and physics alone.
+        """Return one run from the weights `w`; a silent learner and physics alone are tried too.
 
         The arguments as in `estimate`.
 
@@ -172,23 +178,23 @@ class SimulationTask(ABC):
         ):  # one prior deviation of the weights for one of what is left
             ridge = best.loss / plan.residuals
 
-        def tell(iteration: int, loss: float) -> None:
+        def report(iteration: int, loss: float) -> None:
             progress(iteration, loss * plan.rms**2 / plan.residuals)
 
         options: dict[str, Any] = {"ridge": ridge, "evidence": evidence, "evidence_settled": True}
         free_fit = plan.descend(
-            objective, best.p, solver, tell, best.states, ceiling=ceiling, **options
+            objective, best.p, solver, report, best.states, ceiling=ceiling, **options
         )
-        if evidence and not _learned(free_fit, best.loss):
+        if evidence and not _lowers_loss(free_fit, best.loss):
             free = plan.descend(
-                objective, best.p, solver.within_limit, tell, best.states, ceiling=ceiling
+                objective, best.p, solver.within_limit, report, best.states, ceiling=ceiling
             )
-            if _learned(free, best.loss):
+            if _lowers_loss(free, best.loss):
                 point, options = free.end.point, options | {"evidence_settled": False}
                 again = plan.descend(
-                    objective, point.p, solver, tell, point.states, ceiling=ceiling, **options
+                    objective, point.p, solver, report, point.states, ceiling=ceiling, **options
                 )
-                free_fit = again if _learned(again, best.loss) else free_fit
+                free_fit = again if _lowers_loss(again, best.loss) else free_fit
                 spent = {
                     "iterations": free.iterations + free_fit.iterations,
                     "seconds": free.seconds + free_fit.seconds,
@@ -197,7 +203,10 @@ class SimulationTask(ABC):
         return self._below_physics(free_fit)
 
     def _below_physics(self, free_fit: FreeRunFit) -> FreeRunFit:
-        """Return the run, or the best iterate of it where over whole experiments its end is above physics alone."""
+        """Return the run, or its best iterate, so that it is not above physics alone.
+
+        The comparison is over whole experiments.
+        """
         physics = self.physics
         if physics is None or free_fit.mean_square <= physics.mean_square or not free_fit.end.path:
             return free_fit
@@ -224,7 +233,7 @@ class SimulationTask(ABC):
         gram = None if linear is None else linear.information * rms**2
 
         def middle(noise: Matrix) -> Matrix:
-            """ΣψᵀΣ_eψ of the rows of `gram`. They are white where `weight` made them so."""
+            """Return ΣψᵀΣ_eψ of the rows of `gram`, white where `weight` made them so."""
             assert gram is not None
             change = objective.weight @ np.linalg.inv(
                 self.problem.weight.matrix
@@ -251,7 +260,7 @@ class SimulationTask(ABC):
         )
 
     def _errors(self, run: FreeRunFit) -> ErrorStatistics:
-        """Noise covariance of the free run and Cov θ̂ from its sensitivities."""
+        """Return noise covariance of the free run, and Cov θ̂ from its sensitivities."""
         end, objective = run.end, run.objective
         theta, nt = end.point.theta, objective.physics
         freedom = self.plan.segments.count - (nt + end.effective) / len(objective.weight)
@@ -264,7 +273,7 @@ class SimulationTask(ABC):
         return ErrorStatistics(noise, covariance, freedom, run.mean_square, at_bound)
 
     def _scores(self, run: FreeRunFit) -> FreeRunScores | None:
-        """Return what robust standard errors are made of; None for a run that ended nowhere."""
+        """Return the scores for robust standard errors; None for a run without an end."""
         if run.end.linear is None or not run.end.ending.usable:
             return None
         objective, point, slope = self.plan.looked_at(run.objective, run.end)

@@ -1,4 +1,4 @@
-"""How training ends: code, cause and remedy in one place."""
+"""The endings of training: code, cause and remedy."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from enum import IntEnum
 
 
 class Ending(IntEnum):
-    """How a run ended. The number is what compiled loops carry, `code` is what programs read."""
+    """The ending of a run. Compiled loops carry the number, programs read `code`."""
 
     code: str
     cause: str
@@ -61,23 +61,27 @@ class Ending(IntEnum):
 
     @property
     def usable(self) -> bool:
-        """Return whether there is a model."""
+        """True where there is a model."""
         return self is not Ending.NON_FINITE
 
 
 ALONE = {
-    Ending.NO_DESCENT: "no step of the physics' parameters lowered the loss: the start is already a minimum, "
-    "or the free run is too steep about it. Try other initial values, or a shorter "
-    "`segment`",
-    Ending.NON_FINITE: "physics alone has no finite free run from its initial values. Give others, or bounds "
-    "that keep it from running away",
+    Ending.NO_DESCENT: (
+        "no step of the physics' parameters lowered the loss: the start is already a minimum, "
+        "or the free run is too sensitive there. Try other initial values, or a shorter "
+        "`segment`"
+    ),
+    Ending.NON_FINITE: (
+        "physics alone has no finite free run from its initial values. Give others, or bounds "
+        "that keep it from diverging"
+    ),
 }
 """The messages of a training without a learner, where others speak of one."""
 
 
 @dataclass(frozen=True)
 class Status:
-    """How training ended.
+    """The ending of training.
 
     `loss` is the mean of squared errors with every output divided by its standard deviation,
     `start_loss` that of physics alone under the same criterion.
@@ -108,7 +112,7 @@ class Status:
 
     @property
     def lines(self) -> list[str]:
-        """The lines of a fit's summary on it."""
+        """The status as lines of a fit's summary."""
         ended = (
             f"status      {self.code}, {self.iterations} iterations, {self.seconds:.2f} s, "
             f"loss {self.loss:.6g}"
@@ -117,5 +121,5 @@ class Status:
 
     @property
     def ok(self) -> bool:
-        """Return whether there is a usable model."""
+        """True where there is a usable model."""
         return self.ending.usable

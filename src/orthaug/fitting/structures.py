@@ -32,24 +32,24 @@ class PenaltyRows(NamedTuple):
 
 @runtime_checkable
 class Structure(Protocol):
-    """What `estimate(structure=…)` takes."""
+    """A structure as `estimate(structure=…)` accepts it."""
 
     @property
     def name(self) -> str: ...
 
     @property
     def projects(self) -> bool:
-        """Return whether θ is split so that the learner is orthogonal to the physics."""
+        """True where θ is split so that the learner is orthogonal to the physics."""
         ...
 
     @property
     def identifies(self) -> bool:
-        """Return whether the data alone determine θ where nothing is learned."""
+        """True where the data determine θ by themselves where nothing is learned."""
         ...
 
     @property
     def from_initial(self) -> bool:
-        """Return whether one-step training takes θ from θ⁰ beside the weights.
+        """True where one-step training starts θ at θ⁰ beside the weights.
 
         Otherwise it solves θ for any weights.
         """
@@ -57,7 +57,10 @@ class Structure(Protocol):
 
     @property
     def shared(self) -> str:
-        """Along which directions of θ the learner is made orthogonal: "auto" for those it could imitate, or "all"."""
+        """Directions of θ along which the learner is made orthogonal.
+
+        "auto" for those it could imitate, or "all".
+        """
         ...
 
     @property
@@ -66,7 +69,10 @@ class Structure(Protocol):
         ...
 
     def penalty(self, names: Sequence[str], initial: Vector, unit: float) -> PenaltyRows:
-        """Return the rows that join the criterion, from θ⁰ (nθ,) and the output's unit in whitened outputs."""
+        """Return the penalty's rows of the criterion, in whitened outputs.
+
+        They depend on θ⁰ (nθ,) and on the output's unit.
+        """
         ...
 
 
@@ -114,7 +120,7 @@ class Orthogonal(_SolvedTheta):
 
 @dataclass(frozen=True)
 class Additive(_SolvedTheta):
-    """ŷ = φθ + f (eqs:additive_struct): θ takes what this learner happens to leave, so it is not unique.
+    """ŷ = φθ + f (eqs:additive_struct). θ depends on the learner, so it is not unique.
 
     With `from_initial` θ starts at θ⁰ and is trained with the weights, one step ahead; without, it
     is solved for any weights and never sees θ⁰.
@@ -129,7 +135,9 @@ class Additive(_SolvedTheta):
 
 @dataclass(frozen=True)
 class OrthogonalPenalty(_SolvedTheta):
-    """Additive with `λ‖QᵀF‖²` in the criterion (Kon 2022, Györök 2025): drives the learner out of the physics.
+    """Additive with `λ‖QᵀF‖²` in the criterion (Kon 2022, Györök 2025).
+
+    The penalty drives the learner out of the physics.
 
     `weight` is λ, against the sum of squares in the output's units.
     """
@@ -147,7 +155,9 @@ class OrthogonalPenalty(_SolvedTheta):
 
 @dataclass(frozen=True)
 class BaselinePenalty(_SolvedTheta):
-    """Additive with `λ‖(θ − θ⁰)/θ⁰‖²` in the criterion (Bolderman 2022): keeps θ near its initial value.
+    """Additive with `λ‖(θ − θ⁰)/θ⁰‖²` in the criterion (Bolderman 2022).
+
+    The penalty keeps θ near its initial value.
 
     `weight` is λ, against the sum of squares in the output's units.
     """

@@ -23,13 +23,14 @@ from orthaug.fitting.held_out import HeldOutErrors, Pieces, blocked, mean_square
 from orthaug.fitting.kinds import Solver
 from orthaug.fitting.learned import Task, TrainedLearner
 from orthaug.fitting.one_step import OneStepTask
-from orthaug.fitting.silence import add_retries, tell_retries
+from orthaug.fitting.silence import add_retries, retry_warnings
 from orthaug.fitting.status import Ending
 from orthaug.fitting.structures import Orthogonal, Structure
 from orthaug.models.learners import Bound
 
-_INFLATION = 1.4  # of the effective weights in cross-validation, against what follows the noise (Kim and Gu 2004)
-FOLD_ITERATIONS = 60  # enough to tell whether a learner helps, on every block of cross-validation
+# of the effective weights in cross-validation, against following the noise (Kim and Gu 2004)
+_INFLATION = 1.4
+FOLD_ITERATIONS = 60  # enough to see whether a learner helps, on every block of cross-validation
 
 
 Concluding = Callable[[Any, Structure, TrainedLearner], Any]
@@ -54,12 +55,14 @@ def planned(bound: Bound | None, seeds: range, choices: Sequence[str | float]) -
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """How one run is chosen: on `validation`, on held-out `blocks` of the training data, or by the lowest loss.
+    """Choice between runs by held-out errors or by the lowest loss.
+
+    Held-out rows are a `validation` record, or `blocks` of the training data.
 
     With `scored` and without `validation` it is the lowest generalised cross-validation instead,
     one step ahead.
 
-    With `fallback` physics alone is handed over where no free run is better there. An `ensemble`
+    With `fallback` the result is physics alone where no free run is better there. An `ensemble`
     takes them all.
     """
 
@@ -74,14 +77,17 @@ class Choice:
     """
 
     def compares(self, task: Task, starts: Sequence[PlannedRun]) -> bool:
-        """Return whether there is something to choose by held-out errors: runs that fly, or several regularizations."""
+        """Return whether held-out errors choose between runs or regularizations.
+
+        They can where runs are finite, or regularizations are several.
+        """
         several = len({start.regularization for start in starts}) > 1
         return task.bound is not None and (
             task.criterion.free_run is not None or (several and not self.scored)
         )
 
     def ranking(self, task: Task, runs: Sequence[Any], errors: Sequence[float]) -> np.ndarray:
-        """Return what is lowest for the best run: its held-out error, its score, or its loss.
+        """Return the value that is lowest for the best run: held-out error, score, or loss.
 
         On blocks other runs of its kind were judged: one that ended higher on its own data than
         they did on what they had not seen failed to train, and its loss counts.
@@ -117,7 +123,7 @@ def train(
         _run_all(task, starts, structure, solver, choice, progress, runner),
     )
     losses = [task.loss(run) for run in runs]
-    concluded = cache(lambda i: _concluded(conclude, task, structure, task.learned(runs[i])))
+    concluded = cache(lambda i: _conclude(conclude, task, structure, task.learned(runs[i])))
     stopped = sum(run.ending is Ending.STOPPED for run in runs)
     untried = bool(
         stopped and choice.validation is None and choice.blocks and choice.compares(task, starts)
@@ -131,17 +137,17 @@ def train(
     ranking = choice.ranking(task, runs, errors)
     usable = np.array([run.ending.usable for run in runs]) & np.isfinite(ranking)
     best = int(np.argmin(np.where(usable, ranking, np.inf)))
-    told = []
+    replacing = []
     if held_out is not None:
         held_out = replace(held_out, chosen=best)
         runs_freely = task.criterion.free_run is not None and task.start_loss is not None
         if choice.fallback and runs_freely and not held_out.ratio.value < 1:
-            told, best = [_fell_back(held_out)], -1
+            replacing, best = [_fell_back(held_out)], -1
             LOG.info(
-                "no free run is better than physics alone where it was not fitted: physics "
-                "alone is handed over"
+                "no free run is better than physics alone on held-out rows: the result is "
+                "physics alone"
             )
-    LOG.info("run %d is chosen of %d; 0 is physics alone", best + 1, len(runs))
+    LOG.info("run %d of %d is chosen; 0 is physics alone", best + 1, len(runs))
     alike = _members(starts, ranking, best) if choice.scored else _alike(starts, best)
     shown = alike if choice.scored and held_out is None else list(range(len(starts)))
     members = [best]
@@ -149,22 +155,22 @@ def train(
         estimate = _alone(conclude, task, structure)
     elif choice.ensemble:
         members = alike
-        estimate = _concluded(conclude, task, structure, _median(task, runs, members, best))
+        estimate = _conclude(conclude, task, structure, _median(task, runs, members, best))
     else:
         estimate = concluded(best)
     scored = choice.scored and held_out is None
     scores = [_cross_validation(task, run) if scored else math.nan for run in runs]
-    told_of = list(zip(starts, runs, losses, errors, scores, strict=True))
-    restarts = tuple(_restart(*told_of[i], chosen=i in members) for i in shown)
+    results = list(zip(starts, runs, losses, errors, scores, strict=True))
+    restarts = tuple(_restart(*results[i], chosen=i in members) for i in shown)
     seconds = task.seconds + sum(run.seconds for run in runs)
     status = replace(estimate.status, seconds=seconds, start_loss=task.start_loss)
     warnings = (
         *estimate.warnings,
         *task.warnings,
-        *_replaced(starts, runs),
-        *_stopped(stopped, len(runs), untried),
-        *told,
-        *tell_retries(planned, starts, runs, held_out, best),
+        *_replacement_warnings(starts, runs),
+        *_stop_warnings(stopped, len(runs), untried),
+        *replacing,
+        *retry_warnings(planned, starts, runs, held_out, best),
     )
     beside = _beside(conclude, task, structure) if best >= 0 else None
     found = {"restarts": restarts, "status": status, "held_out": held_out, "physics_alone": beside}
@@ -172,12 +178,16 @@ def train(
 
 
 def _beside(conclude: Concluding, task: Task, structure: Structure) -> Any:
-    """Return the estimate of physics alone that a learner stands beside.
+    """Return the estimate of physics alone, to compare with that of a learner.
 
     None without one, and where it costs a pass.
     """
     streamed = hasattr(task.problem, "source")
-    return None if task.bound is None or streamed else _kept_physics(conclude, task, structure)
+    return (
+        None
+        if task.bound is None or streamed
+        else _physics_for_comparison(conclude, task, structure)
+    )
 
 
 def _restart(
@@ -196,7 +206,7 @@ def _restart(
 
 
 def _cross_validation(task: Task, run: Any) -> float:
-    """Generalised: `N RSS / (N − nθ − 1.4 γ)²` of a run one step ahead.
+    """Return the score `N RSS / (N − nθ − 1.4 γ)²` of a run one step ahead (generalised).
 
     Infinite where it uses up all rows.
     """
@@ -229,7 +239,10 @@ def _run_all(
     progress: ProgressCallback,
     runner: Any,
 ) -> tuple[list[PlannedRun], list[Any]]:
-    """Make every planned run, and more where evidence silenced the learner and held-out rows can choose."""
+    """Make every planned run, and weaker regularizations where evidence silenced the learner.
+
+    The latter only where held-out rows can choose.
+    """
     begun, runs = _run(task, starts, structure, solver, progress, runner)
     if task.bound is None or not choice.retry or (choice.validation is None and not choice.blocks):
         return begun, runs
@@ -254,8 +267,8 @@ def _run(
     made, given = list(starts), (task, solver, structure)
     runs = list(runner.map(_one_run, given, made, progress))
     for i, (start, run) in enumerate(zip(made, runs, strict=True), 1):
-        told = (i, start.seed, run.ending.code, run.iterations, task.loss(run), run.seconds)
-        LOG.info("run %d, seed %d: %s after %d iterations, loss %.4g, %.2f s", *told)
+        figures = (i, start.seed, run.ending.code, run.iterations, task.loss(run), run.seconds)
+        LOG.info("run %d, seed %d: %s after %d iterations, loss %.4g, %.2f s", *figures)
     failed = [start for start, run in zip(made, runs, strict=True) if not run.ending.usable]
     if (
         task.bound is None or not failed or len(failed) == len(made)
@@ -275,13 +288,13 @@ def _run(
 
 
 def _one_run(
-    given: tuple[Task, Solver, Structure], start: PlannedRun, tell: Callable[..., None]
+    given: tuple[Task, Solver, Structure], start: PlannedRun, report: Callable[..., None]
 ) -> Any:
     task, solver, structure = given
-    return task.run(solver, start.weights, structure, start.regularization, tell)
+    return task.run(solver, start.weights, structure, start.regularization, report)
 
 
-def _replaced(starts: Sequence[PlannedRun], runs: Sequence[Any]) -> list[Warning]:
+def _replacement_warnings(starts: Sequence[PlannedRun], runs: Sequence[Any]) -> list[Warning]:
     failed = [
         str(start.seed) for start, run in zip(starts, runs, strict=True) if not run.ending.usable
     ]
@@ -294,14 +307,14 @@ def _replaced(starts: Sequence[PlannedRun], runs: Sequence[Any]) -> list[Warning
     return [Warning("start_replaced", text)]
 
 
-def _stopped(count: int, runs: int, untried: bool) -> list[Warning]:
+def _stop_warnings(count: int, runs: int, untried: bool) -> list[Warning]:
     if not count:
         return []
     text = f"training was stopped on request: {count} of {counted(runs, 'run')} had not ended"
     text += ", and none was tried on held-out blocks" if untried else ""
     return [
         Warning(
-            "stopped", f"{text}; the best so far is kept, which training to the end may better."
+            "stopped", f"{text}; the best run so far is kept. Training to the end may improve it."
         )
     ]
 
@@ -316,7 +329,7 @@ def _held_out(
     conclude: Concluding,
     runner: Any,
 ) -> HeldOutErrors | None:
-    """Errors where nothing was fitted: of the runs on the validation record, or of runs on folds on their blocks.
+    """Return held-out errors: of runs on the validation record, or of runs on folds.
 
     `concluded` gives the estimate of a run by its number.
     """
@@ -351,8 +364,8 @@ def _held_out(
     )
 
 
-def _on_fold(given: Any, fold: tuple[Record, Record], tell: Callable[..., None]) -> list[Pieces]:
-    """Errors on a block, of physics alone and of a run from every start on the rest."""
+def _on_fold(given: Any, fold: tuple[Record, Record], report: Callable[..., None]) -> list[Pieces]:
+    """Return errors on a block of physics alone, and of runs from every start on the rest."""
     task, starts, structure, solver, conclude = given
     training, held = fold
     failed: Pieces = [None] * len(held.experiments)
@@ -360,16 +373,16 @@ def _on_fold(given: Any, fold: tuple[Record, Record], tell: Callable[..., None])
         own = task.on(training).prepared(solver, structure)
         fits = [_alone(conclude, own, structure)]
         for start in starts:
-            tell()
+            report()
             run = own.run(solver, start.weights, structure, start.regularization)
-            fits.append(_concluded(conclude, own, structure, own.learned(run)))
+            fits.append(_conclude(conclude, own, structure, own.learned(run)))
     except InputError:  # the block took away what the physics needs
         return [failed] * (1 + len(starts))
     return [_errors(fit, held, task.problem.deviation) for fit in fits]
 
 
 def _errors(fit: Any, record: Record, unit: Any) -> Pieces:
-    """Of the criterion's own response; None for a run without a model or a value."""
+    """Return errors of the criterion's own response; None for a run without model or value."""
     if not fit.status.ok:
         return [None] * len(record.experiments)
     return squared_errors(fit.criterion.response(fit.model, record), unit)
@@ -381,7 +394,7 @@ def _fell_back(held_out: HeldOutErrors) -> Warning:
     )
     errors = f"its error is {model:.4g} deviations of the output, that of physics alone {alone:.4g}"
     if math.isinf(model):
-        errors = "every one of its starts runs away there"
+        errors = "every one of its runs diverges there"
     text = (
         f"in {held_out.where} the learner is not better than physics alone ({errors}), so the "
         "result is physics alone; `fallback = false` keeps the learner."
@@ -394,13 +407,16 @@ def _alone(conclude: Concluding, task: Task, structure: Structure) -> Any:
     return replace(conclude(rows, structure, learned), criterion=task.criterion)
 
 
-def _kept_physics(conclude: Concluding, task: Task, structure: Structure) -> Any:
-    """Return physics alone to set beside a learner: least squares one step ahead, whatever penalty θ has beside it."""
+def _physics_for_comparison(conclude: Concluding, task: Task, structure: Structure) -> Any:
+    """Return physics alone for comparison with a learner.
+
+    It is least squares one step ahead, also where θ has a penalty.
+    """
     plain = task.criterion.one_step and not structure.projects
     return _alone(conclude, task, Orthogonal() if plain else structure)
 
 
-def _concluded(
+def _conclude(
     conclude: Concluding, task: Task, structure: Structure, learned: TrainedLearner
 ) -> Any:
     return replace(conclude(task.rows_task, structure, learned), criterion=task.criterion)

@@ -1,4 +1,4 @@
-"""Fits whose training ended while the loss still fell noticeably: what they say of it, and no intervals of θ.
+"""Fits whose training ended while the loss still fell noticeably: no intervals of θ.
 
 Under the training measure the orthogonal structure's `θ̂ = Φ⁺Y` one step ahead is the same after
 every iteration (F1), and its intervals depend on training through the variance of the residual
@@ -21,11 +21,12 @@ from orthaug.inference.measures import Training
 from orthaug.physics.problem import Problem
 
 NOT_CONVERGED = "not_converged"
-_SETTLED_THETA = 1e-3  # of the loss: half of that is what the standard errors of a θ that does not move change by
+# of the loss: the standard errors of a θ that does not move change by half of that
+_SETTLED_THETA = 1e-3
 
 
 def noticeable_fall(structure: Structure, decoupled: bool, samples: int) -> float:
-    """Return the fall of the loss over a window that is worth going on for, one step ahead.
+    """Return the smallest fall of the loss over a window that is worth more steps.
 
     Args:
         structure: with its measure.
@@ -51,7 +52,7 @@ def unfinished(learned: TrainedLearner) -> bool:
 
 
 def withheld(learned: TrainedLearner) -> TrainedLearner:
-    """Return what a run left without what intervals are made of."""
+    """Return the result of a run without the parts that give intervals."""
     errors = None if learned.errors is None else learned.errors._replace(covariance=None)
     return replace(learned, gram=None, middle=None, errors=errors)
 
@@ -84,7 +85,7 @@ def not_converged(learned: TrainedLearner) -> Warning:
 
 
 def ending_in_words(ending: Ending, tail: Tail | None) -> str:
-    """Return what the limit meant for a run; empty where its ending says all."""
+    """Return the meaning of the limit for a run; empty where its ending says all."""
     if tail is None or not ending.usable:
         return ""
     words = ""
@@ -99,8 +100,8 @@ def ending_in_words(ending: Ending, tail: Tail | None) -> str:
             )
     if tail.prolonged:
         past = (
-            f"training went on past its limit of {counted(tail.limit, 'iteration')}, for the "
-            "loss still fell"
+            f"training went on past its limit of {counted(tail.limit, 'iteration')}, because "
+            "the loss still fell"
         )
         words = f"{past}; {words or ending.message}".rstrip("; ")
     return words

@@ -1,4 +1,6 @@
-"""Covariances and intervals: of θ, of θ and weights together, of predictions, robust to coloured or uneven noise.
+"""Covariances and intervals of θ, of θ and weights together, and of predictions.
+
+Robust ones hold for coloured or uneven noise.
 
 The calibrated form `(Σψᵀψ)⁻¹(ΣψᵀΣ_eψ)(Σψᵀψ)⁻¹` for the criterion `1/N Σ‖ε‖²` (Ljung 1999, ch. 9):
 the factor 2 of the paper's eq:cov_approx cancels against the second derivative of the criterion;
@@ -40,7 +42,7 @@ CONVENTIONS = ("calibrated", "paper")
 
 
 def degrees_of_freedom(rows: int, physics: Vector, effective: float) -> Vector:
-    """Degrees of freedom of each output (ny,): its rows less what the fit has used up.
+    """Return the degrees of freedom of each output (ny,): its rows less what the fit has used up.
 
     The physics uses `Σ_k ‖Q_ki‖²` of output i (its share of nθ), the learner its effective weights.
     """
@@ -48,7 +50,7 @@ def degrees_of_freedom(rows: int, physics: Vector, effective: float) -> Vector:
 
 
 def noise_covariance(squares: Matrix, freedom: Vector) -> Matrix | None:
-    """Σ_e (ny, ny) in the outputs' units from Σ e eᵀ.
+    """Return Σ_e (ny, ny) in the outputs' units from Σ e eᵀ.
 
     None where the fit leaves no degree of freedom.
     """
@@ -58,7 +60,7 @@ def noise_covariance(squares: Matrix, freedom: Vector) -> Matrix | None:
 
 
 def whitening(noise: Matrix) -> Matrix | None:
-    """W with `W Σ Wᵀ = I` (ny, ny).
+    """Return W with `W Σ Wᵀ = I` (ny, ny).
 
     None for a covariance that is singular, as of outputs without errors.
     """
@@ -67,16 +69,18 @@ def whitening(noise: Matrix) -> Matrix | None:
 
 
 def mixing(noise: Matrix) -> Matrix:
-    """M with `MᵀM = Σ` (ny, ny), also of a singular covariance."""
+    """Return M with `MᵀM = Σ` (ny, ny), also of a singular covariance."""
     values, vectors = np.linalg.eigh(noise)
     return (vectors * np.sqrt(np.maximum(values, 0.0))).T
 
 
 def theta_covariance(factor: Factor, middle: Matrix, fixed: Collection[int] = ()) -> Matrix:
-    """Cov θ̂ (nθ, nθ) of θ̂ = Φ⁺Y. For one output this is the textbook s²(ΦᵀΦ)⁻¹.
+    """Return Cov θ̂ (nθ, nθ) of θ̂ = Φ⁺Y.
+
+    For one output this is the textbook s²(ΦᵀΦ)⁻¹.
 
     Args: middle: ΣqᵀΣ_eq (nθ, nθ) over the rows q of Q, in whitened outputs; for one output s² I.
-        fixed: entries that stand at a bound. They have NaN; the others' covariance holds with them
+        fixed: entries at a bound. They have NaN; the others' covariance holds with them
         fixed there.
     """
     nt = len(factor.scale)
@@ -88,7 +92,9 @@ def theta_covariance(factor: Factor, middle: Matrix, fixed: Collection[int] = ()
 
 
 def theta_block(information: Matrix, ridge: float, nt: int, fixed: Collection[int] = ()) -> Matrix:
-    """Cov θ̂ (nθ, nθ) per unit of noise variance, from the information `[S_θ S_w]ᵀ[S_θ S_w]` of θ and weights.
+    """Return Cov θ̂ (nθ, nθ) per unit of noise variance.
+
+    It comes from the information `[S_θ S_w]ᵀ[S_θ S_w]` of θ and weights.
 
     The weights are eliminated: `(H_θθ − H_θw (H_ww + αI)⁺ H_wθ)⁻¹`. Directions of the weights that
     the data do not see count as absent. Entries at a bound (`fixed`) are NaN. All are NaN where θ
@@ -113,26 +119,30 @@ def theta_block(information: Matrix, ridge: float, nt: int, fixed: Collection[in
 
 
 def reach(freedom: float, level: float = 0.95) -> float:
-    """Half the length of a Student-t interval, in standard errors."""
+    """Return half the length of a Student-t interval, in standard errors."""
     return float(scipy.special.stdtrit(max(freedom, 1.0), 0.5 + level / 2))
 
 
 def interval(
     value: Any, std: Any, freedom: float, level: float = 0.95
 ) -> Float[np.ndarray, "*n 2"]:
-    """Student-t interval of each entry, (…, 2)."""
+    """Return the Student-t interval of each entry, (…, 2)."""
     half = reach(freedom, level) * std
     return np.stack([value - half, value + half], axis=-1)
 
 
-def joint_covariance(problem: Problem, model: Model, convention: str = "calibrated") -> Matrix:
+def joint_covariance(
+    problem: Problem, model: Model, convention: str = "calibrated", *, own_units: bool = False
+) -> Matrix:
     """Cov of θ̂ and the learner's weights in the orthogonal structure, from the raw `[Φ J̃]`, J̃ = P⊥J; (nθ + nw)².
 
     Under the training measure the blocks between θ and weights are zero (`thm:zero_cov`), if all
     outputs have the same noise or share no θ. One pass over the rows.
 
     Args: convention: "paper" for eq:cov_approx divided by N, factor 2 and `Σ̂ = (1/N) Σ e eᵀ`
-        included.
+        included. own_units: invert the weights' block by a pseudo-inverse in the weights' own
+        units: of directions whose
+            eigenvalue is rounding beside the largest, there is nothing in the result.
 
     Raises:
         InputError: an unknown convention, or a model without a learner's gradient.
@@ -160,7 +170,7 @@ def joint_covariance(problem: Problem, model: Model, convention: str = "calibrat
     )
     whitened = problem.weight.whitened(noise)
     bound, w = model.form.bound, np.asarray(model.numbers.weights)
-    share = problem.count / len(problem.rows)  # of which the rows in memory are a witness
+    share = problem.count / len(problem.rows)  # of which the rows in memory are a subsample
     outer, middle = (
         share * projected_gram(engine, bound, w, rows, m) for m in (np.eye(ny), mixing(whitened))
     )
@@ -168,14 +178,13 @@ def joint_covariance(problem: Problem, model: Model, convention: str = "calibrat
     change[:nt, :nt] = projection.r / projection.scale
     outer, middle = (change.T @ gram @ change for gram in (outer, middle))
     # block by block, as in the proof: one inverse of both mixes rounding of the weights' singular block into θ's
-    half: Any = scipy.linalg.block_diag(
-        half_inverse(outer[:nt, :nt], nt), half_inverse(outer[nt:, nt:], 0)
-    )
+    weights = half_inverse(outer[nt:, nt:], 0, own_units=own_units)
+    half: Any = scipy.linalg.block_diag(half_inverse(outer[:nt, :nt], nt), weights)
     return (2.0 if convention == "paper" else 1.0) * half @ (half.T @ middle @ half) @ half.T
 
 
 def prediction_std(model: Model, record: Record) -> list[Matrix]:
-    """Return standard error of the one-step prediction on every row of every experiment, (N, ny).
+    """Return the standard error (N, ny) of one-step predictions on every row of every experiment.
 
     NaN on the first lags.
 
@@ -193,8 +202,7 @@ def prediction_std(model: Model, record: Record) -> list[Matrix]:
     joint = model.statistics.joint(len(model.theta))
     if joint is None or model.numbers.tilt is not None:
         raise InputError(
-            "the model has no statistics to take standard errors from (an ensemble, or trained "
-            "elsewhere)."
+            "the model has no statistics for standard errors (an ensemble, or trained elsewhere)."
         )
     root = joint.root()
     record = model.fitting(record, need_outputs=True)
@@ -231,7 +239,7 @@ def changes(
 
 
 def _along(form: Lagged, numbers: Numbers, rows: Any, root: Any) -> Float[Array, "r ny m"]:
-    """∂ŷ/∂(c, w) of a chunk of rows along the columns of `root`."""
+    """Return ∂ŷ/∂(c, w) of a chunk of rows along the columns of `root`."""
     phi = jax.vmap(lambda row: form.baseline.phi(row, form.layout, form.outputs, jnp), -1, -1)(rows)
     columns = jnp.moveaxis(phi, 1, 0)  # (nt, ny, m)
     if form.bound is not None:
@@ -245,7 +253,9 @@ def _along(form: Lagged, numbers: Numbers, rows: Any, root: Any) -> Float[Array,
 
 
 def newey_west(scores: Sequence[Float[np.ndarray, "N nt"]], lags: int | None = None) -> Matrix:
-    """Σ_k Σ_j w_{|k−j|} s_k s_jᵀ with Bartlett weights (Newey and West 1987), lags never across experiments.
+    """Return Σ_k Σ_j w_{|k−j|} s_k s_jᵀ with Bartlett weights (Newey and West 1987).
+
+    No lag reaches across two experiments.
 
     Args:
         scores: of every experiment, (N_i, nt).
@@ -265,7 +275,7 @@ def newey_west(scores: Sequence[Float[np.ndarray, "N nt"]], lags: int | None = N
 def robust_covariance(
     problem: Problem, residual: Matrix, used: float, lags: int | None = None
 ) -> Matrix:
-    """Cov θ̂ (nθ, nθ) of `θ̂ = Φ⁺Y` where the noise may be coloured or uneven (Newey-West).
+    """Return Cov θ̂ (nθ, nθ) of `θ̂ = Φ⁺Y` for coloured or uneven noise (Newey-West).
 
     Args:
         residual: (N, ny) in the outputs' units, rows as in the problem.
@@ -291,14 +301,18 @@ def robust_split_covariance(
     used: float,
     lags: int | None = None,
 ) -> Matrix:
-    """The same of any split `θ = c + θ_aux(w)`, from the influence `[I, ∂θ_aux/∂w] M⁻¹ ψ_k e_k` of every row.
+    """Return Cov θ̂ (nθ, nθ) of a split `θ = c + θ_aux(w)` for coloured or uneven noise.
+
+    It is the sum over the influence `[I, ∂θ_aux/∂w] M⁻¹ ψ_k e_k` of every row.
 
     Args:
         slope: ∂θ_aux/∂w (nθ, nw).
     """
     statistics, nt, ny = model.statistics, len(slope), residual.shape[1]
     if statistics.gram is None or model.numbers.tilt is not None:
-        raise InputError("the fit has no statistics that robust standard errors could be made of.")
+        raise InputError(
+            "the fit has no statistics for robust standard errors; fit the data again."
+        )
     prior = np.concatenate([np.zeros(nt), np.full(len(statistics.gram) - nt, statistics.ridge)])
     half = half_inverse(statistics.gram + np.diag(prior), nt)
     root = half @ (half.T @ np.column_stack([np.eye(nt), slope]).T)
@@ -313,14 +327,14 @@ def robust_split_covariance(
 
 
 def _correction(problem: Problem, residual: Matrix, used: float) -> float:
-    """For what the fit has used up."""
-    share = problem.count / len(problem.rows)  # of which the residual is a witness
+    """Return the factor that corrects for the degrees of freedom that the fit has used up."""
+    share = problem.count / len(problem.rows)  # of which the residual is a subsample
     samples = residual.size * share
     return share * samples / max(samples - len(problem.baseline.names) - used, 1.0)
 
 
 def by_experiment(problem: Problem, values: Matrix) -> list[Matrix]:
-    """Return what each usable row has, (N, m), in a piece per experiment."""
+    """Return values of the usable rows (N, m) in one piece per experiment."""
     ends = np.cumsum(
         [len(experiment) - problem.rows.start for experiment in problem.record.experiments]
     )

@@ -1,4 +1,4 @@
-"""The measures that a spec knows by name.
+"""The measures that a spec refers to by name.
 
 A new one is a file with its declaration, and an entry here.
 
@@ -27,7 +27,7 @@ Range = tuple[Row, Row]
 
 @dataclass(frozen=True, eq=False)
 class MeasurePlace:
-    """What a declared measure is resolved with: the folder of its files, the model's raw lags, the training data.
+    """Context that resolves a declared measure: folder of its files, raw lags, training data.
 
     `start` is the first usable row of each experiment.
     """
@@ -40,7 +40,9 @@ class MeasurePlace:
 
 @dataclass(frozen=True)
 class SampleFiles:
-    """Declares `Samples`: files with a column per raw lag, named as in expressions, and optionally `weight`.
+    """Declaration of `Samples` by files with a column per raw lag, and optionally `weight`.
+
+    Columns are named as in expressions.
 
     Args:
         files: their paths, relative to the spec.
@@ -62,7 +64,7 @@ class SampleFiles:
 
 @dataclass(frozen=True)
 class WeightFiles:
-    """Declares `Weighted`: files with a column `weight`.
+    """Declaration of `Weighted` by files with a column `weight`.
 
     Together they have a row for each row of the training data.
 

@@ -1,4 +1,4 @@
-"""What a learner of terms has learned: each term with its coefficient, unit and interval, and the equation."""
+"""The terms of a learner, each with its coefficient, unit and interval, and the fitted equation."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ class LearnedTerm:
 
 
 def learned_terms(model: Any) -> tuple[LearnedTerm, ...]:
-    """Of a fitted model, the largest contribution first.
+    """Return the learned terms of a fitted model, the largest contribution first.
 
     Empty where the learner is no sum of terms.
     """
     form, numbers, statistics = model.form, model.numbers, model.statistics
     if form.bound is None or not isinstance(form.bound.learner, Terms) or numbers.tilt is not None:
         return ()
-    places, features = _added_to(model), _features(model)
+    places, features = _targets(model), _features(model)
     scale = np.asarray(numbers.gain)[:, None] / np.asarray(numbers.halfwidth)[None, :]
     values = (np.reshape(numbers.weights, scale.shape) * scale).ravel()
     nt = len(numbers.theta)
@@ -74,13 +74,15 @@ def learned_terms(model: Any) -> tuple[LearnedTerm, ...]:
 
 
 def equation(model: Any, writing: str = "text") -> str:
-    """Return the whole model as an equation for each output, or for each equation of a motion, with its numbers.
+    """Return the fitted model with its numbers, an equation per output or per motion equation.
 
-    Args: writing: "text", "latex", or "python": expressions of arrays that Python evaluates, in
-        full precision.
+    Args:
+        writing: "text", "latex", or "python": expressions of arrays that Python evaluates, in full
+            precision.
 
-    Raises: InputError: a learner that is no sum of terms, physics that is a Python function,
-        another writing.
+    Raises:
+        InputError: a learner that is no sum of terms, physics that is a Python function, another
+            writing.
     """
     check_choice(writing, WRITINGS, "`writing`")
     form = model.form
@@ -109,8 +111,8 @@ def _moves(model: Any) -> bool:
     return hasattr(model.form, "motion")
 
 
-def _added_to(model: Any) -> list[tuple[str, str]]:
-    """Name and unit of what each row of weights is added to."""
+def _targets(model: Any) -> list[tuple[str, str]]:
+    """Return the name and unit of the quantity that each row of weights is added to."""
     if not _moves(model):
         return [(channel.name, channel.unit) for channel in model.outputs]
     motion = model.form.motion
@@ -134,7 +136,7 @@ def _units(model: Any) -> dict[str, str]:
 
 
 def _physics(model: Any, writing: str) -> list[tuple[tuple[str, str], list[str]]]:
-    """Of each equation its name and left side, and the terms of the physics."""
+    """Return each equation's name and left side, and its terms of the physics."""
     if _moves(model):
         return _rates(model, writing)
     baseline = model.form.baseline
@@ -203,7 +205,7 @@ def _power_of_ten(number: str) -> str:
 
 
 def term_frame(terms: Sequence[LearnedTerm]) -> pd.DataFrame:
-    """Return a row per term; NaN where there is no interval."""
+    """Return a table with a row per term; NaN where there is no interval."""
     import pandas as pd
 
     nothing = (np.nan, np.nan)
@@ -223,7 +225,7 @@ def term_frame(terms: Sequence[LearnedTerm]) -> pd.DataFrame:
 
 
 def term_lines(terms: Sequence[LearnedTerm]) -> list[str]:
-    """Return the terms as a table of text, a heading before them.
+    """Return the terms as a table in text, with a heading.
 
     A dash where there is no interval.
     """

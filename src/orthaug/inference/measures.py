@@ -1,4 +1,4 @@
-"""Measures: the points, with weights, on which physics and learner are made orthogonal (F3), and the physics there.
+"""Measures: weighted points on which physics and learner are made orthogonal (F3).
 
 θ under a measure is `Φ_μ⁺ G_μ`, the least-squares share of the fitted function g in the physics
 over those points. The paper takes the training set. A function that is orthogonal to the physics
@@ -34,7 +34,8 @@ from orthaug.physics.projection import Projection
 _NODES = (1 << 20, 512, 64)  # of the rule for one, two and three coordinates, in each of them
 _PANEL = 8  # Gauss-Legendre nodes of a panel
 _QUASI_RANDOM = 1 << 17  # points for more coordinates, doubled by their mirror images
-_NEIGHBOURS = 20_000  # points at most, of the data and of the measure, by which the reach of the data is judged
+# points at most, of the data and of the measure, by which the reach of the data is judged
+_NEIGHBOURS = 20_000
 
 
 class Points(NamedTuple):
@@ -46,7 +47,7 @@ class Points(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Support:
-    """What a measure may draw on: the training record, its regressor, and the lags that the model reads."""
+    """The training record, its regressor and the lags that the model reads, for measures."""
 
     record: Record
     layout: Layout
@@ -56,12 +57,12 @@ class Support:
 
     @classmethod
     def of(cls, problem: Problem) -> Support:
-        """Where a problem is posed."""
+        """Return the support of a posed problem."""
         return cls(problem.record, problem.layout, problem.used, problem.rows.x)
 
     @classmethod
     def of_motion(cls, motion: Motion, x: Matrix, u: Matrix) -> Support:
-        """Of a motion's states (M, nx) and inputs (M, nu) at the training rows."""
+        """Return the support of a motion's states (M, nx) and inputs (M, nu) at training rows."""
         layout, points = layout_of(motion), np.concatenate([x, u], axis=1)
         channels = tuple(Channel(f"c{i}") for i in range(len(layout)))
         return cls(
@@ -74,7 +75,7 @@ class Support:
         return stack_rows(self.record, self.layout).x if self.stacked is None else self.stacked
 
     def share(self, points: Points) -> float:
-        """Return the measure's weight within reach of the training data.
+        """Return the share of the measure's weight that lies in the operating range of the data.
 
         A point is within reach if its nearest training point is closer than a limit: twice the
         distance from a training point to its nearest neighbour, at the 99 % quantile. Each used lag
@@ -99,7 +100,7 @@ class Support:
 
 @runtime_checkable
 class Measure(Protocol):
-    """What `Orthogonal(measure=…)` and `fit.split(…)` take."""
+    """A measure as `Orthogonal(measure=…)` and `fit.split(…)` accept it."""
 
     @property
     def name(self) -> str: ...
@@ -142,7 +143,7 @@ class Training:
 
 @dataclass(frozen=True)
 class Symmetrized:
-    """The training rows and their mirror images −x: the paper's sign trick without a new experiment."""
+    """The training rows and their mirror images −x: the paper's sign trick."""
 
     name: str = field(default="symmetrized", metadata=LIBRARY_ONLY)
 
@@ -153,19 +154,19 @@ class Symmetrized:
 
 @dataclass(frozen=True, eq=False)
 class Weighted:
-    """The training rows with weights of one's own, (N,), in the order of the usable rows."""
+    """The training rows with given weights (N,), in the order of the usable rows."""
 
     weights: Any
     name: str = "weighted"
 
     def points(self, support: Support) -> Points:
         x = support.x
-        return Points(x, _normalised(self.weights, len(x), "usable rows"))
+        return Points(x, _normalise(self.weights, len(x), "usable rows"))
 
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Points of one's own: a column per raw lag that the model reads, named as in expressions.
+    """Given points: a column per raw lag that the model reads, named as in expressions.
 
     Args:
         columns: values (M,) of each lag, `{"force[k-1]": …}`.
@@ -215,18 +216,21 @@ class Samples:
         for j, lag in enumerate(support.layout):
             x[:, j] = values.get(lag, 0.0)
         weight = np.ones(count) if self.weights is None else self.weights
-        return Points(x, _normalised(weight, count, "samples"))
+        return Points(x, _normalise(weight, count, "samples"))
 
 
 @dataclass(frozen=True, eq=False)
 class Uniform:
-    """Uniform over a box of raw lags, integrated by a deterministic rule that is symmetric about the box's centre.
+    """Uniform over a box of raw lags.
+
+    A deterministic rule that is symmetric about the box's centre integrates over it.
 
     Composite Gauss-Legendre in up to three coordinates, Sobol points with their mirror images in
     more.
 
-    Args: box: limits of raw lags, `{"force[k-1]": (-200, 200)}`; lags that are not named take the
-        data's own range.
+    Args:
+        box: limits of raw lags, `{"force[k-1]": (-200, 200)}`; lags that are not named take the
+            data's own range.
 
     Examples:
         >>> Uniform(box={"u[k-1]": (-2, 2)}).name  # fit.split(Uniform(…)) gives θ under it
@@ -248,7 +252,7 @@ class Uniform:
         return Points(x, unit.weight)
 
     def limits(self, support: Support) -> tuple[Vector, Vector]:
-        """Lower and upper limits of every entry of the regressor, each (nx,).
+        """Return the lower and upper limits of every entry of the regressor, each (nx,).
 
         Raises:
             InputError: an unknown lag, limits that are empty or reversed.
@@ -270,7 +274,7 @@ class Uniform:
         return low, high
 
 
-def _normalised(weights: Any, count: int, what: str) -> Vector:
+def _normalise(weights: Any, count: int, what: str) -> Vector:
     try:
         values = np.asarray(weights, dtype=float)
     except (TypeError, ValueError):
@@ -297,12 +301,12 @@ def _lag_of(text: str, support: Support) -> Lag:
 
 
 def _entries(support: Support) -> str:
-    """Return what the names of a measure stand for: a motion has no lags."""
+    """Return the entries that a measure may name: a motion has no lags."""
     return "raw lag" if any("[" in str(lag) for lag in support.used) else "state or input"
 
 
 def _rule(coordinates: int) -> Points:
-    """Nodes on [−1, 1]ᵈ with weights that add up to 1, symmetric about 0."""
+    """Return nodes on [−1, 1]ᵈ with weights that add up to 1, symmetric about 0."""
     if coordinates == 0:
         return _even(np.zeros((1, 0)))
     if coordinates <= len(_NODES):
@@ -345,8 +349,9 @@ def weigh(
     Args:
         weight: the matrix of the output weights, (ny, ny).
 
-    Raises: InputError: a measure that does not fit the data, or on whose points the physics is not
-        finite.
+    Raises:
+        InputError: a measure that does not fit the data, or on whose points the physics is not
+            finite.
     """
     points = measure.points(support)
     with np.errstate(all="ignore"):
@@ -358,8 +363,8 @@ def weigh(
             for lag, value in zip(support.layout, points.x[point], strict=True)
         )
         raise InputError(
-            f"the physics is not finite on all points of the {measure.name} measure: what "
-            f"{baseline.names[column]} multiplies is not at {at}. Take the training measure, "
+            f"the physics is not finite on all points of the {measure.name} measure: the "
+            f"regressor of {baseline.names[column]} is not at {at}. Take the training measure, "
             "or a uniform one over a box where it is."
         )
     unit = np.sqrt(points.weight)[:, None, None] * weight
@@ -370,7 +375,7 @@ def weigh(
 
 
 def weigh_problem(measure: Measure, problem: Problem) -> WeighedPhysics:
-    """The same for a posed problem.
+    """Return the physics over a measure's points for a posed problem.
 
     Under the training measure it takes the factor that the problem has.
     """

@@ -1,6 +1,6 @@
-"""The nearest physics of a fitted motion, p̂ = argmin_p Σ_μ ‖G − f(·.
+"""The nearest physics of a fitted motion, p̂ = argmin_p Σ_μ ‖G − f(·; p)‖².
 
-P)‖², along what a learner could imitate.
+p̂ moves only along directions that a learner could imitate.
 
 G = f(·; c) + g is the fitted field over points of states and inputs; only learned equations and
 outputs count. p̂ depends on G and the measure alone, not on how G was put together. For f linear in
@@ -41,7 +41,10 @@ _FEWEST = 4  # moves that succeed, for each parameter
 
 
 class Field(NamedTuple):
-    """Points (M, nx) and (M, nu) with weights (M,), and the size (nl,) of each learned equation and output."""
+    """Weighted points of states (M, nx) and inputs (M, nu), and the size of each learned equation.
+
+    `weight` is (M,); `size` (nl,) counts learned equations and outputs.
+    """
 
     x: Matrix
     u: Matrix
@@ -73,7 +76,7 @@ class MotionSplit:
 
     @classmethod
     def none(cls, name: str, form: MotionField, c: Vector) -> MotionSplit:
-        """Before any split: c itself, nothing shared, over no points."""
+        """Return the split before any: c itself, nothing shared, over no points."""
         nothing = Field(
             np.zeros((0, form.states)),
             np.zeros((0, len(form.motion.inputs))),
@@ -85,7 +88,7 @@ class MotionSplit:
 
 
 def shared_of_motion(form: MotionDynamics, q: Vector, x: Matrix, u: Matrix) -> Shared:
-    """Return the directions of q that a learner on the form's features could imitate, at q.
+    """Return the directions of q that a learner on these features could imitate, at q.
 
     A direction is shared if it moves no equation and no output without a learner, and moves those
     with one by a function of the features alone.
@@ -94,7 +97,7 @@ def shared_of_motion(form: MotionDynamics, q: Vector, x: Matrix, u: Matrix) -> S
     if not learned_places(motion):
         return Shared(names, np.zeros((len(names), 0)))
     if form.bound is not None and getattr(form.bound.learner, "linear", False):
-        return _spanned(form, q, x, u)
+        return _spanned_directions(form, q, x, u)
     nx = x.shape[1]
     points = np.concatenate([x, u], axis=1)
     points = points[np.isfinite(points).all(axis=1)]
@@ -125,15 +128,15 @@ def shared_of_motion(form: MotionDynamics, q: Vector, x: Matrix, u: Matrix) -> S
 def _left_over(
     form: MotionDynamics, q: Vector, points: Matrix, nx: int
 ) -> UnexplainedPhysics | None:
-    """Return what functions of the features leave of the slopes at the points."""
+    """Return the part of the slopes at the points that no function of the features follows."""
     some = points[:: max(1, -(-len(points) // _ROWS))]
     slopes = np.asarray(slopes_at(form, q, some[:, :nx], some[:, nx:]))
     features = np.asarray(form.seen(some[:, :nx].T, some[:, nx:].T, np)).T
     return left_over(slopes, features, _has_learner(form.motion))
 
 
-def _spanned(form: MotionDynamics, q: Vector, x: Matrix, u: Matrix) -> Shared:
-    """Return the directions that move what has a learner by linear combinations of its features, and nothing else."""
+def _spanned_directions(form: MotionDynamics, q: Vector, x: Matrix, u: Matrix) -> Shared:
+    """Return the directions that the learner's features span and that move no other equation."""
     some = slice(None, None, max(1, len(x) // _POINTS))
     slopes = np.moveaxis(np.asarray(slopes_at(form, q, x[some], u[some])), 1, 0)
     features = np.asarray(form.seen(x[some].T, u[some].T, np)).T
@@ -158,7 +161,9 @@ def nearest(
     bounds: tuple[Vector, Vector],
     basis: Matrix | None = None,
 ) -> tuple[Vector, Shared]:
-    """q̂, searched from the point nearest to `start` that differs from c along shared directions only.
+    """Return q̂, which differs from c along shared directions only.
+
+    The search begins at the point of that plane that is nearest to `start`.
 
     Args:
         start: coordinates of physics alone.
@@ -175,7 +180,7 @@ def nearest(
     shared = directions(q)
     if not shared.basis.size:
         return q, shared
-    gauss = np.asarray(_summed(_gauss_newton, form, numbers, q, field)[1])
+    gauss = np.asarray(_sum_over(_gauss_newton, form, numbers, q, field)[1])
     b, size = _unit(shared.basis, gauss), np.sqrt(np.diag(gauss))
     along = np.linalg.lstsq(size[:, None] * b, size * (start - q), rcond=None)[0]
     candidates = [np.clip(q + b @ along, *bounds), q]
@@ -184,7 +189,7 @@ def nearest(
     for _ in range(_ITERATIONS):
         shared = directions(q)
         gradient, gauss = (
-            np.asarray(part) for part in _summed(_gauss_newton, form, numbers, q, field)
+            np.asarray(part) for part in _sum_over(_gauss_newton, form, numbers, q, field)
         )
         b = _unit(shared.basis, gauss)
         inner, downhill = b.T @ gauss @ b, -b.T @ gradient
@@ -204,7 +209,7 @@ def nearest(
 
 
 def _unit(basis: Matrix, gauss: Matrix) -> Matrix:
-    """Return the directions in such a length that each moves the learned equations by one."""
+    """Return the directions scaled so that each moves the learned equations by one."""
     size = np.sqrt(np.maximum(np.einsum("ij,ik,kj->j", basis, gauss, basis), 0.0))
     return basis / np.where(size > 0, size, 1.0)
 
@@ -220,12 +225,14 @@ def split_motion(
     everything: bool = False,
     wobble: Any = None,
 ) -> MotionSplit:
-    """p̂ of a fitted motion under a measure.
+    """Return p̂ of a fitted motion under a measure.
 
-    Args: name: of the measure. start: coordinates of physics alone. everything: whether all
-        directions count as shared (the paper's projection). wobble: (np, np + nw) from (q̂): `Σ
-        φ_qx dx/d(c, w)` of points that are the fitted run's; None where they
-            are fixed.
+    Args:
+        name: of the measure.
+        start: coordinates of physics alone.
+        everything: whether all directions count as shared (the paper's projection).
+        wobble: (np, np + nw) from (q̂): `Σ φ_qx dx/d(c, w)` of points that are the fitted run's;
+            None where they are fixed.
     """
     count = len(form.motion.parameters)
     basis = np.eye(count) if everything else None
@@ -236,7 +243,7 @@ def split_motion(
     q, shared = nearest(form, numbers, start, field, bounds, basis)
     whole = np.concatenate([np.eye(count), np.zeros((count, form.bound.size))], axis=1)
     second, to_c, to_w, gauss, gradient, learner, rest, size = (
-        np.asarray(part) for part in _summed(_second, form, numbers, q, field)
+        np.asarray(part) for part in _sum_over(_second, form, numbers, q, field)
     )
     with np.errstate(all="ignore"):
         share = float(np.sqrt(rest / size)) if size > 0 else None
@@ -265,7 +272,7 @@ def _learned_rows(form: MotionDynamics, q: Any, x: Any, u: Any) -> Any:
 def rest_of(
     form: MotionDynamics, numbers: Numbers, q: Any, c: Any, w: Any, x: Any, u: Any, size: Any
 ) -> Any:
-    """(G − f(q)) / size (nl,) at one point."""
+    """Return (G − f(q)) / size (nl,) at one point."""
     own = numbers._replace(weights=w)
     return (
         _learned_rows(form, c, x, u) + form.learned(own, x, u) - _learned_rows(form, q, x, u)
@@ -276,7 +283,7 @@ def rest_of(
 def slopes_at(
     form: MotionDynamics, q: Any, x: Float[Array, "m nx"], u: Float[Array, "m nu"]
 ) -> Float[Array, "m r np"]:
-    """∂(f, h)/∂q at points."""
+    """Return ∂(f, h)/∂q at points."""
 
     def both(q: Any, x: Any, u: Any) -> Any:
         p = form.motion.coordinates.physical(q, jnp)
@@ -288,11 +295,13 @@ def slopes_at(
 
 
 def _distance(form: MotionDynamics, numbers: Numbers, q: Vector, field: Field) -> float:
-    value = float(np.asarray(_summed(_square, form, numbers, q, field)))
+    value = float(np.asarray(_sum_over(_square, form, numbers, q, field)))
     return value if np.isfinite(value) else np.inf
 
 
-def _summed(function: Any, form: MotionDynamics, numbers: Numbers, q: Vector, field: Field) -> Any:
+def _sum_over(
+    function: Any, form: MotionDynamics, numbers: Numbers, q: Vector, field: Field
+) -> Any:
     """Return the sum over the points, batch by batch."""
     total = None
     for begin in range(0, len(field.x), _BATCH):
@@ -339,7 +348,7 @@ def _gauss_newton(
 def _second(
     form: MotionDynamics, numbers: Numbers, q: Any, x: Any, u: Any, weight: Any, size: Any
 ) -> Any:
-    """Second derivatives of half the distance: in q, in q and c, in q and w.
+    """Return the second derivatives of half the distance: in q, in q and c, in q and w.
 
     And what the rest is made of.
     """

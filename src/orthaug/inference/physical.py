@@ -32,7 +32,10 @@ _SOLVED = {
 
 
 class Consistency(NamedTuple):
-    """Whether θ̂ obeys what the physics fixes among θ: χ² = rᵀCov⁻¹r, its degrees of freedom, p-value, a sentence."""
+    """Test of θ̂ against the relations that the physics imposes on θ.
+
+    χ² = rᵀCov⁻¹r, its degrees of freedom, its p-value, and a sentence.
+    """
 
     chi2: float
     df: int
@@ -51,7 +54,7 @@ class PhysicalEstimate:
     std: tuple[float | None, ...]
     ci95: tuple[tuple[float, float] | None, ...]
     covariance: Matrix | None
-    """Cov p̂ (np, np), NaN at parameters that stand at a bound; None where there are no standard
+    """Cov p̂ (np, np), NaN at parameters at a bound; None where there are no standard
     errors.
     """
     consistency: Consistency | None
@@ -64,11 +67,11 @@ class PhysicalEstimate:
 
     def __repr__(self) -> str:
         rows = zip(self.names, self.value, self.std, self.units, strict=True)
-        told = (
+        parts = (
             f"{n} = {v:.6g}{'' if s is None else f' ± {s:.2g}'} {unit}".rstrip()
             for n, v, s, unit in rows
         )
-        return f"PhysicalEstimate({', '.join(told)})"
+        return f"PhysicalEstimate({', '.join(parts)})"
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,14 +104,14 @@ class _Fit:
         return cls(physics, target, default if whiten is None else whiten, whiten is not None, free)
 
     def at(self, p: Vector) -> tuple[Vector, Matrix]:
-        """Whitened residual (nθ,) and its derivative (nθ, np)."""
+        """Return the whitened residual (nθ,) and its derivative (nθ, np)."""
         theta, jacobian = self.physics.linearised(p)
         with np.errstate(all="ignore"):
             return self.whiten @ (theta - self.target), self.whiten @ jacobian
 
     @np.errstate(all="ignore")  # where there is no solution p goes to infinity
     def descend(self, p: Vector) -> tuple[float, Vector]:
-        """Cost and p of the minimum that Levenberg-Marquardt finds from p.
+        """Return cost and p of the minimum that Levenberg-Marquardt finds from p.
 
         Cost inf where θ has no value at p.
 
@@ -148,7 +151,7 @@ class _Fit:
         return cost, p
 
     def solutions(self, starts: int) -> list[Vector]:
-        """Return the best p first, then others that explain θ̂ as well.
+        """Return the best p first, then others that explain θ̂ equally well.
 
         From p⁰ and `starts` points about it.
         """
@@ -167,14 +170,17 @@ class _Fit:
 
 
 def _cost(residual: Vector, jacobian: Matrix) -> float:
-    """‖residual‖², infinite where it or the derivative is not finite."""
+    """Return ‖residual‖², infinite where it or the derivative is not finite."""
     with np.errstate(over="ignore", invalid="ignore"):
         cost = float(residual @ residual)
     return cost if np.isfinite(cost) and np.isfinite(jacobian).all() else math.inf
 
 
 def _whitener(target: Vector, covariance: Matrix) -> Matrix | None:
-    """K (nθ, nθ) with KᵀK = Cov⁻¹; None where an entry of θ has no variance, as at a bound."""
+    """Return K (nθ, nθ) with KᵀK = Cov⁻¹.
+
+    None where an entry of θ has no variance, as at a bound.
+    """
     nt = len(target)
     if covariance.shape != (nt, nt):
         raise InputError(
@@ -193,7 +199,7 @@ def _whitener(target: Vector, covariance: Matrix) -> Matrix | None:
             "`covariance` must be symmetric with no negative eigenvalue; expected that of "
             "theta_hat."
         )
-    # a combination of θ without variance is known as well as double precision can tell, not unknown
+    # a combination of θ without variance is known as well as double precision can show, not unknown
     return (vectors / np.sqrt(np.maximum(eigenvalues, _ROUNDING))).T / std
 
 
@@ -205,15 +211,19 @@ def solve(
     freedom: float,
     starts: int = 4,
 ) -> PhysicalEstimate:
-    """p̂ = argmin (θ̂ − h(p))ᵀ Cov⁻¹ (θ̂ − h(p)) within the bounds of p, with its statistics.
+    """Return p̂ = argmin (θ̂ − h(p))ᵀ Cov⁻¹ (θ̂ − h(p)) within its bounds, with its statistics.
 
-    Args: physics: h. theta_hat: θ̂ (nθ,) in the order of `physics.theta_names`. covariance: Cov θ̂
-        (nθ, nθ); None, or one that is not finite, gives relative weights and no statistics.
+    Args:
+        physics: h.
+        theta_hat: θ̂ (nθ,) in the order of `physics.theta_names`.
+        covariance: Cov θ̂ (nθ, nθ); None, or one that is not finite, gives relative weights and no
+            statistics.
         freedom: degrees of freedom of the noise variance within it; inf where that is known.
         starts: points about p⁰ from which the solution is sought besides p⁰ itself.
 
-    Raises: InputError: arguments of another shape, or that are no estimate, covariance or degrees
-        of freedom.
+    Raises:
+        InputError: arguments of another shape, or that are no estimate, covariance or degrees of
+            freedom.
     """
     _check_freedom(freedom)
     fit = _Fit.of(physics, theta_hat, covariance)
@@ -238,13 +248,13 @@ def solve(
     if outside:
         warnings.append(_outside(fit, value))
     elif not sensitivity.full_rank:
-        told = (
+        text = (
             f"At the solution {tied(sensitivity)}; the physical parameters have no standard errors."
         )
-        warnings.append(Warning("physical_parameters_tied", told))
+        warnings.append(Warning("physical_parameters_tied", text))
     if not fit.known:
-        told = "theta has no finite covariance, so the physical parameters have no standard errors."
-        warnings.append(Warning("no_standard_errors", told))
+        text = "theta has no finite covariance, so the physical parameters have no standard errors."
+        warnings.append(Warning("no_standard_errors", text))
     if consistency is not None and consistency.p < CONTRADICTION:
         warnings.append(Warning("physics_contradicted", consistency.text))
     std = np.full(len(value), np.nan) if spread is None else np.sqrt(np.diag(spread))
@@ -266,7 +276,7 @@ def solve(
 
 
 def _held(physics: PhysicsMap, value: Vector, gradient: Vector) -> Bool[np.ndarray, "n"]:
-    """Which parameters the data press against a bound, (np,)."""
+    """Return a mask (np,) of the parameters that the data press against a bound."""
     low, high = physics.bounds
     return ((value <= low) & (gradient > 0)) | ((value >= high) & (gradient < 0))
 
@@ -274,7 +284,10 @@ def _held(physics: PhysicsMap, value: Vector, gradient: Vector) -> Bool[np.ndarr
 def _linear(
     fit: _Fit, value: Vector, jacobian: Matrix, held: Bool[np.ndarray, "n"]
 ) -> tuple[Matrix | None, Matrix]:
-    """Cov p̂ = (HᵀWH)⁻¹, None without Cov θ̂, and ∂ln p̂ / ∂ln θ̂ from dp̂/dθ̂ = (HᵀWH)⁻¹HᵀW, by SVD of KH."""
+    """Return Cov p̂ = (HᵀWH)⁻¹ and ∂ln p̂ / ∂ln θ̂, by SVD of KH.
+
+    The covariance is None without Cov θ̂; dp̂/dθ̂ = (HᵀWH)⁻¹HᵀW.
+    """
     norms = np.linalg.norm(jacobian[:, ~held], axis=0)
     u, sigma, vt = np.linalg.svd(jacobian[:, ~held] / norms, full_matrices=False)
     root = vt.T / sigma / norms[:, None]
@@ -302,7 +315,9 @@ def _check_freedom(freedom: float) -> None:
 
 
 def _consistency(chi2: float, df: int, freedom: float, held: bool) -> Consistency:
-    """χ²/df is compared with F(df, freedom), as the noise variance is estimated itself.
+    """Return the test of θ̂ against h(p̂), with χ²/df compared to F(df, freedom).
+
+    F, not χ², because the noise variance is estimated itself.
 
     Χ² itself where it is known.
     """
@@ -324,12 +339,11 @@ def _consistency(chi2: float, df: int, freedom: float, held: bool) -> Consistenc
 
 
 def _at_bounds(physics: PhysicsMap, value: Vector, held: Bool[np.ndarray, "n"]) -> list[Warning]:
-    told = (
-        "{} stands at its bound {:g} and has no standard error; those of the others hold with "
-        "it there."
+    text = (
+        "{} is at its bound {:g} and has no standard error; those of the others hold with it there."
     )
     return [
-        Warning("at_a_bound", told.format(name, v))
+        Warning("at_a_bound", text.format(name, v))
         for name, v, at_bound in zip(physics.names, value, held, strict=True)
         if at_bound
     ]
@@ -341,23 +355,23 @@ def _elsewhere(physics: PhysicsMap, others: Sequence[Vector]) -> list[Warning]:
     listed = ", ".join(
         f"{name} = {v:.6g}" for name, v in zip(physics.names, others[0], strict=True)
     )
-    told = (
-        f"theta is explained as well by {listed}; bounds or better initial values choose "
-        "between the solutions."
+    text = (
+        f"theta is explained equally well by {listed}; give bounds or better initial values to "
+        "choose a solution."
     )
-    return [Warning("several_solutions", told)]
+    return [Warning("several_solutions", text)]
 
 
 def _outside(fit: _Fit, value: Vector) -> Warning:
     nearby = fit.physics.theta(value)
     worst = int(np.argmax(np.abs(nearby - fit.target) / magnitude(fit.target)))
-    told = (
+    text = (
         "No physical parameters give the estimated theta: nearest is "
         f"{fit.physics.theta_names[worst]} = {nearby[worst]:.6g} instead of "
         f"{fit.target[worst]:.6g}. They have no standard errors; check the expressions of "
         "theta, and whether theta is biased."
     )
-    return Warning("physics_not_met", told)
+    return Warning("physics_not_met", text)
 
 
 def profile(
@@ -370,7 +384,9 @@ def profile(
     level: float = 0.95,
     starts: int = 4,
 ) -> tuple[float, float]:
-    """Profile-likelihood interval of one physical parameter: {pᵢ : min over the others χ² ≤ least χ² + F(1, freedom)}.
+    """Return the profile-likelihood interval of one physical parameter.
+
+    The interval is {pᵢ : min over the others χ² ≤ least χ² + F(1, freedom)}.
 
     Unlike p̂ ± reach·std it is asymmetric where h bends, and it ends at the parameter's bounds. A
     side without a limit from the data is ±inf.
@@ -410,14 +426,16 @@ def profile(
     )  # at most one standard deviation
     bounds = (physics.parameters[i].min, physics.parameters[i].max)
     low, high = (
-        _crossing(excess, best[i], sign * step, bound)
+        _find_crossing(excess, best[i], sign * step, bound)
         for sign, bound in zip((-1, 1), bounds, strict=True)
     )
     return low, high
 
 
-def _crossing(excess: Callable[[float], float], start: float, step: float, bound: float) -> float:
-    """Where `excess`, negative at `start`, changes its sign on the way to `bound`.
+def _find_crossing(
+    excess: Callable[[float], float], start: float, step: float, bound: float
+) -> float:
+    """Return the point at which `excess`, negative at `start`, changes sign before `bound`.
 
     `bound` where it does not.
     """

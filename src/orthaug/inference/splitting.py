@@ -1,4 +1,4 @@
-"""θ of a fitted function under any measure, with its uncertainty: `θ_μ = c + Φ_μ⁺F_μ`, without training again (F2).
+"""θ of a fitted function under any measure, without new training: `θ_μ = c + Φ_μ⁺F_μ` (F2).
 
 With `Cov(c, w)` from training, `Cov θ_μ = K Cov(c, w) Kᵀ` with `K = [I, Φ_μ⁺J_μ]`. Under another
 measure θ depends on the learner, and shares its variance.
@@ -29,7 +29,10 @@ SUPPORTED = 0.9  # share of a measure within reach of the data, below which it i
 
 @dataclass(frozen=True, eq=False)
 class MeasureSplit:
-    """θ and θ_aux under a measure, Cov θ (None without statistics), and how far the data support the measure."""
+    """θ, θ_aux and Cov θ under a measure, and the share of it that the data support.
+
+    Cov θ is None without statistics.
+    """
 
     name: str
     theta: Vector
@@ -48,14 +51,14 @@ class MeasureSplit:
     """What it was split under."""
 
     def __str__(self) -> str:
-        told = (
+        text = (
             f"{self.name}, {self.points} points, {100 * self.support:.0f} % of it within reach "
             "of the data"
         )
         if self.price is None or not np.isfinite(self.price).all():
-            return told
+            return text
         return (
-            f"{told}; standard errors {', '.join(f'{r:.3g}' for r in self.price)} times the "
+            f"{text}; standard errors {', '.join(f'{r:.3g}' for r in self.price)} times the "
             "training measure's"
         )
 
@@ -70,8 +73,9 @@ def split_under(
         support: the training data.
         joint: Cov(c, w) from training; None for no intervals.
 
-    Raises: InputError: a measure that does not fit the model, or under which the physics is
-        rank-deficient.
+    Raises:
+        InputError: a measure that does not fit the model, or under which the physics is
+            rank-deficient.
     """
     weighed = weigh(measure, support, model.form.baseline, model.form.outputs, model.weight)
     points, unit, projection = weighed.points, weighed.unit, weighed.projection
@@ -102,14 +106,14 @@ def split_under(
         "training data"
     )
     learns = form.bound is not None
-    told = Warning(
-        "measure_beyond_data", f"{reach}: elsewhere θ rests on how the learner extrapolates."
+    warning = Warning(
+        "measure_beyond_data", f"{reach}: elsewhere θ depends on the learner's extrapolation."
     )
-    warnings = (told,) if share < SUPPORTED and learns else ()
+    warnings = (warning,) if share < SUPPORTED and learns else ()
     condition = weighed.excitation.condition
-    told_of = (share, len(points.x), condition, warnings)
+    of_measure = (share, len(points.x), condition, warnings)
     return MeasureSplit(
-        measure.name, theta, aux, covariance, defect, *told_of, slope=slope, measure=measure
+        measure.name, theta, aux, covariance, defect, *of_measure, slope=slope, measure=measure
     )
 
 
@@ -128,7 +132,7 @@ class _PartitionOverlap:
 
 
 def streamed_slope(model: Model, problem: StreamedProblem) -> Matrix:
-    """∂θ_aux/∂w under the training measure, in one pass over all rows of a source."""
+    """Return ∂θ_aux/∂w under the training measure, in one pass over all rows of a source."""
     bound, numbers = model.form.bound, model.numbers
     nt = len(model.theta)
     if bound is None or not bound.size:
@@ -146,7 +150,10 @@ def streamed_slope(model: Model, problem: StreamedProblem) -> Matrix:
 
 
 def learner_slope(model: Model, points: Points, projection: Projection, unit: np.ndarray) -> Matrix:
-    """∂θ_aux/∂w, `Φ_μ⁺J_μ` or `B(Φ_μB)⁺J_μ` (nθ, nw), in one pass over the points."""
+    """Return ∂θ_aux/∂w (nθ, nw), in one pass over the points.
+
+    It is `Φ_μ⁺J_μ`, or `B(Φ_μB)⁺J_μ` along some directions.
+    """
     bound, numbers = model.form.bound, model.numbers
     nt = len(model.theta)
     if bound is None or not bound.size:

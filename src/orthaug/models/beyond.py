@@ -1,4 +1,4 @@
-"""What a learned correction does beyond the range of its training: it is held, fades, or goes on as it is.
+"""Behaviour of a learned correction beyond its training range: hold, fade, or continue.
 
 A model predicts `φ(x)θ̂ + δ(x)` with the correction `δ = f − φθ_aux`. Within the limits, the range
 of the training rows and half a half-width more on each side, nothing is changed. Beyond them the
@@ -25,15 +25,20 @@ BEYOND = ("auto", "hold", "fade", "free")
 """What `learner.beyond` may be; `auto` is hold for lagged physics, fade for motions, free for
 terms.
 """
-FADED = 0.25  # half-widths beyond the limits at which a fading correction is down to 1/e: benchmarks/defaults.py
-MARGIN = 0.5  # half-widths that a correction goes on as it is beyond the range of training: benchmarks/defaults.py
+# Half-widths beyond the limits at which a fading correction is down to 1/e: benchmarks/defaults.py
+FADED = 0.25
+# Half-widths beyond the range of training in which a correction is not limited:
+# benchmarks/defaults.py
+MARGIN = 0.5
 _WIDER = 1e-9  # of the range: rounding moves no training row
 _AFFINE = 1e-9  # of a feature's size over the probes
 _PROBES = 8  # more than the coefficients of an affine function
 
 
 def beyond_of(learner: Any, usual: str) -> str:
-    """Return what a learner's correction does beyond its training: as declared, or as is `usual` for the physics.
+    """Return how a learner's correction behaves beyond its training range.
+
+    It is as declared, or `usual` for the physics where the declaration is `auto`.
 
     A learner that is linear in declared terms is an equation that a person reads: it goes on as it
     is.

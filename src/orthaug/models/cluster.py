@@ -1,8 +1,8 @@
 """The engine of a Dask cluster: partitions stay on the workers, which sum over them.
 
-N_w² numbers come back.
+N_w² numbers come back from a sum.
 
-Each partition is laid out once, on the worker that keeps it. A pass is a task for each, and a tree
+Each partition is built once, on the worker that keeps it. A pass is a task for each, and a tree
 of sums in the order of the partitions: whoever computes them, and however often after a worker was
 lost, the sum has the same bits.
 """
@@ -36,16 +36,16 @@ _SINGLE_THREADED = {
     "OPENBLAS_NUM_THREADS": "1",
     "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1",
 }
-"""Of a worker of a local cluster: there is one for each core."""
+"""Threads of a worker of a local cluster, which has a worker for each core."""
 _BRANCHES = 8  # partial sums that one task adds up
 _PATIENCE = "20 s"  # to reach a scheduler
 
 
 @dataclass(frozen=True, eq=False)
 class ClusterChunks:
-    """Futures of groups of chunks, or tuples of those whose chunks stand beside each other.
+    """Futures of groups of chunks, or tuples of futures whose chunks belong together.
 
-    How many each group has.
+    `counts` are the chunks of each group.
     """
 
     futures: list[Any]
@@ -69,18 +69,18 @@ class Dask(Threads):
     def build_rows(
         self, z: Matrix, q: Any, e: Matrix, gain: Float[np.ndarray, "N ny ny"]
     ) -> list[Any]:
-        """Rows that are in memory here, sent to the workers."""
+        """Send rows that are in memory here to the workers."""
         workers = self.shares
         shape = chunk_shape(len(z), min(self.limit, -(-len(z) // workers)))
         chunks = apart(build_chunk(z, q, e, gain, shape))
         each = -(-len(chunks) // workers)
-        with told():
+        with cluster_errors():
             groups = [chunks[i : i + each] for i in range(0, len(chunks), each)]
             return [self.client.submit(kept, group, pure=False) for group in groups]
 
     def draw(self, source: Source, row_builder: Callable[[Any], Iterator[RowArrays]]) -> list[Any]:
-        """Return the partitions of a source, laid out where they will be summed."""
-        with told():
+        """Return the partitions of a source, built where they will be summed."""
+        with cluster_errors():
             task = partial(
                 _build_chunks, row_builder=row_builder, size=self.limit
             )  # not scattered: what is lost can be made again
@@ -88,7 +88,7 @@ class Dask(Threads):
 
     def sum(self, function: Callable[..., Any], rows: Sequence[Any], *arguments: Any) -> Any:
         given = jax.tree.map(np.asarray, arguments)
-        with told():
+        with cluster_errors():
             return self._added(
                 [
                     self.client.submit(_partial_sum, function, part, given, pure=False)
@@ -117,7 +117,7 @@ class Dask(Threads):
             else (*[each] * whole, *([rest] if rest else []))
         )
         ends = np.cumsum(counts).tolist()
-        with told():
+        with cluster_errors():
             groups = [pieces[end - count : end] for end, count in zip(ends, counts, strict=True)]
             return ClusterChunks(
                 [self.client.submit(kept, group, pure=False) for group in groups], tuple(counts)
@@ -126,7 +126,7 @@ class Dask(Threads):
     def read(
         self, function: Callable[[Any], Any], partitions: Sequence[Any], counts: Sequence[int]
     ) -> ClusterChunks:
-        with told():
+        with cluster_errors():
             return ClusterChunks(
                 [self._on(partial(_listed, function), partition) for partition in partitions],
                 tuple(counts),
@@ -135,7 +135,7 @@ class Dask(Threads):
     def along(
         self, function: Callable[[Any, Any], Any], partitions: Sequence[Any], carry: Any
     ) -> Any:
-        with told():
+        with cluster_errors():
             for partition in partitions:
                 held = getattr(partition, "held", ())
                 bare = replace(partition, held=()) if held else partition
@@ -149,7 +149,7 @@ class Dask(Threads):
         self, function: Callable[..., Any], rows: ClusterChunks, *arguments: Any
     ) -> tuple[ClusterChunks, Any]:
         given = jax.tree.map(np.asarray, arguments)
-        with told():
+        with cluster_errors():
             both = [self.client.submit(_folded, function, part, given, pure=False) for part in rows]
             kept, parts = (
                 [self.client.submit(itemgetter(i), one, pure=False) for one in both] for i in (0, 1)
@@ -157,16 +157,16 @@ class Dask(Threads):
             return ClusterChunks(kept, rows.counts), self._added(parts)
 
     def fetch(self, rows: ClusterChunks) -> Any:
-        with told():
+        with cluster_errors():
             return together([chunk for group in self.client.gather(list(rows)) for chunk in group])
 
     def passes(self, function: Callable[[Any], Any], partitions: Sequence[Any]) -> list[Any]:
         """Return a function of every partition, where the workers are."""
-        with told():
+        with cluster_errors():
             return self.client.gather([self._on(function, partition) for partition in partitions])
 
     def room(self) -> Room:
-        """Of the smallest worker, which may have to add up a whole branch of the tree."""
+        """Return the room of the smallest worker, which may add up a whole branch of the tree."""
         return smallest_worker(self.client, _BRANCHES + 1)
 
     def _on(self, function: Callable[[Any], Any], partition: Any) -> Any:
@@ -199,9 +199,9 @@ def _carried(function: Callable[[Any, Any], Any], partition: Any, carry: Any, *h
 
 
 def kept(value: Any) -> Any:
-    """Return what a worker keeps.
+    """Return the value that a worker keeps.
 
-    Made again from what the scheduler knows where that worker is lost.
+    The scheduler makes it again where that worker is lost.
     """
     return value
 
@@ -214,7 +214,7 @@ def _paired(groups: Any) -> list[Any]:
 def _folded(
     function: Callable[..., Any], chunks: Sequence[Any], arguments: tuple[Any, ...]
 ) -> tuple[list[Any], Any]:
-    """Return what one partition keeps, and its share of a sum."""
+    """Return the part of a partition that is kept, and its share of a sum."""
     return folded(function, _paired(chunks), arguments)
 
 
@@ -234,7 +234,7 @@ def _added(parts: Sequence[Any]) -> Any:
 
 def smallest_worker(client: Any, matrices: int) -> Room:
     """Return the worker with the least memory; without a limit it is infinite."""
-    with told():
+    with cluster_errors():
         workers = client.scheduler_info(n_workers=-1)["workers"]
     limits = {
         address: float(worker["memory_limit"] or math.inf) for address, worker in workers.items()
@@ -244,8 +244,8 @@ def smallest_worker(client: Any, matrices: int) -> Room:
 
 
 @contextmanager
-def told() -> Iterator[None]:
-    """Errors of the cluster in words."""
+def cluster_errors() -> Iterator[None]:
+    """Turn errors of the cluster into messages for the user."""
     from distributed import CancelledError, KilledWorker
     from distributed.comm.core import CommClosedError
 
@@ -254,18 +254,20 @@ def told() -> Iterator[None]:
     except KilledWorker as error:
         raise InputError(
             "the cluster gave up on a partition: its workers died "
-            f"{error.allowed_failures + 1} times, most often for want of memory. Take smaller "
+            f"{error.allowed_failures + 1} times, most often for lack of memory. Take smaller "
             "partitions (engine.partition_rows) or larger workers."
         ) from None
     except (CancelledError, CommClosedError, OSError, TimeoutError) as error:
-        told = (
+        text = (
             f"the cluster is lost ({type(error).__name__}); start it again, and fit with --resume."
         )
-        raise InputError(told) from None
+        raise InputError(text) from None
 
 
 def connected(scheduler: str | None, workers: int | None) -> Any:
-    """Return a client of the scheduler at an address, or of a local cluster with a process for each core.
+    """Return a client of the scheduler at an address, or of a local cluster.
+
+    A local cluster has a process for each core.
 
     Raises:
         InputError: without Dask, where no scheduler answers, and for workers with other versions.
@@ -297,7 +299,7 @@ def connected(scheduler: str | None, workers: int | None) -> Any:
             ) from None
     atexit.register(
         _closed, client, own=scheduler is None
-    )  # before distributed's own, which tells of what it cancels
+    )  # before distributed's own, which logs what it cancels
     check_versions(client)
     return client
 
@@ -315,7 +317,7 @@ def check_versions(client: Any) -> None:
     for worker, found in client.run(versions, on_error="return").items():
         if isinstance(
             found, OSError
-        ):  # it died while it was asked; its scheduler lays out its rows elsewhere
+        ):  # it died while it was asked; its scheduler rebuilds its rows elsewhere
             continue
         if found != own:
             others = (
@@ -331,7 +333,7 @@ def check_versions(client: Any) -> None:
 
 
 def versions() -> dict[str, str]:
-    """Of orthaug and JAX, in this process."""
+    """Return the versions of orthaug and JAX in this process."""
     import jax
 
     return {"orthaug": __version__, "jax": jax.__version__}

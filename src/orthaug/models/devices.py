@@ -102,12 +102,15 @@ class Devices(LocalEngine):
     def map(
         self, function: Any, given: Any, items: Sequence[Any], heard: Heard = nobody
     ) -> Iterator[Any]:
-        """Yield one after another: programs that share devices wait for each other, on all hosts in the same order."""
+        """Yield the results one after another.
+
+        Programs that share devices wait for each other, on all hosts in the same order.
+        """
         for i, item in enumerate(items):
             yield function(given, item, partial(heard, i))
 
     def room(self) -> Room:
-        """Of a device: its own memory, or a share of this machine's."""
+        """Return the room of a device: its own memory, or a share of this machine's."""
         own_process = jax.process_index()
         devices = [
             device for device in jax.devices()[: self.count] if device.process_index == own_process
@@ -128,9 +131,9 @@ def _mesh(count: int | None) -> tuple[Any, int]:
 
 @cache
 def _compiled(function: Callable[..., Any], count: int | None, arguments: int, keeps: bool) -> Any:
-    """Return each device sums over its own chunks; then all of them have the sum.
+    """Compile a sum: each device adds up its own chunks, then all of them have the total.
 
-    With `keeps` beside what each one keeps.
+    With `keeps` each device also returns what it keeps.
     """
     spec = jax.sharding.PartitionSpec
 

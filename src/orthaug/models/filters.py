@@ -1,4 +1,7 @@
-"""Fitted models as filters: of a lagged model the noise of its equation disturbs, of a motion that of its rates."""
+"""Fitted models as Kalman filters.
+
+Noise disturbs the equation of a lagged model, and the rates of a motion.
+"""
 
 from __future__ import annotations
 
@@ -60,7 +63,11 @@ class LaggedFilter:
     def start(
         self, experiment: Experiment, record: Record, row: int, noise: Noise, size: Vector
     ) -> StateEstimate:
-        """Return the lags before a row: outputs with the sensors' noise, or unknown by their `size` (ny,) where missing."""
+        """Return the lags before a row and their covariance.
+
+        Outputs have the sensors' noise, or are unknown by their `size` (ny,) where they are
+        missing.
+        """
         outputs, lags = list(self.form.outputs), self.memory.lags
         before = Experiment(experiment.inputs[:row], without_gaps(experiment.outputs[:row]))
         mean = self.memory.at(before, record, row)
@@ -96,14 +103,14 @@ class LaggedFilter:
         mean, after, spread, square, likelihood = corrected(
             value, covariance, noise.output, measured
         )
-        told = FilterRow(
+        estimated = FilterRow(
             value[n:], spread, mean[n:], after[n:, n:], mean[:n], after[:n, :n], square, likelihood
         )
-        return StateEstimate(told.state, told.state_covariance), told
+        return StateEstimate(estimated.state, estimated.state_covariance), estimated
 
     @property
     def _newest(self) -> Matrix:
-        """Where an output goes in the next state, (n, ny)."""
+        """Positions of the outputs in the next state, (n, ny)."""
         place = np.zeros((len(self.memory.lags), len(self.form.outputs)))
         for i, lag in enumerate(self.memory.lags):
             if lag.channel in self.form.outputs and lag.lag == 1:
@@ -115,7 +122,10 @@ class LaggedFilter:
         return noise
 
     def linearised(self, numbers: Numbers) -> tuple[Matrix, Matrix, Matrix, Matrix]:
-        """Return a (n, n), C (ny, n) at the origin, and how a disturbance enters state (n, ny) and outputs (ny, ny)."""
+        """Return A (n, n) and C (ny, n) at the origin, and the gains of a disturbance.
+
+        The gains are those of the state (n, ny) and of the outputs (ny, ny).
+        """
         slopes = _at_origin(self, numbers, np.zeros(len(self.memory.inputs)), len(self.memory.lags))
         return *slopes, self._newest, np.eye(len(self.form.outputs))
 
@@ -139,7 +149,7 @@ class MotionFilter:
 
     @property
     def alone(self) -> MotionFilter:
-        """That of the motion without its learner."""
+        """The filter of the motion without its learner."""
         return MotionFilter(self.form.alone)
 
     def inputs(self, experiment: Experiment, record: Record) -> Matrix:
@@ -148,7 +158,10 @@ class MotionFilter:
     def start(
         self, experiment: Experiment, record: Record, row: int, noise: Noise, size: Vector
     ) -> StateEstimate:
-        """Return the state as it is guessed from what is measured about a row, unknown by the `size` (nx,) of all."""
+        """Return the state guessed from the samples about a row.
+
+        It is unknown by the `size` (nx,) of all states.
+        """
         return StateEstimate(
             self.form.start(without_gaps(experiment.outputs), [row])[0], np.diag(size**2)
         )
@@ -169,8 +182,10 @@ class MotionFilter:
         )
         following, moved = slope(lambda x: self.step(numbers, x, inputs)[0], mean[:n])
         own = after[:n, :n]
-        told = FilterRow(value, spread, mean[n:], after[n:, n:], mean[:n], own, square, likelihood)
-        return StateEstimate(following, moved @ own @ moved.T + noise.state), told
+        estimated = FilterRow(
+            value, spread, mean[n:], after[n:, n:], mean[:n], own, square, likelihood
+        )
+        return StateEstimate(following, moved @ own @ moved.T + noise.state), estimated
 
     def unit(self, noise: Matrix, size: Vector) -> Matrix:
         """Return a disturbance (nx, nx) as large as the states.
@@ -184,7 +199,10 @@ class MotionFilter:
         return np.diag(np.where(known, 0.0, size**2))
 
     def linearised(self, numbers: Numbers) -> tuple[Matrix, Matrix, Matrix, Matrix]:
-        """Return a (nx, nx), C (ny, nx) at the origin, and how a disturbance enters state (nx, nx) and outputs (ny, nx)."""
+        """Return A (nx, nx) and C (ny, nx) at the origin, and the gains of a disturbance.
+
+        The gains are those of the state (nx, nx) and of the outputs (ny, nx).
+        """
         n = self.form.states
         nothing = Experiment(
             np.zeros((4, len(self.form.motion.inputs))), np.zeros((4, len(self.form.outputs)))
@@ -208,7 +226,7 @@ def _both(form: Filter, numbers: Numbers, inputs: Any) -> Callable[[Any], Any]:
 
 
 def _at_origin(form: Filter, numbers: Numbers, inputs: Vector, n: int) -> tuple[Matrix, Matrix]:
-    """Return a (n, n) and C (ny, n)."""
+    """Return A (n, n) and C (ny, n) at the origin."""
     both = _both(form, numbers, inputs)
     derivative = np.asarray(jax.jit(lambda x: slope(both, x)[1])(np.zeros(n)))
     return derivative[:n], derivative[n:]

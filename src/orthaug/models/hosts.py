@@ -1,4 +1,6 @@
-"""Several hosts as one machine: the same command runs on each, JAX joins their devices, the first one writes.
+"""Several hosts as one machine: JAX joins their devices, and the first one writes.
+
+The same command runs on each host.
 
 Every process reads all rows and takes every step; only the sums over rows are shared
 (`models.devices`).
@@ -23,7 +25,9 @@ _PATIENCE = 60  # s, to wait for the others
 
 
 def join(environment: Mapping[str, str] = os.environ) -> None:
-    """Join the processes of a run over several hosts, where the environment names their coordinator.
+    """Join the processes of a run over several hosts.
+
+    Does nothing unless the environment names their coordinator.
 
     Their number, and which one this is, may be left to what JAX finds out of SLURM and Open MPI.
 
@@ -64,11 +68,11 @@ def _await(address: str) -> None:
             return
         except (OSError, ValueError, OverflowError) as error:
             if time.monotonic() > end or not isinstance(error, OSError):
-                told = (
+                text = (
                     f"{COORDINATOR}={address}: no first process answers there "
                     f"({type(error).__name__})."
                 )
-                raise InputError(told) from None
+                raise InputError(text) from None
         time.sleep(0.2)
 
 
@@ -90,7 +94,7 @@ def check_alike(fingerprint: str) -> None:
 
 
 def waits() -> str | None:
-    """Return what a process that writes nothing says; None for the one that writes."""
+    """Return the message of a process that writes nothing; None for the one that writes."""
     if not several() or jax.process_index() == 0:
         return None
     return (

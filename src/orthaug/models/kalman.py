@@ -1,8 +1,8 @@
-"""An extended Kalman filter over the rows of a record: where a model stands, told by what is measured.
+"""An extended Kalman filter over the rows of a record: the state of a model from measurements.
 
 `x_{k+1} = f(x_k, u_k) + w_k`, `y_k = h(x_k, u_k) + v_k` with Cov w = Q and Cov v = R (Anderson and
 Moore 1979). A lagged model has its disturbance in the equation of its newest output, a motion in
-the rates of its states (`models.filters`). Outputs that are NaN are missing: they tell nothing, and
+the rates of its states (`models.filters`). Outputs that are NaN are missing: they add nothing, and
 the estimate runs free.
 """
 
@@ -22,7 +22,10 @@ _SIDE_BY_SIDE = 1024  # starts of predictions
 
 
 class Noise(NamedTuple):
-    """`state` Q: what disturbs the outputs of a lagged model (ny, ny), or the states of a motion in a sample (nx, nx).
+    """Covariances Q and R of the noise of a filter.
+
+    `state` Q disturbs the outputs of a lagged model (ny, ny), or the states of a motion over a
+    sample (nx, nx).
 
     `output` R (ny, ny) is added by the sensors; both in squared units of what they disturb.
     """
@@ -39,7 +42,7 @@ class StateEstimate(NamedTuple):
 
 
 class FilterRow(NamedTuple):
-    """What a row tells: the outputs as they were expected, and outputs and state (n,) once they are measured."""
+    """Estimates of one row: predicted outputs, and outputs and state (n,) after the measurement."""
 
     predicted: Any
     """(ny,), from the rows before."""
@@ -67,7 +70,7 @@ class Filter(Protocol):
 
     @property
     def hidden(self) -> bool:
-        """Return whether states are more than past outputs, so that some rows must tell them."""
+        """True if the state is more than past outputs, so that some rows must determine it."""
         ...
 
     @property
@@ -79,7 +82,7 @@ class Filter(Protocol):
         ...
 
     def inputs(self, experiment: Experiment, record: Record) -> Matrix:
-        """Return what the steps read (T, nu), from the first row on."""
+        """Return the inputs of the steps (T, nu), from the first row on."""
         ...
 
     def step(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
@@ -89,7 +92,7 @@ class Filter(Protocol):
     def row(
         self, numbers: Numbers, noise: Noise, belief: StateEstimate, inputs: Any, measured: Any
     ) -> tuple[StateEstimate, FilterRow]:
-        """Return a row: what its outputs (ny,) tell, and the belief before the next one."""
+        """Return the estimates of a row from its outputs (ny,), and of the next row's state."""
         ...
 
 
@@ -102,7 +105,9 @@ def slope(function: Any, at: Any) -> tuple[Any, Any]:
 def corrected(
     mean: Any, covariance: Any, noise: Any, measured: Any
 ) -> tuple[Any, Any, Any, Any, Any]:
-    """Mean (n + ny,) and covariance of (state, outputs) once the outputs are measured with `noise` (ny, ny).
+    """Return mean (n + ny,) and covariance of (state, outputs) after a measurement.
+
+    `noise` (ny, ny) is the covariance of the measured outputs' noise.
 
     By Joseph's form, which stays positive where R is zero. Also S, `νᵀS⁻¹ν` and the log likelihood.
     """
@@ -125,7 +130,7 @@ def corrected(
 def one_row(
     form: Filter, numbers: Numbers, noise: Noise, belief: StateEstimate, inputs: Any, measured: Any
 ) -> tuple[StateEstimate, FilterRow]:
-    """Return one row of a filter."""
+    """Compute one row of a filter."""
     return form.row(numbers, noise, belief, inputs, measured)
 
 
@@ -133,13 +138,13 @@ def one_row(
 def _all_rows(
     form: Filter, numbers: Numbers, noise: Noise, belief: StateEstimate, inputs: Any, measured: Any
 ) -> tuple[StateEstimate, FilterRow]:
-    """Return what is believed before the rows, and what they tell."""
+    """Return the estimates before the rows, and those of the rows."""
 
     def row(
         belief: StateEstimate, given: tuple[Any, Any]
     ) -> tuple[StateEstimate, tuple[StateEstimate, FilterRow]]:
-        following, told = form.row(numbers, noise, belief, *given)
-        return following, (belief, told)
+        following, estimated = form.row(numbers, noise, belief, *given)
+        return following, (belief, estimated)
 
     return jax.lax.scan(row, belief, (inputs, measured))[1]
 
@@ -151,8 +156,8 @@ def _likelihood(
     def row(
         carry: tuple[StateEstimate, Any], given: tuple[Any, Any]
     ) -> tuple[tuple[StateEstimate, Any], None]:
-        following, told = form.row(numbers, noise, carry[0], *given)
-        return (following, carry[1] + told.log_likelihood), None
+        following, estimated = form.row(numbers, noise, carry[0], *given)
+        return (following, carry[1] + estimated.log_likelihood), None
 
     return jax.lax.scan(row, (belief, jnp.zeros(())), (inputs, measured))[0][1]
 
@@ -165,11 +170,14 @@ def filtered(
     inputs: Matrix,
     measured: Matrix,
 ) -> tuple[StateEstimate, FilterRow]:
-    """Return a filter over all rows (T): what is believed before them, and what they tell."""
+    """Run a filter over all rows (T).
+
+    Return the estimates before the rows, and those of the rows.
+    """
     rows = len(inputs)
     found = _all_rows(form, numbers, noise, belief, *_padded(inputs, measured))
-    before, told = ([np.asarray(part)[:rows] for part in one] for one in found)
-    return StateEstimate(*before), FilterRow(*told)
+    before, rows_of = ([np.asarray(part)[:rows] for part in one] for one in found)
+    return StateEstimate(*before), FilterRow(*rows_of)
 
 
 def log_likelihood(
@@ -180,12 +188,12 @@ def log_likelihood(
     inputs: Matrix,
     measured: Matrix,
 ) -> float:
-    """Of the innovations (Schweppe 1965)."""
+    """Return the log-likelihood of the innovations (Schweppe 1965)."""
     return float(_likelihood(form, numbers, noise, belief, *_padded(inputs, measured)))
 
 
 def _padded(inputs: Matrix, measured: Matrix) -> tuple[Matrix, Matrix]:
-    """Rows behind the last are copies of it with nothing measured: they add nothing."""
+    """Pad the rows with copies of the last one in which nothing is measured: they add nothing."""
     more = padded_length(len(inputs)) - len(inputs)
     behind = np.full((more, measured.shape[1]), np.nan)
     return np.concatenate([inputs, np.repeat(inputs[-1:], more, axis=0)]), np.concatenate(
@@ -197,7 +205,10 @@ def _padded(inputs: Matrix, measured: Matrix) -> tuple[Matrix, Matrix]:
 def _ahead(
     form: Filter, numbers: Numbers, noise: Noise, beliefs: StateEstimate, inputs: Any, horizon: Any
 ) -> tuple[Parts, Any]:
-    """Return the outputs of the last of `horizon` steps from each of m beliefs, under inputs (m, h, nu), and their S."""
+    """Return the outputs after `horizon` steps from each of m estimates, and their covariances S.
+
+    The inputs are (m, h, nu).
+    """
     unknown = jnp.full(len(noise.output), jnp.nan)
 
     def one(belief: StateEstimate, rows: Any) -> tuple[Parts, Any]:
@@ -219,7 +230,9 @@ def ahead(
     inputs: Matrix,
     horizon: int,
 ) -> tuple[Parts, Matrix]:
-    """Return the outputs `horizon` steps on from what is believed before the rows (T), and their deviations; (T − h + 1, ny).
+    """Return the outputs `horizon` steps after each row's estimate (T), and their deviations.
+
+    Both have the shape (T − h + 1, ny).
 
     The deviations are those of what would be measured.
     """
@@ -242,7 +255,7 @@ def ahead(
 
 
 def without_gaps(outputs: Matrix) -> Matrix:
-    """Return outputs with missing samples by straight lines between those that are there.
+    """Return outputs whose missing samples are interpolated linearly between the measured ones.
 
     Zero where there are none.
     """

@@ -12,4 +12,4 @@ from orthaug.models.terms import Terms
 LEARNERS = Registry(
     "learner", {"mlp": MLP, "terms": Terms, "none": PhysicsAlone}, reserved=("kind", "nz", "ny")
 )
-"""`nz` and `ny` stand beside a saved learner's own fields."""
+"""`nz` and `ny` are saved next to a learner's own fields."""

@@ -1,4 +1,6 @@
-"""The lagged form: ŷ_k = φ(x_k)θ + f(x_k) − φ(x_k)θ_aux of a regressor x of past outputs and inputs (eq:orth_param).
+"""The lagged form: ŷ_k = φ(x_k)θ + f(x_k) − φ(x_k)θ_aux (eq:orth_param).
+
+The regressor x holds past outputs and inputs.
 
 As dynamics its state is the past outputs, newest first, and a step puts its own output in front of
 them.
@@ -27,7 +29,7 @@ from orthaug.physics.baseline import Baseline
 
 @dataclass(frozen=True)
 class Lagged:
-    """What a model of lagged signals computes, without its numbers: `Dynamics`."""
+    """Computations of a model of lagged signals, without its numbers: `Dynamics`."""
 
     baseline: Baseline
     features: Features
@@ -37,7 +39,7 @@ class Lagged:
 
     @property
     def alone(self) -> Lagged:
-        """The same physics without a learner."""
+        """These dynamics without the learner."""
         return replace(self, features=Features(()), bound=None)
 
     @property
@@ -46,7 +48,7 @@ class Lagged:
 
     @property
     def beyond(self) -> str:
-        """Return what the learner's correction does beyond the range of its training."""
+        """Behaviour of the learner's correction beyond its training range."""
         return "free" if self.bound is None else beyond_of(self.bound.learner, "hold")
 
     @property
@@ -99,7 +101,7 @@ class Lagged:
         return outputs[before].reshape(len(before), self.states)
 
     def start_rows(self, weight: Matrix) -> Matrix:
-        """Return a past output has the same errors as all others."""
+        """Return weights under which a past output has the same errors as all others."""
         return np.kron(np.eye(self.memory), weight)
 
     def inputs(self, experiment: Experiment, record: Record) -> Matrix:
@@ -112,7 +114,7 @@ class Lagged:
         inputs: Matrix,
         rows: Sequence[int] | Int[np.ndarray, "r"],
     ) -> Float[np.ndarray, "r n0"]:
-        """Return the run's own past outputs: nothing needs to run again."""
+        """Return the run's own past outputs, so that no step is computed again."""
         return self.start(outputs, rows)
 
     def scaled_features(
@@ -140,11 +142,14 @@ class Lagged:
         return {str(lag): float(value) for lag, value in zip(self.layout, x, strict=True)}
 
     def regressors(self, experiment: Experiment, record: Record, row: int | None = None) -> Matrix:
-        """Measured regressors x (T, nx) of an experiment, from a row on, by default the first that has one."""
+        """Return measured regressors x (T, nx) of an experiment from a row on.
+
+        By default it is the first row that has one.
+        """
         return lag_matrix(experiment, self.layout, record, self.first_row if row is None else row)
 
     def regressor(self, state: Any, inputs: Any, xp: Any = jnp) -> Any:
-        """x (nx, …) of a state (n0, …) and a row of lagged inputs (nu, …)."""
+        """Return x (nx, …) of a state (n0, …) and a row of lagged inputs (nu, …)."""
         past = state.reshape(self.memory, len(self.outputs), *state.shape[1:])
         lag, output = np.array(self.fed_back, dtype=int).reshape(-1, 2).T
         return xp.concatenate([past[lag - 1, output], inputs])
@@ -167,7 +172,7 @@ class Lagged:
         return Parts(physics, share * (raw - phi @ numbers.theta_aux), raw)
 
     def prepared(self, numbers: Numbers) -> Numbers:
-        """Nothing is common to all steps."""
+        """Return the numbers unchanged: nothing is common to all steps."""
         return numbers
 
     def step(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
@@ -187,7 +192,10 @@ class Lagged:
     def tangents(
         self, numbers: Numbers, state: Any, slopes: Any, inputs: Any
     ) -> tuple[Any, Any, Any, Any]:
-        """`S_k = G_k + Σ_i A_{k,i} S_{k−i}` with G_k = ∂g/∂(c, w) and A_{k,i} = ∂g/∂ŷ_{k−i}."""
+        """Propagate `S_k = G_k + Σ_i A_{k,i} S_{k−i}`.
+
+        G_k = ∂g/∂(c, w) and A_{k,i} = ∂g/∂ŷ_{k−i}.
+        """
         value, slope, feedback = jax.vmap(
             partial(self._derivatives, numbers), in_axes=-1, out_axes=-1
         )(state, inputs)
@@ -198,7 +206,7 @@ class Lagged:
         return self._push(state, value), following, value, slope
 
     def _derivatives(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Any, Any]:
-        """Value (ny,), ∂g/∂(c, w) (ny, n) and ∂g/∂ŷ of every lag that is fed back (ny, lags), at one step."""
+        """Return the value (ny,), ∂g/∂(c, w) (ny, n) and ∂g/∂ŷ (ny, lags) of every fed-back lag."""
         leaves = [] if self.bound is None else self.bound.leaves(numbers.weights)
         past = state.reshape(self.memory, len(self.outputs))
 
@@ -225,7 +233,7 @@ class Lagged:
 
 
 def _learned(bound: Bound, numbers: Numbers, z: Any, phi: Any) -> Any:
-    """f (ny,) at scaled features z; of an ensemble the median of `f_i + φ tilt_i`."""
+    """Return f (ny,) at scaled features z; of an ensemble the median of `f_i + φ tilt_i`."""
     if numbers.tilt is None:
         return numbers.gain * bound.values(numbers.weights, z)
     each = jax.vmap(lambda w, tilt: numbers.gain * bound.values(w, z) + phi @ tilt)(

@@ -19,7 +19,7 @@ from orthaug.physics.baseline import Baseline, Parameter, Term
 
 
 def declare(model: Model) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Return what a file says of a model, and its arrays."""
+    """Return the declaration of a model, and its arrays."""
     form = model.form
     baseline = form.baseline
     declared = {

@@ -35,7 +35,8 @@ ACTIVATIONS: dict[str, Callable[[Any], Any]] = {
     "softplus": lambda a: jax.nn.softplus(a),
     "identity": lambda a: a,
 }
-"""By name. They call JAX only when they are called, so that a spec is read without it."""
+"""Activations by name. They call JAX only when they are called, so that a spec is read without it.
+"""
 MOST_LAYERS = 10  # hidden ones; ten take half a minute to compile
 _PROBES = 16  # points at which a silenced learner is looked at
 _GAIN = {"tanh": 5 / 3, "relu": math.sqrt(2.0)}  # Xavier gains; 1 for the others
@@ -43,7 +44,7 @@ _GAIN = {"tanh": 5 / 3, "relu": math.sqrt(2.0)}  # Xavier gains; 1 for the other
 
 @runtime_checkable
 class Learner(Protocol):
-    """What `estimate(learner=…)` takes: hashable, with `inputs` and these two methods.
+    """Interface of `estimate(learner=…)`: hashable, with `inputs` and these two methods.
 
     A learner that JAX cannot differentiate has also `differentiable = False`.
 
@@ -54,11 +55,14 @@ class Learner(Protocol):
     def inputs(self) -> tuple[str, ...] | None: ...
 
     def init(self, key: Array, nz: int, ny: int) -> Tree:
-        """Return initial weights, any pytree of float arrays, for `nz` features and `ny` outputs."""
+        """Return initial weights, any pytree of float arrays.
+
+        nz is the number of features, ny that of outputs.
+        """
         ...
 
     def apply(self, tree: Tree, z: Float[Array, "nz"]) -> Float[Array, "ny"]:
-        """f(z; w) for one row."""
+        """Return f(z; w) for one row."""
         ...
 
 
@@ -69,12 +73,13 @@ class MLP:
     Initialised as in Sect. 5.1 (Xavier): weights uniform on (-a, a), `a = gain √(6 / (fan_in +
     fan_out))`, biases 0.
 
-    Args: hidden: neurons of each hidden layer; () is a linear learner. activation: one of tanh,
-        relu, gelu, sigmoid, silu, elu, softplus, identity. inputs: what it sees, as expressions or
-        raw lags; None for all lags. beyond: what the correction does beyond the range of its
-        training: "hold", "fade" within a quarter of the
-            half-range, or "free"; "auto" holds it beside lagged physics and lets it fade in a
-            motion.
+    Args:
+        hidden: neurons of each hidden layer; () is a linear learner.
+        activation: one of tanh, relu, gelu, sigmoid, silu, elu, softplus, identity.
+        inputs: what it sees, as expressions or raw lags; None for all lags.
+        beyond: what the correction does beyond the range of its training: "hold", "fade" within a
+            quarter of the half-range, or "free"; "auto" holds it beside lagged physics and lets it
+            fade in a motion.
 
     Examples:
         >>> MLP(hidden=(8, 8), inputs=("v[k-1]", "x[k-1] - x[k-2]"))
@@ -112,15 +117,19 @@ class MLP:
             )
         if len(self.hidden) > MOST_LAYERS:
             has = f"`hidden` has {len(self.hidden)} layers"
-            raise InputError(f"{has}; at most {MOST_LAYERS} are taken: more compile for minutes.")
+            raise InputError(
+                f"{has}; at most {MOST_LAYERS} are allowed, since more take minutes to compile."
+            )
         check_fields(self)
 
     def silent(self, tree: Tree) -> Tree:
-        """The same hidden layers with an output layer of zeros."""
+        """Return the same hidden layers with an output layer of zeros."""
         return [*tree[:-1], tuple(np.zeros_like(part) for part in tree[-1])]
 
     def groups(self, tree: Tree) -> Tree:
-        """Of every weight the neuron that it belongs to: hidden ones by what comes in, the last also by what goes out.
+        """Return the number of the neuron that every weight belongs to.
+
+        A hidden neuron has the weights that come in, the last ones also those that go out.
 
         So a neuron that is not needed can be silenced as one. The output's biases are a group of
         their own.
@@ -135,7 +144,7 @@ class MLP:
         return [*labels, (outward, np.full(np.shape(bias), first + 1))]
 
     def weights(self, nz: int, ny: int) -> int:
-        """Return how many weights it has for `nz` features and `ny` outputs."""
+        """Return the number of weights for `nz` features and `ny` outputs."""
         sizes = (nz, *self.hidden, ny)
         return sum(
             (fan_in + 1) * fan_out for fan_in, fan_out in zip(sizes, sizes[1:], strict=False)
@@ -155,7 +164,7 @@ class MLP:
         ]
 
     def layers(self, tree: Tree) -> list[tuple[Any, Any, str]]:
-        """Weight, bias and activation of each layer: what is written where the learner is exported."""
+        """Return weight, bias and activation of each layer, for export."""
         names = [self.activation] * len(self.hidden) + ["identity"]
         return [(weight, bias, name) for (weight, bias), name in zip(tree, names, strict=True)]
 
@@ -166,7 +175,7 @@ class MLP:
 
 
 def _uniform(key: Array, reach: Vector, count: int) -> Any:
-    """Rows of `count` numbers or more, uniform on [−a, a] for each a of `reach`.
+    """Return rows of at least `count` numbers, uniform on [−a, a] for each a of `reach`.
 
     They are drawn in multiples of 1024: one compiled program for layers of all sizes. JAX makes
     each number from its place alone, so they are those that would be drawn at the layer's own size.
@@ -185,7 +194,7 @@ def _drawn(key: Array, reach: Float[Array, "r"], count: int) -> Float[Array, "r 
 
 @dataclass(frozen=True)
 class PhysicsAlone:
-    """Declares that nothing is learned: the learner of a spec's `kind = "none"`, which is None in Python."""
+    """Declaration that nothing is learned: `kind = "none"` in a spec, None in Python."""
 
     def resolve(self, context: Any) -> None:
         return None
@@ -253,7 +262,9 @@ class EquinoxModule:
 
 @dataclass(frozen=True)
 class External:
-    """A model trained elsewhere: `function(x)` on NumPy rows (N, nx) → (N, ny), with nothing left to train.
+    """A model trained elsewhere: `function(x)` on NumPy rows (N, nx) → (N, ny).
+
+    It has nothing left to train.
 
     It is called back from compiled code, so it may come from any toolbox. `inputs` as of `MLP`,
     `ny` outputs.
@@ -301,14 +312,14 @@ class External:
 
 @dataclass(frozen=True, eq=False)
 class Scaling:
-    """Affine map of each feature: `(z - centre) / halfwidth` lies in [-1, 1] over the training data."""
+    """Affine map `(z - centre) / halfwidth` of each feature to [-1, 1] over the training data."""
 
     centre: Float[np.ndarray, "nz"]
     halfwidth: Float[np.ndarray, "nz"]
 
     @classmethod
     def fit(cls, features: Matrix) -> Scaling:
-        """From training rows (N, nz); a feature that never moves keeps its unit."""
+        """Fit the map to training rows (N, nz); a feature that never moves keeps its unit."""
         low, high = features.min(axis=0), features.max(axis=0)
         halfwidth = (high - low) / 2
         return cls((low + high) / 2, np.where(halfwidth > 0, halfwidth, 1.0))
@@ -348,7 +359,7 @@ class Bound:
 
     @property
     def differentiable(self) -> bool:
-        """Return whether JAX differentiates the learner; otherwise differences have to do."""
+        """True if JAX differentiates the learner; otherwise finite differences are used."""
         return getattr(self.learner, "differentiable", True)
 
     @property
@@ -361,7 +372,9 @@ class Bound:
         return self.ravel(jax.tree.leaves(self.learner.init(key, self.nz, self.ny)))
 
     def silent(self, w: Float[Array | np.ndarray, "nw"]) -> np.ndarray | None:
-        """The same weights with the output silenced, so that f = 0 everywhere and training can go on from there.
+        """Return the same weights with the output layer at zero.
+
+        Then f = 0 everywhere, and training can continue from there.
 
         A learner says how by a method `silent(tree)`; of others the last arrays are set to zero, as
         few as it takes. None where that does not silence it.
@@ -380,7 +393,9 @@ class Bound:
         return None
 
     def groups(self) -> Int[np.ndarray, "nw"]:
-        """Which weights share a prior under automatic relevance determination, by number from 0.
+        """Return the group of each weight under automatic relevance determination.
+
+        Groups are numbered from 0; the weights of a group share a prior.
 
         A learner says it by a method `groups(tree)`; of others each array is one group.
         """
@@ -414,11 +429,11 @@ class Bound:
     def values(
         self, w: Float[Array | np.ndarray, "nw"] | list[Any], z: Float[Array, "nz"]
     ) -> Float[Array, "ny"]:
-        """f(z; w) for one row, of the weights as one vector or as leaves."""
+        """Return f(z; w) for one row; the weights are one vector or leaves."""
         return self.from_leaves(w if isinstance(w, list) else self.leaves(w), z)
 
     def from_leaves(self, leaves: list[Any], z: Float[Array, "nz"]) -> Float[Array, "ny"]:
-        """f(z; w) for one row, of the weight arrays."""
+        """Return f(z; w) for one row, of the weight arrays."""
         return self.learner.apply(self.tree(leaves), z)
 
     def tree(self, leaves: list[Any]) -> Tree:
@@ -428,7 +443,7 @@ class Bound:
     def jacobian(
         self, w: Float[Array, "nw"], z: Float[Array, "nz m"], gain: Float[Array, "ny ny m"]
     ) -> tuple[Float[Array, "ny m"], Float[Array, "nw ny m"]]:
-        """`G f` and `G ∂f/∂w` for a batch of rows, G the `gain` of each.
+        """Return `G f` and `G ∂f/∂w` for a batch of rows, G the `gain` of each.
 
         Reverse mode per row, one pass per output. The batch is the *last* axis: every entry of the
         Jacobian is then contiguous over rows, which is 2.5 times faster here than rows first.
@@ -454,7 +469,7 @@ class Bound:
 def _probed(
     bound: Bound, w: Float[Array, "nw"]
 ) -> tuple[Float[Array, "ny m"], Float[Array, "nw ny m"]]:
-    """f and ∂f/∂w at some points of the scaled box."""
+    """Return f and ∂f/∂w at some points of the scaled box."""
     z = jnp.asarray(np.random.default_rng(0).uniform(-1, 1, (bound.nz, _PROBES)))
     return bound.jacobian(
         w, z, jnp.broadcast_to(jnp.eye(bound.ny)[..., None], (bound.ny, bound.ny, _PROBES))

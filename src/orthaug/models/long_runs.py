@@ -1,4 +1,4 @@
-"""A lagged model along a source: scores from running sums, the free run carried from piece to piece."""
+"""A lagged model along a source: scores from running sums, a free run from piece to piece."""
 
 from __future__ import annotations
 
@@ -19,7 +19,10 @@ from orthaug.physics.problem import Moments
 
 
 class RunPiece(NamedTuple):
-    """A piece, the free run over its rows behind the history (m, ny) in parts, and the state it began in."""
+    """A piece, the free run (m, ny) over its rows behind the history, and the initial state.
+
+    The run is in parts.
+    """
 
     piece: Experiment
     state: Any
@@ -63,14 +66,17 @@ def responses(model: Model, source: Source, *, free: bool) -> Iterator[tuple[Exp
         return
     lost: tuple[str, int] | None = None
     for piece, state, run in run_pieces(model, source):
-        told = model.as_trajectory(state, run, piece, record)
+        run_piece = model.as_trajectory(state, run, piece, record)
         before = lost == (piece.source, piece.offset + model.form.first_row)
         if before:
-            told = replace(
-                told, baseline=told.baseline * np.nan, learner=told.learner * np.nan, diverged=None
+            run_piece = replace(
+                run_piece,
+                baseline=run_piece.baseline * np.nan,
+                learner=run_piece.learner * np.nan,
+                diverged=None,
             )
-        lost = (piece.source, piece.offset + len(piece)) if before or told.diverged else None
-        yield piece, Response((told,), None, model.outputs, source.sampling_time)
+        lost = (piece.source, piece.offset + len(piece)) if before or run_piece.diverged else None
+        yield piece, Response((run_piece,), None, model.outputs, source.sampling_time)
 
 
 def _after(model: Model, state: Any, outputs: Matrix) -> Any:
@@ -93,7 +99,7 @@ class RunningScores:
     rows: int = 0
 
     def add(self, measured: Matrix, model: Matrix) -> None:
-        """More rows (m, ny)."""
+        """Add more rows (m, ny)."""
         with np.errstate(all="ignore"):
             self.squares = self.squares + np.sum((measured - model) ** 2, axis=0)
         seen = Moments.of(measured)
@@ -101,7 +107,7 @@ class RunningScores:
         self.rows += len(measured)
 
     def scores(self) -> Scores:
-        """RMSE, NRMSE and FIT of all of them."""
+        """Return RMSE, NRMSE and FIT of all rows."""
         assert self.moments is not None and self.rows, "no row was scored"
         with np.errstate(all="ignore"):
             rmse = np.sqrt(self.squares / self.rows)
@@ -109,8 +115,8 @@ class RunningScores:
 
 
 Watch = Callable[[Experiment, int, Matrix], None]
-"""Is shown a piece, its first row with a prediction, and the one-step residual from there on (m,
-ny).
+"""Called with a piece, its first row with a prediction, and the one-step residual from there on
+(m, ny).
 """
 
 
@@ -125,7 +131,10 @@ class LongScores(NamedTuple):
 def scores_along(
     model: Model, source: Source, skip: int = 0, watch: Watch | None = None
 ) -> LongScores:
-    """Scores of the one-step prediction and the free run, without the first `skip` rows of each recording."""
+    """Return scores of the one-step prediction and the free run over a source.
+
+    The first `skip` rows of each recording are left out.
+    """
     record, first = as_record(source, (_nothing(source),)), model.form.first_row
     one_step, free, diverged = RunningScores(), RunningScores(), None
     for piece, _, parts in run_pieces(model, source):

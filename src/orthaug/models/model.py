@@ -1,4 +1,4 @@
-"""The fitted model ŷ_k = φ(x_k)θ + (f(x_k) − φ(x_k)θ_aux): prediction, free run and its two parts."""
+"""The fitted model ŷ_k = φ(x_k)θ + (f(x_k) − φ(x_k)θ_aux): prediction, free run, parts."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def _free_run(
 ) -> tuple[Float[Array, "n0"], Parts]:
     """Return one scan over the rows, from the state at the first one.
 
-    With the state after the last.
+    The state after the last row is the second result.
     """
     return jax.lax.scan(lambda state, row: form.step(numbers, state, row), state, inputs)
 
@@ -74,11 +74,12 @@ class Model(RecordModel, NotebookView):
     Examples:
         >>> import orthaug as oa
         >>> u = [1.0, 2.0, 0.0, 3.0, 1.0, 0.0]
-        >>> record = oa.Record.from_arrays(u=u, y=[0.0, 0.5, 1.25, 0.625, 1.8125, 1.40625])  # 0.5 (y[k-1] + u[k-1])
+        >>> y = [0.0, 0.5, 1.25, 0.625, 1.8125, 1.40625]  # 0.5 (y[k-1] + u[k-1])
+        >>> record = oa.Record.from_arrays(u=u, y=y)
         >>> physics = oa.Baseline.from_terms([oa.Term("a", "y[k-1]"), oa.Term("b", "u[k-1]")])
         >>> model = oa.estimate(record, physics, learner=None).model
         >>> other = oa.Record.from_arrays(u=[1.0, 1.0, 1.0], y=[4.0, 0.0, 0.0])
-        >>> model.simulate(other).trajectories[0].model.T.round(6)  # from the first output on its own
+        >>> model.simulate(other).trajectories[0].model.T.round(6)  # from the first output
         array([[ nan, 2.5 , 1.75]])
         >>> model.predict(other).trajectories[0].model.T.round(6)  # from the measured ones
         array([[nan, 2.5, 0.5]])
@@ -99,7 +100,7 @@ class Model(RecordModel, NotebookView):
     time_column: str | None = None
     statistics: Statistics = Statistics()  # noqa: RUF009  (frozen)
     prepared: tuple[Prepared, ...] = field(default=(), kw_only=True, repr=False)
-    """What the training data went through before."""
+    """Preparation of the training data."""
 
     def __repr__(self) -> str:
         learner = self.form.bound.learner if self.form.bound else "none"
@@ -120,11 +121,11 @@ class Model(RecordModel, NotebookView):
 
     @property
     def alone(self) -> Model:
-        """Its physics without the learner."""
+        """The model without its learner."""
         return replace(self, form=self.form.alone, numbers=self.numbers.alone)
 
     def learner_at(self, x: Float[np.ndarray, "M nx"]) -> Float[np.ndarray, "M ny"]:
-        """f, before any split, at regressors of the form's layout; in the outputs' units.
+        """Return f, before any split, at regressors of the form's layout, in the outputs' units.
 
         It is the learner itself, also beyond the range of its training, where the model holds the
         correction.
@@ -170,11 +171,14 @@ class Model(RecordModel, NotebookView):
         return Response(tuple(trajectories), horizon, self.outputs, record.sampling_time)
 
     def simulate(self, record: Record, initial: str | Any = "measured") -> Response:
-        """Free run: the outputs' past is the model's own, from the first usable row on.
+        """Simulate the free run from the first usable row on.
 
-        Args: record: inputs, and outputs where they are measured. initial: the outputs on the rows
-            before the first usable one: "measured" (from the record),
-                "zero", or an array (rows, ny) that holds them.
+        Past outputs in the regressor are the model's own.
+
+        Args:
+            record: inputs, and outputs where they are measured.
+            initial: the outputs on the rows before the first usable one: "measured" (from the
+                record), "zero", or an array (rows, ny) that holds them.
 
         Raises:
             InputError: other channels, too few rows, or initial values that are not there.
@@ -201,7 +205,7 @@ class Model(RecordModel, NotebookView):
 
     @cached_property
     def memory(self) -> Memory:
-        """Return what a step remembers."""
+        """Past samples that a step remembers."""
         return Memory.of(
             self.form.layout, self.form.outputs, [channel.name for channel in self.inputs]
         )
@@ -213,11 +217,13 @@ class Model(RecordModel, NotebookView):
 
     @property
     def step_inputs(self) -> tuple[str, ...]:
-        """Return what a step takes: the inputs at its sample."""
+        """Inputs of a step: those at its sample."""
         return self.memory.inputs
 
     def start(self, record: Record, row: int | None = None) -> Vector:
-        """Return the state before a row of a record of one experiment, by default the first that has a prediction.
+        """Return the state before a row of a record of one experiment.
+
+        By default it is the first row that has a prediction.
 
         Raises:
             InputError: other channels, several experiments, a row that is not there.
@@ -229,7 +235,9 @@ class Model(RecordModel, NotebookView):
         )
 
     def step(self, state: Any, inputs: Any) -> tuple[Array, Array]:
-        """Return one sample of a free run: the next state (n,) and the outputs (ny,), from a state and the inputs (nu,).
+        """Return one sample of a free run: the next state (n,) and the outputs (ny,).
+
+        It starts from a state and the inputs (nu,).
 
         A pure function of JAX arrays, so that `jax.jit`, `jax.vmap` and `jax.grad` take it; to go
         on from a measured output, put that in the place of the model's own.
@@ -238,7 +246,7 @@ class Model(RecordModel, NotebookView):
 
     @property
     def filtering(self) -> tuple[LaggedFilter, Numbers, Vector]:
-        """The model as a filter: its dynamics, its numbers, and how large an unknown output is (ny,)."""
+        """The model as a filter: its dynamics, its numbers, and the size of an unknown output."""
         return LaggedFilter(self.form, self.memory), self.numbers, self.deviation
 
     def check_initial(self, initial: Any) -> Matrix:
@@ -291,7 +299,7 @@ class Model(RecordModel, NotebookView):
         )
 
     def first_state(self, experiment: Experiment, record: Record) -> Vector:
-        """Return the state at the first row of the free run that starts from the measured outputs."""
+        """Return the state at the first row of the free run from the measured outputs."""
         return self._start("measured", experiment.outputs)
 
     def _start(self, initial: Any, measured: Matrix | None) -> Vector:
@@ -310,7 +318,7 @@ class Model(RecordModel, NotebookView):
         return self.form.start(rows, [len(rows)])[0]
 
     def _outside(self, start: Vector, parts: Parts, experiment: Experiment, record: Record) -> Any:
-        """Where along a free run the learner's features lie outside those of training, (N,)."""
+        """Return the rows of a free run where a feature is outside its training range, (N,)."""
         inputs = self.form.inputs(experiment, record)
         with np.errstate(all="ignore"):
             z = self.form.scaled_features(self.numbers, start, np.asarray(parts.total), inputs)
@@ -323,7 +331,7 @@ class Model(RecordModel, NotebookView):
 def _in_batches(
     function: Callable[..., Parts], rows: tuple[np.ndarray, ...], largest: int = _BATCH
 ) -> Parts:
-    """`function` over batches of rows, padded to one shape, its results concatenated."""
+    """Call `function` on batches of rows, padded to one shape, and concatenate its results."""
     count = len(rows[0])
     size, pieces = min(_BATCH, largest), []
     for begin in range(0, count, size):

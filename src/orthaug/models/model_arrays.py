@@ -1,6 +1,6 @@
-"""What every saved model has: its channels, its numbers, what training left of statistics, and its learner.
+"""Contents of every saved model: channels, numbers, statistics of training, learner.
 
-Of a registered learner a file holds kind and fields, of a Python callable neither.
+A file holds kind and fields of a registered learner, and neither of a Python callable.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _SAID = ("structure", "measure", "sampling_time", "time_column")
 
 
 def said_of(model: Any) -> dict[str, Any]:
-    """Return what a file says of every model, whatever its physics."""
+    """Return the declaration that every model has, whatever its physics."""
     channels = {
         kind: [asdict(channel) for channel in getattr(model, kind)]
         for kind in ("outputs", "inputs")
@@ -49,7 +49,7 @@ def fields_from(declared: dict[str, Any], arrays: dict[str, np.ndarray]) -> dict
 
 
 def arrays_of(model: Any) -> dict[str, np.ndarray]:
-    """By the names that files give them; what is None is left out."""
+    """Return the arrays by the names that files give them; None is left out."""
     kept = model.statistics
     arrays = {f"numbers.{name}": value for name, value in model.numbers._asdict().items()}
     arrays |= {
@@ -69,11 +69,13 @@ def arrays_of(model: Any) -> dict[str, np.ndarray]:
 
 def numbers_from(arrays: dict[str, np.ndarray]) -> Numbers:
     """Return the model's numbers."""
-    return Numbers(**{name: arrays.get(f"numbers.{name}") for name in Numbers._fields})  # type: ignore[arg-type]
+    return Numbers(
+        **{n: arrays.get(f"numbers.{n}") for n in Numbers._fields}  # type: ignore[arg-type]
+    )
 
 
 def statistics_from(arrays: dict[str, np.ndarray], declared: dict[str, Any]) -> Statistics:
-    """Return what training left."""
+    """Return the statistics of training."""
     return Statistics(
         gram=arrays.get("gram"),
         middle=arrays.get("middle"),
@@ -88,14 +90,14 @@ def statistics_from(arrays: dict[str, np.ndarray], declared: dict[str, Any]) -> 
 
 
 def declaration_of(bound: Bound | None) -> dict[str, Any] | None:
-    """Return what a file says of a learner; None without one."""
+    """Return the declaration of a learner; None without one."""
     if bound is None:
         return None
     return declare_learner(bound.learner) | {"nz": bound.nz, "ny": bound.ny}
 
 
 def declare_learner(learner: Learner) -> dict[str, Any]:
-    """Kind and fields of a learner."""
+    """Return kind and fields of a learner."""
     kind = LEARNERS.kind_of(learner)
     if kind is None:
         return {"kind": "callable"}
@@ -103,7 +105,10 @@ def declare_learner(learner: Learner) -> dict[str, Any]:
 
 
 def rebuilt_learner(kept: dict[str, Any], given: Learner | None, path: Path) -> Learner:
-    """Return the learner that a file declares. For a callable it is the given one."""
+    """Return the learner that a file declares.
+
+    For a callable it is the given one.
+    """
     kind = kept["kind"]
     if kind in LEARNERS:
         learner = LEARNERS[kind]

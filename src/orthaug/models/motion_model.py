@@ -1,6 +1,4 @@
-"""The fitted motion ẋ = f(x, u.
-
-P) + learner, y = h(x, u; p): free runs, predictions, and what acts in it.
+"""The fitted motion ẋ = f(x, u; p) + learner, y = h(x, u; p): free runs and predictions.
 
 A run starts from a state that was not measured. It is estimated from the first rows of the record
 or, for a prediction, from a window of rows before it: the state from which a free run over the
@@ -43,7 +41,7 @@ from orthaug.physics.parameters import PhysicalParameter
 if TYPE_CHECKING:
     import pandas as pd
 
-FIRST_ROWS = 64  # that tell where a free run starts
+FIRST_ROWS = 64  # from which the start of a free run is estimated
 _SIDE_BY_SIDE = 256  # windows of predictions
 _GUESS_ITERATIONS, _WINDOW_ITERATIONS = 30, 6
 
@@ -52,7 +50,7 @@ _GUESS_ITERATIONS, _WINDOW_ITERATIONS = 30, 6
 def _run(
     form: MotionDynamics, numbers: Numbers, state: Float[Array, "n0"], inputs: Float[Array, "T nu"]
 ) -> tuple[Float[Array, "T n0"], Float[Array, "T ny"]]:
-    """States and outputs of a free run."""
+    """Return states and outputs of a free run."""
     numbers = form.prepared(numbers)
 
     def step(state: Any, row: Any) -> tuple[Any, tuple[Any, Any]]:
@@ -80,7 +78,7 @@ def _last(
 
 
 class TrainedSegments(NamedTuple):
-    """What a later split under a measure needs beside the training data: how segments lay, and where they started.
+    """Training segments and their initial states, for a later split under a measure.
 
     `rows` counts the rows that were scored, `alone` (np,) are the coordinates of physics alone;
     `slope` (k, m, nx, n) is how the starts `states` (k, nx, m) follow the unknowns, less its sign;
@@ -99,7 +97,7 @@ class TrainedSegments(NamedTuple):
 class MotionModel(RecordModel, NotebookView):
     """A fitted motion; `estimate` makes it, `orthaug.save` and `orthaug.load` keep it.
 
-    `window` rows tell a state from which to predict. `weight` (ny, ny) is the inner product of the
+    `window` rows give a state to predict from. `weight` (ny, ny) is the inner product of the
     outputs; `loose` (nx,) how far a state may be from its guess. `deviation` (ny,) is that of the
     training outputs.
     """
@@ -124,7 +122,7 @@ class MotionModel(RecordModel, NotebookView):
     """
     statistics: Statistics = Statistics()  # noqa: RUF009  (frozen)
     prepared: tuple[Prepared, ...] = field(default=(), kw_only=True, repr=False)
-    """What the training data went through before."""
+    """Preparation of the training data."""
 
     def __repr__(self) -> str:
         learner = self.form.bound.learner if self.form.bound else "none"
@@ -154,19 +152,20 @@ class MotionModel(RecordModel, NotebookView):
 
     @property
     def alone(self) -> MotionModel:
-        """Its physics without the learner."""
+        """The model without its learner."""
         return replace(
             self, form=self.form.alone, numbers=self.numbers.alone._replace(gain=np.ones(0))
         )
 
     def simulate(self, record: Record, initial: str | Any = "measured") -> Response:
-        """Free run from the first row on.
+        """Simulate the free run from the first row on.
 
         `baseline` is the output of the physics alone from the same start, `learner` the difference.
 
-        Args: record: inputs, and outputs where they are measured. initial: "measured" (the state by
-            which a free run follows the first rows of the record best), "zero", or an
-                array (rows, ny) of outputs to follow instead.
+        Args:
+            record: inputs, and outputs where they are measured.
+            initial: "measured" (the state by which a free run follows the first rows of the record
+                best), "zero", or an array (rows, ny) of outputs to follow instead.
 
         Raises:
             InputError: other channels, no rows, or initial values that are not there.
@@ -178,7 +177,9 @@ class MotionModel(RecordModel, NotebookView):
         return Response(tuple(trajectories), None, self.outputs, record.sampling_time)
 
     def predict(self, record: Record, horizon: int = 1) -> Response:
-        """Predict each row from a state that was estimated over the `window` rows up to `horizon` samples before it.
+        """Predict each row from a state estimated over earlier rows.
+
+        The state is estimated over the `window` rows up to `horizon` samples before the row.
 
         Where an experiment is shorter than that, over fewer.
 
@@ -199,9 +200,9 @@ class MotionModel(RecordModel, NotebookView):
     def states(self, record: Record, initial: str | Any = "measured") -> pd.DataFrame:
         """Return the states of a free run.
 
-        Of each learned equation its rate by the physics, and what is learned beside it.
+        The table also has the rate of each learned equation by the physics, and by the learner.
 
-        Of a learned output likewise.
+        Learned outputs have the same columns.
         """
         import pandas as pd
 
@@ -230,7 +231,10 @@ class MotionModel(RecordModel, NotebookView):
 
     @property
     def step_inputs(self) -> tuple[str, ...]:
-        """Return what a step takes: the inputs at its sample, under a first-order hold those at the next one behind them."""
+        """Inputs of a step: those at its sample.
+
+        Under a first-order hold those at the next sample follow behind them.
+        """
         return step_inputs(self.form)
 
     @cached_property
@@ -238,7 +242,9 @@ class MotionModel(RecordModel, NotebookView):
         return with_scheme(self.form, self.numbers)
 
     def start(self, record: Record, row: int | None = None) -> Vector:
-        """Return the state at a row of the free run on a record of one experiment, by default at the first row.
+        """Return the state at a row of the free run on a record of one experiment.
+
+        By default it is the first row.
 
         Raises:
             InputError: other channels, several experiments, a row that is not there.
@@ -254,7 +260,9 @@ class MotionModel(RecordModel, NotebookView):
         ][row]
 
     def step(self, state: Any, inputs: Any) -> tuple[Array, Array]:
-        """Return one sample: the next state (nx,) and the outputs (ny,) at this one, from a state and `step_inputs`.
+        """Return one sample: the next state (nx,) and the outputs (ny,) at this one.
+
+        It starts from a state and `step_inputs`.
 
         A pure function of JAX arrays, so that `jax.jit`, `jax.vmap` and `jax.grad` take it.
 
@@ -267,19 +275,19 @@ class MotionModel(RecordModel, NotebookView):
 
     @property
     def filtering(self) -> tuple[MotionFilter, Numbers, Vector]:
-        """The model as a filter: its dynamics, its numbers, and how large an unknown state is (nx,)."""
+        """The model as a filter: its dynamics, its numbers, and the size of an unknown state."""
         return MotionFilter(self.form), self._stepping, np.asarray(self.loose) / LOOSE
 
     @property
     def reached(self) -> Scaling:
-        """Return what training reached of the learner's features.
+        """Range of the learner's features in training.
 
-        Of a model saved without it, what physics alone did.
+        For a model saved without it, it is the range of physics alone.
         """
         return super().reached if self.seen is None else Scaling.fit(self.seen)
 
     def reach(self, record: Record) -> Matrix:
-        """Return the states and inputs (N, nx + nu) of the free run on a record, where they are finite."""
+        """Return the finite states and inputs (N, nx + nu) of the free run on a record."""
         states = self.states(record)[list(self.form.motion.names_of_states)].to_numpy()
         inputs = [e.inputs for e in self.fitting(record, need_outputs=False).experiments]
         points = np.concatenate([states, np.concatenate(inputs)], axis=1)
@@ -311,19 +319,17 @@ class MotionModel(RecordModel, NotebookView):
         if self.form.bound is None:
             return bounded
         alone = self.alone
-        told = self._with_physics(
-            bounded, self._follow(alone.form, alone.numbers, start, inputs)[1]
-        )
+        run = self._with_physics(bounded, self._follow(alone.form, alone.numbers, start, inputs)[1])
         return (
-            told
-            if told.diverged
-            else replace(told, outside=self._outside(states, self.form.now(inputs)))
+            run
+            if run.diverged
+            else replace(run, outside=self._outside(states, self.form.now(inputs)))
         )
 
     def _with_physics(self, run: Trajectory, physics: Matrix) -> Trajectory:
         """Return a run of the whole model with the output of the physics alone.
 
-        No value from where that left all bounds.
+        There is no value from where that output left all bounds.
         """
         with np.errstate(all="ignore"):
             wild = ~(np.abs(physics) <= RUNAWAY * self.largest_output).all(axis=1)
@@ -346,14 +352,14 @@ class MotionModel(RecordModel, NotebookView):
         return np.asarray(states)[:rows], np.asarray(outputs)[:rows]
 
     def _outside(self, states: Matrix, inputs: Matrix) -> Any:
-        """Where the learner's features lie outside those of training, (N,)."""
+        """Return where the learner's features are outside those of training, (N,)."""
         if self.form.bound is None:
             return None
         with np.errstate(all="ignore"):
             return self.beyond(np.asarray(self.form.seen(states.T, inputs.T, np)).T)
 
     def first_state(self, experiment: Experiment, record: Record) -> Vector:
-        """Return the state at the first row of the free run that starts from the measured outputs."""
+        """Return the state at the first row of the free run from the measured outputs."""
         return self._start(experiment, "measured", record)
 
     def _start(self, experiment: Experiment, initial: str | Any, record: Record) -> Vector:
@@ -401,7 +407,10 @@ class MotionModel(RecordModel, NotebookView):
     def _predicted(
         self, experiment: Experiment, record: Record, horizon: int, window: int
     ) -> tuple[Float[np.ndarray, "r ny"], Float[np.ndarray, "r ny"]]:
-        """Return the outputs from row `window + horizon - 1` on, each `horizon` steps after a window; and by physics alone."""
+        """Return the outputs `horizon` steps after each window, of the model and by physics alone.
+
+        The first row is `window + horizon - 1`.
+        """
         steps = window + horizon
         inputs = self.form.inputs(experiment, record)
         run = self._follow(

@@ -23,7 +23,7 @@ _SEGMENTATION = ("segment", "washout", "rows")  # of `Trained`
 
 
 def declare(model: MotionModel) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Return what a file says of a model, and its arrays."""
+    """Return the declaration of a model, and its arrays."""
     form, trained = model.form, model.trained
     declared = {
         "kind": "motion",
@@ -112,7 +112,7 @@ def _declared_motion(motion: Motion) -> dict[str, Any]:
 def _rebuilt_motion(kept: dict[str, Any], given: Any, path: Path) -> Motion:
     """Return the motion that a file declares.
 
-    Of functions it is the given one, with the saved parameters.
+    For functions it is the given one, with the saved parameters.
     """
     parameters = [
         PhysicalParameter(**(p | {k: limit for k, limit in _LIMITS.items() if p[k] is None}))

@@ -23,7 +23,7 @@ _FEW = 8  # states and parameters; programs of more are slow to compile
 
 
 class Slopes(NamedTuple):
-    """Of a map from (x, c, w): its value, and ∂/∂x, ∂/∂c, ∂/∂w."""
+    """Value of a map from (x, c, w), and ∂/∂x, ∂/∂c, ∂/∂w."""
 
     value: Any
     to_x: Any
@@ -32,7 +32,7 @@ class Slopes(NamedTuple):
 
 
 def sample_slopes(form: MotionField, numbers: Numbers, state: Any, row: Any) -> Slopes:
-    """x one sample later, at one state (nx,) and the inputs of one row, under `rk4`."""
+    """Return x one sample later with its slopes, at one state (nx,) and input row, under `rk4`."""
     at, halves = input_at(row, len(form.motion.inputs)), 2 * form.substeps
     h, identity = form.sampling_time / form.substeps, jnp.eye(form.states)
     through, x = [], state
@@ -62,7 +62,10 @@ def sample_slopes(form: MotionField, numbers: Numbers, state: Any, row: Any) -> 
 
 @partial(jax.jit, static_argnames="form")  # for the stages of all substeps it is traced once
 def field_slopes(form: MotionField, numbers: Numbers, x: Any, u: Any) -> Slopes:
-    """F at one point; ∂/∂w is that of the learned equations only, (nl, nw)."""
+    """Return F and its slopes at one point.
+
+    ∂/∂w is that of the learned equations only, (nl, nw).
+    """
     c = numbers.theta - numbers.theta_aux
     coordinates = form.motion.coordinates
 
@@ -82,7 +85,7 @@ def field_slopes(form: MotionField, numbers: Numbers, x: Any, u: Any) -> Slopes:
 
 
 def learner_slopes(form: MotionField, numbers: Numbers, x: Any, u: Any) -> Slopes:
-    """g at one point: of learned equations first, then of learned outputs."""
+    """Return g and its slopes at one point: learned equations first, then learned outputs."""
     bound = form.bound
     assert bound is not None
 
@@ -103,7 +106,7 @@ def learner_slopes(form: MotionField, numbers: Numbers, x: Any, u: Any) -> Slope
 
 
 def output_slopes(form: MotionField, numbers: Numbers, x: Any, u: Any) -> Slopes:
-    """y at one point."""
+    """Return y and its slopes at one point."""
     c = numbers.theta - numbers.theta_aux
 
     def physics(x: Any, c: Any) -> Any:
@@ -121,9 +124,9 @@ def output_slopes(form: MotionField, numbers: Numbers, x: Any, u: Any) -> Slopes
 
 
 def _differentiated(function: Any, x: Any, c: Any) -> tuple[Any, Any, Any]:
-    """Value and slopes by x and c.
+    """Return the value and its slopes by x and c.
 
-    Of few entries one at a time, which leaves out what an entry does not touch.
+    Few entries are differentiated one at a time, without what an entry does not touch.
     """
     entries, n0 = [*x, *c], len(x)
     if len(entries) > _FEW:
@@ -141,8 +144,11 @@ def _differentiated(function: Any, x: Any, c: Any) -> tuple[Any, Any, Any]:
 
 
 def _finite(slope: Any) -> Any:
-    """Return a kink without a derivative, such as sqrt(max(x, 0)) at 0, counts as flat."""
+    """Return slopes with 0 for a derivative that does not exist, as of sqrt(max(x, 0)) at 0."""
     return jnp.where(jnp.isfinite(slope), slope, 0.0)
+
+
+_LARGE = 150  # operations in the expressions of a motion: beyond, compiling its stages one by one takes a minute
 
 
 @dataclass(frozen=True)
@@ -168,24 +174,27 @@ class MotionDynamics(MotionField, AutodiffDynamics):
 
     @property
     def alone(self) -> MotionDynamics:
-        """The same motion without a learner."""
+        """These dynamics without the learner."""
         return replace(self, features=(), bound=None)
 
     def start(
         self, outputs: Matrix, rows: Sequence[int] | Int[np.ndarray, "r"]
     ) -> Float[np.ndarray, "r n0"]:
-        """States as they are declared to start, by local polynomials through the measured outputs about the rows."""
+        """Return the states as declared to start.
+
+        Local polynomials through the measured outputs about the rows determine them.
+        """
         return guess(self.motion, outputs, rows, self.sampling_time)
 
     def start_rows(self, weight: Matrix) -> Matrix:
-        """Return a start costs nothing: the outputs from there on tell it."""
+        """Return zero weights: a start costs nothing, for the outputs after it determine it."""
         return np.zeros((self.states, self.states))
 
     def inputs(self, experiment: Experiment, record: Record) -> Matrix:
         return held(np.asarray(experiment.inputs), self.motion.hold, self.substeps)
 
     def describe(self, state: Vector, inputs: Vector) -> dict[str, float]:
-        """States and inputs by name."""
+        """Return states and inputs by name."""
         named = zip(
             (*self.motion.names_of_states, *self.motion.inputs),
             (*state, *self.now(inputs)),
@@ -211,11 +220,15 @@ class MotionDynamics(MotionField, AutodiffDynamics):
             self.sampling_time,
             self.substeps,
             self.motion.integrator,
+            looped=self._large,
         )
         return following, parts
 
     def prepared(self, numbers: Numbers) -> Numbers:
-        """With the exponentials of an exact integrator and their derivatives by the coordinates of p."""
+        """Return the numbers with the exponentials of an exact integrator.
+
+        Their derivatives are by the coordinates of p.
+        """
         if self.motion.integrator != "exact":
             return numbers
 
@@ -226,14 +239,22 @@ class MotionDynamics(MotionField, AutodiffDynamics):
         return numbers._replace(scheme=(of(theta), jax.jacfwd(of)(theta)))
 
     def exponentials(self, numbers: Numbers) -> Exponentials | None:
-        """Of the linear part over a substep; None where the integrator needs none."""
+        """Return the exponentials of the linear part over a substep.
+
+        None where the integrator needs none.
+        """
         if self.motion.integrator != "exact":
             return None
         return Exponentials.of(self.linear_part(numbers), self.sampling_time / self.substeps)
 
     @property
+    def _large(self) -> bool:
+        return self.motion.size > _LARGE
+
+    @property
     def _by_stages(self) -> bool:
-        return self.motion.integrator == "rk4" and self.substeps <= UNROLLED and self.differentiable
+        few = self.substeps <= UNROLLED and not self._large
+        return self.motion.integrator == "rk4" and few and self.differentiable
 
     def tangents(
         self, numbers: Numbers, state: Any, slopes: Any, inputs: Any
@@ -241,9 +262,9 @@ class MotionDynamics(MotionField, AutodiffDynamics):
         return self.local(numbers, state, inputs).along(slopes, fused=self._by_stages)
 
     def local(self, numbers: Numbers, states: Any, inputs: Any) -> Local:
-        """Of a few Runge-Kutta substeps by the adjoint of their stages.
+        """Return the slopes of a few Runge-Kutta substeps by the adjoint of their stages.
 
-        Otherwise by automatic differentiation.
+        Other schemes are differentiated automatically.
         """
         if numbers.scheme is not None:
             value, to_state, to_unknowns = super().local(numbers, states, inputs)
@@ -261,7 +282,10 @@ class MotionDynamics(MotionField, AutodiffDynamics):
         return Local(value, to_x, jnp.concatenate(own, axis=1))
 
     def _by_scheme(self, numbers: Numbers, state: Any, inputs: Any) -> Any:
-        """Return how states and outputs (n0 + ny, n, r) follow p through the exponentials, which a step takes as given."""
+        """Return the derivatives of states and outputs by p through the exponentials.
+
+        They are (n0 + ny, n, r). A step takes the exponentials as given.
+        """
         scheme, by_theta = numbers.scheme
 
         def following(scheme: Any, state: Any, row: Any) -> Any:
@@ -281,7 +305,10 @@ class MotionDynamics(MotionField, AutodiffDynamics):
 
 @partial(jax.jit, static_argnames="form")
 def _step(form: MotionDynamics, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
-    """Return a step. It is traced once, whatever programs it stands in; so is the field in it."""
+    """Return a step.
+
+    It is traced once, whatever programs contain it; so is the field in it.
+    """
     return form._stepped(numbers, state, inputs)
 
 

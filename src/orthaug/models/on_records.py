@@ -1,4 +1,4 @@
-"""What every fitted model does with a record: match its channels and rows, and cut a run that left all bounds."""
+"""Records of fitted models: match channels and rows, and cut a run that left all bounds."""
 
 from __future__ import annotations
 
@@ -34,18 +34,18 @@ class RecordModel:
 
     @property
     def preparation(self) -> tuple[Any, ...]:
-        """The steps that the training data went through, for `prepare` and `read_record` of other data."""
+        """Preparation of the training data, for `prepare` and `read_record` of other data."""
         return steps_again(
             self.prepared, [c.name for c in (*self.inputs, *self.outputs)], self.sampling_time
         )[0]
 
     @property
     def reached(self) -> Scaling:
-        """Return what training reached of the learner's features."""
+        """Range of the learner's features in training."""
         return Scaling(np.asarray(self.numbers.centre), np.asarray(self.numbers.halfwidth))
 
     def beyond(self, features: Matrix) -> Bool[np.ndarray, "N"]:
-        """Where one of the learner's features (N, nz) lies outside of what training reached."""
+        """Return where a feature of the learner (N, nz) is outside its range in training."""
         return ~(np.abs(self.reached(features)) <= 1 + WITHIN).all(axis=1)
 
     def bounded(self, parts: Parts, experiment: Experiment, measured: Matrix | None) -> Trajectory:
@@ -64,7 +64,7 @@ class RecordModel:
         return replace(bounded, diverged=(step + self.form.first_row, output))
 
     def check_rows(self, experiment: Experiment, first: int) -> None:
-        """Raises InputError where an experiment ends before the row `first`."""
+        """Raise InputError where an experiment ends before the row `first`."""
         if len(experiment) <= first:
             name = experiment.source or "the record"
             raise InputError(
@@ -73,7 +73,7 @@ class RecordModel:
             )
 
     def _wanted(self, with_outputs: bool) -> str:
-        """Return a record of the model's channels, in the words of Python."""
+        """Describe a record of the model's channels in Python."""
         given = {
             "u": ("inputs", self.inputs),
             "y": ("outputs", self.outputs if with_outputs or not self.inputs else ()),
@@ -88,9 +88,9 @@ class RecordModel:
     def fitting(self, record: Record, *, need_outputs: bool, gaps: bool = False) -> Record:
         """Return the record's channels in the model's order, by name.
 
-        Raises: InputError: a channel is missing, the sampling time differs by more than 0.1 %, or
-            outputs are missing
-                samples and `gaps` are not allowed.
+        Raises:
+            InputError: a channel is missing, the sampling time differs by more than 0.1 %, or
+                outputs are missing samples and `gaps` are not allowed.
         """
         check_type(record, Record, "record", self._wanted(need_outputs))
         if not same_step(record.sampling_time, self.sampling_time):
@@ -125,7 +125,7 @@ class RecordModel:
 def trajectory(
     parts: Parts, experiment: Experiment, measured: Matrix | None, first: int
 ) -> Trajectory:
-    """Parts from a row on as a trajectory of the whole experiment."""
+    """Return parts from a row on as a trajectory of the whole experiment."""
 
     def whole(values: Any) -> Matrix:
         padded = np.full((len(experiment), values.shape[1]), np.nan)

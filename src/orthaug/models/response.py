@@ -24,7 +24,10 @@ BAND = 1.959963984540054  # standard deviations: 95 % of a normal distribution
 
 @dataclass(frozen=True, eq=False)
 class Scores:
-    """Per output: `rmse` in the output's unit, `nrmse` = RMSE / std(y), `fit` = 100 (1 − NRMSE) in %, not clipped.
+    """Root-mean-square error and fit of each output.
+
+    `rmse` is in the output's unit, `nrmse` = RMSE / std(y), `fit` = 100 (1 − NRMSE) in %, not
+    clipped.
 
     Entries are NaN where a score does not exist (a run that diverged, an output that does not
     move).
@@ -40,12 +43,14 @@ class Scores:
             (name, [f"{value:.6g}" for value in getattr(self, name)])
             for name in ("rmse", "nrmse", "fit")
         )
-        told = ", ".join(f"{name} = {' | '.join(values)}" for name, values in kinds)
-        return f"Scores({told} %, {self.samples} samples)"
+        scores = ", ".join(f"{name} = {' | '.join(values)}" for name, values in kinds)
+        return f"Scores({scores} %, {self.samples} samples)"
 
 
 def scores(measured: Matrix, model: Matrix) -> Scores:
-    """RMSE, NRMSE (population standard deviation of the scored samples) and FIT of each column.
+    """Return RMSE, NRMSE and FIT of each column.
+
+    NRMSE has the population standard deviation of the scored samples.
 
     Args:
         measured: (N, ny); what is NaN is not scored.
@@ -64,7 +69,7 @@ def scores(measured: Matrix, model: Matrix) -> Scores:
 
 
 def scores_of(rmse: Vector, deviation: Vector, samples: int) -> Scores:
-    """Scores from the RMSE and the standard deviation of each output (ny,)."""
+    """Return scores from the RMSE and the standard deviation of each output (ny,)."""
     rmse = np.where(np.isfinite(rmse), rmse, np.nan)
     moves = (deviation > 0) & np.isfinite(deviation)
     nrmse = np.where(moves, rmse / np.where(moves, deviation, 1.0), np.nan)
@@ -116,7 +121,7 @@ class Trajectory:
 
     @property
     def baseline_before(self) -> Matrix:
-        """φ(θ − θ_aux): what goes with `learner_before`."""
+        """φ(θ − θ_aux), the baseline that belongs to `learner_before`."""
         return self.model - self.learner_before
 
 
@@ -146,7 +151,7 @@ class Response:
         )
 
     def scores(self, skip: int | tuple[int, ...] = 0) -> Scores:
-        """Scores over all experiments, without the first `skip` samples of each.
+        """Return scores over all experiments, without the first `skip` samples of each.
 
         A tuple has one number per experiment.
 
@@ -173,9 +178,9 @@ class Response:
 
     @property
     def physics_alone(self) -> Response:
-        """Of the free run of a motion that of its physics alone.
+        """Response of the physics alone, for the free run of a motion.
 
-        Of other responses the physics' part.
+        For other responses it is the physics' part.
         """
         found = []
         for t in self.trajectories:
@@ -191,7 +196,7 @@ class Response:
     def to_frame(self, experiment: int = 0) -> pd.DataFrame:
         """Return a table with `time` and, per output, measured, model, baseline and learner.
 
-        Of a free run `extrapolates`.
+        A free run also has `extrapolates`.
 
         Of an observer's prediction also the 95 % band of what is measured.
         """

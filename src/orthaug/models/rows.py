@@ -38,13 +38,13 @@ class Chunk(NamedTuple):
     """
 
     z: Float[Array, "*k nz m"]
-    """Scaled learner features."""
+    """Scaled features of the learner."""
     q: Float[Array, "*k ny nt m"]
     """Orthonormal basis of the physics."""
     e: Float[Array, "*k ny m"]
     """P⊥Y, what the physics cannot express."""
     gain: Float[Array, "*k ny ny m"]
-    """What turns the learner's outputs into whitened rows."""
+    """Matrices that turn the learner's outputs into whitened rows."""
 
 
 class Overlap(NamedTuple):
@@ -62,34 +62,37 @@ class Room(NamedTuple):
     size: float
     """Its memory in bytes."""
     place: str
-    """What it is called: "the worker tcp://…"."""
+    """Name in messages: "the worker tcp://…"."""
     matrices: int
     """Gram matrices that it holds at once, where sums are made and added."""
 
 
 @runtime_checkable
 class Engine(Protocol):
-    """Where rows are, and who adds up over them."""
+    """Sums over rows, wherever the rows are."""
 
     @property
     def resident(self) -> bool:
-        """Return whether all rows are one `Chunk` on the device, so that a whole training run may be compiled around a sum."""
+        """True if all rows are one `Chunk` on the device.
+
+        A whole training run can then be compiled around a sum.
+        """
         ...
 
     def build_rows(self, z: Matrix, q: Any, e: Matrix, gain: Float[np.ndarray, "N ny ny"]) -> Any:
-        """Rows (N, …) as this engine keeps them."""
+        """Keep rows (N, …) in the engine's memory."""
         ...
 
     def draw(self, source: Any, row_builder: Callable[[Any], Any]) -> Any:
-        """Rows of a source (`data.sources.Source`), laid out by `laying` of each of its partitions."""
+        """Return rows of a `data.sources.Source`, which `row_builder` makes of each partition."""
         ...
 
     def passes(self, function: Callable[[Any], Any], partitions: Sequence[Any]) -> list[Any]:
-        """`[function(partition) for partition in partitions]`, wherever the partitions are read."""
+        """Return `[function(p) for p in partitions]`, where the partitions are read."""
         ...
 
     def sum(self, function: Callable[..., Any], rows: Any, *arguments: Any) -> Any:
-        """Σ function(chunk, *arguments) over all chunks.
+        """Return Σ function(chunk, *arguments) over all chunks.
 
         `function` is hashable, its result any pytree of arrays.
         """
@@ -97,53 +100,56 @@ class Engine(Protocol):
 
     @property
     def shares(self) -> int:
-        """Return how many can sum at a time: chunks that are placed should be a multiple."""
+        """Number of simultaneous sums; the number of placed chunks should be a multiple of it."""
         ...
 
     def place(self, chunks: Any, like: Any = None) -> Any:
-        """Chunks of any pytree, (k, …) each, as rows.
+        """Place chunks of any pytree, (k, …) each, as rows.
 
-        Where those of `like` are, which are as many.
+        They go where those of `like` are, which are as many.
         """
         ...
 
     def read(
         self, function: Callable[[Any], Any], partitions: Sequence[Any], counts: Sequence[int]
     ) -> Any:
-        """Rows of the chunks, `counts` of each, that `function(partition)` gives one by one."""
+        """Return rows from the chunks that `function(partition)` yields, `counts` of each."""
         ...
 
     def along(
         self, function: Callable[[Any, Any], Any], partitions: Sequence[Any], carry: Any
     ) -> Any:
-        """`carry = function(partition, carry)` over all partitions in their order."""
+        """Compute `carry = function(partition, carry)` over all partitions in their order."""
         ...
 
     def beside(self, *rows: Any) -> Any:
-        """Rows whose chunks are tuples of the chunks of others."""
+        """Return rows whose chunks are tuples of the chunks of others."""
         ...
 
     def keep(self, function: Callable[..., Any], rows: Any, *arguments: Any) -> tuple[Any, Any]:
-        """Of `function(chunk, *arguments)`, a pair: the first as rows that stay where they are, Σ of the second."""
+        """Return two results of `function(chunk, *arguments)`: kept rows, and a sum.
+
+        The first of each pair stays where it is, the second is summed.
+        """
         ...
 
     def fetch(self, rows: Any) -> Any:
-        """Return what was placed or kept, (k, …) each, in NumPy."""
+        """Return placed or kept rows, (k, …) each, in NumPy."""
         ...
 
     def map(
         self, function: Any, given: Any, items: Sequence[Any], heard: Heard = nobody
     ) -> Iterator[Any]:
-        """Independent runs, `function(given, item, tell)` each; as `Threads.map`."""
+        """Yield results of independent runs, `function(given, item, report)`; as `Threads.map`."""
         ...
 
     def room(self) -> Room | None:
-        """Where memory may be short beside this process; None where all sums are made here."""
+        """Return the smallest memory outside this process; None where all sums are made here."""
         ...
 
 
 class LocalEngine(Threads):
-    """What engines share that read partitions in this process, and keep the chunks of rows in one array."""
+    """Engine that reads partitions in this process and keeps the chunks of rows in one array."""
 
     def passes(self, function: Callable[[Any], Any], partitions: Sequence[Any]) -> list[Any]:
         return in_threads(function, partitions)
@@ -208,23 +214,23 @@ def _compiled_sum(function: Callable[..., Any], rows: Chunk, arguments: tuple[An
 
 
 def all_chunks(function: Callable[[Any], Any], partitions: Sequence[Any]) -> Any:
-    """Return the chunks that a function gives of every partition, (k, …) each."""
+    """Return the chunks that a function makes of every partition, (k, …) each."""
     return together([chunk for partition in partitions for chunk in function(partition)])
 
 
 def together(chunks: Sequence[Any]) -> Any:
-    """Chunks of any pytree as one, (k, …) each."""
+    """Join chunks of any pytree into one, (k, …) each."""
     return jax.tree.map(lambda *parts: np.stack(parts), *chunks)
 
 
 def brought(source: Any, row_builder: Callable[[Any], Any]) -> tuple[np.ndarray, ...]:
-    """Return all rows of a source laid out: features, Q, P⊥Y and gain, (N, …) each."""
+    """Return all rows of a source: features, Q, P⊥Y and gain, (N, …) each."""
     pieces = [arrays for partition in source.partitions for arrays in row_builder(partition)]
     return tuple(np.concatenate(parts) for parts in zip(*pieces, strict=True))
 
 
 def row_sum(function: Callable[[Any], Any], rows: Any) -> Any:
-    """Σ function(chunk) over the leading axis of every array in `rows`.
+    """Return Σ function(chunk) over the leading axis of every array in `rows`.
 
     Any pytree in, any pytree out.
     """
@@ -232,7 +238,7 @@ def row_sum(function: Callable[[Any], Any], rows: Any) -> Any:
 
 
 def row_fold(function: Callable[[Any], tuple[Any, Any]], rows: Any) -> tuple[Any, Any]:
-    """Of function(chunk), a pair: the first ones (k, …), and Σ of the second."""
+    """Return the first results of function(chunk), (k, …), and the sum of the second."""
     function = jax.jit(function)  # traced once for its shape and the sum
     first = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), rows)
     zero = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(function, first)[1])
@@ -246,9 +252,9 @@ def row_fold(function: Callable[[Any], tuple[Any, Any]], rows: Any) -> tuple[Any
 
 
 def chunk_shape(rows: int, limit: int = CHUNK_ROWS) -> tuple[int, int]:
-    """(number of chunks, rows in each) for `rows` rows in equal chunks of about `limit`.
+    """Return (number of chunks, rows in each) for `rows` rows in equal chunks of about `limit`.
 
-    Few rows in few sizes.
+    Few rows have few sizes, so that few programs are compiled.
     """
     count = max(1, -(-rows // limit))
     size = -(-rows // count)
@@ -259,7 +265,7 @@ def chunk_shape(rows: int, limit: int = CHUNK_ROWS) -> tuple[int, int]:
 def in_chunks(
     values: Float[np.ndarray, "N ..."], shape: tuple[int, int], *, repeat: bool = False
 ) -> Float[np.ndarray, "k ... m"]:
-    """Rows (N, …) as chunks (k, …, m) with zeros behind the last row, or `repeat`s of it."""
+    """Return rows (N, …) as chunks (k, …, m), padded with zeros or `repeat`s of the last row."""
     count, size = shape
     padded = np.zeros((count, *values.shape[1:], size))
     for i in range(count):
@@ -271,27 +277,30 @@ def in_chunks(
 
 
 def build_chunk(z: Matrix, q: Any, e: Matrix, gain: Any, shape: tuple[int, int]) -> Chunk:
-    """Rows (N, …) as a chunk (k, …, m) of NumPy arrays."""
+    """Return rows (N, …) as a chunk (k, …, m) of NumPy arrays."""
     padded = in_chunks(z, shape, repeat=True)  # zeros may be where the learner has no value
     pieces: Any = (padded, *(in_chunks(piece, shape) for piece in (q, e, gain)))
     return Chunk(*pieces)
 
 
 def from_chunks(chunks: Float[np.ndarray, "k ... m"], rows: int) -> Float[np.ndarray, "N ..."]:
-    """Return the inverse of `in_chunks`."""
+    """Return the rows of chunks: the inverse of `in_chunks`."""
     moved = np.moveaxis(np.asarray(chunks), -1, 1)
     return moved.reshape(moved.shape[0] * moved.shape[1], *moved.shape[2:])[:rows]
 
 
 def gram(columns: Float[Array, "n rows"]) -> Float[Array, "n n"]:
-    """Return a Aᵀ of named columns laid out as rows of A; one matrix product."""
+    """Return A Aᵀ of named columns as the rows of A; one matrix product."""
     return columns @ columns.T
 
 
 def learner_rows(
     engine: Engine, form: Lagged, numbers: Numbers, x: Matrix, q: Any, weight: Any
 ) -> Any:
-    """Regressors x (N, nx) as rows of the engine, their outputs multiplied by `weight`, (ny, ny) or (N, ny, ny)."""
+    """Return regressors x (N, nx) as rows of the engine.
+
+    Outputs are multiplied by `weight`, (ny, ny) or (N, ny, ny).
+    """
     z = np.asarray(form.features.evaluate(x, form.layout, np))
     scaled = (
         (z - np.asarray(numbers.centre)) / np.asarray(numbers.halfwidth)
@@ -317,7 +326,9 @@ class Overlaps:
 
 @dataclass(frozen=True)
 class MixedGram:
-    """Gram matrix of `[Q J]` with the outputs of every row multiplied by `mix`: `ΣψᵀΣ_eψ` for `Σ_e = mixᵀ mix`.
+    """Gram matrix of `[Q J]` with the outputs of every row multiplied by `mix`.
+
+    It is `ΣψᵀΣ_eψ` for `Σ_e = mixᵀ mix`.
 
     J is taken without its `overlaps` with Q, if any are given. Without a learner the matrix is that
     of Q.
@@ -343,7 +354,7 @@ class _LeftOver:
 def _columns(
     bound: Bound | None, chunk: Chunk, w: Any, overlaps: tuple[Any, ...]
 ) -> tuple[Any, Any]:
-    """Q (nt, ny, m) and J (nw, ny, m) of a chunk, J less its overlaps with Q."""
+    """Return Q (nt, ny, m) and J (nw, ny, m) of a chunk, J less its overlaps with Q."""
     q = jnp.moveaxis(chunk.q, 1, 0)
     jacobian = (
         jnp.zeros((0, *q.shape[1:])) if bound is None else bound.jacobian(w, chunk.z, chunk.gain)[1]
@@ -354,7 +365,7 @@ def _columns(
 
 
 def projected_gram(engine: Engine, bound: Bound | None, w: Any, rows: Any, mix: Any) -> Matrix:
-    """Gram matrix of `[Q P⊥J]`, outputs multiplied by `mix`.
+    """Return the Gram matrix of `[Q P⊥J]`, outputs multiplied by `mix`.
 
     J is projected twice, so that Q and it are orthogonal.
     """
@@ -368,15 +379,15 @@ def projected_gram(engine: Engine, bound: Bound | None, w: Any, rows: Any, mix: 
 def row_values(
     bound: Bound, w: Float[Array, "nw"], z: Float[Array, "k nz m"]
 ) -> Float[Array, "k ny m"]:
-    """f at every row, in the learner's unit."""
+    """Return f at every row, in the learner's unit."""
     one_chunk = jax.vmap(lambda row: bound.values(w, row), in_axes=-1, out_axes=-1)
     return jax.lax.map(one_chunk, z)
 
 
 def _values(bound: Bound | None, chunk: Chunk, w: Any, tilt: Any) -> Float[Array, "ny m"]:
-    """F of one chunk.
+    """Return F of one chunk.
 
-    Of an ensemble the median of its members, each with the physics that it adds.
+    For an ensemble it is the median of the members, each with the physics that it adds.
     """
     if bound is None:
         return jnp.zeros_like(chunk.e)

@@ -1,4 +1,4 @@
-"""States by which runs follow what was measured: least squares on the starts alone, of many windows side by side.
+"""Initial states by least squares on the measured outputs, of many windows side by side.
 
 A damped Gauss-Newton iteration on every start by itself. Starts that a window does not show stay
 near the guess.
@@ -16,7 +16,8 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug._base.jax import Array, jax, jnp
 from orthaug.models.dynamics import Dynamics, Numbers
 
-LOOSE = 1e3  # times the size of a state: how far a start may be from its guess before that counts as one error
+# Times the size of a state: the distance of a start from its guess that counts as one error
+LOOSE = 1e3
 _FIRST_DAMPING = 1e-3
 _SHORTEST, _LANES = 64, 16  # steps, and windows side by side
 _SETTLED = 1e-10  # relative decrease that is not worth a step
@@ -31,10 +32,13 @@ class Windows(NamedTuple):
     inputs: Float[Any, "T nu m"]
     target: Float[Any, "T ny m"]
     scored: Any
-    """(T, m)."""
+    """Inputs of each window, (T, m)."""
 
     def padded(self) -> tuple[Windows, int]:
-        """Longer and more, for few shapes have programs of their own, on the device; and T."""
+        """Return longer and more windows on the device, and T.
+
+        Few shapes have programs of their own.
+        """
         steps, count = np.shape(self.scored)
         more = padded_steps(steps) - steps, -count % _LANES
 
@@ -47,7 +51,7 @@ class Windows(NamedTuple):
 
 
 def padded_steps(steps: int) -> int:
-    """Return what to pad the steps of a window to."""
+    """Return the length that the steps of a window are padded to."""
     return max(_SHORTEST, 1 << (steps - 1).bit_length())
 
 
@@ -60,7 +64,7 @@ def settle(
     loose: Vector,
     iterations: int = 12,
 ) -> tuple[Float[np.ndarray, "n0 m"], Vector]:
-    """Return the states at the windows' first rows that lower `‖weight e‖²` most, and its value (m,).
+    """Return the states at the windows' first rows that minimise `‖weight e‖²`, and its value (m,).
 
     A window ends where a step promises to lower it by less than a 10⁻¹⁰th part: that is a 10⁻⁵th of
     its own noise.
@@ -104,7 +108,7 @@ def _steps(
         return np.linalg.solve(damped, right[..., None])[..., 0].T
     except (
         np.linalg.LinAlgError
-    ):  # states beyond what double precision tells apart: there is no step to take
+    ):  # the matrix is singular in double precision: there is no step to take
         return np.zeros_like(right).T
 
 
@@ -117,7 +121,10 @@ def _linearised(
     begun: Matrix,
     prior: Vector,
 ) -> tuple[Any, Any, Any]:
-    """Return normal matrix (m, n0, n0), right-hand side (m, n0) and misfit (m,), infinite where a run is not finite."""
+    """Return normal matrix (m, n0, n0), right-hand side (m, n0) and misfit (m,).
+
+    The misfit is infinite where a run is not finite.
+    """
     gram, square = (np.asarray(part) for part in _gram(form, numbers, states, *layout, weight))
     n0, gone = len(states), begun - states
     matrix = np.moveaxis(gram[:, :n0], -1, 0) + np.diag(prior)
@@ -136,9 +143,9 @@ def _gram(
     steps: Any,
     weight: Float[Array, "ny ny"],
 ) -> tuple[Float[Array, "n0 n0+1 m"], Float[Array, "m"]]:
-    """Gram matrix of the sensitivities to the start with themselves and the error, and the error's square.
+    """Return the Gram matrix of the sensitivities to the start and of the error.
 
-    Of the first `steps` of the windows.
+    The sums are over the first `steps` of the windows.
     """
     numbers = form.prepared(numbers)
     n0, m = states.shape

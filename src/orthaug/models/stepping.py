@@ -1,4 +1,4 @@
-"""A fitted model one sample at a time: `state, outputs = model.step(state, inputs)`, a state with names.
+"""A fitted model one sample at a time: `state, outputs = model.step(state, inputs)`.
 
 The state of a lagged model is what its regressor remembers of outputs and inputs, so that a step
 takes the inputs of its own sample alone; that of a motion is its state.
@@ -27,7 +27,7 @@ from orthaug.models.moving import MotionDynamics
 
 @dataclass(frozen=True)
 class Memory:
-    """What a lagged model remembers: of each channel, outputs first, its last samples, newest first.
+    """Past samples that a lagged model remembers: outputs first, newest first.
 
     Examples:
         >>> memory = Memory.of((Lag("y", 2), Lag("u", 0), Lag("u", 1)), ["y"], ["u"])
@@ -41,7 +41,7 @@ class Memory:
 
     @classmethod
     def of(cls, layout: Layout, outputs: Sequence[str], inputs: Sequence[str]) -> Memory:
-        """Of a regressor's layout."""
+        """Return the memory of a regressor's layout."""
         names = dict.fromkeys((*outputs, *inputs))
         deepest = (
             (name, max((lag.lag for lag in layout if lag.channel == name), default=0))
@@ -61,7 +61,7 @@ class Memory:
 
     @cached_property
     def read(self) -> Int[np.ndarray, "nx"]:
-        """Where the regressor's entries are among state and inputs."""
+        """Positions of the regressor's entries among state and inputs."""
         place = {
             lag: i for i, lag in enumerate((*self.lags, *(Lag(name, 0) for name in self.inputs)))
         }
@@ -69,7 +69,7 @@ class Memory:
 
     @cached_property
     def following(self) -> Int[np.ndarray, "n"]:
-        """Where the next state's entries are among outputs, inputs and state."""
+        """Positions of the next state's entries among outputs, inputs and state."""
         now = [Lag(name, 0) for name, _ in self.depths]  # outputs, then inputs
         place = {lag: i for i, lag in enumerate((*now, *self.lags))}
         return np.array([place[Lag(lag.channel, lag.lag - 1)] for lag in self.lags], dtype=int)
@@ -111,7 +111,9 @@ def step_lagged(
 
 
 def step_inputs(form: MotionDynamics) -> tuple[str, ...]:
-    """Return what a step of a motion takes: its inputs, and under a first-order hold those of the next sample behind them.
+    """Return the input vector of a step of a motion.
+
+    Under a first-order hold the inputs of the next sample follow behind those of this one.
 
     Raises:
         InputError: a hold that needs the whole record.
@@ -119,22 +121,25 @@ def step_inputs(form: MotionDynamics) -> tuple[str, ...]:
     motion = form.motion
     if motion.hold == "spline" and motion.inputs:
         raise InputError(
-            "a step knows no spline through the whole record; fit the motion with hold = "
-            "'zero-order' or 'first-order' to step or export it."
+            "a step cannot interpolate by a spline over the whole record; fit the motion with "
+            "hold = 'zero-order' or 'first-order' to step or export it."
         )
     after = tuple(f"{name}[k+1]" for name in motion.inputs) if motion.hold == "first-order" else ()
     return (*motion.inputs, *after)
 
 
 def with_scheme(form: MotionDynamics, numbers: Numbers) -> Numbers:
-    """Return the numbers with the exponentials of an exact integrator, whose derivatives a step does not need."""
+    """Return the numbers with the exponentials of an exact integrator.
+
+    A step does not need their derivatives.
+    """
     with jax.ensure_compile_time_eval():
         scheme = form.exponentials(numbers)
     return numbers if scheme is None else numbers._replace(scheme=(scheme, None))
 
 
 def checked_row(row: Any, first: int, rows: int) -> int:
-    """`row` where a state can be told, by default the first.
+    """Return `row` if a state can be determined there; by default the first such row.
 
     Raises:
         InputError: no whole number, or outside of the record.
@@ -156,8 +161,8 @@ def one_experiment(record: Record) -> Experiment:
     """
     if len(record.experiments) != 1:
         raise InputError(
-            f"the record has {len(record.experiments)} experiments; a state starts in one: "
-            "give a record of one."
+            f"the record has {len(record.experiments)} experiments; give "
+            "a record of one, in which the state starts."
         )
     if not record.outputs:
         raise InputError(

@@ -1,6 +1,6 @@
 """Models on disk: `model.json` for what a model is, `arrays.safetensors` for its numbers.
 
-Nothing executable.
+The files hold nothing executable.
 
 The JSON carries checksums of itself and of the arrays. A file that was cut or altered is refused.
 `pack` writes other content the same way.
@@ -84,7 +84,10 @@ def check_loaded(model: Any, path: Path) -> None:
 
 
 def _check_step(model: Any, path: Path) -> None:
-    """Trace one step, which computes nothing: expressions, layout and learner must fit the channels and the state."""
+    """Trace one step, which computes nothing, to check the shapes.
+
+    Expressions, layout and learner must fit the channels and the state.
+    """
     state, row = np.zeros(len(model.state_names)), np.zeros(len(model.step_inputs))
     following, outputs = jax.eval_shape(model.step, state, row)
     shapes = tuple(following.shape), tuple(outputs.shape)
@@ -95,9 +98,9 @@ def _check_step(model: Any, path: Path) -> None:
 
 
 def _expected(model: Any) -> Iterator[tuple[str, Any, tuple[int, ...] | None]]:
-    """Names, values and shapes of what a model computes with.
+    """Return names, values and shapes of all arrays that a model computes with.
 
-    None for a shape that something else has checked.
+    The shape is None where something else has checked it.
     """
     form, numbers, kept = model.form, model.numbers, model.statistics
     outputs, parameters = len(model.outputs), len(model.estimated[0])
@@ -152,7 +155,8 @@ def save(model: Model | MotionModel, folder: str | Path, *, force: bool = False)
         >>> import numpy as np
         >>> import orthaug as oa
         >>> record = oa.Record.from_arrays(u=np.sin(np.arange(50.0)), y=2 * np.sin(np.arange(50.0)))
-        >>> fit = oa.estimate(record, oa.Baseline.from_terms([oa.Term("gain", "u[k]")]), learner=None)
+        >>> physics = oa.Baseline.from_terms([oa.Term("gain", "u[k]")])
+        >>> fit = oa.estimate(record, physics, learner=None)
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     save(fit.model, Path(folder, "model"))
         ...     load(Path(folder, "model"))
@@ -168,12 +172,12 @@ def write(model: Model | MotionModel, folder: Path) -> None:
 
 
 def digest(model: Model | MotionModel) -> str:
-    """Return the sha256 that tells a model from others: `checksum` in the file that this version writes of it."""
+    """Return the sha256 that identifies a model: `checksum` in the file of this version."""
     return _packed(model)[0]["checksum"]
 
 
 def _packed(model: Model | MotionModel) -> tuple[dict[str, Any], bytes]:
-    """Return what the two files hold."""
+    """Return the contents of the two files."""
     kind = _KINDS[type(model)]
     declared, arrays = kind.declare(model)
     return pack(FORMAT, declared, arrays)
@@ -184,9 +188,10 @@ def load(
 ) -> Model | MotionModel:
     """Read a model that `save` or `orthaug fit` wrote.
 
-    Args: folder: the model's folder, or the result folder that holds it as `model/`. baseline,
-        learner: the Python callables again, where the saved model had such; a motion counts as a
-        baseline.
+    Args:
+        folder: the model's folder, or the result folder that holds it as `model/`.
+        baseline, learner: the Python callables again, where the saved model had such; a motion
+            counts as a baseline.
 
     Raises:
         InputError: no model there; a file that is cut, altered, or from a newer version.
@@ -225,7 +230,7 @@ def load(
 def pack(
     number: int, declared: Mapping[str, Any], arrays: Mapping[str, Any]
 ) -> tuple[dict[str, Any], bytes]:
-    """Return what the two files hold, in the format of this `number`."""
+    """Return the contents of the two files in the format of this `number`."""
     packed = save_arrays(
         {name: np.ascontiguousarray(value, dtype=np.float64) for name, value in arrays.items()}
     )
@@ -244,7 +249,7 @@ def write_packed(packed: tuple[dict[str, Any], bytes], path: Path, arrays: Path)
 def read_packed(
     path: Path, arrays: Path, number: int, what: str, again: str
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Return what was declared, and the arrays.
+    """Read the declaration and the arrays.
 
     Args:
         number: the newest format that is read.

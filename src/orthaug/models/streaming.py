@@ -1,4 +1,6 @@
-"""The engine of rows that do not fit into memory: they are read, laid out and summed chunk by chunk, at every pass.
+"""The engine of rows that do not fit into memory.
+
+They are read, built and summed chunk by chunk, at every pass.
 
 A thread reads ahead while the chunk before it is summed. All chunks have one shape, so one compiled
 program serves.
@@ -29,7 +31,7 @@ RowArrays = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class SourceRows:
-    """Rows of a source: where they are, how they are laid out, and in chunks of how many."""
+    """Rows of a source: its place, the function that builds them, and the rows in a chunk."""
 
     source: Source
     row_builder: Callable[[Any], Iterator[RowArrays]]
@@ -56,7 +58,7 @@ class Stream(LocalEngine):
     def build_rows(
         self, z: Matrix, q: Any, e: Matrix, gain: Float[np.ndarray, "N ny ny"]
     ) -> list[Chunk]:
-        """Rows that are in memory, in chunks."""
+        """Keep rows that are in memory as chunks."""
         return apart(build_chunk(z, q, e, gain, chunk_shape(len(z), self.limit)))
 
     def draw(self, source: Source, row_builder: Callable[[Any], Iterator[RowArrays]]) -> SourceRows:
@@ -89,7 +91,7 @@ class Stream(LocalEngine):
         return together(list(rows))
 
     def room(self) -> None:
-        """None: all sums are made here."""
+        """Return None, since all sums are made here."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +116,7 @@ class PairedChunks:
 
 
 def apart(chunks: Any) -> list[Any]:
-    """Return the inverse of `together`."""
+    """Return the rows of each: the inverse of `together`."""
     leaves, form = jax.tree.flatten(jax.tree.map(np.asarray, chunks))
     return [jax.tree.unflatten(form, parts) for parts in zip(*leaves, strict=True)]
 
@@ -122,7 +124,7 @@ def apart(chunks: Any) -> list[Any]:
 def folded(
     function: Callable[..., Any], rows: Iterable[Any], arguments: tuple[Any, ...]
 ) -> tuple[list[Any], Any]:
-    """Of function(chunk, *arguments), a pair: the first ones on the host, and Σ of the second."""
+    """Return the first results of function(chunk, *arguments) on the host, and the second's sum."""
     arguments = jax.tree.map(jax.numpy.asarray, arguments)
     first, _ = _compiled(function)
     kept, total = [], None
@@ -134,7 +136,7 @@ def folded(
 
 
 def summed(function: Callable[..., Any], rows: Iterable[Chunk], arguments: tuple[Any, ...]) -> Any:
-    """Σ function(chunk, *arguments), in the order of the rows."""
+    """Return Σ function(chunk, *arguments), in the order of the rows."""
     arguments = jax.tree.map(jax.numpy.asarray, arguments)
     first, more = _compiled(function)
     total = None
@@ -146,7 +148,7 @@ def summed(function: Callable[..., Any], rows: Iterable[Chunk], arguments: tuple
 
 @cache
 def _compiled(function: Callable[..., Any]) -> tuple[Any, Any]:
-    """Return the function, and what adds it to a sum."""
+    """Compile the function, and the addition of its result to a sum."""
 
     def more(total: Any, chunk: Chunk, *arguments: Any) -> Any:
         return jax.tree.map(jax.numpy.add, total, function(chunk, *arguments))
@@ -155,7 +157,7 @@ def _compiled(function: Callable[..., Any]) -> tuple[Any, Any]:
 
 
 def chunks_of(pieces: Iterable[RowArrays], size: int) -> Iterator[Chunk]:
-    """Rows in chunks of one size, the row index last.
+    """Return rows in chunks of one size, the row index last.
 
     The last one is padded with rows that count for nothing.
     """

@@ -1,4 +1,6 @@
-"""Independent runs as tasks of a Dask cluster: restarts, held-out blocks, candidates of a selection, cases of a study.
+"""Independent runs as tasks of a Dask cluster.
+
+Restarts, held-out blocks, candidates of a selection and cases of a study are such runs.
 
 What all runs share is sent once and goes from worker to worker; each run is whole at one place. A
 task that a lost worker had is made again elsewhere, so results do not depend on who made them.
@@ -16,11 +18,11 @@ from typing import Any
 
 from orthaug._base.jax import jax
 from orthaug._base.parallel import Heard, RunCancelled, each, nobody, one_blas_thread, one_core
-from orthaug.models.cluster import Dask, kept, smallest_worker, told
+from orthaug.models.cluster import Dask, cluster_errors, kept, smallest_worker
 from orthaug.models.rows import InMemory, Room
 
 _MATRICES = 3  # of a run in memory
-_WAIT = 0.5  # s between two looks at whether a run is still wanted, and two tellings of a run
+_WAIT = 0.5  # s between two looks at whether a run is still wanted, and two reports of a run
 _ANY_SIZE = {
     "distributed.admin.large-graph-warning-threshold": "1 PB"
 }  # rows are sent on purpose, and once
@@ -46,7 +48,7 @@ class Tasks(InMemory):
         items: Sequence[Any],
         heard: Heard = nobody,
     ) -> Iterator[Any]:
-        """As `Threads.map`.
+        """Yield the results of independent runs, as `Threads.map`.
 
         The function, its arguments and results are pickled, `given` once while it is the same.
         """
@@ -68,16 +70,16 @@ class Tasks(InMemory):
             yield from each(one, list(enumerate(items)), places(self.client))
 
     def room(self) -> Room:
-        """Of the smallest worker, which makes whole runs."""
+        """Return the memory of the smallest worker, which makes whole runs."""
         return smallest_worker(self.client, _MATRICES)
 
     def _shared(self, given: Any) -> Any:
-        """Return what the workers know `given` by."""
+        """Return the reference by which workers know `given`."""
         from dask import config
 
         if id(given) not in self._sent:
             self._sent.clear()
-            with told(), config.set(_ANY_SIZE):
+            with cluster_errors(), config.set(_ANY_SIZE):
                 self._sent[id(given)] = (
                     given,
                     self.client.submit(kept, DoublePrecision(given), pure=False),
@@ -91,7 +93,7 @@ def runs_on(engine: Any) -> Any:
 
 
 def places(client: Any) -> int:
-    """Return how many tasks the workers take at a time."""
+    """Return the number of tasks that the workers take at a time."""
     return max(sum(client.nthreads().values()), 1)
 
 
@@ -104,7 +106,7 @@ def ask(
     """
     from distributed import wait
 
-    with told():
+    with cluster_errors():
         future = client.submit(function, *args, pure=False, **named)
         try:
             while not future.done():
@@ -119,14 +121,14 @@ def ask(
 
 @contextmanager
 def _heard_on(client: Any) -> Iterator[tuple[str, dict[int, deque[Any]]]]:
-    """A topic on which tasks tell, and what each of them told."""
+    """Yield a topic on which tasks report, and the reports of each task."""
     topic, said = f"orthaug-{uuid.uuid4().hex}", defaultdict[int, deque[Any]](deque)
 
     def hear(event: tuple[Any, Any]) -> None:
         i, what = event[1]
         said[i].append(what)
 
-    with told():
+    with cluster_errors():
         client.subscribe_topic(topic, hear)
     try:
         yield topic, said
@@ -136,7 +138,10 @@ def _heard_on(client: Any) -> Iterator[tuple[str, dict[int, deque[Any]]]]:
 
 @dataclass(frozen=True, eq=False)
 class DoublePrecision:
-    """A value that reaches a worker in double precision: JAX would cut its arrays where that is not turned on yet."""
+    """A value that reaches a worker in double precision.
+
+    JAX would cut its arrays where double precision is not turned on yet.
+    """
 
     value: Any
 
@@ -145,7 +150,7 @@ class DoublePrecision:
 
 
 class _Double:
-    """Turns on double precision where it arrives."""
+    """Switch that turns on double precision where it arrives."""
 
     def __reduce__(self) -> Any:
         return _in_double, ()
@@ -160,13 +165,16 @@ def _sealed(_: None, value: Any) -> DoublePrecision:
 
 
 def _made(shared: DoublePrecision, asked: DoublePrecision, topic: str, number: int) -> Any:
-    """Return a run on a worker. What it tells goes to the client, from time to time."""
+    """Make a run on a worker.
+
+    Its reports go to the client from time to time.
+    """
     from dask.context import thread_state
     from distributed import get_worker
 
     worker, key, last = get_worker(), thread_state.key, time.monotonic()
 
-    def tell(*what: Any) -> None:
+    def report(*what: Any) -> None:
         nonlocal last
         if time.monotonic() - last < _WAIT:
             return
@@ -178,4 +186,4 @@ def _made(shared: DoublePrecision, asked: DoublePrecision, topic: str, number: i
 
     with one_blas_thread(), one_core():
         function, item = asked.value
-        return function(shared.value, item, tell)
+        return function(shared.value, item, report)

@@ -28,15 +28,16 @@ Names = tuple[str, ...]
 
 @dataclass(frozen=True)
 class Terms:
-    """`f = Σ w_j t_j`: linear in its weights, so that its training, its intervals and the split are exact.
+    """`f = Σ w_j t_j`, linear in its weights: training, intervals and the split are exact.
 
     Terms given by hand are what it sees. A `degree` adds all products of so many of its inputs, and
     `functions` of them, when the lags or the states are known (`over`).
 
-    Args: terms: expressions such as `v[k-1]**3`, of a motion of states and inputs. degree: of the
-        products, the constant included; 0 for none. functions: abs, sign, sqrt (of the size), tanh,
-        sin, cos, exp; one in a product, times up to `degree − 1`
-            signals.
+    Args:
+        terms: expressions such as `v[k-1]**3`, of a motion of states and inputs.
+        degree: of the products, the constant included; 0 for none.
+        functions: abs, sign, sqrt (of the size), tanh, sin, cos, exp; one in a product, times up to
+            `degree − 1` signals.
         exclude: terms of the library to leave out.
         inputs: the signals that the library is made of; None for all lags, or all states and inputs
             of a motion.
@@ -92,10 +93,12 @@ class Terms:
         return f"terms {named}" if not self.degree else f"all terms to the degree {self.degree}"
 
     linear = True
-    """Combinations of its features are all that it can be."""
+    """Its values are linear combinations of its features."""
 
     def over(self, signals: Sequence[str]) -> Terms:
-        """The same with its library written out over signals: `terms` are then all that it sees.
+        """Return a learner whose library is written out over signals.
+
+        `terms` are then all that it sees.
 
         Raises:
             InputError: too many terms, or an excluded one that is none.
@@ -108,24 +111,27 @@ class Terms:
         return TermLibrary.of(own, self.degree, self.functions, self.terms, self.exclude)
 
     def among(self, kept: Sequence[str]) -> Terms:
-        """The same with some of its terms."""
+        """Return a learner with some of its terms."""
         return Terms(tuple(kept), beyond=self.beyond)
 
     def scaling(self, features: Matrix) -> Scaling:
-        """Return each term by its largest size, without an offset: coefficients stay those of the terms."""
+        """Return a scaling of each term by its largest size, without an offset.
+
+        Coefficients stay those of the terms.
+        """
         size = np.abs(features).max(axis=0, initial=0.0)
         return Scaling(np.zeros(len(size)), np.where(size > 0, size, 1.0))
 
     def weights(self, nz: int, ny: int) -> int:
-        """Return how many weights it has for `nz` features and `ny` outputs."""
+        """Return the number of weights for `nz` features and `ny` outputs."""
         return nz * ny
 
     def silent(self, tree: Tree) -> Tree:
-        """Return all coefficients zero."""
+        """Return zeros for all coefficients."""
         return np.zeros_like(tree)
 
     def groups(self, tree: Tree) -> Tree:
-        """Return each term by itself."""
+        """Return a group for each term."""
         return np.broadcast_to(np.arange(np.shape(tree)[1]), np.shape(tree))
 
     def layers(self, tree: Tree) -> list[tuple[Any, Any, str]]:
@@ -152,7 +158,10 @@ def _written(library: TermLibrary) -> dict[str, Any]:
 def over_lags(
     learner: Any, baseline: Baseline, lags: Lags | None, outputs: Names, inputs: Names
 ) -> Any:
-    """Return a learner whose library waits for the lags, written out; any other as it is."""
+    """Return a learner whose library is written out over the lags.
+
+    Other learners are returned unchanged.
+    """
     if not hasattr(learner, "over"):
         return learner
     return learner.over(
@@ -161,7 +170,7 @@ def over_lags(
 
 
 def over_states(learner: Any, motion: Motion) -> Any:
-    """The same for a motion, with its states and inputs."""
+    """Return a learner whose library is written out over a motion's states and inputs."""
     return (
         learner.over([*motion.names_of_states, *motion.inputs])
         if hasattr(learner, "over")
@@ -170,5 +179,5 @@ def over_states(learner: Any, motion: Motion) -> Any:
 
 
 def scaling_of(learner: Any, features: Matrix) -> Scaling:
-    """Return how a learner's features (N, nz) are scaled: its own way, or into [-1, 1]."""
+    """Return the scaling of a learner's features (N, nz): its own, or into [-1, 1]."""
     return learner.scaling(features) if hasattr(learner, "scaling") else Scaling.fit(features)

@@ -1,4 +1,4 @@
-"""The physics, linear in θ: φ, its projection, what the data say about θ, and what θ is made of.
+"""The physics, linear in θ: φ, its projection, its excitation by data, and physical parameters.
 
 No JAX.
 """

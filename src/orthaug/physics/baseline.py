@@ -93,7 +93,8 @@ class Term:
     be left out where there is only one.
 
     Examples:
-        >>> Baseline.from_terms([Term("one", "y[k-1]", initial=1.0, fixed=True), Term("b", "Ts*u[k-1]", unit="m/N")])
+        >>> kept = Term("one", "y[k-1]", initial=1.0, fixed=True)
+        >>> Baseline.from_terms([kept, Term("b", "Ts*u[k-1]", unit="m/N")])
         Baseline(1*y[k-1] + b*(Ts*u[k-1]))
     """
 
@@ -133,23 +134,24 @@ class Baseline(NotebookView):
             alone = re.fullmatch(r"\w+\[[^][]*\]", term.regressor)
             regressor = term.regressor if alone else f"({term.regressor})"
             sums.setdefault(term.output or "", []).append(f"{factor}*{regressor}")
-        return f"Baseline({'; '.join(f'{name} = ' * bool(name) + ' + '.join(terms) for name, terms in sums.items())})"
+        outputs = (f"{name} = " * bool(name) + " + ".join(terms) for name, terms in sums.items())
+        return f"Baseline({'; '.join(outputs)})"
 
     @classmethod
     def from_terms(
         cls, terms: Sequence[Term], constants: Mapping[str, float] | None = None
     ) -> Baseline:
-        """Return one term per summand.
+        """Return a baseline with one term per summand.
 
         Expressions may use the names in `constants`, and `Ts` for the sampling time.
 
         Args:
-            terms: the same parameter may stand in several.
+            terms: several may have the same parameter.
             constants: numbers by name.
 
-        Raises: InputError: an expression that is not arithmetic on lagged channels, or terms of one
-            parameter
-                that disagree on its initial value, unit or being fixed.
+        Raises:
+            InputError: an expression that is not arithmetic on lagged channels, or terms of one
+                parameter that disagree on its initial value, unit or being fixed.
 
         Examples:
             >>> Baseline.from_terms([Term("g", "c*u[k]**2")], constants={"c": 0.5}).names
@@ -175,7 +177,7 @@ class Baseline(NotebookView):
                 raise InputError(
                     f"the constant '{name}' must be a finite number; got {shown(value)}."
                 )
-        terms = _agreed(terms)
+        terms = _unify(terms)
         parameters = {t.parameter: _parameter(t) for t in terms if not t.fixed}
         baseline = cls(tuple(parameters.values()), tuple(terms), tuple(sorted(constants.items())))
         _ = baseline.expressions  # report what does not parse here, not at first use
@@ -185,7 +187,10 @@ class Baseline(NotebookView):
     def from_function(
         cls, function: Callable[[Any], Any], parameters: Sequence[str | Parameter]
     ) -> Baseline:
-        """From a JAX function φ(x) of the regressor x (nx,) in `Lags` order, returning (ny, nθ)."""
+        """Return a baseline of a JAX function φ(x) that returns (ny, nθ).
+
+        x (nx,) is the regressor in the order of `Lags`.
+        """
         if (
             not callable(function)
             or isinstance(parameters, str)
@@ -200,7 +205,7 @@ class Baseline(NotebookView):
 
     @property
     def linear(self) -> bool:
-        """Return whether the output is linear in θ: here always, by its form."""
+        """Always true: φ(x) θ is linear in θ by its form."""
         return True
 
     @property
@@ -248,7 +253,7 @@ class Baseline(NotebookView):
         )
 
     def sampled(self, sampling_time: float) -> Baseline:
-        """Return the baseline with this value [s] of `Ts`, where its expressions read that without declaring it.
+        """Return the baseline with `Ts` [s] given, where its expressions read it undeclared.
 
         Raises:
             InputError: a constant `Ts` of another value.
@@ -261,7 +266,7 @@ class Baseline(NotebookView):
         )
 
     def check_channels(self, outputs: Sequence[str], inputs: Sequence[str]) -> None:
-        """Raise InputError for a term that uses an unknown channel, an output at lag 0 or an unknown output."""
+        """Raise InputError for a term with an unknown channel or output, or an output at lag 0."""
         for name, _ in self.constants:
             if name in (*outputs, *inputs):
                 raise InputError(
@@ -286,7 +291,7 @@ class Baseline(NotebookView):
                 )
 
     def phi(self, x: Any, layout: Layout, outputs: Sequence[str], xp: Any) -> Any:
-        """φ(x), (…, ny, nθ), of regressors x (…, nx).
+        """Return φ(x), (…, ny, nθ), of regressors x (…, nx).
 
         Several terms of a parameter and output add up.
         """
@@ -302,7 +307,7 @@ class Baseline(NotebookView):
         return self._matrix(list(fixed), x, layout, outputs, xp) @ xp.asarray(list(fixed.values()))
 
     def on(self, x: Any, layout: Layout, outputs: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-        """`phi` and `known` by NumPy; not finite where an expression has no value."""
+        """Return `phi` and `known` by NumPy; not finite where an expression has no value."""
         with np.errstate(all="ignore"):
             return np.asarray(self.phi(x, layout, outputs, np)), np.asarray(
                 self.known(x, layout, outputs, np)
@@ -344,8 +349,11 @@ class Baseline(NotebookView):
 _SHARED = ("initial", "unit", "fixed", "min", "max")  # what the terms of one parameter share
 
 
-def _agreed(terms: Sequence[Term]) -> list[Term]:
-    """Return the terms; what one of them says about a parameter, all of its terms say."""
+def _unify(terms: Sequence[Term]) -> list[Term]:
+    """Return the terms with their parameters' attributes made common.
+
+    An attribute that one term gives to a parameter holds in all of its terms.
+    """
     said: dict[tuple[str, str], Any] = {}
     for term in terms:
         check_parameter_name(term.parameter)
@@ -394,7 +402,7 @@ def derived_units(
 ) -> dict[str, str]:
     """Return the unit of each parameter by its name, "1" where it has none.
 
-    Without those that the channels do not tell.
+    Units that do not follow from those of the channels are left out.
 
     Examples:
         >>> spring = Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "u[k-1]")])
@@ -408,7 +416,7 @@ def derived_units(
     found: dict[str, set[str | None]] = {}
     for term in baseline.terms:
         own = units[term.output or outputs[0].name]
-        told = coefficient_unit(own, parse(term.regressor, constants), units) if own else None
-        found.setdefault(term.parameter, set()).add("1" if told == "" else told)
-    agreed = {name: next(iter(told)) for name, told in found.items() if len(told) == 1}
+        unit = coefficient_unit(own, parse(term.regressor, constants), units) if own else None
+        found.setdefault(term.parameter, set()).add("1" if unit == "" else unit)
+    agreed = {name: next(iter(given)) for name, given in found.items() if len(given) == 1}
     return {name: unit for name, unit in agreed.items() if unit is not None}

@@ -1,4 +1,4 @@
-"""How much of each direction of the physics no function of the learner's features can follow, on measured rows.
+"""The share of each direction of the physics that no function of the learner's features follows.
 
 Names show that a term reads what the learner does not see. They do not show a column that was
 computed from it, such as the sign of a speed. So the rows are asked: `L = Σ_k r_k r_kᵀ / N` with `r
@@ -46,7 +46,7 @@ _SEED = 20_261_124
 
 @dataclass(frozen=True, eq=False)
 class UnexplainedPhysics:
-    """What functions of the learner's features leave of the physics on the rows.
+    """The part of the physics that functions of the learner's features leave on the rows.
 
     `share` (nθ,) is that of each parameter's own slope, between 0 and 1, and `limit` the share
     below which a direction counts as one that the learner could imitate. `left` and `whole` are
@@ -60,7 +60,7 @@ class UnexplainedPhysics:
     whole: Matrix
 
     def share_of(self, direction: Vector) -> float:
-        """Return the share of a direction.
+        """Return the share of a direction that functions of the features leave.
 
         1 where even a linear function of the features leaves nothing.
         """
@@ -69,7 +69,7 @@ class UnexplainedPhysics:
         return min(float(direction @ self.left @ direction) / size, 1.0) if size > least else 1.0
 
     def imitated(self, basis: Matrix) -> Matrix:
-        """Return the directions (nθ, s) beyond `basis` that the rows do not tell from functions of the features.
+        """Return the directions (nθ, s) beyond `basis` that functions of the features imitate.
 
         Single parameters first, then what remains of the others together.
         """
@@ -88,7 +88,7 @@ class UnexplainedPhysics:
         return np.column_stack(found) if found else np.zeros((nt, 0))
 
     def _smallest(self, known: Matrix, others: Sequence[int]) -> Vector | None:
-        """Return the direction of the least share beside those known, where that is below the limit."""
+        """Return the direction of least share beside the known ones, if below the limit."""
         root, size = self._beside(known)
         if not root.shape[1]:
             return None
@@ -104,7 +104,7 @@ class UnexplainedPhysics:
         return direction
 
     def _beside(self, known: Matrix) -> tuple[Matrix, Vector]:
-        """Return coordinates in which slopes, beside those along known directions, have unit size.
+        """Return coordinates in which slopes beside known directions have unit size, and sizes.
 
         And the sizes.
         """
@@ -208,7 +208,7 @@ class _Smoother:
         return cls(scaled, np.concatenate(parts, axis=1), fold)
 
     def beyond_linear(self, values: Matrix) -> Matrix:
-        """Return what linear functions of the features, and a constant, leave of columns."""
+        """Return the residuals of columns after a linear fit of the features and a constant."""
         plain = np.column_stack([np.ones(len(self.z)), self.z])
         q, sigma, _ = np.linalg.svd(plain, full_matrices=False)
         q = q[:, sigma > 1e-12 * sigma[0]]
@@ -219,7 +219,10 @@ class _Smoother:
         )
 
     def probes(self) -> Matrix:
-        """Return functions of the features that a learner follows as well as another one: steps, kinks, waves."""
+        """Return typical functions of the features: steps, kinks, waves.
+
+        A learner follows these as well as any other function.
+        """
         rng = np.random.default_rng(_SEED + 1)
         n, nz = self.z.shape
         found = []
@@ -232,7 +235,7 @@ class _Smoother:
         return np.column_stack(found)
 
     def left(self, values: Matrix, probes: int) -> Matrix:
-        """Return what is left of columns where they are predicted from other stretches.
+        """Return the residuals of columns that are predicted from other stretches.
 
         The last ones are probes.
         """
@@ -248,7 +251,7 @@ class _Smoother:
         return best
 
     def _by_functions(self, values: Matrix, ridge: float) -> Matrix:
-        """By least squares on many functions of the features."""
+        """Return predictions by least squares on many functions of the features."""
         plain = np.column_stack([np.ones(len(self.z)), self.z, self.functions])
         plain = plain / np.maximum(np.sqrt(np.mean(plain**2, axis=0)), 1e-300)
         rest = np.empty_like(values)
@@ -261,7 +264,7 @@ class _Smoother:
         return rest
 
     def _by_neighbours(self, rest: Matrix) -> Matrix:
-        """By the mean of the nearest rows of other stretches.
+        """Return predictions by the mean of the nearest rows of other stretches.
 
         The error of that mean itself is taken out.
         """

@@ -1,4 +1,4 @@
-"""How several outputs are weighed against each other: the inner product of criterion and measure alike.
+"""Weights of several outputs against each other, in criterion and measure alike.
 
 Errors e (ny,) count as `‖W e‖²`. The rows of Φ, of the learner and of Y are multiplied by the same
 W, so that θ is solved exactly (F1).
@@ -25,7 +25,7 @@ _SMALLEST, _LARGEST = (
 
 @dataclass(frozen=True, eq=False)
 class OutputWeights:
-    """W, and how it came about.
+    """The weight matrix W, and how it was chosen.
 
     `matrix` (ny, ny) is W, scaled so that whitened outputs have a mean square of one; `unit` is
     that scale, against which penalties count. `kind` is "none", "std", "covariance" or "given";
@@ -39,36 +39,36 @@ class OutputWeights:
 
     @property
     def one_output(self) -> bool:
-        """Return whether there is nothing to weigh against each other."""
+        """True for a single output, which needs no weight."""
         return len(self.matrix) == 1
 
     def as_dict(self) -> dict[str, Any]:
-        """Return what was chosen, and W."""
+        """Return the choice and W."""
         return {"kind": self.kind, "matrix": self.matrix.tolist()}
 
     def __str__(self) -> str:
-        told = {
+        texts = {
             "none": "every output in its own unit",
             "std": "each output in its standard deviation",
             "covariance": "outputs weighted by the covariance of their errors",
             "given": "outputs weighted as given",
         }
-        return told[self.kind]
+        return texts[self.kind]
 
     def rows(self, values: Float[np.ndarray, "N ny ..."]) -> Float[np.ndarray, "N ny ..."]:
         """Return the rows in whitened outputs."""
         return times(self.matrix, values)
 
     def outputs(self, rows: Float[np.ndarray, "N ny ..."]) -> Float[np.ndarray, "N ny ..."]:
-        """Whitened rows back in the outputs' units."""
+        """Return whitened rows in the outputs' units."""
         return times(np.linalg.inv(self.matrix), rows)
 
     def whitened(self, covariance: Matrix) -> Matrix:
-        """Return a covariance (ny, ny) of the outputs, of whitened outputs."""
+        """Return a covariance (ny, ny) of the outputs in whitened outputs."""
         return self.matrix @ covariance @ self.matrix.T
 
     def covariance(self, whitened: Matrix) -> Matrix:
-        """Return a covariance of whitened outputs, of the outputs."""
+        """Return a covariance of whitened outputs in the outputs' units."""
         inverse = np.linalg.inv(self.matrix)
         return inverse @ whitened @ inverse.T
 
@@ -76,7 +76,7 @@ class OutputWeights:
 def times(
     matrix: np.ndarray, values: Float[np.ndarray, "N ny ..."]
 ) -> Float[np.ndarray, "N ny ..."]:
-    """Return every row's outputs multiplied by one matrix (ny, ny), or by one of its own (N, ny, ny)."""
+    """Return every row's outputs times one matrix (ny, ny), or a matrix per row (N, ny, ny)."""
     if matrix.shape[-1] == 1:  # one output: the same number without a sum
         return values * matrix.reshape(-1, *([1] * (values.ndim - 1)))
     return np.einsum("oi,ki...->ko..." if matrix.ndim == 2 else "koi,ki...->ko...", matrix, values)
@@ -107,11 +107,12 @@ def check_output_weights(choice: Any, ny: int) -> None:
 
 
 def weigh_outputs(choice: str | Sequence[float], deviation: Vector) -> OutputWeights:
-    """W for outputs of these standard deviations (ny,).
+    """Return W for outputs of these standard deviations (ny,).
 
-    Args: choice: "none" for the plain sum of squares, "std" for each output in its standard
-        deviation, numbers for the
-            weights of the squared errors. "auto" and "covariance" begin with "std".
+    Args:
+        choice: "none" for the plain sum of squares, "std" for each output in its standard
+            deviation, numbers for the weights of the squared errors. "auto" and "covariance" begin
+            with "std".
     """
     if len(deviation) == 1:  # one output: the weight changes nothing, penalties count in its unit
         scale = float(1 / deviation[0])
@@ -129,6 +130,6 @@ def weigh_outputs(choice: str | Sequence[float], deviation: Vector) -> OutputWei
 
 
 def by_covariance(white: Matrix, outputs: Matrix) -> OutputWeights:
-    """W from a matrix that whitens the errors, for outputs of the covariance `outputs` (ny, ny)."""
+    """Return W from a matrix that whitens the errors; `outputs` (ny, ny) is their covariance."""
     scale = float(1 / np.sqrt(np.trace(white @ outputs @ white.T) / len(white)))
     return OutputWeights("covariance", scale * white, scale, "covariance")

@@ -1,4 +1,4 @@
-"""Physical parameters p (m, ks, cd …), what is estimated of them, and the baseline's θ: θ = h(p), and dh/dp.
+"""Physical parameters p (m, ks, cd …), their coordinates, and θ = h(p) with dh/dp.
 
 Estimated is p itself, or log p where p is positive: that keeps it so without a bound, and steps of
 it are relative.
@@ -33,9 +33,10 @@ def _complex_arctan2(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.arctan2(np.real(a), np.real(b)) + 1j * slope / (np.real(a) ** 2 + np.real(b) ** 2)
 
 
-# What `Expression.evaluate` asks of numpy, on p + ih: Im θ / h is dθ/dp by the complex step (Squire & Trapp 1998),
-# exact up to rounding whatever the scales of p are. The functions of numpy are analytic, these seven are not. They take
-# the branch of the real part: at a kink that is the slope of one side.
+# The functions that `Expression.evaluate` uses of numpy, on p + ih: Im θ / h is dθ/dp by the complex
+# step (Squire & Trapp 1998), exact up to rounding whatever the scales of p are. The functions of
+# numpy are analytic, these seven are not. They take the branch of the real part: at a kink that is
+# the slope of one side.
 _COMPLEX = SimpleNamespace(
     asarray=lambda x, dtype=None: np.asarray(x, dtype=complex),
     abs=lambda x: np.where(np.real(x) < 0, -1.0, 1.0) * x,
@@ -70,13 +71,16 @@ class PhysicalParameter:
 
 @dataclass(frozen=True)
 class Coordinates:
-    """The map between parameters p (np,) and what is estimated q (np,)."""
+    """The map between parameters p (np,) and their estimated coordinates q (np,)."""
 
     parameters: tuple[PhysicalParameter, ...]
 
     @property
     def positive(self) -> Bool[np.ndarray, "np"]:
-        """Which are estimated as logarithms: those that cannot be negative and start above zero."""
+        """Mask of the parameters that are estimated as logarithms.
+
+        These cannot be negative and start above zero.
+        """
         return np.array([p.min >= 0 and p.initial > 0 for p in self.parameters], dtype=bool)
 
     @property
@@ -85,7 +89,7 @@ class Coordinates:
         return self.of(np.array([p.initial for p in self.parameters], dtype=float))
 
     def of(self, p: Any) -> Vector:
-        """q of p; logarithms end at the smallest value that counts."""
+        """Return q of p; logarithms end at the smallest value that counts."""
         least = np.array([_SMALLEST * abs(parameter.initial) for parameter in self.parameters])
         p = np.asarray(p, dtype=float)
         return np.where(
@@ -93,11 +97,11 @@ class Coordinates:
         )
 
     def physical(self, q: Any, xp: Any = np) -> Any:
-        """p of q, by `xp` (numpy or jax.numpy)."""
+        """Return p of q, by `xp` (numpy or jax.numpy)."""
         return xp.where(self.positive, xp.exp(xp.where(self.positive, q, 0.0)), q)
 
     def slopes(self, q: Vector) -> Vector:
-        """∂p/∂q (np,)."""
+        """Return ∂p/∂q (np,)."""
         return np.where(self.positive, self.physical(q), 1.0)
 
     @property
@@ -111,7 +115,8 @@ class PhysicsMap:
     """θ = h(p); make one with `of`.
 
     Examples:
-        >>> physics = PhysicsMap.of([PhysicalParameter("m", 2.0, "kg")], {"theta1": "Ts / m"}, {"Ts": 0.1})
+        >>> mass = PhysicalParameter("m", 2.0, "kg")
+        >>> physics = PhysicsMap.of([mass], {"theta1": "Ts / m"}, {"Ts": 0.1})
         >>> physics.initial_theta(), physics.jacobian(np.array([2.0]))
         (array([0.05]), array([[-0.025]]))
     """
@@ -135,12 +140,12 @@ class PhysicsMap:
         theta: Mapping[str, str],
         constants: Mapping[str, float] | None = None,
     ) -> PhysicsMap:
-        """`theta[name]` is an expression of the parameters' names and the `constants`.
+        """Return the map in which `theta[name]` is an expression of parameters and `constants`.
 
-        Raises: InputError: a name, value or bound that cannot be; an expression that is not
-            arithmetic on
-                parameters and constants, uses no parameter, or is not finite at the initial values;
-                parameters that θ does not determine, at any point near the initial values.
+        Raises:
+            InputError: a name, value or bound that cannot be; an expression that is not arithmetic
+                on parameters and constants, uses no parameter, or is not finite at the initial
+                values; parameters that θ does not determine, at any point near the initial values.
         """
         constants = dict(constants or {})
         check_parameters(parameters, constants)
@@ -151,7 +156,7 @@ class PhysicsMap:
             )
         names = [p.name for p in parameters]
         known = constants | {p.name: float(p.initial) for p in parameters}
-        expressions = tuple(_parsed(name, text, known, names) for name, text in theta.items())
+        expressions = tuple(_parse(name, text, known, names) for name, text in theta.items())
         used = {name for expression in expressions for name, _ in expression.constants}
         for name in names:
             if name not in used:
@@ -184,22 +189,22 @@ class PhysicsMap:
         )
 
     def theta(self, p: Vector) -> Vector:
-        """h(p), (nθ,) in the order of `theta_names`.
+        """Return h(p), (nθ,) in the order of `theta_names`.
 
         Not finite where an expression has no value.
         """
         return self.linearised(p)[0]
 
     def jacobian(self, p: Vector) -> Matrix:
-        """dh/dp, (nθ, np)."""
+        """Return dh/dp, (nθ, np)."""
         return self.linearised(p)[1]
 
     def initial_theta(self) -> Vector:
-        """θ⁰ = h(p⁰), (nθ,)."""
+        """Return θ⁰ = h(p⁰), (nθ,)."""
         return self.theta(self.initial)
 
     def linearised(self, p: Vector) -> tuple[Vector, Matrix]:
-        """h(p) (nθ,) and dh/dp (nθ, np) in one pass.
+        """Return h(p) (nθ,) and dh/dp (nθ, np) in one pass.
 
         Raises:
             InputError: p has not one entry for each parameter.
@@ -227,7 +232,10 @@ class PhysicsMap:
 
     @cached_property
     def size(self) -> Vector:
-        """The magnitude of each p, (np,), for scaling: |p⁰|. Where p⁰ = 0, that of its bounds, or what moves θ."""
+        """The magnitude |p⁰| (np,) of each p, for scaling.
+
+        Where p⁰ = 0, that of its bounds, or of a change that moves θ.
+        """
         theta, jacobian = self.linearised(self.initial)
         change = np.max(np.abs(jacobian) / magnitude(theta)[:, None], axis=0)
         reach = np.max(np.abs(self.bounds), axis=0)
@@ -237,7 +245,10 @@ class PhysicsMap:
         )
 
     def around(self, count: int, factor: float) -> Matrix:
-        """`count` points within the bounds, (count, np): p⁰ times 1/`factor` to `factor`, the same at every call."""
+        """Return `count` points within the bounds, (count, np), the same at every call.
+
+        They lie between p⁰ times 1/`factor` and p⁰ times `factor`.
+        """
         exponent = np.random.default_rng(0).uniform(-1, 1, (count, len(self.parameters)))
         points = np.where(self.initial != 0, self.initial * factor**exponent, self.size * exponent)
         return np.clip(points, *self.bounds)
@@ -250,12 +261,16 @@ class PhysicsMap:
                 what = f"is {value}" if not np.isfinite(value) else "has no finite derivative"
                 raise InputError(
                     f"physics.theta '{name}' = {expression} {what} at the initial values of "
-                    f"{', '.join(self.names)}; expected a finite one: start elsewhere."
+                    f"{', '.join(self.names)}; expected a finite value: change the initial "
+                    "values."
                 )
 
 
 def magnitude(values: Vector) -> Vector:
-    """|values|. A zero takes the largest of them; where all are zero, each is 1."""
+    """Return |values|.
+
+    A zero takes the largest of them; where all are zero, each is 1.
+    """
     size = np.abs(values)
     return np.where(size > 0, size, size.max(initial=0.0) or 1.0)
 
@@ -265,7 +280,7 @@ def check_parameters(
     constants: Mapping[str, float],
     taken: Collection[str] = RESERVED,
 ) -> None:
-    """Raise InputError for names, values, units or bounds of parameters and constants that cannot be."""
+    """Raise InputError for invalid names, values, units or bounds of parameters and constants."""
     if not parameters:
         raise InputError("the physics has no parameters; give at least one, such as m.")
     check_unique((p.name for p in parameters), "physical parameter")
@@ -308,7 +323,7 @@ def check_not_sampling_time(name: str, what: str) -> None:
         )
 
 
-def _parsed(
+def _parse(
     name: str, text: str, known: Mapping[str, float], parameters: Sequence[str]
 ) -> Expression:
     where = f"physics.theta '{name}'"
@@ -323,7 +338,10 @@ def _parsed(
 
 
 def _check_identifiable(physics: PhysicsMap) -> None:
-    """Raise InputError where θ does not determine p at p⁰ nor at any of twenty points within a factor 2 of it."""
+    """Raise InputError where θ does not determine p near p⁰.
+
+    p⁰ itself and twenty points within a factor 2 of it are tried.
+    """
     best: Excitation | None = None
     for p in (physics.initial, *physics.around(20, 2.0)):
         jacobian = physics.jacobian(p) * physics.size
@@ -337,22 +355,22 @@ def _check_identifiable(physics: PhysicsMap) -> None:
         raise InputError(
             f"theta does not determine the physical parameters: {tied(best)} "
             f"({len(physics.theta_names)} theta, rank {best.rank} of {best.columns}). Make one "
-            "of them a constant, or add a term that tells them apart."
+            "of them a constant, or add a term that distinguishes them."
         )
 
 
 def tied(sensitivity: Excitation) -> str:
-    """Which parameters θ does not tell apart, in words."""
+    """Return the parameters that θ does not separate, in words."""
     return "; ".join(
         f"{group[0]} has no effect"
         if len(group) == 1
-        else f"{', '.join(group)} cannot be told apart"
+        else f"{', '.join(group)} cannot be distinguished"
         for group in sensitivity.collinear
     )
 
 
 def check_baseline(physics: PhysicsMap, baseline: Baseline) -> None:
-    """Raise InputError unless the map gives exactly the baseline's θ, and no term's `initial` differs from it."""
+    """Raise InputError unless the map gives exactly the baseline's θ, with its initial values."""
     fixed = {term.parameter for term in baseline.terms if term.fixed}
     for name in physics.theta_names:
         if name in fixed:

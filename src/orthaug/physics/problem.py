@@ -1,4 +1,4 @@
-"""The estimation problem: rows, physics matrix and projection of a record, checked before any training.
+"""The estimation problem: rows, physics matrix and projection of a record, checked.
 
 Everything that can be wrong with data and physics together is found here, without JAX.
 """
@@ -41,7 +41,7 @@ _SMALLEST_RESIDUAL = 1e-10  # of an output's deviation: the physics leaves at le
 
 
 class Extent(NamedTuple):
-    """Smallest and largest value of some columns, (n,) each; parts of the rows add up by `|`."""
+    """Smallest and largest value of some columns, (n,) each; `|` joins those of two parts."""
 
     low: Vector
     high: Vector
@@ -55,7 +55,7 @@ class Extent(NamedTuple):
 
 
 class Moments(NamedTuple):
-    """Count, mean and scatter `Σ (v − v̄)(v − v̄)ᵀ` of some columns; parts add up too."""
+    """Count, mean and scatter `Σ (v − v̄)(v − v̄)ᵀ` of columns; `|` joins those of two parts."""
 
     count: int
     mean: Vector
@@ -67,7 +67,7 @@ class Moments(NamedTuple):
         return cls(len(values), mean, (values - mean).T @ (values - mean))
 
     def __or__(self, other: Moments) -> Moments:
-        """Of both together (Chan, Golub and LeVeque 1983)."""
+        """Return the moments of both together (Chan, Golub and LeVeque 1983)."""
         count = self.count + other.count
         if not count:
             return self
@@ -91,7 +91,7 @@ class Moments(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Usable rows of a record with everything that does not depend on the learner's weights.
+    """Usable rows of a record, and all quantities that do not depend on the learner's weights.
 
     `weight` weighs the outputs, for criterion and measure alike: so F1 holds for several outputs
     too. Rows multiplied by it are called whitened. `target` is the outputs without the fixed terms,
@@ -127,7 +127,7 @@ class Problem:
 
     @property
     def count(self) -> int:
-        """Return how many rows there are."""
+        """Number of rows."""
         return len(self.rows)
 
     @property
@@ -147,7 +147,7 @@ class Problem:
 
     @cached_property
     def least_squares(self) -> Vector:
-        """Φ⁺Y (nθ,): θ̂ of physics alone, and of the orthogonal structure whatever the learner does (F1)."""
+        """Φ⁺Y (nθ,): θ̂ of physics alone, and of the orthogonal structure with any learner (F1)."""
         return self.projection.solve(self.whitened_target)
 
     @cached_property
@@ -157,16 +157,19 @@ class Problem:
 
     @cached_property
     def unexplained(self) -> Float[np.ndarray, "N ny"]:
-        """P⊥Y, what the physics cannot express of the whitened outputs."""
+        """P⊥Y, the part of the whitened outputs that the physics cannot express."""
         return self.projection.orthogonal_part(self.whitened_target)
 
     @cached_property
     def unexplained_moments(self) -> Moments:
-        """Of `unexplained`."""
+        """Moments of `unexplained`."""
         return Moments.of(self.unexplained)
 
     def unexplained_sizes(self, *, centred: bool) -> tuple[Vector, Vector]:
-        """Return how large what the physics leaves is in each output (ny,), whitened and not: its deviation, or its RMS."""
+        """Return the size (ny,) of the residual of the physics, whitened and not.
+
+        The size is its deviation, or its RMS.
+        """
         moments, back = self.unexplained_moments, np.linalg.inv(self.weight.matrix)
         found = []
         for change, least in ((np.eye(len(back)), np.ones(len(back))), (back, self.deviation)):
@@ -193,11 +196,14 @@ class Problem:
 
     @cached_property
     def freedom_used(self) -> Vector:
-        """Degrees of freedom that the physics uses up in each output (ny,): the output's share `Σ_k ‖Q_ki‖²` of nθ."""
+        """Degrees of freedom (ny,) that the physics uses up in each output.
+
+        An output has the share `Σ_k ‖Q_ki‖²` of nθ.
+        """
         return np.sum(self.projection.q**2, axis=(0, 2))
 
     def seen_linearly(self) -> Problem:
-        """The same for a learner that is a linear combination of its features."""
+        """Return the problem for a learner that is a linear combination of its features."""
         return (
             self
             if self.features.linear
@@ -218,11 +224,11 @@ class Problem:
         return pose(self.record, self.baseline, output_weights=self.weight.choice)
 
     def on(self, record: Record) -> Problem:
-        """The same physics and features on another record."""
-        return _posed(record, self.baseline, self.layout, self.features, self.weight.choice)
+        """Return the problem with the same physics and features on another record."""
+        return _pose(record, self.baseline, self.layout, self.features, self.weight.choice)
 
     def weighed(self, weight: OutputWeights) -> Problem:
-        """The same problem with other output weights."""
+        """Return the problem with other output weights."""
         if weight is self.weight:
             return self
         projection = Projection.factor(weight.rows(self.weight.outputs(self.projection.phi)))
@@ -262,10 +268,10 @@ def pose(
         output_weights: as in `estimate`; "covariance" and "auto" begin with standard deviations.
         require_full_rank: raise where the data do not determine θ; `check` reports it instead.
 
-    Raises: InputError: unknown channels, outputs at lag 0, constant channels, values that are not
-        finite,
-            too few rows, initial values beyond their bounds, a constant `Ts` that is not the
-            sampling time; RankError for linearly dependent physics.
+    Raises:
+        InputError: unknown channels, outputs at lag 0, constant channels, values that are not
+            finite, too few rows, initial values beyond their bounds, a constant `Ts` that is not
+            the sampling time; RankError for linearly dependent physics.
     """
     outputs, inputs = (tuple(c.name for c in group) for group in (record.outputs, record.inputs))
     if not outputs:
@@ -277,12 +283,12 @@ def pose(
     baseline.check_channels(outputs, inputs)
     layout, features = regressor_of(baseline, lags, learner_inputs, outputs, inputs)
     features = features.sampled(record.sampling_time)
-    return _posed(
+    return _pose(
         record, baseline, layout, features, output_weights, require_full_rank=require_full_rank
     )
 
 
-def _posed(
+def _pose(
     record: Record,
     baseline: Baseline,
     layout: Layout,
@@ -291,7 +297,7 @@ def _posed(
     *,
     require_full_rank: bool = True,
 ) -> Problem:
-    """Rows, physics matrix and factor of a record whose channels were checked."""
+    """Return rows, physics matrix and factor of a record whose channels were checked."""
     outputs = tuple(channel.name for channel in record.outputs)
     rows = stack_rows(record, layout)
     signals = [np.concatenate([e.outputs, e.inputs], axis=1) for e in record.experiments]
@@ -314,7 +320,7 @@ def _posed(
 
 
 def check_defined(problem: Problem, record: Record) -> None:
-    """Raise InputError where physics or learner inputs are not finite on another record's measured rows."""
+    """Raise InputError where physics or learner inputs are not finite on another record."""
     layout, outputs, start = problem.layout, problem.outputs, problem.rows.start
     for experiment in record.experiments:
         alone = replace(record, experiments=(experiment,))
@@ -342,7 +348,7 @@ def regressor_of(
     outputs: tuple[str, ...],
     inputs: tuple[str, ...],
 ) -> tuple[Layout, Features]:
-    """Return the regressor of the whole model, and what the learner sees of it.
+    """Return the regressor of the whole model, and the learner's features of it.
 
     Raises:
         InputError: unknown channels, outputs at lag 0, learner inputs that cannot be read.
@@ -360,7 +366,7 @@ def regressor_of(
         except InputError as error:
             raise InputError(f"learner input: {error}") from None
         features = Features(tuple(expressions))
-    if baseline.function is not None:  # it takes the regressor exactly as `lags` lays it out
+    if baseline.function is not None:  # it takes the regressor exactly as `lags` orders it
         if lags is None:
             raise InputError(
                 "a baseline function needs `lags`: they define the regressor x that it is "
@@ -391,7 +397,10 @@ def check_moving(extent: Extent, record: Record, layout: Layout) -> None:
 
 
 def check_sizes(deviation: Vector, moved: Vector) -> None:
-    """Raise InputError for outputs of such a deviation (ny,) that move by `moved`, if their squares do not add up."""
+    """Raise InputError for outputs whose squares double precision cannot represent.
+
+    `moved` is the range of each output (ny,).
+    """
     moves = moved > 0
     if not np.all(np.isfinite(deviation)) or np.any(
         moves & ((deviation > _LARGEST) | (deviation < 1 / _LARGEST))
@@ -405,7 +414,7 @@ def check_sizes(deviation: Vector, moved: Vector) -> None:
 def check_physics(
     phi: np.ndarray, known: np.ndarray, baseline: Baseline, rows: UsableRows, record: Record
 ) -> None:
-    """Raise InputError where Φ (N, ny, nθ) or the fixed terms (N, ny) are not finite, or their squares not."""
+    """Raise InputError where Φ (N, ny, nθ), the fixed terms (N, ny) or their squares overflow."""
     for j, name in enumerate(baseline.names):
         texts = (
             ", ".join(t.regressor for t in baseline.terms if t.parameter == name)

@@ -19,7 +19,7 @@ _ROUNDING = 1e-13  # of the size of what is summed: below it a direction moves n
 
 @dataclass(frozen=True, eq=False)
 class Factor:
-    """R of Φ, for where the rows of Φ are not kept: `Φ scale = q r` with orthonormal q.
+    """R of Φ, for rows of Φ that are not kept: `Φ scale = q r` with orthonormal q.
 
     `r` (nθ, nθ) is upper triangular. `scale` (nθ,) multiplies the columns; its entries are powers
     of two, which is exact.
@@ -30,7 +30,10 @@ class Factor:
 
     @classmethod
     def of_blocks(cls, blocks: Iterable[Float[np.ndarray, "n ny nt"]]) -> Factor:
-        """From blocks of rows, one at a time: R of the blocks before is stacked upon the next block (tree QR)."""
+        """Return the factor of blocks of rows, one at a time (tree QR).
+
+        R of the blocks before is stacked upon the next block.
+        """
         r = scale = None
         for block in blocks:
             rows = block.reshape(
@@ -51,7 +54,7 @@ class Factor:
     def from_coordinates(
         self, coordinates: Float[np.ndarray, "nt *m"]
     ) -> Float[np.ndarray, "nt *m"]:
-        """θ of coordinates in the basis Q: `R⁻¹q`, one vector or several as columns."""
+        """Return θ of coordinates in the basis Q: `R⁻¹q`, one vector or several as columns."""
         if not coordinates.size:
             return coordinates
         return (
@@ -68,19 +71,18 @@ class Factor:
         basis = np.linalg.qr(self.to_coordinates @ directions)[0]
         return basis @ basis.T
 
-    def told_of(self, directions: Float[np.ndarray, "nt s"]) -> Float[np.ndarray, "nt r"]:
-        """Return a basis of some directions of θ without what Φ takes to zero.
+    def without_null(self, directions: Float[np.ndarray, "nt s"]) -> Float[np.ndarray, "nt r"]:
+        """Return a basis of some directions of θ without those that Φ takes to zero.
 
-        The directions as they are where that is none.
-
-        A parameter that stands in none of the rows has a column of zeros.
+        Without such directions, they are returned unchanged. A parameter that appears in none of
+        the rows has a column of zeros.
         """
         moved = self.to_coordinates @ directions
         size = np.linalg.norm(moved, axis=0)
-        told = size > _ROUNDING * np.linalg.norm(
+        seen = size > _ROUNDING * np.linalg.norm(
             np.abs(self.to_coordinates) @ np.abs(directions), axis=0
         )
-        unit = directions[:, told] / size[told]
+        unit = directions[:, seen] / size[seen]
         _, sigma, vt = np.linalg.svd(self.to_coordinates @ unit)
         rank = int(np.sum(sigma > _ROUNDING * sigma.max(initial=0.0)))
         return directions if rank == directions.shape[1] else unit @ vt[:rank].T
@@ -101,14 +103,14 @@ class Factor:
 
 @dataclass(frozen=True, eq=False)
 class Projection(Factor):
-    """A factor with its rows, weighted per output: `phi` and the orthonormal `q`, both (N, ny, nθ)."""
+    """A factor with its rows weighted per output: `phi` and orthonormal `q`, both (N, ny, nθ)."""
 
     phi: Float[np.ndarray, "N ny nt"]
     q: Float[np.ndarray, "N ny nt"]
 
     @classmethod
     def factor(cls, phi: Float[np.ndarray, "N ny nt"]) -> Projection:
-        """Householder QR of the stacked (N·ny, nθ) matrix."""
+        """Return the projection by Householder QR of the stacked (N·ny, nθ) matrix."""
         rows, ny, nt = phi.shape
         if nt == 0:
             return cls(np.zeros((0, 0)), np.zeros(0), phi, phi)
@@ -120,32 +122,35 @@ class Projection(Factor):
         return cls(r, scale, phi, np.ascontiguousarray(q).reshape(rows, ny, -1))
 
     def coordinates(self, values: Float[np.ndarray, "N ny"]) -> Vector:
-        """Qᵀv, (nθ,): the part of stacked outputs that the physics can express."""
+        """Return Qᵀv, (nθ,): the part of stacked outputs that the physics can express."""
         return np.tensordot(self.q, values, axes=([0, 1], [0, 1]))
 
     def solve(self, values: Float[np.ndarray, "N ny"]) -> Vector:
-        """Φ⁺v, (nθ,), refined once: θ̂ for outputs (F1), θ_aux for a learner's values (eq:theta_aux)."""
+        """Return Φ⁺v, (nθ,), refined once.
+
+        This is θ̂ for outputs (F1), and θ_aux for a learner's values (eq:theta_aux).
+        """
         theta = self.from_coordinates(self.coordinates(values))
         return theta + self.from_coordinates(self.coordinates(values - self.phi @ theta))
 
     def solve_along(
         self, values: Float[np.ndarray, "N ny"], directions: Float[np.ndarray, "nt s"] | None
     ) -> Vector:
-        """B(ΦB)⁺v, (nθ,): least squares along some directions of θ only, refined once.
+        """Return B(ΦB)⁺v, (nθ,): least squares along some directions only, refined once.
 
         None for all of them.
 
-        Φ itself need not have full rank: what no row tells stays zero.
+        Φ itself need not have full rank: what no row determines stays zero.
         """
         if directions is None:
             return self.solve(values)
-        told = self.told_of(directions)
-        if not told.shape[1]:
+        directions = self.without_null(directions)
+        if not directions.shape[1]:
             return np.zeros(len(directions))
-        basis, r = np.linalg.qr(self.to_coordinates @ told)
+        basis, r = np.linalg.qr(self.to_coordinates @ directions)
 
         def along(rest: Float[np.ndarray, "N ny"]) -> Vector:
-            return told @ scipy.linalg.solve_triangular(
+            return directions @ scipy.linalg.solve_triangular(
                 r, basis.T @ self.coordinates(rest), check_finite=False
             )
 
@@ -153,7 +158,7 @@ class Projection(Factor):
         return theta + along(values - self.phi @ theta)
 
     def orthogonal_part(self, values: Float[np.ndarray, "N ny"]) -> Float[np.ndarray, "N ny"]:
-        """P⊥v = v − QQᵀv, projected twice so that what is left is orthogonal to rounding."""
+        """Return P⊥v = v − QQᵀv, projected twice to be orthogonal to rounding."""
         for _ in range(2):
             values = values - self.q @ self.coordinates(values)
         return values
@@ -164,7 +169,7 @@ def _scale(rows: Matrix) -> Vector:
 
 
 def powers_of_two(largest: Vector) -> Vector:
-    """Return those that bring the largest entry of each column (nθ,) near 1.
+    """Return the powers of two that bring the largest entry of each column (nθ,) near 1.
 
     1 for a column of zeros.
     """

@@ -1,4 +1,6 @@
-"""Which directions of θ could the learner imitate? Only along these does it have to be made orthogonal to the physics.
+"""The directions of θ that the learner could imitate.
+
+Only along these the learner has to be made orthogonal to the physics.
 
 A direction a of θ is shared if φ(x)a is a function of the learner's features z(x) alone. A change
 of θ along it can be undone by the learner, so there θ is arbitrary until it is split off. Every
@@ -57,7 +59,10 @@ class Shared:
 
     @property
     def nearly(self) -> dict[str, float]:
-        """The parameters of which the features leave little on the rows, but more than nothing, with that share."""
+        """Parameters that the learner could nearly imitate, with the share that is left.
+
+        The features leave little of them on the rows, but more than nothing.
+        """
         if self.rest is None:
             return {}
         shares = zip(self.names, self.basis, self.rest.share, strict=True)
@@ -66,7 +71,7 @@ class Shared:
         }
 
     def beside(self, rest: UnexplainedPhysics | None) -> Shared:
-        """Return these directions and those that the rows do not tell from functions of the features."""
+        """Return these directions and those that the rows do not separate from the features."""
         if rest is None:
             return self
         more = rest.imitated(self.basis)
@@ -78,38 +83,38 @@ class Shared:
             if row.any() and not own.any()
         ]
         size = np.sqrt(np.maximum(np.diag(rest.whole), 1e-300))[:, None]
-        basis = _reduced(np.column_stack([self.basis, more]) * size, 1 / size[:, 0]) / size
+        basis = _reduce(np.column_stack([self.basis, more]) * size, 1 / size[:, 0]) / size
         return Shared(self.names, basis, tuple(moved), rest)
 
     @property
     def all(self) -> bool:
-        """Return whether the learner could imitate all of the physics."""
+        """True where the learner could imitate all of the physics."""
         return self.basis.shape[1] == len(self.names)
 
     @property
     def untouched(self) -> tuple[str, ...]:
-        """Parameters that no shared direction moves: the fit determines them beside any learner."""
+        """Parameters that no shared direction moves: the fit determines them with any learner."""
         return tuple(
             name for name, row in zip(self.names, self.basis, strict=True) if not row.any()
         )
 
     @property
     def directions(self) -> tuple[dict[str, float], ...]:
-        """Each direction by the parameters that it moves, the first one by one."""
-        told = []
+        """Each direction as weights of the parameters that it moves, the first one being 1."""
+        described = []
         for column in self.basis.T:
             first = column[np.flatnonzero(column)[0]]
-            told.append(
+            described.append(
                 {
                     name: float(f"{a / first:.12g}")
                     for name, a in zip(self.names, column, strict=True)
                     if a
                 }
             )
-        return tuple(told)
+        return tuple(described)
 
     def leaving(self, held: Iterable[int]) -> Shared:
-        """Return the shared directions that leave some entries of θ where they are.
+        """Return the shared directions that leave some entries of θ unchanged.
 
         In reduced form too.
         """
@@ -168,7 +173,7 @@ def spanned(
     features: Float[np.ndarray, "N nz"],
     learned: Any = True,
 ) -> Shared:
-    """Return the directions along which all slopes are linear combinations of features, on the same points.
+    """Return the directions along which all slopes are linear combinations of features.
 
     Args:
         learned: which slopes have a learner; the others must not move at all.
@@ -188,14 +193,16 @@ def seen(
     x: Float[np.ndarray, "N nx"],
     values: Callable[[Float[np.ndarray, "M nx"]], Float[np.ndarray, "M k"]],
 ) -> Bool[np.ndarray, "k"]:
-    """Which columns of `values` are functions of what the learner sees: moves that it does not see leave them alone.
+    """Return a mask of the columns of `values` that are functions of the learner's inputs.
+
+    A change that the learner does not see leaves such a column unchanged.
 
     Args:
         x: measured regressors, where the moves begin.
         values: of rows of the regressor, a column for each function in question.
     """
     if features.linear:
-        return _combined(values(x), _values(features, layout)(x))
+        return _are_combinations(values(x), _values(features, layout)(x))
     if _sees(features, layout):
         return np.ones(values(x[:1]).shape[1], dtype=bool)
     start, end = moves(_values(features, layout), x)
@@ -208,10 +215,10 @@ def seen(
     return still & (np.sum(there, axis=0) >= _FEWEST)
 
 
-def _combined(
+def _are_combinations(
     values: Float[np.ndarray, "N k"], features: Float[np.ndarray, "N nz"]
 ) -> Bool[np.ndarray, "k"]:
-    """Which columns are linear combinations of features on the same points."""
+    """Return a mask of the columns that are linear combinations of features at the same points."""
     kept = np.isfinite(values).all(axis=1) & np.isfinite(features).all(axis=1)
     values, q = values[kept], _basis(features[kept])
     left = np.linalg.norm(values - q @ (q.T @ values), axis=0)
@@ -219,19 +226,19 @@ def _combined(
 
 
 def _basis(features: Float[np.ndarray, "N nz"]) -> Float[np.ndarray, "N r"]:
-    """Return an orthonormal basis of what features span."""
+    """Return an orthonormal basis of the span of the features."""
     size = np.sqrt(np.mean(features**2, axis=0))
     q, sigma, _ = np.linalg.svd(features / np.where(size > 0, size, 1.0), full_matrices=False)
     return q[:, sigma > _ROUNDING * sigma.max(initial=0.0)]
 
 
 def _sees(features: Features, lags: Iterable[Lag]) -> bool:
-    """Return whether all of these lags are features as they stand."""
+    """Return whether all of these lags are themselves features."""
     return {str(lag) for lag in lags} <= {str(entry) for entry in features.entries}
 
 
 def agreeing(before: Matrix, after: Matrix) -> Matrix:
-    """Return the directions a with `before a = after a`, relative to the size of `before a`, in reduced form."""
+    """Return the directions a with `before a = after a`, relative to `before a`, reduced."""
     if not before.size:  # of no points at all, as of a run that diverged
         return np.zeros((before.shape[1], 0))
     scale = np.sqrt(np.mean(before**2 + after**2, axis=0))
@@ -242,11 +249,14 @@ def agreeing(before: Matrix, after: Matrix) -> Matrix:
     root = vt[seen].T / sigma[seen]
     _, change, directions = np.linalg.svd((after - before) * unit @ root, full_matrices=False)
     agreeing = root @ directions[change <= _TOLERANCE].T
-    return unit[:, None] * _reduced(agreeing, unit)
+    return unit[:, None] * _reduce(agreeing, unit)
 
 
-def _reduced(basis: Matrix, unit: Vector) -> Matrix:
-    """The same span in reduced column echelon form, in θ's own units times `1/unit`."""
+def _reduce(basis: Matrix, unit: Vector) -> Matrix:
+    """Return a basis of the same span in reduced column echelon form.
+
+    In θ's own units times `1/unit`.
+    """
     if not basis.size:
         return basis
     q = np.linalg.qr(basis)[0]
@@ -265,7 +275,7 @@ def _values(features: Features, layout: Layout) -> Callable[[Matrix], Matrix]:
 def moves(
     seen: Callable[[Matrix], Matrix], x: Float[np.ndarray, "N nx"]
 ) -> tuple[Float[np.ndarray, "M nx"], Float[np.ndarray, "M nx"]]:
-    """Pairs of points with equal features, of the size of the data's spread.
+    """Return pairs of points with equal features, as far apart as the data spread.
 
     A step towards another row, or in any direction, is led back to the features' values by Newton's
     method; every other one along the null space of ∂z/∂x first. The free ones find other branches:

@@ -1,8 +1,8 @@
-"""A problem whose rows stay in a source: what training needs of them comes from passes over its partitions.
+"""A problem whose rows stay in a source: training passes over its partitions.
 
 Three passes: a survey of sizes and ranges, a tree QR of `[Φ Y]`, and a second QR of the rows that
 the first one gives. The second makes Q orthonormal to rounding however ill-conditioned Φ is, as
-Householder's does in memory. A `witness` of the rows stays in memory for everything that only looks
+Householder's does in memory. A subsample of the rows stays in memory for everything that only looks
 at the data.
 """
 
@@ -43,7 +43,7 @@ Passes = Callable[[Callable[[Partition], Any], Sequence[Partition]], list[Any]]
 
 @dataclass(frozen=True, eq=False)
 class Form:
-    """How a piece of a source becomes rows; picklable if the baseline is."""
+    """Rules by which a piece of a source becomes rows; picklable if the baseline is."""
 
     baseline: Baseline
     features: Features
@@ -63,7 +63,7 @@ class Form:
     def posed(
         self, partition: Partition
     ) -> Iterator[tuple[Experiment, UsableRows, np.ndarray, np.ndarray]]:
-        """Pieces with their rows, Φ (m, ny, nθ) and the sum of the fixed terms (m, ny)."""
+        """Return the pieces with their rows, Φ (m, ny, nθ) and sums of the fixed terms (m, ny)."""
         for piece in partition.pieces(self.lead):
             if len(piece) <= self.lead:
                 continue
@@ -74,7 +74,7 @@ class Form:
     def checked(
         self, piece: Experiment, rows: UsableRows, phi: np.ndarray, known: np.ndarray
     ) -> Matrix:
-        """Return the learner's features (m, nz), after everything was found to be finite."""
+        """Return the learner's features (m, nz), after a check that all values are finite."""
         alone = replace(self.empty, experiments=(piece,))
         check_physics(phi, known, self.baseline, rows, alone)
         return feature_rows(self.features, rows, self.layout, alone)
@@ -142,7 +142,7 @@ class Factoring:
 
 
 class SecondQR(NamedTuple):
-    """What the second QR tells: R of `[Q₁ e₁]`, the moments of e₁ and `Σ ‖q_ki‖²` of each output."""
+    """Result of the second QR: R of `[Q₁ e₁]`, the moments of e₁, `Σ ‖q_ki‖²` of each output."""
 
     r: Matrix
     errors: Moments
@@ -167,13 +167,16 @@ class Basis:
         return np.moveaxis(self.turn.T @ (self.inverse.T @ columns), -1, 0)
 
     def left(self, target: Matrix, q: np.ndarray, coordinates: Vector) -> Matrix:
-        """Return what is left of a target (m, ny) by rows of Q at these coordinates, in whitened outputs."""
+        """Return the residual of a target (m, ny) after the rows of Q at these coordinates.
+
+        In whitened outputs.
+        """
         return self.weight.rows(target) - (coordinates @ np.moveaxis(q, 0, -1)).T
 
 
 @dataclass(frozen=True, eq=False)
 class PartitionQR:
-    """The second QR, and what the physics leaves."""
+    """The second QR of a partition, and the residual of the physics."""
 
     basis: Basis
     coordinates: Vector
@@ -196,13 +199,16 @@ def _both(one: SecondQR, other: SecondQR) -> SecondQR:
 
 
 def _triangle(blocks: Sequence[Matrix]) -> Matrix:
-    """R of blocks of rows upon each other, its diagonal not negative."""
+    """Return R of stacked blocks of rows, its diagonal not negative."""
     r = np.asarray(np.linalg.qr(np.concatenate(blocks), mode="r"))
     return r * np.where(np.diag(r) < 0, -1.0, 1.0)[:, None] if len(r) == r.shape[1] else r
 
 
-def _merged(parts: Sequence[Any], merge: Callable[[Any, Any], Any]) -> Any:
-    """Neighbours two by two, and so on: an order that does not depend on who was ready first."""
+def _merge(parts: Sequence[Any], merge: Callable[[Any, Any], Any]) -> Any:
+    """Return the sum of neighbours two by two, and so on.
+
+    This order does not depend on which part was ready first.
+    """
     parts = [part for part in parts if part is not None]
     while len(parts) > 1:
         parts = [
@@ -247,7 +253,7 @@ class RowBuilder:
 class StreamedProblem(Problem):
     """A problem of a source.
 
-    `record`, `rows` and the rows of `projection` are those of its witness.
+    `record`, `rows` and the rows of `projection` are those of its subsample.
 
     `passes` makes passes over the source. `moments` are those of what the physics leaves, in
     whitened outputs.
@@ -305,7 +311,7 @@ class StreamedProblem(Problem):
     def row_builder(
         self, centre: Vector, halfwidth: Vector, rms: float, gain: Matrix
     ) -> RowBuilder:
-        """Return how its rows are laid out for training."""
+        """Return the builder of its rows for training."""
         basis = replace(self.basis, form=replace(self.basis.form, features=self.features))
         return RowBuilder(basis, self.target_coordinates, centre, halfwidth, rms, gain)
 
@@ -320,13 +326,13 @@ class StreamedProblem(Problem):
     def weighed(self, weight: OutputWeights) -> Problem:
         if weight is self.weight:
             return self
-        return _factored(
+        return _factorise(
             replace(self, weight=weight), self.source, self.passes, self.survey, self.basis.form
         )
 
 
 def _survey(form: Form, source: Source, passes: Passes) -> Survey:
-    found = _merged(passes(PartitionSurvey(form), source.partitions), Survey.__or__)
+    found = _merge(passes(PartitionSurvey(form), source.partitions), Survey.__or__)
     if found is None:
         raise InputError(
             "no experiment has enough rows for a single prediction: the largest lag is "
@@ -338,7 +344,7 @@ def _survey(form: Form, source: Source, passes: Passes) -> Survey:
 def pose_streamed(
     source: Source, record: Record, passes: Passes, baseline: Baseline, *args: Any, **options: Any
 ) -> Problem:
-    """`pose` for a source, with a witness `record` of it in memory.
+    """Return the problem of a source, with a subsample `record` of it in memory.
 
     The arguments are those of `pose`.
 
@@ -354,7 +360,7 @@ def pose_streamed(
 
 
 def streamed(seen: Problem, source: Source, passes: Passes) -> StreamedProblem:
-    """Return the problem of a source, from that of a witness of it."""
+    """Return the problem of a source, from the problem of a subsample of it."""
     empty = replace(seen.record, experiments=(seen.record.experiments[0].rows(0, 0),))
     form = Form(seen.baseline, seen.features, seen.layout, empty)
     survey = _survey(form, source, passes)
@@ -365,28 +371,28 @@ def streamed(seen: Problem, source: Source, passes: Passes) -> StreamedProblem:
     weight = seen.weight
     if weight.kind != "covariance":
         weight = weigh_outputs("none" if weight.kind == "none" else weight.choice, deviation)
-    return _factored(
+    return _factorise(
         replace(seen, deviation=deviation, weight=weight), source, passes, survey, form
     )
 
 
-def _factored(
+def _factorise(
     seen: Problem, source: Source, passes: Passes, survey: Survey, form: Form
 ) -> StreamedProblem:
-    """Return two passes: R of `[Φ Y]`, and again of what it gives."""
+    """Return the factor in two passes: R of `[Φ Y]`, then R of the resulting Q."""
     weight, nt = seen.weight, len(seen.baseline.names)
     scale = powers_of_two(survey.columns * np.abs(weight.matrix).max())
-    first = _merged(
+    first = _merge(
         passes(Factoring(form, weight, scale), source.partitions), lambda a, b: _triangle([a, b])
     )
     r, coordinates = first[:nt, :nt], first[:nt, nt]
     excited = excitation(r, seen.baseline.names)
     ready = excited.full_rank and len(r) == nt
-    if not ready:  # `check` tells; nothing can be solved
+    if not ready:  # `check` raises; nothing can be solved
         r, coordinates = np.eye(nt), np.zeros(nt)
     inverse = scale[:, None] * scipy.linalg.solve_triangular(r, np.eye(nt)) if nt else r
     basis = Basis(form, weight, inverse, np.eye(nt))
-    second = _merged(passes(PartitionQR(basis, coordinates), source.partitions), _both)
+    second = _merge(passes(PartitionQR(basis, coordinates), source.partitions), _both)
     turn, rest = (second.r[:nt, :nt], second.r[:nt, nt]) if ready else (np.eye(nt), np.zeros(nt))
     back = np.linalg.inv(turn)
     basis = replace(basis, turn=back)

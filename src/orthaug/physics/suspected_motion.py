@@ -1,8 +1,8 @@
-"""A motion with further terms in its equations and outputs, each times a coefficient that is one more parameter."""
+"""A motion with suspected terms, each times a coefficient that is one more parameter."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, NamedTuple
 
@@ -24,14 +24,14 @@ class SuspectedTerm(NamedTuple):
 
 @dataclass(frozen=True)
 class SuspectedMotion(Motion):
-    """`physics` with `added` terms: their coefficients follow its parameters, and are 0 at first."""
+    """The motion `physics` with `added` terms, whose coefficients are parameters, 0 at first."""
 
     physics: Motion | None = None
     added: tuple[SuspectedTerm, ...] = ()
 
     @classmethod
     def of(cls, physics: Motion, added: Sequence[SuspectedTerm]) -> SuspectedMotion:
-        """Return the terms read what the equations do."""
+        """Return the motion with terms that read the same names as its equations."""
         own = {field.name: getattr(physics, field.name) for field in fields(Motion)}
         own["parameters"] = (
             *physics.parameters,
@@ -39,8 +39,10 @@ class SuspectedMotion(Motion):
         )
         return cls(**own, physics=physics, added=tuple(added))
 
-    def values(self, x: Any, u: Any, p: Any, xp: Any) -> dict[str, Any]:
-        return self._known.values(x, u, p[: self._count], xp)
+    def values(
+        self, x: Any, u: Any, p: Any, xp: Any, needed: Collection[str] | None = None
+    ) -> dict[str, Any]:
+        return self._known.values(x, u, p[: self._count], xp, needed)
 
     def rates(self, x: Any, u: Any, p: Any, xp: Any) -> Any:
         rates = self._known.rates(x, u, p[: self._count], xp)
@@ -60,7 +62,7 @@ class SuspectedMotion(Motion):
         return len(self._known.parameters)
 
     def _with_terms(self, rows: Any, first: int, at: tuple[Any, Any, Any], xp: Any) -> Any:
-        """Rows with the terms that belong to them; the first row is that of the place `first`."""
+        """Return the rows with their terms added; the first row is that of the place `first`."""
         x, u, p = at
         found = list(rows)
         values = None

@@ -62,6 +62,13 @@ class Content(BaseModel):
         return json.dumps(self.content(), indent=1, ensure_ascii=False, allow_nan=False)
 
 
+class IntervalsResult(Content):
+    """Source of the intervals of a fit of chosen terms, in a word and in a sentence."""
+
+    source: str
+    text: str
+
+
 class WarningResult(Content):
     """A `Warning`: a `code` for programs and a sentence for the reader."""
 

@@ -129,6 +129,8 @@ def _parameters(result: FitResult) -> list[Any]:
     caption = f"What was estimated. {text[result.standard_errors]}"
     if result.standard_errors_by is not None:
         caption = f"What was estimated. Standard errors: {STD_KINDS[result.standard_errors_by]}."
+    if result.intervals is not None and result.intervals.source != "none":
+        caption += f" {result.intervals.text[0].upper()}{result.intervals.text[1:]}"
     if result.noise_only:
         caption += (
             " Intervals count noise only: the model leaves more than noise, which may have "

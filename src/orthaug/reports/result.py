@@ -11,7 +11,16 @@ from pydantic import BeforeValidator, Field
 from orthaug import __version__
 from orthaug.physics.baseline import Parameter
 from orthaug.physics.parameters import PhysicalParameter
-from orthaug.reports.fields import ByName, Content, Flag, Number, Numbers, WarningResult, Whole
+from orthaug.reports.fields import (
+    ByName,
+    Content,
+    Flag,
+    IntervalsResult,
+    Number,
+    Numbers,
+    WarningResult,
+    Whole,
+)
 from orthaug.reports.findings import (
     AdviceResult,
     AdviceTrialsResult,
@@ -277,7 +286,7 @@ class FitResult(ResultHeader):
     """The result of `orthaug fit`."""
 
     absent: ClassVar = frozenset(
-        {"motion", "terms", "equation", "unexplained", "standard_errors_by"}
+        {"motion", "terms", "equation", "unexplained", "standard_errors_by", "intervals"}
     )
 
     spec: dict[str, Any]
@@ -311,6 +320,8 @@ class FitResult(ResultHeader):
     motion: MotionFitResult | None = None
     terms: list[TermResult] | None = None
     equation: EquationResult | None = None
+    intervals: IntervalsResult | None = None
+    """Where those of chosen terms come from; None where the spec says no rows that chose."""
     advice: list[AdviceResult] = []
     advice_trials: AdviceTrialsResult | None = None
     warnings: list[WarningResult]

@@ -5,10 +5,16 @@ from __future__ import annotations
 from typing import Any
 
 from orthaug._base.lines import fold
-from orthaug.reports.fields import Content, Flag, Number, WarningResult, Whole
+from orthaug.reports.fields import Content, Flag, IntervalsResult, Number, WarningResult, Whole
 from orthaug.reports.result import DataResult, ResultHeader
 
 _SHOWN = 12  # models of a stage in the text
+_EXPLAINED = (
+    "chosen: share of random halves that choose the term; left: of its norm, beside physics "
+    "and other terms; rate: the least rate of false discoveries at which it stays.",
+    "p, q: of the term on rows that had no say in the choice, and the rate of false "
+    "discoveries among the chosen ones.",
+)
 
 
 class OrdersResult(Content):
@@ -38,11 +44,21 @@ class NonlinearityResult(Content):
 
 
 class TermShareResult(Content):
-    """A chosen term, how often random halves choose it, and the share of it that is left."""
+    """A chosen term: its stability, its uniqueness and its significance.
+
+    `rate` is the least rate of false discoveries at which the choice keeps it, on the rows that
+    chose; `p` and `q` are those of the rows that had no say. `rivals` are candidates that it may
+    replace. `chosen` is the share of random halves that choose it, `left` the share of it that the
+    other columns leave.
+    """
 
     term: str
     chosen: Number
     left: Number = None
+    rate: Number = None
+    p: Number = None
+    q: Number = None
+    rivals: list[str] = []
 
 
 class ShiftResult(Content):
@@ -81,6 +97,8 @@ class SelectResult(ResultHeader):
     learner: dict[str, Any] | None
     focus: str
     terms: list[TermShareResult] | None
+    intervals: IntervalsResult
+    level: Number
     physics: list[ShiftResult] | None = None
     condition: Number = None
     models: list[SelectionRowResult]
@@ -102,17 +120,19 @@ def selection_text(result: SelectResult) -> str:
     if result.nonlinearity is not None:
         lines.append(f"nonlinear    {result.nonlinearity.text}")
     lines.append(f"learner      {_learner(result)}")
+    lines.append(f"intervals    {result.intervals.source}: {result.intervals.text}")
     if result.terms:
         width = max(len(term.term) for term in result.terms)
         lines += [
             "",
-            f"{'term':<{width}}  chosen over random halves of the data, left beside physics "
-            "and other terms",
+            f"{'term':<{width}}  {'chosen':>6}  {'left':>6}  {'rate':>8}  {'p':>8}  {'q':>8}",
         ]
         lines += [
-            f"{t.term:<{width}}  {_percent(t.chosen):>5}  {_percent(t.left):>6}"
+            f"{t.term:<{width}}  {_percent(t.chosen):>6}  {_percent(t.left):>6}  "
+            f"{_small(t.rate)}  {_small(t.p)}  {_small(t.q)}"
             for t in result.terms
         ]
+        lines += ["", *_EXPLAINED]
         lines += _physics(result)
     for stage in dict.fromkeys(row.stage for row in result.models):
         lines += ["", *_table(stage, [row for row in result.models if row.stage == stage])]
@@ -121,8 +141,14 @@ def selection_text(result: SelectResult) -> str:
     return "\n".join(fold(lines))
 
 
+def _small(p: float | None) -> str:
+    return f"{'–' if p is None else f'{p:.2g}':>8}"
+
+
 def _percent(share: float | None) -> str:
-    return "–" if share is None else f"{100 * share:.2g} %"
+    return (
+        "–" if share is None else f"{100 * share:.0f} %" if share > 0.1 else f"{100 * share:.2g} %"
+    )
 
 
 def _physics(result: SelectResult) -> list[str]:

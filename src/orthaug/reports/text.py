@@ -40,6 +40,8 @@ def fit_text(fit: Estimate | MotionEstimate, result: FitResult) -> str:
         return ""
     lines = [_mark_noise_only(line, result) for line in fit.lines()]
     blocks = [[w.text.capitalize() for w in result.warnings if w.code == "one_step_only"], lines]
+    if result.intervals is not None and result.intervals.source != "none":  # else a warning says it
+        blocks.append([f"{result.intervals.text[0].upper()}{result.intervals.text[1:]}"])
     if result.focus is not None and result.focus.candidates:
         blocks.append([f"{result.focus.text[0].upper()}{result.focus.text[1:]}"])
     if result.physical_parameters:

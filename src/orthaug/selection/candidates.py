@@ -1,4 +1,4 @@
-"""Which terms of a library can be chosen at all on these data, and of very many those that are worth a closer look."""
+"""Terms of a library that can be chosen on given data, shortlisted where there are very many."""
 
 from __future__ import annotations
 
@@ -27,14 +27,16 @@ _NAMED = 6
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """Terms that can be chosen, and what is told of the others."""
+    """Terms that can be chosen, and warnings on the others."""
 
     library: TermLibrary
     notes: tuple[Warning, ...]
+    considered: int
+    """Number of terms that could have been chosen, those that promise little included."""
 
 
 def candidates(problem: Problem, library: TermLibrary) -> Candidates:
-    """Return the terms that the physics does not express already, of more than `SHORTLIST` the most promising.
+    """Return the terms that the physics does not express, of many the `SHORTLIST` most promising.
 
     A term is promising by what it lowers the error one step ahead, beside the physics and beside
     those that are picked between rounds of looking through all (iterated screening). Nothing of the
@@ -62,19 +64,19 @@ def candidates(problem: Problem, library: TermLibrary) -> Candidates:
             "looked at on the free run."
         )
         notes.append(Warning("terms_shortlisted", text))
-    return Candidates(library.picked(kept), tuple(notes))
+    return Candidates(library.picked(kept), tuple(notes), int(own.sum()))
 
 
 @dataclass(frozen=True, eq=False)
 class _ModelColumns:
-    """What is in the model: an orthonormal basis Q of its columns over the rows, and the error that it leaves."""
+    """Columns of the model: their orthonormal basis Q over the rows, and the error left."""
 
     q: Float[np.ndarray, "N k"]
     left: Vector
 
     @classmethod
     def of(cls, runs: TermRuns) -> _ModelColumns:
-        """Of the physics alone."""
+        """Return the columns of the physics without terms."""
         every = (
             runs.physics(*runs.rows(experiment)) for experiment in runs.problem.record.experiments
         )
@@ -84,7 +86,7 @@ class _ModelColumns:
         )
 
     def beside(self, columns: Float[np.ndarray, "N m"]) -> _ModelColumns:
-        """With further columns."""
+        """Return the columns with further ones."""
         size = np.linalg.norm(columns, axis=0)
         columns = columns / np.where(size > 0, size, 1.0)
         for _ in range(2):  # twice is enough
@@ -96,7 +98,7 @@ class _ModelColumns:
     def weigh(
         self, runs: TermRuns, chosen: Sequence[int] | np.ndarray | None = None
     ) -> tuple[Vector, Vector, Vector]:
-        """Of each term its squared norm, what of that the model leaves, and its product with the error."""
+        """Return each term's squared norm, its part outside the model, and product with error."""
         every = np.arange(len(runs.library)) if chosen is None else np.asarray(chosen)
         norms, left, right = (np.zeros(len(every)) for _ in range(3))
         for a in range(0, len(every), _BLOCK):
@@ -124,7 +126,7 @@ def _chunks(
 
 
 def _promising(runs: TermRuns, known: _ModelColumns, among: np.ndarray) -> np.ndarray:
-    """Return the terms that promise most, in rounds: a look through all, and picks among the best of it."""
+    """Return the most promising terms, in rounds: one look through all, then picks of the best."""
     found: dict[int, None] = {}
     for _ in range(_ROUNDS):
         norms, left, right = known.weigh(runs, among)
@@ -147,11 +149,11 @@ def _notes(library: TermLibrary, finite: np.ndarray, own: np.ndarray) -> list[Wa
     texts, notes = library.texts, []
     infinite = [texts[i] for i in np.flatnonzero(~finite)]
     if infinite:
-        text = f"left out, for they are not finite on these data: {_named(infinite)}."
+        text = f"terms that are not finite on these data were left out: {_named(infinite)}."
         notes.append(Warning("terms_not_finite", text))
     known = [texts[i] for i in np.flatnonzero(finite & ~own)]
     if known:
-        text = f"left out, for the physics expresses them already: {_named(known)}."
+        text = f"terms that the physics expresses already were left out: {_named(known)}."
         notes.append(Warning("terms_are_physics", text))
     return notes
 

@@ -1,4 +1,4 @@
-"""What has a learner found? Its output over data, regressed on suspected terms and on products of what it sees.
+"""Regression of a learner's output over data on suspected terms and on products of its inputs.
 
 Forward orthogonal regression: the physics is projected out first where the learner shares
 directions with it, then the term that explains most beside those that are in comes next, or a pair
@@ -29,9 +29,11 @@ _ROUNDING = 1e-8  # of the largest variance
 
 @dataclass(frozen=True, eq=False)
 class LearnerTarget:
-    """How a learner shows what is missing: `target` (r,) is what it shows, `covariance` (r, r) that of its errors.
+    """Target for terms from a learner: values `target` (r,) and their `covariance` (r, r).
 
-    `view` (P, r) takes whitened values over all points to that; None where the learner tells no
+    Values are its output in a space where its errors are known.
+
+    `view` (P, r) takes whitened values over all points to that; None where the learner has no
     tangent space: then they are taken as they are, less the physics. `size` is the norm of the
     learner with all that physics expresses.
     """
@@ -45,7 +47,7 @@ class LearnerTarget:
 
     @classmethod
     def of(cls, linearization: LearnedLinearization) -> LearnerTarget:
-        """By the learner's tangent space over the points, where it has one."""
+        """Return the target in the learner's tangent space over the points, where it has one."""
         q = basis_of(linearization.physics_moves.T)
         raw = linearization.fitted(linearization.learner)
         rest, size, tangent = without(raw, q), float(np.linalg.norm(raw)), linearization.tangent
@@ -83,7 +85,7 @@ class LearnerTarget:
 
     @property
     def p(self) -> float | None:
-        """Of the learner being nothing but its own errors, beside the physics (Wald's test).
+        """P-value of the learner being only its own errors, beside the physics (Wald's test).
 
         None if not known.
         """
@@ -95,7 +97,7 @@ class LearnerTarget:
         return float(scipy.special.chdtrc(max(int(kept.sum()), 1), square))
 
     def unit(self, column: Vector) -> Vector:
-        """Return a column over the points (P,), taken as of size 1, as the learner would show it."""
+        """Return a column over the points (P,), of unit size, as the learner would show it."""
         with np.errstate(all="ignore"):
             column = column / np.linalg.norm(column)
         if not np.isfinite(column).all():
@@ -106,7 +108,7 @@ class LearnerTarget:
 
 
 def without(values: np.ndarray, basis: Float[np.ndarray, "R k"]) -> np.ndarray:
-    """Less what an orthonormal basis expresses, projected twice."""
+    """Return values less the part that an orthonormal basis expresses, projected twice."""
     for _ in range(2 if basis.size else 0):
         values = values - basis @ (basis.T @ values)
     return values
@@ -123,7 +125,7 @@ def basis_of(columns: Sequence[Vector] | Matrix) -> Float[np.ndarray, "R k"]:
 
 
 def least_squares(table: Float[np.ndarray, "R s"], values: Vector) -> Vector:
-    """(s,) of the columns that express values best, each taken as of size 1."""
+    """Return coefficients (s,) of the columns that express values best, each taken as of size 1."""
     size = np.linalg.norm(table, axis=0)
     unit = 1 / np.where(size > 0, size, 1.0)
     return unit * np.linalg.lstsq(table * unit, values, rcond=1e-10)[0]
@@ -151,10 +153,9 @@ _TIE, _TIE_UNKNOWN = (
     2e-4,
     2e-3,
 )  # share of the learner: within this of the best the simpler term is taken
-_PART = 0.1  # of what even the best leaves: less tells no two terms apart either
-_DRAWS = (
-    10.0  # variances of the noise in one direction: what two terms with widths differ by at random
-)
+_PART = 0.1  # of what even the best leaves: less does not separate two terms either
+# Variances of the noise in one direction: what two terms with widths differ by at random
+_DRAWS = 10.0
 _ROUGH, _FINE = 0.03, 1e-3  # of its logarithm
 _TRIED = 10  # kinds of terms, or pairs of kinds, that are refined before the choice
 _BLOCK, _LOOKED = 256, 200  # candidates whose pairs are looked at together, and pairs of them
@@ -163,7 +164,7 @@ _T = 3.0  # standard errors that a coefficient must differ from 0: the term was 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A term that could explain the learner in one output or equation: `kind` of `on` with its `width`, written out."""
+    """A term that could explain the learner in one output or equation: `kind` of `on`, `width`."""
 
     kind: str
     on: str | None
@@ -172,7 +173,7 @@ class Candidate:
     text: str
 
     def wide(self, width: float) -> Candidate:
-        """The same with another width, of four digits."""
+        """Return the candidate with another width, of four digits."""
         width = float(f"{width:.4g}")
         return replace(self, width=width, text=_written(self.kind, self.on, width))
 
@@ -183,7 +184,7 @@ class Candidate:
 
     @property
     def complexity(self) -> int:
-        """Of terms that explain as much the simplest is taken.
+        """Complexity of the term: of terms that explain as much the simplest is taken.
 
         A learner is smooth: clipping imitates jumps last.
         """
@@ -191,21 +192,21 @@ class Candidate:
 
     @property
     def identity(self) -> tuple[str, str, int]:
-        """Return what it is whatever its width."""
+        """Key of the term without its width."""
         return self.kind, self.text if self.on is None else self.on, self.place
 
     @property
     def form(self) -> tuple[str, str, int]:
-        """The same, both kinds of a peak alike."""
+        """Key of the term without its width, with both kinds of a peak alike."""
         return self.kind.removesuffix("_gauss"), *self.identity[1:]
 
 
 @dataclass(frozen=True, eq=False)
 class Space:
-    """Candidates as the learner would show them, beside the physics: `columns` (K, r), and the learner, `target` (r,).
+    """Candidates as a learner would show them beside the physics, (K, r), and the `target` (r,).
 
     The target has norm 1, so that squares are shares of what the learner adds; `norm` is what it
-    had. `tie` is the share by which two terms cannot be told apart.
+    had. `tie` is the share within which two terms count as equal.
     """
 
     linearization: LearnedLinearization
@@ -218,7 +219,10 @@ class Space:
 
     @classmethod
     def of(cls, linearization: LearnedLinearization, candidates: Sequence[Candidate]) -> Space:
-        """Candidates without a value on some point, and those that physics expresses or no learner shows, are out."""
+        """Return the space without candidates that have no value, or that the physics expresses.
+
+        Candidates that no learner could show are out, too.
+        """
         shown = LearnerTarget.of(linearization)
         norm = float(np.linalg.norm(shown.target))
         kept, columns = [], []
@@ -237,7 +241,7 @@ class Space:
 
     @property
     def empty(self) -> bool:
-        """Return whether the learner adds nothing beside the physics, or nothing could explain it."""
+        """True if the learner adds nothing beside the physics, or nothing could explain it."""
         return not self.target.any() or not self.candidates
 
     def column(self, candidate: Candidate) -> Vector:
@@ -247,7 +251,7 @@ class Space:
         )
 
     def gains(self, chosen: Sequence[Vector]) -> Vector:
-        """Share of the learner that each candidate would explain beside those that are chosen (K,)."""
+        """Return the share of the learner that each candidate adds to the `chosen` ones (K,)."""
         basis = basis_of(chosen)
         left = np.einsum("kr,kr->k", self.columns, self.columns)
         if basis.size:
@@ -258,7 +262,7 @@ class Space:
         )
 
     def explained(self, chosen: Sequence[Vector]) -> float:
-        """Share of the learner that chosen columns explain together."""
+        """Return the share of the learner that chosen columns explain together."""
         return float(np.sum((basis_of(chosen).T @ self.target) ** 2)) if len(chosen) else 0.0
 
 
@@ -268,7 +272,7 @@ def candidates_of(
     functions: Sequence[str],
     suspects: Sequence[tuple[str, int]],
 ) -> tuple[Candidate, ...]:
-    """Return what could explain the learner, simple terms first.
+    """Return the candidates that could explain the learner, simple ones first.
 
     Args:
         degree, functions: of products of what the learner sees (`TermLibrary`).
@@ -313,7 +317,7 @@ def candidates_of(
 
 
 def _likely(linearization: LearnedLinearization, kind: str, on: str) -> bool:
-    """Friction only of what changes its sign, a root only of what has one."""
+    """Return whether a kind suits a variable: friction needs both signs, a root a positive one."""
     if kind not in (*ODD_JUMPS, "square_root"):
         return True
     values = _values(linearization, on)
@@ -328,7 +332,7 @@ def _values(linearization: LearnedLinearization, on: str) -> Vector:
 
 
 def _grid(linearization: LearnedLinearization, on: str) -> Iterator[float]:
-    """Widths that the data could tell; none for what is zero, or has no value somewhere."""
+    """Yield widths that the data can resolve; none for what is zero, or has no value somewhere."""
     size = np.abs(_values(linearization, on))
     if np.isfinite(size).all() and np.any(size > 0):
         yield from (float(f"{share * np.median(size[size > 0]):.4g}") for share in _WIDTHS)
@@ -452,7 +456,7 @@ def _refined(space: Space, chosen: list[Candidate], within: float = _FINE) -> li
 
 
 def _pruned(space: Space, chosen: list[Candidate], least: float) -> list[Candidate]:
-    """Without terms that the others make superfluous."""
+    """Return the chosen terms less those that the others make superfluous."""
     while len(chosen) > 1:
         columns = [space.column(one) for one in chosen]
         whole = space.explained(columns)
@@ -478,14 +482,14 @@ def _ordered(space: Space, chosen: list[Candidate]) -> list[Candidate]:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Chosen terms fitted beside the physics: how far that moves (s,), coefficients (k,) and their Cov or None."""
+    """Chosen terms fitted beside the physics: its shift (s,), coefficients (k,), Cov or None."""
 
     along: Vector
     coefficients: Vector
     covariance: Matrix | None
 
     def doubtful(self) -> int | None:
-        """Return the number of the term that stands out least from the learner's own errors, where one does not."""
+        """Return the number of the least significant term, None where all are significant."""
         if self.covariance is None or not len(self.coefficients):
             return None
         std = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
@@ -494,7 +498,7 @@ class Fit:
 
 
 def fit_terms(space: Space, chosen: Sequence[Candidate]) -> Fit:
-    """Least squares of the learner on the terms as it would show them.
+    """Fit the terms to the learner by least squares, as it would show them.
 
     The physics takes what they do not express.
     """
@@ -517,9 +521,9 @@ def fit_terms(space: Space, chosen: Sequence[Candidate]) -> Fit:
 
 
 def settled(space: Space, chosen: list[Candidate]) -> tuple[list[Candidate], Fit, bool]:
-    """Return the terms whose coefficients stand out from the learner's own errors.
+    """Return the terms whose coefficients are significant against the learner's own errors.
 
-    And whether any other was dropped.
+    The last value is whether any other was dropped.
     """
     fit, dropped = fit_terms(space, chosen), False
     while (weak := fit.doubtful()) is not None:
@@ -531,7 +535,7 @@ def settled(space: Space, chosen: list[Candidate]) -> tuple[list[Candidate], Fit
 def rivals(
     space: Space, chosen: Sequence[Candidate], number: int, most: int = 3
 ) -> tuple[str, ...]:
-    """Other terms that could stand in the place of one and explain nearly as much."""
+    """Return other terms that could replace one and explain nearly as much."""
     columns = [space.column(one) for one in chosen]
     others = columns[:number] + columns[number + 1 :]
     gains = space.gains(others) + space.explained(others)

@@ -1,4 +1,4 @@
-"""`explain`: the terms that a learner has found, what they explain of it, and what to write into the physics."""
+"""The verb `explain`: terms that a learner has found, their share, and the lines of a new spec."""
 
 from __future__ import annotations
 
@@ -42,10 +42,10 @@ _DIVIDED = re.compile(r"\((?P<inner>.+)\)\s*/\s*(?P<by>[A-Za-z_]\w*)")
 
 @dataclass(frozen=True)
 class NewTerm:
-    """A term to be added: its parameter's `name`, the `text` with its `width` as a number, and where it goes.
+    """A term to add: its parameter's `name`, the `text` with its `width` as a number, its place.
 
-    `scale` is the expression whose unit the term has; None for one by which no unit is told.
-    `template` has `{width}` where the width stands, None without one.
+    `scale` is the expression whose unit the term has; None for one without a known unit.
+    `template` has `{width}` in the width's place, None without one.
     """
 
     name: str
@@ -120,14 +120,14 @@ def baseline_lines(added: Sequence[NewTerm], several: bool) -> str:
 
 @dataclass(frozen=True, eq=False)
 class ChangedMotion:
-    """A motion with terms added to its equations, the new parameters, and the equations that changed by their keys."""
+    """A motion with added terms, the new parameters, and the changed equations by their keys."""
 
     motion: Motion
     parameters: tuple[PhysicalParameter, ...]
     equations: tuple[tuple[str, str, str], ...]
 
     def lines(self) -> str:
-        """Return what to change in a spec."""
+        """Return the lines to change in a spec."""
         blocks = [f"[{table}]\n{key} = {_toml(text)}" for table, key, text in self.equations]
         rows = []
         for one in self.parameters:
@@ -203,7 +203,7 @@ def added_to_motion(
 def _unit_inside(inner: str, added: NewTerm, units: dict[str, str]) -> str:
     """Return the unit of a term's coefficient within a sum.
 
-    None where the sum's or the term's is not told.
+    None where the sum's or the term's is unknown.
     """
     unit = _unit_of_first(inner, units)
     if not unit or added.scale is None:
@@ -236,7 +236,7 @@ def _balanced(text: str) -> bool:
 
 
 def _short(value: float) -> float:
-    """Six digits: more the learner does not tell."""
+    """Return the value to six digits, as accurate as the learner is."""
     return float(f"{value:.6g}")
 
 
@@ -249,7 +249,7 @@ _HALF = 0.5  # of the learner, less its own errors: terms that explain less are 
 _LEVEL = 0.01  # at which the learner is something beside its own errors
 _ENDED = ("converged", "exact")
 _SHOWN = 8  # terms, each as the only one
-_OUTSIDE = 0.05  # share of rows beyond the training data that is told of
+_OUTSIDE = 0.05  # share of rows beyond the training data that is reported
 _CONDITIONAL = (
     "the terms were chosen on these data: intervals of a fit with them to the same data are "
     "conditional on the choice; a fit to other data has intervals that are not."
@@ -266,7 +266,7 @@ _NAMES = {
 class ExplainingTerm:
     """A term to add to the physics.
 
-    `coefficient` is in `unit`, None where that is not told; `std` is its standard error by the
+    `coefficient` is in `unit`, None where that is unknown; `std` is its standard error by the
     learner's, None if not known. `share` is what it adds to the terms before it, `alone` what it
     explains as the only one. `rivals` would explain nearly as much in its place.
     """
@@ -307,10 +307,10 @@ class MovedParameter:
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """What a learner has found.
+    """Terms that a learner has found.
 
     `share` is what the `terms` explain together of the mean square that the learner adds beside the
-    physics, `noise` the share that is its own error as far as training tells, `p` that of the
+    physics, `noise` the share that is its own error as far as training shows, `p` that of the
     learner being nothing else; None if not known. `physics` is the baseline or motion with the
     terms added, None where there are none or it is a function; `spec` the same as lines of a spec
     file.
@@ -330,7 +330,7 @@ class Explanation:
 
     @property
     def found(self) -> bool:
-        """Return whether there are terms to add."""
+        """True if there are terms to add."""
         return bool(self.terms)
 
     def __repr__(self) -> str:
@@ -347,15 +347,16 @@ def explain(
     most: int = 6,
     least: float = LEAST,
 ) -> Explanation:
-    """Which terms a learner has found: its output over a record, regressed on suspects and on products.
+    """Find the terms that a learner holds: its output over a record on suspects and products.
 
     Friction, drag, hardening, dead zones and saturations of everything that the learner sees are
     tried, and products of it. Each is taken as the learner would show it, for a smooth one shows no
     jumps (`selection.as_shown`).
 
-    Args: model: a model with a learner, or what `estimate` returned. record: best the one that it
-        was trained on; may be left out for an estimate. Outputs are needed but for a
-            motion, whose free run then starts from 0.
+    Args:
+        model: a model with a learner, or what `estimate` returned.
+        record: best the one that it was trained on; may be left out for an estimate. Outputs are
+            needed but for a motion, whose free run then starts from 0.
         suspects: further terms to try.
         degree, functions: of the products, as in `Terms`.
         most: terms at most.
@@ -392,21 +393,23 @@ def explain(
         candidates_of(linearization, degree, functions, _declared(suspects, linearization)),
     )
     chosen, fitted, dropped = settled(space, select(space, most, least))
-    told = _told(space, chosen, fitted, dropped)
+    explanation = _explanation(space, chosen, fitted, dropped)
     code = getattr(getattr(fit, "status", None), "code", "converged")
     if code not in _ENDED:
         text = (
             "training did not end at a minimum: the learner may show terms otherwise than they "
             "are; train longer."
         )
-        told = replace(told, warnings=(*told.warnings, Warning("not_converged", text)))
-    return told
+        explanation = replace(
+            explanation, warnings=(*explanation.warnings, Warning("not_converged", text))
+        )
+    return explanation
 
 
 def _declared(
     suspects: Sequence[Any], linearization: LearnedLinearization
 ) -> list[tuple[str, int]]:
-    """Expressions of suspects with the number of their output or equation."""
+    """Return expressions of suspects with the number of their output or equation."""
     names, found = [name for name, _ in linearization.places], []
     for suspect in suspects:
         check_type(
@@ -426,7 +429,7 @@ def _declared(
     return found
 
 
-def _told(space: Space, chosen: list[Candidate], fitted: Fit, dropped: bool) -> Explanation:
+def _explanation(space: Space, chosen: list[Candidate], fitted: Fit, dropped: bool) -> Explanation:
     linearization, noise, p = space.linearization, None, space.shown.p
     if space.shown.covariance is not None and space.norm > 0:
         noise = min(float(np.trace(space.shown.covariance)) / space.norm**2, 1.0)
@@ -451,18 +454,18 @@ def _told(space: Space, chosen: list[Candidate], fitted: Fit, dropped: bool) -> 
         what = named or f"{len(terms)} terms"
         verb = "explains" if len(terms) == 1 else "explain"
         text = f"{what} {verb} {percent(share, 3)} of what the learner adds beside the physics."
-    told = []
+    warnings = []
     if linearization.outside > _OUTSIDE:
         reach = (
             f"{100 * linearization.outside:.0f} % of the rows lie beyond what the learner saw "
             "in training"
         )
-        told.append(Warning("beyond_training", f"{reach}: there it shows how it extrapolates."))
+        warnings.append(Warning("beyond_training", f"{reach}: its values there are extrapolated."))
     if terms:
-        told.append(Warning("conditional_on_selection", _CONDITIONAL))
+        warnings.append(Warning("conditional_on_selection", _CONDITIONAL))
     points = len(linearization.target)
     return Explanation(
-        terms, share, noise, p, singles, parameters, physics, spec, points, text, tuple(told)
+        terms, share, noise, p, singles, parameters, physics, spec, points, text, tuple(warnings)
     )
 
 
@@ -478,17 +481,17 @@ def _why_nothing(
         return "nothing explains the learner: the physics expresses all candidate terms already."
     if not real:
         return (
-            "what the learner adds does not stand out from its own errors; there is nothing to "
-            "explain."
+            "what the learner adds is not significant against its own errors; there is nothing "
+            "to explain."
         )
     best = (
         f"the best single term, {singles[0].expression}, explains {percent(singles[0].share)} of it"
     )
     if dropped and share < _HALF:
-        return f"no term stands out from the learner's own errors; {best}. Keep the learner."
+        return f"no term is significant against the learner's own errors; {best}. Keep the learner."
     return (
-        f"no few terms explain half of what the learner adds; {best}. Keep the learner, or try "
-        "other suspects."
+        f"a few terms do not explain half of what the learner adds; {best}. Keep the learner, or "
+        "try other suspects."
     )
 
 

@@ -1,4 +1,6 @@
-"""Forward orthogonal least squares on normal equations: which column lowers the error most, beside those that are in.
+"""Forward orthogonal least squares on normal equations.
+
+Each pick is the column that lowers the error most beside those chosen before.
 
 Chen, Billings and Luo (1989), on Gram matrices: each pick is projected out of all others, so what a
 column would lower the squared error by is its right-hand side squared over what is left of its norm
@@ -33,7 +35,7 @@ free run on Silverbox's arrow errs by a sixth more.
 
 
 class Equations(NamedTuple):
-    """Normal equations `H p = b` of `‖y − S p‖²` over some rows: `H = SᵀS`, `b = Sᵀy`, `square = ‖y‖²`."""
+    """Normal equations `H p = b` of `‖y − S p‖²`: `H = SᵀS`, `b = Sᵀy`, `square = ‖y‖²`."""
 
     hessian: Matrix
     right: Vector
@@ -42,17 +44,17 @@ class Equations(NamedTuple):
 
     @classmethod
     def sum_of(cls, parts: Iterable[Equations]) -> Equations:
-        """Over the rows of all."""
+        """Return the equations over the rows of all parts."""
         hessian, right, square, rows = (sum(part) for part in zip(*parts, strict=True))
         return cls(np.asarray(hessian), np.asarray(right), float(square), int(rows))
 
     def of(self, columns: Sequence[int]) -> Equations:
-        """Of some of the columns, in that order."""
+        """Return the equations of some of the columns, in that order."""
         picked = np.asarray(columns, dtype=int)
         return self._replace(hessian=self.hessian[np.ix_(picked, picked)], right=self.right[picked])
 
     def among(self, columns: Sequence[int], count: int) -> Equations:
-        """As these of `count` columns, of which the others are zero."""
+        """Return the equations as these of `count` columns, of which the others are zero."""
         picked, hessian, right = (
             np.asarray(columns, dtype=int),
             np.zeros((count, count)),
@@ -62,13 +64,13 @@ class Equations(NamedTuple):
         return self._replace(hessian=hessian, right=right)
 
     def scaled(self) -> Equations:
-        """With columns of unit norm."""
+        """Return the equations with columns of unit norm."""
         size = np.sqrt(np.maximum(np.diag(self.hessian), 0.0))
         unit = 1 / np.where(size > 0, size, 1.0)
         return self._replace(hessian=self.hessian * np.outer(unit, unit), right=self.right * unit)
 
     def solve(self) -> Vector:
-        """p, the shortest where columns depend on each other."""
+        """Return p, the shortest where columns depend on each other."""
         size = np.sqrt(np.maximum(np.diag(self.hessian), 0.0))
         unit = 1 / np.where(size > 0, size, 1.0)
         return (
@@ -79,7 +81,7 @@ class Equations(NamedTuple):
         )
 
     def miss(self, p: Vector) -> float:
-        """`‖y − S p‖²`."""
+        """Return `‖y − S p‖²`."""
         return float(self.square - 2 * p @ self.right + p @ self.hessian @ p)
 
 
@@ -101,10 +103,12 @@ def forward(
 ) -> list[ForwardStep]:
     """Pick up to `most` columns, one after another, beside those that are `known`.
 
-    Args: least: share of the squared error left that a column must take away. within: share of a
-        column's deviation; one of which less is left lies within the span of those that are in.
+    Args:
+        least: share of the squared error left that a column must take away.
+        within: share of a column's deviation; one of which less is left lies within the span of
+            those that are in.
         constant: the column of a constant, beside which a column's deviation is what is left; None
-        for its norm.
+            for its norm.
     """
     gram, right, square, _ = equations.scaled()
     gram, right, square = gram.copy(), right.copy(), float(square)
@@ -151,7 +155,7 @@ def _deviations(gram: Matrix, constant: int | None) -> Vector:
 def spanned(
     equations: Equations, known: Sequence[int], within: float, constant: int | None
 ) -> list[int]:
-    """Return the columns of which less than `within` of the deviation is left beside the `known` ones."""
+    """Return the columns with less than `within` of their deviation outside the `known` ones."""
     gram = equations.scaled().hessian
     size, known = np.diag(gram), list(known)
     across = gram[known]

@@ -1,7 +1,7 @@
-"""What is to be explained: a learner's output over data, beside what the parameters of the physics could do.
+"""Linearization of a learner's output over data, beside the physics' own parameters.
 
-Of a lagged model over the rows of a record, of a motion over the states and inputs of its free run
-there, by what it does to the outputs.
+For a lagged model the data are the rows of a record; for a motion the states and inputs of its free
+run, where the output counts by its effect on the outputs.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ MOST_WEIGHTS = 2000  # of a learner whose tangent is looked at
 
 
 class Tangent(NamedTuple):
-    """What the learner's weights w do to what is fitted, whitened, and what training left of the weights."""
+    """Derivatives by the learner's weights w, whitened, and the covariance of w after training."""
 
     jacobian: Float[np.ndarray, "R nw"]
     weights: Vector
@@ -66,7 +66,7 @@ class LearnedLinearization:
     signals: tuple[str, ...]
     """What the learner sees, as expressions, and rates of change that follow from it."""
     seen: int
-    """How many of the signals the learner sees as they stand."""
+    """Number of signals that the learner sees as they are."""
     units: dict[str, str]
     parse: Callable[[str], Expression]
     evaluate: Callable[[Expression], Any]
@@ -80,7 +80,7 @@ class LearnedLinearization:
     outside: float
 
     def column(self, expression: Expression, place: int) -> Vector:
-        """Return a term with coefficient 1, whitened, all points and places below each other (M·nl,)."""
+        """Return a term with coefficient 1, whitened, all points and places stacked (M·nl,)."""
         with np.errstate(all="ignore"):
             values = np.broadcast_to(
                 np.asarray(self.evaluate(expression), dtype=float), (len(self.target),)
@@ -88,7 +88,7 @@ class LearnedLinearization:
         return (values[:, None] * self.weight[:, place]).ravel()
 
     def fitted(self, columns: Float[np.ndarray, "P *k"]) -> np.ndarray:
-        """Return what columns over the points do to what was fitted (R, …)."""
+        """Return the effect of columns over the points on the fitted values (R, …)."""
         return columns if self.response is None else self.response.forward(columns)
 
     @property
@@ -205,12 +205,14 @@ def _of_motion(model: MotionModel, record: Record) -> LearnedLinearization:
 
 @dataclass(frozen=True, eq=False)
 class MotionResponse:
-    """The tangent system along a free run: from terms at M points in all equations and outputs to whitened outputs.
+    """Tangent system along a free run: from terms at M points to whitened outputs.
+
+    Terms are those in all equations and outputs.
 
     `s_{k+1} = A_k s_k + h/2 (A_k t_k + t_{k+1})`, `y_k = C_k s_k + o_k` for terms t in the
     equations and o in the outputs, h the sampling time; A, `steps`, and C, `outputs`, are
     derivatives of the fitted motion. A segment of training starts anew, from a state that was
-    estimated beside everything else: `begins` (M,) tells where.
+    estimated beside everything else: `begins` (M,) marks where.
     """
 
     steps: Float[np.ndarray, "M nx nx"]
@@ -231,13 +233,13 @@ class MotionResponse:
         begins: Any,
         weight: Matrix,
     ) -> MotionResponse:
-        """Along states x (M, nx) and inputs u (M, nu), with the rows that steps read."""
+        """Return the system along states x (M, nx) and inputs u (M, nu), with the steps' rows."""
         steps, outputs = (np.asarray(part) for part in _derivatives(form, numbers, x, u, rows))
         half = 0.0 if form.motion.integrator == "discrete" else form.sampling_time / 2
         return cls(np.nan_to_num(steps), weight @ np.nan_to_num(outputs), begins, weight, half)
 
     def forward(self, terms: Float[np.ndarray, "M n k"]) -> Float[np.ndarray, "R k"]:
-        """Of terms in all equations and then all outputs (n = nx + ny)."""
+        """Return outputs for terms in all equations and then all outputs (n = nx + ny)."""
         count, nx, _ = self.steps.shape
         moved, direct = terms[:, :nx], np.einsum("oi,mik->mok", self.weight, terms[:, nx:])
         s, found = np.zeros((nx, terms.shape[2])), np.zeros_like(direct)
@@ -270,7 +272,7 @@ class MotionResponse:
         return np.concatenate([found, direct], axis=1)
 
     def starts(self) -> Float[np.ndarray, "R s"]:
-        """Return what the states at the begin of each segment do."""
+        """Return the effect of the states at the beginning of each segment."""
         count, nx, _ = self.steps.shape
         places = np.flatnonzero(self.begins)
         found = np.zeros((count, self.outputs.shape[1], nx * len(places)))
@@ -286,7 +288,7 @@ class MotionResponse:
 def _derivatives(
     form: MotionDynamics, numbers: Numbers, x: Any, u: Any, rows: Any
 ) -> tuple[Any, Any]:
-    """∂(next state)/∂x and ∂y/∂x at points."""
+    """Return ∂(next state)/∂x and ∂y/∂x at points."""
     numbers = form.prepared(numbers)
     steps = jax.vmap(lambda x, row: jax.jacfwd(lambda s: form.step(numbers, s, row)[0])(x))(x, rows)
     return steps, jax.vmap(lambda x, u: jax.jacfwd(lambda s: form.observed(numbers, s, u))(x))(x, u)
@@ -301,7 +303,7 @@ class Response:
     equations: int
 
     def forward(self, columns: Float[np.ndarray, "P *k"]) -> np.ndarray:
-        """Of columns over all points and places, to whitened outputs."""
+        """Return whitened outputs for columns over all points and places."""
         single = columns.ndim == 1
         table = columns.reshape(-1, len(self.learned), 1 if single else columns.shape[1])
         terms = np.zeros((len(table), self.equations, table.shape[2]))
@@ -327,7 +329,7 @@ class _Run(NamedTuple):
 
     @classmethod
     def of(cls, model: MotionModel, record: Record) -> _Run:
-        """Of a long record the first rows."""
+        """Return the run of a record, of a long one over its first rows."""
         states = model.states(record, initial="measured" if record.outputs else "zero")
         states = states[list(model.form.motion.names_of_states)].to_numpy()
         length = model.trained.segment if model.trained is not None else 0
@@ -350,7 +352,7 @@ def _stacked(values: Float[np.ndarray, "M n *k"]) -> np.ndarray:
 
 
 def _places(model: MotionModel) -> tuple[tuple[str, str], ...]:
-    """Name and unit of every learned equation, by its state, and of every learned output."""
+    """Return name and unit of every learned equation, by its state, and of every learned output."""
     motion = model.form.motion
     states, outputs = motion.learned
     names = [motion.states[i].name for i in states] + [motion.outputs[i].name for i in outputs]
@@ -361,7 +363,7 @@ def _places(model: MotionModel) -> tuple[tuple[str, str], ...]:
 
 
 def _moved(motion: Motion, q: Vector, along: Vector, x: Matrix, u: Matrix) -> Vector:
-    """Return the parameters after a step of their coordinates q (np,), along a line of the parameters themselves.
+    """Return the parameters after a step of their coordinates q (np,), along a straight line.
 
     A step of logarithms where that would end at a zero that the equations divide by.
     """
@@ -374,7 +376,7 @@ def _moved(motion: Motion, q: Vector, along: Vector, x: Matrix, u: Matrix) -> Ve
 
 
 def _rates_of_change(outputs: Sequence[str], seen: Sequence[str]) -> list[str]:
-    """Return the velocity of each output of which the learner sees two lags, one after the other."""
+    """Return the velocity of each output of which the learner reads two successive lags."""
     found = []
     for name in outputs:
         lags = [lag for lag in range(1, len(seen) + 2) if f"{name}[k-{lag}]" in seen]
@@ -385,7 +387,7 @@ def _rates_of_change(outputs: Sequence[str], seen: Sequence[str]) -> list[str]:
 
 
 def _beyond(model: Any, z: Matrix) -> float:
-    """Share of the points at which a feature lies outside those of training."""
+    """Return the share of the points with a feature outside its training range."""
     if not model.form.bound.differentiable or not len(z):
         return 0.0
     return float(np.mean(model.beyond(z)))

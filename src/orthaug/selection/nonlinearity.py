@@ -1,4 +1,4 @@
-"""Is anything nonlinear missing, before a learner is trained? A test of what linear lags leave one step ahead.
+"""Test for a missing nonlinearity before a learner is trained, on the residual of linear lags.
 
 Squares, cubes and sizes of each regressor, less what physics and linear lags express of them, are
 multiplied by what these leave of the output. Their sums over blocks of rows change sign at random
@@ -27,7 +27,9 @@ from orthaug.selection.forward import DEPENDENT
 from orthaug.selection.term_runs import TermRuns
 
 LEVEL = 0.05
-_BLOCKS = 20  # at most: 40 blocks of 1000 rows reject 7 to 13 % under a held input, `benchmarks/coverage_noise.py`
+# At most: 40 blocks of 1000 rows reject 7 to 13 % under a held input,
+# `benchmarks/coverage_noise.py`
+_BLOCKS = 20
 _FEWEST_BLOCKS = 8  # whose signs can make 256 sums
 _MEMORIES = 3  # times as long a block as the products remember each other
 _FEWEST_ROWS = 160
@@ -37,7 +39,7 @@ _SEED = 20_261_123
 
 @dataclass(frozen=True)
 class Nonlinearity:
-    """Whether functions of the regressors explain what linear lags leave; `p` is the p-value.
+    """Test that functions of regressors explain the residual of linear lags; `p` is its p-value.
 
     `regressors` are the p-values of the functions of each regressor alone, multiplied by their
     number (Bonferroni).
@@ -48,7 +50,7 @@ class Nonlinearity:
 
     @property
     def found(self) -> bool:
-        """Return whether something nonlinear is missing, at the level of 5 %."""
+        """True if a nonlinear term is missing, at the level of 5 %."""
         return self.p < LEVEL
 
     @property
@@ -115,7 +117,7 @@ def nonlinearity(problem: Problem, lags: Sequence[str], draws: int = _DRAWS) -> 
 
 
 def _blocks(products: Matrix) -> int:
-    """Return how many blocks remember little of each other: none where the products remember for too long."""
+    """Return the number of blocks that hardly depend on each other; 0 where memory is too long."""
     lengths = [correlation_length(column[None]) for column in products.T]
     if any(length is None for length in lengths):
         return 0
@@ -124,7 +126,7 @@ def _blocks(products: Matrix) -> int:
 
 
 def _without_own_block(error: Vector, q: Matrix, blocks: Vector) -> Vector:
-    """Return the residual of each block for a fit that did not use it, `(I − q_b q_bᵀ)⁻¹e_b`, by Woodbury's formula."""
+    """Return each block's residual for a fit without it, `(I − q_b q_bᵀ)⁻¹e_b` (Woodbury)."""
     parts = []
     for e, own in zip(np.split(error, blocks[1:]), np.split(q, blocks[1:]), strict=True):
         values, vectors = np.linalg.eigh(np.eye(q.shape[1]) - own.T @ own)
@@ -134,7 +136,7 @@ def _without_own_block(error: Vector, q: Matrix, blocks: Vector) -> Vector:
 
 
 def _rows(runs: TermRuns, linear: int) -> tuple[Matrix, Matrix, Vector]:
-    """Physics and linear lags, their functions, and what the fixed terms leave of the output."""
+    """Return physics and linear lags, their functions, and the output less the fixed terms."""
     known, functions, targets = [], [], []
     for experiment in runs.problem.record.experiments:
         (phi, target), terms = runs.physics(*runs.rows(experiment)), runs.factors(experiment).T

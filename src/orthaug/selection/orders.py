@@ -1,6 +1,6 @@
-"""Orders and delays: na, nb and nk of linear lags beside the physics, judged by free runs on held-out blocks.
+"""Orders and delays na, nb and nk beside the physics, judged by free runs on held-out blocks.
 
-From the orders up to the largest, lags are taken away as long as what is left is as good; also a
+Starting from the largest orders, lags are removed as long as the rest is as good; also a
 past output together with an input, for pole and zero go in pairs where both are superfluous.
 """
 
@@ -45,7 +45,7 @@ class Orders:
     def smaller(self, least: Orders) -> Iterator[Orders]:
         """Yield one lag less: the oldest output, the oldest or the newest of an input.
 
-        Or an output and an input at once.
+        An output and an input may also go at once.
         """
         shorter = [replace(self, na=self.na - 1)] if self.na > least.na else []
         yield from shorter
@@ -63,7 +63,9 @@ class Orders:
 
 @dataclass(frozen=True, eq=False)
 class Delay:
-    """The delay of an input: by its cross-correlation with the output, both filtered until the input is white.
+    """Delay of an input, by its cross-correlation with the output under whitening.
+
+    Both signals are filtered until the input is white.
 
     `correlation` is None where no lag is significant; `fitted` is the first lag that the choice of
     orders kept, None where it kept none. `square` is that of the cross-correlation of the input's
@@ -113,12 +115,12 @@ def search_orders(
     largest: Orders,
     least: Orders,
     blocks: int,
-    told: OnModel = lambda rung: None,
+    report: OnModel = lambda rung: None,
     runner: Any = Threads(),  # noqa: B008  (it holds nothing)
 ) -> OrderSearch:
     """Judge orders from `largest` down, never below `least`, what the physics reads already.
 
-    Every model has a constant: without one, lags that are not there stand in for the level of the
+    Every model has a constant: without one, further lags would make up for the level of the
     signals.
 
     Raises:
@@ -152,7 +154,7 @@ def search_orders(
                 new, folds.fitted(list(map(chosen, new))), strict=True
             ):
                 found[orders] = PathModel(point, (str(orders),), held, seconds, orders.size)
-                told(found[orders])
+                report(found[orders])
 
         try:
             shorter = []
@@ -182,7 +184,7 @@ def search_orders(
 def _shrink(
     found: dict[Orders, PathModel], judge: Callable[[Iterable[Orders]], None], least: Orders
 ) -> None:
-    """From the best on, as long as one lag less is as good as the best."""
+    """Remove one lag after another from the best orders, as long as the rest is as good."""
     current = min(found, key=lambda orders: found[orders].score)
     while True:
         smaller = list(current.smaller(least))

@@ -1,4 +1,4 @@
-"""Models of chosen terms: fitted one step ahead or on the free run, linearised for all terms, and flown where held out.
+"""Models of chosen terms: fitted on one step or on free runs, and simulated on held-out data.
 
 One compiled program serves every choice (`Menu`). On the free run a term is weighed by what it does
 to the run, not to one step: noise in measured lags does not count as structure, and what pays only
@@ -40,7 +40,8 @@ from orthaug.selection.forward import COLLINEAR, Equations
 
 _PLACES = 32  # for terms in a compiled program; choices that need more take a multiple
 _NARROW = (8, 16)  # places of programs that are worth being compiled besides, from so many rows on:
-_MANY_ROWS = 20_000  # compiling takes 1 s, and a pass over 65,000 rows 0.012 s with 8 places and 0.04 s with 32
+# Compiling takes 1 s, and a pass over 65,000 rows 0.012 s with 8 places and 0.04 s with 32
+_MANY_ROWS = 20_000
 _CHUNK = 4096  # rows
 _SETTLED = 0.1  # of the loss: a step that lowers it by more may change the sensitivities
 _TOLERANCE = 1e-4  # relative change of the loss: models are compared, not published
@@ -48,7 +49,7 @@ _TOLERANCE = 1e-4  # relative change of the loss: models are compared, not publi
 
 @dataclass(frozen=True)
 class Menu(Lagged):
-    """A lagged form, its `features` the factors, with places for `width` terms of up to `order` factors.
+    """A lagged form with the factors as `features`, for `width` terms of up to `order` factors.
 
     `ŷ_k = φ(x_k)θ + Σ_j w_j t_j(x_k)`, the t_j products of few factors whose numbers come with the
     weights. So every choice of `width` terms runs by the same compiled programs. Of `Numbers`,
@@ -64,14 +65,17 @@ class Menu(Lagged):
         return len(self.baseline.names) + self.width
 
     def numbers(self, theta: Any, products: Any, weights: Any, sizes: Any) -> Numbers:
-        """Return the model's numbers, of coefficients (width,) of terms of the factors divided by their `sizes`."""
+        """Return the model's numbers for coefficients (width,) of terms of scaled factors.
+
+        The factors are divided by their `sizes`.
+        """
         pair = (np.asarray(products), np.asarray(weights, dtype=float))
         return Numbers(
             np.asarray(theta), np.zeros(len(theta)), pair, np.zeros(len(sizes)), sizes, np.ones(1)
         )
 
     def terms(self, numbers: Numbers, x: Any) -> Any:
-        """t (width,) at one regressor x (nx,)."""
+        """Return t (width,) at one regressor x (nx,)."""
         factors = self.features.evaluate(x, self.layout, jnp) / numbers.halfwidth
         return products_of(factors, numbers.weights[0], jnp)
 
@@ -107,7 +111,7 @@ Able = Collection[int] | None
 
 
 class Point(NamedTuple):
-    """A fitted model: the terms by number, c and w of terms divided by the sizes of their factors."""
+    """A fitted model: the terms by number, c, and w for terms of factors divided by their sizes."""
 
     chosen: tuple[int, ...]
     c: Vector
@@ -145,7 +149,7 @@ class TermRuns:
         like: TermRuns | None = None,
         collinear: float = COLLINEAR,
     ) -> TermRuns:
-        """Lay a problem out; its segments padded to the shapes of another's."""
+        """Return the runs of a problem, its segments padded to the shapes of another's."""
         factors = Features(tuple(parse(text) for text in library.factors)).sampled(
             problem.record.sampling_time
         )
@@ -183,12 +187,12 @@ class TermRuns:
 
     @property
     def free_run(self) -> Simulation:
-        """Return how the free run is laid out, where held-out blocks are flown too."""
+        """Free-run objective of the training data, with room for held-out blocks."""
         return self.criterion.free_run or Simulation()
 
     @cached_property
     def rms(self) -> float:
-        """Of what least squares leaves one step ahead, in the output's unit."""
+        """RMS of the one-step least-squares residual, in the output's unit."""
         return max(float(np.sqrt(np.mean(self.problem.unexplained**2))), 1e-10) * float(
             self.problem.deviation[0]
         )
@@ -208,18 +212,18 @@ class TermRuns:
             )
 
     def rows(self, experiment: Any) -> tuple[Float[np.ndarray, "T nx"], Float[np.ndarray, "T 1"]]:
-        """Regressors and outputs along an experiment."""
+        """Return regressors and outputs along an experiment."""
         return self.menu.regressors(experiment, self.problem.record), experiment.outputs[
             self.menu.first_row :
         ]
 
     def physics(self, x: Matrix, y: Matrix) -> tuple[Float[np.ndarray, "T nt"], Vector]:
-        """Φ along some of these rows, and what the fixed terms leave of the output."""
+        """Return Φ along some of these rows, and the output less the fixed terms."""
         phi, known = self.problem.baseline.on(x, self.menu.layout, self.menu.outputs)
         return phi[:, 0], (y - known)[:, 0]
 
     def on(self, record: Record) -> TermRuns:
-        """The same on another record."""
+        """Return the same terms on another record."""
         return TermRuns.of(
             self.problem.on(record), self.library, self.criterion, self, self.collinear
         )
@@ -243,7 +247,7 @@ class TermRuns:
         return len(physics.names) + texts.index(CONSTANT) if CONSTANT in texts else None
 
     def start(self) -> Point:
-        """Physics alone, one step ahead."""
+        """Return physics alone, fitted one step ahead."""
         return Point(
             (),
             self.problem.least_squares,
@@ -252,7 +256,7 @@ class TermRuns:
         )
 
     def fit(self, point: Point, chosen: Sequence[int], iterations: int = 30) -> Point:
-        """Physics and the chosen terms, from a point with some of them."""
+        """Return physics and the chosen terms, fitted from a point with some of them."""
         before = dict(zip(point.chosen, point.w, strict=True))
         chosen, w = tuple(chosen), np.array([before.get(i, 0.0) for i in chosen])
         if self.layout is None:
@@ -284,21 +288,17 @@ class TermRuns:
         return objective.samples(objective.evaluate(p, Start(point.states)))[1]
 
     def equations(self, point: Point, able: Able = None, scored: Any = None) -> Equations:
-        """Return the normal equations of physics and all terms about a point, for p itself: its chosen terms are in the error.
+        """Return the normal equations of physics and all terms about a point, for p itself.
 
         Args: able: terms that may be chosen, beside those that are; the columns of others are zero.
-            scored: which steps of the segments count, or chunks of rows one step ahead; None for
-            all.
+            scored: which steps of the segments count, or which range of rows one step ahead; None
+            for all.
         """
         nt, terms = len(point.c), len(self.library)
         taken = range(terms) if able is None else sorted({*able, *point.chosen})
         columns = [*range(nt), *(nt + i for i in taken)]
         if self.layout is None:
-            own = (
-                self.step_equations
-                if scored is None
-                else Equations.sum_of(self.step_blocks[scored])
-            )
+            own = self.step_equations if scored is None else self._step_equations_of(scored)
             return own if able is None else own.of(columns).among(columns, nt + terms)
         objective = _TermSubset.of(self, tuple(taken), exactly=True)
         if scored is not None:
@@ -315,10 +315,10 @@ class TermRuns:
         return own.among(columns, nt + terms)
 
     def parts(self, point: Point, count: int, able: Able = None) -> list[Equations]:
-        """Return the equations about a point over up to `count` parts of the data, one after another."""
+        """Return the equations about a point over up to `count` successive parts of the data."""
         if self.layout is None:
-            chunks = len(self.step_blocks)
-            edges = np.linspace(0, chunks, min(count, chunks) + 1).astype(int)
+            rows = self.step_equations.rows
+            edges = np.linspace(0, rows, min(count, rows) + 1).astype(int)
             return [
                 self.equations(point, able, slice(a, b))
                 for a, b in zip(edges[:-1], edges[1:], strict=True)
@@ -331,13 +331,19 @@ class TermRuns:
         return [self.equations(point, able, scored & (place == part)) for part in range(count)]
 
     @cached_property
-    def step_blocks(self) -> tuple[Equations, ...]:
-        """The normal equations one step ahead of physics and all terms, by chunks of rows, in the output's unit."""
-        found = []
+    def step_equations(self) -> Equations:
+        """The normal equations one step ahead of physics and all terms, in the output's unit."""
+        return self._step_equations_of(slice(None))
+
+    def _step_equations_of(self, part: slice) -> Equations:
+        """The same over a range of rows, counted over the experiments."""
+        found, before = [], 0
         for experiment in self.problem.record.experiments:
             (x, y), factors = self.rows(experiment), self.factors(experiment)
-            for a in range(0, len(x), _CHUNK):
-                rows = slice(a, a + _CHUNK)
+            first, last = ((0 if e is None else e - before) for e in (part.start, part.stop))
+            last = len(x) if part.stop is None else min(max(last, 0), len(x))
+            for a in range(min(max(first, 0), last), last, _CHUNK):
+                rows = slice(a, min(a + _CHUNK, last))
                 phi, target = self.physics(x[rows], y[rows])
                 with np.errstate(all="ignore"):
                     terms = products_of(factors[:, rows], self.library.numbers, np)
@@ -347,14 +353,11 @@ class TermRuns:
                         columns @ columns.T, columns @ target, float(target @ target), len(target)
                     )
                 )
-        return tuple(found)
-
-    @cached_property
-    def step_equations(self) -> Equations:
-        return Equations.sum_of(self.step_blocks)
+            before += len(x)
+        return Equations.sum_of(found)
 
     def errors(self, point: Point, held: Segments) -> float:
-        """Mean of squared errors of free runs over held-out segments from measured starts.
+        """Return the mean squared error of free runs over held-out segments from measured starts.
 
         Infinite if one diverges.
         """
@@ -369,7 +372,7 @@ class TermRuns:
 
 
 def _descended(objective: FreeRunObjective, p: Vector, start: Start, iterations: int) -> TrialPoint:
-    """Minimise the misfit by Gauss-Newton steps, and by Levenberg-Marquardt from where one of them does not descend.
+    """Minimise the misfit by Gauss-Newton steps, with Levenberg-Marquardt where one fails.
 
     About a fitted model the misfit is nearly quadratic. A small step that lowers it by what was
     expected leaves nothing to gain, so no trial is linearised only to confirm that: a linearisation
@@ -403,7 +406,7 @@ def _descended(objective: FreeRunObjective, p: Vector, start: Start, iterations:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _TermSubset(FreeRunObjective):
-    """The free run of some terms, in a program with more places: those that are not taken stay zero."""
+    """Free run of some terms in a program with more places; unused places stay zero."""
 
     taken: int
 

@@ -1,4 +1,4 @@
-"""Shared by the studies of the paper: what an entry of `orthaug reproduce` is, its pipelines, structures and records.
+"""Shared parts of the paper's studies: entries of `orthaug reproduce`, pipelines, records.
 
 An entry has its runs, its figures, and its numbers beside those of the paper and of its scripts.
 """
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from orthaug.studies.references import Spread
 
-# Okabe-Ito, told apart by every reader; each structure keeps its colour and marker in all figures
+# Okabe-Ito, distinct for every reader; each structure keeps its colour and marker in all figures
 COLOURS = {
     "orthogonal": "#0072B2",
     "additive": "#E69F00",
@@ -74,12 +74,15 @@ quicker.
 
 
 class Finding(NamedTuple):
-    """A quantity, each counted once, beside what the paper prints and what its scripts gave when they were run."""
+    """A quantity, with the paper's number and those of its scripts.
+
+    Each is counted once.
+    """
 
     quantity: str
     ours: str
     verdict: str
-    """What the numbers say, in words."""
+    """Meaning of the numbers, in words."""
     published: str = ""
     scripts: str = ""
     as_published: bool | None = None
@@ -89,14 +92,17 @@ class Finding(NamedTuple):
 
     @property
     def beyond(self) -> bool:
-        """Return whether there is nothing to compare with, so that the row is neither met nor missed."""
+        """True if there is nothing to compare with.
+
+        Such a row is neither met nor missed.
+        """
         return self.as_published is None and self.as_scripts is None
 
 
 class Counts(NamedTuple):
-    """Comparisons that are met, and all of them, apart by what ours is compared with.
+    """Numbers of comparisons that are met, and of all.
 
-    Rows beyond the paper.
+    They are counted apart by what ours is compared with; rows beyond the paper apart from both.
     """
 
     published_met: int
@@ -152,9 +158,9 @@ def trained(
 ) -> Estimate:
     """Return one fit of an example by a pipeline; `which` names the paper's iterations.
 
-    Args: pipeline: "ours", Levenberg-Marquardt with `iterations` and `regularization`; "paper",
-        Adam and L-BFGS on
-            normalised data; "scripts", the published scripts' own.
+    Args:
+        pipeline: "ours", Levenberg-Marquardt with `iterations` and `regularization`; "paper", Adam
+            and L-BFGS on normalised data; "scripts", the published scripts' own.
     """
     if pipeline == "scripts":
         return published.train(example, structure, PIPELINES[which], seed)
@@ -193,7 +199,7 @@ def drawn(data_set: int, *, samples: int = 1024, draw: int = 0, noise: bool = Fa
 
 
 def rows_of(table: pd.DataFrame, **values: Any) -> pd.DataFrame:
-    """Return the rows of a table that have these values in the columns of these names, in the table's order."""
+    """Return the rows of a table with these values in these columns, in the table's order."""
     for column, value in values.items():
         table = table.loc[table[column] == value]
     return table
@@ -222,7 +228,7 @@ def panels(
     sharey: bool = False,
     rows: bool = False,
 ) -> tuple[Figure, list[Axes]]:
-    """Axes side by side at column width, or one above the other."""
+    """Return axes side by side at column width, or one above the other."""
     figure = Figure(figsize=(width, height), layout="constrained")
     shape = (count, 1) if rows else (1, count)
     axes = list(np.atleast_1d(figure.subplots(*shape, sharex=sharex, sharey=sharey)))
@@ -234,7 +240,7 @@ def panels(
 
 
 def legend(figure: Figure, axes: Axes | Iterable[Axes], ncols: int = 4) -> None:
-    """One legend for all panels, above them."""
+    """Draw one legend for all panels, above them."""
     unique = {}
     for axis in [axes] if isinstance(axes, Axes) else axes:
         handles, labels = axis.get_legend_handles_labels()
@@ -251,7 +257,7 @@ def legend(figure: Figure, axes: Axes | Iterable[Axes], ncols: int = 4) -> None:
 
 
 def against_samples(axis: Axes, title: str) -> None:
-    """Both axes logarithmic, over N."""
+    """Make both axes logarithmic, over N."""
     axis.set_xscale("log")
     axis.set_yscale("log")
     axis.set_xlabel("samples N")
@@ -259,14 +265,17 @@ def against_samples(axis: Axes, title: str) -> None:
 
 
 def extremes(rows: pd.DataFrame, by: str, column: str) -> pd.DataFrame:
-    """Per value of `by` the median, the smallest and the largest of a column."""
+    """Return median, smallest and largest value of a column, per value of `by`."""
     return rows.groupby(by)[column].agg(["median", "min", "max"]).reset_index()
 
 
 def whiskers(
     axis: Axes, x: Any, of: pd.DataFrame, name: str, *, label: str = "", **style: Any
 ) -> None:
-    """Medians with bars from the smallest to the largest value, which a logarithmic axis shows whole."""
+    """Draw medians with bars from the smallest to the largest value.
+
+    A logarithmic axis shows such bars whole.
+    """
     reach = np.stack([of["median"] - of["min"], of["max"] - of["median"]])
     style = {
         "color": COLOURS[name],
@@ -279,7 +288,10 @@ def whiskers(
 
 
 def scripts_bars(axis: Axes, x: Any, spreads: Sequence[Spread], name: str, **style: Any) -> None:
-    """What the scripts gave: a cross at each mean with a bar from the smallest to the largest run."""
+    """Draw the results of the scripts: a cross at each mean, a bar over all runs.
+
+    The bar goes from the smallest to the largest run.
+    """
     low, mean, high = (
         np.array([getattr(spread, part) for spread in spreads]) for part in ("low", "mean", "high")
     )
@@ -302,13 +314,16 @@ def signed(exponent: float) -> str:
 
 
 def agreement(values: Any) -> str:
-    """Return how far rows of values, one per start, lie apart."""
+    """Return a text on the largest difference between starts, one row of values each."""
     apart = float(np.ptp(np.asarray(values, dtype=float), axis=0).max())
     return f"starts agree within {apart:.1g}" if apart else "the same number for every start"
 
 
 def span(values: Any) -> str:
-    """`mean (smallest … largest)` in three digits, one number where they agree in all of them."""
+    """Return `mean (smallest … largest)` in three digits.
+
+    It is one number where they agree in all of them.
+    """
     values = np.asarray(values, dtype=float)
     if np.ptp(values) <= 1e-6 * abs(values.mean()):
         return f"{values.mean():.5g}"

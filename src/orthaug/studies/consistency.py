@@ -1,7 +1,4 @@
-"""Sect.
-
-5.1, panel (c) of the last static figure: error of θ against the number of samples, 30 dB of noise.
-"""
+"""Sect. 5.1, last static figure, panel (c): error of θ over the samples, 30 dB of noise."""
 
 from __future__ import annotations
 
@@ -40,7 +37,7 @@ if TYPE_CHECKING:
 
 
 def one(data_set: int, samples: int, curve: str, run: int, pipeline: str) -> dict[str, Any]:
-    """θ's error and, under the uniform measure, its price in standard error.
+    """Return θ's error and, under the uniform measure, its price in standard error.
 
     Each run has its record and start.
     """
@@ -49,7 +46,8 @@ def one(data_set: int, samples: int, curve: str, run: int, pipeline: str) -> dic
     if curve == "orthogonal":
         fit = estimate(example.train, example.baseline, learner=None)
     else:
-        # evidence for the uniform measure, which looks at the learner; the additive structure as published
+        # evidence for the uniform measure, which looks at the learner;
+        # the additive structure as published
         prior = "evidence" if curve == "uniform" and pipeline == "ours" else "none"
         structure = STRUCTURES["additive" if curve == "additive" else "orthogonal"]
         options = {
@@ -75,7 +73,7 @@ def _runs(data_set: int, samples: int, curve: str, run: int, pipeline: str) -> b
 
 
 def study(pipeline: str, small: bool) -> Study:
-    """Lengths × data sets × curves × runs; run 0 is the paper's own record."""
+    """Return lengths × data sets × curves × runs; run 0 is the paper's own record."""
     grid = {
         "data_set": (1, 3),
         "samples": (1024, 256) if small else SIZES,
@@ -87,7 +85,7 @@ def study(pipeline: str, small: bool) -> Study:
 
 
 def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
-    """Figure "theta_error": sets 1 and 3, all curves."""
+    """Draw "theta_error": sets 1 and 3, all curves."""
     figure, axes = panels(2, sharey=True, height=3.4)
     for axis, data_set in zip(axes, (1, 3), strict=True):
         for i, curve in enumerate(("additive", "orthogonal", "uniform")):
@@ -112,17 +110,17 @@ def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
         "theta_error": Drawing(
             figure,
             "Error of θ against the number of samples under 30 dB of noise, data set 1 (left) "
-            "and 3 (right), for the additive structure and for the orthogonal one under two "
-            "measures.",
+            "and 3 (right).",
+            "The curves are the additive structure and the orthogonal one under two measures. "
             "Marks are medians over runs, bars go from the smallest to the largest of them; "
-            "the curves are shifted sideways by a few per cent, so that the bars can be told "
-            "apart.",
+            "the curves are shifted sideways by a few per cent, so that the bars do not "
+            "overlap.",
         )
     }
 
 
 def findings(table: pd.DataFrame) -> list[Finding]:
-    """Consistent or not, and the uniform measure's price.
+    """Return whether θ is consistent, and the uniform measure's price.
 
     The paper's record of 1024 is in `static_noise`.
     """

@@ -1,4 +1,7 @@
-"""Beyond the paper: do 95 % intervals of θ hold the truth in 95 % of repetitions? Three kinds of interval, 30 dB."""
+"""Beyond the paper: do 95 % intervals of θ hold the truth in 95 % of repetitions?
+
+Three kinds of interval are compared under 30 dB of noise.
+"""
 
 from __future__ import annotations
 
@@ -56,7 +59,10 @@ def _noiseless(data_set: int) -> Estimate:
 
 
 def one(data_set: int, draw: int) -> dict[str, Any]:
-    """Return one draw of the noise, trained on from the noiseless fit: does each interval hold the true θ?"""
+    """Return whether each interval holds the true θ, for one draw of the noise.
+
+    Training goes on from the noiseless fit.
+    """
     example, start = static(data_set), _noiseless(data_set)
     inputs, clean = example.train.experiments[0].inputs, example.train.experiments[0].outputs
     assert clean is not None
@@ -97,7 +103,7 @@ def _shares(table: pd.DataFrame, data_set: int, kind: str) -> np.ndarray:
 
 
 def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
-    """Figure "coverage": share of draws whose interval holds the truth, and widths of the intervals."""
+    """Draw "coverage": share of draws whose interval holds the truth, and interval widths."""
     figure, axes = panels(2, height=3.4)
     low, high = (100 * limit for limit in _band(table))
     for k, (kind, label) in enumerate(KINDS.items()):
@@ -127,9 +133,9 @@ def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
         "coverage": Drawing(
             figure,
             f"Share of {_draws(table)} draws of the noise in which a 95 % interval of θ holds "
-            "the true value (left), and the mean width of these intervals (right), for three "
-            "kinds of interval on data sets 1 and 3.",
-            "The grey band is 95 % plus and minus four binomial standard deviations.",
+            "the true value (left), and the mean width of these intervals (right).",
+            "There are three kinds of interval, on data sets 1 and 3. The grey band is 95 % "
+            "plus and minus four binomial standard deviations.",
         )
     }
 
@@ -139,7 +145,10 @@ def _draws(table: pd.DataFrame) -> int:
 
 
 def _band(table: pd.DataFrame) -> tuple[float, float]:
-    """Where the share of an exact 95 % interval lies: four binomial standard deviations about 0.95."""
+    """Return the limits of the share of an exact 95 % interval.
+
+    They are four binomial standard deviations about 0.95.
+    """
     reach = 4 * float(np.sqrt(0.95 * 0.05 / _draws(table)))
     return 0.95 - reach, min(0.95 + reach, 1.0)
 
@@ -149,7 +158,7 @@ def _widths(table: pd.DataFrame, data_set: int, kind: str) -> np.ndarray:
 
 
 def findings(table: pd.DataFrame) -> list[Finding]:
-    """Coverage of each kind, with the band that the number of draws allows."""
+    """Return the coverage of each kind, with the band that the number of draws allows."""
     low, high = _band(table)
     compared = []
     for data_set in (1, 3):

@@ -1,7 +1,4 @@
-"""Sect.
-
-5.1, panel (b) of the last static figure: error of θ against the number of samples, without noise.
-"""
+"""Sect. 5.1, last static figure, panel (b): error of θ over the samples, without noise."""
 
 from __future__ import annotations
 
@@ -41,7 +38,10 @@ TRAINED_DRAWS = 3  # the uniform measure needs the learner; θ under the trainin
 
 
 def one(data_set: int, samples: int, measure: str, draw: int, pipeline: str) -> dict[str, Any]:
-    """θ's error on one record: Φ⁺Y for the training measure, the split of a trained model for the uniform one."""
+    """Return θ's error on one record.
+
+    θ is Φ⁺Y for the training measure, the split of a trained model for the uniform one.
+    """
     example = drawn(data_set, samples=samples, draw=draw)
     if measure == "training":
         fit = estimate(example.train, example.baseline, learner=None)
@@ -55,7 +55,10 @@ def _runs(data_set: int, samples: int, measure: str, draw: int, pipeline: str) -
 
 
 def study(pipeline: str, small: bool) -> Study:
-    """Lengths × data sets × measures × draws of the record, the paper's own draw first."""
+    """Return lengths × data sets × measures × draws of the record.
+
+    The paper's own draw comes first.
+    """
     grid = {
         "data_set": (2, 3),
         "samples": (1024, 256) if small else SIZES,
@@ -67,7 +70,7 @@ def study(pipeline: str, small: bool) -> Study:
 
 
 def limit(data_set: int) -> float:
-    """‖E[φφᵀ]⁻¹ E[φδ]‖ of the inputs' distribution: what ‖θ* − θ̂‖ tends to as N → ∞."""
+    """Return ‖E[φφᵀ]⁻¹ E[φδ]‖ of the inputs' distribution, the limit of ‖θ* − θ̂‖ for N → ∞."""
     mean, deviation = (0.0 if data_set == 2 else -0.01), 0.3
     node, weight = np.polynomial.hermite_e.hermegauss(20)
     u = mean + deviation * node
@@ -77,7 +80,7 @@ def limit(data_set: int) -> float:
 
 
 def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
-    """Figure "theta_error": a panel per data set, both measures."""
+    """Draw "theta_error": a panel per data set, both measures."""
     figure, axes = panels(2, sharey=True, height=3.3)
     for axis, data_set in zip(axes, (2, 3), strict=True):
         for measure, name in (("training", "orthogonal"), ("uniform", "uniform")):
@@ -112,7 +115,7 @@ def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
 
 
 def findings(table: pd.DataFrame) -> list[Finding]:
-    """Return the two trends, and what the uniform measure makes of them.
+    """Return the two trends, and the effect of the uniform measure on them.
 
     The paper's own record is in `static_errors`.
     """

@@ -1,13 +1,15 @@
-"""The published scripts' own pipeline: nothing is normalised, and θ is iterated from θ⁰ together with the weights.
+"""The published scripts' own pipeline: no normalisation, θ iterated from θ⁰ with the weights.
 
 Adam and SciPy's L-BFGS-B run as jax-sysid 1.0.1 runs them: Adam with β₂ = 0.99 whose best iterate
 is kept, then L-BFGS-B with at most as many evaluations as iterations. Initial weights are NumPy's,
-seed for seed. In the orthogonal structure θ_aux = Φ⁺F stands inside the criterion; here it is
+seed for seed. In the orthogonal structure θ_aux = Φ⁺F is inside the criterion; here it is
 formed by the QR factors instead of `pinv(ΦᵀΦ)`.
 
 On the mass-spring-damper this follows the scripts' runs start by start. On the static example it
 trains farther than they do, to a fifth of their test error without noise, so there the same start
-ends at another θ of the additive structure.
+ends at another θ of the additive structure. jax-sysid 1.0.1 itself, with the iterations, the
+criterion and the initial weights that are on record, ends where this does: a setting of those
+scripts is not on record. benchmarks/README.md has what was tried.
 """
 
 from __future__ import annotations
@@ -41,7 +43,7 @@ LBFGS = {"maxls": 20, "maxcor": 10, "ftol": 1e-16, "gtol": 1e-16}
 
 
 class Data(NamedTuple):
-    """The rows as measured, an orthonormal basis of the physics' columns, and the structure's penalty rows."""
+    """The rows as measured, an orthonormal basis of the physics, and the penalty rows."""
 
     z: Float[Array, "N nz"]
     phi: Float[Array, "N nt"]
@@ -53,7 +55,7 @@ class Data(NamedTuple):
 
     @classmethod
     def of(cls, problem: Problem, structure: Structure) -> Data:
-        """Of a problem with one output."""
+        """Return the data of a problem with one output."""
         baseline = problem.baseline
         q = np.asarray(problem.projection.q).reshape(len(problem.rows), -1)
         phi = q @ problem.projection.to_coordinates / problem.weight.matrix[0, 0]
@@ -71,7 +73,9 @@ class Data(NamedTuple):
 
 
 def initial_weights(seed: int, nz: int) -> Vector:
-    """Xavier's uniform weights of 16 tanh neurons from NumPy's `RandomState`: hidden ones first.
+    """Return Xavier's uniform weights of 16 tanh neurons from NumPy's `RandomState`.
+
+    Hidden weights come first.
 
     Biases are zero.
     """
@@ -86,9 +90,9 @@ def initial_weights(seed: int, nz: int) -> Vector:
 
 
 def loss(unknowns: Float[Array, "n"], data: Data, bound: Bound, projects: bool) -> Float[Array, ""]:
-    """`‖Y − Φ(θ − θ_aux) − F‖²` plus the penalty rows, a sum of squares.
+    """Return `‖Y − Φ(θ − θ_aux) − F‖²` plus the penalty rows, a sum of squares.
 
-    Θ_aux = 0 unless the structure projects.
+    θ_aux = 0 unless the structure projects.
     """
     theta, w = jnp.split(unknowns, [data.phi.shape[1]])
     f = jax.vmap(bound.values, in_axes=(None, 0))(w, data.z)[:, 0]
@@ -159,7 +163,7 @@ def train(
 def _run(
     task: OneStepTask, w: Any, iterations: int, converged: bool, seconds: float
 ) -> TrainingRun:
-    """Return what the statistics need of a run that ended at `w`."""
+    """Return the statistics' input from a run that ended at `w`."""
     assert task.bound is not None
     nt = len(task.problem.baseline.names)
     hold = Hold(jnp.zeros((nt, nt)), jnp.zeros(nt))

@@ -1,4 +1,4 @@
-"""What the authors' published scripts gave when they were run: per configuration mean, smallest and largest value.
+"""Results of the authors' published scripts: mean, smallest and largest per configuration.
 
 `python tests/test_references.py FOLDER` makes `references.json` from the single runs, and says how
 they were measured.
@@ -33,14 +33,14 @@ class Spread(NamedTuple):
     def __str__(self) -> str:
         digits = (
             3 if self.high - self.low > 0.01 * self.mean else 6
-        )  # as many as tell the ends apart
+        )  # as many as make low and high differ
         return f"{self.mean:.{digits}g} ({self.low:.{digits}g} … {self.high:.{digits}g})"
 
     def scaled(self, factor: float) -> Spread:
         return Spread(factor * self.mean, factor * self.low, factor * self.high, self.runs)
 
     def beside(self, values: Any, *, smaller_is_better: bool = False) -> tuple[bool, str]:
-        """Return whether the mean of our runs lies between the smallest and the largest of theirs, and that in words.
+        """Return whether the mean of our runs is within the range of theirs, and a text on it.
 
         Three digits count, as they are shown.
 
@@ -76,14 +76,14 @@ def _tables() -> dict[str, dict[tuple[Any, ...], Mapping[str, Any]]]:
 
 
 def static(data_set: int, structure: str, quantity: str, *, noise: bool = False) -> Spread:
-    """`test_rmse`, `test_sse`, `theta_error` or `seconds` of Sect. 5.1."""
+    """Return `test_rmse`, `test_sse`, `theta_error` or `seconds` of Sect. 5.1."""
     return _spread(_tables()["static"][data_set, noise, structure], quantity)
 
 
 def mass_spring_damper(structure: str, weight: float, quantity: str) -> Spread | None:
-    """`test_rmse` [m], `theta_error` (relative) or `seconds` of Sect.
+    """Return `test_rmse` [m], `theta_error` (relative) or `seconds` of Sect. 5.2.
 
-    5.2; None for a weight that was not run.
+    None for a weight that was not run.
     """
     row = _tables()["mass_spring_damper"].get((structure, weight))
     return None if row is None else _spread(row, quantity)

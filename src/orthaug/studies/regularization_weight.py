@@ -1,7 +1,6 @@
-"""Sect.
+"""Sect. 5.2: errors of θ and of the test output over the regularization weight.
 
-5.2: error of θ and of the test output against the regularization weight, mass-spring-damper, five
-starts.
+The example is the mass-spring-damper, with five starts.
 """
 
 from __future__ import annotations
@@ -74,7 +73,7 @@ def one(structure: str, weight: float, seed: int, pipeline: str) -> dict[str, An
 
 @cache
 def _limits() -> tuple[float, float]:
-    """Relative errors of Φ⁺Y and of the initial θ⁰."""
+    """Return the relative errors of Φ⁺Y and of the initial θ⁰."""
     example = mass_spring_damper()
     problem = pose(example.train, example.baseline)
     values = (problem.least_squares, example.baseline.initial)
@@ -83,7 +82,10 @@ def _limits() -> tuple[float, float]:
 
 
 def _runs(structure: str, weight: float, seed: int, pipeline: str) -> bool:
-    """Once for the orthogonal structure and, as the limit of both penalties, once for weight 0."""
+    """Return whether a case is run.
+
+    It is once for the orthogonal structure and, as the limit of both penalties, once for weight 0.
+    """
     return (
         weight > 0
         if structure == "baseline-penalty"
@@ -92,7 +94,7 @@ def _runs(structure: str, weight: float, seed: int, pipeline: str) -> bool:
 
 
 def study(pipeline: str, small: bool) -> Study:
-    """Structures × weights × starts; weight 0 is the additive structure."""
+    """Return structures × weights × starts; weight 0 is the additive structure."""
     grid = {
         "structure": ("orthogonal-penalty", "baseline-penalty", "orthogonal"),
         "weight": (0.0, 1e2) if small else (0.0, *WEIGHTS),
@@ -111,7 +113,10 @@ def _of(table: pd.DataFrame, structure: str, weight: float | None = None) -> pd.
 
 
 def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
-    """Figure "weights": θ, one-step and free-run errors over the weight, the orthogonal structure as bands."""
+    """Draw "weights": θ, one-step and free-run errors over the weight.
+
+    The orthogonal structure is drawn as bands.
+    """
     figure, axes = panels(3, rows=True, sharex=True, height=8.4)
     for axis, (quantity, label) in zip(axes, QUANTITIES.items(), strict=True):
         _panel(axis, table, quantity)
@@ -130,8 +135,8 @@ def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
             "Marks are medians over initial weights; bars and the band go from the smallest to "
             "the largest. A cross with a bar is the mean of the scripts, from their smallest "
             "to their largest run; of the free run there is none. The axes of errors are "
-            "logarithmic but for the last. Curves are shifted sideways, so that the bars can "
-            "be told apart.",
+            "logarithmic but for the last. Curves are shifted sideways, so that the bars do "
+            "not overlap.",
         )
     }
 
@@ -171,7 +176,7 @@ def _panel(axis: Axes, table: pd.DataFrame, quantity: str) -> None:
 
 
 def _scripts(structure: str, weight: float, quantity: str) -> references.Spread | None:
-    """Return what the scripts gave, in the units of our columns; they have no free run."""
+    """Return the scripts' results, in the units of our columns; they have no free run."""
     if quantity == "theta_error":
         return references.mass_spring_damper(structure, weight, "theta_error")
     rmse = (
@@ -183,7 +188,7 @@ def _scripts(structure: str, weight: float, quantity: str) -> references.Spread 
 
 
 def findings(table: pd.DataFrame) -> list[Finding]:
-    """Return the paper's trends, and both errors beside the scripts' at every weight that they ran."""
+    """Return the paper's trends, and both errors with the scripts' at every weight they ran."""
     own = _of(table, "orthogonal")
     compared = []
     for quantity, label in (
@@ -220,7 +225,7 @@ def _converged(table: pd.DataFrame) -> Finding:
 
 
 def _ends(table: pd.DataFrame) -> list[Finding]:
-    """Where θ tends to at the largest weight."""
+    """Return findings on the limit of θ at the largest weight."""
     compared = []
     limits = zip(
         PENALTIES, _limits(), ("the orthogonal structure's θ", "the initial θ⁰"), strict=True
@@ -235,7 +240,10 @@ def _ends(table: pd.DataFrame) -> list[Finding]:
 
 
 def _prices(table: pd.DataFrame) -> list[Finding]:
-    """Return what a penalty costs in test RMSE, which is "slightly reduced" accuracy in the paper."""
+    """Return the cost of a penalty in test RMSE.
+
+    It is "slightly reduced" accuracy in the paper.
+    """
     own = float(_of(table, "orthogonal").one_step.mean())
     means = {
         structure: _of(table, structure).groupby("weight").one_step.mean()

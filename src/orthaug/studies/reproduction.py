@@ -1,4 +1,4 @@
-"""`orthaug reproduce`: the paper's studies run, drawn, put beside the published numbers, and gathered on one page."""
+"""`orthaug reproduce`: run and draw the paper's studies, and compare them on one page."""
 
 from __future__ import annotations
 
@@ -51,13 +51,19 @@ StudiesProgress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True, eq=False)
 class StudyOutcome:
-    """One study with its table, figures and findings."""
+    """One study with its table, figures and findings.
+
+    Args:
+        whole: how many runs the study has at its full size.
+        small: whether it was run at the reduced size.
+    """
 
     entry: Reproduction
     runs: list[Run]
     table: pd.DataFrame
     figures: dict[str, Drawing]
     findings: list[Finding]
+    whole: int
     small: bool = False
 
 
@@ -103,9 +109,9 @@ def reproduce(
 ) -> list[StudyOutcome]:
     """Run the studies; what a store holds already is not run again.
 
-    Args: pipeline: "ours", "paper" for Adam and L-BFGS with the published iterations on normalised
-        data, or "scripts"
-            for what the published scripts do, un-normalised and from θ⁰.
+    Args:
+        pipeline: "ours", "paper" for Adam and L-BFGS with the published iterations on normalised
+            data, or "scripts" for what the published scripts do, un-normalised and from θ⁰.
         small: at the reduced size of the tests.
         store: where results are kept as they are made; None for the user's cache folder.
         client: a `distributed.Client` whose workers make the runs.
@@ -114,18 +120,16 @@ def reproduce(
     store = Path(platformdirs.user_cache_dir("orthaug")) / "studies" if store is None else store
     reproduced = []
     for entry in entries:
-        tell = (
+        report = (
             None
             if progress is None
             else lambda done, total, e=entry: progress(e.title, done, total)
         )
-        done = runs(entry.study(pipeline, small), store=store, progress=tell, client=client)
+        done = runs(entry.study(pipeline, small), store=store, progress=report, client=client)
         table = as_table(done)
-        reproduced.append(
-            StudyOutcome(
-                entry, done, table, dict(entry.figures(table)), entry.findings(table), small
-            )
-        )
+        whole = len(entry.study(pipeline, False).cases())
+        shown = dict(entry.figures(table)), entry.findings(table)
+        reproduced.append(StudyOutcome(entry, done, table, *shown, whole, small))
     return reproduced
 
 
@@ -137,9 +141,9 @@ def check_output(folder: Path, *, force: bool = False) -> None:
 def write(
     reproduced: Sequence[StudyOutcome], folder: Path, pipeline: str, *, force: bool = False
 ) -> None:
-    """index.html, and for each study its figures as PNG and its runs as CSV.
+    """Write index.html, and for each study its figures as PNG and its runs as CSV.
 
-    Whole or not at all.
+    The folder is written whole or not at all.
     """
     with whole_folder(folder, force=force) as partial:
         for study in reproduced:
@@ -152,6 +156,7 @@ def write(
             "orthaug": __version__,
             "pipeline": pipeline,
             "counts": _counts(reproduced)._asdict(),
+            "size": _size(reproduced),
             "findings": as_rows(reproduced),
             "runs": {study.entry.name: when(study.runs) for study in reproduced},
         }
@@ -174,8 +179,32 @@ def _counts(reproduced: Sequence[StudyOutcome]) -> Counts:
     return Counts.of(finding for study in reproduced for finding in study.findings)
 
 
+def reduced(reproduced: Sequence[StudyOutcome]) -> str:
+    """Return what the reduced size means for the comparisons; empty at full size."""
+    some = [study for study in reproduced if study.small]
+    if not some:
+        return ""
+    made, whole = sum(len(study.runs) for study in some), sum(study.whole for study in some)
+    return (
+        f"small: {made} of {whole} runs. At this size differences from the paper and its "
+        "scripts are expected; without --small it is seen which of them stay."
+    )
+
+
+def _size(reproduced: Sequence[StudyOutcome]) -> dict[str, Any]:
+    """Return the reduced size in words, null at full size, and each study's runs of all."""
+    studies = {
+        study.entry.name: {"runs": len(study.runs), "of": study.whole} for study in reproduced
+    }
+    return {
+        "small": any(study.small for study in reproduced),
+        "text": reduced(reproduced) or None,
+        "studies": studies,
+    }
+
+
 def when(done: Sequence[Run]) -> str:
-    """Return how many runs were made now and how many came from a store, when those were made, and their seconds."""
+    """Return how many runs were made now or read from a store, when, and their seconds."""
     parts = []
     for stored in (False, True):
         some = [run for run in done if run.stored is stored]
@@ -214,12 +243,17 @@ def text(reproduced: Sequence[StudyOutcome]) -> str:
         ):
             table.add_column(name, ratio=ratio, overflow="fold")
         for row in study.findings:
-            marked = (
-                _marked(row.published, row.as_published),
-                _marked(row.scripts, row.as_scripts),
-            )
+            references = ((row.published, row.as_published), (row.scripts, row.as_scripts))
+            marked = (_marked(*pair, study.small) for pair in references)
             table.add_row(row.quantity, *marked, row.ours, row.verdict)
         console.print(table, markup=False, highlight=False)
+        if study.small:
+            console.print(
+                f"small: {len(study.runs)} of {study.whole} runs\n", markup=False, highlight=False
+            )
+    note = reduced(reproduced)
+    if note:
+        console.print(note, markup=False, highlight=False)
     counts = _counts(reproduced)
     console.print(
         f"met against the printed paper: {counts.published_met} of {counts.published}\n"
@@ -231,10 +265,10 @@ def text(reproduced: Sequence[StudyOutcome]) -> str:
     return "\n".join(line.rstrip() for line in buffer.getvalue().splitlines())
 
 
-def _marked(reference: str, met: bool | None) -> str:
+def _marked(reference: str, met: bool | None, small: bool) -> str:
     if met is None:
         return reference or "–"
-    return f"{reference} ({'met' if met else 'differs'})"
+    return f"{reference} ({'met' if met else 'differs at small size' if small else 'differs'})"
 
 
 def _page(reproduced: Sequence[StudyOutcome], pipeline: str) -> str:
@@ -252,6 +286,8 @@ def _page(reproduced: Sequence[StudyOutcome], pipeline: str) -> str:
             "figures": [(drawing, _inline(drawing.figure)) for drawing in study.figures.values()],
             "counts": Counts.of(study.findings),
             "when": when(study.runs),
+            "small": study.small,
+            "size": f"{len(study.runs)} of {study.whole} runs",
         }
         for study in reproduced
     ]
@@ -260,7 +296,7 @@ def _page(reproduced: Sequence[StudyOutcome], pipeline: str) -> str:
         theory=THEORY,
         trained=PIPELINES[pipeline],
         version=__version__,
-        small=any(study.small for study in reproduced),
+        reduced=reduced(reproduced),
         counts=_counts(reproduced),
     )
 

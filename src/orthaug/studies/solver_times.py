@@ -43,7 +43,10 @@ NOISY = 1.25  # the slowest over the fastest start, per iteration, from which a 
 
 
 def declared(name: str, example: str, share: float) -> Any:
-    """Return a solver with a share of its iterations: the paper's numbers for gradient solvers, 300 for ours."""
+    """Return a solver with a share of its iterations.
+
+    Gradient solvers have the paper's numbers, ours 300.
+    """
     adam, lbfgs = PIPELINES[example]
     total = adam + lbfgs
     if name == "levenberg-marquardt":
@@ -67,7 +70,7 @@ def one(example: str, solver: str, share: float, seed: int) -> dict[str, Any]:
 
 
 def study(pipeline: str, small: bool) -> Study:
-    """Examples × solvers × shares of the iterations × starts, one after the other.
+    """Return examples × solvers × shares of the iterations × starts, one after the other.
 
     The same under every pipeline.
     """
@@ -81,7 +84,7 @@ def study(pipeline: str, small: bool) -> Study:
 
 
 def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
-    """Figure "loss": training error over seconds."""
+    """Draw "loss": training error over seconds."""
     examples = table.example.unique()
     figure, axes = panels(len(examples), height=3.6)
     for axis, example in zip(axes, examples, strict=True):
@@ -168,10 +171,10 @@ def findings(table: pd.DataFrame) -> list[Finding]:
 REPRODUCTION = Reproduction(
     "solver_times",
     "Time and loss of the solvers",
-    "The same normalised problem and initial weights for every solver, the orthogonal "
-    "structure, stopped at 3, 10, 30 and 100 % of its iterations: the paper's numbers for "
-    "gradient solvers, 300 for Levenberg-Marquardt. Times are of this machine when the run was "
-    "made, one run at a time, compiled before.",
+    "Every solver has the same normalised problem, the same initial weights and the orthogonal "
+    "structure. It is stopped at 3, 10, 30 and 100 % of its iterations. Gradient solvers have "
+    "the paper's number of iterations, Levenberg-Marquardt 300. Times are of this machine when "
+    "the run was made, one run at a time, compiled before.",
     study,
     figures,
     findings,

@@ -1,6 +1,6 @@
-"""Sect.
+"""Sect. 5.1 without noise: errors of θ and of the test output.
 
-5.1 without noise: errors of θ and of the test output, both structures, three data sets, ten starts.
+Both structures are compared on three data sets, with ten starts.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ GRID = np.linspace(-1.0, 1.0, 81)  # inputs at which the learner is drawn
 def one(data_set: int, structure: str, seed: int, pipeline: str) -> dict[str, Any]:
     """Return one start: θ, its error, the test RMSE.
 
-    Θ under the uniform measure; the learner on a grid of inputs.
+    θ under the uniform measure and the learner on a grid of inputs are added.
     """
     example = static(data_set)
     fit = trained(example, "static", pipeline, structure=STRUCTURES[structure], seed=seed)
@@ -83,13 +83,13 @@ def study(pipeline: str, small: bool) -> Study:
 
 
 def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
-    """Figures "sigma0_errors", the estimated θ and the learner's outputs."""
+    """Draw "sigma0_errors", the estimated θ and the learner's outputs."""
     starts = table.seed.nunique()
     return {
         "sigma0_errors": Drawing(
             _errors(table),
             f"Test error (left) and error of θ (right) of {starts} initial weights on each "
-            "data set, additive and orthogonal structure beside what the scripts gave.",
+            "data set, for both structures, with the results of the scripts.",
             "Filled marks are single starts; a cross with a bar is the mean of the scripts, "
             "from their smallest to their largest run. The scripts train the additive "
             "structure from θ⁰, never with θ eliminated. Errors of θ below 10⁻⁹ are rounding, "
@@ -100,7 +100,7 @@ def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
             f"The estimated θ of {starts} initial weights on each data set, with the true θ "
             "where the dashed lines cross, and θ⁰ as a small cross.",
             "All panels have the same scale, which is finer for θ₃ than for θ₁. The starts of "
-            "the orthogonal structure lie on each other.",
+            "the orthogonal structure coincide.",
         ),
         "learner": Drawing(
             _learner(table),
@@ -126,14 +126,14 @@ def _both(table: pd.DataFrame) -> bool:
 
 
 def _label(structure: str, table: pd.DataFrame) -> str:
-    """Which additive structure it is, where there are both."""
+    """Return the label of a structure; the additive one is qualified where there are both."""
     return (
         "additive, θ eliminated" if structure == "additive" and _both(table) else LABELS[structure]
     )
 
 
 def _of_scripts(structure: str, table: pd.DataFrame) -> str | None:
-    """Return what the scripts call it.
+    """Return the scripts' name of a structure.
 
     Their additive structure is the one from θ⁰; with θ eliminated they have none.
     """
@@ -250,7 +250,7 @@ def _learner(table: pd.DataFrame) -> Figure:
 
 
 def findings(table: pd.DataFrame) -> list[Finding]:
-    """Return both errors of every data set and structure beside the scripts', and what the paper says about them."""
+    """Return both errors of every data set and structure, with those of scripts and paper."""
     compared = []
     for data_set in (1, 2, 3):
         for structure in reversed(_shown(table)):

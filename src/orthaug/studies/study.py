@@ -40,12 +40,16 @@ CasesProgress = Callable[[int, int], None]
 class Study:
     """A function and the grid that it runs over.
 
-    Args: name: of its folder in a store. one: takes one value of each axis as keyword arguments,
-        gives a mapping of plain values: numbers, texts, lists. grid: axes by name, each with its
-        values; all combinations run, the last axis fastest. Slow cases go first. version: raise it
-        when `one` computes something else, so that stored results no longer count. where: of all
-        combinations, those that run; takes what `one` takes. None for all. workers: cases at a
-        time; 1 for a study that measures time, None for the machine's cores.
+    Args:
+        name: of its folder in a store.
+        one: takes one value of each axis as keyword arguments, gives a mapping of plain values:
+            numbers, texts, lists.
+        grid: axes by name, each with its values; all combinations run, the last axis fastest. Slow
+            cases go first.
+        version: raise it when `one` computes something else, so that stored results no longer
+            count.
+        where: of all combinations, those that run; takes what `one` takes. None for all.
+        workers: cases at a time; 1 for a study that measures time, None for the machine's cores.
     """
 
     name: str
@@ -64,7 +68,10 @@ class Study:
         return [case for case in combinations if self.where is None or self.where(**case)]
 
     def key(self, case: Case) -> str:
-        """Return the key of a stored result: a hash of study, version, arguments, function and this package's code."""
+        """Return the key of a stored result.
+
+        It is a hash of study, version, arguments, function and this package's code.
+        """
         declared = {
             "study": self.name,
             "version": self.version,
@@ -118,9 +125,11 @@ def run(
 ) -> pd.DataFrame:
     """Run what the store does not hold yet, several cases at a time; a row per case, axes first.
 
-    Args: store: a folder that keeps each result as it is made; None to keep nothing. workers: cases
-        at a time; by default the study's own number, or the machine's cores. client: a
-        `distributed.Client`; its workers make the cases of a study that does not measure time.
+    Args:
+        store: a folder that keeps each result as it is made; None to keep nothing.
+        workers: cases at a time; by default the study's own number, or the machine's cores.
+        client: a `distributed.Client`; its workers make the cases of a study that does not measure
+            time.
 
     Raises:
         InputError: a result that is not plain values; a store that cannot be written.
@@ -129,7 +138,10 @@ def run(
 
 
 def as_table(done: Sequence[Run]) -> pd.DataFrame:
-    """Return a row per run, axes first. It does not tell stored results from those made now."""
+    """Return a row per run, axes first.
+
+    Stored results and those made now are not distinguished.
+    """
     import pandas as pd
 
     return pd.DataFrame([{**run.case, **run.result} for run in done])
@@ -143,7 +155,7 @@ def runs(
     progress: CasesProgress | None = None,
     client: Any = None,
 ) -> list[Run]:
-    """`run`, with the time of every result instead of a table."""
+    """Return the runs as `run` makes them, with the time of every result instead of a table."""
     cases = study.cases()
     found = [_read(store, study, case) for case in cases]
     todo = [i for i, run in enumerate(found) if run is None]
@@ -214,7 +226,7 @@ def _write(store: Path | None, study: Study, run: Run) -> None:
     path = _path(store, study, run.case)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with whole_file(path, force=True) as partial:
+        with whole_file(path, force=True, result=False) as partial:
             partial.write_text(json.dumps(content, allow_nan=False), encoding="utf-8")
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror}).") from None

@@ -28,7 +28,7 @@ class Example:
 
 
 def static(data_set: int = 1, *, noise: bool = False, samples: int = 1024) -> Example:
-    """Sect. 5.1: `y = 0.01 + u − 0.5u² + 0.1u³ + e` with the baseline `θ₁u + θ₃u³`.
+    """Return the example of Sect. 5.1: `y = 0.01 + u − 0.5u² + 0.1u³ + e`, baseline `θ₁u + θ₃u³`.
 
     Args:
         data_set: 1 symmetric (`u` and `−u`), 2 drawn at random, 3 drawn with mean −0.01.
@@ -64,10 +64,9 @@ def _static_map(u: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class MassSpringDamper:
-    """Sect.
+    """The mass-spring-damper of Sect. 5.2.
 
-    5.2: mass [kg], damping [Ns/m], stiffness [N/m], Stribeck friction [N, N, m/s], sampling time
-    [s].
+    Mass [kg], damping [Ns/m], stiffness [N/m], Stribeck friction [N, N, m/s], sampling time [s].
     """
 
     m: float = 1.0
@@ -79,7 +78,7 @@ class MassSpringDamper:
     sampling_time: float = 0.01
 
     def paper_theta(self) -> Vector:
-        """θ as printed in the paper and its scripts.
+        """Return θ as printed in the paper and its scripts.
 
         Backward Euler has `2m + cd Ts` in the first entry.
         """
@@ -93,7 +92,7 @@ class MassSpringDamper:
         return (self.coulomb + (self.static - self.coulomb) * decay) * np.sign(velocity)
 
     def simulate(self, force: Vector, theta: Vector, noise: Vector | None = None) -> Vector:
-        """Position [m] under `force` [N], at rest before; `noise` enters the equation."""
+        """Return the position [m] under `force` [N] from rest; `noise` enters the equation."""
         y = np.zeros(len(force))
         e = np.zeros(len(force)) if noise is None else np.concatenate([[0.0, 0.0], noise])
         for k in range(2, len(force)):
@@ -108,7 +107,10 @@ class MassSpringDamper:
 
 
 def mass_spring_damper() -> Example:
-    """Sect. 5.2, the paper's record: 10⁴ noisy training samples, 1000 noise-free test samples."""
+    """Return the paper's record of Sect. 5.2.
+
+    It has 10⁴ noisy training samples and 1000 noise-free test samples.
+    """
     system = MassSpringDamper()
     theta = system.paper_theta()
     rng = np.random.RandomState(12345)

@@ -1,4 +1,7 @@
-"""The paper's assumptions, conditions, lemmas, theorems and remarks: where each is computed, and what shows it."""
+"""Statements of the paper: where the program computes each, and what shows it.
+
+They are assumptions, conditions, lemmas, theorems and remarks.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The paper's pipeline: Adam, then L-BFGS, over θ and the learner's weights together, compiled whole.
+"""The paper's solver: Adam, then L-BFGS, over θ and weights together, compiled whole.
 
 θ starts at θ⁰ in units of its columns, the weights where the caller says. L-BFGS is optax's, in one
 compiled loop. SciPy's L-BFGS-B, called back from Python, took 3 to 6 times longer on both of the
@@ -27,7 +27,7 @@ _SMALL = 1e-14  # a relative decrease below this, five steps in a row, is roundi
 
 
 class GradientRun(NamedTuple):
-    """Where one run ended: θ's unknowns and the weights."""
+    """The end of one run: θ's unknowns and the weights."""
 
     v: Float[Array, "nt"]
     w: Float[Array, "nw"]
@@ -69,7 +69,7 @@ class AdamLBFGS:
         return self.adam_iterations + self.lbfgs_iterations
 
     def at_most(self, iterations: int) -> AdamLBFGS:
-        """Itself: the pipeline is run whole."""
+        """Return itself: the pipeline is run whole."""
         return self
 
     def minimise(
@@ -83,7 +83,7 @@ class AdamLBFGS:
     ) -> GradientRun:
         """Minimise the joint criterion from θ⁰ and `w`.
 
-        The loss told to `progress` is a mean square.
+        The loss that `progress` receives is a mean square.
         """
         import optax
 
@@ -100,7 +100,7 @@ class AdamLBFGS:
             begun = {"iteration": jnp.asarray(0), "small": jnp.asarray(0)}
             state = state._replace(optimizer=optimizer.init(state.unknowns), **begun)
             burst, second = 1, optimizer is phases[1][1]
-            while int(state.iteration) < limit and bool(_going(state)) and not enough:
+            while int(state.iteration) < limit and bool(_goes_on(state)) and not enough:
                 tick = training_clock()
                 stop = jnp.asarray(min(int(state.iteration) + burst, limit))
                 advance = _lbfgs if second else _adam
@@ -128,7 +128,7 @@ class AdamLBFGS:
         return GradientRun(v, w, done, ending, training_clock() - began)
 
 
-def _going(state: _GradientState) -> Any:
+def _goes_on(state: _GradientState) -> Any:
     """Return whether another step makes sense: the loss is finite and still falls."""
     return jnp.isfinite(state.loss) & (state.small < 5)
 
@@ -157,7 +157,7 @@ def _adam(
         unknowns: Any = optax.apply_updates(s.unknowns, update)
         return _GradientState(unknowns, inner, loss, s.iteration + 1, s.small)
 
-    return jax.lax.while_loop(lambda s: (s.iteration < stop) & _going(s), step, state)
+    return jax.lax.while_loop(lambda s: (s.iteration < stop) & _goes_on(s), step, state)
 
 
 @partial(jax.jit, static_argnames="criterion")
@@ -188,4 +188,4 @@ def _lbfgs(
         small = jnp.where(loss - reached <= _SMALL * loss, s.small + 1, 0)
         return _GradientState(unknowns, inner, reached, s.iteration + 1, small)
 
-    return jax.lax.while_loop(lambda s: (s.iteration < stop) & _going(s), step, state)
+    return jax.lax.while_loop(lambda s: (s.iteration < stop) & _goes_on(s), step, state)

@@ -1,4 +1,4 @@
-"""The Levenberg-Marquardt loop compiled whole, for a criterion whose rows are in memory: the fast path of the solver.
+"""The Levenberg-Marquardt loop compiled whole, for a criterion with rows in memory.
 
 The step solves `(H + (α + μ) I) d = g − α w`. Damping with the identity and Nielsen's update
 (Madsen, Nielsen and Tingleff 2004, algorithm 3.16) converges from Xavier starts on normalised data.
@@ -26,7 +26,7 @@ from orthaug.models.rows import Overlap
 
 _NOTHING_LEFT = 1e-22  # of ‖J‖²: what rounding leaves of a Jacobian in the span of the physics
 _UNUSED = 1e-12  # effective weights of a group at least, so that one that does nothing stays so
-_SECONDS_PER_BURST = 0.5  # how often progress is told and Ctrl-C is heard
+_SECONDS_PER_BURST = 0.5  # how often progress is reported and Ctrl-C noticed
 
 
 class State(NamedTuple):
@@ -47,14 +47,14 @@ class State(NamedTuple):
 
 @runtime_checkable
 class CheckpointWriter(Protocol):
-    """Where the states of a run are kept."""
+    """Storage of the states of a run."""
 
-    def state(self) -> State | None:
-        """Return the last one; None for none."""
+    def state(self, *shapes: tuple[int, ...]) -> State | None:
+        """Return the last one whose first arrays have these shapes; None for none."""
         ...
 
     def keep(self, state: State, *, ended: bool = False) -> None:
-        """Take a state, now and then; `ended` for the last one."""
+        """Store a state, if it is due or if the run `ended`."""
         ...
 
 
@@ -91,7 +91,7 @@ class TrainingRun(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Settings:
-    """What a run is made with.
+    """The settings of a run.
 
     Args:
         limit: of the iterations.
@@ -100,7 +100,7 @@ class Settings:
         ridge: α in normalised units; with `evidence` where it starts.
         evidence: choose α by MacKay's re-estimation after every accepted step.
         groups: which weights share an α, by number; None where all do.
-        progress: told of the steps.
+        progress: called after the steps.
         kept: where states are kept; a run goes on from the last one.
     """
 
@@ -114,7 +114,7 @@ class Settings:
     kept: CheckpointWriter | None = None
 
     def prepared(self, w: Any) -> tuple[Options, Any, State | None]:
-        """Return the numbers of the compiled program, the ridge it starts with, and the state to go on from."""
+        """Return the numbers of the compiled program, the initial ridge, and the first state."""
         groups = self.groups
         if (
             groups is None and not self.evidence
@@ -129,7 +129,7 @@ class Settings:
         start = (
             np.float64(self.ridge) if groups is None else np.full(len(groups), float(self.ridge))
         )
-        return options, start, self.kept.state() if self.kept else None
+        return options, start, self.kept.state(np.shape(w)) if self.kept else None
 
     def runs(self, state: State) -> bool:
         """Return whether there is a step to take."""
@@ -144,8 +144,8 @@ class Settings:
         begins = self.limit.begins_window(int(state.iteration))
         return state._replace(mark=np.asarray(state.normal.loss)) if begins else state
 
-    def tell(self, state: State) -> bool:
-        """Whoever listens, and whoever keeps states; whether a listener says that it is enough."""
+    def report(self, state: State) -> bool:
+        """Report the state to a listener and to checkpoints; return whether to end the run."""
         try:
             self.progress(int(state.iteration), float(state.normal.loss))
         except StopTraining:
@@ -155,7 +155,7 @@ class Settings:
         return False
 
     def ended(self, state: State, seconds: float, *, enough: bool = False) -> TrainingRun:
-        """Return the run, from its last state; `enough` where it was asked to end with that."""
+        """Return the run from its last state; with `enough`, a listener ended it."""
         held: Any = (
             np.asarray(state.ridge)
             if self.groups is not None
@@ -204,7 +204,7 @@ def minimise(
         )
         state = settings.marked(state)
         burst = burst_length(burst, training_clock() - tick)
-        enough = settings.tell(state)
+        enough = settings.report(state)
     return settings.ended(state, training_clock() - began, enough=enough)
 
 
@@ -214,7 +214,9 @@ def driven(
     overlap: Overlap,
     settings: Settings,
 ) -> TrainingRun:
-    """`minimise` where every pass over the rows is asked for from here: the same steps, whoever makes the sums.
+    """Minimise as `minimise` does, with every pass over the rows made by the caller's engine.
+
+    The steps are the same wherever the sums are computed.
 
     Args:
         normal_at: the criterion at weights, with the overlap of the pass before.
@@ -229,15 +231,15 @@ def driven(
     assert state is not None
     enough = False
     while settings.runs(state) and not enough:
-        step = _proposed(state)
-        state = _judged(state, step, normal_at(state.w + step, state.normal.overlap), options)
+        step = _propose(state)
+        state = _judge(state, step, normal_at(state.w + step, state.normal.overlap), options)
         state = settings.marked(state)
-        enough = settings.tell(state)
+        enough = settings.report(state)
     return settings.ended(state, training_clock() - began, enough=enough)
 
 
 def burst_length(burst: int, spent: float) -> int:
-    """Return how many steps to take at a time, when `burst` of them took `spent` seconds."""
+    """Return the number of steps to take at a time, when `burst` of them took `spent` seconds."""
     return int(np.clip(burst * _SECONDS_PER_BURST / max(spent, 1e-6), 1, 4 * burst))
 
 
@@ -274,8 +276,8 @@ def _advance(
 
 def _trial(criterion: Any, state: State, arguments: tuple[Any, ...], options: Options) -> State:
     """Return one damped step: accept it, or damp more."""
-    step = _proposed(state)
-    return _judged(
+    step = _propose(state)
+    return _judge(
         state, step, one_pass(criterion, state.w + step, arguments, state.normal.overlap), options
     )
 
@@ -285,15 +287,15 @@ def _downhill(state: State) -> Any:
 
 
 @jax.jit
-def _proposed(state: State) -> Any:
+def _propose(state: State) -> Any:
     """Return the damped step."""
     shifted = state.normal.hessian + (state.ridge + state.damping) * jnp.eye(state.w.shape[0])
     return jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(shifted), _downhill(state))
 
 
 @jax.jit
-def _judged(state: State, step: Any, trial: Normal, options: Options) -> State:
-    """Return the state after a step was tried: moved where the objective is lower, otherwise damped more."""
+def _judge(state: State, step: Any, trial: Normal, options: Options) -> State:
+    """Return the state after a tried step: moved where the objective is lower, else damped more."""
     w, normal, alpha, downhill = state.w, state.normal, state.ridge, _downhill(state)
     before = normal.loss + _prior(alpha, w)
     after = trial.loss + _prior(alpha, w + step)
@@ -332,18 +334,23 @@ def _judged(state: State, step: Any, trial: Normal, options: Options) -> State:
 
 
 def _level(normal: Normal, downhill: Any, objective: Any) -> Any:
-    """Residual and Jacobian are orthogonal to rounding (MINPACK's gtol): no step can descend from a minimum."""
+    """Return whether residual and Jacobian are orthogonal to rounding (MINPACK's gtol).
+
+    No step can descend from such a minimum.
+    """
     size = jnp.sqrt(jnp.maximum(jnp.diag(normal.hessian), 0.0) * objective)
     return jnp.all(jnp.abs(downhill) <= 1e-7 * size)
 
 
 def _prior(alpha: Any, w: Any) -> Any:
-    """`Σ α_i w_i²`."""
+    """Return `Σ α_i w_i²`."""
     return alpha * (w @ w) if alpha.ndim == 0 else w @ (alpha * w)
 
 
 def _evidence(w: Any, normal: Normal, alpha: Any, options: Options) -> Any:
-    """MacKay's fixed point: `γ = tr(H(H + αI)⁻¹)`, `α = γ σ² / ‖w‖²` with `σ² = ‖r‖² / (N − γ)`.
+    """Return MacKay's fixed point of the ridge.
+
+    `γ = tr(H(H + αI)⁻¹)`, `α = γ σ² / ‖w‖²` with `σ² = ‖r‖² / (N − γ)`.
 
     With groups γ and ‖w‖² are those of each group (automatic relevance determination).
     """
@@ -361,7 +368,10 @@ def _evidence(w: Any, normal: Normal, alpha: Any, options: Options) -> Any:
 
 
 def _effective(normal: Normal, alpha: Any) -> Any:
-    """Return the diagonal of `H (H + A)⁻¹` for a ridge of each weight, from the eigenvalues of `A^-½ H A^-½`."""
+    """Return the diagonal of `H (H + A)⁻¹` for a ridge of each weight.
+
+    From the eigenvalues of `A^-½ H A^-½`.
+    """
     unit = 1 / jnp.sqrt(alpha)
     scaled = normal.hessian * unit[:, None] * unit
     values, vectors = jnp.linalg.eigh(jnp.where(jnp.isfinite(scaled), scaled, 0.0))
@@ -371,7 +381,10 @@ def _effective(normal: Normal, alpha: Any) -> Any:
 
 @jax.jit
 def effective_weights(normal: Normal, alpha: Any) -> Any:
-    """tr(H (H + αI)⁻¹). Directions that are rounding beside the columns of J count as absent."""
+    """Return tr(H (H + αI)⁻¹).
+
+    Directions that are rounding beside the columns of J count as absent.
+    """
     n = normal.hessian.shape[0]
     if n == 0:
         return jnp.asarray(0.0)
@@ -383,7 +396,7 @@ def effective_weights(normal: Normal, alpha: Any) -> Any:
 
 
 def spanned(normal: Normal) -> Any:
-    """P⊥J = 0: the learner lies in the span of the physics, as in the paper's Example 1."""
+    """Return whether P⊥J = 0: the learner lies in the span of the physics (Example 1)."""
     curvature = jnp.max(jnp.diag(normal.hessian), initial=0.0)
     return curvature <= _NOTHING_LEFT * _largest_column(normal)
 

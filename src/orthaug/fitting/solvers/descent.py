@@ -1,4 +1,4 @@
-"""The Levenberg-Marquardt loop that the host drives, for any objective that can be tried and linearised.
+"""The Levenberg-Marquardt loop driven by the host, for any objective with a linearisation.
 
 The step solves `(H + αE + μ D) d = g − αE p` with Nielsen's update of μ (Madsen, Nielsen and
 Tingleff 2004, algorithm 3.16). The ridge α acts on the weights alone (E). One step ahead D is the
@@ -77,7 +77,7 @@ class LinearModel(Protocol):
 
     @property
     def start(self) -> Any:
-        """Return what the next trial starts from beside p; the objective's own affair."""
+        """The start of the next trial beside p, in a form that only the objective reads."""
         ...
 
 
@@ -90,7 +90,7 @@ class SquaredResiduals(Protocol):
 
     @property
     def physics(self) -> int:
-        """Return how many leading entries of p are θ: they have bounds and no ridge."""
+        """Number of leading entries of p that are θ: they have bounds and no ridge."""
         ...
 
     def evaluate(self, p: Vector, start: Any) -> Any:
@@ -102,12 +102,15 @@ class SquaredResiduals(Protocol):
         ...
 
     def samples(self, point: Any) -> tuple[float, float]:
-        """Return number of residuals of a trial, and the share of them that is independent."""
+        """Return the number of residuals of a trial, and the share that is independent."""
         ...
 
 
 class Descent(NamedTuple):
-    """Where a run ended: the last accepted trial and its derivative, which is None where the start has none."""
+    """The end of a run: the last accepted trial and its derivative.
+
+    The derivative is None where the start has none.
+    """
 
     point: Any
     linear: Any | None
@@ -123,7 +126,7 @@ class Descent(NamedTuple):
 
 
 class Pause(NamedTuple):
-    """A descent between two steps, in arrays: it goes on from there at the same bits."""
+    """A descent between two steps, in arrays, from which it resumes at the same bits."""
 
     point: Any
     """What the objective needs to make the last accepted trial again."""
@@ -138,7 +141,9 @@ class Pause(NamedTuple):
 
 
 class _Counts(NamedTuple):
-    """Steps that were tried, accepted ones before the last, whether evidence has begun, and two losses.
+    """Counts of tried and accepted steps, whether evidence has begun, and two losses.
+
+    Accepted steps are counted before the last.
 
     These are the loss of the start, and where the last window of the limit began.
     """
@@ -151,7 +156,7 @@ class _Counts(NamedTuple):
 
 
 class _Iterate(NamedTuple):
-    """An accepted trial, and what the rest of the run knows of the way there."""
+    """An accepted trial, and the state of the rest of the run."""
 
     point: Any
     linear: Any
@@ -167,7 +172,7 @@ class _Iterate(NamedTuple):
 
     @property
     def settled(self) -> bool:
-        """Return whether the objective falls slowly, after a few steps."""
+        """True once the objective falls slowly, after a few steps."""
         return self.coloured and len(self.path) > _FIRST_STEPS
 
 
@@ -189,11 +194,12 @@ def descend(
 ) -> Descent:
     """Minimise `‖r‖² + α‖w‖²` from p.
 
-    Args: start: handed to the first trial. ridge: α; with `evidence` where it starts.
+    Args:
+        start: handed to the first trial.
+        ridge: α; with `evidence` where it starts.
         evidence_settled: whether α waits until the weights have lowered the loss and the objective
-        falls slowly, or no
-            longer; otherwise until the first accepted step. From weights that do nothing yet,
-            evidence would find that none are needed (w = 0 is its fixed point).
+            falls slowly, or no longer; otherwise until the first accepted step. From weights that
+            do nothing yet, evidence would find that none are needed (w = 0 is its fixed point).
         ceiling: a trial with a larger `‖r‖²` is rejected.
         bounds: of θ, each (physics,); the start is moved inside.
         kept: where pauses are kept; a descent goes on from the last one.
@@ -203,9 +209,9 @@ def descend(
     if bounds is not None:
         for whole, side in zip(limits, bounds, strict=True):
             whole[: objective.physics] = side
-    paused = None if kept is None else kept.state()
+    paused = None if kept is None else kept.state(np.shape(p))
     if paused is not None:
-        iterate, (done, taken, begun, first_loss, mark), ending = _resumed(objective, paused)
+        iterate, (done, taken, begun, first_loss, mark), ending = _resume(objective, paused)
     else:
         point = objective.evaluate(np.clip(p, *limits), start)
         linear = objective.linearise(point) if np.isfinite(point.loss) else None
@@ -239,7 +245,7 @@ def descend(
         if kept is not None:
             counts = _Counts(done, taken, begun, first_loss, mark)
             kept.keep(
-                partial(_paused, objective, iterate, counts, ending),
+                partial(_pause, objective, iterate, counts, ending),
                 ended=ending is not Ending.RUNNING,
             )
     effective = effective_weights(iterate.linear.hessian, iterate.ridge, objective.physics)
@@ -261,13 +267,13 @@ def descend(
     )
 
 
-def _paused(objective: Any, iterate: _Iterate, counts: _Counts, ending: Ending) -> Pause:
+def _pause(objective: Any, iterate: _Iterate, counts: _Counts, ending: Ending) -> Pause:
     own = (iterate.ridge, iterate.damping, iterate.growth, iterate.small)
     held = (objective.kept(iterate.point), *own, np.stack(iterate.path), iterate.coloured)
     return Pause(*held, np.array(counts, dtype=float), int(ending))
 
 
-def _resumed(objective: Any, paused: Pause) -> tuple[_Iterate, _Counts, Ending]:
+def _resume(objective: Any, paused: Pause) -> tuple[_Iterate, _Counts, Ending]:
     point = objective.again(paused.point)
     ridge, damping, growth = (float(paused[i]) for i in (1, 2, 3))
     path, done = tuple(paused.path), paused.counts.tolist()
@@ -328,14 +334,16 @@ def _next_ridge(objective: SquaredResiduals, iterate: _Iterate) -> float:
 def evidence_ridge(
     objective: SquaredResiduals, point: Any, effective: float, *, coloured: bool = True
 ) -> float:
-    """Return MacKay's fixed point `α = γσ²/(κ‖w‖²)`, κ the share of the residuals that is independent.
+    """Return MacKay's fixed point `α = γσ²/(κ‖w‖²)`.
+
+    κ is the share of the residuals that is independent.
 
     Residuals of a free run are coloured: N of them say as much as κN independent ones. So the data
     weigh less against the prior.
 
     Args:
         objective: that the weights minimise.
-        flown: the trial at the weights.
+        point: the trial at the weights.
         effective: number γ of effective weights there.
         coloured: whether the colour of the residuals counts.
     """
@@ -354,7 +362,10 @@ def _step(
     bounds: tuple[Vector, Vector],
     kind: Damping,
 ) -> tuple[Vector, float]:
-    """Return the damped step inside the bounds, and the decrease that the quadratic model expects of it."""
+    """Return the damped step inside the bounds, and its predicted decrease.
+
+    The quadratic model predicts it.
+    """
     free = np.flatnonzero(~_held(p, downhill, *bounds))
     curvature = np.diag(hessian)[free] if kind.diagonal else np.ones(len(free))
     scale = np.maximum(curvature, _SMALLEST_CURVATURE * curvature.max(initial=0.0))
@@ -378,14 +389,17 @@ def _step(
 
 
 def _held(p: Vector, downhill: Vector, lower: Vector, upper: Vector) -> Bool[np.ndarray, "n"]:
-    """Which entries stand at a bound that the descent would leave."""
+    """Return a mask of the entries at a bound that the descent would leave."""
     return ((p <= lower) & (downhill < 0)) | ((p >= upper) & (downhill > 0))
 
 
 def _level(
     hessian: Matrix, downhill: Vector, objective: float, held: Bool[np.ndarray, "n"]
 ) -> bool:
-    """Residual and Jacobian are orthogonal to rounding in every free entry: the start is a minimum."""
+    """Return whether the start is a minimum.
+
+    There, residual and Jacobian are orthogonal to rounding in every free entry.
+    """
     flat = np.abs(downhill) <= 1e-7 * np.sqrt(np.maximum(np.diag(hessian), 0.0) * objective)
     return bool(np.all(flat | held))
 
@@ -405,7 +419,7 @@ def weights_hessian(hessian: Matrix, physics: int) -> Matrix:
 
 
 def effective_weights(hessian: Matrix, ridge: float, physics: int) -> float:
-    """tr(H (H + αI)⁻¹) of the weights. Directions that are rounding count as absent."""
+    """Return tr(H (H + αI)⁻¹) of the weights. Directions that are rounding count as absent."""
     if len(hessian) == physics:
         return 0.0
     values = np.linalg.eigvalsh(weights_hessian(hessian, physics))

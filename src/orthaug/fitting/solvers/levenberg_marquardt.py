@@ -26,9 +26,9 @@ _ITERATIONS = 300  # the default limit
 class LevenbergMarquardt:
     """Declaration of the solver.
 
-    Args: iterations: trial steps at most. Only the default, 300, is a limit that a run passes where
-        the loss still falls
-            noticeably (`solvers/limit.py`), up to ten times.
+    Args:
+        iterations: trial steps at most. Only the default, 300, is a limit that a run passes where
+            the loss still falls noticeably (`solvers/limit.py`), up to ten times.
         tolerance: two successive steps that lower the objective by less than this fraction end the
             run.
         longest: trial steps at most where the loss still falls; None for what `iterations` says.
@@ -47,17 +47,17 @@ class LevenbergMarquardt:
             check_count(self.longest, "longest", least=self.iterations)
 
     def at_most(self, iterations: int) -> LevenbergMarquardt:
-        """Return the same with fewer iterations, a limit that no run passes."""
+        """Return the solver with fewer iterations, a limit that no run passes."""
         iterations = min(self.iterations, iterations)
         return replace(self, iterations=iterations, longest=iterations)
 
     @property
     def within_limit(self) -> LevenbergMarquardt:
-        """Return the same without iterations past the limit, for runs that only lead to others."""
+        """The solver without iterations past the limit, for runs that only lead to others."""
         return self.at_most(self.iterations)
 
     def after(self, done: int) -> LevenbergMarquardt:
-        """Return the same with the iterations that are left after `done` of them."""
+        """Return the solver with the iterations that are left after `done` of them."""
         limit = self.limit()
         left = max(limit.iterations - done, 0)
         return replace(self, iterations=left, longest=max(limit.longest - done, left))
@@ -78,7 +78,7 @@ class LevenbergMarquardt:
         overlap: Overlap,
         **options: Any,
     ) -> TrainingRun:
-        """`‖r(w)‖² + α‖w‖²` from `w`, compiled whole: the rows are in memory.
+        """Minimise `‖r(w)‖² + α‖w‖²` from `w`, compiled whole: the rows are in memory.
 
         See `compiled.minimise`.
         """
@@ -91,7 +91,7 @@ class LevenbergMarquardt:
         overlap: Overlap,
         **options: Any,
     ) -> TrainingRun:
-        """The same, pass by pass: the rows are elsewhere; see `compiled.driven`."""
+        """Minimise the same pass by pass, for rows elsewhere; see `compiled.driven`."""
         return compiled.driven(normal_at, w, overlap, self._settings(**options))
 
     def descend(
@@ -103,7 +103,7 @@ class LevenbergMarquardt:
         noticeable: float = 0.0,
         **options: Any,
     ) -> Descent:
-        """`‖r(p)‖² + α‖w‖²` from p, driven by the host; see `descent.descend`."""
+        """Minimise `‖r(p)‖² + α‖w‖²` from p, driven by the host; see `descent.descend`."""
         return descend(
             objective, p, start, limit=self.limit(noticeable), tolerance=self.tolerance, **options
         )

@@ -1,4 +1,4 @@
-"""The limit of a run's iterations, and how far past it a run goes while its loss still falls noticeably.
+"""The limit of a run's iterations, and its extension while the loss still falls noticeably.
 
 A run that has not converged at its limit is judged by the last quarter of the limit: did the loss
 fall there by more than the `noticeable` fraction? For residuals of variance σ² the parameters are
@@ -19,9 +19,11 @@ _PROLONGED = 10  # times the limit, at most
 class Limit(NamedTuple):
     """Trial steps that a run may take.
 
-    Args: iterations: the limit. longest: the limit while the loss still falls noticeably;
-        `iterations` for none beyond. noticeable: a relative fall of the loss over the last quarter
-        of the limit that is worth going on for.
+    Args:
+        iterations: the limit.
+        longest: the limit while the loss still falls noticeably; `iterations` for none beyond.
+        noticeable: a relative fall of the loss over the last quarter of the limit that is worth
+            going on for.
     """
 
     iterations: int
@@ -30,7 +32,7 @@ class Limit(NamedTuple):
 
     @property
     def window(self) -> int:
-        """Return the number of last steps over which the fall of the loss is judged."""
+        """Number of last steps over which the fall of the loss is judged."""
         return max(self.iterations // 4, min(_FEWEST, self.iterations), 1)
 
     def reached(self, done: int, before: float, loss: float) -> bool:
@@ -65,7 +67,7 @@ class Limit(NamedTuple):
 
 
 def relative_fall(before: float, loss: float) -> float:
-    """Return by what fraction of itself the loss changed; with evidence it may also rise."""
+    """Return the relative change of the loss; with evidence it may also rise."""
     return abs(before - loss) / loss if loss > 0 else 0.0
 
 
@@ -96,12 +98,12 @@ class Tail(NamedTuple):
 
     @property
     def prolonged(self) -> bool:
-        """Return whether the run went on past its limit."""
+        """True where the run went on past its limit."""
         return 0 < self.limit < self.done
 
 
 def longest_of(iterations: int, default: int) -> int:
-    """Return how far a run may go: ten times the default limit.
+    """Return the largest number of steps of a run: ten times the default limit.
 
     A limit that somebody chose is not passed.
     """
@@ -109,5 +111,8 @@ def longest_of(iterations: int, default: int) -> int:
 
 
 def noticeable_in(residuals: float) -> float:
-    """Return the fall of the loss over N residuals by which parameters still move by half a standard error."""
+    """Return the noticeable fall of a loss over N residuals.
+
+    At that fall, parameters still move by half a standard error.
+    """
     return _HALF_AN_ERROR / max(residuals, 1.0)
