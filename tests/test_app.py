@@ -270,7 +270,7 @@ def test_a_file_beyond_the_limit_is_refused_before_it_comes(tmp_path, monkeypatc
         return reply.status_code, bytes(reply.body).decode()
 
     for code, text in (dropped(b"x" * 40), dropped(b"", **{"content-length": "11"})):
-        assert code == 413 and "larger than 10 bytes" in text and "name its path" in text
+        assert code == 413 and "larger than 10 bytes" in text and "give its path" in text
     assert list(session.folder.iterdir()) == []
 
 

@@ -610,7 +610,7 @@ def test_a_prediction_tells_whether_its_band_is_one_of_95_percent(fitted, tmp_pa
     assert one_line(
         done.err.splitlines()[-1] + "\n",
         "note: the squared innovations are",
-        "(NIS, ",
+        "(NIS; ",
         "Its 95 % band contains 9",
     )
     model = oa.load(fitted / "out")
