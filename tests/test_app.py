@@ -30,7 +30,7 @@ from orthaug.commands.app.processes import Command, Run, WorkerPool
 from orthaug.commands.app.session import Session, Sessions
 from orthaug.commands.app.worker import thinned
 from orthaug.commands.bars import training_bar
-from orthaug.commands.job import ALONE, AS_DECLARED, Variant
+from orthaug.commands.job import AS_DECLARED, PHYSICS_ONLY, Variant
 from orthaug.commands.kinds import open_job
 from orthaug.commands.parts import expanded
 
@@ -270,7 +270,7 @@ def test_a_file_beyond_the_limit_is_refused_before_it_comes(tmp_path, monkeypatc
         return reply.status_code, bytes(reply.body).decode()
 
     for code, text in (dropped(b"x" * 40), dropped(b"", **{"content-length": "11"})):
-        assert code == 413 and "larger than 10 bytes" in text and "name its path" in text
+        assert code == 413 and "larger than 10 bytes" in text and "give its path" in text
     assert list(session.folder.iterdir()) == []
 
 
@@ -279,7 +279,7 @@ def test_a_session_keeps_to_its_folder(tmp_path):
     assert session.place_for("../../etc/run one.csv") == tmp_path / "run one.csv"
     assert session.place_for("C:\\data\\<b>.CSV").parent == tmp_path
     for name in ("run.exe", ".csv", "", "spec.toml"):
-        with pytest.raises(InputError, match="no data file that is known"):
+        with pytest.raises(InputError, match="unknown type of data file"):
             session.place_for(name)
     for name in ("../x", "spec.toml", "model.zip", "c.zip", "/etc/passwd"):
         with pytest.raises(InputError, match="there is nothing of that name yet"):
@@ -312,7 +312,9 @@ def test_lines_of_progress_say_what_each_run_is(csv, tmp_path, monkeypatch, caps
             ("orthogonal", 2, "ard"),
         )
     ]
-    assert len(runs) == job.run_count and job.planned(Variant(ALONE)) == ({"structure": ALONE},)
+    assert len(runs) == job.run_count and job.planned(Variant(PHYSICS_ONLY)) == (
+        {"structure": PHYSICS_ONLY},
+    )
     penalised = job.planned(Variant("baseline-penalty"))
     assert {run["structure"] for run in penalised} == {"baseline-penalty"} and len(penalised) == 4
     monkeypatch.setenv("ORTHAUG_PROGRESS", "json")
@@ -405,10 +407,7 @@ def test_a_process_that_cannot_start_is_told(tmp_path, monkeypatch):
         return session.trouble
 
     monkeypatch.setattr("orthaug.commands.app.processes._started", refused)
-    assert (
-        asyncio.run(looked())
-        == "no process can be started for that (Resource temporarily unavailable)."
-    )
+    assert asyncio.run(looked()) == "no process can be started (Resource temporarily unavailable)."
     monkeypatch.setattr("orthaug.commands.app.session.Session.worded", lambda *_: 1 / 0)
     assert asyncio.run(failed(tmp_path)) == "this did not work (ZeroDivisionError)."
 
@@ -459,7 +458,7 @@ def test_sessions_that_nobody_used_make_room(tmp_path):
     for key in keys:
         if (session := sessions.find(key)) is not None:
             session.data = first.data
-    with pytest.raises(InputError, match="50 pieces of work are open"):
+    with pytest.raises(InputError, match="50 sessions are open"):
         sessions.new()
 
 
@@ -861,7 +860,7 @@ def test_from_a_file_to_code_with_the_numbers_of_the_command_line(
     second = csv.with_name("second.csv")
     write_csv(second, left=np.arange(40.0) % 7, right=np.arange(40.0) % 5)
     other.page.set_input_files("#dropped", second)
-    other.page.wait_for_selector("text=The names of the columns do not say")
+    other.page.wait_for_selector("text=The names of the columns do not show")
     assert other.page.url != page.url and "plant.csv" not in other.page.inner_text("body")
 
     # a reload in the middle finds it again, and it can be stopped
@@ -1085,7 +1084,7 @@ def test_what_is_wrong_is_told_on_the_page(server, browser, csv, tmp_path):
     page.wait_for_selector("text=no such file")
     (tmp_path / "run.docx").write_text("no data")
     page.set_input_files("#dropped", tmp_path / "run.docx")
-    page.wait_for_selector("text=no data file that is known")
+    page.wait_for_selector("text=unknown type of data file")
     tab.told.clear()  # the browser tells of the 422
     (tmp_path / "own.csv").write_text(csv.read_text().replace("u,y", "force,<i>way</i>"))
     page.get_by_label("or its path").fill(str(tmp_path / "own.csv"))
@@ -1118,7 +1117,7 @@ def test_what_is_wrong_is_told_on_the_page(server, browser, csv, tmp_path):
     page.get_by_role("button", name="Remove step 1").click()
     own = page.inner_text(".head .hint")
     tab.drop(tmp_path / "own.csv")
-    page.wait_for_selector("text=own.csv is no part of them")
+    page.wait_for_selector("text=own.csv is not among them")
     assert (
         page.inner_text(".head .hint") == own
         and page.get_by_text("The names of the columns").count() == 0
@@ -1126,7 +1125,7 @@ def test_what_is_wrong_is_told_on_the_page(server, browser, csv, tmp_path):
     assert [
         page.get_by_label(f"use of {name}").input_value() for name in ("force", "<i>way</i>")
     ] == [*("input", "output")]
-    page.get_by_role("button", name="Take it as a test").click()
+    page.get_by_role("button", name="Use it as a test").click()
     page.wait_for_selector("text=tests.own")
     tab.go("Export")
     page.wait_for_selector("text=The spec names own.csv: keep the two in one folder")
@@ -1138,7 +1137,7 @@ def test_what_is_wrong_is_told_on_the_page(server, browser, csv, tmp_path):
     assert tab.get("spec.toml?show=true").headers["content-disposition"][:10] == "attachment"
     assert tab.fetch("../x") and tab.get("result.zip").status == 404
     gone = tab.context.request.get(f"{server.base}session/absent")
-    assert gone.status == 404 and "not open any more" in gone.text()
+    assert gone.status == 404 and "this session has ended" in gone.text()
     tab.close()
 
 

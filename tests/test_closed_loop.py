@@ -113,5 +113,6 @@ def test_check_and_fit_name_it(tmp_path):
     result = json.loads((tmp_path / "result" / "result.json").read_text())
     assert [warning["code"] for warning in result["warnings"]].count("closed_loop") == 1
     assert (
-        "its data look recorded under feedback" in (tmp_path / "result" / "report.html").read_text()
+        "its data were probably recorded under feedback"
+        in (tmp_path / "result" / "report.html").read_text()
     )

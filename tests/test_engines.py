@@ -525,7 +525,7 @@ def test_what_is_wrong_with_a_partition_is_named(folder):
     )
     bad(folder, r"c.parquet: sampled every 0.2 s, .*a.parquet every 0.1 s", good.assign(t=0.2 * np.arange(len(good))),
         timed=timed)  # fmt: skip
-    bad(folder, "no file fits 'nothing/", pattern=("runs/*", "nothing/*"))
+    bad(folder, "no file matches 'nothing/", pattern=("runs/*", "nothing/*"))
     bad(
         folder,
         "`rows` and `every` need the rows in memory",

@@ -317,10 +317,10 @@ def test_columns_of_one_name_are_told_apart(tmp_path, monkeypatch):
 
 
 NOTHING = [
-    ("u,y\n1,2\n", (), "no column could be a channel, 1 row: u (constant), y (constant). A first model needs"),
+    ("u,y\n1,2\n", (), "no column can be a channel, 1 row: u (constant), y (constant). A first model needs"),
     ("u,y\n1,\n2,\n3,\n", (), '--inputs "" --outputs "u"; columns that are not named are left out. No channels: '
      "y (no numbers)."),
-    ("u,y\n1,\n2,\n3,\n", ("--inputs", "u"), "an input already (u), and none is left for an output; left out: y (no"),
+    ("u,y\n1,\n2,\n3,\n", ("--inputs", "u"), "already an input (u), so no column is left for an output; left out: y (no"),
     ("a,b,c\n1,2,4\n2,1,7\n", ("--outputs", "b"), 'only outputs are named: a, b, c. Say both, separated by commas, '
      'such as --inputs "a,c" --outputs "b" (--inputs "" for none)'),
     ("a,b,c\n1,2,4\n2,1,7\n", ("--inputs", "c"), '--inputs "c" --outputs "b"; columns'),
@@ -440,7 +440,7 @@ STEPS = [
         "time",
         0.1,
         "",
-        "so 1 s is taken, but column 'time' of a.csv gives 0.1 s; perhaps time = \"time\" is meant",
+        "so 1 s is used, but column 'time' of a.csv gives 0.1 s; perhaps time = \"time\" is meant",
     ),
     ("time", 0.1, "sampling_time = 0.1", ""),
     ("other", 0.1, "sampling_time = 1.0", ""),
@@ -572,7 +572,9 @@ def test_a_long_file_is_looked_at_in_windows_and_says_so(tmp_path, monkeypatch):
     pd.DataFrame({"u": u, "y": y}).to_csv(tmp_path / "a.csv", index=False)
     done = run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml")
     assert done.code == 0 and "reading a.csv" in done.err and "looking at signals" in done.err
-    assert "delays and orders are found on 500 of these rows" in done.out and "nk 3;" in done.out
+    assert (
+        "delays and orders are estimated from 500 of these rows" in done.out and "nk 3;" in done.out
+    )
 
 
 def frame_with(**columns) -> pd.DataFrame:

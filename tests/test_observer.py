@@ -609,9 +609,9 @@ def test_a_prediction_tells_whether_its_band_is_one_of_95_percent(fitted, tmp_pa
     )
     assert one_line(
         done.err.splitlines()[-1] + "\n",
-        "note: the innovations' squares are",
-        "(NIS, ",
-        "its 95 % band holds 9",
+        "note: the squared innovations are",
+        "(NIS; ",
+        "Its 95 % band contains 9",
     )
     model = oa.load(fitted / "out")
     small = replace(
@@ -623,13 +623,14 @@ def test_a_prediction_tells_whether_its_band_is_one_of_95_percent(fitted, tmp_pa
     done = run(
         "predict", tmp_path / "model", fitted / "run.csv", "--observer", "--out", tmp_path / "b.csv"
     )
-    words = ("Do not take the band for one of 95 %: its noises are too small", ".tuned(record)")
+    words = ("Do not use the band as one of 95 %: its noises are too small", ".tuned(record)")
     assert done.code == 0 and one_line(
-        done.err.splitlines()[-1] + "\n", "warning: the innovations' squares are", *words
+        done.err.splitlines()[-1] + "\n", "warning: the squared innovations are", *words
     )
     rows = np.genfromtxt(tmp_path / "b.csv", delimiter=",", names=True)
     there = np.isfinite(rows["y"]) & np.isfinite(rows["y_model"])
     inside = (rows["y_model_low"] <= rows["y"]) & (rows["y"] <= rows["y_model_high"])
     assert (
-        f"its 95 % band holds {percent(inside[there].mean(), 3)} of what was measured" in done.err
+        f"Its 95 % band contains {percent(inside[there].mean(), 3)} of the measured values"
+        in done.err
     )

@@ -87,7 +87,7 @@ def test_the_counts_of_a_fit(
 ) -> None:
     """Both parts are scored, of the model and of physics alone, which the verdict takes; the page drops the learner."""
     monkeypatch.setattr(
-        "orthaug.commands.fit.advised", lambda fitted: fitted
+        "orthaug.commands.fit.with_advice", lambda fitted: fitted
     )  # which fits other specs
     run("fit", spec, "--out", tmp_path / "result")
     assert counted["pose"] == counted["factor"] == counted["stack_rows"] == 1

@@ -281,7 +281,7 @@ def test_units_that_the_spec_does_not_give_are_those_that_the_channels_ask_for(l
         fit_report(replace(lagged, result=lagged.result.model_copy(update={"parameters": rows})))
     )
     assert "(mm/N)" in told.text("td") and any(
-        "the channels' units ask for it" in c for c in told.text("caption")
+        "it follows from the units of the channels" in c for c in told.text("caption")
     )
 
 
@@ -354,7 +354,7 @@ def test_a_divergence_is_seen_and_does_not_flatten_the_rest():
     assert told["text"] == "free run diverges in y" and told["x"] == pytest.approx(
         0.01 * (301 + 200)
     )
-    assert "leaves all bounds in y at row 200" in plot.caption and "2 experiments" in plot.caption
+    assert "diverges in y at row 200" in plot.caption and "2 experiments" in plot.caption
     low, high = plot.layout["yaxis"]["range"]
     assert -4 < low < -1 and 1 < high < 4
     assert (
@@ -391,14 +391,12 @@ def test_long_records_are_thinned_by_their_envelope_and_said_to_be():
     assert kept.max() == pytest.approx(9.0, rel=1e-6) and kept.min() == pytest.approx(
         peak.min(), rel=1e-6
     )
-    assert "points are kept, the least and the largest value of every stretch" in plots[0].caption
+    assert "points, the minimum and maximum of every stretch" in plots[0].caption
     assert (
         sum(len(json.dumps([p.traces, p.series])) for p in plots) < LARGEST - 2_200_000
     )  # the rest is Plotly's
     short = run_plots([Run("train", wave(5000))], {})[0]
-    assert (
-        len(values(short.series["measured 0"])) == 5000 and "points are kept" not in short.caption
-    )
+    assert len(values(short.series["measured 0"])) == 5000 and "is drawn by" not in short.caption
     both = compared_plots({name: {"train": long} for name in "abc"})[0]
     assert len(json.dumps([both.traces, both.series])) < LARGEST - 2_200_000
 
@@ -424,14 +422,14 @@ def with_warning(fitted, code: str, text: str):
 def test_the_verdict_is_built_from_the_findings(lagged, motion):
     good = fit_verdict(motion.result)
     assert good.level in ("good", "care") and "on tests.steps its free run leaves" in good.trust
-    assert "m and k as physics" in good.use and "c is what the physics nearest" in good.use
+    assert "m and k as physics" in good.use and "c is taken from the physics nearest" in good.use
     ran = fit_verdict(
         with_warning(lagged, "free_run_diverged", "tests.steps: the free run diverged.")
     )
     assert ran.level == "bad" and "its free run diverges on tests.steps" in ran.trust
     untold = lagged.result.model_copy(update={"data": lagged.result.data.model_copy(update={"tests": None}),
                                               "validation": None})  # fmt: skip
-    assert "never tried on data" in fit_verdict(untold).trust
+    assert "not tested on data" in fit_verdict(untold).trust
     row = lagged.result.parameters[0]
     bias = {"value": 10 * (row.std or 1.0), "cause": "square", "share": 0.9}
     biased = row.model_copy(update={"bias": type("B", (), bias)()})
@@ -496,7 +494,7 @@ def test_the_verdict_of_a_comparison_names_a_model(compared):
 
 
 def test_a_witness_is_told_where_runs_are_shown(lagged):
-    told = "train: findings and figures look at 10 of 99 rows, in windows spread over them."
+    told = "train: findings and figures use 10 of 99 rows, in windows spread over them."
     page = Read(fit_report(replace(lagged, result=with_warning(lagged, "witness", told))))
     (section,) = page.text("section", id="free-run")
     assert told in section

@@ -67,7 +67,7 @@ ENDS = [
     ("$O schema >&-", "standard output"),
     ("$O fit absent.toml 2>&-", None),
     ("mkdir w; cd w; rmdir ../w; $O schema", "the working folder is gone"),
-    ("ulimit -v 1500000; $O schema", "the limit on memory (ulimit -v) is 1.43 GiB"),
+    ("ulimit -v 1500000; $O schema", "the memory limit (ulimit -v) is 1.43 GiB"),
 ]
 
 

@@ -137,7 +137,7 @@ def no_log():
 def test_the_log_tells_the_stages_of_a_fit(project, monkeypatch, caplog, no_log):
     monkeypatch.chdir(project)
     monkeypatch.setattr(
-        "orthaug.commands.fit.advised", lambda fitted: fitted
+        "orthaug.commands.fit.with_advice", lambda fitted: fitted
     )  # which fits other specs
     with caplog.at_level(logging.DEBUG, logger="orthaug"):
         assert run("fit", "plant.toml", "--out", "logged", "--force").code == 0

@@ -1,9 +1,9 @@
 """Tested advice: changes of a spec, each refitted and judged by its free run on data not fitted.
 
-The model as it is and every change of it are fitted to the same rows and run over the same others:
+The present model and every change of it are fitted to the same rows and run over the same others:
 the validation part, or the last third of the training rows as one long run. A change is advised
-where it lowers the error there surely, by the rule that all models are compared by (`Ratio`). A few
-changes are tried, the same on every machine; the rest is counted.
+where it lowers the error there significantly, by the rule that compares all models (`Ratio`). A few
+changes are tried, the same on every machine; the others are only counted.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from orthaug._base.errors import InputError
 from orthaug._base.lines import counted
 from orthaug._base.progress import LOG
 from orthaug.analysis.suspects import Suspect
-from orthaug.commands.job import ALONE, Job, Variant
+from orthaug.commands.job import PHYSICS_ONLY, Job, Variant
 from orthaug.commands.spec import spec_model
 from orthaug.data.expressions import SAMPLING_TIME
 from orthaug.data.record import Record
@@ -182,7 +182,7 @@ def _term(
 ) -> Iterator[Proposal]:
     """Yield the proposal to add a term, with its coefficient as a new parameter.
 
-    Nothing where the spec has the term.
+    Yields nothing where the spec has the term already.
     """
     spec, declared = job.spec, job.declaration
     name, initial = _new_name(job), float(size or 0.0)
@@ -269,7 +269,7 @@ def _predicted_changes(job: Job, result: FitResult, fit: Any) -> Iterator[Propos
             yield from _learner(job, result, fit)
         elif (
             change.kind == "criterion"
-            and not _compared(result)
+            and not _has_compared_criteria(result)
             and change.what != CRITERIA.kind_of(fit.criterion)
         ):
             yield Proposal(
@@ -277,7 +277,7 @@ def _predicted_changes(job: Job, result: FitResult, fit: Any) -> Iterator[Propos
             )
 
 
-def _compared(result: FitResult) -> bool:
+def _has_compared_criteria(result: FitResult) -> bool:
     """Return whether the fit itself has already tried both criteria."""
     return result.focus is not None and bool(result.focus.candidates)
 
@@ -371,7 +371,7 @@ _MOST, _MOST_OF_A_MOTION = (
     3,
     2,
 )  # changes that are tried: together they take about as long as the fit
-_SAME = 1e-6  # relative: two terms of one error span the same beside the physics, as a dead zone and a limit
+_SAME = 1e-6  # relative: two terms of one error span the same, as a dead zone and a limit
 _LISTED = 3  # changes without gain that the text names
 
 
@@ -445,7 +445,7 @@ class Trials:
     ) -> Pieces | None:
         """Return the squared errors of the free run of a job's model.
 
-        None where there is none, or it is not accepted.
+        None where training failed, or the fit is not accepted.
         """
         try:
             fit = job.fold_fit(variant)(self.rows.training)
@@ -464,7 +464,7 @@ class Trials:
             LOG.info("%s was not tried: %s", proposal.words, error)
             return ProposalErrors(proposal, None)
         criterion = job.spec.declared_criterion() if proposal.refocuses else self.variant.criterion
-        kind = ALONE if physics_only else None if proposal.learns else self.variant.kind
+        kind = PHYSICS_ONLY if physics_only else None if proposal.learns else self.variant.kind
         pieces = self.run(job, Variant(kind, criterion=criterion), proposal.accepts)
         return ProposalErrors(proposal, pieces, physics_only)
 
@@ -498,7 +498,7 @@ def advise(
     except InputError:
         return None
     learns = fit.model.form.bound is not None
-    variant = Variant(None if learns else ALONE, criterion=fit.criterion)
+    variant = Variant(None if learns else PHYSICS_ONLY, criterion=fit.criterion)
     motion = result.motion
     substeps = None if motion is None or motion.integrator == "discrete" else motion.substeps
     trials = Trials(job, rows, variant, fit.problem.deviation, substeps)
@@ -552,7 +552,7 @@ def _concluded(
 
 def _which(better: int, tried: int) -> str:
     if tried == 1:
-        return "which betters it" if better else "which does not better it"
+        return "which betters it" if better else "which does not improve it"
     return (
         "of which "
         f"{'none betters' if not better else 'one betters' if better == 1 else f'{better} better'} "
@@ -563,7 +563,7 @@ def _which(better: int, tried: int) -> str:
 def _ratio(pieces: Pieces, base: Pieces) -> Ratio:
     """Return the ratio of errors to those of the present model, on the rows that both predict.
 
-    More lags begin later.
+    With more lags the predictions begin later.
     """
     cut = [
         (a, b) if a is None or b is None else (a[-min(len(a), len(b)) :], b[-min(len(a), len(b)) :])

@@ -24,7 +24,7 @@ DEFECTS: tuple[type[BaseException], ...] = (
 def attempt(what: str, analysis: Callable[[], T], warnings: list[Any], otherwise: T) -> T:
     """Return the result of an analysis, or `otherwise` with one more warning where it fails.
 
-    A training may have taken hours: a defect of an analysis does not take it away, and is logged.
+    Training may have taken hours: a defect of an analysis does not discard it, and is logged.
 
     Args:
         what: the analysis in words, to begin a sentence with.

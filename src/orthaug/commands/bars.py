@@ -24,19 +24,19 @@ if TYPE_CHECKING:
     from rich.progress import ProgressColumn
 
 PROGRESS_VARIABLE = "ORTHAUG_PROGRESS"
-"""Environment variable; `json` writes the progress of training to standard error, a line each.
+"""Environment variable: with the value `json`, progress is written as JSON to standard error.
 """
 ENOUGH = threading.Event()
-"""An event of the process: once it is set, training ends with the result reached so far, and the warning `stopped`.
+"""Event of the process: it ends training with the result so far and the warning `stopped`.
 """
 ENOUGH_LINE = b"enough\n"
 """What sets it, on the standard input of a child of the page."""
 GO_ON = "The runs that are done are kept: the same command goes on from there"
 """What an interrupted `reproduce` says last."""
 _OFTEN = 0.02  # s between such lines
-_MANY = 1_000_000  # rows from which the rate is told
-_LONG = 5.0  # s of a search that are told beforehand
-_SEEN = 3  # models after which the time of the rest is told: the first ones compile
+_MANY = 1_000_000  # rows from which the rate is shown
+_LONG = 5.0  # s of a search from which its duration is announced
+_SEEN = 3  # models after which the remaining time is shown: the first ones compile
 
 
 def on_terminal() -> bool:
@@ -50,7 +50,7 @@ def on_terminal() -> bool:
 def drawn_bar(*columns: ProgressColumn, transient: bool = True) -> Bar:
     """Return a bar with its description and these columns, drawn on a terminal only.
 
-    NO_COLOR is heeded.
+    NO_COLOR has effect.
     """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn
@@ -68,8 +68,7 @@ def training_bar(
     """Show a progress bar on standard error where that is a terminal; report what Ctrl-C stopped.
 
     Args:
-        rows: of the training data. Where there are many, it says how many are gone through in a
-            second.
+        rows: of the training data. Where there are many, the rate in rows/s is shown.
     """
     if not wanted:
         yield SILENT
@@ -113,7 +112,7 @@ def training_bar(
 class _Lines:
     """A writer of progress as lines of JSON, for a program that follows this one.
 
-    Nothing unless it is asked for.
+    It writes only if the environment asks for it.
     """
 
     def __init__(self, runs: int, iterations: int) -> None:
@@ -177,10 +176,9 @@ def study_bars() -> Iterator[Callable[[str, int, int], None]]:
 def selection_bar(most: int) -> Iterator[Callable[[str, Any], None]]:
     """Show a bar of the models judged so far, on standard error.
 
-    Ctrl-C keeps what there is, a second one ends at once.
+    Ctrl-C keeps the models judged so far, a second one ends at once.
 
-    Once terms have been judged for a while, it says what the rest takes at most, also where there
-    is no terminal.
+    After some terms it announces the longest remaining time, also without a terminal.
     """
     from rich.progress import MofNCompleteColumn, TimeElapsedColumn, TimeRemainingColumn
 

@@ -1,4 +1,4 @@
-"""The rows that chose terms, in a spec: cut from those that are fitted, and asked for again when it is fitted."""
+"""Training rows that chose terms: recorded in a spec, and checked when it is fitted."""
 
 from __future__ import annotations
 
@@ -145,7 +145,7 @@ def intervals_of(job: Any, fit: Any) -> Intervals | None:
 
 
 def after_choice(job: Any, fit: Any) -> tuple[Any, Intervals | None]:
-    """Return a fit, without intervals where its rows chose its terms, and where its intervals come from."""
+    """Return a fit and the source of its intervals; without these where its rows chose its terms."""
     found = intervals_of(job, fit) if fit.status.ok else None
     if found is None or found.source != "none":
         return fit, found

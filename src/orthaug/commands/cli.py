@@ -35,7 +35,7 @@ from orthaug.commands.program import (
 from orthaug.commands.signals import WATCH
 
 __all__ = ["main"]
-_LARGE = 20e6  # bytes of a data file from which on `init` tells what it is at
+_LARGE = 20e6  # bytes of a data file from which on `init` reports its stage
 
 
 @app.command()
@@ -164,7 +164,7 @@ def design(
 ) -> None:
     """Design an input that biases the parameters least.
 
-    Within limits, against suspected terms and noise: [design] of the spec.
+    [design] of the spec has the limits, suspected terms and noise.
     """
     from orthaug.commands import design as designing
     from orthaug.commands.folder import check_file
@@ -188,7 +188,7 @@ def select(
 ) -> None:
     """Choose orders, delay and terms, and write a spec with them.
 
-    Or a network's width and inputs: [selection] of the spec.
+    It can also choose a network's width and inputs: [selection] of the spec.
     """
     from orthaug.commands.bars import selection_bar
     from orthaug.commands.folder import check_folder, check_inputs_kept
@@ -249,9 +249,9 @@ def init(
         streams.say("columns: " + ", ".join(column.header for column in found.signals))
         if inputs is None:
             check = partial(assign, found, outputs=outputs, sampling_time=sampling_time)
-            inputs = [_asked("inputs, separated by commas (none: press enter)", check)]
+            inputs = [_ask("inputs, separated by commas (none: press enter)", check)]
         if outputs is None:
-            outputs = [_asked("outputs", partial(assign, found, inputs), default=None)]
+            outputs = [_ask("outputs", partial(assign, found, inputs), default=None)]
         roles = assign(found, inputs, outputs, sampling_time)
     if (
         roles is not None
@@ -275,10 +275,10 @@ def _silent(line: str) -> None:
     """Show nothing: the file is read too quickly for a message."""
 
 
-def _asked(text: str, check: Callable[[str], Any], default: str | None = "") -> str:
+def _ask(text: str, check: Callable[[str], Any], default: str | None = "") -> str:
     """Return an answer that `check` accepts.
 
-    What is wrong with another one is said, and it is asked again.
+    Another answer is refused with the reason, and the question is repeated.
     """
     from orthaug._base.errors import InputError
 
@@ -359,7 +359,7 @@ def reproduce(
 ) -> None:
     """Compute the paper's figures and tables again.
 
-    Goes on where it was interrupted.
+    An interrupted run continues where it stopped.
     """
     from orthaug.studies import reproduction
 
@@ -382,4 +382,4 @@ def reproduce(
     streams.echo(f"{reproduction.text(reproduced)}\n\nwritten to {folder}/index.html")
 
 
-from orthaug.commands import model_cli  # noqa: E402, F401  (its commands stand behind these)
+from orthaug.commands import model_cli  # noqa: E402, F401  (its commands come after these)

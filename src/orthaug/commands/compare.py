@@ -13,7 +13,7 @@ from orthaug._base.errors import InputError
 from orthaug._base.folders import whole_folder
 from orthaug._base.progress import SILENT, Progress
 from orthaug.analysis.validation import Verdict, dominance
-from orthaug.commands.doubts import doubted
+from orthaug.commands.doubts import with_doubts
 from orthaug.commands.fit import (
     FitReport,
     cross_validated,
@@ -22,7 +22,7 @@ from orthaug.commands.fit import (
     score_part,
     wanted_blocks,
 )
-from orthaug.commands.job import ALONE, Job, Variant, origin_of
+from orthaug.commands.job import PHYSICS_ONLY, Job, Variant, origin_of
 from orthaug.data.record import same_step
 from orthaug.fitting.criteria import Criterion, Prediction
 from orthaug.models import storage
@@ -77,7 +77,7 @@ def compare(job: Job, saved: Sequence[Path] = (), progress: Progress = SILENT) -
         ):
             fitted[kind] = decided
             continue
-        fitted[kind] = doubted(
+        fitted[kind] = with_doubts(
             fit_variant(job, variant, progress.after(runs=number * job.run_count))
         )
     verdicts = _verdicts(job, fitted)
@@ -99,15 +99,15 @@ def _criterion(job: Job, progress: Progress) -> tuple[Criterion, FitReport | Non
     declared = job.spec.declared_criterion()
     if not declared.automatic:
         return declared, None
-    kind = job.spec.structure.kind if job.spec.structure.kind in job.compared else ALONE
-    fitted = doubted(fit_variant(job, Variant(kind), progress))
+    kind = job.spec.structure.kind if job.spec.structure.kind in job.compared else PHYSICS_ONLY
+    fitted = with_doubts(fit_variant(job, Variant(kind), progress))
     return (fitted.fit.criterion if fitted.fit.status.ok else Prediction()), fitted
 
 
 def _verdicts(job: Job, fitted: dict[str, FitReport]) -> dict[str, Verdict]:
     """Return whether each structure's learner helps, by cross-validation and held-out parts."""
-    alone = fitted[ALONE].fit
-    kinds = [kind for kind, tried in fitted.items() if kind != ALONE and tried.fit.status.ok]
+    alone = fitted[PHYSICS_ONLY].fit
+    kinds = [kind for kind, tried in fitted.items() if kind != PHYSICS_ONLY and tried.fit.status.ok]
     if not kinds or not alone.status.ok:
         return {}
     criterion = alone.criterion
@@ -118,7 +118,7 @@ def _verdicts(job: Job, fitted: dict[str, FitReport]) -> dict[str, Verdict]:
         trials = cross_validated(
             job, blocks, [Variant(kind, criterion=criterion) for kind in kinds]
         )
-    ran = fitted[ALONE].responses
+    ran = fitted[PHYSICS_ONLY].responses
     verdicts = {
         k: judge_fit(fitted[k], lambda: alone, own, ran)
         for k, own in zip(kinds, trials, strict=True)
@@ -220,4 +220,8 @@ def _chosen(rows: Sequence[RowResult], simulates: bool) -> str | None:
             errors[row.name] = float(np.mean(np.square(np.array(score.nrmse, dtype=float))))
     best = min(errors, key=errors.__getitem__) if errors else None
     verdict = next((row.validation for row in rows if row.name == best), None)
-    return ALONE if verdict is not None and verdict.verdict != "helps" and ALONE in errors else best
+    return (
+        PHYSICS_ONLY
+        if verdict is not None and verdict.verdict != "helps" and PHYSICS_ONLY in errors
+        else best
+    )

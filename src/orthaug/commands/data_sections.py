@@ -139,7 +139,7 @@ class EngineSection(Section):
         parquet = all(file.suffix.lower() == _PARQUET for file in files)
         try:
             size = sum(file.stat().st_size for file in files)
-        except OSError:  # reading them will tell
+        except OSError:  # reading them will report it
             return "memory"
         return "stream" if parquet and _COPIES * size > _SHARE * available() else "memory"
 

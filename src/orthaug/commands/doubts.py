@@ -1,7 +1,6 @@
 """Causes of error that the intervals of a fit do not count: missing structure or a missing state.
 
-It is asked of every fit, of lagged physics and of motions, whether a learner stayed, fell back or
-was never declared.
+Every fit is tested, for either kind of physics, with a learner or without one.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ _DETERMINED = re.compile(
 )
 
 
-def doubted(fitted: Any) -> Any:
+def with_doubts(fitted: Any) -> Any:
     """Return a fit with the warnings `unexplained` and `hidden_state`, and its intervals marked.
 
     The marks say what the intervals count.
@@ -64,7 +63,7 @@ def doubted(fitted: Any) -> Any:
         }
     reason = _reason(result, test, unmodelled)
     if result.shared is not None and reason:
-        found["shared"] = _withdrawn(result.shared, reason)
+        found["shared"] = _withdraw(result.shared, reason)
     return replace(fitted, result=FitResult.model_validate({**dict(result), **found}))
 
 
@@ -90,8 +89,8 @@ def _unexplained(test: StructureTest | None, judged: bool) -> str:
         name = f"a further lag of {best.on}" if test.is_a_lag(best) else best.name
         what = (
             f"the model leaves more than noise: {name} in {best.equation} predicts "
-            f"{percent(best.share)} of the free run's error, beside the colour of its noise, "
-            "on rows that it was not fitted to"
+            f"{percent(best.share)} of the free run's error on rows not fitted, beside the "
+            "colour of its noise"
         )
     return (
         f"{what}. The 95 % intervals count noise only; what is missing may have moved the "
@@ -118,12 +117,12 @@ def _hidden_state(fit: Any, test: StructureTest) -> str:
     remedy += "; or let the learner see lags or a filtered copy of that signal"
     return (
         f"a state is missing: {best.name} in {best.equation} predicts {percent(best.share)} of "
-        "the free run's error on rows that it was not fitted to, which no function of the "
-        f"model's own states does{beside}.{_moved(fit, best)} Do this: {remedy}."
+        f"the free run's error on rows not fitted{beside}. No function of the model's own "
+        f"states does so.{_movement_text(fit, best)} Do this: {remedy}."
     )
 
 
-def _moved(fit: Any, best: FamilyTest) -> str:
+def _movement_text(fit: Any, best: FamilyTest) -> str:
     """Return a sentence on how much a term moves the parameters."""
     values = _values_with(fit, best)
     if not values:
@@ -198,17 +197,14 @@ def _reason(result: FitResult, test: StructureTest | None, unmodelled: bool) -> 
     return ""
 
 
-def _withdrawn(shared: SharedResult, reason: str) -> SharedResult:
+def _withdraw(shared: SharedResult, reason: str) -> SharedResult:
     """Return what the learner could imitate, with no parameter determined by the fit."""
     lost = [*shared.determined, *(shared.physical or [])]
     if not lost:
         return shared
     text = _DETERMINED.sub("", shared.text).rstrip(".")
     named = ", ".join(lost)
-    text = (
-        f"{text}. {named} would be determined by the fit beside such a learner, but not here: "
-        f"{reason}."
-    )
+    text = f"{text}. The fit would determine {named} beside such a learner, but not here: {reason}."
     physical = None if shared.physical is None else []
     update = {
         "text": text,

@@ -1,6 +1,6 @@
 """Entry point of the program: signals first, then streams and environment, then the command line.
 
-The user's switches for libraries that orthaug uses within itself do not reach them.
+Environment variables of the user for libraries inside orthaug have no effect on them.
 """
 
 from __future__ import annotations
@@ -69,8 +69,8 @@ def _complaint() -> str | None:
     needed = _LEAST_MEMORY + _MEMORY_PER_CORE * (os.cpu_count() or 1)
     if limit() < needed and not {"--help", "--version"} & set(sys.argv):
         return (
-            f"the limit on memory (ulimit -v) is {in_words(limit())}; with its libraries "
-            f"orthaug takes {in_words(needed)} of addresses on this machine. Raise the limit."
+            f"the memory limit (ulimit -v) is {in_words(limit())}; with its libraries orthaug "
+            f"needs {in_words(needed)} of address space on this machine. Raise the limit."
         )
     return None
 

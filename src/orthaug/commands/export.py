@@ -11,7 +11,7 @@ from orthaug.export import exporting
 
 
 def check(model: Path, to: str, out: Path, name: str, *, force: bool = False) -> None:
-    """Raise InputError for an unknown target or place, or where the code would replace the model."""
+    """Raise InputError for an unknown target or place, or one that would replace the model."""
     exporting.check_export(to, out, name, force=force)
     try:
         inside = model.exists() and model.resolve().is_relative_to(out.resolve())
@@ -35,7 +35,10 @@ def run(model: Path, to: str, out: Path, name: str, *, force: bool = False) -> t
     except InputError as error:
         own = str(error).startswith(str(out))
         raise InputError(str(error) if own else f"{model}: {error}") from None
-    what = "The code expects data after these steps: it does not contain a delay by `shift`, for example."
+    what = (
+        "The code expects data after these steps: it does not contain a delay by `shift`, for "
+        "example."
+    )
     return (
         prepared_notes(loaded, what=what)
         if any(done.step not in MENDING for done in loaded.prepared)

@@ -17,9 +17,9 @@ from orthaug._base.progress import SILENT, Progress
 from orthaug._base.views import MAKERS
 from orthaug.commands.attempt import attempt
 from orthaug.commands.chosen_rows import after_choice
-from orthaug.commands.doubts import doubted
+from orthaug.commands.doubts import with_doubts
 from orthaug.commands.folder import PHYSICS
-from orthaug.commands.job import ALONE, AS_DECLARED, DEFAULT_BLOCKS, Job, Variant, origin_of
+from orthaug.commands.job import AS_DECLARED, DEFAULT_BLOCKS, PHYSICS_ONLY, Job, Variant, origin_of
 from orthaug.commands.kinds import kind_of
 from orthaug.commands.parts import Part
 from orthaug.commands.scales import describe_scales
@@ -73,14 +73,14 @@ class FitReport:
 @one_blas_thread()
 def fit_job(job: Job, progress: Progress = SILENT) -> FitReport:
     """Train as the spec says, score every part, judge the learner, and try improvements."""
-    return advised(doubted(judged(fit_variant(job, AS_DECLARED, progress))))
+    return with_advice(with_doubts(with_verdict(fit_variant(job, AS_DECLARED, progress))))
 
 
-def advised(fitted: FitReport) -> FitReport:
+def with_advice(fitted: FitReport) -> FitReport:
     """Return a fit with the changes of its spec that were tried."""
     from orthaug.commands.advice import advise
 
-    if not fitted.fit.status.ok or _stopped(fitted.fit):
+    if not fitted.fit.status.ok or _was_stopped(fitted.fit):
         return fitted
     failed: list[Any] = []
     found = attempt(
@@ -96,7 +96,7 @@ def advised(fitted: FitReport) -> FitReport:
     return replace(fitted, result=FitResult.model_validate({**dict(fitted.result), **trials}))
 
 
-def judged(fitted: FitReport) -> FitReport:
+def with_verdict(fitted: FitReport) -> FitReport:
     """Return a fit with the verdict on its learner."""
     job, fit, warnings = fitted.job, fitted.fit, list(fitted.result.warnings)
     if not fit.status.ok or (fit.model.form.bound is None and fit.held_out is None):
@@ -114,7 +114,7 @@ def judged(fitted: FitReport) -> FitReport:
     asked = fit.model.form.bound is not None and job.spec.validation.blocks != 0
     if verdict is None and asked and not failed:
         short = "the training data have too few rows for cross-validation in so many blocks"
-        why = "training was stopped too early for cross-validation" if _stopped(fit) else short
+        why = "training was stopped too early for cross-validation" if _was_stopped(fit) else short
         text = f"whether the learner helps is not judged: no part is held out, and {why}."
         warnings.append(WarningResult(code="not_judged", text=text))
     if verdict is not None and fit.model.form.bound is not None:
@@ -136,7 +136,9 @@ def _physics_alone(fitted: FitReport) -> Any:
     """
     made = fitted.fit.physics_alone
     return (
-        made if made is not None else fitted.job.run(Variant(ALONE, criterion=fitted.fit.criterion))
+        made
+        if made is not None
+        else fitted.job.run(Variant(PHYSICS_ONLY, criterion=fitted.fit.criterion))
     )
 
 
@@ -181,7 +183,7 @@ def _unexplained(fitted: FitReport, physics: Callable[[], Any] | None) -> list[W
 def keep_states(job: Job, folder: Path, *, resume: bool = False) -> Job:
     """Return the job, with its states of training kept beside the result folder.
 
-    With `resume` it goes on from them.
+    With `resume` training continues from them.
 
     Raises:
         InputError: states of another fit; hosts that do not run the same one.
@@ -193,7 +195,7 @@ def keep_states(job: Job, folder: Path, *, resume: bool = False) -> Job:
         hosts.check_alike(job.fingerprint)
         if resume:
             raise InputError(
-                "--resume: a fit over several hosts keeps no states to go on from; leave it out."
+                "--resume: a fit over several hosts keeps no states to continue from; leave it out."
             )
         return job
     place = folder.with_name(f"{folder.name}.training")
@@ -208,7 +210,7 @@ def fit_variant(job: Job, variant: Variant, progress: Progress = SILENT) -> FitR
 
 
 def report_of(job: Job, fit: Any) -> FitReport:
-    """Scores of a fit on every part of its job, and all that results tell of it but the verdict on the learner."""
+    """Score a fit on every part of its job, and fill its result up to the verdict."""
     fit, intervals = after_choice(job, fit)
     warnings: list[Any] = [*job.warnings, *fit.warnings]
     if job.checkpoints is not None and job.checkpoints.lost:
@@ -221,8 +223,8 @@ def report_of(job: Job, fit: Any) -> FitReport:
     if job.checkpoints is not None and job.checkpoints.spoilt:
         text = (
             "a kept state of training is damaged "
-            f"({job.checkpoints.folder.name}/{job.checkpoints.spoilt[0]}), so training began "
-            "anew there; the result is that of a whole training."
+            f"({job.checkpoints.folder.name}/{job.checkpoints.spoilt[0]}), so that run began "
+            "anew; the result is complete."
         )
         warnings.append(Warning("checkpoint_spoilt", text))
     scores, responses = {}, {}
@@ -276,7 +278,7 @@ def report_of(job: Job, fit: Any) -> FitReport:
 def _status(fit: Any, warnings: Sequence[Any]) -> Any:
     """Return how training ended.
 
-    Of a model that does not run freely its message begins with that.
+    For a model whose free run diverges, the message begins with that.
     """
     first = next((warning.text for warning in warnings if warning.code == "one_step_only"), "")
     last = "" if fit.status.ok else describe_scales(fit.problem.record)
@@ -315,7 +317,8 @@ def _one_step_only(
         else "physics alone follows the outputs better in free run"
     )
     text = (
-        f'the model is for one-step prediction only: {why}. `focus = "auto"`, the default, trains the free run, too, '
+        f'the model is for one-step prediction only: {why}. `focus = "auto"`, the default, '
+        "trains the free run, too, "
         "where one step ahead is not enough."
     )
     return [Warning("one_step_only", text)]
@@ -343,7 +346,7 @@ def judge_fit(
 ) -> Verdict | None:
     """Return whether the learner is useful: its free run against physics alone on data not fitted.
 
-    Where the fit fell back to physics alone, that is judged by which it did.
+    Where the fit fell back to physics alone, the trials behind that choice decide.
 
     Args:
         physics: gives the fit of physics alone, where a part is held out.
@@ -365,7 +368,7 @@ def judge_fit(
         else:
             blocks = (
                 cross_validated(job, wanted, [Variant(criterion=fitted.fit.criterion)])[0]
-                if wanted and not _stopped(fitted.fit)
+                if wanted and not _was_stopped(fitted.fit)
                 else ()
             )
     trials, beyond = list(blocks), []
@@ -389,7 +392,7 @@ def judge_fit(
     return judge(trials, beyond)
 
 
-def _stopped(fit: Any) -> bool:
+def _was_stopped(fit: Any) -> bool:
     """Return whether training was asked to end early: then cross-validation is omitted too."""
     return any(warning.code == "stopped" for warning in fit.warnings)
 
@@ -406,7 +409,7 @@ def cross_validated(job: Job, blocks: int, variants: Sequence[Variant]) -> list[
 
     fits = [
         job.fold_fit(variant)
-        for variant in (Variant(ALONE, criterion=variants[0].criterion), *variants)
+        for variant in (Variant(PHYSICS_ONLY, criterion=variants[0].criterion), *variants)
     ]
     try:
         options: dict[str, Any] = {"start": job.first_row, "runner": job.runner}
@@ -421,11 +424,11 @@ def score_part(
 ) -> tuple[PartScores, tuple[Response, Response]]:
     """Return the scores of a part, and the responses that they come from.
 
-    For a score that does not exist a warning is added.
+    A missing score adds a warning.
     """
     responses = model.predict(part.record), model.simulate(part.record)
     if part.source is not None:
-        return _scored_along(model, part, warnings), responses
+        return _score_along(model, part, warnings), responses
     scores = {}
     for kind, response in zip(("prediction", "simulation"), responses, strict=True):
         runaway = next((t.diverged for t in response.trajectories if t.diverged), None)
@@ -453,14 +456,14 @@ def score_part(
     return PartScores.model_validate(scores), responses
 
 
-def _scored_along(model: Any, part: Part, warnings: list[Any]) -> PartScores:
+def _score_along(model: Any, part: Part, warnings: list[Any]) -> PartScores:
     """Return scores and residual tests over all rows of a part that is kept as a subsample."""
     from orthaug.analysis.residuals import RunningResidual
     from orthaug.data.sources import rows_of
     from orthaug.models.long_runs import scores_along
 
     assert part.source is not None
-    whole = len(part.record) == rows_of(part.source)  # whose tests are those of the result
+    whole = len(part.record) == rows_of(part.source)  # its tests are those of the result
     residual = RunningResidual([c.name for c in model.outputs], [c.name for c in model.inputs])
     found = scores_along(model, part.source, part.skip, None if whole else residual.watch)
     if found.diverged is not None:
@@ -523,7 +526,7 @@ def _draw(fitted: FitReport, folder: Path) -> None:
 def fit_report(fitted: FitReport, origin: Origin | None = None) -> str:
     """Return the page of a fit that has a model.
 
-    `origin` is where it comes from, None for its spec.
+    `origin` is None for the origin given by its spec.
     """
     from orthaug.reports.learned_part import learned_of
     from orthaug.reports.page import fit_page

@@ -44,7 +44,7 @@ def chosen_model(model: Path, which: str) -> Path:
 def results_beside(model: Path) -> Iterator[Any]:
     """Yield what is read from result.json in the folder of a model, or the one above.
 
-    For the caller to check.
+    The caller has to check its content.
     """
     for folder in (model, model.parent):
         with suppress(OSError, ValueError, RecursionError):

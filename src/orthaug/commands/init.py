@@ -99,9 +99,7 @@ def spec_text(
         )
     )
     document.add(
-        tomlkit.comment(
-            "Every key: orthaug schema keys. What is written here is a start, not a verdict."
-        )
+        tomlkit.comment("Every key: orthaug schema keys. This is a first draft to be improved.")
     )
     document.add("data", _data(found, roles, out, rows, cut, gaps, named))
     document.add(tomlkit.nl())
@@ -342,15 +340,15 @@ def question(found: Survey, inputs: Names | None = None, outputs: Names | None =
     }
     free = [c for c in found.signals if id(c) not in given]
     if not found.signals or (outputs is None and not free):
-        raise InputError(f"{found.path}: {_nothing_left(found, _joined(inputs))}")
+        raise InputError(f"{found.path}: {_no_output_reason(found, _join(inputs))}")
     some = _listed([c.header for c in found.signals])
     output = free.pop() if outputs is None else None
     rows = next((c.filled for c in (output, *given.values()) if c is not None), 0)
     alike = [c.header for c in free if c.filled == rows] or [c.header for c in free]
     named = ",".join(alike[:_LISTED]) if outputs is not None else alike[0] if alike else ""
-    into = named if inputs is None else _joined(inputs)
+    into = named if inputs is None else _join(inputs)
     proposed = (
-        f'--inputs "{into}" --outputs "{_joined(outputs) if output is None else output.header}"'
+        f'--inputs "{into}" --outputs "{_join(outputs) if output is None else output.header}"'
     )
     said = "the names of the columns do not show which are inputs and which outputs"
     if inputs is not None or outputs is not None:
@@ -364,23 +362,22 @@ def question(found: Survey, inputs: Names | None = None, outputs: Names | None =
     )
 
 
-def _joined(names: Names | None) -> str | None:
+def _join(names: Names | None) -> str | None:
     """Return the names as a person would write them."""
     return names if names is None or isinstance(names, str) else ",".join(names)
 
 
-def _nothing_left(found: Survey, inputs: str | None) -> str:
+def _no_output_reason(found: Survey, inputs: str | None) -> str:
     """Return the reason why no column is left for an output."""
     rows = counted(max(column.filled for column in found.columns), "row")
     others = left_out(found, [*found.signals])
     if not found.signals:
         return (
-            f"no column could be a channel, {rows}: {others}. A first model needs an output "
-            "that varies, over some dozens of rows."
+            f"no column can be a channel, {rows}: {others}. A first model needs an output that "
+            "varies over some dozens of rows."
         )
     text = (
-        f"every column that could be a channel is an input already ({inputs}), and none is "
-        "left for an output"
+        f"every possible channel is already an input ({inputs}), so no column is left for an output"
     )
     return f"{text}; left out: {others}." if others else f"{text}."
 
@@ -501,7 +498,7 @@ def _account(
     """Return the description of the file, a line for each finding."""
     step = f"{roles.sampling_time:g} s, as given" if roles.sampling_time else str(found.clock)
     if roles.sampling_time is None and found.clock.step is None:
-        step += "; 1 s is written: change it"
+        step += "; the spec has 1 s: change it"
     horizon = f"; {found.note}" if found.note else ""
     lines = [
         f"{found.path.name}: {rows} rows, {len(found.columns)} columns{horizon}",
@@ -542,10 +539,11 @@ def _account(
     lines[-1] += f" on rows held out is {errors} of the output's standard deviation"
     if cut - missing > LOOKED_AT:
         lines.append(
-            f"delays and orders are found on {LOOKED_AT} of these rows, in windows spread over them"
+            f"delays and orders are estimated from {LOOKED_AT} of these rows, in windows "
+            "spread over them"
         )
     lines.append(
-        "test: " + (f"rows {cut} to {rows}" if cut < rows else "none, for there are few rows")
+        "test: " + (f"rows {cut} to {rows}" if cut < rows else "none, because there are few rows")
     )
     return "\n".join(lines)
 

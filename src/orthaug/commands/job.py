@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from orthaug.reports.page_fit import Origin
 
 DEFAULT_BLOCKS = 4
-ALONE = "physics alone"
+PHYSICS_ONLY = "physics alone"
 _TOLD = ("jax", "numpy", "scipy")  # packages whose versions move numbers
 
 
@@ -51,7 +51,7 @@ class Variant:
     @property
     def alone(self) -> bool:
         """Whether the variant has no learner."""
-        return self.kind == ALONE
+        return self.kind == PHYSICS_ONLY
 
     @property
     def structure_kind(self) -> str | None:
@@ -143,7 +143,7 @@ class Job(ABC):
     def without(self, samples: Any) -> str:
         """Return a sentence on the result of a fit without these samples of the training data.
 
-        "" where that is dear.
+        It is "" where such a fit is expensive.
         """
         return ""
 
@@ -160,13 +160,13 @@ class Job(ABC):
     def planned(self, variant: Variant) -> Plan:
         """Return the known settings of each run of a variant.
 
-        Nothing where fits to new weights of the outputs follow.
+        Empty where fits to new weights of the outputs follow.
         """
         spec = self.spec
         if spec.training.output_weights == "covariance":
             return ()
         if variant.alone or spec.declared_learner() is None:
-            return ({"structure": ALONE},)
+            return ({"structure": PHYSICS_ONLY},)
         kind, validated = variant.kind or spec.structure.kind, spec.data.validation is not None
         choices = spec.regularizations(linear=self.linear, validated=validated, kind=kind)
         starts = range(1, spec.training.restarts + 1)
@@ -255,7 +255,7 @@ def date_of_results() -> datetime:
     """Return the date of a result: SOURCE_DATE_EPOCH where it is set, now otherwise.
 
     Raises:
-        InputError: seconds that no date is made of.
+        InputError: seconds that are no date.
     """
     epoch = os.environ.get("SOURCE_DATE_EPOCH", "")
     if not epoch:
@@ -295,7 +295,7 @@ def origin_of(job: Job, command: str) -> Origin:
 def _toml(job: Job) -> str:
     """Return the spec as it was written.
 
-    Where its file is another one by now, what was read of it.
+    Where its file has changed since, it is the content that was read.
     """
     import tomlkit
 

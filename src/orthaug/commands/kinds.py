@@ -26,7 +26,7 @@ class Kind(Protocol):
     def checked(self, job: Any) -> CheckResult:
         """Return the findings before training: excitation, identifiability, possible biases.
 
-        Nothing is kept.
+        Nothing is stored.
         """
         ...
 

@@ -13,7 +13,7 @@ import numpy as np
 from orthaug._base.errors import InputError, KeyedError, Warning
 from orthaug._base.progress import SILENT, Progress
 from orthaug.commands.data_sections import engine_of
-from orthaug.commands.job import ALONE, AS_DECLARED, Job, Variant
+from orthaug.commands.job import AS_DECLARED, PHYSICS_ONLY, Job, Variant
 from orthaug.commands.parts import load_parts
 from orthaug.commands.spec import Spec
 from orthaug.commands.suspects import check_suspects
@@ -46,8 +46,7 @@ class LaggedJob(Job):
     engine: Engine
     """The engine that sums over the rows."""
     left_out: tuple[Warning, ...] = ()
-    """Warnings on terms declared for the learner that give none of their own.
-    """
+    """Warnings on terms of the learner that are left out, as they add nothing of their own."""
 
     @property
     def warnings(self) -> tuple[Warning, ...]:
@@ -72,7 +71,9 @@ class LaggedJob(Job):
 
     @property
     def compared(self) -> tuple[str, ...]:
-        return (ALONE,) if self.spec.declared_learner() is None else (ALONE, *STRUCTURES)
+        return (
+            (PHYSICS_ONLY,) if self.spec.declared_learner() is None else (PHYSICS_ONLY, *STRUCTURES)
+        )
 
     @property
     def used(self) -> tuple[Lag, ...]:
@@ -114,7 +115,7 @@ class LaggedJob(Job):
         spec, options = self.spec, self.training_options(variant.on(self.train.record))
         options["structure"] = spec.declared_structure(
             variant.structure_kind
-        )  # predictions score it: no measure tells
+        )  # scored by predictions, on which the measure has no effect
         weights, lags, learner_inputs = spec.training.output_weights, None, None
         if not variant.alone and spec.declared_learner() is not None:
             lags, learner_inputs = spec.lag_orders(), spec.learner_inputs()
@@ -265,7 +266,7 @@ def measure_of(spec: Spec, problem: Problem, folder: Path) -> Measure:
 
 
 def _check_measure(weighed: WeighedPhysics, problem: Problem) -> None:
-    """Raise InputError where the physics is rank-deficient under the measure but not on the data."""
+    """Raise InputError where physics is rank-deficient under the measure but not on the data."""
     if problem.excitation.full_rank and not weighed.excitation.full_rank:
         groups = "; ".join(", ".join(group) for group in weighed.excitation.collinear)
         name = weighed.measure.name

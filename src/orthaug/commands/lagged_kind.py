@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 _NOT_ANALYSED = Warning(
     "residual_not_analysed",
-    "the residual is not analysed: there are too few rows for that, or it is rounding only.",
+    "the residual is not analysed: there are too few rows, or it is rounding error only.",
 )
 _UNKNOWN = ("physical_parameters", "physical_consistency", "sensitivities", "bias")
 
@@ -60,7 +60,7 @@ def checked(job: LaggedJob) -> CheckResult:
             "warnings": [
                 *job.warnings,
                 *ill_conditioned.of_physics(problem),
-                *_said_of_shared(job),
+                *_shared_warnings(job),
                 *closed_loop(job.train.record),
             ],
         }
@@ -127,7 +127,7 @@ def content(
         "excitation": fit.excitation,
         "shared": shared,
     }
-    warnings += _said_of_shared(job, fit) if fit.status.ok else ()
+    warnings += _shared_warnings(job, fit) if fit.status.ok else ()
     budget = None
     if fit.status.ok:
         budget = attempt(
@@ -136,7 +136,7 @@ def content(
     warnings += budget.warnings if budget else ()
     if (
         fit.model.structure != "orthogonal" or fit.model.form.bound is None
-    ):  # a variant of what the spec declares
+    ):  # a variant, not the declared structure
         shared = None
     fields["parameters"] = _with_biases(
         rows, shared.determined if shared else None, budget, fit.at_bound
@@ -251,10 +251,9 @@ def _analysed(
 def _bias_of(job: LaggedJob, fit: Estimate | None = None) -> list[dict[str, Any]]:
     """Return the table of suspects under the spec's measure.
 
-    After a fit with its θ and what its learner explains.
+    After a fit it uses θ and what the learner explains.
 
-    Whether a measure can remove a bias is asked before a fit: then it is answered for the usual
-    suspects, too.
+    Before a fit it includes the usual suspects, since it shows which measure removes a bias.
     """
     if not job.problem.baseline.names:
         return []
@@ -282,7 +281,7 @@ def _with_biases(
 ) -> list[ParameterResult]:
     """Return the parameters, with whether the learner could imitate them and what biases them.
 
-    Not of those `held` at a bound.
+    Those `held` at a bound have none.
     """
     shared = [
         None if determined is None or row.name in held else row.name not in determined
@@ -309,7 +308,7 @@ def _linearization(job: LaggedJob, fit: Estimate | None) -> MeasureLinearization
     return MeasureLinearization(weighed, problem, fit.theta, job.physics, learned, fit.model.shared)
 
 
-def _said_of_shared(job: LaggedJob, fit: Estimate | None = None) -> list[Warning]:
+def _shared_warnings(job: LaggedJob, fit: Estimate | None = None) -> list[Warning]:
     """Return warnings on directions that are determined in name, but not beside the learner."""
     structure, problem = job.spec.declared_structure(), fit.problem if fit else job.problem
     if job.spec.declared_learner() is None or not structure.projects or structure.shared == "all":
@@ -332,7 +331,7 @@ def _shared_of(
 
     Args:
         fit: of the job's problem; None for the problem as it was posed.
-        others: tell what other learner inputs would make of it.
+        others: compute the effect of other learner inputs too.
     """
     structure = job.spec.declared_structure()
     if job.spec.declared_learner() is None or not structure.projects or structure.shared == "all":

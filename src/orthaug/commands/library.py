@@ -1,6 +1,6 @@
 """The interface for users of Python: open, fit and compare specs, and write the page of a fit.
 
-For a fit without a spec a job is made of what the fit knows.
+For a fit without a spec a job is built from the fit.
 """
 
 from __future__ import annotations
@@ -15,8 +15,15 @@ from typing import TYPE_CHECKING, Any
 from orthaug._base.checks import check_type
 from orthaug._base.errors import InputError, TrainingError
 from orthaug._base.folders import check_new_file, whole_file
-from orthaug.commands.doubts import doubted
-from orthaug.commands.fit import FitReport, fit_job, fit_report, judged, report_of, write_result
+from orthaug.commands.doubts import with_doubts
+from orthaug.commands.fit import (
+    FitReport,
+    fit_job,
+    fit_report,
+    report_of,
+    with_verdict,
+    write_result,
+)
 from orthaug.commands.folder import check_folder, check_inputs_kept
 from orthaug.commands.job import Job, origin_of
 from orthaug.commands.kinds import open_job
@@ -70,7 +77,7 @@ def fit_spec(spec: Spec, out: str | os.PathLike | None = None) -> FitReport:
     Raises:
         InputError: as `load_spec`; a folder that cannot be written or holds something else.
     """
-    job, folder = _opened(spec, out)
+    job, folder = _open(spec, out)
     fitted = fit_job(job)
     if folder is not None:
         write_result(fitted, folder)
@@ -98,7 +105,7 @@ def compare(
         raise InputError("`models` must be a list of folders, such as ['orthaug-out/spec'].")
     for model in models:
         check_type(model, str | os.PathLike, "models", "a list of folders")
-    job, folder = _opened(spec, out)
+    job, folder = _open(spec, out)
     from orthaug.commands import compare as comparing
 
     comparison = comparing.compare(job, [Path(model) for model in models])
@@ -107,7 +114,7 @@ def compare(
     return comparison
 
 
-def _opened(spec: Spec, out: str | os.PathLike | None) -> tuple[Job, Path | None]:
+def _open(spec: Spec, out: str | os.PathLike | None) -> tuple[Job, Path | None]:
     """Return the job, and the folder to write, checked."""
     check_type(spec, Spec, "spec", "the name of a spec file, or what load_spec returns")
     check_type(out, str | os.PathLike | None, "out", "the name of a folder, or None")
@@ -124,7 +131,7 @@ def _opened(spec: Spec, out: str | os.PathLike | None) -> tuple[Job, Path | None
 class Page:
     """A page of a fit: `html` is all of it; `path` the file that has it, or None.
 
-    A notebook shows it.
+    A notebook displays it.
     """
 
     html: str = field(repr=False)
@@ -186,15 +193,15 @@ def page_of(
     """Return the page of a fit: parameters, free runs, learned part, residuals, stability.
 
     Raises:
-        TrainingError: a fit without a usable model. InputError: a path that cannot be written,
-            records that do not fit.
+        TrainingError: a fit without a usable model.
+        InputError: a path that cannot be written, records that do not fit.
     """
     place = _checked(fit, path)
     job = job_of(fit, {} if tests is None else tests)
     made = replace(
         origin_of(job, "fit"), name="spec", command=f"{NAME} in Python", toml=_account(fit)
     )
-    return _written(fit_report(doubted(judged(report_of(job, fit))), made), place)
+    return _written(fit_report(with_doubts(with_verdict(report_of(job, fit))), made), place)
 
 
 def page_of_spec(fitted: FitReport, path: str | os.PathLike | None, tests: None = None) -> Page:

@@ -70,7 +70,7 @@ def open_linear(model: Path, data: Path | None) -> tuple[Model | MotionModel, Re
 def write(found: Linearization, out: Path, *, force: bool = False) -> None:
     """Write a folder with result.json, linear.txt and figures/.
 
-    Or one file, by its ending JSON or the frequency response.
+    Or write one file, by its ending JSON or the frequency response.
 
     Whole or not at all.
     """
@@ -102,7 +102,7 @@ def write(found: Linearization, out: Path, *, force: bool = False) -> None:
         save(poles_figure(found), partial / "figures" / "poles.png")
 
 
-def printed(found: Linearization, *, as_json: bool) -> str:
+def output_text(found: Linearization, *, as_json: bool) -> str:
     """Return the text that the command prints."""
     from orthaug.reports.linear import LinearizeResult
     from orthaug.reports.linear_text import linear_text

@@ -75,16 +75,14 @@ def write(
 ) -> tuple[Scores | None, list[Warning]]:
     """Write the table of `run.write_csv`, to a file (whole or not at all) or standard output.
 
-    Return the scores, None where nothing was measured, and warnings.
+    Return the scores of all rows, None where nothing was measured, and warnings.
 
-    Scores of all rows, warnings.
-
-    No scores where a free run left all bounds.
+        There are no scores where the free run diverged.
     """
     from orthaug.models.long_runs import RunningScores, responses
 
     scored, warnings, first = RunningScores(), [], run.model.form.first_row
-    with _opened(out, force) as file:
+    with _open(out, force) as file:
         for piece, response in responses(run.model, run.source, free=run.free):
             (trajectory,) = response.trajectories
             frame = response.to_frame()
@@ -104,7 +102,7 @@ def write(
 
 
 @contextmanager
-def _opened(out: Path | None, force: bool) -> Iterator[Any]:
+def _open(out: Path | None, force: bool) -> Iterator[Any]:
     if out is None:
         yield sys.stdout
         return

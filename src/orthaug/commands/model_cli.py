@@ -134,7 +134,7 @@ def split(
 ) -> None:
     """Split the parameters of a saved model by another measure.
 
-    Without training again.
+    The model is not trained again.
     """
     from orthaug.commands import split as splitting
     from orthaug.commands.run import read_rows
@@ -174,7 +174,7 @@ def explain(
 ) -> None:
     """Explain which terms the learner of a saved model has found.
 
-    And what to write into the physics.
+    And print what to write into the physics.
     """
     check_count(degree, "--degree", of="factors")
     check_count(most, "--terms", of="terms")
@@ -245,7 +245,7 @@ def linearize(
 ) -> None:
     """Linearize a saved model: operating points, poles and gains.
 
-    With intervals, and the frequency response.
+    All with intervals, and the frequency response.
     """
     from orthaug.commands import linearize as linearizing
     from orthaug.commands.run import prepared_notes
@@ -262,7 +262,7 @@ def linearize(
     found = linearized(opened, at, record, continuous=continuous)
     if out is not None:
         linearizing.write(found, out, force=force)
-    streams.echo(linearizing.printed(found, as_json=as_json))
+    streams.echo(linearizing.output_text(found, as_json=as_json))
     if out is not None and not as_json:
         streams.echo(f"\nwritten to {out}")
 
@@ -304,7 +304,7 @@ def track(
 ) -> None:
     """Track the parameters of a saved model over new data.
 
-    By recursive least squares with forgetting.
+    It uses recursive least squares with forgetting.
     """
     from orthaug.commands import track as tracking
     from orthaug.commands.folder import check_folder, check_kept
@@ -331,7 +331,7 @@ def _written_long(
 ) -> bool:
     """Return whether the file is one that is read piece by piece.
 
-    Then its table is written piece by piece.
+    Its table is then written piece by piece.
     """
     from orthaug.commands import long_run
     from orthaug.commands.folder import check_file

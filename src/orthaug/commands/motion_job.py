@@ -12,7 +12,7 @@ from orthaug._base.errors import InputError, KeyedError
 from orthaug._base.progress import SILENT, Progress
 from orthaug.analysis.motion_suspects import MotionSuspect
 from orthaug.commands.data_sections import engine_of
-from orthaug.commands.job import ALONE, AS_DECLARED, Job, Variant
+from orthaug.commands.job import AS_DECLARED, PHYSICS_ONLY, Job, Variant
 from orthaug.commands.parts import Part, load_parts
 from orthaug.commands.spec import Spec
 from orthaug.commands.suspects import declared_terms
@@ -60,7 +60,11 @@ class MotionJob(Job):
 
     @property
     def compared(self) -> tuple[str, ...]:
-        return (ALONE,) if self.spec.declared_learner() is None else (ALONE, WITH_LEARNER)
+        return (
+            (PHYSICS_ONLY,)
+            if self.spec.declared_learner() is None
+            else (PHYSICS_ONLY, WITH_LEARNER)
+        )
 
     def refusal(self, variant: Variant) -> str | None:
         return None
@@ -108,7 +112,7 @@ def open_motion(path: Path, spec: Spec) -> MotionJob:
         _check_choices(spec, motion)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    least = len(motion.states) + 1  # rows of a run that tell where it starts
+    least = len(motion.states) + 1  # rows that determine the initial state of a run
     train, validation, *tests = (
         p and p.without_short(0, least) for p in _parts(load_parts(path, spec))
     )

@@ -28,16 +28,16 @@ if TYPE_CHECKING:
     from orthaug.reports.drawing import Figure
 
 _UNKNOWN = ("physical_parameters", "physical_consistency", "sensitivities", "bias", "missing_lags")
-_STIFF = 20  # substeps from which a motion is told to be stiff for its sampling
+_STIFF = 20  # substeps from which a motion is called stiff for its sampling
 _NOT_ANALYSED = Warning(
     "residual_not_analysed",
-    "the residual is not analysed: the free run ran away, has too few rows, or leaves rounding "
-    "only.",
+    "the residual is not analysed: the free run diverged, has too few rows, or leaves rounding "
+    "error only.",
 )
 _NOT_RICH = Warning(
     "rich_inputs_run_away",
-    "physics alone runs away with rich inputs: what is told of identifiability is that of the "
-    "record's own.",
+    "physics alone diverges under rich inputs, so identifiability is computed for the inputs "
+    "of the record.",
 )
 
 
@@ -63,7 +63,7 @@ def checked(job: MotionJob) -> CheckResult:
         )
         scales = describe_scales(problem.record)
         cause = f" {scales[0].upper()}{scales[1:]}" if scales else ""
-        remedy = f"it runs on a sample that is none.{wild}" if wild else f"give others.{cause}"
+        remedy = f"it meets a wild sample.{wild}" if wild else f"give others.{cause}"
         raise InputError(
             f"{job.path}: physics alone has no finite free run from its initial values; {remedy}"
         )
@@ -123,7 +123,7 @@ def checked(job: MotionJob) -> CheckResult:
 def _biases(job: MotionJob, trial: Trial) -> list[dict[str, Any]] | None:
     """Return the bias that each suspect would cause, with physics alone.
 
-    Of the usual ones those that do anything, where none is named.
+    Without suspects in the spec, the usual ones with an effect.
 
     None where physics alone has no run.
     """
@@ -336,7 +336,7 @@ def _about_steps(job: MotionJob, trial: Trial) -> tuple[str, list[Warning]]:
         + (
             " are as declared."
             if motion.substeps is not None
-            else ": twice as many move the outputs by less than 1 % of the residual."
+            else ": twice as many change the outputs by less than 1 % of the residual."
         )
     ]
     if trial.substeps >= _STIFF:
@@ -351,12 +351,15 @@ def _about_steps(job: MotionJob, trial: Trial) -> tuple[str, list[Warning]]:
             for held in trial.holds
         )
         sentences.append(
-            "Physics alone leaves, by the hold of its inputs, in deviations of the output: "
-            f"{shown}."
+            "Residual of physics alone for each hold of the inputs, in deviations of the "
+            f"output: {shown}."
         )
         if trial.best is None:
-            sentences.append("None explains the data clearly better than the declared one.")
+            sentences.append("No hold explains the data clearly better than the declared one.")
         else:
-            text = f'the data are explained better by hold = "{trial.best}" than by the declared "{motion.hold}".'
+            text = (
+                f'the data are explained better by hold = "{trial.best}" than by the '
+                f'declared "{motion.hold}".'
+            )
             warnings.append(Warning("other_hold", text))
     return " ".join(sentences), warnings

@@ -43,7 +43,7 @@ class Part:
         They have no row after the first `first`.
 
         Args:
-            least: rows of a stretch that has a use.
+            least: minimum rows of a useful stretch.
         """
         if not self.record.missing:
             return self
@@ -98,7 +98,7 @@ def long_stretches(
     Args:
         skips: leading samples of each stretch that are not scored.
         least: rows of a stretch that has a use.
-        what: stands before what is wrong; `skip` is the largest of the skips as it was asked for.
+        what: prefix of the message; `skip` is the largest of the skips as given.
 
     Raises:
         InputError: no stretch is long enough.
@@ -158,7 +158,7 @@ def expanded(path: Path, entries: Sequence[str], name: str) -> list[str]:
             continue
         if not files:
             raise InputError(
-                f"{path}: 'data.{name}.files': no file fits '{entry}'; expected one of "
+                f"{path}: 'data.{name}.files': no file matches '{entry}'; expected one of "
                 f"{', '.join(KNOWN)}."
             )
         found += sorted(file for file in files if Path(file).suffix)
@@ -168,10 +168,10 @@ def expanded(path: Path, entries: Sequence[str], name: str) -> list[str]:
 def _load(path: Path, spec: Spec, part: PartSection, name: str, *, stays: bool = False) -> Part:
     """Return a part with its files read.
 
-    Messages begin with the file at fault; once it is read, with its name in the spec.
+    Messages begin with the file at fault, after reading by its name in the spec.
 
     Args:
-        stays: leave the rows of Parquet files where they are, and read a witness of them.
+        stays: leave the rows of Parquet files where they are, and read a subsample of them.
     """
     unknown = [
         channel
@@ -184,7 +184,7 @@ def _load(path: Path, spec: Spec, part: PartSection, name: str, *, stays: bool =
         )
     files = expanded(path, part.files, name)
     if stays and all(Path(file).suffix.lower() == ".parquet" for file in files):
-        return _left(path, spec, part, name, files)
+        return _open_in_files(path, spec, part, name, files)
     records, results = [], []
     used = _used_columns(spec, part.columns)
     for file in files:
@@ -228,17 +228,19 @@ def _load(path: Path, spec: Spec, part: PartSection, name: str, *, stays: bool =
     return Part(name, record, part.skip, tuple(results), warnings)
 
 
-def _left(path: Path, spec: Spec, part: PartSection, name: str, files: Sequence[str]) -> Part:
+def _open_in_files(
+    path: Path, spec: Spec, part: PartSection, name: str, files: Sequence[str]
+) -> Part:
     """Return a part whose rows remain in its Parquet files."""
     if spec.data.prepare:
         raise InputError(
-            f"{path}: 'data.prepare' needs the rows in memory, and these stay in their files; prepare the files, or "
-            'set engine.kind = "memory".'
+            f"{path}: 'data.prepare' needs the rows in memory, and these stay in "
+            'their files; prepare the files, or set engine.kind = "memory".'
         )
     if part.rows is not None or part.every > 1:
         raise InputError(
-            f"{path}: 'data.{name}': `rows` and `every` need the rows in memory; write the files that way, or set "
-            'engine.kind = "memory".'
+            f"{path}: 'data.{name}': `rows` and `every` need the rows in memory; "
+            'write the files that way, or set engine.kind = "memory".'
         )
     few_arenas()
     places = [path.parent / file for file in files]
@@ -262,7 +264,7 @@ def _left(path: Path, spec: Spec, part: PartSection, name: str, files: Sequence[
         warnings = _other_step(path, spec, files, name, part.columns)
     if len(record) < total:
         text = (
-            f"{name}: findings and figures look at {len(record)} of {total} rows, in windows "
+            f"{name}: findings and figures use {len(record)} of {total} rows, in windows "
             "spread over them."
         )
         warnings += (Warning("witness", text),)
@@ -284,7 +286,10 @@ def _used_columns(spec: Spec, columns: Mapping[str, str]) -> set[str]:
 
 
 def _guessed_encoding(path: Path, files: Sequence[str], name: str) -> tuple[Warning, ...]:
-    """Return a warning for the first file that is no UTF-8: what looks like an old encoding may be damage."""
+    """Return a warning for the first file that is not UTF-8.
+
+    Apparent text in an old encoding may be damaged.
+    """
     for file in files:
         line = guessed_encoding(path.parent / file)
         if line is not None:
@@ -309,7 +314,7 @@ def _other_step(
         said = (
             f"`sampling_time` is {step:g} s"
             if given
-            else "the spec says no sampling time, so 1 s is taken"
+            else "the spec gives no sampling time, so 1 s is used"
         )
         header = clock.column.header
         remedy = f'time = "{header}"' if clock.instants else f"sampling_time = {clock.step:g}"

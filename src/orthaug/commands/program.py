@@ -63,11 +63,12 @@ class ListOptionCommand(typer.core.TyperCommand):
 def _repeated(args: Sequence[str], lists: Set[str], valued: Set[str]) -> list[str]:
     """Return arguments with the option of a list repeated before each of its values.
 
-    One value is left to be the argument of the command where there would be none: a file that
-    exists, or the last.
+    Where the command would have no argument, one value is left for it: a file that exists, or the
+    last.
 
     Examples:
-        >>> _repeated(["run.csv", "--inputs", "a", "b", "--out", "c"], {"--inputs"}, {"--inputs", "--out"})
+        >>> given = ["run.csv", "--inputs", "a", "b", "--out", "c"]
+        >>> _repeated(given, {"--inputs"}, {"--inputs", "--out"})
         ['run.csv', '--inputs', 'a', '--inputs', 'b', '--out', 'c']
     """
     found: list[list[str]] = []
@@ -94,8 +95,8 @@ def _repeated(args: Sequence[str], lists: Set[str], valued: Set[str]) -> list[st
 app = typer.Typer(
     name="orthaug",
     cls=_Group,
-    help="Fit physics together with a learned correction, so that the physics keeps all that "
-    "physics can explain.",
+    help="Fit physics together with a learned correction, so that physics keeps what it can "
+    "explain.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
@@ -248,8 +249,8 @@ def print_result(result: Content, text: str, as_json: bool, place: object = None
     written = f"\n\nwritten to {place}" if place is not None else ""
     if place in PARTIALS.overtaken:
         streams.say(
-            f"warning: {place}: another run wrote a result here while this one ran, and this "
-            "one has replaced it; run it again with another --out to have both."
+            f"warning: {place}: another run wrote a result here meanwhile, and this one has "
+            "replaced it; run again with another --out to have both."
         )
     streams.echo(result.to_json() if as_json else f"{text}{written}")
 

@@ -55,7 +55,7 @@ class ReadOptions:
         """Return the options of a command.
 
         Raises:
-            InputError: an option that is none.
+            InputError: an invalid value of an option.
         """
         check_choice(missing, ("error", "skip"), "--missing")
         if every < 1:
@@ -98,7 +98,7 @@ def read_rows(text: str | None) -> tuple[int, int] | None:
 def trained_reading(model: Path, data: Path) -> ReadOptions | None:
     """Return the options by which a model's training file was read, from the result beside it.
 
-    None where it is none of its files.
+    None for a file that the model was not trained on.
     """
     digest = file_digest(data)
     for content in results_beside(model):
@@ -156,7 +156,7 @@ def open_run(
 ) -> ModelOnData:
     """Load a model and read its channels from a file.
 
-    Outputs only where the file has them, unless needed.
+    Outputs are optional unless needed.
 
     Args:
         ahead: rows behind the first usable one before a stretch between missing samples has a
@@ -184,7 +184,7 @@ def open_run(
     elif held:
         missing = [c.name for c in loaded.outputs if c not in held]
         raise InputError(
-            f"{data}: has some of the model's outputs but not {', '.join(missing)}; give all "
+            f"{data}: has some of the model's outputs but lacks {', '.join(missing)}; give all "
             "or none."
         )
     try:
@@ -258,8 +258,8 @@ def prepared_notes(
     """Return notes on a model whose training data were prepared.
 
     Args:
-        record: other data that went through the same; what the steps found there is told.
-        what: stands behind the steps where there are no such data.
+        record: other data after the same steps, whose effects there are reported.
+        what: sentence after the steps where there are no such data.
     """
     if not model.prepared:
         return ()
@@ -285,7 +285,7 @@ def read_initial(initial: str | None, opened: ModelOnData) -> str | Any:
         remedy = (
             "leave --initial out"
             if measured
-            else "a free run without measured outputs cannot go on behind them"
+            else "a free run without measured outputs cannot continue after them"
         )
         raise InputError(
             f"{opened.source}: has missing samples, and each stretch starts from its own "
@@ -386,7 +386,7 @@ def observed(opened: ModelOnData, horizon: int) -> tuple[Response, list[str]]:
 def _of_band(found: Consistency, response: Response) -> list[str]:
     """Return the NIS with its interval where outputs were measured.
 
-    A warning where it leaves that, for the band is then wrong.
+    It is a warning outside of that interval, since the band is then wrong.
     """
     from orthaug.models.response import BAND
 
@@ -400,9 +400,9 @@ def _of_band(found: Consistency, response: Response) -> list[str]:
         return []
     held, (low, high) = float(np.mean(np.abs(apart) <= BAND)), found.expected
     text = (
-        f"the innovations' squares are {found.nis:.3g} times what the observer expects (NIS, "
-        f"{low:.3g} to {high:.3g} where it knows its noise); its 95 % band holds "
-        f"{percent(held, 3)} of what was measured."
+        f"the squared innovations are {found.nis:.3g} times as large as the observer expects "
+        f"(NIS; {low:.3g} to {high:.3g} with the right noises). Its 95 % band contains "
+        f"{percent(held, 3)} of the measured values."
     )
     if found.consistent:
         return [f"note: {text}"]
@@ -412,7 +412,7 @@ def _of_band(found: Consistency, response: Response) -> list[str]:
         else "its noises are too large"
     )
     return [
-        f"warning: {text} Do not take the band for one of 95 %: {why}. "
+        f"warning: {text} Do not use the band as one of 95 %: {why}. "
         "oa.Observer(oa.load(MODEL)).tuned(record) finds noises by the likelihood of a record."
     ]
 
@@ -429,7 +429,7 @@ def write_csv(
 ) -> None:
     """Write one row per data row, with empty cells where there is no value.
 
-    To a file (whole or not at all) or standard output.
+    It goes to a file (whole or not at all) or standard output.
     """
     frame = _table(response, opened)
     if out is None:
@@ -442,7 +442,7 @@ def write_csv(
 def _table(response: Response, opened: ModelOnData) -> Any:
     """Return the tables of all stretches in the order of the file's rows.
 
-    Of rows that were left out the time alone.
+    Rows that were left out have their time only.
     """
     stretches = opened.record.experiments
     frames = [response.to_frame(i) for i in range(len(stretches))]
@@ -466,8 +466,9 @@ def explain_notes(model: Path) -> list[str]:
         with suppress(AttributeError, KeyError, TypeError):
             if content["spec"].get("physics"):
                 return [
-                    "note: the spec has [physics]: a term from here also takes a line of [physics.theta], such as "
-                    'drag = "drag", its parameter in [physics.parameters] with that `initial`, and none in the term.'
+                    "note: the spec has [physics]. For a term from here add a line to "
+                    '[physics.theta], such as drag = "drag". Declare its parameter in '
+                    "[physics.parameters] with that `initial`, not in the term."
                 ]
     return []
 

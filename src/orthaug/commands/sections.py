@@ -1,6 +1,6 @@
 """Tables of the spec as pydantic models: a common base, and the keys of the kinds in a registry.
 
-What is wrong with one is told in one sentence: pydantic's complaints in the words of TOML.
+An error is one sentence: pydantic's message in the words of TOML.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ def with_kinds(section: type[Kinds], **other: Any) -> type[Kinds]:
 def _field(key: Key) -> tuple[Any, Any]:
     """Return a key as pydantic's type and default.
 
-    One that its kind needs is None where another kind is chosen.
+    A required key is None where another kind is chosen.
     """
     if key.default is MISSING:
         return Union[_in_file(key.annotation), None], None  # noqa: UP007  (the parts are known at run time only)
@@ -143,7 +143,8 @@ def _thawed(value: Any) -> Any:
 def first_message(error: ValidationError, content: dict[str, Any], model: type[BaseModel]) -> str:
     """Return the first error as `key: found …; expected …`."""
     errors = error.errors()
-    # every branch of a union complains: the branch was meant whose type fits, and there the deepest complaint counts
+    # every branch of a union has errors: the branch whose type fits was meant, and there the
+    # deepest error counts
     fitting = [e for e in errors if not e["type"].endswith("_type")]
     first = max(fitting or errors[:1], key=lambda e: len(e["loc"]))
     key = _key(first["loc"], content)

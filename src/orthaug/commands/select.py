@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from orthaug.selection.kept_physics import Shift
     from orthaug.selection.selecting import OnStage, Selection
 
-_DEGREE = 3  # of the terms that a spec without [learner] is searched with
+_DEGREE = 3  # of the terms to search where a spec has no [learner]
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,8 +53,8 @@ def open_select(path: Path) -> tuple[LaggedJob, Spec]:
     spec = load_spec(path)
     if spec.motion is not None:
         raise InputError(
-            f"{path}: structure is selected for lagged signals; for a motion declare a learner of terms "
-            '(kind = "terms"), or a network, and ask `orthaug explain` what it found.'
+            f"{path}: structure is selected for lagged signals; for a motion declare a learner of "
+            'terms (kind = "terms"), or a network, and ask `orthaug explain` what it found.'
         )
     if spec.engine.kind not in ("auto", "memory", "dask"):
         raise InputError(
@@ -73,11 +73,11 @@ def select_for(job: LaggedJob, spec: Spec, folder: Path, report_model: OnStage) 
     """Select the structure, and write the choice into the spec.
 
     Args:
-        folder: where the new spec will be; its paths are relative to that.
+        folder: of the new spec; its paths are relative to that.
         report_model: called with the stage and each model that was judged.
 
     Raises:
-        InputError: what cannot be selected from.
+        InputError: data or physics that selection does not support.
     """
     from orthaug.selection.selecting import MOST, WIDTHS, lagged_rows, select
 

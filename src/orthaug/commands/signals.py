@@ -31,7 +31,7 @@ def _nothing() -> str:
 
 
 def ending(words: str, during: str, kept: str = "", then: str = "") -> str:
-    """Return what an early end says: what was stopped, what is written all the same, and how to go on."""
+    """Return the message of an early end: what was stopped, what is written, how to continue."""
     return (
         f"{words}{during and f' during {during}'}; {kept or 'nothing'} is "
         f"written{then and f'. {then}'}"
@@ -41,7 +41,7 @@ def ending(words: str, during: str, kept: str = "", then: str = "") -> str:
 class SignalWatch:
     """A watch that ends the program on a signal, once it is started.
 
-    Before that, signals do what they always do.
+    Before that, signals have their usual effect.
     """
 
     def __init__(self) -> None:
@@ -54,7 +54,7 @@ class SignalWatch:
     def start(self) -> None:
         """Begin to wait for signals.
 
-        Those that the program is to ignore, as `nohup` asks, are ignored.
+        Signals that `nohup` made the program ignore stay ignored.
         """
         if os.name != "posix":  # elsewhere Ctrl-C is an exception in the main thread
             return
@@ -84,7 +84,7 @@ class SignalWatch:
     def asking(self) -> Iterator[threading.Event]:
         """Yield an event that the first Ctrl-C sets, for work that can stop with a partial result.
 
-        The next ends the program.
+        A second one ends the program.
         """
         import threading
 

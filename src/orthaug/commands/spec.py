@@ -51,9 +51,9 @@ Regularization = (
 )
 
 _BESIDE_MOTION = {
-    "baseline": "expected one of them, for both are the physics",
-    "lags": "expected none, for a motion has states instead; `learner.inputs` says what its "
-    "learner sees",
+    "baseline": "expected one of them, because both are the physics",
+    "lags": "expected none, because a motion has states instead; `learner.inputs` declares the "
+    "inputs of its learner",
     "physics": "expected none, for the parameters of a motion are physical: [motion.parameters]",
 }
 
@@ -249,12 +249,13 @@ class Spec(Section):
                 found = (
                     "beside [motion]; expected `equation`"
                     if self.motion
-                    else "without [motion], whose key it is"
+                    else "without [motion], which it belongs to"
                 )
                 raise ValueError(f"`suspects[{i}].{key}`: found {found}")
         if self.motion is not None and self.training.ensemble:
             raise ValueError(
-                "`training.ensemble`: a motion has none, for medians of runs follow no equations"
+                "`training.ensemble`: a motion has none, because medians of runs follow no "
+                "equations"
             )
         return self
 
@@ -340,7 +341,7 @@ class Spec(Section):
     ) -> Structure:
         """Return the declared structure, or another kind with the same keys.
 
-        Under a measure where it splits θ by one.
+        It has a measure where it splits θ.
         """
         structure = resolve(self.structure.declared(STRUCTURES, kind or self.structure.kind))
         takes = any(field.name == "measure" for field in fields(structure))
@@ -371,7 +372,7 @@ class Spec(Section):
         """Return the kind of engine that sums over the rows of these files.
 
         Raises:
-            InputError: rows that are not in memory, for training that flies over them.
+            InputError: rows that are not in memory, for training by free runs over them.
         """
         if not self.brought:
             return self.engine.chosen(files)

@@ -76,10 +76,10 @@ def _other_files(model: Path, data: Sequence[Path]) -> list[Warning]:
             if kept.keys() == set(map(file_digest, data)):
                 return []
             text = (
-                f"the model was trained on {', '.join(kept.values())}; by the checksums in its "
-                "result.json that is not what was given "
-                f"({', '.join(path.name for path in data)}). Give the files that it was "
-                "trained on: a split over other data does not belong to the fit."
+                f"the model was trained on {', '.join(kept.values())}; the checksums in its "
+                f"result.json differ from those of {', '.join(path.name for path in data)}. "
+                "Give the files that it was trained on: a split over other data does not "
+                "belong to the fit."
             )
             return [Warning("other_training_data", text)]
     return []

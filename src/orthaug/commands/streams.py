@@ -56,7 +56,7 @@ def prepare() -> None:
 def plain(error: UnicodeError) -> tuple[str, int]:
     """Return an ASCII replacement for letters that an encoding lacks.
 
-    In JSON the escape that means the same.
+    In JSON it is the equivalent escape.
     """
     if not isinstance(error, UnicodeEncodeError):
         raise error

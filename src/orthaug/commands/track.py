@@ -73,8 +73,8 @@ def open_track(
         )
     if state is not None and training:
         raise InputError(
-            "--training: found beside --state, which holds what training left; leave one of "
-            "them out."
+            "--training: found beside --state, which holds the statistics of training; leave "
+            "one of them out."
         )
     for path in data:
         check_readable(path)

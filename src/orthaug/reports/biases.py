@@ -1,6 +1,6 @@
 """Table of the parameters' biases, by their causes.
 
-Which biases by suspected terms a heat map shows, and how its cells are written.
+It selects the biases for a heat map, and formats its cells.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from orthaug.reports.result import ParameterResult
 
 _MOST_COLUMNS = 12  # more cells beside each other are too narrow for their numbers on paper
 _MOST_CELLS = 200
-_LEAST = 0.01  # per cent: of less only that it is less is text, for a cell is narrow
+_LEAST = 0.01  # per cent: a smaller bias is written as "less", since a cell is narrow
 _ZERO = 1e-7
 
 

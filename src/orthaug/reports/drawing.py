@@ -23,10 +23,10 @@ try:
     from matplotlib.figure import Figure
 except UnicodeDecodeError:
     raise InputError(
-        "matplotlibrc: found letters that are not UTF-8; mend that file, or remove it."
+        "matplotlibrc: found letters that are not UTF-8; correct that file, or remove it."
     ) from None
 
-# Okabe-Ito: told apart by every reader
+# Okabe-Ito: distinguishable for every reader
 BLACK, GREY, BLUE, ORANGE, GREEN = "#000000", "#B8B8B8", "#0072B2", "#E69F00", "#009E73"
 CYCLE = (BLUE, ORANGE, GREEN, BLACK)
 SIZE = (7.0, 2.4)  # inches per panel
@@ -35,14 +35,14 @@ _LEFT, _GAP = 0.95, 0.32
 _WINDOW = 250  # samples of a long record that are shown, so that single swings can be seen
 _TITLE, _YLABEL, _XLABEL = 0.1, 0.72, 0.26  # inches from the figure's edge or the panel's
 _SHARPNESS = 160  # pixels per inch
-_COLUMNS = round(SIZE[0] * _SHARPNESS)  # more points than these cannot be told apart
+_COLUMNS = round(SIZE[0] * _SHARPNESS)  # more points than these cannot be distinguished
 Drawn = ParamSpec("Drawn")
 
 
 def _own_style() -> AbstractContextManager[None]:
     """Return a context in which the user's own settings of matplotlib do not change the figures.
 
-    A `$` in a unit begins no formula.
+    A `$` in a unit does not begin a formula.
     """
     own: dict[Any, Any] = {
         key: value for key, value in rcParamsDefault.items() if not key.startswith("backend")

@@ -77,7 +77,7 @@ def explain_text(result: ExplainResult) -> str:
         rows += [[_percent(one.share), one.added_to, one.expression] for one in result.singles]
         blocks.append(table(rows))
     if result.memory:
-        rows = [["share", "equation", "term with memory of what the free run leaves"]]
+        rows = [["share", "equation", "term with memory in the free run's residual"]]
         rows += [[_percent(one.share), one.equation, one.name] for one in result.memory[:_MEMORY]]
         blocks.append(table(rows))
     if result.spec is not None:

@@ -63,7 +63,7 @@ class Content(BaseModel):
 
 
 class IntervalsResult(Content):
-    """Where the intervals of a fit of chosen terms come from, in a word and in a sentence."""
+    """Source of the intervals of a fit of chosen terms, in a word and in a sentence."""
 
     source: str
     text: str

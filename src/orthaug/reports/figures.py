@@ -151,7 +151,7 @@ class FitPlots:
             axis.plot(
                 *drawn, color=ORANGE, linewidth=0.9, zorder=1.5, label="model without its learner"
             )
-            axis.set_ylim(*limits)  # physics that runs away hides nothing
+            axis.set_ylim(*limits)  # a diverging run of physics does not set the limits
             axis.legend(fontsize="small", frameon=False)
         return axis
 
@@ -213,10 +213,10 @@ class FitPlots:
         """Draw the learned part over one input of the learner: means with the cloud, or the curve.
 
         The curve, all else at its median, is drawn where the data can move the input alone; a band
-        is its 95 % interval, dashed is where the training data do not reach.
+        is its 95 % interval, dashed outside of the range of the training data.
 
         Args:
-            feature: one of the learner's inputs; None for the most telling one.
+            feature: one of the learner's inputs; None for the one that explains most.
             output: which learned part; None for the first.
 
         Raises:

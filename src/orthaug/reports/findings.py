@@ -389,7 +389,7 @@ class EquationPartsResult(Content):
 
 
 class MotionFitResult(Content):
-    """How a fitted motion is integrated, and the rows that a prediction starts from.
+    """Integration of a fitted motion, and the rows that a prediction starts from.
 
     `substep_bias`: the parameters less what a fit with twice the substeps would give.
     """

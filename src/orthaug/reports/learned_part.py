@@ -23,12 +23,12 @@ if TYPE_CHECKING:
 _MOST_POINTS = 2000  # of a cloud
 _BATCH = 512  # points of a compiled call
 _CURVE = 200  # points of a curve
-_BEYOND = 0.2  # of the data's reach, drawn at each side of it
+_BEYOND = 0.2  # of the data's range, drawn at each side of it
 _BINS = 24  # of means over a feature
 _CELLS = 36  # of a surface, in each direction, in which data are looked for
 _FINER = 2  # times as many in which the learned part is drawn
 _IN_A_CELL = 3  # points of the data on average, where their means are drawn
-_TIED = 0.95  # correlation with another feature from which others at their medians are no state of the system
+_TIED = 0.95  # correlation of features from which medians of the others are no possible state
 Reach = Callable[[Matrix], Matrix | None]
 """Half the length of 95 % intervals of the learned part (M, nl) at points (M, n); None where there
 are none.
@@ -51,7 +51,7 @@ class Curve:
 class Surface:
     """The learned part over two variables, all others at their medians.
 
-    NaN where no data are near.
+    It is NaN where no data are near.
     """
 
     across: Vector
@@ -158,7 +158,7 @@ class LearnedPart:
     def telling_pair(self) -> tuple[str, str]:
         """Return the feature that explains most, and of those that are not tied to it the next.
 
-        Of at least two features.
+        There are at least two features.
         """
         first, *others = self.ranked()
         own = self.seen[:, self.features.index(first)]
@@ -190,7 +190,7 @@ class LearnedPart:
         return known and not self.tied(across, along) and not self.tied(along, across)
 
     def means(self, feature: str) -> tuple[Vector, Matrix]:
-        """Return means of feature (k,) and learned part (k, nl) over bins of equally many points."""
+        """Return means of feature (k,) and learned part (k, nl) in bins of equally many points."""
         order = np.argsort(self.seen[:, self.features.index(feature)], kind="stable")
         bins = np.array_split(order, min(_BINS, max(len(order) // 8, 1)))
         centres = np.array([self.seen[b, self.features.index(feature)].mean() for b in bins])
@@ -209,7 +209,7 @@ class LearnedPart:
     def surface(self, across: str, along: str) -> Surface:
         """Return the surface over two features where there are data near.
 
-        Of such that do not move alone the mean of the data in each cell.
+        For features that do not vary alone, it is the mean of the data in each cell.
         """
         pair = self.seen[:, [self.features.index(across), self.features.index(along)]]
         low, high = pair.min(axis=0), pair.max(axis=0)

@@ -12,7 +12,7 @@ from orthaug.analysis.linear_view import COHERENT, Linearization, LinearView, Po
 from orthaug.reports.linear import gain_unit
 
 _MOST = 8  # states of matrices that are printed; result.json has all
-_FEWEST = 10  # frequencies of data alone that a median is told of
+_FEWEST = 10  # frequencies from data that a median needs
 _HELD = {
     "zero": "inputs that --at does not name are held at 0",
     "mean": "inputs that --at does not name are held at their means over the data",
@@ -23,7 +23,7 @@ _HELD = {
 def linear_text(found: Linearization) -> str:
     """Return all operating points as text, each with gains, poles and matrices.
 
-    Then what data alone say, and warnings.
+    The response from data, and warnings, follow.
     """
     blocks = []
     for i, view in enumerate(found):
@@ -89,7 +89,7 @@ def _poles(view: LinearView) -> list[str]:
     rows = [["pole z", "magnitude", between, "frequency", between, "", "damping", between]]
     for pole in view.poles:
         if pole.z.imag < 0:
-            continue  # its conjugate is told
+            continue  # its conjugate is listed
         hertz = "–" if pole.hertz is None else f"{pole.hertz:.5g} Hz"
         rate = "–" if pole.natural_frequency is None else f"{pole.natural_frequency:.5g} 1/s"
         damping = "–" if pole.damping is None else f"{pole.damping:.4g}"

@@ -1,6 +1,6 @@
 """Building blocks of a page: sections of paragraphs, tables and plots.
 
-And how numbers are written in cells.
+And the format of numbers in cells.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from orthaug.reports.result import ParameterResult
 
 _LARGE = 7  # digits before the point from which a power of ten is written
 _RAISED = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
-_ROUNDING = 1e-12  # of its scale: a number below is rounding of zero
+_ROUNDING = 1e-12  # of its scale: a smaller number is the rounding error of zero
 _MOST_DIGITS = 15
-_MINUS = re.compile(r"(?<![\w\])}.-])-(?=[\d.])")  # before a number that stands by itself
+_MINUS = re.compile(r"(?<![\w\])}.-])-(?=[\d.])")  # before a number of its own
 
 
 def number(value: float | None, digits: int = 5, scale: float | None = None) -> str:
@@ -173,7 +173,7 @@ class Code:
 class Plot:
     """A Plotly figure that the page draws.
 
-    `label` is read aloud in its place, `caption` stands below.
+    `label` is for screen readers, `caption` is shown below.
     """
 
     label: str

@@ -25,8 +25,10 @@ from orthaug.reports.residual_tests import RegressorResult, ResidualTestResult
 from orthaug.reports.result import ParameterResult, PartScores, RestartResult, RowResult
 
 _ROW = 62  # pixels of a parameter
-_NAMED = 0.8  # height of its name on an axis from -1 to 1: above the numbers of its axis, and below those of the last
-_FAR = 6.0  # widths of an interval from which the initial value is not drawn: the interval would be a point
+_NAMED = (
+    0.8  # height of its name on an axis from -1 to 1: between the numbers of its axis and the last
+)
+_FAR = 6.0  # widths of an interval from which the initial value is not drawn
 _DECADES = 20.0  # ratio of scores from which their axis is logarithmic
 _BAD = 1.0  # NRMSE of the mean, from which it is too
 _KINDS = {"prediction": ("one step", "@physics"), "simulation": ("free run", "@model")}
@@ -72,8 +74,8 @@ def interval_plot(rows: Sequence[ParameterResult]) -> Plot | None:
             "range": _reach(row),
         }
     caption = (
-        "Every parameter on an axis of its own: the circle is the estimate, the thick bar its "
-        "95 % interval"
+        "Every parameter has its own axis: the circle is the estimate, the thick bar its 95 % "
+        "interval"
         + (
             "; the thin bar is its 95 % interval once the bias is taken out, which need not "
             "hold the estimate."
@@ -335,9 +337,9 @@ def _means_plot(
     }
     surely = chance(curve.p)
     caption = (
-        f"Mean of the {what} of {test.name}, less that of all rows, over {name} with 99 % "
-        "intervals, both with its autocorrelation taken into account as in the test: that it "
-        f"is flat has p {'' if surely.startswith('<') else '= '}{surely}. Plain means explain "
+        f"Mean of the {what} of {test.name}, less that of all rows, over {name}, with 99 % "
+        "intervals. Both take its autocorrelation into account, as in the test: that it is flat "
+        f"has p {'' if surely.startswith('<') else '= '}{surely}. Plain means explain "
         f"{percent(curve.share)} of its variance."
     )
     label = f"Mean of the {what} of {test.name} over {name}."
@@ -402,9 +404,9 @@ def restart_plot(restarts: Sequence[RestartResult]) -> Plot | None:
     shown = range(0, len(restarts), 1 + len(restarts) // 12)
     layout["xaxis"] |= {"tickvals": [i + 1 for i in shown], "ticktext": [names[i] for i in shown]}
     layout["yaxis"] = {"title": {"text": "loss"}, "type": "log" if wide else "linear"}
-    caption = "The loss that every start came to; the large dot is the chosen one. "
-    caption += "Where several starts end at the same loss, it is hardly a poor minimum."
-    return Plot("Loss that every start came to.", caption, [dots], layout, 260)
+    caption = "The loss that every start reached; the large dot is the chosen one. "
+    caption += "Where several starts reach the same loss, a poor local minimum is unlikely."
+    return Plot("Loss that every start reached.", caption, [dots], layout, 260)
 
 
 def parameter_comparison(rows: Sequence[RowResult]) -> list[Plot]:
@@ -448,13 +450,11 @@ def parameter_comparison(rows: Sequence[RowResult]) -> list[Plot]:
             "yaxis": CATEGORIES,
             "showlegend": False,
         }
-        caption = (
-            f"{parameter.name} by every way of modelling, with its 95 % interval where it has one."
-        )
+        caption = f"{parameter.name} in every model, with its 95 % interval where it has one."
         plots.append(Plot(caption, caption, [dots], layout, 120 + 30 * len(rows), small=True))
     return plots
 
 
 def _band(half: float) -> dict[str, Any]:
-    told = {"name": "99 % of what noise gives", "showlegend": True}
-    return area("@reach", xref="paper", x0=0, x1=1, y0=-half, y1=half, **told)
+    style = {"name": "99 % of what noise gives", "showlegend": True}
+    return area("@reach", xref="paper", x0=0, x1=1, y0=-half, y1=half, **style)

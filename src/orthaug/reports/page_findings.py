@@ -135,7 +135,7 @@ def excitation_blocks(result: FitResult) -> list[Any]:
                 + (
                     "."
                     if detail.support is None
-                    else f", {percent(detail.support)} within reach of the data."
+                    else f", {percent(detail.support)} within the range of the data."
                 )
             )
         )

@@ -114,7 +114,7 @@ def fit_sections(page: FitPage) -> list[Section]:
 def _parameters(result: FitResult) -> list[Any]:
     rows = [*result.parameters, *(result.physical_parameters or [])]
     if not rows:
-        return [Text("The physics has no parameters: all of the model was learned.")]
+        return [Text("The physics has no parameters: the whole model was learned.")]
     text = {
         "robust": "Standard errors are robust against a coloured residual.",
         "plain": "Standard errors are those of a white residual.",
@@ -138,11 +138,12 @@ def _parameters(result: FitResult) -> list[Any]:
         )
     if result.standard_errors is not None:
         caption += (
-            " Intervals hold for the inputs that were applied; under others the bias is "
-            "another one."
+            " Intervals hold for the inputs that were applied; under other inputs the bias differs."
         )
     if any(row.derived_unit for row in rows):
-        caption += " A unit in brackets is not the spec's: the channels' units ask for it."
+        caption += (
+            " A unit in brackets is not in the spec: it follows from the units of the channels."
+        )
     if biased:
         caption += f"{BIAS_TOLD[:-1]};"
         caption += (
@@ -164,7 +165,7 @@ def _parameters(result: FitResult) -> list[Any]:
                 ", once what the physics can imitate is taken out of both; drawn over one "
                 "input it may explain less"
             )
-        what = "what the learner found" if result.learns else "the squares that the free run leaves"
+        what = "what the learner found" if result.learns else "the squared residual of the free run"
         blocks.append(Text(f"The bias budget: of {what}{text}{more}."))
     if result.physical_consistency:
         blocks.append(Text(result.physical_consistency.text))
@@ -268,7 +269,7 @@ def _runs(page: FitPage) -> list[Any]:
     ]
     band, alone = error_band(train), bool(page.alone)
     text = (
-        "A model in free run sees the inputs alone and lives on its own past; the residual is "
+        "In free run a model uses the inputs and its own past outputs only; the residual is "
         "measured less model."
     )
     if alone:
@@ -283,8 +284,8 @@ def _runs(page: FitPage) -> list[Any]:
         else ""
     )
     how = Text(
-        "Drag over a stretch to zoom, double-click for the whole record; with the keyboard the "
-        "arrows move, + and − zoom, 0 shows all.",
+        "Drag to zoom, double-click for the whole record; on the keyboard the arrows move, + "
+        "and − zoom, 0 shows all.",
         "hint",
     )
     return [*notes, Text(text), how, *run_plots(runs, band)]
@@ -319,7 +320,7 @@ def _shares(page: FitPage) -> list[Any]:
         f"RMS of what physics and learner add to {what}. The share is the learner's RMS over "
         "that of their sum; "
     )
-    caption += "it need not fit to the two RMS, for the parts may cancel or follow each other."
+    caption += "it need not match the two RMS, because the parts may cancel or add up."
     bars = {
         "type": "bar",
         "orientation": "h",
@@ -333,8 +334,8 @@ def _shares(page: FitPage) -> list[Any]:
     text = "The learner's RMS over that of physics and learner together."
     if result.structure == "orthogonal":
         text += (
-            " The learner holds only what the physics cannot: its overlap with the physics is "
-            "split off."
+            " The learner has only what the physics cannot explain: its overlap with the "
+            "physics is split off."
         )
     label = "Share of the learner; the table has the numbers."
     return [Table(caption, head, cells), Plot(label, text, [bars], layout, 90 + 34 * len(rows))]

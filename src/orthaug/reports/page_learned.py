@@ -12,14 +12,14 @@ from orthaug.reports.page_blocks import Grid, Plot, Text, area, percent, rounded
 _MOST_CURVES = 12
 _CLOUD = 600  # points of a cloud
 _COLOURED = 0.98  # of the cells of a surface have a colour of their own
-_LEVEL = 0.02  # share of the learned part below which an input is text to do next to nothing
+_LEVEL = 0.02  # share of the learned part below which an input is said to explain next to nothing
 
 
 def learned_blocks(part: LearnedPart, measure: str) -> list[Text | Grid | Plot]:
     """Return the curves over the inputs, by the share that each explains, and the surface."""
     shares = part.shares()
     ranked = list(part.ranked())
-    blocks: list[Text | Grid | Plot] = [Text(_told(part, ranked, shares, measure))]
+    blocks: list[Text | Grid | Plot] = [Text(_introduction(part, ranked, shares, measure))]
     plots = [
         _curve_plot(part, k, feature, shares[part.features.index(feature), k])
         for k in range(len(part.names))
@@ -37,10 +37,10 @@ def learned_blocks(part: LearnedPart, measure: str) -> list[Text | Grid | Plot]:
     return blocks
 
 
-def _told(part: LearnedPart, ranked: list[str], shares: Any, measure: str) -> str:
+def _introduction(part: LearnedPart, ranked: list[str], shares: Any, measure: str) -> str:
     explained = shares.max(axis=1)
     text = f"The learner sees {', '.join(part.features)}, and adds to {', '.join(part.names)}"
-    text += f" what the {measure} measure does not give to the physics" if measure else ""
+    text += f" what the {measure} measure does not assign to the physics" if measure else ""
     if len(ranked) == 1:
         return f"{text}. The curve shows what it adds over that input."
     text += (
@@ -87,7 +87,7 @@ def _curve_plot(part: LearnedPart, k: int, feature: str, share: float) -> Plot:
             ", the one input of the learner" if one else ", all else at its median"
         ) + ": solid within the shaded"
         text += (
-            " reach of the data, dashed beyond; the dots are what it adds along the training data"
+            " range of the data, dashed beyond; the dots are what it adds along the training data"
         )
         text += ", and the band is its 95 % interval." if curve.half is not None else "."
     else:

@@ -1,7 +1,6 @@
 """Free runs on a page: whole records with the residual below, packed as four-byte numbers.
 
-The page draws of every curve the least and the largest value in each column of pixels, anew
-whenever it is zoomed.
+The page draws the minimum and maximum of every curve in each column of pixels, anew at every zoom.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ _PANEL = 330  # pixels of a pair of panels
 _DASHES = ("dash", "solid", "dot", "dashdot")
 _MOST_BREAKS = 40  # between experiments that are marked
 _FAR = 3.0  # times the measured range: a curve that leaves it is cut off at the edge of the panel
-WITHOUT = "model without its learner"  # its name where it is drawn: the physics that is fitted by itself is another
+WITHOUT = "model without its learner"  # its label: it is not the physics fitted alone
 
 
 @dataclass(frozen=True)
@@ -48,8 +47,7 @@ def run_plots(runs: Sequence[Run], band: Mapping[str, tuple[float, float]]) -> l
     """Return a plot for every part: measured, model, the model without its learner, residual.
 
     Args:
-        band: of each output the two limits between which 95 % of the errors on the training data
-            lie.
+        band: limits of 95 % of the errors on the training data, for each output.
     """
     lengths = [
         _length(run)
@@ -57,7 +55,7 @@ def run_plots(runs: Sequence[Run], band: Mapping[str, tuple[float, float]]) -> l
         for _ in run.response.outputs
         for _ in range(2 + (run.alone is not None))
     ]
-    most = _fair(lengths, _BUDGET)
+    most = _points_per_curve(lengths, _BUDGET)
     return [_plot(run, band, most) for run in runs]
 
 
@@ -108,8 +106,8 @@ def _compared(part: str, runs: Mapping[str, Response], most: int) -> Plot:
     lost = [name for name, run in runs.items() if any(t.diverged for t in run.trajectories)]
     samples = sum(len(t.model) for t in first.trajectories)
     caption = (
-        f"The free runs of {', '.join(runs)} on {part}, all {samples} samples, with what each "
-        "leaves of the measured output under them."
+        f"The free runs of {', '.join(runs)} on {part}, all {samples} samples, with their "
+        "residuals below."
     )
     caption += f" The run of {', '.join(lost)} diverges." if lost else ""
     return panels.plot(
@@ -120,7 +118,7 @@ def _compared(part: str, runs: Mapping[str, Response], most: int) -> Plot:
 def error_band(response: Response) -> dict[str, tuple[float, float]]:
     """Return for each output the limits between which 95 % of the errors of a run are.
 
-    None of one that diverged.
+    None for a run that diverged.
     """
     found = {}
     if any(t.measured is None or t.diverged for t in response.trajectories):
@@ -141,7 +139,7 @@ def _length(run: Run) -> int:
     return sum(len(t.model) + 1 for t in run.response.trajectories)
 
 
-def _fair(lengths: Sequence[int], budget: int) -> int:
+def _points_per_curve(lengths: Sequence[int], budget: int) -> int:
     """Return how many points a curve may have: short ones are whole, all fit the budget."""
     left, ordered = budget, sorted(lengths)
     for i, length in enumerate(ordered):
@@ -155,7 +153,7 @@ def _fair(lengths: Sequence[int], budget: int) -> int:
 def packed(values: Vector, x0: float, dx: float, most: int = MOST_POINTS) -> dict[str, Any]:
     """Return a curve at even steps as the page reads it.
 
-    Of a longer one the least and the largest value of each stretch.
+    A longer one is kept as the minimum and maximum of each stretch.
     """
     step = dx
     if len(values) > most:
@@ -285,7 +283,7 @@ class PanelExit:
 def frame_of(measured: Vector, curves: Iterable[Vector]) -> list[float] | None:
     """Return the limits of the upper panel where a curve leaves the measured range by far.
 
-    None for all of it.
+    None for the whole range.
     """
     low, high = float(np.nanmin(measured)), float(np.nanmax(measured))
     width = max(high - low, 1e-300)
@@ -350,7 +348,7 @@ def _plot(run: Run, band: Mapping[str, tuple[float, float]], most: int) -> Plot:
 def _upper(curves: Sequence[str], i: int, limits: tuple[float, float] | None) -> list[dict]:
     """Return the traces of output i: measured, band, the model without its learner and with it.
 
-    The legend tells of the first.
+    The legend has the first.
     """
     found = []
     if "measured" in curves:
@@ -456,21 +454,20 @@ def _caption(run: Run, most: int) -> str:
     ]
     if rows > most:
         sentences.append(
-            f"Of each curve {number(most, 3)} points are kept, the least and the largest value "
-            "of every stretch."
+            f"Each curve is drawn by {number(most, 3)} points, the minimum and maximum of "
+            "every stretch."
         )
     for t in response.trajectories:
         if t.diverged:
             sentences.append(
-                f"The run leaves all bounds in {t.diverged[1]} at row {t.diverged[0]}, where "
-                "it is cut off."
+                f"The run diverges in {t.diverged[1]} at row {t.diverged[0]}, where it is cut off."
             )
     outside = [t.outside for t in response.trajectories if t.outside is not None]
     beyond = float(np.concatenate(outside).mean()) if outside else 0.0
     if beyond > 0:
         sentences.append(
-            f"On {percent(beyond)} of the samples, shaded, the learner is outside what it was "
-            "trained on; `learner.beyond` says what its correction does there."
+            f"On {percent(beyond)} of the samples, shaded, the learner is outside its training "
+            "data; `learner.beyond` sets its correction there."
         )
     return " ".join(sentences)
 

@@ -22,12 +22,12 @@ from orthaug.reports.result import (
 )
 
 _GOOD, _POOR = 0.2, 0.5  # NRMSE of a free run up to which it is close, and from which it is far
-_ALIKE = 1.1  # ratio of errors up to which models are text to be as good as each other
-_SURE = 0.1  # standard error over value up to which a parameter is text to be known
-_NAMED = 0.5  # share of what was learned from which its cause is what to do first
-_FAR = 5.0  # standard errors from which the size of a bias is text in figures
-_MOST_DOUBTS = 3  # that are text in the first sentence
-_WORSE = 1.5  # times the error on the training data: a Gaussian error then leaves the 95 % band on a fifth of the rows
+_ALIKE = 1.1  # ratio of errors up to which models are called equally good
+_SURE = 0.1  # standard error over value up to which a parameter counts as known
+_NAMED = 0.5  # share of the learned part from which its cause is the first advice
+_FAR = 5.0  # standard errors from which the size of a bias is given in figures
+_MOST_DOUBTS = 3  # in the first sentence
+_WORSE = 1.5  # times the error on training data: then 1/5 of a Gaussian error is outside the band
 _STOPPED = ("iteration_limit", "no_descent", "stopped")
 _RAN_AWAY = "free_run_diverged"
 _TIED = (
@@ -39,7 +39,7 @@ _TIED = (
 class PageVerdict(NamedTuple):
     """`level` is good, care or bad.
 
-    The sentences say whether to trust the model, for what, and what to do next.
+    The sentences state its reliability, its use, and the next step.
     """
 
     level: str
@@ -64,18 +64,18 @@ def fit_verdict(result: FitResult) -> PageVerdict:
     )
     level = "bad" if bad else "care" if doubts else "good"
     opening = {
-        "good": "The model is to be trusted",
-        "care": "The model is to be trusted with care",
-        "bad": "Do not trust the model as it is",
+        "good": "The model is reliable",
+        "care": "Use the model with care",
+        "bad": "Do not use the model as it is",
     }[level]
-    shown = "" if error is None else f": {_told_error(error, part)}"
+    shown = "" if error is None else f": {_error_text(error, part)}"
     because = (
-        f"{', but ' if level == 'care' else '; '}{_joined(doubts[:_MOST_DOUBTS])}" if doubts else ""
+        f"{', but ' if level == 'care' else '; '}{_join(doubts[:_MOST_DOUBTS])}" if doubts else ""
     )
     first = next((f"{w.text.split(':')[0][0].upper()}{w.text.split(':')[0][1:]}. " for w in result.warnings
                   if w.code == "one_step_only"), "")  # fmt: skip
     return PageVerdict(
-        level, f"{first}{opening}{shown}{because}.", _use(result, level), _then(result)
+        level, f"{first}{opening}{shown}{because}.", _use_text(result, level), _next_step(result)
     )
 
 
@@ -86,11 +86,11 @@ def compare_verdict(result: CompareResult) -> PageVerdict:
         return PageVerdict(
             "bad",
             "No model has a free run that could be scored.",
-            "None of them is of use as it is.",
+            "None of them can be used as it is.",
             "Look at the warnings below, and fit again.",
         )
     errors = {row.name: _worst(row.scores)[0] or 0.0 for row in rows}
-    best = result.chosen or _taken(rows, errors)
+    best = result.chosen or _best_model(rows, errors)
     row = next(row for row in result.comparison if row.name == best)
     error, part = _worst(row.scores)
     doubts = list(_doubts(row, result.data))
@@ -108,13 +108,13 @@ def compare_verdict(result: CompareResult) -> PageVerdict:
     least = all(errors[best] <= other for name, other in errors.items() if name not in same)
     less = f", as {'does' if len(same) == 1 else 'do'} {_quoted(same)}" if same else ""
     less += (", and no other leaves less" if same else ", less than of any other") if least else ""
-    how = f"it has the lowest error on the validation part, and {_told_error(error or 0.0, part)}"
-    trust = f"Take “{best}”: {how if result.chosen else _told_error(error or 0.0, part) + less}"
+    how = f"it has the lowest error on the validation part, and {_error_text(error or 0.0, part)}"
+    trust = f"Take “{best}”: {how if result.chosen else _error_text(error or 0.0, part) + less}"
     trust += f"; {_quoted(near)} {_is(near)} as good within 10 %." if near else "."
     if doubts:
-        trust = f"{trust[:-1]}. But {_joined(doubts[:_MOST_DOUBTS])}."
+        trust = f"{trust[:-1]}. But {_join(doubts[:_MOST_DOUBTS])}."
     alone = errors.get("physics alone")
-    use = "It is the physics alone: no learner earns its place beside it."
+    use = "It is the physics alone: no learner improves on it."
     if best != "physics alone" and alone is not None and error is not None:
         learns = error / alone if alone else 1.0
         use = (
@@ -125,10 +125,10 @@ def compare_verdict(result: CompareResult) -> PageVerdict:
     return PageVerdict(level, trust, use, _after_comparison(result, row))
 
 
-def _taken(rows: Sequence[RowResult], errors: Mapping[str, float]) -> str:
+def _best_model(rows: Sequence[RowResult], errors: Mapping[str, float]) -> str:
     """Return the model of the lowest error.
 
-    Of such that are as good, one whose θ means something.
+    Among equally good ones, one whose θ has a meaning.
     """
     best = min(errors, key=errors.__getitem__)
     earns = [
@@ -142,7 +142,7 @@ def _after_comparison(result: CompareResult, row: RowResult) -> str:
     if row.residuals is not None and row.residuals.changes:
         return f"An option, not tried here: {_change(row.residuals.changes[0])}."
     if not result.data.tests and not result.data.validation:
-        return "Hold out a test part, on which the models can be judged."
+        return "Hold out a test part, so that the models can be judged."
     if not result.data.validation:
         return (
             "Hold out a validation part (`[data.validation]`), so that the choice is not made "
@@ -161,7 +161,7 @@ def _word(row: RowResult) -> str:
     )
 
 
-def _told_error(error: float, part: str) -> str:
+def _error_text(error: float, part: str) -> str:
     return f"{_on(part)} its free run leaves {percent(error)} of the output's deviation"
 
 
@@ -185,7 +185,7 @@ def _worse(scores: dict[str, PartScores]) -> tuple[float, str] | None:
 def _worst(scores: dict[str, PartScores], kind: str = "simulation") -> tuple[float | None, str]:
     """Return the NRMSE of the free run on the held-out part where it is largest, RMS over outputs.
 
-    Of training if none is.
+    On the training data where none is held out.
 
     Args:
         kind: `prediction` for that of one step ahead.
@@ -203,7 +203,7 @@ def _worst(scores: dict[str, PartScores], kind: str = "simulation") -> tuple[flo
 def _code(result: FitResult | RowResult) -> str | None:
     """Return the verdict on the learner.
 
-    None without one, and where the model is the physics alone that was taken for it.
+    None without one, or where physics alone was chosen.
     """
     return (
         None
@@ -220,7 +220,7 @@ def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
     """Yield the objections to the model, the gravest first."""
     runaway = [w.text.split(":")[0] for w in result.warnings if w.code == _RAN_AWAY]
     if runaway:
-        yield f"its free run diverges on {_joined(runaway)}"
+        yield f"its free run diverges on {_join(runaway)}"
     if _code(result) == "hurts":
         yield "its learner makes the free run worse than physics alone"
     if (
@@ -228,7 +228,7 @@ def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
         and not data.validation
         and not (result.validation and result.validation.trials)
     ):
-        yield "it was never tried on data that it was not fitted to"
+        yield "it was not tested on data that it was not fitted to"
     if (result.status if isinstance(result, RowResult) else result.status.code) in _STOPPED:
         yield "training stopped before it converged"
     if _warned(result, "spectral_radius_above_one"):
@@ -248,17 +248,17 @@ def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
         carry = (
             f"probably {carry}" if guessed and getattr(result, "motion", None) is None else carry
         )
-        yield f"the estimate{'' if one else 's'} of {_joined(biased)} {carry}"
+        yield f"the estimate{'' if one else 's'} of {_join(biased)} {carry}"
     if result.residuals is not None and result.residuals.verdict in ("unmodelled", "sensor_noise"):
         coarse = list(result.residuals.steps or {})
         yield {
-            "unmodelled": f"its one-step residual has the size of the steps of {_joined(coarse)}"
+            "unmodelled": f"its one-step residual has the size of the steps of {_join(coarse)}"
             if coarse
             else "its residual is not noise alone",
             "sensor_noise": "noise on the measured output biases its one-step estimates",
         }[result.residuals.verdict]
     if _warned(result, "closed_loop"):
-        yield "its data look recorded under feedback, which biases it"
+        yield "its data were probably recorded under feedback, which biases the estimates"
     worse = _worse(result.scores)
     if worse is not None:
         times = number(worse[0], 2)
@@ -269,7 +269,7 @@ def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
     if result.validation is not None and result.validation.extrapolation:
         left = dict.fromkeys(entry.part for entry in result.validation.extrapolation)
         yield (
-            f"{_joined(list(left))} {'leaves' if len(left) == 1 else 'leave'} the range of the "
+            f"{_join(list(left))} {'leaves' if len(left) == 1 else 'leave'} the range of the "
             "training data"
         )
 
@@ -277,7 +277,7 @@ def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
 def _size_of_bias(rows: Sequence[ParameterResult]) -> str:
     """Return a text on the size of the biases.
 
-    In figures where one is far larger than its standard error.
+    With figures where one is far larger than its standard error.
     """
     one = len(rows) == 1
     worst = max(rows, key=_errors_of)
@@ -310,7 +310,7 @@ def _biased(row: ParameterResult) -> bool:
     return row.bias is not None and bool(row.std) and abs(row.bias.value or 0.0) > (row.std or 0.0)
 
 
-def _use(result: FitResult, level: str) -> str:
+def _use_text(result: FitResult, level: str) -> str:
     rows = _rows(result)
     sure = [row.name for row in rows if _known(row)]
     known = sure if _noise_alone(result) else []
@@ -320,30 +320,29 @@ def _use(result: FitResult, level: str) -> str:
     predicts = ahead is not None and ahead <= (_GOOD if level == "bad" else _POOR)
     if level == "bad" and ahead is not None and ahead > _POOR:
         return (
-            "Use it for nothing but to look for what is missing: not even its prediction of "
-            f"the next sample holds, which leaves {percent(ahead)} of the output's deviation "
-            f"{_on(part)}."
+            "Use it only to look for what is missing: its one-step prediction, too, leaves "
+            f"{percent(ahead)} of the output's deviation {_on(part)}."
         )
     if level == "bad" and not (known and predicts):
-        return "Use it for nothing but to look for what is missing."
+        return "Use it only to look for what is missing."
     if level == "bad":
         text = "predict the next sample"
     else:
         text = f"simulate{' and predict' if predicts else ''} within the range of its training data"
-    text += f" and to read {_joined(known)} as physics" if known else ""
+    text += f" and to read {_join(known)} as physics" if known else ""
     if sure and not known:
         cover = "interval does" if len(sure) == 1 else "intervals do"
         text += (
-            f", but do not read {_joined(sure)} as physics yet: the {cover} not cover what the "
+            f", but do not read {_join(sure)} as physics yet: the {cover} not cover what the "
             "residual still holds"
         )
     text += (
-        f"; {_joined(others)} {_is(others)} too uncertain or biased to be read so" if others else ""
+        f"; {_join(others)} {_is(others)} too uncertain or biased to be read so" if others else ""
     )
     if shared:
         text += (
-            f"; {_joined(shared)} {_is(shared)} what the physics nearest to the data has, for "
-            "the learner could"
+            f"; {_join(shared)} {_is(shared)} taken from the physics nearest to the data, "
+            "for the learner could"
         )
         text += f" imitate {'it' if len(shared) == 1 else 'them'}"
     return f"Use it to {text}."
@@ -364,17 +363,17 @@ def _known(row: ParameterResult) -> bool:
 
 
 def _quoted(names: list[str]) -> str:
-    return _joined([f"“{name}”" for name in names])
+    return _join([f"“{name}”" for name in names])
 
 
 def _is(names: list[str]) -> str:
     return "is" if len(names) == 1 else "are"
 
 
-def _then(result: FitResult) -> str:
+def _next_step(result: FitResult) -> str:
     """Return the first thing to do: a change that lowered the free run's error in a trial.
 
-    Else an option, named as one.
+    Otherwise an option, named as one.
     """
     if result.advice:
         return result.advice[0].text
@@ -383,12 +382,12 @@ def _then(result: FitResult) -> str:
         return f"An option, not tried here: {option}."
     if result.advice_trials is not None and result.advice_trials.tried:
         text = (
-            "None of the changes that were tried betters the free run; export it (`orthaug "
+            "None of the changes that were tried improves the free run; export it (`orthaug "
             "export`), or design the"
         )
         return f"{text} next experiment."
     return (
-        "Nothing further is predicted to help; export it (`orthaug export`) or design the next "
+        "No further change is predicted to help; export it (`orthaug export`) or design the next "
         "experiment."
     )
 
@@ -423,25 +422,25 @@ def _option(result: FitResult) -> str | None:
         )
     if _undecided(result):
         return (
-            "the learner (`training.fallback = false`), for cross-validation leaves undecided "
-            "if it helps"
+            "the learner (`training.fallback = false`), for cross-validation does not decide "
+            "whether it helps"
         )
     if result.residuals is not None and result.residuals.steps:
-        steps = _joined(list(result.residuals.steps))
+        steps = _join(list(result.residuals.steps))
         return (
             f"fewer samples, or a finer measurement, for the steps of {steps} are as large as "
             "the one-step residual"
         )
     if not _noise_alone(result):
         return (
-            "physics of your own for what the residual still follows (residual tests; "
+            "your own physics for what the residual still depends on (residual tests; "
             "`[[suspects]]` tests a form)"
         )
     worse = _worse(result.scores)
     return (
         None
         if worse is None
-        else f"more training data of the kind of {worse[1]}, on which the error is larger"
+        else f"more training data like {worse[1]}, on which the error is larger"
     )
 
 
@@ -491,5 +490,5 @@ def _change(change: object) -> str:
     return f"{predicted.name}, with which {predicted.prediction}"
 
 
-def _joined(words: list[str]) -> str:
+def _join(words: list[str]) -> str:
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"

@@ -172,8 +172,8 @@ def learner_figure(part: LearnedPart, title: str) -> Figure:
 
     The curve is drawn where the input is a variable.
 
-    The curve of a state or input is drawn with all others at their medians, dashed beyond the reach
-    of the data.
+    The curve of a state or input is drawn with all others at their medians, dashed outside of the
+    range of the data.
     """
     values, names, seen = part.values, part.names, part.features
     columns = min(len(seen), _BESIDE)
@@ -320,10 +320,10 @@ def tracking_figure(
 ) -> Figure:
     """Draw a panel for each parameter with its 95 % band, and the alarm below.
 
-    Vertical lines are where it was raised.
+    Vertical lines mark when it was raised.
 
     Args:
-        course: `Recursive.history`.
+        history: `Recursive.history`.
         parameters: θ, each with name and unit.
         alarms: instants [s].
         physical: `Recursive.physical_history`, drawn above θ, of the `physical_parameters`.

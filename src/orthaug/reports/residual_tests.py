@@ -81,7 +81,7 @@ class ResidualTestResult(Content):
 
         It is the one of the most certain curvature, or that explains most where none has any.
 
-        By its name; none where none was looked at.
+        By its name; empty where none was tested.
         """
         curves = {name: curve for name, curve in self.regressors.items() if curve is not None}
         curved = [name for name in self.curved_regressors if name in curves]

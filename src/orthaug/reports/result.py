@@ -296,7 +296,7 @@ class FitResult(ResultHeader):
     parameters: list[ParameterResult]
     standard_errors: str | None
     standard_errors_by: str | None = None
-    """How the standard errors were computed, a key of `fitting.estimates.STD_KINDS`; None for white noise of even size.
+    """Kind of the standard errors, a key of `fitting.estimates.STD_KINDS`; None for white noise.
     """
     physical_parameters: list[ParameterResult] | None
     physical_consistency: ConsistencyResult | None
@@ -335,7 +335,7 @@ class FitResult(ResultHeader):
     def learns(self) -> bool:
         """Whether the biases are due to a learned part.
 
-        Of a motion without one they are of what the free run leaves.
+        Without one, those of a motion are due to the residual of the free run.
         """
         return self.motion is None or self.shared is not None
 

@@ -44,11 +44,12 @@ class NonlinearityResult(Content):
 
 
 class TermShareResult(Content):
-    """A chosen term: how often it is chosen over random halves, what the others leave of it, and how sure it is.
+    """A chosen term: its stability, its uniqueness and its significance.
 
     `rate` is the least rate of false discoveries at which the choice keeps it, on the rows that
     chose; `p` and `q` are those of the rows that had no say. `rivals` are candidates that it may
-    stand in for.
+    replace. `chosen` is the share of random halves that choose it, `left` the share of it that the
+    other columns leave.
     """
 
     term: str
@@ -61,7 +62,7 @@ class TermShareResult(Content):
 
 
 class ShiftResult(Content):
-    """A parameter without and with the chosen terms, and the share of its regressor that is left."""
+    """A parameter without and with the chosen terms, and the share of its regressor left."""
 
     parameter: str
     unit: str | None
@@ -181,7 +182,7 @@ def _figure(value: float | None, std: float | None) -> str:
 def _learner(result: SelectResult) -> str:
     learner = result.learner
     if learner is None:
-        return "none: on the blocks that were held out nothing beside the physics lowers the error"
+        return "none: nothing beside the physics lowers the error on the held-out blocks"
     if learner["kind"] == "terms":
         return f"{len(learner['terms'])} terms"
     seen = ", ".join(learner.get("inputs") or ["all lags"])

@@ -38,7 +38,7 @@ def fit_text(fit: Estimate | MotionEstimate, result: FitResult) -> str:
     """Return parameters, scores on every part, residual tests, the verdict and warnings."""
     if not fit.status.ok:
         return ""
-    lines = [_as_doubted(line, result) for line in fit.lines()]
+    lines = [_mark_noise_only(line, result) for line in fit.lines()]
     blocks = [[w.text.capitalize() for w in result.warnings if w.code == "one_step_only"], lines]
     if result.intervals is not None and result.intervals.source != "none":  # else a warning says it
         blocks.append([f"{result.intervals.text[0].upper()}{result.intervals.text[1:]}"])
@@ -61,7 +61,7 @@ def fit_text(fit: Estimate | MotionEstimate, result: FitResult) -> str:
     return "\n\n".join("\n".join(fold(lines)) for lines in blocks if lines)
 
 
-def _as_doubted(line: str, result: FitResult) -> str:
+def _mark_noise_only(line: str, result: FitResult) -> str:
     """Return a line of a fit whose intervals count noise only, without withdrawn claims.
 
     The line says so.
@@ -69,7 +69,10 @@ def _as_doubted(line: str, result: FitResult) -> str:
     if result.noise_only:
         line = line.replace(f"{'95 % interval':^29}", f"{'95 %, noise only':^29}")
     if result.shared is not None and result.shared.doubt and line.startswith("shared "):
-        line = f"{line.partition('; determined by the fit: ')[0]}; determined by the fit: none, see below"
+        line = (
+            f"{line.partition('; determined by the fit: ')[0]}; determined by the fit: none, "
+            "see below"
+        )
     return line
 
 
@@ -142,7 +145,7 @@ def _shared_lines(shared: SharedResult) -> list[str]:
 def compare_text(result: CompareResult, verdicts: Mapping[str, Verdict]) -> str:
     """Return two tables, parameters with standard errors and scores on every part.
 
-    Then the verdicts on each row.
+    The verdicts on each row follow.
     """
     lines = [*table(_parameter_cells(result)), "", *table(_score_cells(result.comparison))]
     if result.chosen:
@@ -171,8 +174,8 @@ def split_text(result: SplitResult) -> str:
     detail = result.measure_detail
     support = "–" if detail.support is None else f"{100 * detail.support:.0f} %"
     lines = [
-        f"measure     {result.measure}, {detail.points} points, {support} of it within reach "
-        "of the data",
+        f"measure     {result.measure}, {detail.points} points, {support} of it within the "
+        "range of the data",
         *parameter_table("parameter", result.parameters),
     ]
     return "\n".join(fold([*lines, *warning_lines(result.warnings)]))
@@ -252,8 +255,8 @@ def _bias_lines(result: FitResult) -> list[str]:
     for (cause, share), own in causes.items():
         if result.learns and share < SURE_SHARE:
             lines.append(
-                f"What the {what} looks most like {cause}: {percent(share)} of it. The bias if "
-                "it is that:"
+                f"What the {what} looks most like {cause}: {percent(share)} of it. The bias in "
+                "that case:"
             )
         else:
             lines.append(
@@ -353,7 +356,7 @@ def _residual_lines(result: FitResult) -> list[str]:
 def response_text(response: Response) -> str:
     """Return the scores of a response where its outputs were measured and every row has a value.
 
-    Otherwise nothing.
+    Otherwise empty.
     """
     if any(t.measured is None or t.diverged for t in response.trajectories):
         return ""

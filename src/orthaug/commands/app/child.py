@@ -1,8 +1,8 @@
 """The command line as a child of the page: it ends with the process that started it.
 
-Whoever started it holds its standard input open. Where that is closed, the child is interrupted as
-by Ctrl-C, which keeps or removes what is partial; that is also how the page stops it. A line
-`enough` on it ends training with what it has reached.
+The parent keeps its standard input open. Where that is closed, the child is interrupted as by
+Ctrl-C, which keeps or removes partial files; the page stops it in the same way. A line `enough`
+on it ends training with the result reached so far.
 """
 
 from __future__ import annotations

@@ -37,17 +37,17 @@ _HEADERS = {
 class Gate:
     """A guard before an application: requests and websockets without the token never reach it.
 
-    The token comes in the query of the first request, which is sent on without it; from then on a
-    secret of its own in a cookie opens the gate. A ticket is a token for one request: who finds it
-    afterwards finds nothing. Names of the host other than this machine's are refused, so that no
-    foreign name can be made to lead here, and so are requests that a page of another origin makes.
+    The first request has the token in its query and is redirected without it; after that a separate
+    secret in a cookie gives access. A ticket is a token for one request and useless afterwards.
+    Other host names than this machine's are refused, so that no foreign name can be pointed here.
+    Requests by pages of other origins are refused too.
     """
 
     def __init__(self, app: ASGIApp, port: int, token: str | None = None) -> None:
         self.app, self.port = app, port
         self.token = secrets.token_urlsafe(32) if token is None else token
         self.cookie = f"orthaug-{port}"  # cookies know no ports
-        self._secret = secrets.token_urlsafe(32)  # of the cookie: it stands in no address
+        self._secret = secrets.token_urlsafe(32)  # of the cookie: no address contains it
         self._tickets: set[str] = set()
 
     @property
@@ -147,7 +147,7 @@ async def _refuse(scope: Scope, send: Send) -> None:
 def _with_headers(send: Send) -> Send:
     """Return a sender that marks every answer as one for this page only.
 
-    What an answer says itself stands.
+    Headers that an answer has already are kept.
     """
 
     async def sending(message: Message) -> None:

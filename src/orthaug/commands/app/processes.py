@@ -72,7 +72,7 @@ class Command:
         known = [
             line for line in lines if line.startswith(("error:", "training failed:", "interrupted"))
         ]
-        last = (known or ["it ended without a word; is there enough memory?"])[-1]
+        last = (known or ["it ended without a message; is there enough memory?"])[-1]
         return last.removeprefix("error:").strip()
 
     async def run(self) -> None:
@@ -163,7 +163,7 @@ class WorkerPool:
         """Return the answer of a worker. A caller that is cancelled ends the worker.
 
         Raises:
-            InputError: what the question is refused with.
+            InputError: the question was refused.
         """
         async with self._room:
             process = await self._taken()
@@ -201,7 +201,7 @@ class WorkerPool:
             self._coming = self._coming or coming  # for the next one
             raise
         except OSError as error:
-            raise InputError(f"no process can be started for that ({error.strerror}).") from None
+            raise InputError(f"no process can be started ({error.strerror}).") from None
 
     async def close(self) -> None:
         coming: list[asyncio.subprocess.Process] = []
@@ -236,7 +236,7 @@ async def _answered(
         return json.loads(line)
     except (OSError, ValueError):
         raise InputError(
-            "the data could not be looked at: the process ended early. Is there enough memory?"
+            "the data could not be read: the process ended early. Is there enough memory?"
         ) from None
 
 

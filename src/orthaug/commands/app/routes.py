@@ -28,11 +28,8 @@ from orthaug.commands.app.view_results import ExportView, ReportView
 from orthaug.commands.app.view_training import TrainingView
 from orthaug.commands.app.widgets import sentence, text
 
-LARGEST = 2 * 2**30  # bytes of a file that is dropped: it lies once more in a temporary folder
-_TOO_LARGE = (
-    "the file is larger than {}, the most that this page takes in; name its path instead, and "
-    "it stays there."
-)
+LARGEST = 2 * 2**30  # bytes of an upload: there is a second copy in a temporary folder
+_TOO_LARGE = "the file is larger than {}, the limit of this page; give its path instead."
 _OFTEN = 0.25  # s between looks at what has changed
 _PARTS = ("Data", "Model", "Training", "Report", "Export")
 MARK = (
@@ -91,7 +88,7 @@ class Page:
                 tabs.set_value(event.args)
 
         def reopen(event: Any) -> None:
-            if tabs.value == start:  # else somebody was faster
+            if tabs.value == start:  # otherwise another page was faster
                 go(event)
 
         ui.on("part", go)
@@ -133,7 +130,7 @@ class Page:
         for look in looks:
             try:
                 look()
-            except Exception as error:  # a part that fails keeps no other from what is new
+            except Exception as error:  # a part that fails does not stop the others
                 LOG.exception("a part of the page failed")
                 self._complain(error)
 
@@ -158,7 +155,7 @@ def application(sessions: Sessions, spec: Path | None) -> FastAPI:
         try:
             session = sessions.new(spec)
         except InputError as error:
-            return _told(str(error), 503)
+            return _error_page(str(error), 503)
         return RedirectResponse(f"/session/{session.key}", 303)
 
     @app.put("/session/{key}/file/{name}")
@@ -170,10 +167,10 @@ def application(sessions: Sessions, spec: Path | None) -> FastAPI:
         session = sessions.find(key)
         try:
             if session is None:
-                raise InputError("this work is not open any more.")
+                raise InputError("this session has ended.")
             file = session.download(what)
         except InputError as error:
-            return _told(str(error), 404)
+            return _error_page(str(error), 404)
         if show and file.suffix == ".html":  # else a spec could be read as a page of this origin
             return FileResponse(file, headers={"cache-control": "no-store"}, media_type="text/html")
         return FileResponse(file, filename=what, headers={"cache-control": "no-store"})
@@ -182,13 +179,13 @@ def application(sessions: Sessions, spec: Path | None) -> FastAPI:
     def work(key: str) -> Response | None:
         session = sessions.find(key)
         if session is None:
-            return _told(
-                "This work is not open any more. Its spec is offered where something new begins.",
+            return _error_page(
+                "This session has ended. Its spec is offered at the start of a new one.",
                 404,
             )
         Page(session).draw()
 
-    pages.on_exception(lambda error: None)  # each page tells of its own
+    pages.on_exception(lambda error: None)  # each page reports its own errors
     ui.run_with(
         app,
         title="orthaug",
@@ -207,7 +204,7 @@ async def _kept(sessions: Sessions, key: str, name: str, request: Request) -> Re
     """Return the answer to an upload: the file is written piece by piece, then examined."""
     session = sessions.find(key)
     if session is None:
-        return _refused("this work is not open any more; open the page anew.", 404)
+        return _refused("this session has ended; open the page anew.", 404)
     partial: Path | None = None
     declared = request.headers.get("content-length", "")
     if declared.isdecimal() and int(declared) > LARGEST:
@@ -224,7 +221,7 @@ async def _kept(sessions: Sessions, key: str, name: str, request: Request) -> Re
     except InputError as error:
         return _refused(str(error), 422)
     except ClientDisconnect:
-        return _refused("the file came only in part.", 400)
+        return _refused("only a part of the file arrived.", 400)
     except OSError as error:
         return _refused(f"the file cannot be kept ({error.strerror}).", 507)
     finally:
@@ -239,7 +236,7 @@ def _refused(text: str, code: int) -> Response:
     return JSONResponse({"refused": text}, code)
 
 
-def _told(text: str, code: int) -> Response:
+def _error_page(text: str, code: int) -> Response:
     return HTMLResponse(
         f"{PLAIN}<p>{escape(text)}</p><p><a href='/'>Begin anew</a></p></body></html>", code
     )

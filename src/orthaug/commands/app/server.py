@@ -59,7 +59,7 @@ def check_installed() -> None:
 def private_folder() -> Iterator[Path]:
     """Yield a folder that only this user can read; it is removed at the end.
 
-    What a killed one left goes with the next.
+    The folder of a killed program is removed by the next one.
     """
     before = os.umask(0o077)
     folder = PARTIALS.folder(Path(tempfile.gettempdir()))
@@ -122,7 +122,7 @@ async def _serve(
         "timeout_graceful_shutdown": 1,
     }
     server = uvicorn.Server(uvicorn.Config(gate, lifespan="on", ws_max_size=2**26, **options))
-    server.capture_signals = contextlib.nullcontext  # type: ignore[method-assign]  # the program has its own way
+    server.capture_signals = contextlib.nullcontext  # type: ignore[method-assign]
     sessions.desk.prepare()
     serving = asyncio.ensure_future(server.serve([listening]))
     while not (server.started or serving.done()):

@@ -66,7 +66,7 @@ class Session:
         something to keep.
         """
         self.authors: list[str] = []
-        """Who made each change of the spec: a part of a page, which need not be told of its own."""
+        """Author of each change of the spec: a part of a page, which ignores its own changes."""
         self.checked: dict[str, Any] | None = None
         self.refused = ""
         """Why the spec cannot be trained."""
@@ -130,14 +130,14 @@ class Session:
         ending = Path(plain_name).suffix.lower()
         if ending not in KNOWN or not Path(plain_name).stem:
             raise InputError(
-                f"'{plain_name}': no data file that is known; known are {', '.join(KNOWN)}."
+                f"'{plain_name}': unknown type of data file; expected one of {', '.join(KNOWN)}."
             )
         return self.folder / plain_name
 
     def begin_file(self, name: str) -> Path:
         """Return the path of a partial file for an upload of that name.
 
-        `keep_file` gives it its place.
+        `keep_file` moves it to its place.
 
         Raises:
             InputError: an ending of no data file.
@@ -148,7 +148,7 @@ class Session:
     def keep_file(self, partial: Path, name: str) -> tuple[Path, str]:
         """Move an uploaded file to its place; return that place and a message for the page.
 
-        Nothing that is there is replaced: another content under the same name gets a number.
+        No file is replaced: other content under the same name gets a number.
         """
         first = self.place_for(name)
         place, number, digest = first, 1, file_digest(partial)
@@ -218,7 +218,7 @@ class Session:
         assert self.data is not None
         if self.title != self.data.name:  # the earlier work keeps its name
             self.title, self.kept_as = self.data.name, ""
-        own = self.data.parent == self.folder  # a file that was dropped stands beside the spec
+        own = self.data.parent == self.folder  # an uploaded file is in the same folder as the spec
         self.write(spec if own else absolute(spec, self.folder), "look")
 
     @property
@@ -245,7 +245,7 @@ class Session:
     def open_spec(self, path: Path, *, kept: bool = False) -> None:
         """Open a spec from a file, or one of earlier work that was kept.
 
-        It is read, and never written.
+        The file is read, and never written.
 
         Raises:
             InputError: a file that cannot be read, or broken TOML.
@@ -308,7 +308,7 @@ class Session:
     def units(self) -> dict[str, str]:
         """Units of parameters that follow from the channels of the present spec.
 
-        Nothing until it is checked.
+        Empty until the spec is checked.
         """
         if self.checked is None or self.checking or self.stale:
             return {}
@@ -380,7 +380,7 @@ class Session:
             self.running.finish()
             self.changed("work")
 
-    # What can be taken away
+    # Downloads
 
     def export(self, target: str, name: str) -> None:
         """Run `orthaug export` on the model."""
@@ -451,9 +451,7 @@ class Sessions:
         if len(self._open) >= _SESSIONS and untouched:
             del self._open[untouched[0].key]
         if len(self._open) >= _SESSIONS:
-            raise InputError(
-                f"{_SESSIONS} pieces of work are open; end orthaug app, and start it again."
-            )
+            raise InputError(f"{_SESSIONS} sessions are open; end orthaug app, and start it again.")
         key = secrets.token_urlsafe(12)
         self._made += 1
         folder = self.folder / f"work-{self._made}"

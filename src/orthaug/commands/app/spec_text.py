@@ -1,6 +1,6 @@
 """A spec as text that forms change, one key or table at a time, comments and order kept.
 
-And where it stands.
+And the files where specs are kept.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def in_file(path: Path) -> str:
 def keep(title: str, key: str, spec: str) -> None:
     """Write the spec of a session anew, whole or not at all.
 
-    Nothing where the folder cannot be written.
+    It does nothing where the folder cannot be written.
     """
     place = _folder() / f"{title}-{key[: _MARK - 1]}.toml"
     with suppress(OSError):
@@ -135,7 +135,7 @@ def columns(content: Mapping[str, Any]) -> dict[str, str]:
 def section(content: Mapping[str, Any], *path: str) -> Mapping[str, Any]:
     """Return the table at the end of the path.
 
-    An empty one where there is none, or something else in its place.
+    Empty where there is no table.
     """
     for key in path:
         found = content.get(key)
@@ -163,7 +163,7 @@ def shown(value: Any) -> str:
 def read(key: str, value: str) -> Any:
     """Return the value of a field's text: a number, names, or text; None for nothing.
 
-    The spec's own check says what is wrong.
+    Errors are left to the check of the spec.
     """
     value = value.strip()
     if not value:
@@ -207,7 +207,8 @@ def changed(text: str, change: Callable[[Any], None]) -> str:
     written = tomlkit.dumps(document)
     if plain(written) != document.unwrap():
         raise InputError(
-            "a form cannot write this change into the spec in its present layout; make it in the text."
+            "a form cannot write this change into the spec in its present layout; make it in "
+            "the text."
         )
     return written
 
@@ -215,7 +216,7 @@ def changed(text: str, change: Callable[[Any], None]) -> str:
 def with_value(text: str, path: Sequence[str], value: Any) -> str:
     """Return the text with a key of a table set, or removed where the value is None.
 
-    Tables on the way are made.
+    Missing tables on the path are added.
     """
 
     def change(document: Any) -> None:
@@ -224,7 +225,7 @@ def with_value(text: str, path: Sequence[str], value: Any) -> str:
             table.pop(path[-1], None)
         elif isinstance(
             value, Mapping
-        ):  # inline: a table of its own would land elsewhere beside dotted keys
+        ):  # inline: beside dotted keys a separate table would be written elsewhere
             table[path[-1]] = tomlkit.inline_table()
             table[path[-1]].update(value)
         else:
@@ -236,7 +237,7 @@ def with_value(text: str, path: Sequence[str], value: Any) -> str:
 def rows_of(text: str, path: Sequence[str]) -> list[dict[str, Any]]:
     """Return the tables of a list of tables, such as `data.prepare`.
 
-    None where there is no such list.
+    Empty where there is no such list.
     """
     found = section(plain(text), *path[:-1]).get(path[-1])
     return (
@@ -316,10 +317,9 @@ k = {{ initial = 1.0{k}, min = 0 }}
 def as_motion(text: str) -> str:
     """Return the spec with the equations of a mass, spring and damper in place of the baseline.
 
-    A person is to change them.
+    The user is to change them.
 
-    Comments about the baseline go with it; the parameters get units where force and output have
-    theirs.
+    Comments on the baseline are removed; parameters get units where force and output have units.
     """
     data = section(plain(text), "data")
     inputs, outputs = names(data, "inputs") or ["0"], names(data, "outputs") or ["y"]
@@ -345,7 +345,7 @@ def as_motion(text: str) -> str:
 def _without_comments(text: str, phrases: Sequence[str]) -> str:
     """Return the text without the comments that contain one of these phrases.
 
-    A line that holds nothing else goes too.
+    A line without other content is removed too.
     """
     kept = []
     for line in text.splitlines(keepends=True):

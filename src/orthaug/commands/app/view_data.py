@@ -37,8 +37,8 @@ _LISTED = 40  # columns
 _COLUMNS = (
     "input ",
     "output ",
-)  # begins of lines of an account that tell of columns, which stand by themselves
-_DRAFT = ("first physics", "test:")  # of lines that tell of a spec for the file
+)  # beginnings of lines on columns, which the page shows elsewhere
+_DRAFT = ("first physics", "test:")  # of lines on a spec for the file
 _OFFERED = 5  # specs of earlier work
 _USES = {"": "leave out", "input": "input", "output": "output"}
 _SUMMARIES = {
@@ -157,7 +157,7 @@ class DataView:
                 if self._apart:
                     self._offer_test(found)
             elif not session.spec and (kept := spec_text.earlier()[:_OFFERED]):
-                text("Or go on with the spec of earlier work:", "p", "hint")
+                text("Or continue with an earlier spec:", "p", "hint")
                 with ui.element("div").classes("fields"):
                     for place in kept:
                         when = datetime.fromtimestamp(place.stat().st_mtime)
@@ -171,8 +171,8 @@ class DataView:
             message += f"; it trains on {', '.join(file.name for file in trained)}"
         if lacking:
             message += f". This file has no column {', '.join(lacking)}, which the spec reads"
-        note(f"{message}. Take this file as a test of it, or begin anew below.", "care")
-        button("Take it as a test", self.session.add_test, main=not lacking)
+        note(f"{message}. Use this file as a test of it, or begin anew below.", "care")
+        button("Use it as a test", self.session.add_test, main=not lacking)
 
     def _trained(self) -> list[Path]:
         """Return the files that the spec trains on."""
@@ -189,7 +189,7 @@ class DataView:
     def _of_spec(self, found: Mapping[str, Any]) -> dict[str, str]:
         """Return the use of each column in the spec.
 
-        Empty where there is none, or where the file lacks one of them.
+        Empty without a spec, or where the file lacks one of its columns.
         """
         return {} if self._lacking(found) else spec_text.columns(self.session.content())
 
@@ -245,7 +245,7 @@ class DataView:
                 return
             if found["spec"] is None and not self._of_spec(found):
                 names = (
-                    "The names of the columns do not say which are inputs and outputs: choose "
+                    "The names of the columns do not show which are inputs and outputs: choose "
                     "them here."
                 )
                 note(found["open"] or names, "care")
@@ -354,7 +354,7 @@ class DataView:
     def follow_check(self) -> None:
         """Draw the curves of the file, and of the training data after preparation.
 
-        Why they cannot be drawn.
+        Where they cannot be drawn, it shows the reason.
         """
         session, checked = self.session, self.session.checked
         with redrawn(self.refusal):
@@ -377,9 +377,7 @@ class DataView:
                     unit, name = curve["unit"], channel
             if drawn:
                 rows.append((f"{name} [{unit}]" if unit else name, drawn))
-        other = (
-            f"; {session.data.name} is no part of them" if session.apart and session.data else ""
-        )
+        other = f"; {session.data.name} is not among them" if session.apart and session.data else ""
         state = (
             rows,
             cleaned,

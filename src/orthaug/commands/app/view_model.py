@@ -28,8 +28,8 @@ from orthaug.commands.app.widgets import (
 _TERMS = ("baseline", "terms")
 _LEARNERS = {"mlp": "a network", "terms": "a sum of terms", "none": "none: physics alone"}
 _FOCUS = {"prediction": "one step ahead", "simulation": "the free run"}
-_MULTIPLE = 1e5  # % from which a change is checked in words
-_ROUNDING = 1e-7  # % below which it is none
+_MULTIPLE = 1e5  # % from which a change is given in words
+_ROUNDING = 1e-7  # % below which it counts as none
 _STRUCTURES = {
     "orthogonal": "orthogonal",
     "additive": "additive",
@@ -173,7 +173,7 @@ class ModelView:
         moves = "motion" in content
         with redrawn(self.learner):
             if not content:
-                text("A learner finds what the physics does not say.", "p", "hint")
+                text("A learner finds what the physics lacks.", "p", "hint")
                 return
             kind = str(learner.get("kind", "mlp"))
             with ui.element("div").classes("fields"):
@@ -233,8 +233,8 @@ class ModelView:
         with redrawn(self.check):
             if not session.spec.strip():
                 text(
-                    "Rank, units, what the learner could take from the physics, and what would "
-                    "bias it.",
+                    "Rank, units, what the learner could imitate of the physics, and possible "
+                    "biases.",
                     "p",
                     "hint",
                 )
@@ -335,7 +335,7 @@ def _biases(percents: Mapping[str, float | None]) -> str:
 def _percent(value: float | None) -> str:
     """Return a change in per cent.
 
-    Of a parameter near zero no number says more than that it is a multiple.
+    Near zero the change is a multiple of the parameter, and no number is of use.
     """
     if value is None:
         return "–"

@@ -24,12 +24,12 @@ from orthaug.commands.app.widgets import (
 
 _REPORTS = {"report.html": "of the fit", "comparison.html": "of the comparison"}
 _FILES = (
-    ("spec", "spec.toml", "Spec", "the command line runs it to the same numbers"),
+    ("spec", "spec.toml", "Spec", "the command line gives the same numbers"),
     ("fit", "model.zip", "Model", "for orthaug simulate, predict, linearize, track"),
     ("fit", "report.html", "Report", "one file, needs no network"),
     ("fit", "result.json", "Numbers", "result.json"),
-    ("fit", "result.zip", "All of the fit", "result folder"),
-    ("compare", "comparison.zip", "All of the comparison", "result folder"),
+    ("fit", "result.zip", "The whole fit", "result folder"),
+    ("compare", "comparison.zip", "The whole comparison", "result folder"),
 )
 _TARGETS = {
     "c": "C99 without libraries",
@@ -145,7 +145,7 @@ class ExportView:
                     text(hint, "p", "hint")
                 link(name, f"/session/{session.key}/get/{name}")
         if not files:
-            text("There is nothing to take yet.", "p", "hint")
+            text("There is nothing to download yet.", "p", "hint")
             return
         text("The same on the command line:", "p", "small")
         text("orthaug fit spec.toml --out result", "pre")

@@ -123,7 +123,10 @@ class TrainingView:
             if progress:
                 name = run_name(Run.of(progress), of_structure=command.arguments[0] == "compare")
                 name = f" ({name})" if progress.get("structure") else ""
-                now = f"run {progress['run']} of {progress['runs']}{name}, iteration {progress['iteration']}"
+                now = (
+                    f"run {progress['run']} of {progress['runs']}{name}, iteration "
+                    f"{progress['iteration']}"
+                )
                 now += f", loss {number(progress['loss'], 4)}"
             if command.stopping or command.ending:
                 now = "stopping …" if command.stopping else "ending with the best so far …"
@@ -151,7 +154,7 @@ class TrainingView:
                 with card(title):
                     same = session.trained[kind] == session.spec
                     if not same:
-                        note(f"The spec has changed since this was {done}.", "care")
+                        note(f"The spec has changed since it was {done}.", "care")
                     if (
                         verdict := session.verdicts.get(kind)
                     ) is not None:  # that the report begins with

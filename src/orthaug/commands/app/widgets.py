@@ -1,6 +1,6 @@
 """Building blocks of the page: headings, fields, tables, curves.
 
-Plain HTML where that is all it takes.
+Plain HTML where that is enough.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from typing import Any, TypeVar
 from nicegui import ui
 
 from orthaug.commands.app.processes import Run
-from orthaug.commands.job import ALONE
+from orthaug.commands.job import PHYSICS_ONLY
 
 Drawn = TypeVar("Drawn", bound=ui.element)
-_SHORT = 12  # letters that stand on one line
+_SHORT = 12  # letters that fit on one line
 _WIDE = 5  # columns of a table that may be wider than its place
 
 
@@ -156,7 +156,7 @@ def link(label: str, place: str) -> ui.element:
 
 
 def note(what: str, kind: str = "") -> ui.html:
-    """Return a note that stands out: `bad`, `care` or `good`."""
+    """Return a highlighted note: `bad`, `care` or `good`."""
     return text(what, "p", f"note {kind}").props("role=alert" if kind == "bad" else "role=status")
 
 
@@ -234,7 +234,7 @@ def loss_figure(losses: Sequence[tuple[Run, int, float | None]]) -> dict[str, An
         x.append(iteration)
         y.append(loss)
     several = of_several(runs)
-    differ = len({run.regularization for run in runs if run.structure != ALONE}) > 1
+    differ = len({run.regularization for run in runs if run.structure != PHYSICS_ONLY}) > 1
     names = {run: run_name(run, of_structure=several, of_regularization=differ) for run in runs}
     groups = {run: (run.structure or "run made again") if several else names[run] for run in runs}
     entries = list(dict.fromkeys(groups[run] for run in sorted(runs)))

@@ -36,7 +36,7 @@ _DRAWN = 12  # columns of a file whose curves are
 def main() -> None:
     """Answer questions until the standard input ends.
 
-    End where a question took much memory, which would be kept.
+    Also end after a question that took much memory, which the process would keep.
     """
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # what a library prints is no answer
@@ -95,16 +95,16 @@ def look(
     """Return the columns of a file, their curves, and a first spec where its channels are known.
 
     Args:
-        out: where the spec will stand.
-        inputs: columns of the inputs, separated by commas; None for what their names say.
+        out: the path that the spec will have.
+        inputs: columns of the inputs, separated by commas; None for those that the names show.
         outputs: the same of the outputs.
-        step: sampling time in s where a person said it.
+        step: sampling time in s where the user gave it.
     """
     found = starting.look(Path(path))
     answer: dict[str, Any] = {
         "columns": [_column(found, column) for column in found.columns],
         "rows": max(column.filled for column in found.columns),
-        "timed": _timed(found),
+        "timed": _time_text(found),
         "step": found.clock.step,
         "spec": None,
         "account": "",
@@ -124,7 +124,7 @@ def look(
     return answer | {"curves": _curves(found)}
 
 
-def _timed(found: Survey) -> str:
+def _time_text(found: Survey) -> str:
     """Return a sentence on the column that gives the time; empty where none does."""
     clock = found.clock
     if clock.column is None or clock.step is None:
