@@ -86,7 +86,7 @@ def test_white_noise_on_a_static_map(seed):
 
 
 def test_a_missing_square_of_a_static_map_is_unmodelled():
-    """The residual of independent samples is white whatever is missing: it is curved over the input."""
+    """The residual of independent samples is white whatever is missing: it depends nonlinearly on the input."""
     example = synthetic.static(1, noise=True)
     found = of(example.train, example.baseline)
     assert found.one_step[0].curved_regressors == ("u[k]",)

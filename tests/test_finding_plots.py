@@ -139,7 +139,7 @@ def test_the_largest_autocorrelation_keeps_its_sign():
     found = analysed(e, {"voltage[k-1]": e})
     assert found.strongest_acf == pytest.approx(-found.largest_acf) and found.strongest_acf < -0.5
     assert (
-        f"The largest in size is −{found.largest_acf:.2g}."
+        f"The largest magnitude is −{found.largest_acf:.2g}."
         in residual_plots(found, "residual", UNITS)[0].caption
     )
     json.loads(found.model_dump_json())

@@ -324,8 +324,8 @@ def test_a_threshold_that_is_known():
 def test_a_model_without_inputs_has_none_to_scale():
     """y[k] = a y[k-1] decays or explodes from where it starts."""
     for a, says in (
-        (0.5, "stays within all bounds; it has no inputs"),
-        (3.0, "leaves all bounds from where it starts"),
+        (0.5, "remains bounded; it has no inputs"),
+        (3.0, "diverges without inputs"),
     ):
         model = model_of([Term("a", "y[k-1]")], [a], inputs=[])
         found = stability(model, Record.from_arrays(None, np.ones(60)))

@@ -321,11 +321,13 @@ NOTHING = [
     ("u,y\n1,\n2,\n3,\n", (), '--inputs "" --outputs "u"; columns that are not named are left out. No channels: '
      "y (no numbers)."),
     ("u,y\n1,\n2,\n3,\n", ("--inputs", "u"), "already an input (u), so no column is left for an output; left out: y (no"),
-    ("a,b,c\n1,2,4\n2,1,7\n", ("--outputs", "b"), 'only outputs are named: a, b, c. Say both, separated by commas, '
-     'such as --inputs "a,c" --outputs "b" (--inputs "" for none)'),
+    ("a,b,c\n1,2,4\n2,1,7\n", ("--outputs", "b"), "only outputs are named: a, b, c. Give both, "
+                                                  'separated by commas, such as --inputs "a,c" '
+                                                  '--outputs "b" (--inputs "" for none)'),
     ("a,b,c\n1,2,4\n2,1,7\n", ("--inputs", "c"), '--inputs "c" --outputs "b"; columns'),
     ("a,b,c\n1,2,4\n2,1,7\n", ("--inputs", "A"), "no column 'A', did you mean 'a'?"),
-    ("-1.5,2\n1,2\n2,3\n", (), 'which outputs: x1, x2. Say both, separated by commas, such as --inputs "x1"'),
+    ("-1.5,2\n1,2\n2,3\n", (), "which outputs: x1, x2. Give both, separated by commas, such as "
+                               '--inputs "x1"'),
     ("bench 3, May\nu\nnone\n", (), "expected one for each signal, under a header. The names that were found are "
      "'bench 3, May'; a line above the header must begin with #"),
 ]  # fmt: skip

@@ -488,7 +488,7 @@ def test_the_verdict_of_a_comparison_names_a_model(compared):
     )
     trust = compare_verdict(twin.model_copy(update={"chosen": None})).trust
     assert (
-        "as does “twin”, and no other leaves less" in trust
+        "as does “twin”, and no other model has a smaller error" in trust
         and "less than of any other" not in trust
     )
 

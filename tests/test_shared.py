@@ -357,7 +357,7 @@ def test_what_could_be_imitated_in_words():
     told = imitation(problem, PHYSICS)
     assert told.text == (
         "The learner sees y[k-1]-y[k-2] and could imitate t1 - t2. The orthogonal split sets θ "
-        "along this direction only. The fit determines t3 beside any learner of these inputs. Of the physical "
+        "along this direction only. The data determine t3 with any learner of these inputs. Of the physical "
         "parameters it determines ks."
     )
     others = {other.inputs: (other.shared, other.physical) for other in told.alternatives}

@@ -26,9 +26,9 @@ MESSAGES = {
         "is wrong. Try another seed or another activation"
     ),
     "non_finite": (
-        "the loss is not finite: (a) a learner input grows without bound, (b) the learner "
-        "returns NaN, (c) channels differ by many orders of magnitude, or (d) `learning_rate` "
-        "is too large. Rescale the channels, choose other learner inputs, or lower the rate"
+        "the loss is not finite: a learner input grows without bound, the learner returns NaN, "
+        "channels differ by many orders of magnitude, or `learning_rate` is too large. Rescale "
+        "the channels, choose other learner inputs, or lower the rate"
     ),
 }
 """What each code has always said."""

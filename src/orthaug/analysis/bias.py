@@ -142,7 +142,7 @@ class SuspectedBias:
             f"{self.suspect.name}: no weighting that counts any of "
             f"{percent(certificate.positive, 3)} of these points leaves θ unbiased. There "
             f"(φᵀa)δ is positive, and it is nowhere negative; a = {' '.join(terms)} (columns "
-            "scaled to root mean square 1). Only the least bias can be asked for."
+            "scaled to root mean square 1). A measure can then only make the bias small."
         )
 
     def as_dict(self) -> dict[str, Any]:

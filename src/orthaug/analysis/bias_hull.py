@@ -116,19 +116,18 @@ def undetermined_warning(
     )
     apart = sorted(candidates, key=lambda c: float(np.sum(np.sign(c.moved) * c.moved**2)))
     pair = [apart[0], apart[-1]] if len(apart) > 1 else apart
-    causes = " and ".join(f"{c.name}, {percent(c.share)} of what it found" for c in pair)
-    of = f": {causes} imply other values" if len(pair) > 1 else ""
+    causes = " and ".join(f"{c.name} ({percent(c.share)} of what it found)" for c in pair)
+    of = f": {causes} imply different values" if len(pair) > 1 else ""
     cure = " or ".join(
         remedies
         or (
             "split under another measure",
             "give the learner fewer inputs",
-            "use an input that was designed for these parameters (`orthaug design`)",
+            "use an input designed for these parameters (`orthaug design`)",
         )
     )
     verb = "is" if len(names) == 1 else "are"
     return Warning(
         "not_determined",
-        f"{shown} {verb} not determined by these data beside this learner{of}. To determine: "
-        f"{cure}.",
+        f"{shown} {verb} not determined by these data with this learner{of}. Remedy: {cure}.",
     )

@@ -73,18 +73,18 @@ def margin(factor: float | None, searched: float, driven: bool) -> tuple[str, st
     """
     if not driven:
         stays = (
-            "stays within all bounds"
+            "remains bounded"
             if factor is None
-            else "leaves all bounds from where it starts"
+            else "diverges without inputs"
         )
         return (
             f"The free run {stays}; it has no inputs that could be larger.",
             "small_margin" if factor is not None else "",
         )
-    stays, times = ("stays within", searched) if factor is None else ("leaves", factor)
+    stays, times = ("remains bounded", searched) if factor is None else ("diverges", factor)
     text = (
-        f"The free run {stays} all bounds with the inputs' deviations from their means "
-        f"{times:.4g} times as large."
+        f"The free run {stays} with the inputs' deviations from their means {times:.4g} times "
+        "as large."
     )
     return text, "small_margin" if factor is not None and factor < _MARGIN else ""
 

@@ -597,9 +597,10 @@ def _unbounded(names: Sequence[str], std: Vector, ends: Matrix) -> list[Warning]
     if not none:
         return []
     text = (
-        f"no interval of {', '.join(none)} includes the bias: some theta within the intervals that"
+        f"no interval of {', '.join(none)} includes the bias: some values of theta within the "
+        "wider intervals"
     )
-    return [Warning("physics_not_met", f"{text} do belongs to no physical parameters.")]
+    return [Warning("physics_not_met", f"{text} correspond to no physical parameters.")]
 
 
 def _warning(
@@ -629,7 +630,7 @@ def _warning(
     other = (
         ""
         if rival is None
-        else f" ({rival.suspect.name} explains as much and would move them elsewhere)"
+        else f" ({rival.suspect.name} explains as much and would imply other values)"
     )
     if share < SURE_SHARE:
         near = near_causes(linearization, cause, suspects)
@@ -638,13 +639,13 @@ def _warning(
         return Warning(
             "biased",
             f"what the learner found{there} looks most like {name} ({percent(share)} of "
-            f"it{beside}), which would move {listed}, and the standard errors do not cover "
-            f"that{other}{f': if it is that, {cure}' if cure else ''}.",
+            f"it{beside}). This term would move {listed}; the standard errors do not cover "
+            f"this bias{other}{f'. Remedy: {cure}' if cure else ''}.",
         )
     return Warning(
         "biased",
-        f"{name} explains {100 * share:.0f} % of the learner{there} and moves {listed}, "
-        f"which the standard errors do not cover{other}{f': {cure}' if cure else ''}.",
+        f"{name} explains {100 * share:.0f} % of the learner{there} and moves {listed}. The "
+        f"standard errors do not cover this bias{other}{f'. Remedy: {cure}' if cure else ''}.",
     )
 
 

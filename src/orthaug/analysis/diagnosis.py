@@ -368,8 +368,9 @@ def wild_rows(response: Response, experiments: Sequence[Experiment]) -> tuple[Wa
         more = f" and {len(wild) - _NAMED} more" if len(wild) > _NAMED else ""
         text = (
             f"{counted(len(wild), 'row')} of {len(error)} make up {percent(held, 3)} of the "
-            f"squared one-step residual of {output.name}: {'; '.join(named)}{more}. Wrong samples "
-            'there bias θ: mark them (step = "outliers" of data.prepare), or leave them out.'
+            f"squared one-step residual of {output.name}: {'; '.join(named)}{more}. Wrong "
+            'samples among them bias θ: mark them (step = "outliers" of data.prepare), or '
+            "leave them out."
         )
         found.append(Warning("wild_rows", text))
     return tuple(found)

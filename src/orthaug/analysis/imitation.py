@@ -79,8 +79,8 @@ class Imitation:
             sees = f"The learner is a sum of {len(self.inputs)} terms"
         if self.everything:
             return (
-                f"{sees} and could imitate all of the physics: the orthogonal split sets θ along "
-                "every direction."
+                f"{sees} and could imitate all of the physics. The data alone do not determine "
+                "θ; the orthogonal split does."
             )
         if self.held:
             are, them = ("is", "it") if len(self.held) == 1 else ("are", "them")
@@ -91,18 +91,21 @@ class Imitation:
         if not self.directions:
             rest = " other" if self.held else ""
             text = f"{sees} and could imitate nothing of the{rest} physics"
-            return f"{text}: the fit determines every{rest} parameter beside it.{self._nearly}"
+            return f"{text}: the data determine every{rest} parameter.{self._nearly}"
         could = _listed([_combination(direction) for direction in self.directions])
         along = "this direction" if len(self.directions) == 1 else "these directions"
         sentences = [
-            f"{sees} and could imitate {could}. The orthogonal split sets θ along {along} only."
+            f"{sees} and could imitate {could}. Along {along} the data alone do not determine "
+            "θ; the orthogonal split does."
         ]
         if self.determined:
             sentences.append(
-                f"The fit determines {_listed(self.determined)} beside any learner of these inputs."
+                f"The data determine {_listed(self.determined)} with any learner of these "
+                "inputs."
             )
         if self.physical:
-            sentences.append(f"Of the physical parameters it determines {_listed(self.physical)}.")
+            sentences.append("Of the physical parameters they determine "
+                             f"{_listed(self.physical)}.")
         return " ".join(sentences) + self._nearly
 
     @property
@@ -133,22 +136,22 @@ class MotionImitation(Imitation):
         sees = f"The learner sees {', '.join(self.inputs)}"
         if self.everything:
             return (
-                f"{sees} and could imitate a change of every parameter: the nearest physics "
-                "sets them."
+                f"{sees} and could imitate a change of every parameter. The data alone do not "
+                "determine them; the physics nearest to the fitted motion does."
             )
         if not self.directions:
             return (
-                f"{sees} and could imitate no change of a parameter: the fit determines all of "
-                "them beside it."
+                f"{sees} and could imitate no change of a parameter: the data determine all of "
+                "them."
             )
         moved = "; ".join(" with ".join(direction) for direction in self.directions)
         text = (
-            f"{sees} and could imitate a change of {moved}. Only there the nearest physics sets "
-            "the parameters."
+            f"{sees} and could imitate a change of {moved}. Along this change the data alone "
+            "do not determine the parameters; the physics nearest to the fitted motion does."
         )
         if self.determined:
             text += (
-                f" The fit determines {', '.join(self.determined)} beside any learner of these "
+                f" The data determine {', '.join(self.determined)} with any learner of these "
                 "inputs."
             )
         return text

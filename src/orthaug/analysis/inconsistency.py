@@ -74,13 +74,13 @@ class Inconsistency:
     def warning(self) -> Warning:
         """Warning on the inconsistency, with the values that the remedies give."""
         each = [
-            f"{self.names[i]} is then {self.modelled[i]:.6g} (std {self.modelled_std[i]:.2g}) "
+            f"{self.names[i]} is {self.modelled[i]:.6g} (std {self.modelled_std[i]:.2g}) "
             f"instead of {self.theta[i]:.6g}, {abs(self.apart[i]):.1f} standard errors away"
             for i in self.moved
         ]
         text = (
-            "one-step θ is inconsistent: its errors are coloured and so correlated with "
-            "the lagged outputs, and more rows do not help. With a model of the colour "
+            "the one-step θ is inconsistent: its coloured errors are correlated with the "
+            "lagged outputs, and more rows do not reduce the bias. With a noise model "
             f"(autoregression of order {self.order}) {'; '.join(each)}."
         )
         if self.instruments is not None and self.instruments_std is not None:
@@ -88,7 +88,10 @@ class Inconsistency:
                 f"{self.names[i]} = {self.instruments[i]:.6g} (std {self.instruments_std[i]:.2g})"
                 for i in self.moved
             ]
-            text += f" Instruments (the outputs of the free run) give {', '.join(given)}."
+            text += (
+                    " Instrumental variables (the outputs of the free run) give "
+                    f"{', '.join(given)}."
+)
         text += (
             " No interval of the one-step θ covers this bias. Train on the free run "
             '(focus = "simulation"), which does not have it.'

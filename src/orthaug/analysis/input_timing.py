@@ -189,10 +189,10 @@ class DeadTime:
         """With what to write into the spec."""
         return Warning(
             "dead_time",
-            f"{self.input} seems to act late: {self.gain}, with other parameters. If there is a "
-            'dead time, delay the input by [[data.prepare]] with step = "shift", '
-            f'channel = "{self.input}", samples = {self.samples}; if its drive is slow, '
-            "model that in the equations.",
+            f"{self.input} seems to act late: {self.gain}, with other parameters. If there is "
+            'a dead time, delay the input by [[data.prepare]] with step = "shift", channel = '
+            f'"{self.input}", samples = {self.samples}. If its drive is slow, model the drive '
+            "in the equations.",
         )
 
 

@@ -201,8 +201,8 @@ def _view(
         for pole in poles
     ):
         text = (
-            "the 95 % interval of a pole contains magnitude 1: whether the point is stable is "
-            "not sure."
+            "the 95 % interval of a pole contains magnitude 1: the stability of the point is "
+            "not certain."
         )
         warnings.append(Warning("stability_not_sure", text))
     gain, gain_ci95 = gain_of(sampled, freedom)
@@ -330,6 +330,6 @@ def _rough(bode: Any) -> list[Warning]:
         return []
     text = (
         f"at {percent(share)} of the frequencies the band is so wide that the delta method is "
-        "rough there."
+        "only approximate."
     )
     return [Warning("wide_band", text)]

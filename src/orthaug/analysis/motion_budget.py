@@ -390,7 +390,7 @@ def _motion_warning(
         return None
     several, first = len(found.causes) > 1, sorted(found.rivals, key=explains, reverse=True)[:2]
     named = " and ".join(f"{rival.suspect.name}, {percent(explains(rival))}" for rival in first)
-    other = f" (near it: {named}, and would move them elsewhere)" if first else ""
+    other = f" (close to it: {named}, which would imply other values)" if first else ""
     what = "the learner" if learns else "the free run's squared error"
     listed = " and ".join(
         f"{c.suspect.name} of size {_size(c):.3g} {c.suspect.unit}".rstrip()
@@ -400,13 +400,13 @@ def _motion_warning(
     if learns and found.share < SURE_SHARE:
         return Warning(
             "biased",
-            f"what the learner found looks most like {listed} ({percent(found.share)} of it), "
-            f"which would move {list_biases(large)}, and the standard errors do not cover "
-            f"that{other}.",
+            f"what the learner found looks most like {listed} ({percent(found.share)} of it). "
+            f"This would move {list_biases(large)}; the standard errors do not cover this "
+            f"bias{other}.",
         )
     return Warning(
         "biased",
         f"{listed} explain{'' if several else 's'} {100 * found.share:.0f} % of {what} and "
-        f"move{'' if several else 's'} {list_biases(large)}, which the standard errors do not "
-        f"cover{other}.",
+        f"move{'' if several else 's'} {list_biases(large)}. The standard errors do not cover "
+        f"this bias{other}.",
     )

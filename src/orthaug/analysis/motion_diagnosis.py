@@ -152,18 +152,21 @@ def _words(
         )
     if late:
         return (
-            f"The free run's error ({sizes}) holds more than noise. Most likely "
+            f"The free run's error ({sizes}) contains more than noise. Most likely "
             f"{late[0].input} acts later than in the equations: {late[0].gain}."
         )
     if lacks is not None:
-        return f"The free run's error ({sizes}) holds more than noise. {_named(lacks)}"
+        return f"The free run's error ({sizes}) contains more than noise. {_named(lacks)}"
     what = [f"{name} follows {', '.join(given)}" for name, given in followed.items()]
-    what += [f"{name} is not flat over {', '.join(given)}" for name, given in curved.items()]
+    what += [f"{name} varies with {', '.join(given)}" for name, given in curved.items()]
     what = what or [f"{100 * max(s.inputs for s in shares):.0f} % follows from the inputs"]
     held = "Physics is missing" + (
-        ", or inputs run otherwise between samples" if fit.problem.motion.inputs else ""
+        ", or inputs move differently between samples" if fit.problem.motion.inputs else ""
     )
-    return f"The free run's error ({sizes}) holds more than noise: {'; '.join(what)}. {held}."
+    return (
+           f"The free run's error ({sizes}) contains more than noise: {'; '.join(what)}. "
+           f"{held}."
+)
 
 
 def _traces(tests: tuple[ResidualTest, ...], shares: tuple[Predictable, ...]) -> str:
@@ -174,7 +177,7 @@ def _traces(tests: tuple[ResidualTest, ...], shares: tuple[Predictable, ...]) ->
         if test.correlated_inputs
     ]
     effects += [
-        f"{test.name} is not flat over {', '.join(over)}"
+        f"{test.name} varies with {', '.join(over)}"
         for test in tests
         if (over := test.curved_over(0.0))
     ]
@@ -183,7 +186,7 @@ def _traces(tests: tuple[ResidualTest, ...], shares: tuple[Predictable, ...]) ->
     most = max(share.largest(own_past=False) for share in shares)
     return (
         f" Tests still detect small effects ({'; '.join(effects)}): {percent(most)} of its "
-        "square at most."
+        "mean square at most."
     )
 
 
@@ -197,7 +200,8 @@ def _colour(tests: tuple[ResidualTest, ...], shares: tuple[Predictable, ...]) ->
                 past if share.own_past > _LITTLE else ", too little to predict it from its own past"
             )
             clauses.append(
-                f"{test.name} has autocorrelations of up to {test.largest_acf:.2f} in size{past}"
+                f"{test.name} has autocorrelations of up to {test.largest_acf:.2f} in "
+                f"magnitude{past}"
             )
     return "; ".join(clauses)
 
@@ -205,7 +209,7 @@ def _colour(tests: tuple[ResidualTest, ...], shares: tuple[Predictable, ...]) ->
 def _named(lacks: MissingTest) -> str:
     """Return the terms that are most likely missing."""
     best, *others = lacks.terms
-    text = f"Most likely {best} would explain {percent(best.share)} of its square"
+    text = f"Most likely {best} would explain {percent(best.share)} of its mean square"
     if others:
         text += (
             ", as would "

@@ -105,7 +105,7 @@ def _of_modes(model: MotionModel, x: Matrix, u: Matrix) -> MotionStability:
         return MotionStability(found, (), text + _without_growth(found))
     where = ", ".join(f"{name} = {value:.4g}" for name, value in found.worst.items())
     text += (
-        f"At {percent(found.growing, 3)} of its points one grows, by up to "
+        f"At {percent(found.growing, 3)} of its points a mode grows, by up to "
         f"{found.rightmost:.4g} 1/s ({where}); median of the largest real part "
         f"{found.median:.4g} 1/s."
     )
@@ -118,7 +118,7 @@ def _sizes(found: Modes) -> str:
     count = found.integrators
     whole = f"{count} integrators" if count > 1 else "an integrator" if count else ""
     if not found.fastest:
-        return f"{whole} and no other mode"
+        return f"{whole} and no other modes"
     sizes = dict.fromkeys(f"{size:.4g}" for size in (found.slowest, found.fastest))
     return f"{whole}{' and ' if count else ''}modes of {' to '.join(sizes)} 1/s"
 

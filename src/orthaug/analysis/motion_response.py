@@ -307,7 +307,7 @@ def _warnings(found: SubstepBias, fit: MotionEstimate) -> tuple[Warning, ...]:
     steps = f"{found.substeps} substep{'s' * (found.substeps > 1)} in a sample"
     text = (
         f"the integrator is too coarse for the parameters: with {steps} instead of "
-        f"{2 * found.substeps} it moves {', '.join(shifts)}; give substeps = "
+        f"{2 * found.substeps} substeps the fit moves {', '.join(shifts)}; give substeps = "
         f"{2 * found.substeps} or more."
     )
     return (Warning("too_few_substeps", text),)

@@ -154,9 +154,9 @@ class Observer:
         finite = np.isfinite(rows.predicted).all(axis=1) & np.isfinite(before.state).all(axis=1)
         if not finite.all():
             raise InputError(
-                f"{experiment.where(first + int(np.argmin(finite)))}: the estimate leaves all "
-                "bounds there; the model does not hold on this record, or the noise of the "
-                "observer is wrong."
+                f"{experiment.where(first + int(np.argmin(finite)))}: the estimate diverges "
+                "there; the model does not fit this record, or the noise of the observer is "
+                "wrong."
             )
         return _observed(rows, experiment, first), before, inputs
 
@@ -269,7 +269,7 @@ class ObserverState:
         form, numbers, _ = model.filtering
         belief, latest = one_row(form, numbers, self.observer.noise, self.belief, row, measured)
         if not (np.isfinite(latest.predicted).all() and np.isfinite(belief.state).all()):
-            raise InputError("the estimate leaves all bounds; the model does not hold here.")
+            raise InputError("the estimate diverges; the model does not fit here.")
         return replace(self, belief=belief, latest=latest)
 
 

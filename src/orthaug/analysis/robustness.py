@@ -137,27 +137,27 @@ def _withheld(fit: Any) -> Any:
     known = [length for length in lengths if length is not None]
     if len(known) == len(lengths) and max(known) <= fit.scores.longest:
         why = (
-            f"over {max(known)} steps, and the {segments.count} steps of training hold too few "
+            f"over {max(known)} steps. The {segments.count} steps of training contain too few "
             "stretches of that length"
         )
     else:
         why = (
-            f"over more than the segments of training ({fit.scores.longest} steps) or a good "
-            "part of the data"
+            f"over more than a segment of training ({fit.scores.longest} steps) or much of the "
+            "record"
         )
     each = (
         ""
         if fit.std is None
-        else " White errors would give standard errors of "
+        else " A formula for white errors gives standard errors of "
         + ", ".join(
             f"{std:.2g} of {name}"
             for name, std in zip(_names(fit), fit.std, strict=True)
             if np.isfinite(std)
         )
-        + ", which is too small."
+        + ", which are too small."
     )
     text = (
-        "there are no standard errors and no intervals: the errors of the free run are correlated "
+        "no standard errors and no intervals: the errors of the free run are correlated "
         f"{why}.{each} Use longer segments, a longer record, or physics with smaller errors."
     )
     return replace(

@@ -215,8 +215,8 @@ def _sensor_noise(seen: Finding) -> tuple[str, tuple[Warning, ...]]:
     )
     own = "the free run is" if seen.simulated else "the physics trained on the free run comes"
     how = (
-        f"its largest autocorrelation is {colour:.2f} in size, and {own} {closer} without "
-        "measured lags"
+        f"its autocorrelation reaches {colour:.2f} in magnitude, and {own} {closer} to the "
+        "outputs without measured lags"
     )
     text = f"The one-step residual is coloured: {how}. That is noise on the measured output"
     if seen.simulated:
@@ -241,16 +241,19 @@ def _sensor_noise(seen: Finding) -> tuple[str, tuple[Warning, ...]]:
 
 def _unmodelled(seen: Finding) -> tuple[str, tuple[Warning, ...]]:
     findings = [
-        f"its largest autocorrelation is {max((t.largest_acf or 0.0) for t in seen.own):.2f} "
-        "in size"
+        f"its autocorrelation reaches {max((t.largest_acf or 0.0) for t in seen.own):.2f} in "
+        "magnitude"
     ]
     for test in seen.own:
         findings += [f"the residual of {test.name} still follows {name}" for name in test.follows()]
         findings += [
-            f"the residual of {test.name} is curved over {name}" for name in test.curved_over(SHARE)
+            f"the residual of {test.name} depends nonlinearly on {name}" for name in test.curved_over(SHARE)
         ]
     findings = [*findings[:_LISTED], *(["and more"] if len(findings) > _LISTED else [])]
-    opening = f"The {seen.what}, {_size(seen)}, is not noise alone: {'; '.join(findings)}."
+    opening = (
+              f"The {seen.what}, {_size(seen)}, contains more than noise: "
+              f"{'; '.join(findings)}."
+)
     advice = "" if seen.steps and not seen.changes else _advice(seen, _cause(seen))
     return " ".join(part for part in (opening, _shares(seen), _quantised(seen), advice) if part), ()
 
@@ -265,9 +268,9 @@ def _quantised(seen: Finding) -> str:
             for test in seen.tests if test.name in seen.steps}  # fmt: skip
     trained = "" if seen.simulated else 'training on the free run (focus = "simulation"), '
     return (
-        f"{'; '.join(each.values())}: such steps colour it as noise on the output does, and "
-        f"bias one-step estimates of θ. Remedies: {trained}fewer samples (`decimate` of "
-        "data.prepare), or a finer measurement."
+        f"{'; '.join(each.values())}: these steps make it coloured, as noise on the output "
+        f"does, and bias one-step estimates of θ. Remedies: {trained}fewer samples (`decimate` "
+        "of data.prepare), or a finer measurement."
     )
 
 
@@ -285,8 +288,8 @@ def _cause(seen: Finding) -> str:
             "slow dynamics that the physics lacks: record the disturbance as an input"
         )
     return (
-        "its colour is that of a disturbance or of sensor noise that neither criterion describes. "
-        "Its own past predicts it; an unrecorded input might, too"
+        "its autocorrelation is that of a disturbance, or of sensor noise, which neither "
+        "criterion describes. Its own past predicts it; an unrecorded input may do so, too"
     )
 
 
@@ -296,7 +299,7 @@ def _joined(names: Sequence[str]) -> str:
 
 def _small(seen: Finding) -> str:
     """Return sentences on a residual that the tests reject but hardly anything predicts."""
-    colour = " Its colour is that of the noise." if seen.simulated and not seen.white else ""
+    colour = " Its autocorrelation is that of the noise." if seen.simulated and not seen.white else ""
     followed = seen.follows()
     shown = (
         f"mostly noise, but still follows {_joined(followed)}" if followed else "noise by all tests"

@@ -545,17 +545,18 @@ def _concluded(
         text += f" No gain from {_error(before)}: {named}{more}."
     if left:
         text += (
-            f" {counted(left, 'change')} {'was' if left == 1 else 'were'} not tried, to spare time."
+            f" {counted(left, 'change')} {'was' if left == 1 else 'were'} not tried, to save "
+            "time."
         )
     return advice, AdviceTrialsResult(text=text, tried=len(tried), not_tried=left)
 
 
 def _which(better: int, tried: int) -> str:
     if tried == 1:
-        return "which betters it" if better else "which does not improve it"
+        return "which improves it" if better else "which does not improve it"
     return (
         "of which "
-        f"{'none betters' if not better else 'one betters' if better == 1 else f'{better} better'} "
+        f"{'none improves' if not better else 'one improves' if better == 1 else f'{better} improve'} "
         "it"
     )
 

@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from orthaug.data.record import Record
 
 _CONDITIONAL = (
-    "no standard errors and no intervals: [selection.chosen_on] says that the terms were "
-    "chosen on rows that are among these, which look surer there than they are. Fit other rows "
-    "for intervals; `orthaug select` keeps a half for that where the rows suffice."
+    "no standard errors and no intervals: the terms were chosen on some of these rows "
+    "([selection.chosen_on]), where they look more certain than they are. Fit other rows for "
+    "intervals; `orthaug select` keeps half of the rows for that where these suffice."
 )
 _MOVES_ROWS = {"decimate", "resample", "shift"}
 

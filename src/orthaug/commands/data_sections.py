@@ -117,8 +117,8 @@ class Data(Section):
         kind = "inputs" if close[0] in self.inputs else "outputs"
         return (
             f"`channels.{name}` is neither an input nor an output, and `{kind}` has "
-            f"'{close[0]}', of which `channels` knows nothing; expected the same name in both, "
-            "so one of them is misspelt"
+            f"'{close[0]}', which `channels` does not have; expected the same name in both, so "
+            "one of them is misspelt"
         )
 
 

@@ -79,7 +79,7 @@ def _noise_only(rows: list[ParameterResult] | None) -> list[ParameterResult] | N
 
 def _unexplained(test: StructureTest | None, judged: bool) -> str:
     if test is None or not test.found:
-        what = "the residual holds more than noise"
+        what = "the residual contains more than noise"
         what += " (its verdict is `unmodelled`)" if judged else ""
     else:
         best = max(
@@ -88,14 +88,14 @@ def _unexplained(test: StructureTest | None, judged: bool) -> str:
         )
         name = f"a further lag of {best.on}" if test.is_a_lag(best) else best.name
         what = (
-            f"the model leaves more than noise: {name} in {best.equation} predicts "
-            f"{percent(best.share)} of the free run's error on rows not fitted, beside the "
-            "colour of its noise"
+            f"the model's error contains more than noise: {name} in {best.equation} predicts "
+            f"{percent(best.share)} of the free run's error on held-out rows, beyond what its "
+            "own past predicts"
         )
     return (
-        f"{what}. The 95 % intervals count noise only; what is missing may have moved the "
-        "parameters by more. `[[suspects]]` and `orthaug explain` look for its terms; write "
-        "them into the physics, or let the learner see what they depend on."
+        f"{what}. The 95 % intervals count noise only; missing physics may have moved the "
+        "parameters by more. Search for its terms with `[[suspects]]` or `orthaug explain`. "
+        "Write them into the physics, or let the learner see what they depend on."
     )
 
 
@@ -117,8 +117,8 @@ def _hidden_state(fit: Any, test: StructureTest) -> str:
     remedy += "; or let the learner see lags or a filtered copy of that signal"
     return (
         f"a state is missing: {best.name} in {best.equation} predicts {percent(best.share)} of "
-        f"the free run's error on rows not fitted{beside}. No function of the model's own "
-        f"states does so.{_movement_text(fit, best)} Do this: {remedy}."
+        f"the free run's error on held-out rows{beside}. No function of the model's own states "
+        f"predicts it.{_movement_text(fit, best)} Remedy: {remedy}."
     )
 
 
@@ -190,7 +190,7 @@ def _reason(result: FitResult, test: StructureTest | None, unmodelled: bool) -> 
             "predicts it)"
         )
     if unmodelled:
-        return "the residual holds more than noise"
+        return "the residual contains more than noise"
     stopped = {"not_converged", "stopped"} & {warning.code for warning in result.warnings}
     if result.status.code == "iteration_limit" or stopped:
         return "training had not converged"
@@ -204,7 +204,10 @@ def _withdraw(shared: SharedResult, reason: str) -> SharedResult:
         return shared
     text = _DETERMINED.sub("", shared.text).rstrip(".")
     named = ", ".join(lost)
-    text = f"{text}. The fit would determine {named} beside such a learner, but not here: {reason}."
+    text = (
+           f"{text}. The data would determine {named} with such a learner, but not here: "
+           f"{reason}."
+)
     physical = None if shared.physical is None else []
     update = {
         "text": text,

@@ -169,13 +169,13 @@ def _unexplained(fitted: FitReport, physics: Callable[[], Any] | None) -> list[W
         if not alone or alone.verdict != "unmodelled":
             return failed
         text = (
-            "physics alone leaves more than noise, which the learner takes up without better "
-            "free runs"
+            "physics alone leaves more than noise, which the learner takes up without "
+            "improving the free run"
         )
     text += (
-        f": a part of that may belong to {', '.join(shared)}, and no interval counts it. "
-        "`orthaug explain` looks for its terms, [[suspects]] declares them; another measure, "
-        "or a learner that sees less, may separate them."
+        f": a part of it may belong to {', '.join(shared)}, and no interval includes that "
+        "part. Search for its terms with `orthaug explain`, or declare them in [[suspects]]. "
+        "Another measure, or a learner with fewer inputs, may separate them."
     )
     return [Warning("unexplained", text)]
 
@@ -317,9 +317,8 @@ def _one_step_only(
         else "physics alone follows the outputs better in free run"
     )
     text = (
-        f'the model is for one-step prediction only: {why}. `focus = "auto"`, the default, '
-        "trains the free run, too, "
-        "where one step ahead is not enough."
+        f'the model is for one-step prediction only: {why}. With `focus = "auto"`, the '
+        "default, the free run is trained as well where one step ahead does not suffice."
     )
     return [Warning("one_step_only", text)]
 

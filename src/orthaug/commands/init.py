@@ -356,7 +356,7 @@ def question(found: Survey, inputs: Names | None = None, outputs: Names | None =
     none = ' (--inputs "" for none)' if inputs is None and named else ""
     others = left_out(found, [*found.signals])
     return (
-        f"{found.path}: {said}: {some}. Say both, separated by commas, such as "
+        f"{found.path}: {said}: {some}. Give both, separated by commas, such as "
         f"{proposed}{none}; columns that are not named are left out."
         + (f" No channels: {others}." if others else "")
     )
@@ -447,7 +447,7 @@ def write_spec(found: Draft, out: Path, *, force: bool = False) -> None:
             except InputError as error:
                 reason = str(error).removeprefix(f"{partial}: ")
                 raise InputError(
-                    f"{out}: a spec for these columns would be refused: {reason}"
+                    f"{out}: a spec for these columns would not be accepted: {reason}"
                 ) from None
 
 

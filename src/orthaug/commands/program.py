@@ -249,8 +249,8 @@ def print_result(result: Content, text: str, as_json: bool, place: object = None
     written = f"\n\nwritten to {place}" if place is not None else ""
     if place in PARTIALS.overtaken:
         streams.say(
-            f"warning: {place}: another run wrote a result here meanwhile, and this one has "
-            "replaced it; run again with another --out to have both."
+            f"warning: {place}: another run wrote a result here in the meantime, and this run "
+            "has replaced it. Run again with another --out to keep both."
         )
     streams.echo(result.to_json() if as_json else f"{text}{written}")
 

@@ -78,8 +78,8 @@ def _other_files(model: Path, data: Sequence[Path]) -> list[Warning]:
             text = (
                 f"the model was trained on {', '.join(kept.values())}; the checksums in its "
                 f"result.json differ from those of {', '.join(path.name for path in data)}. "
-                "Give the files that it was trained on: a split over other data does not "
-                "belong to the fit."
+                "Give the files that it was trained on: a split over other data is not one of "
+                "this fit."
             )
             return [Warning("other_training_data", text)]
     return []

@@ -365,10 +365,10 @@ def warnings_of(prepared: Sequence[Prepared], names: Sequence[str]) -> tuple[War
         found.append(
             Warning(
                 "filtered_noise",
-                f"{done.step} colours the noise{late}: residuals are correlated, which biases θ "
-                "one step ahead. Nonlinear terms are not the same of filtered signals. Compare "
-                "with a fit to the data as they are, and with training.focus = "
-                '"simulation".',
+                f"{done.step} colours the noise{late}: residuals are correlated, which biases "
+                "θ one step ahead. A nonlinear term of filtered signals differs from the "
+                "filtered term. Compare with a fit to the data as they are, and with "
+                'training.focus = "simulation".',
             )
         )
     return tuple(found)

@@ -173,11 +173,11 @@ def _wild_text(record: Record, own: tuple[WildSample, ...], effect: str) -> str:
         else "apart from"
     )
     return (
-        f"{'; '.join(where)}{more}{of}, {far} every other sample, and {answer}: a wild sample "
-        f"with {percent(_share_of(record, own), 3)} of the squares of {name}.{effect} Mark it by "
-        f'[[data.prepare]], step = "outliers", channels = ["{name}"], '
-        f"threshold = {threshold_for(record, own):g}. Add "
-        'missing = "skip" in [data], or a step "fill" behind it.'
+        f"{'; '.join(where)}{more}{of}, {far} every other sample, and {answer}. It is a wild "
+        f"sample with {percent(_share_of(record, own), 3)} of the squares of {name}.{effect} "
+        f'Mark it by [[data.prepare]], step = "outliers", channels = ["{name}"], threshold = '
+        f'{threshold_for(record, own):g}. Add missing = "skip" in [data], or a step "fill" '
+        "behind it."
     )
 
 
@@ -204,10 +204,10 @@ def _twice(record: Record) -> list[Warning]:
             if pairs.mean() > _TWICE and between.mean() < 1 - _TWICE:
                 where = experiment.where(first)
                 text = (
-                    f"{where}: from here on each row is there twice, in all channels: the file was "
-                    "written at twice the rate of the measurement. Standard errors count every "
-                    "sample twice, and over one step nothing moves. Give `every = 2` for these "
-                    "files, with the sampling time of the measurement."
+                    f"{where}: from here on every row occurs twice, in all channels: the file "
+                    "was written at twice the rate of the measurement. Standard errors then "
+                    "count every sample twice, and half of the steps show no change. Give "
+                    "`every = 2` for these files, with the sampling time of the measurement."
                 )
                 return [Warning("rows_twice", text)]
     return []
@@ -234,7 +234,7 @@ def _frozen(record: Record) -> list[Warning]:
             text = (
                 f"{experiment.where(begin)}: {output.name} is {y[begin]:.6g} for "
                 f"{counted(rows + 1, 'row')} from here on ({percent((rows + 1) / n)} of them), "
-                "and changes from row to row elsewhere: a sensor or a recorder was frozen. "
+                "and changes from row to row elsewhere: the sensor or the recorder froze. "
                 "Leave these rows out (`rows` of the data)."
             )
             found.append(Warning("frozen_output", text))

@@ -44,8 +44,8 @@ from orthaug.physics.baseline import Baseline
 from orthaug.physics.problem import Problem, pose
 
 _UNDETERMINED = (
-    "no standard errors: beside the learner's weights the data do not determine θ to rounding. "
-    "Use more data, a smaller learner, or one that sees less."
+    "no standard errors: together with the learner's weights, the data do not determine θ to "
+    "machine precision. Use more data, a smaller learner, or one with fewer inputs."
 )
 
 
@@ -283,9 +283,9 @@ def _warnings(
     warnings: list[Warning] = []
     if learned.ending is Ending.SPANNED:
         text = (
-            "the learner lies in the span of the physics (P⊥J = 0): there is nothing for it to "
-            "learn that the physics does not express already. Give it another form or other "
-            "inputs, or leave it out."
+            "the learner lies in the span of the physics (P⊥J = 0) and can learn nothing that "
+            "the physics does not express already. Give it another form or other inputs, or "
+            "leave it out."
         )
         warnings.append(Warning("learner_spanned", text))
     if learned.errors is not None:
@@ -312,7 +312,8 @@ def _warnings(
         names = ", ".join(f"{problem.baseline.names[i]} = {value:g}" for i, value in fixed.items())
         text = (
             f"at a bound: {names}. A parameter at a bound is a known term, as with `fixed = "
-            "true`: it has no standard error, and the other estimates hold with it there; "
+            "true`: it has no standard error, and the other estimates hold for this value of "
+            "it; "
         )
         if (
             structure.projects
@@ -320,7 +321,7 @@ def _warnings(
             and directions(structure, problem) is not None
         ):
             text += "the learner is not made orthogonal to it; "
-        text += "data that contradict a bound contradict the physics or the bound."
+        text += "where the data contradict a bound, the bound or the physics is wrong."
         warnings.append(Warning("at_a_bound", text))
     return warnings
 

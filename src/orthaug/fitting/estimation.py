@@ -446,8 +446,9 @@ def _check_splittable(structure: Structure, baseline: Baseline, learner: Learner
     bounded = [p.name for p in baseline.parameters if np.isfinite(p.min) or np.isfinite(p.max)]
     if bounded:
         raise InputError(
-            f"{', '.join(bounded)} have bounds, which hold under the training measure only: "
-            "under another one θ is split off after training. Drop the bounds or the measure."
+            f"{', '.join(bounded)} have bounds, which hold under the training measure only. "
+            "Under another measure θ is computed after training, without bounds. Drop the "
+            "bounds or the measure."
         )
 
 

@@ -57,7 +57,7 @@ def choose_focus(problem: Any, fit: Fit, options: Mapping[str, Any], criterion: 
     reason = _why_not(problem, first, fit, options)
     if reason is None:
         text = (
-            "one step ahead is enough: the free run is good on held-out rows, and the residual "
+            "one step ahead suffices: the free run is good on held-out rows, and the residual "
             "is white."
         )
         return replace(first, focus=Focus(ONE_STEP, text))
@@ -91,7 +91,7 @@ def _why_not(problem: Any, first: Any, fit: Fit, options: Mapping[str, Any]) -> 
         if wrong is not None:
             return f"{wrong} {where}"
     return (
-        "its residual is correlated with its past, as sensor noise makes it"
+        "its residual is correlated with its past, as with sensor noise"
         if _is_coloured(first)
         else None
     )

@@ -379,8 +379,8 @@ def _doubts(
     if at_bound:
         text = (
             f"at a bound: {', '.join(at_bound)}. A parameter at a bound has no interval, and "
-            "the other estimates hold with it there. Data that contradict a bound contradict "
-            "the physics or the bound."
+            "the other estimates hold for this value of it. Where the data contradict a bound, "
+            "the bound or the physics is wrong."
         )
         warnings.append(Warning("at_a_bound", text))
     if unseen:
@@ -402,7 +402,7 @@ def _doubts(
 def shared_in_words(shared: Shared) -> str:
     """Return the directions that the learner could imitate, in words."""
     if not shared.basis.size:
-        return "nothing: the fit determines all parameters beside the learner"
+        return "nothing: the data determine all parameters"
     if shared.all:
         return "all parameters: they are those of the physics nearest to the fitted motion"
     moved = [" with ".join(direction) for direction in shared.directions]

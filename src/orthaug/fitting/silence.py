@@ -93,10 +93,10 @@ def retry_warnings(
     effective = max(run.effective for run in runs[:planned])
     tried = " and ".join(_name(choice) for choice in choices[1:])
     text = (
-        f"evidence left {counted_weights(effective)} of the learner, no more than a constant, "
-        f"so training was tried again with {tried}. Errors in {held_out.where}, in deviations "
-        f"of the output: {found}, physics alone {_error(np.sqrt(mean_square(held_out.alone)))}. "
-        f"The result is {kept}."
+        f"regularization by evidence left {counted_weights(effective)} of the learner, no more "
+        f"than a constant. Training was therefore repeated with {tried}. Errors in "
+        f"{held_out.where}, in standard deviations of the output: {found}, physics alone "
+        f"{_error(np.sqrt(mean_square(held_out.alone)))}. The result is {kept}."
     )
     return [Warning("evidence_retried", text)]
 
@@ -117,16 +117,16 @@ def learner_silent(learned: TrainedLearner, values: Matrix | None = None) -> lis
     ):
         return []
     if learned.effective < _SILENT or (values is not None and not values.any()):
-        does = "the learner is silent: the fit is that of physics alone"
+        does = "the learner contributes nothing: the fit is that of physics alone"
     elif values is not None and silenced(learned.effective, bound.ny) and _is_flat(values):
-        does = "the learner has learned nothing but a constant"
+        does = "the learner contributes only a constant"
     else:
         return []
     left = f"training left {counted_weights(learned.effective)} of {bound.size}"
     text = (
         f"{does} ({left}). Either its inputs explain nothing more, and it can be left out, or "
-        'its regularization was too strong. Compare `regularization = "none"` and a small ridge '
-        "such as 0.01 on held-out data. A constant that the physics lacks belongs into the "
+        'its regularization was too strong. Compare `regularization = "none"` and a small '
+        "ridge such as 0.01 on held-out data. Write a missing constant as a term of the "
         "physics."
     )
     return [Warning("learner_silent", text)]

@@ -145,8 +145,8 @@ class SimulationTask(ABC):
             return ()
         text = (
             "the free run of physics alone diverges over whole experiments of the training "
-            "data, so `loss` counts its segments; bound the parameters that make it diverge, or "
-            "use predictions at most a segment ahead."
+            "data, so `loss` is that of its segments. Bound the parameters that make it "
+            "diverge, or use predictions at most a segment ahead."
         )
         return (Warning("free_run_diverges", text),)
 

@@ -35,9 +35,8 @@ class Ending(IntEnum):
     NON_FINITE = (
         3,
         "non_finite",
-        "the loss is not finite: (a) a learner input grows without bound, (b) the learner "
-        "returns NaN, (c) channels differ by many orders of magnitude, or (d) `learning_rate` "
-        "is too large",
+        "the loss is not finite: a learner input grows without bound, the learner returns NaN, "
+        "channels differ by many orders of magnitude, or `learning_rate` is too large",
         "Rescale the channels, choose other learner inputs, or lower the rate",
     )
     SPANNED = 4, "converged"

@@ -392,11 +392,14 @@ def _fell_back(held_out: HeldOutErrors) -> Warning:
     model, alone = (
         math.sqrt(mean_square(p)) for p in (held_out.runs[held_out.chosen], held_out.alone)
     )
-    errors = f"its error is {model:.4g} deviations of the output, that of physics alone {alone:.4g}"
+    errors = (
+             f"its error is {model:.4g} standard deviations of the output, that of physics "
+             f"alone {alone:.4g}"
+)
     if math.isinf(model):
         errors = "every one of its runs diverges there"
     text = (
-        f"in {held_out.where} the learner is not better than physics alone ({errors}), so the "
+        f"in {held_out.where} the learner is not better than physics alone ({errors}). The "
         "result is physics alone; `fallback = false` keeps the learner."
     )
     return Warning("physics_alone", text)

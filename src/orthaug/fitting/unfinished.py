@@ -62,7 +62,7 @@ def not_converged(learned: TrainedLearner) -> Warning:
     assert learned.tail is not None
     text = (
         f"no intervals: training ended after {counted(learned.tail.done, 'iteration')} while "
-        f"the loss still fell ({_fall(learned.tail)}), so the parameters may still move by "
+        f"the loss was still falling ({_fall(learned.tail)}). The parameters may still move by "
         "more than their standard errors. "
     )
     if learned.ending is Ending.STOPPED:
@@ -74,12 +74,13 @@ def not_converged(learned: TrainedLearner) -> Warning:
         )
     else:
         text += (
-            "Take a smaller learner or a stronger regularization, which settle sooner, or "
+            "Take a smaller learner or a stronger regularization, which converge sooner, or "
             "allow more `iterations`"
         )
     if not learned.tail.prolonged:
         text += (
-            "; without the key training goes on by itself while the loss falls, up to ten times 300"
+            ". Without the key `iterations`, training continues while the loss falls, up to "
+            "3000 iterations"
         )
     return Warning(NOT_CONVERGED, f"{text}.")
 
@@ -100,8 +101,8 @@ def ending_in_words(ending: Ending, tail: Tail | None) -> str:
             )
     if tail.prolonged:
         past = (
-            f"training went on past its limit of {counted(tail.limit, 'iteration')}, because "
-            "the loss still fell"
+            f"training continued past its limit of {counted(tail.limit, 'iteration')}, because "
+            "the loss was still falling"
         )
         words = f"{past}; {words or ending.message}".rstrip("; ")
     return words

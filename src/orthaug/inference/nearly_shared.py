@@ -73,11 +73,12 @@ def shared_warnings(shared: Shared | None, inputs: Sequence[str]) -> list[Warnin
         share = dict(zip(shared.names, shared.rest.share, strict=True))
         names = " and ".join(f"{name} ({percent(share[name], 2)} left)" for name in shared.on_data)
         text = (
-            f"on these rows, functions of the learner's inputs ({sees}) follow the regressor of "
-            f"{names}, although its expression reads other signals. They leave up to "
-            f"{percent(shared.rest.limit, 2)} of the learner's own functions. The data do not "
-            "separate it from the learner: it is split off as a direction that the learner "
-            f"could imitate. Its interval excludes any share that the learner took. {remedy}"
+            f"on these rows, functions of the learner's inputs ({sees}) reproduce the "
+            f"regressor of {names}, although its expression reads other signals. Up to "
+            f"{percent(shared.rest.limit, 2)} would be left of a function that the learner can "
+            "form exactly. The data do not separate the parameter from the learner, so it is "
+            "split off as a direction that the learner could imitate. Its interval excludes "
+            f"any share that the learner took. {remedy}"
         )
         found.append(Warning("shared_on_data", text))
     nearly = {name: share for name, share in shared.nearly.items() if name not in shared.on_data}
@@ -86,8 +87,9 @@ def shared_warnings(shared: Shared | None, inputs: Sequence[str]) -> list[Warnin
             f"{percent(share, 2)} of the regressor of {name}" for name, share in nearly.items()
         )
         text = (
-            f"functions of the learner's inputs ({sees}) leave {names} on these rows. The fit "
-            f"determines it from that part alone, which sets the width of its interval. {remedy}"
+            f"functions of the learner's inputs ({sees}) explain all but {names} on these "
+            "rows. Only this part determines the parameter, which widens its interval. "
+            f"{remedy}"
         )
         found.append(Warning("nearly_shared", text))
     return found

@@ -340,7 +340,8 @@ def _consistency(chi2: float, df: int, freedom: float, held: bool) -> Consistenc
 
 def _at_bounds(physics: PhysicsMap, value: Vector, held: Bool[np.ndarray, "n"]) -> list[Warning]:
     text = (
-        "{} is at its bound {:g} and has no standard error; those of the others hold with it there."
+        "{} is at its bound {:g} and has no standard error; those of the others hold for this "
+        "value of it."
     )
     return [
         Warning("at_a_bound", text.format(name, v))

@@ -120,10 +120,10 @@ def _warnings(
         least = "at least " if small[-1] <= finest else ""
         text = (
             f"the physics is ill-conditioned on the data (condition {least}{1 / small[-1]:.1e} "
-            f"of the scaled columns): the data hardly tell {listed} apart. What one of them "
-            f"does is a combination of what the others do, to {least}1 part in "
-            f"{inflation:.1e}; its standard error is as many times what it would be alone. Fix "
-            "one of them, join them to one parameter, or use data in which they act separately."
+            f"of the scaled columns): the data hardly distinguish {listed}. The effect of one "
+            f"is a combination of the effects of the others to {least}1 part in "
+            f"{inflation:.1e}. Its standard error is larger by this factor. Fix one of them, "
+            "merge them into one parameter, or use data that excite them separately."
         )
         found.append(Warning("ill_conditioned", text))
     return found

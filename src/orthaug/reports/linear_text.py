@@ -16,7 +16,7 @@ _FEWEST = 10  # frequencies from data that a median needs
 _HELD = {
     "zero": "inputs that --at does not name are held at 0",
     "mean": "inputs that --at does not name are held at their means over the data",
-    "found": "inputs that --at does not name are those that this takes",
+    "found": "inputs that --at does not name take the values that this point requires",
 }
 
 

@@ -275,7 +275,7 @@ def residual_plots(test: ResidualTestResult, what: str, units: Mapping[str, str]
         }
         caption = (
             f"Autocorrelation of the {what} of {test.name}; the band holds 99 % of the values "
-            f"that noise gives. The largest in size is {number(test.strongest_acf, 2)}."
+            f"that noise gives. The largest magnitude is {number(test.strongest_acf, 2)}."
         )
         layout = titled("lag [samples]", "autocorrelation") | {
             "shapes": [_band(test.acf_band)],
@@ -373,7 +373,7 @@ def bias_plot(suspects: Sequence[SuspectResult]) -> Plot:
     }
     caption = (
         "Bias of each parameter (columns) by each term that may be missing from the physics "
-        "(rows), in per cent of its value; a term without a guessed size counts as 1 % of the "
+        "(rows), in per cent of its value. A term without a guessed size counts as 1 % of the "
         "output. Colours are logarithmic."
     )
     caption += f" {shown.left_out}" if shown.left_out else ""

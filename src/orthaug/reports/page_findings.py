@@ -148,15 +148,15 @@ def excitation_blocks(result: FitResult) -> list[Any]:
         caption = "Terms that may be missing from the physics."
         if any(s.removed_by for s in result.bias):
             caption = (
-                "Terms that may be missing from the physics, and what takes their bias from "
+                "Terms that may be missing from the physics, and what removes their bias from "
                 "the parameters."
             )
             head = [*head, "removed by"]
             rows = [[*row, s.removed_by or "–"] for row, s in zip(rows, result.bias, strict=True)]
         else:
             caption += (
-                " Whether a measure takes their bias from the parameters is shown by `orthaug "
-                "check`."
+                " `orthaug check` shows whether a measure removes their bias from the "
+                "parameters."
             )
         blocks.append(Table(caption, head, rows))
         if result.bias[0].percent:

@@ -133,8 +133,8 @@ def _parameters(result: FitResult) -> list[Any]:
         caption += f" {result.intervals.text[0].upper()}{result.intervals.text[1:]}"
     if result.noise_only:
         caption += (
-            " Intervals count noise only: the model leaves more than noise, which may have "
-            "moved the parameters."
+            " Intervals count noise only: the model's error contains more than noise, which "
+            "may have moved the parameters."
         )
     if result.standard_errors is not None:
         caption += (

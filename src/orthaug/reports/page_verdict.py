@@ -65,7 +65,7 @@ def fit_verdict(result: FitResult) -> PageVerdict:
     level = "bad" if bad else "care" if doubts else "good"
     opening = {
         "good": "The model is reliable",
-        "care": "Use the model with care",
+        "care": "The model is usable with reservations",
         "bad": "Do not use the model as it is",
     }[level]
     shown = "" if error is None else f": {_error_text(error, part)}"
@@ -107,7 +107,7 @@ def compare_verdict(result: CompareResult) -> PageVerdict:
     near = [name for name in near if name not in same]
     least = all(errors[best] <= other for name, other in errors.items() if name not in same)
     less = f", as {'does' if len(same) == 1 else 'do'} {_quoted(same)}" if same else ""
-    less += (", and no other leaves less" if same else ", less than of any other") if least else ""
+    less += (", and no other model has a smaller error" if same else ", the smallest of all models") if least else ""
     how = f"it has the lowest error on the validation part, and {_error_text(error or 0.0, part)}"
     trust = f"Take “{best}”: {how if result.chosen else _error_text(error or 0.0, part) + less}"
     trust += f"; {_quoted(near)} {_is(near)} as good within 10 %." if near else "."
@@ -145,8 +145,8 @@ def _after_comparison(result: CompareResult, row: RowResult) -> str:
         return "Hold out a test part, so that the models can be judged."
     if not result.data.validation:
         return (
-            "Hold out a validation part (`[data.validation]`), so that the choice is not made "
-            "on what judges it."
+            "Hold out a validation part (`[data.validation]`), so that the choice and its test "
+            "use different data."
         )
     return (
         f"Fit it alone with `orthaug fit` and structure “{row.name}”, whose report has its "
@@ -162,7 +162,10 @@ def _word(row: RowResult) -> str:
 
 
 def _error_text(error: float, part: str) -> str:
-    return f"{_on(part)} its free run leaves {percent(error)} of the output's deviation"
+    return (
+           f"the RMS error of its free run {_on(part)} is {percent(error)} of the output's "
+           "standard deviation"
+)
 
 
 def _on(part: str) -> str:
@@ -228,13 +231,13 @@ def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
         and not data.validation
         and not (result.validation and result.validation.trials)
     ):
-        yield "it was not tested on data that it was not fitted to"
+        yield "it was not tested on held-out data"
     if (result.status if isinstance(result, RowResult) else result.status.code) in _STOPPED:
         yield "training stopped before it converged"
     if _warned(result, "spectral_radius_above_one"):
         yield (
-            "it is not proved stable, for its local spectral radius is above 1 on a part of "
-            "its free run"
+            "its stability is not proved, because the local spectral radius exceeds 1 on a "
+            "part of its free run"
         )
     biased = [row.name for row in _rows(result) if _biased(row)]
     if biased:
@@ -252,9 +255,10 @@ def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
     if result.residuals is not None and result.residuals.verdict in ("unmodelled", "sensor_noise"):
         coarse = list(result.residuals.steps or {})
         yield {
-            "unmodelled": f"its one-step residual has the size of the steps of {_join(coarse)}"
+            "unmodelled": "its one-step residual is no larger than the quantisation steps of "
+                          f"{_join(coarse)}"
             if coarse
-            else "its residual is not noise alone",
+            else "its residual contains more than noise",
             "sensor_noise": "noise on the measured output biases its one-step estimates",
         }[result.residuals.verdict]
     if _warned(result, "closed_loop"):
@@ -293,7 +297,10 @@ def _size_of_bias(rows: Sequence[ParameterResult]) -> str:
         else f", {percent(abs((worst.bias.value or 0.0) / worst.value))} of its value"
     )
     size = f"{plain_number(_errors_of(worst))} standard errors{share}"
-    return f"carries a bias of {size}" if one else f"carry biases, that of {worst.name} of {size}"
+    return f"carries a bias of {size}" if one else (
+                                                   f"carry biases of up to {size} "
+                                                   f"({worst.name})"
+)
 
 
 def _errors_of(row: ParameterResult) -> float:
@@ -320,11 +327,12 @@ def _use_text(result: FitResult, level: str) -> str:
     predicts = ahead is not None and ahead <= (_GOOD if level == "bad" else _POOR)
     if level == "bad" and ahead is not None and ahead > _POOR:
         return (
-            "Use it only to look for what is missing: its one-step prediction, too, leaves "
-            f"{percent(ahead)} of the output's deviation {_on(part)}."
+            "Use it only to search for missing physics: the RMS error of its one-step "
+            f"prediction {_on(part)} is {percent(ahead)} of the output's standard deviation, "
+            "too."
         )
     if level == "bad" and not (known and predicts):
-        return "Use it only to look for what is missing."
+        return "Use it only to search for missing physics."
     if level == "bad":
         text = "predict the next sample"
     else:
@@ -333,16 +341,15 @@ def _use_text(result: FitResult, level: str) -> str:
     if sure and not known:
         cover = "interval does" if len(sure) == 1 else "intervals do"
         text += (
-            f", but do not read {_join(sure)} as physics yet: the {cover} not cover what the "
-            "residual still holds"
+            f". Do not read {_join(sure)} as physics yet: the {cover} not include what the "
+            "residual still contains"
         )
     text += (
-        f"; {_join(others)} {_is(others)} too uncertain or biased to be read so" if others else ""
+        f". {_join(others)} {_is(others)} too uncertain or too biased to be read as physics" if others else ""
     )
     if shared:
         text += (
-            f"; {_join(shared)} {_is(shared)} taken from the physics nearest to the data, "
-            "for the learner could"
+            f". The data alone do not determine {_join(shared)}, because the learner could"
         )
         text += f" imitate {'it' if len(shared) == 1 else 'them'}"
     return f"Use it to {text}."
@@ -382,13 +389,13 @@ def _next_step(result: FitResult) -> str:
         return f"An option, not tried here: {option}."
     if result.advice_trials is not None and result.advice_trials.tried:
         text = (
-            "None of the changes that were tried improves the free run; export it (`orthaug "
-            "export`), or design the"
+            "None of the changes that were tried improves the free run; export the model "
+            "(`orthaug export`), or design the"
         )
         return f"{text} next experiment."
     return (
-        "No further change is predicted to help; export it (`orthaug export`) or design the next "
-        "experiment."
+        "No further change is predicted to help; export the model (`orthaug export`) or design "
+        "the next experiment."
     )
 
 
@@ -404,9 +411,9 @@ def _option(result: FitResult) -> str | None:
     if not result.data.tests and not result.data.validation:
         return "a test part (`[data.tests.NAME]`), held out to judge the model on"
     if result.status.code == "stopped":
-        return "training to the end, for it was stopped on request"
+        return "training to the end, because it was stopped on request"
     if result.status.code == "iteration_limit":
-        return "more iterations (`training.iterations`), for training ended at their limit"
+        return "more iterations (`training.iterations`), because training ended at their limit"
     if result.validation is not None and result.validation.extrapolation:
         entry = result.validation.extrapolation[0]
         low, high = entry.found
@@ -417,23 +424,23 @@ def _option(result: FitResult) -> str | None:
         return "data over the range that the free run leaves"
     if _warned(result, "closed_loop"):
         return (
-            "data with the reference recorded, to model the whole loop, with more of its "
-            "motion, or in open loop"
+            "data with the reference recorded, with larger motions of the reference, or "
+            "without the controller"
         )
     if _undecided(result):
         return (
-            "the learner (`training.fallback = false`), for cross-validation does not decide "
-            "whether it helps"
+            "the learner (`training.fallback = false`), because cross-validation does not "
+            "decide whether it helps"
         )
     if result.residuals is not None and result.residuals.steps:
         steps = _join(list(result.residuals.steps))
         return (
-            f"fewer samples, or a finer measurement, for the steps of {steps} are as large as "
-            "the one-step residual"
+            f"fewer samples, or a finer measurement, because the quantisation steps of {steps} "
+            "are as large as the one-step residual"
         )
     if not _noise_alone(result):
         return (
-            "your own physics for what the residual still depends on (residual tests; "
+            "a physical term for what the residual still depends on (residual tests; "
             "`[[suspects]]` tests a form)"
         )
     worse = _worse(result.scores)
@@ -470,7 +477,7 @@ def _cause_option(cause: BiasResult, learned: bool) -> str:
     """Return a term that explains the learned part or the residual, for the physics."""
     looks = "looks most like it" if (cause.share or 0.0) < SURE_SHARE and learned else "is that"
     what = "what was learned" if learned else "what the free run leaves"
-    return f"“{cause.cause}” in the physics, for {percent(cause.share)} of {what} {looks}"
+    return f"“{cause.cause}” in the physics, because {percent(cause.share)} of {what} {looks}"
 
 
 def _undecided(result: FitResult) -> bool:

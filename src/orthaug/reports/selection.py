@@ -12,7 +12,7 @@ _SHOWN = 12  # models of a stage in the text
 _EXPLAINED = (
     "chosen: share of random halves that choose the term; left: of its norm, beside physics "
     "and other terms; rate: the least rate of false discoveries at which it stays.",
-    "p, q: of the term on rows that had no say in the choice, and the rate of false "
+    "p, q: of the term on rows that were not used for the choice, and the rate of false "
     "discoveries among the chosen ones.",
 )
 

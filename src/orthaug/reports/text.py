@@ -256,11 +256,11 @@ def _bias_lines(result: FitResult) -> list[str]:
         if result.learns and share < SURE_SHARE:
             lines.append(
                 f"What the {what} looks most like {cause}: {percent(share)} of it. The bias in "
-                "that case:"
+                "this case:"
             )
         else:
             lines.append(
-                f"{100 * share:.0f} % of what the {what} is {cause}. The bias that implies:"
+                f"{100 * share:.0f} % of what the {what} is {cause}. The resulting bias:"
             )
         head = (
             f"{'parameter':<{width}}  {'bias':>11}  {'of std':>7}  {'of value':>9}  "

@@ -60,8 +60,8 @@ def candidates(problem: Problem, library: TermLibrary) -> Candidates:
     if len(kept) > SHORTLIST:
         kept = _promising(runs, known, kept)
         text = (
-            f"of {own.sum()} terms the {len(kept)} that promise most one step ahead were "
-            "looked at on the free run."
+            f"of {own.sum()} terms the {len(kept)} that are most promising one step ahead were "
+            "tried on the free run."
         )
         notes.append(Warning("terms_shortlisted", text))
     return Candidates(library.picked(kept), tuple(notes), int(own.sum()))

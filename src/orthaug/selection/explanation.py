@@ -251,8 +251,8 @@ _ENDED = ("converged", "exact")
 _SHOWN = 8  # terms, each as the only one
 _OUTSIDE = 0.05  # share of rows beyond the training data that is reported
 _CONDITIONAL = (
-    "the terms were chosen on these data: intervals of a fit with them to the same data are "
-    "conditional on the choice; a fit to other data has intervals that are not."
+    "the terms were chosen on these data. Intervals of a fit of these terms to the same data "
+    "are conditional on the choice; those of a fit to other data are not."
 )
 _NAMES = {
     "coulomb": "coulomb",
@@ -397,8 +397,8 @@ def explain(
     code = getattr(getattr(fit, "status", None), "code", "converged")
     if code not in _ENDED:
         text = (
-            "training did not end at a minimum: the learner may show terms otherwise than they "
-            "are; train longer."
+            "training did not end at a minimum, so the terms that the learner shows may be "
+            "distorted; train longer."
         )
         explanation = replace(
             explanation, warnings=(*explanation.warnings, Warning("not_converged", text))
@@ -490,8 +490,8 @@ def _why_nothing(
     if dropped and share < _HALF:
         return f"no term is significant against the learner's own errors; {best}. Keep the learner."
     return (
-        f"a few terms do not explain half of what the learner adds; {best}. Keep the learner, or "
-        "try other suspects."
+        f"a few terms explain less than half of what the learner adds; {best}. Keep the "
+        "learner, or try other suspects."
     )
 
 

@@ -101,8 +101,8 @@ class PhysicsComparison:
             beside = "physics and the chosen terms" if self.left else "the physics"
             text = (
                 f"{self.excluded} of {self.candidates} candidate terms lie within the span of "
-                f"{beside} and were not taken: less than {100 * self.collinear:g} % of each is "
-                f"left beside these, whose condition number is {self.condition:.3g}."
+                f"{beside} and were not taken: these explain all but {100 * self.collinear:g} "
+                f"% of each. Their condition number is {self.condition:.3g}."
             )
             notes.append(Warning(SPANNED, text))
         return notes

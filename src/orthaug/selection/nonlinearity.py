@@ -61,8 +61,8 @@ class Nonlinearity:
     def __str__(self) -> str:
         if not self.found:
             return (
-                "nothing nonlinear is missing beside physics and linear lags, as far as is "
-                f"seen (p = {self.p:.2g})."
+                "the data show nothing nonlinear beside physics and linear lags (p = "
+                f"{self.p:.2g})."
             )
         named = ", ".join(self.matter)
         where = f" in {named}" if named else "; no single regressor shows it"

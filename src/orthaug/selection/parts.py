@@ -40,8 +40,8 @@ class Intervals:
         """Return that there are none, and why."""
         return cls(
             NONE,
-            f"no intervals and no p-values: {why}, and the terms were chosen on the rows that "
-            "are fitted, which look surer there than they are. Fit the choice to other data "
+            f"no intervals and no p-values: {why}. The terms were chosen on the rows that are "
+            "fitted, where they look more certain than they are. Fit the choice to other data "
             "for intervals.",
         )
 
@@ -98,8 +98,8 @@ def parted(
 def of_parts(rows: int) -> Intervals:
     """Return what intervals are after a choice on other rows."""
     text = (
-        f"coefficients and intervals are of {rows} rows that had no say in the choice: a split "
-        "sample, so they hold as if the terms had been declared."
+        f"coefficients and intervals are of {rows} rows that were not used for the choice (a "
+        "split sample). They are as valid as if the terms had been declared."
     )
     return Intervals(SPLIT, text)
 

@@ -172,12 +172,12 @@ WIDTHS = (4, 8, 16)
 _RIVALS = (
     "may stand in: {}. Beside the other, the chosen term is not significant on the rows that "
     "are fitted. Its coefficient and interval are those of a model without the other; more "
-    "varied inputs tell them apart."
+    "varied inputs distinguish them."
 )
 _NOT_CONFIRMED = (
-    "not confirmed on the rows that had no say in the choice: {}. The q-value there is above "
-    "{:g} %: the term does nothing, or too little for so many rows. Its interval holds either "
-    "way."
+    "not confirmed on the rows that were not used for the choice: {}. The q-value there is "
+    "above {:g} %: the term does nothing, or too little for so many rows. Its interval holds "
+    "either way."
 )
 OnStage = Callable[[str, Any], None]
 """Called with the stage and each model that was judged; it may raise KeyboardInterrupt to keep what
@@ -382,7 +382,7 @@ class Selection:
             lines += [
                 "",
                 f"{'term':<{width}}  chosen over halves of the data, p and q on the rows that "
-                "had no say",
+                "were not used for it",
             ]
             for term, share in self.shares.items():
                 one = self.confirmed.get(term)
@@ -451,14 +451,14 @@ def select(
     collinear = check_number(collinear, "collinear")
     if len(record.outputs) != 1:
         raise InputError(
-            f"structure is chosen for one output; the record has {len(record.outputs)}: choose "
-            "for each."
+            f"a structure is chosen for one output; the record has {len(record.outputs)}: "
+            "choose for each."
         )
     baseline = Baseline(()) if baseline is None else baseline
     if baseline.function is not None:
         raise InputError(
-            "structure is chosen beside physics that are terms; of a Python function nothing "
-            "is known."
+            "a structure is chosen beside physics made of terms; this physics is a Python "
+            "function. Write it as terms."
         )
     criterion = Simulation() if criterion is None else criterion
     if check_number(level, "level", positive=True) > 1:

@@ -113,7 +113,7 @@ class Session:
     def first_step(self) -> str:
         """The first step of the work, where there is no spec yet."""
         return (
-            "It begins with a data file."
+            "Start with a data file."
             if self.found is None
             else "Choose the channels in Data first."
         )

@@ -97,10 +97,11 @@ class DataView:
                         button("Open", self.name_file)
                     self.status = ui.element("div")
                 self.columns = card(
-                    "Channels", "Say what each column is; the spec begins with that."
+                    "Channels", "Choose what each column is; the spec starts from this choice."
                 )
                 self.cleaning = card(
-                    "Preparation", "Every part of the data goes through these steps, in this order."
+                    "Preparation", "These steps are applied to every part of the data, in this "
+                                   "order."
                 )
                 with self.columns:
                     self.column_rows = ui.element("div")
@@ -391,7 +392,7 @@ class DataView:
         self._curves = state
         with redrawn(self.curves):
             if not rows:
-                text("The curves of a file are drawn here, once there is one.", "p", "hint")
+                text("Choose a data file to see its curves here.", "p", "hint")
                 return
             plot(
                 curves_figure(rows), f"Curves of {', '.join(label for label, _ in rows)} over time."

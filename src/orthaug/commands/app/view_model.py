@@ -52,8 +52,8 @@ class ModelView:
                 with card("Learner and training"):
                     self.learner = ui.element("div")
                 hint = (
-                    "What the forms write; forms and text change each other. Every key: "
-                    "orthaug schema keys."
+                    "The forms write this text, and a change of the text changes the forms. "
+                    "All keys: orthaug schema keys."
                 )
                 with card("Spec", hint):
                     self.editor = ui.textarea("spec in TOML", value=self.session.spec).classes(
@@ -255,7 +255,8 @@ class ModelView:
                     _findings(checked, (session.checked or {})["bias"])
             elif session.checking and session.checked is not None:
                 text(
-                    "The equations are run to see what they determine; that takes a while.",
+                    "The equations are simulated to find which parameters they determine; this "
+                    "takes a while.",
                     "p",
                     "hint",
                 )
@@ -290,8 +291,8 @@ def _findings(checked: Mapping[str, Any], bias: Sequence[Mapping[str, Any]]) -> 
     if bias:
         text("What would bias the parameters", "h3")
         hint = (
-            "If such a term is missing from the physics; its size 1 % of the output's, or as "
-            "the spec says."
+            "The bias if such a term is missing from the physics, with the size that the spec "
+            "gives, or 1 % of the output's."
         )
         text(hint, "p", "hint")
         rows = [(one["name"], _biases(one["percent"]), one["removed_by"] or "–") for one in bias]
@@ -308,7 +309,7 @@ def _units(units: Sequence[tuple[str, str, str | None]], *, moves: bool) -> None
     for name, given, asked in units:
         if asked is not None and given not in (asked, ""):
             note(
-                f"Unit of {name}: the spec says {given}, output and regressor ask for {asked}.",
+                f"Unit of {name}: the spec says {given}, output and regressor require {asked}.",
                 "care",
             )
     wanted = [

@@ -70,7 +70,7 @@ class ReportView:
             if not there:
                 with card("Report"):
                     text(
-                        "The report of a fit or of a comparison is read here, once there is one.",
+                        "Run a fit or a comparison to see its report here.",
                         "p",
                         "hint",
                     )

@@ -167,7 +167,7 @@ def _runs_caption(runs: set[Run]) -> str:
     caption = "Each curve is a run: one training"
     if any(run.start for run in runs):
         kinds = ", ".join(sorted({run.regularization for run in runs if run.start}))
-        caption += " from one start, which is first weights of the learner drawn at random"
+        caption += " from one start, which is a random draw of the learner's first weights"
         caption += f", with one regularization of them ({kinds})" if kinds else ""
     if of_several(runs):
         caption += ". The colour shows the structure; point at a curve for its run"
