@@ -19,7 +19,7 @@ PAGE = ROOT / "docs" / "messages.md"
 FEWEST_WORDS = 4  # below that a text is a label, a heading or a key
 MOST_WORDS = 30  # of a sentence that a user reads
 SKIPPED = ("export", "studies")  # code for other programs; captions of the paper's figures
-ERRORS, REST = "errors", "reports"  # the groups beside the codes of warnings
+ERRORS, HELP, REST = "errors", "help", "reports"  # the groups beside the codes of warnings
 ROOMS = {
     "_base": "Arguments, folders, memory",
     "data": "Records, files, expressions",
@@ -35,11 +35,12 @@ ROOMS = {
 HEAD = """# Messages
 
 Every text of four words or more that the program can print. A name in braces stands for a value, and
-braces with a slash for one of two words: `{channel}`, `{is/are}`. Long messages are built from several of these texts.
-Search for a few words of a message that have no figures in them. What to do about a warning is in
-[What goes wrong](guide/trouble.md); the text itself names the cause and the remedy.
+braces with a slash for one of two words: `{channel}`, `{is/are}`. Long messages consist of several of these texts.
 
-`python tests/messages.py` writes this page anew from the source.
+To find a message, search for a few words of it without figures or names. The text states the cause and then the
+remedy; [What goes wrong](guide/trouble.md) has more on each warning.
+
+`python tests/messages.py` writes this page from the source, and a test compares both.
 """
 Text = tuple[str, str]  # the group of a text, and the text
 
@@ -63,7 +64,9 @@ def placeholder(node: ast.AST) -> str:
             return key
         case ast.Subscript(value=first) | ast.UnaryOp(operand=first) | ast.NamedExpr(target=first):
             return placeholder(first)
-        case ast.GeneratorExp(elt=first) | ast.ListComp(elt=first) | ast.FormattedValue(value=first):
+        case (
+            ast.GeneratorExp(elt=first) | ast.ListComp(elt=first) | ast.FormattedValue(value=first)
+        ):
             return placeholder(first)
         case ast.BinOp(left=first, right=second):
             return next((p for p in map(placeholder, (first, second)) if p != "…"), "…")
@@ -103,9 +106,23 @@ def sentences_of(text: str) -> list[str]:
     return [part for part in re.split(r"(?<=[.?!])\s+(?=[A-Zθ`{\[a-z])", flat(text)) if part]
 
 
+def _help_of(tree: ast.AST) -> Iterator[ast.expr]:
+    """Yield what `--help` prints: `help=` of options, and the docstrings of commands."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.keyword) and node.arg == "help":
+            yield node.value
+        elif isinstance(node, ast.FunctionDef):
+            first = node.body[0]
+            if isinstance(first, ast.Expr) and any(
+                ast.unparse(one).startswith("app.") for one in node.decorator_list
+            ):
+                yield first.value
+
+
 def _unread(tree: ast.AST) -> set[int]:
     """Return the nodes whose texts nobody reads: docstrings, annotations, keys, parts of others."""
     found: set[int] = set()
+    helped = {id(one) for part in _help_of(tree) for one in ast.walk(part)}
     for node in ast.walk(tree):
         inner: list[ast.AST | None] = []
         if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
@@ -118,12 +135,17 @@ def _unread(tree: ast.AST) -> set[int]:
             inner = [node.annotation]
         elif isinstance(node, ast.FunctionDef):
             inner = [node.returns]
-        elif isinstance(node, ast.Call) and ast.unparse(node.func) in ("Float", "Bool", "Int", "re.compile"):
+        elif isinstance(node, ast.Call) and ast.unparse(node.func) in (
+            "Float",
+            "Bool",
+            "Int",
+            "re.compile",
+        ):
             inner = [node]
         elif isinstance(node, ast.Subscript):
             inner = [node.slice]
         found.update(id(part) for one in inner if one is not None for part in ast.walk(one))
-    return found
+    return found - helped
 
 
 class _Groups:
@@ -137,6 +159,7 @@ class _Groups:
         for function in self._functions.values():  # an inner function comes after its outer one
             self._scope |= {id(node): function for node in ast.walk(function)}
         self._since: dict[tuple[int, str], int] = {}  # the line of a name's last use, by its scope
+        self.of |= {id(part): HELP for one in _help_of(tree) for part in ast.walk(one)}
         raised = [n for n in ast.walk(tree) if isinstance(n, ast.Raise) and n.exc is not None]
         calls = [n for n in ast.walk(tree) if isinstance(n, ast.Call)]
         for call in sorted(calls, key=lambda one: one.lineno):
@@ -175,7 +198,9 @@ class _Groups:
         seen: dict[str, bool],
         use: ast.Call | None = None,
     ) -> None:
-        called = {part.func for part in ast.walk(node) if isinstance(part, ast.Call)} if node else set()
+        called = (
+            {part.func for part in ast.walk(node) if isinstance(part, ast.Call)} if node else set()
+        )
         for part in ast.walk(node) if node is not None else ():
             if isinstance(part, ast.Constant | ast.JoinedStr):
                 self.of.setdefault(id(part), group)
@@ -222,24 +247,44 @@ def messages() -> dict[str, list[Text]]:
 
 def page() -> str:
     """Return the page of all messages: errors by room, warnings by code, other texts by room."""
-    by_heading: dict[str, dict[str, list[str]]] = {"Errors": {}, "Warnings": {}, "Other": {}}
+    by_heading: dict[str, dict[str, list[str]]] = {
+        top: {} for top in ("Errors", "Warnings", "Other", "Help")
+    }
     for name, texts in messages().items():
         room = ROOMS.get(name.split("/")[0], ROOMS["commands"])
         for group, text in texts:
-            place = {ERRORS: ("Errors", room), REST: ("Other", room)}
+            place = {ERRORS: ("Errors", room), REST: ("Other", room), HELP: ("Help", HELP)}
             top, heading = place.get(group, ("Warnings", f"`{group}`"))
             by_heading[top].setdefault(heading, []).append(text)
     parts = [HEAD]
     for top, title, says in (
-        ("Errors", "Errors", "The command line writes `error:` before them and ends with exit code 2, Python raises."),
-        ("Warnings", "Warnings, by code", "They are in `warnings` of the result, in the report and on the terminal."),
-        ("Other", "Reports, terminal and app", "Sentences and parts of sentences, in the order of the source."),
+        (
+            "Errors",
+            "Errors",
+            "The command line writes `error:` before them and ends with exit code 2 or 1; Python raises them as exceptions.",
+        ),
+        (
+            "Warnings",
+            "Warnings, by code",
+            "They are in `warnings` of the result, in the report and on the terminal.",
+        ),
+        (
+            "Other",
+            "Reports, terminal and app",
+            "Sentences and parts of sentences, in the order of the source.",
+        ),
+        (
+            "Help",
+            "Help of the command line",
+            "`orthaug --help` and `orthaug COMMAND --help` print them.",
+        ),
     ):
         parts += [f"\n## {title}\n", says]
         headings = by_heading[top]
-        order = sorted(headings) if top == "Warnings" else [r for r in ROOMS.values() if r in headings]
-        for heading in order:
-            parts += [f"\n### {heading}\n", "```text", *dict.fromkeys(headings[heading]), "```"]
+        order = sorted(headings) if top == "Warnings" else [*ROOMS.values(), HELP]
+        for heading in filter(headings.__contains__, order):
+            parts += [f"\n### {heading}\n"] if heading != HELP else [""]
+            parts += ["```text", *dict.fromkeys(headings[heading]), "```"]
     return "\n".join(parts) + "\n"
 
 

@@ -95,9 +95,9 @@ def compared(*rows: RowResult) -> CompareResult:
 def test_a_refuted_model_is_of_use_for_the_next_sample_only_where_that_is_predicted():
     assert fit_verdict(fitted(0.05, 3.0)).use.startswith("Use it to predict the next sample")
     use = fit_verdict(fitted(18.0, 3.0)).use
-    assert (
-        "Use it only to look for" in use
-        and "one-step prediction, too, leaves 1800 % of the output's deviation on tests.far" in use
+    assert use == (
+        "Use it only to search for missing physics: the RMS error of its one-step prediction on "
+        "tests.far is 1800 % of the output's standard deviation, too."
     )
     assert "predict the next" not in fit_verdict(fitted(0.4, 3.0)).use
     assert "simulate within" in fit_verdict(fitted(0.7, 0.1)).use
@@ -170,7 +170,7 @@ def test_a_comparison_has_the_doubts_of_its_model():
     doubted = row("orthogonal", 0.1, "iteration_limit", "helps", "spectral_radius_above_one")
     found = compare_verdict(compared(row("physics alone", 0.5, code=None), doubted))
     assert found.level == "care"
-    assert "But training stopped before it converged and it is not proved stable" in found.trust
+    assert "But training stopped before it converged and its stability is not proved" in found.trust
 
 
 def test_of_models_that_are_as_good_the_one_whose_parameters_mean_something_is_taken():

@@ -245,7 +245,7 @@ TIMES = [
     ("0 0.1 0.2 0.1 0.4 0.5", r"line 5 \(row 3\), column 't': a step of -0.1 s"),
     (
         "1.7e18 1.700000001e18 1.700000002e18",
-        "instants of 1.7e.18 are no seconds; perhaps they are milli- or nano",
+        "instants of 1.7e.18 are not seconds; perhaps they are milli- or nano",
     ),
     ("0", "one row is too few for a sampling time from column 't'"),
 ]

@@ -569,7 +569,7 @@ def test_stopped_and_again(tmp_path, page, monkeypatch, number, words):
     kept = {path: path.stat().st_mtime_ns for path in store.rglob("*.json")}
     assert process.returncode == 128 + number, "it was done before the signal came"
     title, done = catalogue()["consistency"].title, r"\d+ of \d+ runs done"
-    then = "The runs that are done are kept: the same command goes on from there"
+    then = "The finished runs are kept; the same command continues from there"
     assert re.fullmatch(
         f"{words} during '{title}', {done}; nothing is written. {then}\n", errors
     ), errors

@@ -249,8 +249,9 @@ def test_what_cannot_be_selected_from(options, words):
 
 def test_several_outputs_are_refused():
     record = oa.Record.from_arrays(u=np.ones(50), y=np.zeros((50, 2)))
-    with pytest.raises(oa.InputError, match="a structure is chosen for one output; the record "
-                                            "has 2"):
+    with pytest.raises(
+        oa.InputError, match="a structure is chosen for one output; the record has 2"
+    ):
         oa.select(record)
 
 
@@ -591,7 +592,5 @@ terms = ["TERM"]
         done = run("check", tmp_path / f"{name}.toml", "--json")
         assert done.code == 0, done.err
         texts.append(finite_json(done.out)["shared"]["text"])
-    assert (
-        "the data determine every parameter" in texts[0] and "the terms span" in texts[0]
-    )
+    assert "the data determine every parameter" in texts[0] and "the terms span" in texts[0]
     assert "% of the regressor of a1" in texts[0] and "the terms span" not in texts[1]

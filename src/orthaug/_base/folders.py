@@ -377,10 +377,11 @@ def not_ours(folder: Path) -> str | None:
     listed = _listed(folder / MANIFEST)
     if listed is None:
         name = next(_names(folder), None)
-        return None if name is None else (
-                                         f"{name} and no {MANIFEST} which shows that orthaug "
-                                         "wrote it"
-)
+        return (
+            None
+            if name is None
+            else (f"{name} and no {MANIFEST} which shows that orthaug wrote it")
+        )
     names = [name for name in _names(folder) if name != MANIFEST]
     for name in names:
         if name not in listed:

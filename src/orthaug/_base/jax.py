@@ -47,8 +47,8 @@ def _real_jax() -> Any:
     asked = os.environ.get("JAX_ENABLE_X64", "")
     if asked.strip().lower() not in {"", "1", "true", "t", "yes", "y", "on"}:
         raise PrecisionError(
-            "orthaug computes in double precision, but the environment has "
-            f"JAX_ENABLE_X64={asked}. Unset it, or set it to 1."
+            f"JAX_ENABLE_X64={asked} in the environment turns off double precision, which "
+            "orthaug needs. Unset it, or set it to 1."
         )
     import jax
 

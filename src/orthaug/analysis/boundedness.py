@@ -72,11 +72,7 @@ def margin(factor: float | None, searched: float, driven: bool) -> tuple[str, st
     does not.
     """
     if not driven:
-        stays = (
-            "remains bounded"
-            if factor is None
-            else "diverges without inputs"
-        )
+        stays = "remains bounded" if factor is None else "diverges without inputs"
         return (
             f"The free run {stays}; it has no inputs that could be larger.",
             "small_margin" if factor is not None else "",

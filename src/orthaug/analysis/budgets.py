@@ -66,7 +66,7 @@ def bias_budget(
             suspect,
             wanted,
             "suspects",
-            f"a sequence of {wanted.__name__}, as the fit's physics asks for",
+            f"a sequence of {wanted.__name__}, as the fit's physics requires",
         )
     if not moves:
         return lagged_budget(fit, cast(Any, suspects), physics=physics, measure=measure)

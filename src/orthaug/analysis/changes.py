@@ -77,7 +77,7 @@ class Change:
         """Predicted gain, as a clause."""
         if self.kind == "criterion" and not self.gains:
             return (
-                "the parameters would not be biased so; the error of its free run is not "
+                "the parameters would not have this bias; the error of its free run is not "
                 "predicted to fall"
             )
         error = (

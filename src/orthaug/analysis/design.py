@@ -430,7 +430,8 @@ class _Search:
         u, factors = self.measured(np.stack(list(named.values()), axis=1))
         if not factors.any():
             raise InputError(
-                "the simulated output runs away under every input; give a `theta` that is stable."
+                "the simulated output diverges under every input; give the `theta` of a stable "
+                "model."
             )
         rank = dict(zip(named, self.scores(factors).ranked, strict=True))
         patterns = self.patterns(

@@ -100,12 +100,10 @@ class Imitation:
         ]
         if self.determined:
             sentences.append(
-                f"The data determine {_listed(self.determined)} with any learner of these "
-                "inputs."
+                f"The data determine {_listed(self.determined)} with any learner of these inputs."
             )
         if self.physical:
-            sentences.append("Of the physical parameters they determine "
-                             f"{_listed(self.physical)}.")
+            sentences.append(f"Of the physical parameters they determine {_listed(self.physical)}.")
         return " ".join(sentences) + self._nearly
 
     @property

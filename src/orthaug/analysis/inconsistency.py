@@ -89,9 +89,8 @@ class Inconsistency:
                 for i in self.moved
             ]
             text += (
-                    " Instrumental variables (the outputs of the free run) give "
-                    f"{', '.join(given)}."
-)
+                f" Instrumental variables (the outputs of the free run) give {', '.join(given)}."
+            )
         text += (
             " No interval of the one-step θ covers this bias. Train on the free run "
             '(focus = "simulation"), which does not have it.'

@@ -162,8 +162,7 @@ def _spread(model: Model | MotionModel, fit: Any) -> tuple[_Spread | None, list[
         spread = _Spread(vectors * np.sqrt(np.maximum(values, 0.0)), float(fit.freedom), True)
         return spread, [Warning("learner_frozen", text)]
     text = (
-        "the model carries no covariance (an ensemble, or trained elsewhere); there are no "
-        "intervals."
+        "the model has no covariance (an ensemble, or trained elsewhere); there are no intervals."
     )
     return None, [Warning("no_intervals", text)]
 

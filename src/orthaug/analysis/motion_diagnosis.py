@@ -163,10 +163,7 @@ def _words(
     held = "Physics is missing" + (
         ", or inputs move differently between samples" if fit.problem.motion.inputs else ""
     )
-    return (
-           f"The free run's error ({sizes}) contains more than noise: {'; '.join(what)}. "
-           f"{held}."
-)
+    return f"The free run's error ({sizes}) contains more than noise: {'; '.join(what)}. {held}."
 
 
 def _traces(tests: tuple[ResidualTest, ...], shares: tuple[Predictable, ...]) -> str:

@@ -195,7 +195,7 @@ def _balanced(text: str) -> None:
             break
     if depth or not text.strip():
         raise InputError(
-            f"'{text}' is no expression: its parentheses are no pairs, or it is empty."
+            f"'{text}' is no expression: its parentheses do not match, or it is empty."
         )
 
 

@@ -247,13 +247,11 @@ def _unmodelled(seen: Finding) -> tuple[str, tuple[Warning, ...]]:
     for test in seen.own:
         findings += [f"the residual of {test.name} still follows {name}" for name in test.follows()]
         findings += [
-            f"the residual of {test.name} depends nonlinearly on {name}" for name in test.curved_over(SHARE)
+            f"the residual of {test.name} depends nonlinearly on {name}"
+            for name in test.curved_over(SHARE)
         ]
     findings = [*findings[:_LISTED], *(["and more"] if len(findings) > _LISTED else [])]
-    opening = (
-              f"The {seen.what}, {_size(seen)}, contains more than noise: "
-              f"{'; '.join(findings)}."
-)
+    opening = f"The {seen.what}, {_size(seen)}, contains more than noise: {'; '.join(findings)}."
     advice = "" if seen.steps and not seen.changes else _advice(seen, _cause(seen))
     return " ".join(part for part in (opening, _shares(seen), _quantised(seen), advice) if part), ()
 
@@ -299,7 +297,9 @@ def _joined(names: Sequence[str]) -> str:
 
 def _small(seen: Finding) -> str:
     """Return sentences on a residual that the tests reject but hardly anything predicts."""
-    colour = " Its autocorrelation is that of the noise." if seen.simulated and not seen.white else ""
+    colour = (
+        " Its autocorrelation is that of the noise." if seen.simulated and not seen.white else ""
+    )
     followed = seen.follows()
     shown = (
         f"mostly noise, but still follows {_joined(followed)}" if followed else "noise by all tests"

@@ -545,8 +545,7 @@ def _concluded(
         text += f" No gain from {_error(before)}: {named}{more}."
     if left:
         text += (
-            f" {counted(left, 'change')} {'was' if left == 1 else 'were'} not tried, to save "
-            "time."
+            f" {counted(left, 'change')} {'was' if left == 1 else 'were'} not tried, to save time."
         )
     return advice, AdviceTrialsResult(text=text, tried=len(tried), not_tried=left)
 

@@ -31,7 +31,7 @@ ENOUGH = threading.Event()
 """
 ENOUGH_LINE = b"enough\n"
 """What sets it, on the standard input of a child of the page."""
-GO_ON = "The runs that are done are kept: the same command goes on from there"
+GO_ON = "The finished runs are kept; the same command continues from there"
 """What an interrupted `reproduce` says last."""
 _OFTEN = 0.02  # s between such lines
 _MANY = 1_000_000  # rows from which the rate is shown

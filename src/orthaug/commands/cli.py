@@ -88,7 +88,7 @@ def fit(
     spec: SpecPath,
     out: OutFolder = None,
     resume: Annotated[
-        bool, typer.Option("--resume", help="Go on from where an earlier fit was ended.")
+        bool, typer.Option("--resume", help="Continue an earlier fit from its last state.")
     ] = False,
     as_json: AsJson = False,
     force: Force = False,
@@ -115,7 +115,7 @@ def fit(
     print_result(fitted.result, fit_text(fitted.fit, fitted.result), as_json, folder)
     if not fitted.fit.status.ok:
         raise TrainingError(
-            f"{fitted.result.status.message.removesuffix('.')}. The account is in "
+            f"{fitted.result.status.message.removesuffix('.')}. The details are in "
             f"{folder / 'result.json'}."
         )
 
@@ -126,7 +126,9 @@ def compare(
     out: OutFolder = None,
     model: Annotated[
         list[Path] | None,
-        typer.Option("--model", metavar="MODEL", help="A saved model to put beside; any number."),
+        typer.Option(
+            "--model", metavar="MODEL", help="A saved model to compare with; may be repeated."
+        ),
     ] = None,
     as_json: AsJson = False,
     force: Force = False,
@@ -215,7 +217,7 @@ def init(
     ),
     inputs: Annotated[
         list[str] | None,
-        typer.Option("--inputs", metavar="A B", help="Columns of the inputs; A,B as well."),
+        typer.Option("--inputs", metavar="A B", help="Columns of the inputs; A,B for several."),
     ] = None,
     outputs: Annotated[
         list[str] | None, typer.Option("--outputs", metavar="Y", help="Columns of the outputs.")
@@ -295,10 +297,11 @@ def _ask(text: str, check: Callable[[str], Any], default: str | None = "") -> st
 @app.command("app")
 def page(
     spec: Annotated[
-        Path | None, typer.Argument(metavar="[SPEC]", help="Spec to begin with; it is not written.")
+        Path | None, typer.Argument(metavar="[SPEC]", help="Spec to start with; it is not changed.")
     ] = None,
     port: Annotated[
-        int | None, typer.Option("--port", metavar="N", help="A free one without it.")
+        int | None,
+        typer.Option("--port", metavar="N", help="Port to listen on; a free one by default."),
     ] = None,
     browser: Annotated[
         bool, typer.Option("--browser/--no-browser", help="Open it in the browser.")
@@ -337,22 +340,24 @@ def schema(
 @app.command()
 def reproduce(
     name: Annotated[
-        str | None, typer.Argument(metavar="[NAME]", help="One study; all without it.")
+        str | None, typer.Argument(metavar="[NAME]", help="One study; all by default.")
     ] = None,
     out: OutFolder = None,
     pipeline: Annotated[
         str,
         typer.Option(
-            "--pipeline", metavar="ours|paper|scripts", help="Who trains; scripts: as published."
+            "--pipeline",
+            metavar="ours|paper|scripts",
+            help="Who trains the networks; scripts: as published.",
         ),
     ] = "ours",
     small: Annotated[
-        bool, typer.Option("--small", help="The reduced size that the tests run.")
+        bool, typer.Option("--small", help="Run the reduced size of the tests.")
     ] = False,
     scheduler: Annotated[
         str | None,
         typer.Option(
-            "--scheduler", metavar="ADDRESS", help="A Dask cluster whose workers make the runs."
+            "--scheduler", metavar="ADDRESS", help="Dask cluster whose workers do the runs."
         ),
     ] = None,
     force: Force = False,

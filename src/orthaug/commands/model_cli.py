@@ -74,7 +74,8 @@ def predict(
     observer: Annotated[
         bool,
         typer.Option(
-            "--observer", help="From an estimated state, with 95 % bands; outputs may be missing."
+            "--observer",
+            help="Start from an estimated state, with 95 % bands; outputs may be missing.",
         ),
     ] = False,
     missing: Missing = "error",
@@ -159,14 +160,19 @@ def explain(
     model: ModelPath,
     data: Annotated[
         list[Path],
-        typer.Argument(metavar="DATA…", help="Best the files that the model was trained on."),
+        typer.Argument(metavar="DATA…", help="Data files, best those of the training."),
     ],
     degree: Annotated[
-        int, typer.Option("--degree", metavar="D", help="Of products of what the learner sees.")
+        int,
+        typer.Option(
+            "--degree", metavar="D", help="Highest degree of products of the learner's inputs."
+        ),
     ] = 3,
     functions: Annotated[
         list[str] | None,
-        typer.Option("--function", metavar="NAME", help="In products, such as abs; any number."),
+        typer.Option(
+            "--function", metavar="NAME", help="Function in products, such as abs; may be repeated."
+        ),
     ] = None,
     most: Annotated[int, typer.Option("--terms", metavar="N", help="Terms at most.")] = 6,
     rows: Rows = None,
@@ -201,7 +207,7 @@ def export(
         ),
     ],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the code.")],
-    name: Annotated[str, typer.Option("--name", help="Of files and functions.")] = "model",
+    name: Annotated[str, typer.Option("--name", help="Name of files and functions.")] = "model",
     which: Which = "fitted",
     force: Force = False,
 ) -> None:
@@ -272,7 +278,9 @@ def track(
     model: ModelPath,
     data: Annotated[
         list[Path] | None,
-        typer.Option("--data", metavar="FILE", help="New data; any number, a gap between them."),
+        typer.Option(
+            "--data", metavar="FILE", help="New data, with a gap between files; may be repeated."
+        ),
     ] = None,
     training: Annotated[
         list[Path] | None,
@@ -283,14 +291,14 @@ def track(
     ] = None,
     forgetting: Annotated[
         float | None,
-        typer.Option("--forgetting", metavar="λ", help="Weight of a row against the next one."),
+        typer.Option("--forgetting", metavar="λ", help="Weight of a row relative to the next one."),
     ] = None,
     memory: Annotated[
-        float | None, typer.Option("--memory", metavar="S", help="The same in seconds.")
+        float | None, typer.Option("--memory", metavar="S", help="The same as a time in seconds.")
     ] = None,
     state: Annotated[
         Path | None,
-        typer.Option("--state", metavar="DIR", help="Result of an earlier run, to go on from."),
+        typer.Option("--state", metavar="DIR", help="Result of an earlier run, to continue from."),
     ] = None,
     follows: Annotated[
         bool,

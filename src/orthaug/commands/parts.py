@@ -218,7 +218,7 @@ def _load(path: Path, spec: Spec, part: PartSection, name: str, *, stays: bool =
         )
         kept = f"{name}: one row in {part.every} is kept without a filter{apart}"
         warnings = (
-            Warning("thinned", f"{kept}; content above the new Nyquist frequency folds back."),
+            Warning("thinned", f"{kept}; content above the new Nyquist frequency is aliased."),
         )
     warnings += _guessed_encoding(path, files, name)
     if spec.data.time is None:

@@ -119,7 +119,7 @@ DataPath = Annotated[
 ]
 OutFolder = Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Result folder.")]
 OutFile = Annotated[
-    Path | None, typer.Option("--out", metavar="FILE", help="CSV file; standard output without it.")
+    Path | None, typer.Option("--out", metavar="FILE", help="CSV file; standard output by default.")
 ]
 Initial = Annotated[
     str | None,
@@ -142,7 +142,7 @@ Every = Annotated[int, typer.Option("--every", metavar="N", help="Keep each N-th
 Columns = Annotated[
     list[str] | None,
     typer.Option(
-        "--column", metavar="NAME=COLUMN", help="The file's column of a channel; any number."
+        "--column", metavar="NAME=COLUMN", help="The file's column of a channel; may be repeated."
     ),
 ]
 Prepare = Annotated[
@@ -152,7 +152,7 @@ Prepare = Annotated[
         help="Prepare the rows as the training data were, by the model's steps.",
     ),
 ]
-Force = Annotated[bool, typer.Option("--force", help="Replace what is there, whoever wrote it.")]
+Force = Annotated[bool, typer.Option("--force", help="Replace existing files, whoever wrote them.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of the summary.")]
 
 
@@ -220,7 +220,7 @@ def options(
             "--verbose",
             "-v",
             count=True,
-            help="Tell what is done; twice for more.",
+            help="Log what is done; twice for more.",
             show_default=False,
         ),
     ] = 0,

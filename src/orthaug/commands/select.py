@@ -53,8 +53,8 @@ def open_select(path: Path) -> tuple[LaggedJob, Spec]:
     spec = load_spec(path)
     if spec.motion is not None:
         raise InputError(
-            f"{path}: structure is selected for lagged signals; for a motion declare a learner of "
-            'terms (kind = "terms"), or a network, and ask `orthaug explain` what it found.'
+            f"{path}: structure is selected for lagged signals; for a motion declare a learner "
+            'of terms (kind = "terms"), or a network, and run `orthaug explain` on it.'
         )
     if spec.engine.kind not in ("auto", "memory", "dask"):
         raise InputError(

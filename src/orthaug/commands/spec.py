@@ -54,7 +54,8 @@ _BESIDE_MOTION = {
     "baseline": "expected one of them, because both are the physics",
     "lags": "expected none, because a motion has states instead; `learner.inputs` declares the "
     "inputs of its learner",
-    "physics": "expected none, for the parameters of a motion are physical: [motion.parameters]",
+    "physics": "expected none, because the parameters of a motion are physical: "
+    "[motion.parameters]",
 }
 
 

@@ -132,9 +132,7 @@ def track(
         place = state / STATE if (state / STATE).is_dir() else state
         online = Recursive.load(place)
         if digest(online.fitted) != digest(opened.model):
-            raise InputError(
-                f"{state}: is the state of another model; give the one that it was begun with."
-            )
+            raise InputError(f"{state}: is the state of another model; give a state of this model.")
     online.update(opened.record, gap=not follows)
     return TrackingReport(online, _result(opened, online), opened.physics)
 

@@ -209,7 +209,7 @@ def parse(text: str, constants: Mapping[str, float] | None = None) -> Expression
             raise
         if any(mark in text for mark in ("&&", "||", "~=", "==")):
             raise InputError(
-                f"'{text}': there is no logic in an expression; sign, min and max can switch."
+                f"'{text}': an expression has no logic; use sign, min or max to switch."
             ) from None
         reason = getattr(error, "msg", str(error))
         raise InputError(
@@ -424,10 +424,7 @@ def _evaluate(
 
 def _unknown_name(name: str, text: str, constants: Mapping[str, float]) -> str:
     if name == "k":
-        return (
-            f"'{text}': k is the time index and no value by itself; write a channel at a lag, "
-            "y[k-1]."
-        )
+        return f"'{text}': k is the time index and not a value; write a channel at a lag, y[k-1]."
     if name in FUNCTIONS:
         return f"'{text}': {name} is a function; write {name}(…)."
     hint = (

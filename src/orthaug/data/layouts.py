@@ -386,8 +386,8 @@ def _check_parts(path: Path, file: Any) -> None:
             with archive.open(info) as part:
                 if b"<!DOCTYPE" in part.read(_PROLOGUE):
                     raise InputError(
-                        f"{path}: '{info.filename}' declares a document type, which no "
-                        "workbook has."
+                        f"{path}: '{info.filename}' declares a document type, which a workbook "
+                        "must not have."
                     )
     file.seek(0)
 

@@ -328,8 +328,8 @@ def _ranges(
     for pair in pairs:
         if len(pair) != 2 or not 0 <= pair[0] < pair[1]:
             raise InputError(
-                f"{path}: rows {list(pair)} is no half-open range [start, stop] with 0 ≤ start "
-                "< stop."
+                f"{path}: rows {list(pair)} is not a half-open range [start, stop] with 0 ≤ "
+                "start < stop."
             )
         if pair[1] > total:
             raise InputError(
@@ -454,7 +454,7 @@ def _uniform_step(table: Table, time: str, start: int, stop: int) -> float:
         )
     if np.abs(instants).max() > _LATEST:
         raise InputError(
-            f"{table.path}: column '{time}': instants of {np.abs(instants).max():.3g} are no "
+            f"{table.path}: column '{time}': instants of {np.abs(instants).max():.3g} are not "
             "seconds; perhaps they are milli- or nanoseconds since 1970. Write seconds."
         )
     return mean

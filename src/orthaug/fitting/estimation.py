@@ -74,8 +74,8 @@ def reweighted(first: Estimate, again: Callable[[Problem, Estimate], Estimate]) 
         problem = problem.weighed(weight)
         estimate = again(problem, estimate)
     text = (
-        f"the weights of the outputs still change by {change:.1g} after {_TURNS} fits; θ "
-        "depends on where they stopped."
+        f"the weights of the outputs still change by {change:.1g} after {_TURNS} fits, so θ "
+        "depends on where the iteration stopped."
     )
     warnings = (*estimate.warnings, Warning("output_weights_unsettled", text))
     return replace(estimate, restarts=first.restarts, warnings=warnings)

@@ -63,7 +63,7 @@ class Alarm(NamedTuple):
     time: float
 
     def __str__(self) -> str:
-        return f"the residual has left its band at {self.time:g} s (row {self.row})"
+        return f"the residual left its band at {self.time:g} s (row {self.row})"
 
 
 class Recursive:
@@ -424,7 +424,7 @@ class Recursive:
         alarms = "; ".join(map(str, self.alarms)) or "none"
         lines = [
             f"rows        {self.rows}, {self.rows * step:g} s",
-            f"memory      {memory} (forgetting {self.forgetting:.8g}), worth "
+            f"memory      {memory} (forgetting {self.forgetting:.8g}), equivalent to "
             f"{self.effective_rows:.0f} rows",
             f"alarms      {alarms}{' (still raised)' if self.alarmed else ''}",
         ]

@@ -41,7 +41,9 @@ def check_starts(restarts: int, seed: int, *, ensemble: bool) -> None:
     if ensemble and restarts < 2:
         words = f": found {shown(restarts)}; expected 2 or more for an ensemble"
         raise KeyedError(
-            "an ensemble needs `restarts` of 2 or more to be the median of.", "restarts", words
+            "an ensemble is the median of its restarts; give `restarts` of 2 or more.",
+            "restarts",
+            words,
         )
 
 
@@ -69,7 +71,7 @@ def check_solver(solver: Solver, criterion: Criterion, regularizations: Sequence
     """Raise InputError where a solver without normal equations cannot do what is asked."""
     if "ard" in regularizations and not criterion.one_step:
         raise KeyedError(
-            "ard regularization is for training one step ahead; take evidence on the free run.",
+            "ard regularization is for training one step ahead; use evidence on the free run.",
             "regularization",
             " = ard; expected none, evidence or a number on the free run, or more than one "
             "step ahead",

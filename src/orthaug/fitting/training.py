@@ -393,9 +393,9 @@ def _fell_back(held_out: HeldOutErrors) -> Warning:
         math.sqrt(mean_square(p)) for p in (held_out.runs[held_out.chosen], held_out.alone)
     )
     errors = (
-             f"its error is {model:.4g} standard deviations of the output, that of physics "
-             f"alone {alone:.4g}"
-)
+        f"its error is {model:.4g} standard deviations of the output, that of physics "
+        f"alone {alone:.4g}"
+    )
     if math.isinf(model):
         errors = "every one of its runs diverges there"
     text = (

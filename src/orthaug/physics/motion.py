@@ -310,8 +310,8 @@ class Motion(NotebookView):
             used |= there
             if not there & set(self.names_of_states):
                 raise InputError(
-                    f"the output '{output.name}' = {expression} is no expression of a state; "
-                    f"expected one of {', '.join(self.names_of_states)} in it."
+                    f"the output '{output.name}' = {expression} contains no state; expected "
+                    f"one of {', '.join(self.names_of_states)} in it."
                 )
         for name in self.names:
             if name not in used:

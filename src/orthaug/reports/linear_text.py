@@ -73,7 +73,7 @@ def _gains(view: LinearView) -> list[str]:
     if not view.inputs:
         return ["no inputs: no gains and no frequency response"]
     if view.gain is None:
-        return ["static gain: none, for a pole at 1 integrates"]
+        return ["static gain: none, because a pole at 1 integrates"]
     rows = [["static gain", "value", "95 % interval", "unit"]]
     for i, j in np.ndindex(*view.gain.shape):
         interval = _interval(None if view.gain_ci95 is None else view.gain_ci95[i, j])
@@ -105,7 +105,7 @@ def _poles(view: LinearView) -> list[str]:
     lines = table(rows) if len(rows) > 1 else []
     if view.at_zero:
         times = "once" if view.at_zero == 1 else f"{view.at_zero} times"
-        lines.append(f"pole 0, {times}: dead time, and what the state remembers of inputs")
+        lines.append(f"pole 0, {times}: dead time, and past inputs in the state")
     return lines or ["no poles"]
 
 

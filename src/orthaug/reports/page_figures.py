@@ -212,7 +212,7 @@ def score_plot(
     caption += "; the axis is logarithmic." if logarithmic else "."
     if lost:
         caption += (
-            f" There is none of {', '.join(dict.fromkeys(lost))}: the run diverged, or the "
+            f" There is no value of {', '.join(dict.fromkeys(lost))}: the run diverged, or the "
             "output does not move."
         )
     count = len({place for trace in traces for place in trace["y"]})

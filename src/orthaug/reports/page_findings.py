@@ -155,8 +155,7 @@ def excitation_blocks(result: FitResult) -> list[Any]:
             rows = [[*row, s.removed_by or "–"] for row, s in zip(rows, result.bias, strict=True)]
         else:
             caption += (
-                " `orthaug check` shows whether a measure removes their bias from the "
-                "parameters."
+                " `orthaug check` shows whether a measure removes their bias from the parameters."
             )
         blocks.append(Table(caption, head, rows))
         if result.bias[0].percent:
@@ -169,8 +168,8 @@ def _sentence(text: str) -> str:
 
 
 _CHOOSES = {
-    "score": "score, generalised cross-validation: the loss, raised by how many weights a run uses "
-    "for it",
+    "score": "score, generalised cross-validation: the loss, raised with the number of weights "
+    "that a run uses",
     "validation": "error on data that were not fitted",
 }
 

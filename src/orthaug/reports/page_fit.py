@@ -37,8 +37,8 @@ from orthaug.reports.page_runs import Run, error_band, run_plots
 from orthaug.reports.result import CompareResult, DataResult, FitResult, ParameterResult, PartScores
 
 BIAS_TOLD = (
-    " The bias is estimate less truth, as far as one suspected term explains what the learner "
-    "found."
+    " The bias is the estimate minus the true value, as far as one suspected term explains "
+    "what the learner found."
 )
 
 

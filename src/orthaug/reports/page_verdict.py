@@ -107,14 +107,18 @@ def compare_verdict(result: CompareResult) -> PageVerdict:
     near = [name for name in near if name not in same]
     least = all(errors[best] <= other for name, other in errors.items() if name not in same)
     less = f", as {'does' if len(same) == 1 else 'do'} {_quoted(same)}" if same else ""
-    less += (", and no other model has a smaller error" if same else ", the smallest of all models") if least else ""
+    less += (
+        (", and no other model has a smaller error" if same else ", the smallest of all models")
+        if least
+        else ""
+    )
     how = f"it has the lowest error on the validation part, and {_error_text(error or 0.0, part)}"
     trust = f"Take “{best}”: {how if result.chosen else _error_text(error or 0.0, part) + less}"
     trust += f"; {_quoted(near)} {_is(near)} as good within 10 %." if near else "."
     if doubts:
         trust = f"{trust[:-1]}. But {_join(doubts[:_MOST_DOUBTS])}."
     alone = errors.get("physics alone")
-    use = "It is the physics alone: no learner improves on it."
+    use = "This is physics alone: no learner improves on it."
     if best != "physics alone" and alone is not None and error is not None:
         learns = error / alone if alone else 1.0
         use = (
@@ -163,9 +167,9 @@ def _word(row: RowResult) -> str:
 
 def _error_text(error: float, part: str) -> str:
     return (
-           f"the RMS error of its free run {_on(part)} is {percent(error)} of the output's "
-           "standard deviation"
-)
+        f"the RMS error of its free run {_on(part)} is {percent(error)} of the output's "
+        "standard deviation"
+    )
 
 
 def _on(part: str) -> str:
@@ -256,7 +260,7 @@ def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
         coarse = list(result.residuals.steps or {})
         yield {
             "unmodelled": "its one-step residual is no larger than the quantisation steps of "
-                          f"{_join(coarse)}"
+            f"{_join(coarse)}"
             if coarse
             else "its residual contains more than noise",
             "sensor_noise": "noise on the measured output biases its one-step estimates",
@@ -297,10 +301,7 @@ def _size_of_bias(rows: Sequence[ParameterResult]) -> str:
         else f", {percent(abs((worst.bias.value or 0.0) / worst.value))} of its value"
     )
     size = f"{plain_number(_errors_of(worst))} standard errors{share}"
-    return f"carries a bias of {size}" if one else (
-                                                   f"carry biases of up to {size} "
-                                                   f"({worst.name})"
-)
+    return f"carries a bias of {size}" if one else (f"carry biases of up to {size} ({worst.name})")
 
 
 def _errors_of(row: ParameterResult) -> float:
@@ -345,12 +346,12 @@ def _use_text(result: FitResult, level: str) -> str:
             "residual still contains"
         )
     text += (
-        f". {_join(others)} {_is(others)} too uncertain or too biased to be read as physics" if others else ""
+        f". {_join(others)} {_is(others)} too uncertain or too biased to be read as physics"
+        if others
+        else ""
     )
     if shared:
-        text += (
-            f". The data alone do not determine {_join(shared)}, because the learner could"
-        )
+        text += f". The data alone do not determine {_join(shared)}, because the learner could"
         text += f" imitate {'it' if len(shared) == 1 else 'them'}"
     return f"Use it to {text}."
 

@@ -10,8 +10,9 @@ from orthaug.reports.result import DataResult, ResultHeader
 
 _SHOWN = 12  # models of a stage in the text
 _EXPLAINED = (
-    "chosen: share of random halves that choose the term; left: of its norm, beside physics "
-    "and other terms; rate: the least rate of false discoveries at which it stays.",
+    "chosen: share of random halves of the data that choose the term. left: share of its norm "
+    "that physics and other terms do not explain. rate: lowest rate of false discoveries at "
+    "which it is kept.",
     "p, q: of the term on rows that were not used for the choice, and the rate of false "
     "discoveries among the chosen ones.",
 )

@@ -259,9 +259,7 @@ def _bias_lines(result: FitResult) -> list[str]:
                 "this case:"
             )
         else:
-            lines.append(
-                f"{100 * share:.0f} % of what the {what} is {cause}. The resulting bias:"
-            )
+            lines.append(f"{100 * share:.0f} % of what the {what} is {cause}. The resulting bias:")
         head = (
             f"{'parameter':<{width}}  {'bias':>11}  {'of std':>7}  {'of value':>9}  "
             f"{'95 % interval with it':^29}"

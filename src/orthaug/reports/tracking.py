@@ -43,7 +43,7 @@ def track_text(result: TrackResult) -> str:
         f"{result.effective_rows:.0f} rows",
     ]
     alarms = [
-        f"the residual has left its band at {alarm.time:g} s (row {alarm.row})"
+        f"the residual left its band at {alarm.time:g} s (row {alarm.row})"
         for alarm in result.alarms
     ]
     lines += [f"alarm       {sentence}" for sentence in alarms] or ["alarm       none"]

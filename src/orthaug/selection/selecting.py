@@ -170,9 +170,9 @@ LARGEST = (4, 5)
 WIDTHS = (4, 8, 16)
 """Hidden neurons that are tried where nothing is said."""
 _RIVALS = (
-    "may stand in: {}. Beside the other, the chosen term is not significant on the rows that "
-    "are fitted. Its coefficient and interval are those of a model without the other; more "
-    "varied inputs distinguish them."
+    "may be a substitute: {}. Beside the other term, the chosen term is not significant on the "
+    "rows that are fitted. Its coefficient and interval are those of a model without the "
+    "other; more varied inputs distinguish them."
 )
 _NOT_CONFIRMED = (
     "not confirmed on the rows that were not used for the choice: {}. The q-value there is "

@@ -100,8 +100,8 @@ class DataView:
                     "Channels", "Choose what each column is; the spec starts from this choice."
                 )
                 self.cleaning = card(
-                    "Preparation", "These steps are applied to every part of the data, in this "
-                                   "order."
+                    "Preparation",
+                    "These steps are applied to every part of the data, in this order.",
                 )
                 with self.columns:
                     self.column_rows = ui.element("div")
@@ -172,7 +172,7 @@ class DataView:
             message += f"; it trains on {', '.join(file.name for file in trained)}"
         if lacking:
             message += f". This file has no column {', '.join(lacking)}, which the spec reads"
-        note(f"{message}. Use this file as a test of it, or begin anew below.", "care")
+        note(f"{message}. Use this file as a test of it, or start a new spec below.", "care")
         button("Use it as a test", self.session.add_test, main=not lacking)
 
     def _trained(self) -> list[Path]:

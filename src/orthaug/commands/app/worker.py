@@ -75,7 +75,7 @@ def _answer(given: dict[str, Any]) -> dict[str, Any]:
     except Exception as error:  # a page shows no traceback
         return {
             "refused": f"this could not be computed: {type(error).__name__}: "
-                       f"{' '.join(str(error).split())[:300]}"
+            f"{' '.join(str(error).split())[:300]}"
         }
 
 
