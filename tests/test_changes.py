@@ -200,7 +200,7 @@ def test_a_change_in_words():
     )
     told = str(Change("criterion", "simulation", 0.0, "simulation"))
     assert (
-        told.startswith('with focus = "simulation" the parameters would not be biased so')
+        told.startswith('with focus = "simulation" the parameters would not have this bias')
         and "%" not in told
     )
     assert "not predicted to fall" in told

@@ -294,7 +294,7 @@ def test_the_pole_of_a_slow_system_needs_a_slow_input() -> None:
 
 
 UNSTABLE = Baseline.from_terms([Term("a", "y[k-1]", initial=1.2), Term("b", "u[k-1]", initial=0.1)])
-AWAY = r"^the simulated output runs away under every input; give a `theta` that is stable\.$"
+AWAY = r"^the simulated output diverges under every input; give the `theta` of a stable model\.$"
 
 
 @pytest.mark.parametrize(

@@ -189,7 +189,10 @@ def test_coloured_noise_on_the_sensor_is_not_unmodelled_on_the_free_run():
     )
     found = of(record, criterion=Simulation(0, 40))
     assert found.verdict == "equation_noise" and found.changes == ()
-    assert found.predictable[0].own_past > 0.6 and "Its colour is that of the noise" in found.text
+    assert (
+        found.predictable[0].own_past > 0.6
+        and "Its autocorrelation is that of the noise" in found.text
+    )
 
 
 def friction(seed, rows=1500):

@@ -411,10 +411,10 @@ def test_theta_keeps_its_intervals_where_training_does_not_move_it(short):
     told = {warning.code: warning.text for warning in found.warnings}
     assert found.status.code == "iteration_limit" and found.std is None
     assert (
-        "no intervals: training ended after 6 iterations while the loss still fell"
+        "no intervals: training ended after 6 iterations while the loss was still falling"
         in told["not_converged"]
     )
-    assert "without the key training goes on by itself" in told["not_converged"]
+    assert "Without the key `iterations`, training continues" in told["not_converged"]
     flown = estimate(record, PHYSICS, criterion=oa.Simulation(30, 0), **options | {"blocks": 0})
     assert flown.std is None and "not_converged" in {warning.code for warning in flown.warnings}
 
@@ -425,7 +425,8 @@ def test_a_learner_that_was_regularised_to_nothing_says_so():
     told = {warning.code: warning.text for warning in silent.warnings}
     assert silent.effective_weights < 0.5
     assert re.search(
-        r"the learner is silent: the fit is that of physics alone .*Compare", told["learner_silent"]
+        r"the learner contributes nothing: the fit is that of physics alone .*Compare",
+        told["learner_silent"],
     )
     heard = estimate(record_of(), PHYSICS, regularization="none", **options)
     assert "learner_silent" not in {warning.code for warning in heard.warnings}

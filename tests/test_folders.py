@@ -102,7 +102,7 @@ def test_something_else_is_refused_and_kept(tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "thesis.txt").write_text("mine")
     message = (
-        "out: holds thesis.txt and no manifest.json that says orthaug wrote it; give another "
+        "out: holds thesis.txt and no manifest.json which shows that orthaug wrote it; give another "
         "folder, or .* with --force"
     )
     with pytest.raises(InputError, match=message):
@@ -173,7 +173,7 @@ def exchange(folder: Path) -> None:
         (add_note, "note.txt, which orthaug did not write"),
         (change, "ours, which was changed since orthaug wrote it"),
         (link, "deep, which orthaug did not write"),
-        (exchange, "manifest.json and no manifest.json that says orthaug wrote it"),
+        (exchange, "manifest.json and no manifest.json which shows that orthaug wrote it"),
     ],
 )
 def test_a_result_with_something_else_is_kept_unless_forced(tmp_path, alter, words):
@@ -208,7 +208,7 @@ def test_without_a_manifest_every_file_is_the_users(tmp_path):
     (tmp_path / "out" / "manifest.json").unlink()
     with pytest.raises(
         InputError,
-        match="out: holds ours and no manifest.json that says orthaug wrote it; .*--force",
+        match="out: holds ours and no manifest.json which shows that orthaug wrote it; .*--force",
     ):
         check_replaceable(tmp_path / "out")
     assert (tmp_path / "out" / "ours").read_text() == "old"

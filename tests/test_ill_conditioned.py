@@ -66,7 +66,7 @@ def told(tmp_path, command, text, apart, **options):
 )
 def test_inputs_that_are_nearly_one(tmp_path, command, text, apart):
     (warning,) = told(tmp_path, command, text, apart)
-    assert "the data hardly tell b, c apart" in warning and "Fix one of them" in warning
+    assert "the data hardly distinguish b, c" in warning and "Fix one of them" in warning
     condition = float(warning.partition("(condition ")[2].partition(" ")[0])
     part = float(warning.partition("to 1 part in ")[2].partition(";")[0])
     assert 0.5 < part * apart < 2 and 1 < condition * apart < 4  # √2 each, and a third column

@@ -136,7 +136,7 @@ def test_what_cannot_be_opened_or_written(job, tmp_path):
             0.06,
             0.5,
             "no_help",
-            "without better free runs",
+            "without improving the free run",
         ),  # noise hides on the test part what was learned
         (0.0, 0.5, "no_help", None),
         (0.3, 0.0, "helps", "no suspect explains half of what the learner found"),

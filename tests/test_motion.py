@@ -66,7 +66,7 @@ def test_positive_parameters_are_estimated_as_logarithms() -> None:
         ({"outputs": []}, "the motion has no outputs"),
         (
             {"outputs": [oa.Output("y", "u*k*m")]},
-            "the output 'y' = u*k*m is no expression of a state",
+            "the output 'y' = u*k*m contains no state",
         ),
         ({"outputs": [oa.Output("y")]}, "the output 'y' has no expression"),
         ({"define": {"a": "b + 1", "b": "2*a"}}, "motion.define: an algebraic loop, a → b → a"),

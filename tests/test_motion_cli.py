@@ -773,7 +773,7 @@ BAD = {
     "no state": (
         'position = "x"\n',
         'position = "3*k"\n',
-        "'position' = 3*k is no expression of a state",
+        "'position' = 3*k contains no state",
     ),
     "loop": (
         "[motion.parameters]",

@@ -487,7 +487,7 @@ def test_traces_that_tests_see_beside_the_noise_are_told() -> None:
     told = _traces(analyse([e], [u], [x], *names), shares)
     assert (
         told
-        == " Tests still detect small effects (y follows u; z is not flat over v): 2 % of its square at most."
+        == " Tests still detect small effects (y follows u; z varies with v): 2 % of its mean square at most."
     )
 
 
@@ -571,15 +571,14 @@ def test_evidence_that_silences_dry_friction_is_tried_again():
     by_hand = oa.estimate(record, AXIS, learner=SPEED, regularization="evidence", blocks=0)
     told = {warning.code: warning.text for warning in by_hand.warnings}
     assert (
-        by_hand.effective_weights < 1.5
-        and "has learned nothing but a constant" in told["learner_silent"]
+        by_hand.effective_weights < 1.5 and "contributes only a constant" in told["learner_silent"]
     )
     assert abs(by_hand.values[0] - 95.1) > 3 * by_hand.std[0]
     found = oa.estimate(record, AXIS, learner=SPEED)
     told = {warning.code: warning.text for warning in found.warnings}
     assert found.effective_weights > 4 and "learner_silent" not in told
     assert (
-        "so training was tried again with no regularization and a ridge of"
+        "Training was therefore repeated with no regularization and a ridge of"
         in told["evidence_retried"]
     )
     assert [r.regularization for r in found.restarts][:2] == ["evidence", "none"]
@@ -629,13 +628,13 @@ def test_a_motion_whose_training_has_not_ended_has_no_intervals():
     assert short.status.code == "iteration_limit" and short.std is None and short.interval is None
     assert short.parameters["std"].isna().all() and short.split(oa.Uniform()).std is None
     assert (
-        "while the loss still fell" in told["not_converged"]
+        "while the loss was still falling" in told["not_converged"]
         and "`iterations`" in told["not_converged"]
     )
     whole = oa.estimate(tanks(), motion, **options)
     assert (
         whole.status.iterations > 300
-        and "went on past its limit of 300 iterations" in whole.status.message
+        and "continued past its limit of 300 iterations" in whole.status.message
     )
     assert (whole.std is None) == ("not_converged" in {warning.code for warning in whole.warnings})
     assert whole.status.loss < short.status.loss

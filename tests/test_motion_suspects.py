@@ -186,7 +186,7 @@ def test_suspects_that_the_motion_cannot_have_are_refused() -> None:
     refused("unknown kind of suspect 'culomb', did you mean 'coulomb'", "culomb", "v")
     refused("needs `on`, an expression such as v", "coulomb")
     refused("unknown name 'w'", "coulomb", "w")
-    refused("its parentheses are no pairs", "coulomb", "v) + (v")
+    refused("its parentheses do not match", "coulomb", "v) + (v")
     refused("no equation is that of 'w'; known are x, v, y", "coulomb", "v", equation="w")
     refused("is not finite at", "expression", "1/(x - x)")
     refused("a signal such as y", "cubic", "y[k-1]")

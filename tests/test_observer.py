@@ -430,7 +430,7 @@ def test_an_estimate_without_bounds_is_told():
     y = np.full(40, np.nan)
     y[0] = 3.0
     record = record_of(model, np.ones(40), y)
-    with pytest.raises(oa.InputError, match=r"row \d+: the estimate leaves all bounds there"):
+    with pytest.raises(oa.InputError, match=r"row \d+: the estimate diverges there"):
         oa.Observer(model, oa.Noise(of([[1.0]]), of([[1.0]]))).run(record)
 
 

@@ -188,4 +188,4 @@ def test_of_models_that_are_as_good_the_one_whose_parameters_mean_something_is_t
         == "Take “physics alone"
     )
     lower = compare_verdict(compared(alone, row("additive", 0.1), row("orthogonal", 0.105)))
-    assert "less than of any other" not in lower.trust
+    assert "the smallest of all models" not in lower.trust

@@ -418,7 +418,7 @@ def test_a_parameter_at_its_bound():
     np.testing.assert_array_equal(np.isnan(found.sensitivities), [[True, True], [False, False]])
     assert found.consistency.df == 1 and found.consistency.chi2 == pytest.approx(0.25 / 0.05)
     assert texts(found)[0] == (
-        "m is at its bound 0 and has no standard error; those of the others hold with it there."
+        "m is at its bound 0 and has no standard error; those of the others hold for this value of it."
     )
     assert "own constraint, bounds included (chi2" in found.consistency.text
     json.dumps([row.content() for row in physical_rows(found)], allow_nan=False)

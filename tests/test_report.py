@@ -421,15 +421,18 @@ def with_warning(fitted, code: str, text: str):
 
 def test_the_verdict_is_built_from_the_findings(lagged, motion):
     good = fit_verdict(motion.result)
-    assert good.level in ("good", "care") and "on tests.steps its free run leaves" in good.trust
-    assert "m and k as physics" in good.use and "c is taken from the physics nearest" in good.use
+    assert good.level in ("good", "care") and "its free run on tests.steps is" in good.trust
+    assert (
+        "m and k as physics" in good.use
+        and "The data alone do not determine c, because" in good.use
+    )
     ran = fit_verdict(
         with_warning(lagged, "free_run_diverged", "tests.steps: the free run diverged.")
     )
     assert ran.level == "bad" and "its free run diverges on tests.steps" in ran.trust
     untold = lagged.result.model_copy(update={"data": lagged.result.data.model_copy(update={"tests": None}),
                                               "validation": None})  # fmt: skip
-    assert "not tested on data" in fit_verdict(untold).trust
+    assert "not tested on held-out data" in fit_verdict(untold).trust
     row = lagged.result.parameters[0]
     bias = {"value": 10 * (row.std or 1.0), "cause": "square", "share": 0.9}
     biased = row.model_copy(update={"bias": type("B", (), bias)()})
@@ -454,8 +457,8 @@ def test_the_verdict_is_built_from_the_findings(lagged, motion):
     }
     coarse = fit_verdict(motion.result.model_copy(update=changed))
     assert (
-        "its one-step residual has the size of the steps of x" in coarse.trust
-        and "the steps of x are as large" in coarse.then
+        "its one-step residual is no larger than the quantisation steps of x" in coarse.trust
+        and "quantisation steps of x are as large" in coarse.then
     )
     train, test = (motion.result.scores[part] for part in ("train", "tests.steps"))
     far = test.simulation.model_copy(
@@ -489,7 +492,7 @@ def test_the_verdict_of_a_comparison_names_a_model(compared):
     trust = compare_verdict(twin.model_copy(update={"chosen": None})).trust
     assert (
         "as does “twin”, and no other model has a smaller error" in trust
-        and "less than of any other" not in trust
+        and "the smallest of all models" not in trust
     )
 
 

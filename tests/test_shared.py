@@ -356,9 +356,9 @@ def test_what_could_be_imitated_in_words():
     problem = pose(oscillator(), OSCILLATOR, None, VELOCITY.inputs)
     told = imitation(problem, PHYSICS)
     assert told.text == (
-        "The learner sees y[k-1]-y[k-2] and could imitate t1 - t2. The orthogonal split sets θ "
-        "along this direction only. The data determine t3 with any learner of these inputs. Of the physical "
-        "parameters it determines ks."
+        "The learner sees y[k-1]-y[k-2] and could imitate t1 - t2. Along this direction the "
+        "data alone do not determine θ; the orthogonal split does. The data determine t3 with "
+        "any learner of these inputs. Of the physical parameters they determine ks."
     )
     others = {other.inputs: (other.shared, other.physical) for other in told.alternatives}
     assert others[("u[k-1]",)][0] == 1 and ("y[k-1]-y[k-2]",) not in others
@@ -366,7 +366,7 @@ def test_what_could_be_imitated_in_words():
 
 def test_a_learner_that_sees_everything_in_words():
     told = imitation(pose(oscillator(), OSCILLATOR), PHYSICS)
-    assert told.everything and told.text.endswith("along every direction.")
+    assert told.everything and told.text.endswith("the orthogonal split does.")
     assert told.physical == ()
     assert {other.inputs: other.physical for other in told.alternatives}[("y[k-1]-y[k-2]",)] == (
         "ks",

@@ -337,7 +337,8 @@ def test_a_folder_of_something_else_is_refused_and_kept(models, tmp_path):
     (tmp_path / "model").mkdir()
     (tmp_path / "model" / "notes.txt").write_text("mine")
     with pytest.raises(
-        InputError, match="model: holds notes.txt and no manifest.json that says orthaug wrote it"
+        InputError,
+        match="model: holds notes.txt and no manifest.json which shows that orthaug wrote it",
     ):
         save(models["physics"], tmp_path / "model")
     assert [p.name for p in (tmp_path / "model").iterdir()] == ["notes.txt"]

@@ -161,7 +161,8 @@ def test_a_folder_with_the_two_keys_and_more_is_not_ours(tmp_path):
     (tmp_path / "result.json").write_text('{"schema": 2, "orthaug": "0.1.0"}')
     (tmp_path / "thesis.tex").touch()
     with pytest.raises(
-        InputError, match="holds .* and no manifest.json that says orthaug wrote it; .* --force"
+        InputError,
+        match="holds .* and no manifest.json which shows that orthaug wrote it; .* --force",
     ):
         check_folder(tmp_path)
     (tmp_path / "thesis.tex").unlink()

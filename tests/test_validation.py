@@ -158,7 +158,7 @@ def test_what_auto_stands_for(change, expected):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ({"criterion": FREE}, "ard regularization is for training one step ahead; take evidence"),
+        ({"criterion": FREE}, "ard regularization is for training one step ahead; use evidence"),
         ({"solver": PAPER}, "ard regularization needs the Gauss-Newton matrix"),
     ],
 )

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 _LISTED = 3  # parameters, and terms with memory
 _DETERMINED = re.compile(
-    r"( The fit determines | Of the physical parameters it determines )[^.]*\.|: the fit determines [^.]*"
+    r"( The data determine | Of the physical parameters they determine )[^.]*\.|: the data determine [^.]*"
 )
 
 
