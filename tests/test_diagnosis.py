@@ -90,7 +90,7 @@ def test_a_missing_square_of_a_static_map_is_unmodelled():
     example = synthetic.static(1, noise=True)
     found = of(example.train, example.baseline)
     assert found.one_step[0].curved_regressors == ("u[k]",)
-    assert found.verdict == "unmodelled" and "curved over u[k]" in found.text
+    assert found.verdict == "unmodelled" and "depends nonlinearly on u[k]" in found.text
 
 
 def test_what_no_single_input_shows_is_found_between_neighbours():
@@ -214,7 +214,7 @@ def test_a_free_run_that_follows_its_inputs_is_no_noise_however_white_one_step_i
     ]
     assert (
         found.verdict == "unmodelled"
-        and "curved over u[k-1]" in found.text
+        and "depends nonlinearly on u[k-1]" in found.text
         and "noise floor" not in found.text
     )
     assert "the effect of u[k-1] has a form that was not tried" in found.text
@@ -253,7 +253,7 @@ def test_a_learner_that_finds_the_cubic_leaves_the_equation_noise():
 )
 def test_the_text_names_the_largest_autocorrelation(options):
     found = of(second_order(0, **options))
-    assert f"its largest autocorrelation is {found.one_step[0].largest_acf:.2f}" in found.text
+    assert f"its autocorrelation reaches {found.one_step[0].largest_acf:.2f}" in found.text
 
 
 def two_inputs(own):
@@ -281,7 +281,7 @@ def test_a_missing_lag_is_no_sensor_noise_where_the_output_hardly_feeds_back():
 def test_the_text_names_the_regressor_over_which_the_residual_is_curved():
     found = of(second_order(0, equation=0.1, missing="cubic"))
     assert "y[k-1]" in found.one_step[0].curved_regressors
-    assert "curved over y[k-1]" in found.text
+    assert "depends nonlinearly on y[k-1]" in found.text
 
 
 def test_an_unmodelled_residual_is_told_with_its_size_and_advice():
@@ -343,7 +343,7 @@ def test_weak_colour_in_the_equation_is_inconsistent_in_standard_errors():
             assert "the intervals hold" not in found.text and "`inconsistent`" in found.text
             assert (
                 "standard errors away" in text
-                and "Instruments" in text
+                and "Instrumental variables" in text
                 and 'focus = "simulation"' in text
             )
         tested = inconsistency(

@@ -432,7 +432,7 @@ def test_an_input_that_acts_late_is_named_with_its_delay(samples: int) -> None:
     assert len(texts) == (samples > 0) and ("Most likely u acts later" in found.text) == bool(
         samples
     )
-    assert all('channel = "u", samples = 5;' in text for text in texts)
+    assert all('channel = "u", samples = 5.' in text for text in texts)
 
 
 @pytest.mark.parametrize(

@@ -443,7 +443,7 @@ def test_the_verdict_is_built_from_the_findings(lagged, motion):
             update={"verdict": name, "changes": [], "missing": None}
         )
         doubted = fit_verdict(motion.result.model_copy(update={"residuals": residuals}))
-        assert doubted.level != "good" and "do not read m and k as physics yet" in doubted.use
+        assert doubted.level != "good" and "Do not read m and k as physics yet" in doubted.use
         assert not doubted.then.startswith("Nothing further")
     residuals = residuals.model_copy(update={"verdict": "unmodelled", "steps": {"x": 0.1}})
     ended = motion.result.status.model_copy(update={"code": "converged"})
