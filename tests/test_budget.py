@@ -119,7 +119,7 @@ def test_the_papers_data_sets():
             warning.code == "biased"
             and "u[k]**2 explains 98 % of the learner and moves theta3 by" in warning.text
         )
-        assert warning.text.endswith("cover: split under the symmetrized measure.")
+        assert warning.text.endswith("bias. Remedy: split under the symmetrized measure.")
 
 
 def test_a_declared_suspect_comes_first_and_learner_inputs_are_named_where_they_help():
@@ -264,7 +264,10 @@ def test_a_cause_that_is_not_sure_is_told_with_those_close_to_it():
         f"what the learner found looks most like {found.cause.suspect.name} ("
     )
     assert len({entry.suspect.on or entry.suspect.expression for entry in near}) == len(near)
-    assert f"next: {near[0].suspect.name}" in warning.text and "if it is that, " in warning.text
+    assert (
+        f"next: {near[0].suspect.name}" in warning.text
+        and "If this term is the cause: " in warning.text
+    )
     assert near_causes(ground, found.cause, [found.cause.suspect]) == []
 
 

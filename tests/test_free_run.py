@@ -752,5 +752,5 @@ def test_a_theta_that_the_data_do_not_determine_beside_the_learner_has_a_sentenc
     fit = choosing(nonlinear(), PHYSICS, learner=NETWORK, criterion=FREE, blocks=0)
     assert np.isnan(fit.std).all()
     assert [w.text[:60] for w in fit.warnings if w.code == "no_standard_errors"] == [
-        "no standard errors: together with the learner's weights"
+        "no standard errors: together with the learner's weights, the"
     ]

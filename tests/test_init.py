@@ -139,7 +139,7 @@ REFUSED = [
         "the names of the columns do not show which are inputs and which outputs: force [N], position_mm. Say "
         "both",
     ),
-    (("--inputs", "force"), "Say both"),
+    (("--inputs", "force"), "Give both"),
     (
         ("--inputs", "force", "--outputs", "speed"),
         "no column 'speed'; the file has time [ms], force [N]",

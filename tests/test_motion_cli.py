@@ -521,7 +521,7 @@ def test_an_angle_integrates_and_does_not_decay():
     )
     mass = told(oa.State("x", "v"), oa.State("v", "c*u"))
     assert (
-        "has 2 integrators and no other mode along" in mass.text
+        "has 2 integrators and no other modes along" in mass.text
         and "decay everywhere" not in mass.text
     )
     swing = told(oa.State("x", "v"), oa.State("v", "c*u - 9*x"))

@@ -259,7 +259,7 @@ def test_friction_that_turns_round_smoothly_is_no_drag() -> None:
         fit, [beside.cause, replace(table[1], explained=beside.share)]
     )  # a rival that is elsewhere
     assert not twice.of("c").determined or twice.of("c").ci95[1] > alone.of("c").ci95[0]
-    assert "(near it: quadratic_drag, " in twice.warnings[0].text
+    assert "(close to it: quadratic_drag, " in twice.warnings[0].text
 
 
 def test_usual_terms_that_the_learner_sees_are_weighed_too(

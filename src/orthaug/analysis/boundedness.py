@@ -77,7 +77,9 @@ def margin(factor: float | None, searched: float, driven: bool) -> tuple[str, st
             f"The free run {stays}; it has no inputs that could be larger.",
             "small_margin" if factor is not None else "",
         )
-    stays, times = ("remains bounded", searched) if factor is None else ("grows without bound", factor)
+    stays, times = (
+        ("remains bounded", searched) if factor is None else ("grows without bound", factor)
+    )
     text = (
         f"The free run {stays} with the inputs' deviations from their means {times:.4g} times "
         "as large."

@@ -640,7 +640,7 @@ def _warning(
             "biased",
             f"what the learner found{there} looks most like {name} ({percent(share)} of "
             f"it{beside}). This term would move {listed}; the standard errors do not cover "
-            f"this bias{other}{f'. Remedy: {cure}' if cure else ''}.",
+            f"this bias{other}{f'. If this term is the cause: {cure}' if cure else ''}.",
         )
     return Warning(
         "biased",

@@ -74,8 +74,8 @@ def closed_loop(record: Record) -> tuple[Warning, ...]:
         "were probably recorded under feedback. An estimate is then consistent only with "
         "complete physics and the right noise: white in the equation for one step ahead, white "
         "on the sensor for the free run. Otherwise noise and missing physics that are fed back "
-        "appear as an effect of the input. Model the loop with the recorded reference as the "
-        "input, make the reference much larger than the noise, or record without the "
+        "appear as an effect of the input. Record the reference and model the loop with it as "
+        "the input, make the reference much larger than the noise, or record without the "
         "controller."
     )
     return (Warning("closed_loop", text),)
