@@ -136,7 +136,7 @@ def test_a_file_is_seen_and_its_spec_runs(csv, tmp_path):
 REFUSED = [
     (
         (),
-        "the names of the columns do not show which are inputs and which outputs: force [N], position_mm. Say "
+        "the names of the columns do not show which are inputs and which outputs: force [N], position_mm. Give "
         "both",
     ),
     (("--inputs", "force"), "Give both"),
