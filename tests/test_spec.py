@@ -469,7 +469,7 @@ MEANING = [
         "[data.channels.angle]",
         "[data.channels.angel]",
         "'data'.*`channels.angel` is neither an input nor an output, and `outputs` has "
-        "'angle', of which `channels`",
+        "'angle', which `channels` does not have",
     ),
 ]
 
