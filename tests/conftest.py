@@ -51,7 +51,7 @@ def pytest_xdist_auto_num_workers() -> int:
 
 # Half a minute or more each: a worker that took one of these files last would be waited for.
 _LONGEST = """
-app documents engines motion_fit report_browser cli export reproduction motion_cli free_run scikit_learn published
+golden golden_motion golden_examples app documents engines motion_fit report_browser cli export reproduction motion_cli free_run scikit_learn published
 """
 
 
@@ -103,6 +103,23 @@ def data_folder() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no data sets in {folder}; set ORTHAUG_DATA to their folder")
     return folder
+
+
+@pytest.fixture(scope="session")
+def golden_records(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The records of the golden specs, written once."""
+    from golden_records import write_data
+
+    folder = tmp_path_factory.mktemp("golden")
+    write_data(folder)
+    return folder
+
+
+@pytest.fixture
+def golden_folder(golden_records: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder of the golden records, as the current one."""
+    monkeypatch.chdir(golden_records)
+    return golden_records
 
 
 @pytest.fixture(scope="module")

@@ -43,7 +43,7 @@ CHANGED = [
     ({"status": RESULT["status"] | {"loss": 0.5 * (1 + 1e-8)}}, "status.loss: 0.5, then"),
     ({"parameters": []}, "parameters: 1 entries, then 0"),
     ({"parameters": [{"name": "a", "value": 2.0, "std": 0.0}]}, "parameters[0].std: None, then 0.0"),
-    ({"parameters": [{"name": "a", "value": 2.0}]}, "parameters[0].std: only in one of them"),
+    ({"parameters": [{"name": "a", "value": 2.0}]}, "parameters[0].std: None, then absent"),
     ({"text": "at experiment 0, run.csv: line 6"}, "text: "),
     ({"warnings": [{"code": "poor", "text": "the model is good"}]}, "warnings[0]: "),
     ({"orthogonality_defect": 1e-9}, "orthogonality_defect: "),
