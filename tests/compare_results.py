@@ -2,7 +2,7 @@
 
 Numbers are equal to 1e-9 relative. Aside stay times, the number of the schema, whether a warning is text or has a code,
 and paths. Rounding may differ: the orthogonality defect, of about 1e-16, by 1e-12, and a number beside larger ones (in
-a list, or by name) by 1e-12 of the largest. The contraction metric is the end of a search that rounding of the model
+a list, or by name) by 1e-12 of the largest, a share by 1e-12, a mean by that of the RMS. The contraction metric is the end of a search that rounding of the model
 turns elsewhere; it may differ by 1e-3.
 """
 
@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 RELATIVE, ROUNDING, SEARCH = 1e-9, 1e-12, 1e-3
+SHARES = {"p", "share", "explained", "cosine"}  # at most one
 ASIDE = {"seconds", "schema", "where"}
 FOLDERS = re.compile(r"(?:[^\s:,;()]*/)+")  # of a path within a text
 
@@ -47,9 +48,9 @@ ABSENT = Note("absent")
 
 
 def differences(
-    before: Any, after: Any, where: str = "", beside: float = 0.0, relative: float = RELATIVE
+    before: Any, after: Any, where: str = "", beside: float = 0.0, relative: float = RELATIVE, floor: float = ROUNDING
 ) -> Iterator[Difference]:
-    """What differs by more than `relative`, each with its place; `beside` is the largest number next to it."""
+    """What differs by more than `relative`, or `floor` of `beside`, the largest number next to it, with its place."""
     key = where.rpartition(".")[2]
     if key in ASIDE:
         return
@@ -58,15 +59,15 @@ def differences(
     if isinstance(before, dict) and isinstance(after, dict):
         for name in {**before, **after}:
             place, pair = f"{where}.{name}" if where else name, [d.get(name, ABSENT) for d in (before, after)]
-            yield from differences(*pair, place, largest(before), relative)
+            yield from differences(*pair, place, scale(before, name), relative, floor)
     elif isinstance(before, list) and isinstance(after, list) and len(before) == len(after):
         for i, pair in enumerate(zip(before, after, strict=True)):
-            yield from differences(*pair, f"{where}[{i}]", largest(before), relative)
+            yield from differences(*pair, f"{where}[{i}]", largest(before), relative, floor)
     elif isinstance(before, list) and isinstance(after, list):
         yield Difference(where, Note(f"{len(before)} entries"), Note(len(after)))
     else:
         allowed = SEARCH if "stability.contraction" in where else relative
-        if not same(before, after, rounding(where, beside) * relative / RELATIVE, allowed):
+        if not same(before, after, rounding(where, beside, floor), allowed):
             yield Difference(where, before, after, apart(before, after))
 
 
@@ -88,9 +89,14 @@ def largest(values: Any) -> float:
     return max((abs(value) for value in values if is_number(value)), default=0.0)
 
 
-def rounding(where: str, beside: float) -> float:
+def scale(entries: dict, name: str) -> float:
+    """What an entry of a mapping is large or small beside: one for a share, the RMS for a mean."""
+    return 1.0 if name in SHARES else float(entries.get("rms") or 0.0) if name == "mean" else largest(entries)
+
+
+def rounding(where: str, beside: float, floor: float) -> float:
     """The absolute difference that is rounding."""
-    return ROUNDING if where.endswith("orthogonality_defect") else ROUNDING * beside
+    return ROUNDING if where.endswith("orthogonality_defect") else floor * beside
 
 
 def same(before: Any, after: Any, absolute: float, relative: float = RELATIVE) -> bool:
