@@ -27,7 +27,9 @@ MEASURED_LOOKING = re.compile(
 NOT_MEASURED = re.compile(  # terms and names that hold such numbers
     r"`[^`]*`|\]\([^)]*\)|\b9[59] % (?:band|interval)s?|\bSect\. [\d.]+|\bPython [\d.]+"
 )
-WITHIN = re.compile(r"within (?:(?P<times>a factor )(?P<factor>[\d.]+)|(?P<size>[\d.e-]+)(?P<share> %)?)$")
+WITHIN = re.compile(
+    r"within (?:(?P<times>a factor )(?P<factor>[\d.]+)|(?P<size>[\d.e-]+)(?P<share> %)?)$"
+)
 
 
 class AnchorError(ValueError):
@@ -53,7 +55,9 @@ class Tolerance:
         """From `within 20 %`, `within 0.5` or `within a factor 3`."""
         found = WITHIN.fullmatch(text)
         if found is None:
-            raise AnchorError(f"'{text}': expected `within 20 %`, `within 0.5` or `within a factor 3`.")
+            raise AnchorError(
+                f"'{text}': expected `within 20 %`, `within 0.5` or `within a factor 3`."
+            )
         if found["times"]:
             return cls(factor=float(found["factor"]))
         size = float(found["size"])
@@ -63,9 +67,15 @@ class Tolerance:
         """Whether the text's number stands for this value; one behind `<` or `≤` for any smaller value."""
         if told.bound:
             return value <= told.value
-        if self.factor > 1 and told.value * value > 0 and 1 / self.factor <= told.value / value <= self.factor:
+        if (
+            self.factor > 1
+            and told.value * value > 0
+            and 1 / self.factor <= told.value / value <= self.factor
+        ):
             return True
-        return abs(told.value - value) <= self.share * abs(value) + self.size + 0.5 * told.digit * (1 + 1e-9)
+        return abs(told.value - value) <= self.share * abs(value) + self.size + 0.5 * told.digit * (
+            1 + 1e-9
+        )
 
 
 @dataclass(frozen=True)
@@ -82,7 +92,9 @@ class Number:
     def of(cls, found: re.Match[str], offset: int = 0) -> Number:
         digit = 10.0 ** (int(found["power"] or 0) - len(found["decimals"] or ""))
         value = float(found["value"].replace("−", "-"))
-        return cls(value, digit, found["bound"] is not None, offset + found.start(), offset + found.end())
+        return cls(
+            value, digit, found["bound"] is not None, offset + found.start(), offset + found.end()
+        )
 
 
 def numbers_in(text: str, offset: int = 0) -> list[Number]:
@@ -114,7 +126,10 @@ class Block:
         for number in (number for claim in self.claims for number in claim.numbers):
             text = text[: number.start] + "·" * (number.end - number.start) + text[number.end :]
         text = NOT_MEASURED.sub(lambda found: "·" * len(found[0]), text)
-        return [text[max(0, found.start() - 20) : found.end() + 10] for found in MEASURED_LOOKING.finditer(text)]
+        return [
+            text[max(0, found.start() - 20) : found.end() + 10]
+            for found in MEASURED_LOOKING.finditer(text)
+        ]
 
 
 @dataclass(frozen=True)
@@ -151,7 +166,9 @@ def quoted_numbers(block: Block, quoted: str) -> list[Number]:
     pattern = NUMBER.pattern
     for name in ("bound", "value", "decimals", "power"):
         pattern = pattern.replace(f"?P<{name}>", "?:")
-    found = re.search(f"({pattern})".join(re.escape(part) for part in quoted.split("#")), block.text)
+    found = re.search(
+        f"({pattern})".join(re.escape(part) for part in quoted.split("#")), block.text
+    )
     if found is None:
         raise AnchorError(f'{block.page}:{block.line}: no text "{quoted}" in the block below.')
     return [numbers_in(found[i], found.start(i))[0] for i in range(1, found.re.groups + 1)]
@@ -175,7 +192,10 @@ def column_numbers(block: Block, text: str) -> list[Number]:
 def taken(page: str, line: int, anchors: list[tuple[str, str]]) -> list[tuple[str, str]]:
     """The anchors before a heading, none of which may be `measured`; the list is empty afterwards."""
     if any(kind == "measured" for kind, _ in anchors):
-        raise AnchorError(f"{page}:{line}: `measured` stands before a heading; expected a paragraph, list or table.")
+        raise AnchorError(
+            f"{page}:{line}: `measured` stands before a heading; expected a paragraph, list or "
+            "table."
+        )
     found = anchors.copy()
     anchors.clear()
     return found
@@ -190,7 +210,11 @@ def blocks(page: str, text: str) -> Iterator[Block]:
 
     def end() -> Iterator[Block]:
         if lines:
-            joined = "\n".join(lines) if lines[0].startswith("|") else re.sub(r"\s+", " ", " ".join(lines))
+            joined = (
+                "\n".join(lines)
+                if lines[0].startswith("|")
+                else re.sub(r"\s+", " ", " ".join(lines))
+            )
             yield Block(page, begin, joined, tuple(anchors), next(iter(sections.values()), None))
             lines.clear()
             anchors.clear()
@@ -201,7 +225,10 @@ def blocks(page: str, text: str) -> Iterator[Block]:
         if line.startswith("```"):
             fenced = not fenced
         if fenced and anchors:
-            raise AnchorError(f"{page}:{number}: an anchor stands before code; expected a paragraph, list or table.")
+            raise AnchorError(
+                f"{page}:{number}: an anchor stands before code; expected a paragraph, list or "
+                "table."
+            )
         if fenced or not line or line.startswith("```") or heading or anchor:
             yield from end()
             if anchor and not fenced:
@@ -212,7 +239,9 @@ def blocks(page: str, text: str) -> Iterator[Block]:
                 if anchors:
                     sections[level] = "; ".join(told for _, told in taken(page, number, anchors))
             continue
-        if lines and (re.match(r"[-*] |\d+\. ", line) or line.startswith("|") != lines[-1].startswith("|")):
+        if lines and (
+            re.match(r"[-*] |\d+\. ", line) or line.startswith("|") != lines[-1].startswith("|")
+        ):
             yield from end()
         if not lines:
             begin = number

@@ -35,7 +35,9 @@ def write(path: Path) -> None:
     with path.open("w", encoding="utf-8") as file:
         file.write("time [s],u,y [m]\n")
         for a in range(0, ROWS, BLOCK):
-            file.write("".join(f"{k / 1000:.3f},{u[k]:.16f},{y[k]:.16f}\n" for k in range(a, a + BLOCK)))
+            file.write(
+                "".join(f"{k / 1000:.3f},{u[k]:.16f},{y[k]:.16f}\n" for k in range(a, a + BLOCK))
+            )
 
 
 class Watched(threading.Thread):
@@ -75,7 +77,9 @@ def main() -> None:
         watched.start()
         try:
             with sync_playwright() as playing:
-                tab = playing.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"]).new_page()
+                tab = playing.chromium.launch(
+                    executable_path=CHROMIUM, args=["--no-sandbox"]
+                ).new_page()
                 tab.set_default_timeout(LATE)
                 tab.goto(url)
                 tab.wait_for_selector("#drop")
@@ -106,9 +110,14 @@ def main() -> None:
             server.wait(20)
         helpers = max(most for number, most in watched.most.items() if number != server.pid)
         print(
-            f"{file.stat().st_size / 1e6:.0f} MB, {ROWS} rows: " + ", ".join(f"{w} {t:.1f} s" for w, t in told.items())
+            f"{file.stat().st_size / 1e6:.0f} MB, {ROWS} rows: "
+            + ", ".join(f"{w} {t:.1f} s" for w, t in told.items())
         )
-        print(f"server {before / 1e6:.0f} MB before, at most {watched.most[server.pid] / 1e6:.0f} MB; ", end="")
+        print(
+            f"server {before / 1e6:.0f} MB before, at most "
+            f"{watched.most[server.pid] / 1e6:.0f} MB; ",
+            end="",
+        )
         print(f"largest process that looks at data or trains {helpers / 1e6:.0f} MB")
 
 

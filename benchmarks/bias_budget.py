@@ -18,7 +18,7 @@ import numpy as np
 from machine import describe
 
 import orthaug as oa
-from orthaug.analysis.budget import ground_of, left_over, named_cause
+from orthaug.analysis.budget import left_over, linearization_of, named_cause
 from orthaug.analysis.suspects import Suspect
 
 SAMPLES, TS = 2000, 0.01
@@ -122,7 +122,11 @@ def form(kind: str, on: str, width: float | None):
         "cubic": lambda v: v**3,
         "dead_zone": lambda v: v - min(max(v, -w), w),
     }
-    acts = {VELOCITY: lambda a, b, u: a - b, "y[k-1]": lambda a, b, u: a, "u[k-1]": lambda a, b, u: u}
+    acts = {
+        VELOCITY: lambda a, b, u: a - b,
+        "y[k-1]": lambda a, b, u: a,
+        "u[k-1]": lambda a, b, u: u,
+    }
     products = {"y[k-1]**2": lambda a, b, u: a * a, "u[k-1]**2": lambda a, b, u: u * u}
     products |= {"u[k-1]*y[k-1]": lambda a, b, u: u * a, "abs(u[k-1])": lambda a, b, u: abs(u)}
     products[f"({VELOCITY})**2"] = lambda a, b, u: (a - b) ** 2
@@ -177,7 +181,7 @@ def look(seed: int) -> Looked:
     for cause, coefficient in made.causes:
         values = coefficient * cause.values(problem.rows.x, problem.layout, problem.outputs)
         true = true + problem.projection.solve(problem.weight.rows(values))
-    ground, told = ground_of(fit, oa.Training()), []
+    ground, told = linearization_of(fit, oa.Training()), []
     for declared in (tuple(cause for cause, _ in made.causes[:1]), ()):
         best = named_cause(ground, declared, 0.0)
         if best is None or not best.explained or not best.coefficient_found:
@@ -186,7 +190,9 @@ def look(seed: int) -> Looked:
         bias = best.coefficient_found * np.array(best.bias)
         told.append((best.explained, bias, left_over(ground, best, declared)))
     shape = problem.projection.to_coordinates
-    return Looked(true, np.asarray(fit.std), fit.theta - made.theta, fit.freedom, shape, tuple(told))
+    return Looked(
+        true, np.asarray(fit.std), fit.theta - made.theta, fit.freedom, shape, tuple(told)
+    )
 
 
 @cache
@@ -219,9 +225,14 @@ def rates(systems: int, declared: bool, least: float) -> list[float]:
             continue
         misses.append(not warned)
         if warned:
-            errors.append(np.linalg.norm(one.shape @ (bias - one.true)) / np.linalg.norm(one.shape @ one.true))
+            errors.append(
+                np.linalg.norm(one.shape @ (bias - one.true)) / np.linalg.norm(one.shape @ one.true)
+            )
     wrong = float(np.mean(np.array(errors) > 0.5))
-    return [100 * v for v in (float(np.mean(alarms)), float(np.mean(misses)), float(np.median(errors)), wrong)]
+    return [
+        100 * v
+        for v in (float(np.mean(alarms)), float(np.mean(misses)), float(np.median(errors)), wrong)
+    ]
 
 
 @cache
@@ -237,10 +248,16 @@ def shown(systems: int, declared: bool) -> tuple[tuple[float, ...], ...]:
         budget = oa.bias_budget(fit, [cause for cause, _ in made.causes[:1]] if declared else ())
         if budget is None:
             continue
-        for entry, truth, plain in zip(budget.parameters, made.theta, np.asarray(fit.interval), strict=True):
+        for entry, truth, plain in zip(
+            budget.parameters, made.theta, np.asarray(fit.interval), strict=True
+        ):
             low, high = entry.ci95 or (-np.inf, np.inf)
             found.append(
-                (float(plain[0] <= truth <= plain[1]), float(low <= truth <= high), float(not entry.determined))
+                (
+                    float(plain[0] <= truth <= plain[1]),
+                    float(low <= truth <= high),
+                    float(not entry.determined),
+                )
             )
     return tuple(found)
 
@@ -267,7 +284,11 @@ def main(systems: int) -> None:
     print(describe())
     began = time.perf_counter()
     print(f"{len(looked(systems))} systems, {time.perf_counter() - began:.0f} s\n")
-    print("| cause | least share | false alarms | misses | median error | off by more than half |\n" + 6 * "|---" + "|")
+    print(
+        "| cause | least share | false alarms | misses | median error | off by more than half |\n"
+        + 6 * "|---"
+        + "|"
+    )
     kinds = [(kind, least) for kind in ("declared", "found") for least in SHARES]
     for (kind, least), row in zip(kinds, warned(systems), strict=True):
         print(f"| {kind} | {least} | " + " | ".join(f"{v:.1f} %" for v in row) + " |")

@@ -62,8 +62,15 @@ def compare(claim: Claim, values: Sequence[float | None]) -> tuple[bool, str]:
     """Whether text and values agree, and a line that says so."""
     head = f"{claim.place}  {claim.function}"
     if len(values) != len(claim.numbers):
-        return False, f"differs  {head}: {len(claim.numbers)} numbers in the text, {len(values)} computed"
-    pairs = [(told, value) for told, value in zip(claim.numbers, values, strict=True) if value is not None]
+        return (
+            False,
+            f"differs  {head}: {len(claim.numbers)} numbers in the text, {len(values)} computed",
+        )
+    pairs = [
+        (told, value)
+        for told, value in zip(claim.numbers, values, strict=True)
+        if value is not None
+    ]
     wrong = [(told.value, value) for told, value in pairs if not claim.tolerance.met(told, value)]
     listed = ", ".join(f"{told:g} (computed {value:.4g})" for told, value in wrong)
     absent = f", {len(values) - len(pairs)} left out: no data" if len(pairs) < len(values) else ""
@@ -72,7 +79,11 @@ def compare(claim: Claim, values: Sequence[float | None]) -> tuple[bool, str]:
         return False, f"differs  {head}: {listed}{absent}"
     if not pairs:
         return True, f"skipped  {head}: no data"
-    few = "" if len(pairs) > 4 else ": " + ", ".join(f"{told.value:g} ({value:.4g})" for told, value in pairs)
+    few = (
+        ""
+        if len(pairs) > 4
+        else ": " + ", ".join(f"{told.value:g} ({value:.4g})" for told, value in pairs)
+    )
     return True, f"met      {head}, {count}{few}{absent}"
 
 

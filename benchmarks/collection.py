@@ -47,7 +47,9 @@ class Problem:
         header = ",".join((*self.inputs, *self.outputs))
         parts = {f"train{i}": rows for i, rows in enumerate(self.train)} | self.tests
         for name, rows in parts.items():
-            np.savetxt(folder / f"{name}.csv", rows, delimiter=",", header=header, comments="", fmt="%.9g")
+            np.savetxt(
+                folder / f"{name}.csv", rows, delimiter=",", header=header, comments="", fmt="%.9g"
+            )
 
     @property
     def sections(self) -> dict[str, object]:
@@ -65,27 +67,50 @@ def _csv(path: str, columns: list[int], rows: slice = slice(None)) -> np.ndarray
 
 def silverbox() -> Problem:
     rows = _csv("silverbox/SNLS80mV.csv", [0, 1])
-    tests = {"multisine": rows[105712:107712], "inner_arrow": rows[30100:32100], "arrow": rows[38575:40575]}
-    return Problem("silverbox", MEASURED, ("V1",), ("V2",), 0.001638468, [rows[101712:105712]], tests, skip=50)
+    tests = {
+        "multisine": rows[105712:107712],
+        "inner_arrow": rows[30100:32100],
+        "arrow": rows[38575:40575],
+    }
+    return Problem(
+        "silverbox", MEASURED, ("V1",), ("V2",), 0.001638468, [rows[101712:105712]], tests, skip=50
+    )
 
 
 def cascaded_tanks() -> Problem:
     path = "cascaded_tanks/dataBenchmark.csv"
     train, test = _csv(path, [0, 2]), _csv(path, [1, 3])
-    return Problem("cascaded_tanks", MEASURED, ("pump",), ("level",), 4.0, [train], {"official": test}, skip=5)
+    return Problem(
+        "cascaded_tanks", MEASURED, ("pump",), ("level",), 4.0, [train], {"official": test}, skip=5
+    )
 
 
 def mr_damper() -> Problem:
     cells = loadmat(data_folder() / "mr_damper" / "damper.mat")
     rows = np.column_stack([cells["X"].ravel(), cells["y"].ravel()])
-    return Problem("mr_damper", MEASURED, ("velocity",), ("force",), 0.005, [rows[:2000]], {"rest": rows[2000:]})
+    return Problem(
+        "mr_damper",
+        MEASURED,
+        ("velocity",),
+        ("force",),
+        0.005,
+        [rows[:2000]],
+        {"rest": rows[2000:]},
+    )
 
 
 def f16() -> Problem:
     rows = np.loadtxt(data_folder() / "f16" / "f-16.txt", delimiter=",")
     cut = len(rows) * 3 // 4
     channels = ("force", "voltage"), ("acceleration",)
-    return Problem("f16", MEASURED, *channels, 1 / 400, [rows[cut - ROWS : cut]], {"last": rows[cut : cut + ROWS]})
+    return Problem(
+        "f16",
+        MEASURED,
+        *channels,
+        1 / 400,
+        [rows[cut - ROWS : cut]],
+        {"last": rows[cut : cut + ROWS]},
+    )
 
 
 def ball_and_beam() -> Problem:
@@ -94,31 +119,59 @@ def ball_and_beam() -> Problem:
         recording = file["aquisicao_02_mpc_modelo_NARX"]
         drive, position = (np.ravel(file[one[0]][()]) for one in recording["Y"]["Data"][:2])
     steps = len(drive) // 20
-    rows = np.column_stack([drive[: 20 * steps].reshape(steps, 20).mean(axis=1), position[: 20 * steps : 20]])
+    rows = np.column_stack(
+        [drive[: 20 * steps].reshape(steps, 20).mean(axis=1), position[: 20 * steps : 20]]
+    )
     cut = steps * 3 // 4
-    return Problem("ball_and_beam", MEASURED, ("drive",), ("position",), 0.02, [rows[:cut]], {"last": rows[cut:]})
+    return Problem(
+        "ball_and_beam",
+        MEASURED,
+        ("drive",),
+        ("position",),
+        0.02,
+        [rows[:cut]],
+        {"last": rows[cut:]},
+    )
 
 
 def servo() -> Problem:
     """Speeds over pulse widths in rising order, in the order of the file: no dynamics are in it."""
-    cells = loadmat(data_folder() / "servo" / "Training_Set.mat", squeeze_me=True, struct_as_record=False)
+    cells = loadmat(
+        data_folder() / "servo" / "Training_Set.mat", squeeze_me=True, struct_as_record=False
+    )
     turns = [getattr(cells["Training_set"], name) for name in ("Anti_clock", "Clock")]
     rows = np.vstack([np.column_stack([turn.Unique_PW_Keys, turn.motor_rpm]) for turn in turns])
     cut = len(rows) * 3 // 4
-    return Problem("servo", MEASURED, ("pulse",), ("speed",), 1.0, [rows[:cut]], {"last": rows[cut:]})
+    return Problem(
+        "servo", MEASURED, ("pulse",), ("speed",), 1.0, [rows[:cut]], {"last": rows[cut:]}
+    )
 
 
 def wiener_hammerstein() -> Problem:
     rows = _csv("wiener_hammerstein/WienerHammerBenchmark.csv", [0, 1])
     train, test = rows[20_000 : 20_000 + ROWS], rows[100_000 : 100_000 + ROWS]
-    return Problem("wiener_hammerstein", MEASURED, ("u",), ("y",), 1 / 51_200, [train], {"official": test}, skip=1000)
+    return Problem(
+        "wiener_hammerstein",
+        MEASURED,
+        ("u",),
+        ("y",),
+        1 / 51_200,
+        [train],
+        {"official": test},
+        skip=1000,
+    )
 
 
 def wh_process_noise() -> Problem:
     train = _csv("wh_process_noise/WH_EstimationExample.csv", [10, 20], slice(ROWS))
     path = "wh_process_noise/WH_TestDataset.csv"
-    tests = {"multisine": _csv(path, [2, 4], slice(ROWS // 2)), "sweep": _csv(path, [3, 5], slice(ROWS // 2))}
-    return Problem("wh_process_noise", MEASURED, ("u",), ("y",), 1 / 78_125, [train], tests, skip=50)
+    tests = {
+        "multisine": _csv(path, [2, 4], slice(ROWS // 2)),
+        "sweep": _csv(path, [3, 5], slice(ROWS // 2)),
+    }
+    return Problem(
+        "wh_process_noise", MEASURED, ("u",), ("y",), 1 / 78_125, [train], tests, skip=50
+    )
 
 
 def bouc_wen() -> Problem:
@@ -127,7 +180,9 @@ def bouc_wen() -> Problem:
         with h5py.File(data_folder() / "bouc_wen" / f"{name}.h5") as file:
             group = file["multisine"]
             parts.append(np.column_stack([np.ravel(group[key][:ROWS]) for key in ("u", "y")]))
-    return Problem("bouc_wen", MEASURED, ("u",), ("y",), 1 / 750, parts[:1], {"multisine": parts[1]}, skip=50)
+    return Problem(
+        "bouc_wen", MEASURED, ("u",), ("y",), 1 / 750, parts[:1], {"multisine": parts[1]}, skip=50
+    )
 
 
 def f1tenth() -> Problem:
@@ -136,8 +191,13 @@ def f1tenth() -> Problem:
     train = ("circle_0.6", "eight_0.55", "eight_0.75", "circle_0.8", "eight_0.95", "circle_1.0")
     test = ("eight_0.6", "circle_0.65", "eight_0.8", "circle_0.85", "eight_1.0", "circle_0.55")
     runs = [_csv(str(folder / "train" / f"{name}.csv"), columns, slice(650)) for name in train]
-    tests = {n.replace(".", "_"): _csv(str(folder / "test" / f"{n}.csv"), columns, slice(650)) for n in test}
-    return Problem("f1tenth", MEASURED, ("delta", "d"), ("v_long", "v_lat", "yaw_rate"), 0.025, runs, tests)
+    tests = {
+        n.replace(".", "_"): _csv(str(folder / "test" / f"{n}.csv"), columns, slice(650))
+        for n in test
+    }
+    return Problem(
+        "f1tenth", MEASURED, ("delta", "d"), ("v_long", "v_lat", "yaw_rate"), 0.025, runs, tests
+    )
 
 
 LAGGED: dict[str, Callable[[], Problem]] = {

@@ -40,7 +40,9 @@ def per_row(fit: oa.Estimate) -> np.ndarray:
     """`Σψψᵀ` inverted times σ², from the ψ of every row."""
     psi = np.asarray(jax.lax.map(one_row(fit), jnp.arange(len(fit.problem.rows))))
     scale = 1 / np.linalg.norm(psi, axis=0)
-    inverse = np.linalg.pinv((psi * scale).T @ (psi * scale), rcond=psi.shape[1] * np.finfo(float).eps, hermitian=True)
+    inverse = np.linalg.pinv(
+        (psi * scale).T @ (psi * scale), rcond=psi.shape[1] * np.finfo(float).eps, hermitian=True
+    )
     return fit.model.statistics.noise[0, 0] * inverse * np.outer(scale, scale)
 
 
@@ -56,7 +58,9 @@ def seconds_per_row(fit: oa.Estimate, timed: int) -> float:
 
 def fitted() -> oa.Estimate:
     example = oa.synthetic.static(1, noise=True, samples=ROWS)
-    return oa.estimate(example.train, example.baseline, learner=oa.MLP((NEURONS,)), regularization="none")
+    return oa.estimate(
+        example.train, example.baseline, learner=oa.MLP((NEURONS,)), regularization="none"
+    )
 
 
 def theta_block(fit: oa.Estimate | None = None) -> float:
@@ -72,12 +76,17 @@ def main(timed: int) -> None:
     fast = median_seconds(fit.joint_covariance, 20)
     slow, worst = seconds_per_row(fit, min(timed, ROWS)), theta_block(fit)
     found, nt = fit.joint_covariance(), len(fit.theta)
-    across = np.abs(found[:nt, nt:]).max() / np.sqrt(found[:nt, :nt].max() * np.diag(found)[nt:].max())
-    print("| rows | weights | one pass | a Jacobian per row | ratio | allowed | θ block, largest relative difference |")
+    across = np.abs(found[:nt, nt:]).max() / np.sqrt(
+        found[:nt, :nt].max() * np.diag(found)[nt:].max()
+    )
+    print(
+        "| rows | weights | one pass | a Jacobian per row | ratio | allowed | θ block, largest "
+        "relative difference |"
+    )
     print("|---|---|---|---|---|---|---|")
     print(
-        f"| {ROWS} | {fit.model.form.bound.size} | {1e3 * fast:.2f} ms | {slow:.1f} s | {slow / fast:.0f} | >= 100 | "
-        f"{worst:.1e} (allowed 1e-10) |"
+        f"| {ROWS} | {fit.model.form.bound.size} | {1e3 * fast:.2f} ms | {slow:.1f} s | "
+        f"{slow / fast:.0f} | >= 100 | {worst:.1e} (allowed 1e-10) |"
     )
     print(f"\nLargest correlation of θ with a weight (thm:zero_cov has 0): {across:.1e}")
 

@@ -43,7 +43,9 @@ OUTSIDE = {
     "-.1 sin(4 v)": lambda v: -0.1 * np.sin(4 * v),
     "-.15 v/√(v²+.04)": lambda v: -0.15 * v / np.sqrt(v * v + 0.04),
 }
-BASELINE = oa.Baseline.from_terms([oa.Term("a1", "y[k-1]"), oa.Term("a2", "y[k-2]"), oa.Term("b", "u[k-1]")])
+BASELINE = oa.Baseline.from_terms(
+    [oa.Term("a1", "y[k-1]"), oa.Term("a2", "y[k-2]"), oa.Term("b", "u[k-1]")]
+)
 MOTION_ROWS, HOLD, TS, FINE = 500, 20, 0.02, 4
 MOTION_TRUE = np.array([1.0, 2.0, 100.0])  # m, c, k
 MOTIONS = {
@@ -95,7 +97,9 @@ def motion_record(friction: Callable[[Any], Any], noise: float, seed: int) -> oa
             state = state + h / 6 * (first + 2 * second + 2 * third + rate(state + h * third, u))
     position = np.array(positions)
     position = position + noise * position.std() * rng.normal(size=MOTION_ROWS)
-    return oa.Record.from_arrays(force, position, sampling_time=TS, inputs=["force"], outputs=["position"])
+    return oa.Record.from_arrays(
+        force, position, sampling_time=TS, inputs=["force"], outputs=["position"]
+    )
 
 
 def motion() -> oa.Motion:
@@ -112,7 +116,9 @@ def motion() -> oa.Motion:
     )
 
 
-def judged(fit: Any, names: tuple[str, ...], true: np.ndarray) -> tuple[float, float, list[float], list[bool]]:
+def judged(
+    fit: Any, names: tuple[str, ...], true: np.ndarray
+) -> tuple[float, float, list[float], list[bool]]:
     """Shares of the parameters that the intervals hold and that are missed silently, widths over values, what is open.
 
     Of the parameters that the learner could imitate: the others have no bias, and miss 5 % by chance.
@@ -136,7 +142,9 @@ def judged(fit: Any, names: tuple[str, ...], true: np.ndarray) -> tuple[float, f
     return float(np.mean(held)), float(np.mean(silent)), widths, open_ones
 
 
-def summed(system: str, noise: float, found: list[tuple[float, float, list[float], list[bool]]]) -> Row:
+def summed(
+    system: str, noise: float, found: list[tuple[float, float, list[float], list[bool]]]
+) -> Row:
     """A line of the table from its draws; the width is that of what the learner could imitate."""
     held, silent, widths, open_ones = zip(*found, strict=True)
     largest = [max(w, default=np.nan) for w in widths]
@@ -151,7 +159,10 @@ def rows(draws: int = 20, motion_draws: int = 3) -> Iterator[Row]:
     learner = oa.MLP((8,), inputs=("y[k-1] - y[k-2]",))
     for noise in NOISES:
         for name, delta in {**IN_CATALOGUE, **OUTSIDE}.items():
-            fits = (oa.estimate(record(delta, noise, i), BASELINE, learner=learner, seed=i) for i in range(draws))
+            fits = (
+                oa.estimate(record(delta, noise, i), BASELINE, learner=learner, seed=i)
+                for i in range(draws)
+            )
             yield summed(name, noise, [judged(fit, ("a1", "a2"), TRUE) for fit in fits])
     for name, friction in MOTIONS.items():
         made = (motion_record(friction, 0.01, i) for i in range(motion_draws))
@@ -166,12 +177,15 @@ def rows(draws: int = 20, motion_draws: int = 3) -> Iterator[Row]:
 
 def main(draws: int, motion_draws: int) -> None:
     print(describe())
-    print("\n| system | noise | learner on | draws | held | silent misses | median width | not determined |")
+    print(
+        "\n| system | noise | learner on | draws | held | silent misses | median width | not "
+        "determined |"
+    )
     print(8 * "|---" + "|")
     for row in rows(draws, motion_draws):
         print(
-            f"| {row.system} | {row.noise} | {row.sees} | {row.draws} | {row.held:.0f} % | {row.silent:.0f} % "
-            f"| {row.width:.2g} | {row.undetermined:.0f} % |",
+            f"| {row.system} | {row.noise} | {row.sees} | {row.draws} | {row.held:.0f} % | "
+            f"{row.silent:.0f} % | {row.width:.2g} | {row.undetermined:.0f} % |",
             flush=True,
         )
 

@@ -114,7 +114,9 @@ def lagged(seed: int, noise: str, hidden: str) -> tuple[np.ndarray, np.ndarray]:
     return u, y + (0.01 * y.std() * random.normal(size=ROWS) if noise == "sensor" else 0.0)
 
 
-SYSTEMS: dict[str, tuple[Callable[..., tuple[np.ndarray, np.ndarray]], str, str, str, float, str]] = {
+SYSTEMS: dict[
+    str, tuple[Callable[..., tuple[np.ndarray, np.ndarray]], str, str, str, float, str]
+] = {
     "motion, hidden lag": (spring, "lag", MOTION, "k", 4.0, "v"),
     "motion, right physics": (spring, "", MOTION, "k", 4.0, "v"),
     "motion, backlash": (spring, "backlash", MOTION, "k", 4.0, "v"),
@@ -136,19 +138,33 @@ def row(system: str, noise: str, sees: str, draws: int) -> Row:
             table = np.column_stack(make(seed, noise, hidden))
             np.savetxt(place / "run.csv", table, delimiter=",", header="u,y", comments="")
             spec = f'[data]\ninputs = ["u"]\noutputs = ["y"]\nsampling_time = {TS}\ntrain = {{ files = ["run.csv"] }}\n'
-            spec += physics.replace("LEARNED", "false" if sees == "none" else "true") + LEARNERS[sees].replace("{v}", v)
+            spec += physics.replace("LEARNED", "false" if sees == "none" else "true") + LEARNERS[
+                sees
+            ].replace("{v}", v)
             (place / "spec.toml").write_text(spec)
             result = oa.fit_spec(place / "spec.toml").result
         found = next(one for one in result.parameters if one.name == name)
         codes = {warning.code for warning in result.warnings}
-        ends = [one for one in (found.ci95, found.ci95_with_bias) if one is not None and None not in one]
+        ends = [
+            one for one in (found.ci95, found.ci95_with_bias) if one is not None and None not in one
+        ]
         inside = any(low <= truth <= high for low, high in ends)
         held += inside
         silent += bool(ends) and not inside and not WARNED & codes
         warned += bool(WARNED & codes)
         named += "hidden_state" in codes
         widths += [ends[0][1] - ends[0][0]] if ends else []
-    return Row(system, noise, sees, draws, held, silent, float(np.median(widths or [np.nan])), warned, named)
+    return Row(
+        system,
+        noise,
+        sees,
+        draws,
+        held,
+        silent,
+        float(np.median(widths or [np.nan])),
+        warned,
+        named,
+    )
 
 
 def rows(draws: int = 10, words: str = "") -> list[Row]:
@@ -160,13 +176,19 @@ def rows(draws: int = 10, words: str = "") -> list[Row]:
                 if all(word in f"{system} {noise} {sees}" for word in words.split()):
                     began = time.perf_counter()
                     found.append(row(system, noise, sees, draws))
-                    print(*found[-1], f"{(time.perf_counter() - began) / draws:.1f} s", sep=" | ", flush=True)
+                    print(
+                        *found[-1],
+                        f"{(time.perf_counter() - began) / draws:.1f} s",
+                        sep=" | ",
+                        flush=True,
+                    )
     return found
 
 
 if __name__ == "__main__":
     print(describe())
     print(
-        "system | noise | learner sees | draws | held | silent misses | median width | warned | hidden_state | a draw"
+        "system | noise | learner sees | draws | held | silent misses | median width | warned "
+        "| hidden_state | a draw"
     )
     rows(int(sys.argv[1]) if len(sys.argv) > 1 else 10, " ".join(sys.argv[2:]))

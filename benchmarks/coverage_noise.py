@@ -30,7 +30,11 @@ DOUBTS = {
 """Codes that say that an interval may not hold."""
 THETA = np.array([1.35, -0.48, 0.5])
 LAGGED = oa.Baseline.from_terms(
-    [oa.Term("a1", "y[k-1]", initial=1.2), oa.Term("a2", "y[k-2]", initial=-0.4), oa.Term("b", "u[k-1]", initial=0.4)]
+    [
+        oa.Term("a1", "y[k-1]", initial=1.2),
+        oa.Term("a2", "y[k-2]", initial=-0.4),
+        oa.Term("b", "u[k-1]", initial=0.4),
+    ]
 )
 SEES = "y[k-1] - y[k-2]"
 TS, MCK = 0.02, np.array([1.0, 2.0, 50.0])
@@ -83,7 +87,9 @@ def lagged_record(
     return oa.Record.from_arrays(u, y, sampling_time=0.1)
 
 
-def motion_record(kind: str, seed: int, rows: int = 1500, size: float = 0.05, place: str = "output") -> Any:
+def motion_record(
+    kind: str, seed: int, rows: int = 1500, size: float = 0.05, place: str = "output"
+) -> Any:
     """A mass, a spring and a damper by exact steps of 5 ms; noise on the position, or as a force."""
     rng, fine = np.random.default_rng([seed, 38]), 4
     u = 20 * input_of(rng, rows, 10)
@@ -97,7 +103,9 @@ def motion_record(kind: str, seed: int, rows: int = 1500, size: float = 0.05, pl
             x = x + h * np.array([middle[1], (f - c * middle[1] - k * middle[0]) / m])
     position = np.array(found)
     y = position + (
-        size * position.std() * noise if place == "output" else 0.002 * position.std() * rng.normal(size=rows)
+        size * position.std() * noise
+        if place == "output"
+        else 0.002 * position.std() * rng.normal(size=rows)
     )
     return oa.Record.from_arrays(u, y, sampling_time=TS, inputs=["force"], outputs=["position"])
 
@@ -110,28 +118,42 @@ def motion() -> Any:
         ],
         outputs=[oa.Output("position", "x")],
         inputs=["force"],
-        parameters=[oa.PhysicalParameter(*given, min=0) for given in (("m", 1.2), ("c", 1.5), ("k", 60.0))],
+        parameters=[
+            oa.PhysicalParameter(*given, min=0) for given in (("m", 1.2), ("c", 1.5), ("k", 60.0))
+        ],
     )
 
 
-def lagged_fit(record: Any, sees: str | None, seed: int) -> tuple[Any, set[str], np.ndarray, np.ndarray | None]:
+def lagged_fit(
+    record: Any, sees: str | None, seed: int
+) -> tuple[Any, set[str], np.ndarray, np.ndarray | None]:
     """The fit as `orthaug fit` makes it, its warnings' codes, θ̂ and its intervals."""
     learner = None if sees is None else oa.MLP((6,), inputs=(sees,))
-    fit = oa.estimate(record, LAGGED, learner=learner, criterion=oa.Prediction(), restarts=1, blocks=0, seed=seed)
+    fit = oa.estimate(
+        record, LAGGED, learner=learner, criterion=oa.Prediction(), restarts=1, blocks=0, seed=seed
+    )
     fit = robust_where_asked(fit, fit.model.predict(record))
     return fit, codes_of(fit), fit.theta, fit.interval
 
 
-def motion_fit(record: Any, sees: str | None, seed: int, segment: int | None = None) -> tuple[Any, set[str], Any, Any]:
+def motion_fit(
+    record: Any, sees: str | None, seed: int, segment: int | None = None
+) -> tuple[Any, set[str], Any, Any]:
     learner = None if sees is None else oa.MLP((6,), inputs=(sees,))
-    options: dict[str, Any] = {} if segment is None else {"criterion": oa.Simulation(segment=segment)}
-    fit = robust_free_run(oa.estimate(record, motion(), learner=learner, blocks=0, seed=seed, **options))
+    options: dict[str, Any] = (
+        {} if segment is None else {"criterion": oa.Simulation(segment=segment)}
+    )
+    fit = robust_free_run(
+        oa.estimate(record, motion(), learner=learner, blocks=0, seed=seed, **options)
+    )
     return fit, codes_of(fit), fit.values, fit.interval
 
 
 def codes_of(fit: Any) -> set[str]:
     found = oa.diagnose(fit)
-    return {warning.code for warning in (*fit.warnings, *(found.warnings if found is not None else ()))}
+    return {
+        warning.code for warning in (*fit.warnings, *(found.warnings if found is not None else ()))
+    }
 
 
 def row(
@@ -164,7 +186,17 @@ def row(
         width += (100 * np.ptp(limits, axis=1) / np.abs(truth))[there].tolist()
     share = lambda values: 100 * float(np.mean(values)) if values else float("nan")  # noqa: E731
     middle = float(np.median(width)) if width else float("nan")
-    return Row(system, noise, sees or "none", draws, share(held), share(silent), middle, share(shown), share(warned))
+    return Row(
+        system,
+        noise,
+        sees or "none",
+        draws,
+        share(held),
+        share(silent),
+        middle,
+        share(shown),
+        share(warned),
+    )
 
 
 def lagged_rows(draws: int = 40) -> Iterator[Row]:
@@ -183,7 +215,9 @@ def lagged_rows(draws: int = 40) -> Iterator[Row]:
         ("friction", "uneven", {"friction": 0.15}, SEES),
     ]
     for system, noise, options, sees in cases:
-        yield row(system, noise, sees, THETA, partial(lagged_record, noise, **options), lagged_fit, draws)
+        yield row(
+            system, noise, sees, THETA, partial(lagged_record, noise, **options), lagged_fit, draws
+        )
 
 
 def motion_rows(draws: int = 10) -> Iterator[Row]:
@@ -201,7 +235,15 @@ def motion_rows(draws: int = 10) -> Iterator[Row]:
     ]
     for system, noise, options, sees, segment in cases:
         fit = partial(motion_fit, segment=segment)
-        yield row(f"motion, {system}", noise, sees, MCK, partial(motion_record, noise, **options), fit, draws)
+        yield row(
+            f"motion, {system}",
+            noise,
+            sees,
+            MCK,
+            partial(motion_record, noise, **options),
+            fit,
+            draws,
+        )
 
 
 def rows(lagged: int = 40, motions: int = 10) -> list[Row]:
@@ -211,11 +253,20 @@ def rows(lagged: int = 40, motions: int = 10) -> list[Row]:
 
 def nonlinear_level(draws: int = 200) -> list[tuple[str, float]]:
     """How often something nonlinear is said to be missing where nothing is, in percent, at the level of 5 %."""
-    cases = [("white", 1), ("heavy", 1), ("uneven", 1), ("AR(0.9)", 1), ("white", 10), ("AR(0.9)", 10)]
+    cases = [
+        ("white", 1),
+        ("heavy", 1),
+        ("uneven", 1),
+        ("AR(0.9)", 1),
+        ("white", 10),
+        ("AR(0.9)", 10),
+    ]
     found = []
     for noise, hold in cases:
         tests = (
-            nonlinearity(pose(lagged_record(noise, seed, hold=hold), LAGGED), ["y[k-1]", "y[k-2]", "u[k-1]"])
+            nonlinearity(
+                pose(lagged_record(noise, seed, hold=hold), LAGGED), ["y[k-1]", "y[k-2]", "u[k-1]"]
+            )
             for seed in range(draws)
         )
         level = 100 * float(np.mean([test.found for test in tests if test is not None]))
@@ -223,31 +274,44 @@ def nonlinear_level(draws: int = 200) -> list[tuple[str, float]]:
     return found
 
 
-def selected_level(draws: int = 20) -> list[tuple[str, float]]:
-    """The same inside `select`, which chooses the orders first."""
+def selected_level(draws: int = 100) -> list[tuple[str, float]]:
+    """Return the same inside `select`, which chooses the orders first, on half of the rows."""
     found = []
-    for noise, hold in (("white", 1), ("AR(0.9)", 10)):
-        tests = [
-            oa.select(lagged_record(noise, seed, hold=hold), LAGGED, learner=None).nonlinearity for seed in range(draws)
-        ]
-        found.append(
-            (
-                f"{noise}, input held for {hold}",
-                100 * float(np.mean([test.found for test in tests if test is not None])),
-            )
+    for noise, hold in (("white", 1), ("white", 10), ("AR(0.9)", 1), ("AR(0.9)", 10)):
+        tests = (
+            oa.select(lagged_record(noise, seed, hold=hold), LAGGED, learner=None).nonlinearity
+            for seed in range(draws)
         )
+        level = 100 * float(np.mean([test is not None and test.found for test in tests]))
+        found.append((f"{noise}, input held for {hold}", level))
     return found
+
+
+def selected_table(draws: int = 100) -> list[float]:
+    """Return the rates of `selected_level`."""
+    return [level for _, level in selected_level(draws)]
 
 
 def main(lagged: int = 40, motions: int = 10) -> None:
     print(describe())
-    print("\n| system | noise | learner sees | draws | held | silent misses | median width | shown | warned |")
+    print(
+        "\n| system | noise | learner sees | draws | held | silent misses | median width | "
+        "shown | warned |"
+    )
     print(9 * "|---" + "|")
     began = time.perf_counter()
     for one in chain(lagged_rows(lagged), motion_rows(motions)):
-        shares = f"{one.held:.0f} % | {one.silent:.1f} % | {one.width:.2g} % | {one.shown:.0f} % | {one.warned:.0f} %"
-        print(f"| {one.system} | {one.noise} | {one.learner} | {one.draws} | {shares} |", flush=True)
-    print(f"\n{time.perf_counter() - began:.0f} s. Nonlinearity test, rejections at 5 % where nothing is missing:")
+        shares = (
+            f"{one.held:.0f} % | {one.silent:.1f} % | {one.width:.2g} % | {one.shown:.0f} % | "
+            f"{one.warned:.0f} %"
+        )
+        print(
+            f"| {one.system} | {one.noise} | {one.learner} | {one.draws} | {shares} |", flush=True
+        )
+    print(
+        f"\n{time.perf_counter() - began:.0f} s. Nonlinearity test, rejections at 5 % where "
+        "nothing is missing:"
+    )
     for name, level in nonlinear_level():
         print(f"{name}: {level:.1f} %", flush=True)
     for name, level in selected_level():

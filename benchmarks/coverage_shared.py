@@ -39,7 +39,10 @@ class Row(NamedTuple):
 def _speed(rng: np.random.Generator) -> np.ndarray:
     """A speed that passes through zero often: a sum of sines (ROWS,)."""
     t = STEP * np.arange(ROWS)
-    waves = [rng.uniform(0.3, 1) * np.sin(2 * np.pi * rng.uniform(0.2, 3) * t + rng.uniform(0, 6.28)) for _ in range(6)]
+    waves = [
+        rng.uniform(0.3, 1) * np.sin(2 * np.pi * rng.uniform(0.2, 3) * t + rng.uniform(0, 6.28))
+        for _ in range(6)
+    ]
     return np.sum(waves, axis=0)
 
 
@@ -53,7 +56,9 @@ COLUMNS: dict[str, Callable[[np.ndarray, np.ndarray, np.random.Generator], np.nd
     "speed times its size": lambda v, p, rng: v * np.abs(v),
     "sign of a noisy speed": _noisy_sign,
     "speed 20 samples ago": lambda v, p, rng: np.roll(v, 20),
-    "low-pass of the speed": lambda v, p, rng: np.asarray(scipy.signal.lfilter([0.05], [1, -0.95], v)),
+    "low-pass of the speed": lambda v, p, rng: np.asarray(
+        scipy.signal.lfilter([0.05], [1, -0.95], v)
+    ),
     "independent noise": lambda v, p, rng: rng.normal(size=len(v)),
     "independent steps": lambda v, p, rng: np.repeat(rng.normal(size=len(v) // 20), 20),
 }
@@ -65,11 +70,20 @@ def lagged(column: str, noise: float, seed: int) -> tuple[float, tuple[float, fl
     v = _speed(rng)
     p, a = np.cumsum(v) * STEP, np.gradient(v, STEP)
     extra = COLUMNS[column](v, p, rng)
-    force = 2.0 * v + TRUTH * extra + 0.8 * a + 0.3 + 0.4 * np.sin(3 * p) + 0.3 * np.exp(-np.abs(v) / 0.1) * np.sign(v)
+    force = (
+        2.0 * v
+        + TRUTH * extra
+        + 0.8 * a
+        + 0.3
+        + 0.4 * np.sin(3 * p)
+        + 0.3 * np.exp(-np.abs(v) / 0.1) * np.sign(v)
+    )
     force = force + noise * np.std(force) * rng.normal(size=ROWS)
     names = ["speed", "place", "acceleration", "extra"]
     signals = np.column_stack([v, p, a, extra])
-    record = oa.Record.from_arrays(signals, force, sampling_time=STEP, inputs=names, outputs=["force"])
+    record = oa.Record.from_arrays(
+        signals, force, sampling_time=STEP, inputs=names, outputs=["force"]
+    )
     terms = [("c", "speed[k]"), ("e", "extra[k]"), ("m", "acceleration[k]"), ("offset", "1")]
     baseline = oa.Baseline.from_terms([oa.Term(*term) for term in terms])
     inputs = ("speed[k]", "place[k]")
@@ -80,8 +94,16 @@ def lagged(column: str, noise: float, seed: int) -> tuple[float, tuple[float, fl
 def motion(column: str, noise: float, seed: int) -> tuple[float, tuple[float, float], bool]:
     """A mass with friction of its speed, beside a column that acts on it."""
     rng = np.random.default_rng(seed)
-    drive, x, v = np.repeat(rng.normal(size=ROWS // 10 + 1), 10)[:ROWS] * 6, np.zeros(ROWS), np.zeros(ROWS)
-    extra = COLUMNS[column](np.zeros(ROWS), np.zeros(ROWS), rng) if column.startswith("independent") else np.zeros(ROWS)
+    drive, x, v = (
+        np.repeat(rng.normal(size=ROWS // 10 + 1), 10)[:ROWS] * 6,
+        np.zeros(ROWS),
+        np.zeros(ROWS),
+    )
+    extra = (
+        COLUMNS[column](np.zeros(ROWS), np.zeros(ROWS), rng)
+        if column.startswith("independent")
+        else np.zeros(ROWS)
+    )
     for k in range(ROWS - 1):
         if column == "sign of the speed":
             extra[k] = np.sign(v[k])
@@ -100,18 +122,26 @@ def motion(column: str, noise: float, seed: int) -> tuple[float, tuple[float, fl
     physics = oa.Motion.from_equations(
         states=[
             oa.State("x", "v", start="place"),
-            oa.State("v", "(drive - c*v - k*x - e*extra)/m", start="derivative of place", learned=True),
+            oa.State(
+                "v", "(drive - c*v - k*x - e*extra)/m", start="derivative of place", learned=True
+            ),
         ],
         outputs=[oa.Output("place", "x")],
-        parameters=[oa.PhysicalParameter(n, s) for n, s in (("m", 1.2), ("c", 2.0), ("k", 7.0), ("e", 1.0))],
+        parameters=[
+            oa.PhysicalParameter(n, s) for n, s in (("m", 1.2), ("c", 2.0), ("k", 7.0), ("e", 1.0))
+        ],
         inputs=names,
     )
     fit = oa.estimate(record, physics, learner=oa.MLP(hidden=(5,), inputs=("v",)), seed=seed)
     return _judged(fit, "e", fit.values[3], fit.interval, 3, fit.shared, ("v",))
 
 
-def _judged(fit: Any, name: str, value: float, interval: Any, i: int, shared: Any, inputs: Any) -> Any:
-    warned = any(re.search(rf"\b{name}\b", warning.text) for warning in shared_warnings(shared, inputs))
+def _judged(
+    fit: Any, name: str, value: float, interval: Any, i: int, shared: Any, inputs: Any
+) -> Any:
+    warned = any(
+        re.search(rf"\b{name}\b", warning.text) for warning in shared_warnings(shared, inputs)
+    )
     held = (np.nan, np.nan) if interval is None else tuple(np.asarray(interval)[i])
     return float(value), held, warned
 
@@ -149,10 +179,15 @@ def rows(draws: int = 10) -> list[Row]:
 
 def main() -> None:
     """Print the table."""
-    print("| system | noise | learner sees | draws | held | warned | silent misses | median width |")
+    print(
+        "| system | noise | learner sees | draws | held | warned | silent misses | median width |"
+    )
     print("|---|---|---|---|---|---|---|---|")
     for row in rows(int(sys.argv[1]) if len(sys.argv) > 1 else 10):
-        print("| " + " | ".join(f"{v:.3g}" if isinstance(v, float) else str(v) for v in row) + " |", flush=True)
+        print(
+            "| " + " | ".join(f"{v:.3g}" if isinstance(v, float) else str(v) for v in row) + " |",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

@@ -25,7 +25,12 @@ from collection import Problem
 
 SECONDS = 300.0
 COLUMNS = ("physics", "physics-free", "one-step", "simulation", "default", "free", "fade", "hold")
-_SINGLE = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "JAX_PLATFORMS": "cpu"}
+_SINGLE = {
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "JAX_PLATFORMS": "cpu",
+}
 
 Result = dict[str, Any]
 """error (mean test NRMSE, null where a run diverged), diverged, failed, refused, code, seconds, cpu, status, …"""
@@ -35,18 +40,24 @@ Result = dict[str, Any]
 def program() -> str:
     """Version and state of the program under test: the tree of its source, and what was changed since."""
     code = "import orthaug; print(orthaug.__version__, orthaug.__file__)"
-    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    answer = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
     version, file = answer.stdout.split(maxsplit=1)
     source = Path(file.strip()).parent
 
     def git(*arguments: str) -> str:
-        done = subprocess.run(["git", "-C", str(source), *arguments], capture_output=True, text=True, check=False)
+        done = subprocess.run(
+            ["git", "-C", str(source), *arguments], capture_output=True, text=True, check=False
+        )
         return done.stdout.strip()
 
     if not git("rev-parse", "HEAD"):
         return version
     changed = git("diff", "HEAD", "--", ".") + git("status", "--porcelain", "--", ".")
-    return f"{version} {git('rev-parse', 'HEAD:./')[:12]}" + (f"+{_sha(changed)}" if changed else "")
+    return f"{version} {git('rev-parse', 'HEAD:./')[:12]}" + (
+        f"+{_sha(changed)}" if changed else ""
+    )
 
 
 def _sha(text: str | bytes) -> str:
@@ -144,7 +155,9 @@ def spec_text(problem: Problem, folder: Path, store: Store, data: str) -> str:
         options += ["--sampling-time", repr(problem.sampling_time), "--out", "init.toml"]
         code, *_, messages = command(["init", "train0.csv", *options], folder)
         if code:
-            raise RuntimeError(f"orthaug init of {problem.name} ended with {code}: {messages[-500:]}")
+            raise RuntimeError(
+                f"orthaug init of {problem.name} ended with {code}: {messages[-500:]}"
+            )
         text = (folder / "init.toml").read_text(encoding="utf-8")
         store.put(key, text)
     return _with_data(tomlkit.parse(text), problem)
@@ -160,7 +173,12 @@ def _with_data(document: tomlkit.TOMLDocument, problem: Problem) -> str:
 
 
 def run(
-    problem: Problem, columns: tuple[str, ...], store: Store, again: bool, warm: bool, say: Callable[[str], None]
+    problem: Problem,
+    columns: tuple[str, ...],
+    store: Store,
+    again: bool,
+    warm: bool,
+    say: Callable[[str], None],
 ) -> None:
     """Fit a problem in each column that is not in the store yet; `warm` fits twice, and times the second.
 
@@ -182,19 +200,35 @@ def run(
                 if warm and not result.get("failed") and not result.get("refused"):
                     result = fit(problem, spec, folder)
                 store.put(key, result | {"spec": spec, "warm": warm, "when": time.time()})
-                say(f"{problem.name:36} {column:13} {shown(result):>8} {result['seconds']:6.1f} s  {result['note']}")
+                say(
+                    f"{problem.name:36} {column:13} {shown(result):>8} "
+                    f"{result['seconds']:6.1f} s  {result['note']}"
+                )
 
 
 def fit(problem: Problem, spec: str, folder: Path) -> Result:
     """Fit a spec and read what came of it."""
     (folder / "spec.toml").write_text(spec, encoding="utf-8")
-    code, seconds, cpu, messages = command(["fit", "spec.toml", "--out", "result", "--force"], folder)
-    result: Result = {"code": code, "seconds": seconds, "cpu": cpu, "error": None, "diverged": False, "note": ""}
+    code, seconds, cpu, messages = command(
+        ["fit", "spec.toml", "--out", "result", "--force"], folder
+    )
+    result: Result = {
+        "code": code,
+        "seconds": seconds,
+        "cpu": cpu,
+        "error": None,
+        "diverged": False,
+        "note": "",
+    }
     file = folder / "result" / "result.json"
     if code == 124 or not file.is_file():
         refused = "unknown key 'learner.beyond'" in messages
         last = " ".join(messages.split())[-200:]
-        return result | {"note": f"exit code {code}: {last}", "failed": not refused, "refused": refused}
+        return result | {
+            "note": f"exit code {code}: {last}",
+            "failed": not refused,
+            "refused": refused,
+        }
     read = json.loads(file.read_text(encoding="utf-8"))
     for path in (folder / "result").rglob("*"):
         if path.is_file():
@@ -205,7 +239,9 @@ def fit(problem: Problem, spec: str, folder: Path) -> Result:
     result["error"] = None if result["diverged"] else sum(tests) / len(tests)
     result["train"], result["tests"] = scores.get("train"), tests
     result["status"] = read.get("status")
-    result["validation"] = {k: (read.get("validation") or {}).get(k) for k in ("verdict", "text", "ratio")}
+    result["validation"] = {
+        k: (read.get("validation") or {}).get(k) for k in ("verdict", "text", "ratio")
+    }
     result["warnings"] = [one["code"] for one in read.get("warnings", [])]
     result["criterion"] = read.get("criterion", read.get("focus"))
     result["parameters"] = {one["name"]: one["value"] for one in read.get("parameters", [])}

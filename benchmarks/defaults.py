@@ -72,9 +72,14 @@ def _ratio(upper: float | None, lower: float | None) -> float | None:
     return None if upper is None or lower is None else upper / lower
 
 
-def regrets(results: Results, columns: tuple[str, ...], column: str = "default") -> dict[str, float]:
+def regrets(
+    results: Results, columns: tuple[str, ...], column: str = "default"
+) -> dict[str, float]:
     """log(default / best of some columns) of each problem that has both."""
-    ratios = {name: _ratio(default_error(one, column), error_of(one, columns)) for name, one in results.items()}
+    ratios = {
+        name: _ratio(default_error(one, column), error_of(one, columns))
+        for name, one in results.items()
+    }
     return {name: log(ratio) for name, ratio in ratios.items() if ratio is not None}
 
 
@@ -88,34 +93,63 @@ def table(results: Results) -> list[str]:
         physics, best = error_of(one, PHYSICS), error_of(one, COLUMNS)
         ratio = _ratio(default_error(one), physics)
         which = next((c for c in COLUMNS if c in one and default_error(one, c) == best), "")
-        cells = [_number(physics), shown(one.get("default")), _number(best), which, _number(ratio, ".2f")]
-        lines.append("| " + " | ".join([name, *cells, *(shown(one.get(c)) for c in COLUMNS)]) + " |")
+        cells = [
+            _number(physics),
+            shown(one.get("default")),
+            _number(best),
+            which,
+            _number(ratio, ".2f"),
+        ]
+        lines.append(
+            "| " + " | ".join([name, *cells, *(shown(one.get(c)) for c in COLUMNS)]) + " |"
+        )
     return lines
 
 
 def summary(results: Results) -> list[str]:
     """A row per column: how many diverge, and its regret, over all problems that it was run on."""
-    heads = ["column", "problems", "diverge or fail", f"above {WORSE} × physics", "mean log-regret", "largest"]
-    lines = ["| " + " | ".join([*heads, "mean ratio to physics"]) + " |", (len(heads) + 1) * "|---" + "|"]
+    heads = [
+        "column",
+        "problems",
+        "diverge or fail",
+        f"above {WORSE} × physics",
+        "mean log-regret",
+        "largest",
+    ]
+    lines = [
+        "| " + " | ".join([*heads, "mean ratio to physics"]) + " |",
+        (len(heads) + 1) * "|---" + "|",
+    ]
     for column in COLUMNS:
         ran = {name: one for name, one in results.items() if column in one}
         if not ran:
             continue
         lost = sum(default_error(one, column) == CAP for one in ran.values())
         found = regrets(ran, (*PHYSICS, *LEARNERS), column)
-        ratios = [r for one in ran.values() if (r := _ratio(default_error(one, column), error_of(one, PHYSICS)))]
-        worse, mean = sum(ratio > WORSE for ratio in ratios), np.mean(list(found.values())) if found else np.nan
+        ratios = [
+            r
+            for one in ran.values()
+            if (r := _ratio(default_error(one, column), error_of(one, PHYSICS)))
+        ]
+        worse, mean = (
+            sum(ratio > WORSE for ratio in ratios),
+            np.mean(list(found.values())) if found else np.nan,
+        )
         largest = max(found, key=lambda name: found[name], default="")
         at = f"{found[largest]:.2f} ({largest})" if largest else ""
         geometric = exp(np.mean(np.log(ratios))) if ratios else np.nan
-        lines.append(f"| {column} | {len(ran)} | {lost} | {worse} | {mean:.3f} | {at} | {geometric:.3f} |")
+        lines.append(
+            f"| {column} | {len(ran)} | {lost} | {worse} | {mean:.3f} | {at} | {geometric:.3f} |"
+        )
     return lines
 
 
 def checks(results: Results, groups: dict[str, str]) -> list[tuple[bool | None, str]]:
     """What the collection demands, each with the figure; None where the runs that it needs are not there."""
     measured = {name: one for name, one in results.items() if groups[name] == MEASURED}
-    ratios = {name: _ratio(default_error(one), error_of(one, PHYSICS)) for name, one in measured.items()}
+    ratios = {
+        name: _ratio(default_error(one), error_of(one, PHYSICS)) for name, one in measured.items()
+    }
     known = {name: ratio for name, ratio in ratios.items() if ratio is not None}
     above = [f"{name} {ratio:.3g}" for name, ratio in known.items() if ratio > WORSE]
     lost = [name for name, one in results.items() if default_error(one) == CAP]
@@ -123,18 +157,24 @@ def checks(results: Results, groups: dict[str, str]) -> list[tuple[bool | None, 
     strict = regrets(results, COLUMNS)
     mean = float(np.mean(list(found.values()))) if found else np.nan
     strictly = float(np.mean(list(strict.values()))) if strict else np.nan
-    worst = ", ".join(f"{name} {found[name]:.2f}" for name in sorted(found, key=lambda n: -found[n])[:5])
+    worst = ", ".join(
+        f"{name} {found[name]:.2f}" for name in sorted(found, key=lambda n: -found[n])[:5]
+    )
     done = sum("default" in one for one in results.values())
     return [
         (
             None if not known else not above,
-            f"defaults above {WORSE} × physics alone, of {len(known)} measured: {len(above)} ({', '.join(above)})",
+            f"defaults above {WORSE} × physics alone, of {len(known)} measured: {len(above)} "
+            f"({', '.join(above)})",
         ),
-        (None if not done else not lost, f"defaults that diverge or fail, of {done}: {len(lost)} ({', '.join(lost)})"),
+        (
+            None if not done else not lost,
+            f"defaults that diverge or fail, of {done}: {len(lost)} ({', '.join(lost)})",
+        ),
         (
             mean <= REGRET if isfinite(mean) else None,
-            f"mean log-regret over {len(found)}: {mean:.3f}, allowed {REGRET}; against the best of all columns "
-            f"{strictly:.3f}; largest: {worst}",
+            f"mean log-regret over {len(found)}: {mean:.3f}, allowed {REGRET}; against the "
+            f"best of all columns {strictly:.3f}; largest: {worst}",
         ),
         _axis_check(results),
         *_time_checks(results),
@@ -151,7 +191,10 @@ def _axis_check(results: Results) -> tuple[bool | None, str]:
     if error is None:
         return None, "the axis was not run"
     ratio = error / _grey()
-    return ratio <= GREY, f"axis, default over SciPy's grey box: {ratio:.3f} (NRMSE {error:.4f} over {_grey():.4f})"
+    return (
+        ratio <= GREY,
+        f"axis, default over SciPy's grey box: {ratio:.3f} (NRMSE {error:.4f} over {_grey():.4f})",
+    )
 
 
 def went_up(result: Result) -> bool | None:
@@ -167,11 +210,18 @@ def _time_checks(results: Results) -> list[tuple[bool | None, str]]:
         if all(one.get(column, {}).get("warm") for column in ("default", "one-step")):
             found[went_up(one["default"])].append(one["default"]["cpu"] / one["one-step"]["cpu"])
     lines: list[tuple[bool | None, str]] = []
-    for up, what in ((True, "where the free run was trained"), (False, "where it was not"), (None, "unknown which")):
+    for up, what in (
+        (True, "where the free run was trained"),
+        (False, "where it was not"),
+        (None, "unknown which"),
+    ):
         if ratios := found[up]:
             limit = {True: UP, False: STAYED, None: np.inf}[up]
             middle, largest = float(np.median(ratios)), max(ratios)
-            text = f"time over one step, {what} ({len(ratios)}): median {middle:.2f}, largest {largest:.2f}"
+            text = (
+                f"time over one step, {what} ({len(ratios)}): median {middle:.2f}, largest "
+                f"{largest:.2f}"
+            )
             lines.append((None if up is None else middle <= limit, text))
     return lines or [(None, "time over one step: run columns default and one-step with --warm")]
 
@@ -184,7 +234,9 @@ def report(results: Results, groups: dict[str, str]) -> str:
     """The tables and checks as Markdown."""
     marks = {True: "PASS", False: "FAIL", None: "open"}
     lines = [f"{describe()}; orthaug {program()}", "", *table(results), "", *summary(results), ""]
-    return "\n".join([*lines, *(f"- {marks[held]}: {text}" for held, text in checks(results, groups))])
+    return "\n".join(
+        [*lines, *(f"- {marks[held]}: {text}" for held, text in checks(results, groups))]
+    )
 
 
 def main() -> None:
@@ -192,15 +244,23 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", help="names of problems, groups, or parts of names")
     parser.add_argument("--columns", default=",".join(COLUMNS), help=f"of {', '.join(COLUMNS)}")
     parser.add_argument("--jobs", type=int, default=1, help="fits at a time")
-    parser.add_argument("--out", type=Path, default=ROOT / "build" / "defaults.json", help="where results are kept")
+    parser.add_argument(
+        "--out", type=Path, default=ROOT / "build" / "defaults.json", help="where results are kept"
+    )
     parser.add_argument("--again", action="store_true", help="run what is in the store already")
-    parser.add_argument("--warm", action="store_true", help="fit twice and time the second, for the checks of time")
+    parser.add_argument(
+        "--warm", action="store_true", help="fit twice and time the second, for the checks of time"
+    )
     parser.add_argument("--table", action="store_true", help="run nothing, print the tables")
-    parser.add_argument("--fill", action="store_true", help="take columns that were not run from other programs")
+    parser.add_argument(
+        "--fill", action="store_true", help="take columns that were not run from other programs"
+    )
     given = parser.parse_args()
     columns = tuple(given.columns.split(","))
     if unknown := set(columns) - set(COLUMNS):
-        parser.error(f"there is no column {', '.join(sorted(unknown))}; columns are {', '.join(COLUMNS)}")
+        parser.error(
+            f"there is no column {', '.join(sorted(unknown))}; columns are {', '.join(COLUMNS)}"
+        )
     chosen = {
         name: one
         for name, one in problems().items()
@@ -210,16 +270,23 @@ def main() -> None:
         parser.error("--only names no problem of the collection")
     store = Store(given.out)
     if not given.table:
-        print(f"orthaug {program()}: {len(chosen)} problems, columns {', '.join(columns)}", flush=True)
+        print(
+            f"orthaug {program()}: {len(chosen)} problems, columns {', '.join(columns)}", flush=True
+        )
         with ThreadPoolExecutor(given.jobs) as pool:
-            futures = [pool.submit(_run, make, columns, store, given.again, given.warm) for _, make in chosen.values()]
+            futures = [
+                pool.submit(_run, make, columns, store, given.again, given.warm)
+                for _, make in chosen.values()
+            ]
             for future in futures:
                 future.result()
     groups = {name: group for name, (group, _) in chosen.items()}
     print(report(latest(store, list(chosen), given.fill), groups))
 
 
-def _run(make: Callable[[], Problem], columns: tuple[str, ...], store: Store, again: bool, warm: bool) -> None:
+def _run(
+    make: Callable[[], Problem], columns: tuple[str, ...], store: Store, again: bool, warm: bool
+) -> None:
     try:
         run(make(), columns, store, again, warm, partial(print, flush=True))
     except RuntimeError as error:  # no spec, so no fit: the others go on

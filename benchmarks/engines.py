@@ -33,7 +33,9 @@ from orthaug.physics.streamed import StreamedProblem, pose_streamed
 
 ROUNDS = 5
 GROUP, BLOCK = 250_000, 1_000_000
-BASELINE = oa.Baseline.from_terms([oa.Term("a", "y[k-1]"), oa.Term("b", "y[k-2]"), oa.Term("c", "u[k-1]")])
+BASELINE = oa.Baseline.from_terms(
+    [oa.Term("a", "y[k-1]"), oa.Term("b", "y[k-2]"), oa.Term("c", "u[k-1]")]
+)
 LAGS, LEARNER = oa.Lags(na=3, nb=3, nk=1), oa.MLP(hidden=(10,))  # 6 regressors, 81 weights
 
 SPEC = """
@@ -83,7 +85,9 @@ def written(path: Path, rows: int) -> Path:
 
 
 def opened(path: Path, partition_rows: int = BLOCK) -> Any:
-    return oa.open_parquet([path], inputs=["u"], outputs=["y"], sampling_time=0.1, partition_rows=partition_rows)
+    return oa.open_parquet(
+        [path], inputs=["u"], outputs=["y"], sampling_time=0.1, partition_rows=partition_rows
+    )
 
 
 def posed(source: Any, engine: Any) -> StreamedProblem:
@@ -130,9 +134,13 @@ def against_rows(folder: Path, most: int) -> dict[str, Any]:
         path = written(folder / f"{rows}.parquet", rows)
         rounds = ROUNDS if rows <= 1_000_000 else 2
         problem = posed(opened(path), Stream())
-        told["stream"].append(fastest(a_pass(OneStepTask.of(problem, LEARNER, engine=Stream())), rounds))
+        told["stream"].append(
+            fastest(a_pass(OneStepTask.of(problem, LEARNER, engine=Stream())), rounds)
+        )
         if rows <= 5_000_000:
-            told["memory"].append(fastest(a_pass(OneStepTask.of(problem, LEARNER, engine=InMemory())), rounds))
+            told["memory"].append(
+                fastest(a_pass(OneStepTask.of(problem, LEARNER, engine=InMemory())), rounds)
+            )
         if rows < most and rows != 1_000_000:
             path.unlink()
     for name, seconds in told.items():
@@ -147,7 +155,10 @@ def stream_over_memory(folder: Path) -> float:
     problem = posed(opened(path), Stream())
     streamed = a_pass(OneStepTask.of(problem, LEARNER, engine=Stream()))
     in_memory = a_pass(OneStepTask.of(problem, LEARNER, engine=InMemory()))
-    ratios = [fastest(streamed, 2) / (fastest(lambda: read_whole(path), 2) + fastest(in_memory, 2)) for _ in range(3)]
+    ratios = [
+        fastest(streamed, 2) / (fastest(lambda: read_whole(path), 2) + fastest(in_memory, 2))
+        for _ in range(3)
+    ]
     print(f"a streamed pass over reading the file and a pass in memory: {np.median(ratios):.2f}")
     return float(np.median(ratios))
 
@@ -159,15 +170,26 @@ def stream_memory(folder: Path, rows: int) -> float:
     path.rename(folder / "rows.parquet")
     (folder / "spec.toml").write_text(SPEC.format(), encoding="utf-8")
     code = (
-        "import sys; from orthaug.commands.cli import main\n"
-        "try: main()\nexcept SystemExit: pass\n"
-        "print([line for line in open('/proc/self/status') if line.startswith('VmHWM')][0].split()[1])"
+        "import sys; from orthaug.commands.cli import main\ntry: main()\nexcept SystemExit: "
+        "pass\nprint([line for line in open('/proc/self/status') if "
+        "line.startswith('VmHWM')][0].split()[1])"
     )
-    command = [sys.executable, "-c", code, "fit", str(folder / "spec.toml"), "--out", str(folder / f"out{rows}")]
+    command = [
+        sys.executable,
+        "-c",
+        code,
+        "fit",
+        str(folder / "spec.toml"),
+        "--out",
+        str(folder / f"out{rows}"),
+    ]
     begin = time.perf_counter()
     ran = subprocess.run(command, capture_output=True, text=True, check=True)
     peak = int(ran.stdout.split()[-1]) / 1e3
-    print(f"orthaug fit of {rows:.0e} rows, streamed, 3 iterations: {time.perf_counter() - begin:.0f} s, {peak:.0f} MB")
+    print(
+        f"orthaug fit of {rows:.0e} rows, streamed, 3 iterations: "
+        f"{time.perf_counter() - begin:.0f} s, {peak:.0f} MB"
+    )
     return peak
 
 
@@ -186,7 +208,9 @@ def on_a_cluster(folder: Path) -> dict[str, float]:
                 told["two workers over memory"] = fastest(on_workers) / in_memory
                 record = witness(source, 2000)
                 small = posed(RecordSource(record, 3, 1000), engine)
-                told["overhead [ms]"] = 1e3 * fastest(a_pass(OneStepTask.of(small, LEARNER, engine=engine)), 20)
+                told["overhead [ms]"] = 1e3 * fastest(
+                    a_pass(OneStepTask.of(small, LEARNER, engine=engine)), 20
+                )
             else:
                 told["one worker over one thread"] = fastest(on_workers) / single_threaded(folder)
         finally:
@@ -209,7 +233,10 @@ print(e.fastest(e.a_pass(e.OneStepTask.of(problem, e.LEARNER, engine=e.InMemory(
 def single_threaded(folder: Path) -> float:
     """Seconds of a pass in memory on one thread."""
     script = THREAD.format(here=str(Path(__file__).parent), path=str(folder / "1000000.parquet"))
-    one = {"XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1", "OMP_NUM_THREADS": "1"}
+    one = {
+        "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1",
+        "OMP_NUM_THREADS": "1",
+    }
     command = ["taskset", "-c", "0", sys.executable, "-c", script]
     run = subprocess.run(command, capture_output=True, text=True, check=True, env=os.environ | one)
     return float(run.stdout.split()[-1])
@@ -231,12 +258,16 @@ class Costs(NamedTuple):
 def costs(folder: Path) -> Costs:
     """Measured here, but for a network of 1 GB/s with 1 ms: workers of one machine have none."""
     row = single_threaded(folder) / 1e6
-    part = np.random.default_rng(0).normal(size=(85, 85))  # 81 weights, the residual and 3 parameters
+    part = np.random.default_rng(0).normal(
+        size=(85, 85)
+    )  # 81 weights, the residual and 3 parameters
     add = fastest(lambda: [part + part for _ in range(1000)], 3) / 1000
     client = connected(None, 2)
     try:
         numbers = range(2000)
-        task = fastest(lambda: client.gather(client.map(abs, numbers, pure=False)), 3) / len(numbers)
+        task = fastest(lambda: client.gather(client.map(abs, numbers, pure=False)), 3) / len(
+            numbers
+        )
     finally:
         client.close()
         client.cluster.close()
@@ -248,10 +279,14 @@ def planned(cost: Costs, rows: float, workers: int, partition: float) -> float:
     partitions = int(np.ceil(rows / partition))
     each = np.ceil(partitions / workers) * partition * cost.row
     levels = int(np.ceil(np.log(max(partitions, 2)) / np.log(8)))
-    return max(each, 9 / 8 * partitions * cost.task) + levels * (cost.task + 8 * (cost.send + cost.add))
+    return max(each, 9 / 8 * partitions * cost.task) + levels * (
+        cost.task + 8 * (cost.send + cost.add)
+    )
 
 
-def simulated(cost: Costs, rows: float, workers: int, partition: float, spread: float = 0.05) -> float:
+def simulated(
+    cost: Costs, rows: float, workers: int, partition: float, spread: float = 0.05
+) -> float:
     """The same by events: tasks are given out one after another, workers differ, a sum waits for all its parts."""
     rng, partitions = np.random.default_rng(0), int(np.ceil(rows / partition))
     free, scheduler = np.zeros(workers), 0.0
@@ -275,13 +310,19 @@ def simulated(cost: Costs, rows: float, workers: int, partition: float, spread: 
     return float(done[0])
 
 
-def a_plan(cost: Costs, rows: float = 1e10, partition: float = 5e6) -> list[tuple[int, float, float]]:
+def a_plan(
+    cost: Costs, rows: float = 1e10, partition: float = 5e6
+) -> list[tuple[int, float, float]]:
     """Seconds of an iteration of 10¹⁰ rows by workers: on paper, and simulated."""
-    table = [(w, *(f(cost, rows, w, partition) for f in (planned, simulated))) for w in (1, 4, 16, 64, 256, 1024)]
+    table = [
+        (w, *(f(cost, rows, w, partition) for f in (planned, simulated)))
+        for w in (1, 4, 16, 64, 256, 1024)
+    ]
     print(f"costs: {cost}")
     for workers, paper, events in table:
         print(
-            f"{workers} workers: {paper:.4g} s on paper, {events:.4g} s simulated, {table[0][2] / events:.3g} times one"
+            f"{workers} workers: {paper:.4g} s on paper, {events:.4g} s simulated, "
+            f"{table[0][2] / events:.3g} times one"
         )
     return table
 

@@ -75,7 +75,13 @@ def by_hand(model: Model) -> str:
     assert bound is not None
     w1, b1, w2, b2 = (np.asarray(leaf) for leaf in bound.leaves(np.asarray(numbers.weights)))
     gain = float(numbers.gain[0])
-    tables = {"w1": w1.ravel(), "b1": b1, "w2": gain * w2.ravel(), "centre": numbers.centre, "half": numbers.halfwidth}
+    tables = {
+        "w1": w1.ravel(),
+        "b1": b1,
+        "w2": gain * w2.ravel(),
+        "centre": numbers.centre,
+        "half": numbers.halfwidth,
+    }
     tables |= {"theta": model.theta - model.theta_aux}
     text = "\n".join(
         f"static const double {name}[] = {{{', '.join(repr(float(v)) for v in values)}}};"
@@ -108,7 +114,11 @@ def run(*command: str, folder: Path) -> str:
 
 def main() -> None:
     print(describe())
-    print(subprocess.run(["gcc", "--version"], capture_output=True, text=True, check=True).stdout.splitlines()[0])
+    print(
+        subprocess.run(
+            ["gcc", "--version"], capture_output=True, text=True, check=True
+        ).stdout.splitlines()[0]
+    )
     model = paper_model()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name) / "c"
@@ -117,10 +127,15 @@ def main() -> None:
         (folder / "timer.c").write_text(TIMER)
         sizes = [f"-DSTEPS={STEPS}", f"-DROUNDS={ROUNDS}"]
         run(*OPTIONS, *sizes, "model.c", "hand.c", "timer.c", "-lm", "-o", "timer", folder=folder)
-        rounds = np.array([line.split() for line in run("./timer", folder=folder).splitlines()], dtype=float)
+        rounds = np.array(
+            [line.split() for line in run("./timer", folder=folder).splitlines()], dtype=float
+        )
         exported, hand = np.median(rounds[:, :2], axis=0)
         ratio = np.median(rounds[:, 0] / rounds[:, 1])
-        print(f"C, exported: {1e6 * exported:.3f} us a step; by hand {1e6 * hand:.3f} us; ratio {ratio:.2f}")
+        print(
+            f"C, exported: {1e6 * exported:.3f} us a step; by hand {1e6 * hand:.3f} us; ratio "
+            f"{ratio:.2f}"
+        )
         print(f"largest difference after a run: {np.abs(rounds[:, 2]).max():.1e}")
         for label, option in (
             ("double, -O2", []),
@@ -131,8 +146,20 @@ def main() -> None:
             text, data, bss = run("size", "model.o", folder=folder).splitlines()[1].split()[:3]
             stack = [line.split("\t") for line in (folder / "model.su").read_text().splitlines()]
             used = {place.rsplit(":", 1)[-1]: int(size) for place, size, _ in stack}
-            print(f"{label}: code and constants {text} bytes, data {data}, bss {bss}; stack by function {used}")
-        run(*OPTIONS, "-fsanitize=address,undefined", "model.c", "check.c", "-lm", "-o", "check", folder=folder)
+            print(
+                f"{label}: code and constants {text} bytes, data {data}, bss {bss}; stack by "
+                f"function {used}"
+            )
+        run(
+            *OPTIONS,
+            "-fsanitize=address,undefined",
+            "model.c",
+            "check.c",
+            "-lm",
+            "-o",
+            "check",
+            folder=folder,
+        )
         print(f"sanitizers: {run('./check', folder=folder).strip()}")
     numpy_step = oa.numpy_step(model)
     state, inputs = np.zeros(3), np.array([50.0])

@@ -28,7 +28,9 @@ def record(seed: int, pole: float, samples: int = SAMPLES) -> oa.Record:
     """One draw; the noise has the same deviation whatever its colour."""
     rng = np.random.default_rng([seed, 12])
     u = lfilter([1.0], [1.0, -0.8], rng.normal(size=samples + WARM_UP))
-    y = lfilter([0.0, THETA[2]], [1.0, -THETA[0], -THETA[1]], u) + THETA[3] / (1 - THETA[0] - THETA[1])
+    y = lfilter([0.0, THETA[2]], [1.0, -THETA[0], -THETA[1]], u) + THETA[3] / (
+        1 - THETA[0] - THETA[1]
+    )
     e = lfilter([np.sqrt(1 - pole**2)], [1.0, -pole], rng.normal(size=samples + WARM_UP))
     return oa.Record.from_arrays(u[WARM_UP:], (y + NOISE * e)[WARM_UP:])
 
@@ -39,7 +41,10 @@ def coverage(pole: float, segment: int, draws: int) -> tuple[np.ndarray, np.ndar
     criterion = oa.Simulation(segment, 40)
     for seed in range(draws):
         fit = oa.estimate(record(seed, pole), BASELINE, learner=None, criterion=criterion)
-        default += robust_where_asked(fit, fit.model.predict(fit.problem.record)).plain_covariance is not None
+        default += (
+            robust_where_asked(fit, fit.model.predict(fit.problem.record)).plain_covariance
+            is not None
+        )
         for i, found in enumerate((fit, fit.robust())):
             inside[i] += (found.interval[:, 0] <= THETA) & (found.interval[:, 1] >= THETA)
     return inside[0] / draws, inside[1] / draws, default / draws
@@ -51,7 +56,9 @@ def table(draws: int = 200) -> list[list[float]]:
     found = []
     for _, pole, segment in CASES:
         plain, robust, default = coverage(pole, segment, draws)
-        found.append([100 * v for v in (plain.min(), plain.mean(), robust.min(), robust.mean(), default)])
+        found.append(
+            [100 * v for v in (plain.min(), plain.mean(), robust.min(), robust.mean(), default)]
+        )
     return found
 
 
@@ -61,7 +68,10 @@ def main(draws: int) -> None:
     print("| noise | segments | plain, least | mean | robust, least | mean | robust by default |")
     print("|---|---|---|---|---|---|---|")
     for (noise, _, segment), row in zip(CASES, table(draws), strict=True):
-        print(f"| {noise} | {segment or 'whole'} | {' | '.join(f'{v:.1f} %' for v in row)} |", flush=True)
+        print(
+            f"| {noise} | {segment or 'whole'} | {' | '.join(f'{v:.1f} %' for v in row)} |",
+            flush=True,
+        )
     print(f"\n{draws} draws, {time.perf_counter() - began:.0f} s")
 
 

@@ -43,7 +43,12 @@ def _silverbox() -> FreeRunProblem:
     )
     baseline = _terms("V2[k-1]", "V2[k-2]", "V1[k]", "V1[k-1]", "V1[k-2]", "1")
     return FreeRunProblem(
-        "silverbox", train, held_out, baseline, Lags(2, 3, 0), MLP((10,), inputs=("V2[k-1]", "V2[k-2]"))
+        "silverbox",
+        train,
+        held_out,
+        baseline,
+        Lags(2, 3, 0),
+        MLP((10,), inputs=("V2[k-1]", "V2[k-2]")),
     )
 
 
@@ -62,12 +67,18 @@ def _tanks(first: str, second: str) -> Callable[[], FreeRunProblem]:
         file = data_folder() / "cascaded_tanks" / "dataBenchmark.csv"
         train, held_out = (
             read_record(
-                file, inputs=["u"], outputs=["y"], sampling_time=4.0, columns={"u": f"u{part}", "y": f"y{part}"}
+                file,
+                inputs=["u"],
+                outputs=["y"],
+                sampling_time=4.0,
+                columns={"u": f"u{part}", "y": f"y{part}"},
             )
             for part in (first, second)
         )
         baseline = _terms("y[k-1]", "y[k-2]", "u[k-1]", "sqrt(max(y[k-1], 0))", "1")
-        return FreeRunProblem(f"tanks, {first}", train, held_out, baseline, Lags(3, 3, 1), MLP((8,)))
+        return FreeRunProblem(
+            f"tanks, {first}", train, held_out, baseline, Lags(3, 3, 1), MLP((8,))
+        )
 
     return make
 
@@ -145,7 +156,10 @@ def _inverted_pendulum() -> FreeRunProblem:
     def derivative(x: Any, u: Any) -> Any:
         return np.array([x[1], u[0] - 0.2 * x[1] + 9.81 * np.sin(x[0])])
 
-    control = {"force": lambda r, n: _held(r, n, 8, 8.0), "feedback": lambda x, u: -25 * x[0] - 5 * x[1]}
+    control = {
+        "force": lambda r, n: _held(r, n, 8, 8.0),
+        "feedback": lambda x, u: -25 * x[0] - 5 * x[1],
+    }
     return _simulated("inverted pendulum", derivative, 0.02, **control)
 
 
@@ -160,7 +174,10 @@ def _double_integrator() -> FreeRunProblem:
 def _tank() -> FreeRunProblem:
     def derivative(x: Any, u: Any) -> Any:
         return np.array(
-            [u[0] - 0.6 * np.sqrt(max(x[0], 0.0)), 0.6 * np.sqrt(max(x[0], 0)) - 0.5 * np.sqrt(max(x[1], 0))]
+            [
+                u[0] - 0.6 * np.sqrt(max(x[0], 0.0)),
+                0.6 * np.sqrt(max(x[0], 0)) - 0.5 * np.sqrt(max(x[1], 0)),
+            ]
         )
 
     force = {"force": lambda r, n: 0.6 + np.abs(_held(r, n, 20, 0.6))}
@@ -171,7 +188,9 @@ def _saturation() -> FreeRunProblem:
     def derivative(x: Any, u: Any) -> Any:
         return np.array([x[1], 4 * np.tanh(u[0]) - 1.2 * x[1] - 9 * x[0]])
 
-    return _simulated("saturated input", derivative, 0.1, force=lambda r, n: _held(r, n, 4, 1.5), noise=0.05)
+    return _simulated(
+        "saturated input", derivative, 0.1, force=lambda r, n: _held(r, n, 4, 1.5), noise=0.05
+    )
 
 
 def _coupled() -> FreeRunProblem:
@@ -179,12 +198,16 @@ def _coupled() -> FreeRunProblem:
 
     def derivative(x: Any, u: Any) -> Any:
         spring = 15 * (x[0] - x[1]) + 60 * (x[0] - x[1]) ** 3
-        return np.array([x[2], x[3], u[0] - spring - 10 * x[0] - 0.6 * x[2], spring - 5 * x[1] - 0.6 * x[3]])
+        return np.array(
+            [x[2], x[3], u[0] - spring - 10 * x[0] - 0.6 * x[2], spring - 5 * x[1] - 0.6 * x[3]]
+        )
 
     names = [f"y{j}[k-{i}]" for j in (1, 2) for i in (1, 2)] + ["u[k-1]", "u[k-2]"]
     terms = [Term(f"p{j}{i}", text, output=f"y{j}") for j in (1, 2) for i, text in enumerate(names)]
     options = {"outputs": (0, 1), "states": 4, "baseline": Baseline.from_terms(terms)}
-    return _simulated("two masses", derivative, 0.05, force=lambda r, n: _held(r, n, 6, 6.0), **options)
+    return _simulated(
+        "two masses", derivative, 0.05, force=lambda r, n: _held(r, n, 6, 6.0), **options
+    )
 
 
 MEASURED = (_silverbox, _mr_damper, _tanks("Est", "Val"), _tanks("Val", "Est"))

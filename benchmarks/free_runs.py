@@ -43,11 +43,20 @@ def error(model: oa.Model, record: oa.Record, unit: np.ndarray) -> float:
 
 def outcome(problem: FreeRunProblem, segment: int, washout: int, starts: int) -> Outcome:
     """Train from every start and look at what is handed over."""
-    options = {"lags": problem.lags, "criterion": oa.Simulation(segment, washout), "solver": oa.LevenbergMarquardt(100)}
+    options = {
+        "lags": problem.lags,
+        "criterion": oa.Simulation(segment, washout),
+        "solver": oa.LevenbergMarquardt(100),
+    }
     unit = problem.train.experiments[0].outputs.std(axis=0)
     alone = oa.estimate(problem.train, problem.baseline, learner=None, **options)
     fit = oa.estimate(
-        problem.train, problem.baseline, learner=problem.learner, restarts=starts, fallback=False, **options
+        problem.train,
+        problem.baseline,
+        learner=problem.learner,
+        restarts=starts,
+        fallback=False,
+        **options,
     )
     kept = fit.held_out is None or fit.held_out.ratio.code == "helps"
     ratio = error(fit.model, problem.held_out, unit) / error(alone.model, problem.held_out, unit)
@@ -58,7 +67,9 @@ def outcome(problem: FreeRunProblem, segment: int, washout: int, starts: int) ->
 def outcomes(starts: int = STARTS) -> list[Outcome]:
     """All problems under all segmentations, told as they come."""
     found = []
-    print("| problem | segment | starts above physics | held-out ratio of the chosen | handed over |")
+    print(
+        "| problem | segment | starts above physics | held-out ratio of the chosen | handed over |"
+    )
     print("|---|---|---|---|---|")
     for problem in problems():
         for segment, washout in SEGMENTATIONS:
@@ -72,14 +83,21 @@ def outcomes(starts: int = STARTS) -> list[Outcome]:
 def summary(found: list[Outcome]) -> tuple[int, int, float]:
     """Starts above physics alone, results worse by more than 2 % on held-out rows, geometric mean of the ratio."""
     ratios = np.array([one.handed_over for one in found])
-    return sum(one.above for one in found), int(np.sum(ratios > 1.02)), float(np.exp(np.mean(np.log(ratios))))
+    return (
+        sum(one.above for one in found),
+        int(np.sum(ratios > 1.02)),
+        float(np.exp(np.mean(np.log(ratios)))),
+    )
 
 
 def main() -> None:
     print(describe())
     found = outcomes(int(sys.argv[1]) if len(sys.argv) > 1 else STARTS)
     above, worse, mean = summary(found)
-    print(f"{above} starts above physics alone; {worse} of {len(found)} results worse; geometric mean {mean:.2f}")
+    print(
+        f"{above} starts above physics alone; {worse} of {len(found)} results worse; geometric "
+        f"mean {mean:.2f}"
+    )
 
 
 if __name__ == "__main__":

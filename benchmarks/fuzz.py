@@ -21,13 +21,20 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
-from fuzzing import SPEC, TYPES, try_file, try_model, try_spec, write_original
-from fuzzing_runs import model_of, try_command, try_export, try_folder, try_forged, try_state
 from machine import describe
 
+FILES = ("csv", "semicolons.csv", "tsv", "xlsx", "parquet", "npz", "v5.mat", "v73.mat", "h5")
 TRIALS = {
-    **dict.fromkeys(TYPES, 150),
-    **{"specs": 400, "commands": 350, "models": 250, "forged": 150, "states": 150, "folders": 250, "exports": 100},
+    **dict.fromkeys(FILES, 150),
+    **{
+        "specs": 400,
+        "commands": 350,
+        "models": 250,
+        "forged": 150,
+        "states": 150,
+        "folders": 250,
+        "exports": 100,
+    },
 }
 LONGEST, MEMORY = 30.0, 16 * 2**30  # s and bytes of one trial
 
@@ -45,6 +52,10 @@ def child(kind: str, start: int, stop: int) -> None:
 
 def _trial(kind: str, folder: Path) -> Callable[[int], str]:
     """The trial of a kind by its seed, with what it needs made in the folder."""
+    # imported here: under `--guided` what is imported before atheris instruments it is not seen
+    from fuzzing import SPEC, TYPES, try_file, try_model, try_spec, write_original
+    from fuzzing_runs import model_of, try_command, try_export, try_folder, try_forged, try_state
+
     write_original("csv", folder / "run.csv")
     if kind in TYPES:
         write_original(kind, folder / f"original.{kind}")
@@ -72,7 +83,9 @@ def run(kind: str, count: int) -> tuple[Counter, float]:
     ends, longest, seed = Counter(), 0.0, 0
     while seed < count:
         command = [sys.executable, __file__, "--child", kind, str(seed), str(count)]
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env={**os.environ})
+        process = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env={**os.environ}
+        )
         assert process.stdout is not None and process.stderr is not None
         process.stdout.readline()
         while seed < count:
@@ -107,13 +120,20 @@ def main() -> int:
     """Print a row for each kind; return 1 where a trial failed."""
     factor = float(sys.argv[1]) if len(sys.argv) > 1 else 1.0
     print(describe())
-    print("| what | held | trials | refused | equal | faults | longest |\n|---|---|---|---|---|---|---|")
+    print(
+        "| what | held | trials | refused | equal | faults | longest "
+        "|\n|---|---|---|---|---|---|---|"
+    )
     whole = Counter()
     for kind in sys.argv[2:] or TRIALS:
         ends, longest = run(kind, round(factor * TRIALS[kind]))
         counts = " | ".join(str(ends[end]) for end in ("refused", "equal", "fault"))
         whole += ends
-        print(f"| {kind} | {ends.total() - ends['fault']} | {ends.total()} | {counts} | {longest:.1f} s |", flush=True)
+        print(
+            f"| {kind} | {ends.total() - ends['fault']} | {ends.total()} | {counts} | "
+            f"{longest:.1f} s |",
+            flush=True,
+        )
     print(f"\n{whole.total() - whole['fault']} of {whole.total()} trials held.")
     return 1 if whole["fault"] else 0
 

@@ -62,7 +62,11 @@ k = { initial = 20.0, min = 0 }
 hidden = [6]
 inputs = ["x", "v"]
 """
-DRIVE = MOTION.replace(" - k*x", "").replace("k = { initial = 20.0, min = 0 }\n", "").replace('"x", "v"', '"v"')
+DRIVE = (
+    MOTION.replace(" - k*x", "")
+    .replace("k = { initial = 20.0, min = 0 }\n", "")
+    .replace('"x", "v"', '"v"')
+)
 
 
 def _signal(random: np.random.Generator, rows: int, kind: int) -> np.ndarray:
@@ -73,7 +77,10 @@ def _signal(random: np.random.Generator, rows: int, kind: int) -> np.ndarray:
         raw = np.repeat(random.uniform(-1, 1, rows), random.integers(8, 40, rows))[:rows]
     else:
         time = np.arange(rows) * _TS
-        raw = sum(np.sin(2 * np.pi * f * time + random.uniform(0, 7)) for f in random.uniform(0.05, 2.0, 25))
+        raw = sum(
+            np.sin(2 * np.pi * f * time + random.uniform(0, 7))
+            for f in random.uniform(0.05, 2.0, 25)
+        )
     return (raw - raw.mean()) / raw.std()
 
 
@@ -108,7 +115,9 @@ class Plant:
             return float(np.tanh(u))
         return min(max(play, u - SHARE / 2), u + SHARE / 2) if self.effect == "backlash" else u
 
-    def run(self, command: Callable[[int, float], float], noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def run(
+        self, command: Callable[[int, float], float], noise: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return states and inputs; `command` gives the input of a row from the position there."""
         x = v = z = play = 0.0
         step = _TS / _SUBSTEPS
@@ -116,7 +125,9 @@ class Plant:
 
         def slope(x: float, v: float, z: float, u: float) -> np.ndarray:
             acting = z if self.effect == "hidden" else u
-            return np.array([v, acting - self.c * v - self.k * x - self._force(x, v), (u - z) / (3 * _TS)])
+            return np.array(
+                [v, acting - self.c * v - self.k * x - self._force(x, v), (u - z) / (3 * _TS)]
+            )
 
         for row in range(len(noise)):
             states[row], inputs[row] = (x, v, z), command(row, x)
@@ -129,7 +140,9 @@ class Plant:
         return states, inputs
 
 
-def _record(plant: Plant, random: np.random.Generator, difficulty: str, wanted: np.ndarray) -> np.ndarray:
+def _record(
+    plant: Plant, random: np.random.Generator, difficulty: str, wanted: np.ndarray
+) -> np.ndarray:
     """Record inputs and outputs: `wanted` is the input, or in closed loop the reference in units of the position."""
     rows, size = len(wanted), plant.size[0]
     level = {"sensor noise": 0.1, "closed loop": 0.03, "few rows": 0.03}.get(difficulty, 0.003)
@@ -173,13 +186,24 @@ def oscillator(name: str, seed: int, effect: str, difficulty: str, as_motion: bo
     motion = (MOTION if plant.k else DRIVE) if as_motion else ""
     what = f"{effect}, {difficulty}"
     return Problem(
-        name, GENERATED, ("u",), ("y",), _TS, [train], {"new": test, "alike": alike}, motion=motion, what=what
+        name,
+        GENERATED,
+        ("u",),
+        ("y",),
+        _TS,
+        [train],
+        {"new": test, "alike": alike},
+        motion=motion,
+        what=what,
     )
 
 
 def oscillators() -> dict[str, Callable[[], Problem]]:
     """The 40 problems by name, each made when it is called."""
-    pairs = [(EFFECTS[i % len(EFFECTS)], DIFFICULTIES[i % len(DIFFICULTIES)]) for i in range(LAGGED_PROBLEMS)]
+    pairs = [
+        (EFFECTS[i % len(EFFECTS)], DIFFICULTIES[i % len(DIFFICULTIES)])
+        for i in range(LAGGED_PROBLEMS)
+    ]
     found: dict[str, Callable[[], Problem]] = {}
     for i, (effect, difficulty) in enumerate((*pairs, *MOTION_PAIRS)):
         as_motion = i >= LAGGED_PROBLEMS
@@ -222,7 +246,11 @@ def _moves(random: np.random.Generator, smooth: bool) -> np.ndarray:
         flat = max(distance / (push * rise) - rise, 0.0) if random.random() < 0.6 else 0.0
         scale = distance / (push * rise * (rise + flat))
         time = np.arange(int((2 * rise + flat) / _FAST))
-        speed = np.minimum(np.minimum(time * _FAST, 2 * rise + flat - time * _FAST), rise) * push * scale
+        speed = (
+            np.minimum(np.minimum(time * _FAST, 2 * rise + flat - time * _FAST), rise)
+            * push
+            * scale
+        )
         path = place + np.sign(goal - place) * np.cumsum(speed) * _FAST
         rest = np.full(int(random.uniform(0.05, 0.6) / _FAST), path[-1])
         pieces += [path, rest]
@@ -250,7 +278,9 @@ def _axis_record(seed: int, smooth: bool) -> np.ndarray:
 
 def axis(as_motion: bool = False) -> Problem:
     tests = {"sines": _axis_record(2, True), "moves": _axis_record(3, False)}
-    found = Problem("axis", AXIS, ("force",), ("position",), _FAST * _THIN, [_axis_record(1, False)], tests)
+    found = Problem(
+        "axis", AXIS, ("force",), ("position",), _FAST * _THIN, [_axis_record(1, False)], tests
+    )
     return replace(found, name="axis_motion", motion=AXIS_MOTION) if as_motion else found
 
 

@@ -23,7 +23,9 @@ def deviations(draws: int, exact_start: bool) -> np.ndarray:
     found = []
     for seed in range(draws):
         criterion = oa.Simulation(exact_start=exact_start)
-        fit = oa.estimate(sensor_noise.record(seed), sensor_noise.BASELINE, learner=None, criterion=criterion)
+        fit = oa.estimate(
+            sensor_noise.record(seed), sensor_noise.BASELINE, learner=None, criterion=criterion
+        )
         physical = fit.physical(sensor_noise.PHYSICS)
         found.append((physical.value - TRUE) / physical.std)
     return np.array(found)
@@ -38,7 +40,10 @@ def compare(draws: int = DRAWS) -> list[float]:
 def main() -> None:
     print(describe())
     off, held, draws = compare()
-    print(f"Measured starts: m is off by {off:.1f} standard errors. Unknown: {held:.0f} of {draws:.0f} within 3.")
+    print(
+        f"Measured starts: m is off by {off:.1f} standard errors. Unknown: {held:.0f} of "
+        f"{draws:.0f} within 3."
+    )
 
 
 if __name__ == "__main__":

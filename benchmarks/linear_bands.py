@@ -27,7 +27,9 @@ LINES = [oa.Term("a1", "y[k-1]"), oa.Term("a2", "y[k-2]"), oa.Term("b1", "u[k-1]
 BASELINE = oa.Baseline.from_terms(LINES)
 
 
-def record(seed: int, *, equation: float = 0.0, sensor: float = 0.0, cubic: float = 0.0) -> oa.Record:
+def record(
+    seed: int, *, equation: float = 0.0, sensor: float = 0.0, cubic: float = 0.0
+) -> oa.Record:
     """One draw."""
     rng = np.random.default_rng([seed, 41])
     n = SAMPLES + WARM_UP
@@ -43,11 +45,19 @@ def record(seed: int, *, equation: float = 0.0, sensor: float = 0.0, cubic: floa
 
 def truth(cubic: float) -> tuple[np.ndarray, float, float]:
     """The response at the frequencies, the magnitude of the poles and the static gain, about rest at `HELD`."""
-    rest = np.roots([cubic, 0.0, A1 + A2 - 1, B1 * HELD]) if cubic else np.array([B1 * HELD / (1 - A1 - A2)])
+    rest = (
+        np.roots([cubic, 0.0, A1 + A2 - 1, B1 * HELD])
+        if cubic
+        else np.array([B1 * HELD / (1 - A1 - A2)])
+    )
     y = float(min(rest[np.abs(rest.imag) < 1e-9].real, key=abs))
     a1 = A1 + 3 * cubic * y**2
     z = np.exp(2j * np.pi * FREQUENCIES * STEP)
-    return B1 * z / (z**2 - a1 * z - A2), float(np.abs(np.roots([1.0, -a1, -A2])).max()), B1 / (1 - a1 - A2)
+    return (
+        B1 * z / (z**2 - a1 * z - A2),
+        float(np.abs(np.roots([1.0, -a1, -A2])).max()),
+        B1 / (1 - a1 - A2),
+    )
 
 
 def arx(seed: int) -> oa.Estimate:
@@ -55,12 +65,16 @@ def arx(seed: int) -> oa.Estimate:
 
 
 def output_error(seed: int) -> oa.Estimate:
-    return oa.estimate(record(seed, sensor=0.3), BASELINE, learner=None, criterion=oa.Simulation(0, 40))
+    return oa.estimate(
+        record(seed, sensor=0.3), BASELINE, learner=None, criterion=oa.Simulation(0, 40)
+    )
 
 
 def of_terms(seed: int) -> oa.Estimate:
     """With the learner that can be right."""
-    return oa.estimate(record(seed, equation=0.1, cubic=CUBIC), BASELINE, learner=oa.Terms(["y[k-1]**3"]))
+    return oa.estimate(
+        record(seed, equation=0.1, cubic=CUBIC), BASELINE, learner=oa.Terms(["y[k-1]**3"])
+    )
 
 
 def of_neurons(seed: int) -> oa.Estimate:
@@ -126,7 +140,10 @@ def augmented(draws: int = 500) -> list[list[float]]:
 def main(draws: int) -> None:
     print(describe())
     began = time.perf_counter()
-    print("| system | gain, least | mean | largest | phase, least | mean | largest | poles | static gain |")
+    print(
+        "| system | gain, least | mean | largest | phase, least | mean | largest | poles | "
+        "static gain |"
+    )
     print("|---|---|---|---|---|---|---|---|---|")
     for name in CASES:
         print(f"| {name} | {' | '.join(f'{v:.1f} %' for v in row(name, draws))} |", flush=True)

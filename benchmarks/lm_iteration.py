@@ -26,15 +26,25 @@ def task(rows: int, lags: Lags, neurons: int) -> OneStepTask:
     rng = np.random.default_rng(0)
     u, y = rng.normal(size=rows + 3), np.zeros(rows + 3)
     for k in range(3, len(y)):
-        y[k] = 0.5 * y[k - 1] - 0.3 * y[k - 2] + u[k - 1] + 0.3 * np.tanh(2 * u[k - 1] * y[k - 1]) + 0.1 * rng.normal()
-    baseline = Baseline.from_terms([Term(n, e) for n, e in (("a1", "y[k-1]"), ("a2", "y[k-2]"), ("b1", "u[k-1]"))])
+        y[k] = (
+            0.5 * y[k - 1]
+            - 0.3 * y[k - 2]
+            + u[k - 1]
+            + 0.3 * np.tanh(2 * u[k - 1] * y[k - 1])
+            + 0.1 * rng.normal()
+        )
+    baseline = Baseline.from_terms(
+        [Term(n, e) for n, e in (("a1", "y[k-1]"), ("a2", "y[k-2]"), ("b1", "u[k-1]"))]
+    )
     record = Record.from_arrays(u, y).rows(0, rows + max(lags.na, lags.nb))  # type: ignore[type-var]
     return OneStepTask.of(pose(record, baseline, lags), MLP((neurons,)))
 
 
 def main() -> None:
     print(describe())
-    print("| rows | weights | LM iteration | `J.T @ J` | ratio | allowed |\n|---|---|---|---|---|---|")
+    print(
+        "| rows | weights | LM iteration | `J.T @ J` | ratio | allowed |\n|---|---|---|---|---|---|"
+    )
     for rows, lags, neurons, weights, iterations, repeats, allowed in CASES:
         posed = task(rows, lags, neurons)
         assert posed.bound.size == weights and len(posed.problem.rows) == rows
@@ -52,7 +62,10 @@ def main() -> None:
         short = median_seconds(lambda n=iterations: train(n), repeats)
         long = median_seconds(lambda n=3 * iterations: train(n), repeats)
         one = (long - short) / (2 * iterations)
-        print(f"| {rows} | {weights} | {1e3 * one:.2f} ms | {1e3 * bare:.2f} ms | {one / bare:.2f} | {allowed} |")
+        print(
+            f"| {rows} | {weights} | {1e3 * one:.2f} ms | {1e3 * bare:.2f} ms | "
+            f"{one / bare:.2f} | {allowed} |"
+        )
 
 
 if __name__ == "__main__":

@@ -26,11 +26,16 @@ def describe() -> str:
     info = Path("/proc/cpuinfo")
     if info.exists():
         names = [
-            line.split(":", 1)[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")
+            line.split(":", 1)[1].strip()
+            for line in info.read_text().splitlines()
+            if line.startswith("model name")
         ]
         model = names[0] if names else model
     versions = ", ".join(f"{name} {version(name)}" for name in ("jax", "numpy", "scipy"))
-    return f"{model}, {os.cpu_count()} cores, Python {platform.python_version()}, {versions}, {datetime.date.today()}"
+    return (
+        f"{model}, {os.cpu_count()} cores, Python {platform.python_version()}, {versions}, "
+        f"{datetime.date.today()}"
+    )
 
 
 def median_seconds(call: Callable[[], object], repeats: int) -> float:
@@ -39,7 +44,9 @@ def median_seconds(call: Callable[[], object], repeats: int) -> float:
     return float(np.median([_seconds(call) for _ in range(repeats)]))
 
 
-def alternate(first: Callable[[], object], second: Callable[[], object], repeats: int) -> tuple[float, float]:
+def alternate(
+    first: Callable[[], object], second: Callable[[], object], repeats: int
+) -> tuple[float, float]:
     """Median seconds of two calls taken in turn, so that both see the same machine; one warm call before."""
     first(), second()
     pairs = [(_seconds(first), _seconds(second)) for _ in range(repeats)]

@@ -36,7 +36,10 @@ def record(system: str) -> oa.Record:
     y = np.zeros(ROWS)
     first = second = 0.0
     for k in range(1, ROWS):
-        second, first = first, 0.6 * first - 0.2 * second + 0.5 * u[k - 1] - 0.1 * np.tanh(5 * first) + e[k]
+        second, first = (
+            first,
+            0.6 * first - 0.2 * second + 0.5 * u[k - 1] - 0.1 * np.tanh(5 * first) + e[k],
+        )
         y[k] = first
     return oa.Record.from_arrays(u, y)
 
@@ -67,9 +70,15 @@ def losses() -> list[float]:
 
 def main() -> None:
     print(describe())
-    print("| system | loss, begun on some by from the starts | time | from the starts |\n" + 4 * "|---" + "|")
+    print(
+        "| system | loss, begun on some by from the starts | time | from the starts |\n"
+        + 4 * "|---"
+        + "|"
+    )
     for system, row in zip(SYSTEMS, rows(), strict=True):
-        print(f"| {system} | {row.loss:.4f} | {row.seconds:.0f} s | {row.direct:.0f} s |", flush=True)
+        print(
+            f"| {system} | {row.loss:.4f} | {row.seconds:.0f} s | {row.direct:.0f} s |", flush=True
+        )
 
 
 if __name__ == "__main__":

@@ -10,7 +10,9 @@ import sys
 import time
 from functools import cache
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the matrices are small, and its threads would wait for JAX's
+os.environ.setdefault(
+    "OPENBLAS_NUM_THREADS", "1"
+)  # the matrices are small, and its threads would wait for JAX's
 
 import numpy as np
 from machine import describe
@@ -18,13 +20,19 @@ from machine import describe
 import orthaug as oa
 
 MEASURE = oa.Uniform({"u[k]": (-0.6, 0.6)})
-NOISY = {1: ("0.0028", 0.006), 2: ("0.081", 0.010), 3: ("0.144", 0.010)}  # data set: prototype's training, allowed
+NOISY = {
+    1: ("0.0028", 0.006),
+    2: ("0.081", 0.010),
+    3: ("0.144", 0.010),
+}  # data set: prototype's training, allowed
 INITIALISATIONS, NOISELESS_LIMIT = 10, 5e-5
 
 
 def errors(fit: oa.Estimate, theta: np.ndarray) -> tuple[float, float]:
     """‖θ̂ − θ*‖ under the training and under the uniform measure."""
-    training, uniform = (float(np.linalg.norm(found - theta)) for found in (fit.theta, fit.split(MEASURE).theta))
+    training, uniform = (
+        float(np.linalg.norm(found - theta)) for found in (fit.theta, fit.split(MEASURE).theta)
+    )
     return training, uniform
 
 
@@ -33,7 +41,9 @@ def noisy(data_set: int, draws: int) -> np.ndarray:
     example, found = oa.synthetic.static(data_set), []
     clean = example.train.experiments[0]
     for seed in range(draws):
-        noise = np.random.default_rng([seed, data_set]).normal(0.0, oa.synthetic.NOISE_30_DB, clean.outputs.shape)
+        noise = np.random.default_rng([seed, data_set]).normal(
+            0.0, oa.synthetic.NOISE_30_DB, clean.outputs.shape
+        )
         record = oa.Record.from_arrays(clean.inputs, clean.outputs + noise)
         fit = oa.estimate(record, example.baseline, regularization="evidence", seed=seed)
         found.append(errors(fit, example.theta))
@@ -47,7 +57,9 @@ def noiseless(data_set: int, iterations: int) -> np.ndarray:
     return np.array(
         [
             errors(
-                oa.estimate(example.train, example.baseline, solver=solver, regularization="none", seed=seed),
+                oa.estimate(
+                    example.train, example.baseline, solver=solver, regularization="none", seed=seed
+                ),
                 example.theta,
             )
             for seed in range(INITIALISATIONS)
@@ -78,20 +90,30 @@ def uniform() -> list[float]:
 
 def main(draws: int) -> None:
     print(describe())
-    print(f"\n30 dB, medians over {draws} draws of noise and of the initial weights, evidence regularisation.\n")
-    print("| data set | training | its prototype | uniform | 90 % of draws | allowed | a draw |\n" + 7 * "|---" + "|")
+    print(
+        f"\n30 dB, medians over {draws} draws of noise and of the initial weights, evidence "
+        "regularisation.\n"
+    )
+    print(
+        "| data set | training | its prototype | uniform | 90 % of draws | allowed | a draw |\n"
+        + 7 * "|---"
+        + "|"
+    )
     for data_set, (prototype, allowed) in NOISY.items():
         began = time.perf_counter()
         found = noisy(data_set, draws)
         (training, uniform), ninth = np.median(found, axis=0), np.quantile(found[:, 1], 0.9)
         seconds = (time.perf_counter() - began) / draws
         print(
-            f"| {data_set} | {training:.4f} | {prototype} | {uniform:.4f} | {ninth:.4f} | {allowed:.3f} "
-            f"| {seconds:.2f} s |",
+            f"| {data_set} | {training:.4f} | {prototype} | {uniform:.4f} | {ninth:.4f} | "
+            f"{allowed:.3f} | {seconds:.2f} s |",
             flush=True,
         )
     print(f"\nNo noise, largest of {INITIALISATIONS} initialisations.\n")
-    print("| data set | iterations | training | uniform | its median | allowed |\n|---|---|---|---|---|---|")
+    print(
+        "| data set | iterations | training | uniform | its median | allowed "
+        "|\n|---|---|---|---|---|---|"
+    )
     for iterations in (300, 1000):
         for data_set in (2, 3):
             found = noiseless(data_set, iterations)

@@ -16,7 +16,7 @@ import numpy as np
 from machine import ROOT, data_folder, describe
 
 from orthaug.commands.fit import fit_variant
-from orthaug.commands.job import ALONE, AS_DECLARED, Job, Variant
+from orthaug.commands.job import AS_DECLARED, PHYSICS_ONLY, Job, Variant
 from orthaug.commands.kinds import open_job
 from orthaug.fitting import objective
 from orthaug.fitting.estimation import fit
@@ -57,7 +57,9 @@ def silverbox() -> list[float | None]:
 
 def mr_damper() -> list[float | None]:
     """FIT of the free run on the test part: with the learner, and by physics alone."""
-    found = [scores("mr_damper", "fit", variant) for variant in (AS_DECLARED, Variant(ALONE))]
+    found = [
+        scores("mr_damper", "fit", variant) for variant in (AS_DECLARED, Variant(PHYSICS_ONLY))
+    ]
     return [None if one is None else one[0] for one in found]
 
 
@@ -69,7 +71,7 @@ def cascaded_tanks() -> float | None:
 
 def cascaded_tanks_alone() -> float | None:
     """The same of physics alone."""
-    found = scores("cascaded_tanks", "fit", Variant(ALONE))
+    found = scores("cascaded_tanks", "fit", Variant(PHYSICS_ONLY))
     return None if found is None else found[0]
 
 
@@ -95,7 +97,9 @@ def colour() -> list[float | None]:
 
     def median() -> float:
         fits = [fit(opened.problem, seed=seed, **options) for seed in range(6)]
-        return float(np.median([one.model.simulate(test.record).scores(test.skip).fit[0] for one in fits]))
+        return float(
+            np.median([one.model.simulate(test.record).scores(test.skip).fit[0] for one in fits])
+        )
 
     with every_error_counts():
         all_rows = median()

@@ -36,7 +36,10 @@ def main() -> None:
     print(describe())
     done = subprocess.run([sys.executable, "-c", FIT], capture_output=True, text=True, check=True)
     peak, seconds = done.stdout.split()
-    print("| rows | regressors | weights | peak | allowed | seconds, 3 iterations |\n|---|---|---|---|---|---|")
+    print(
+        "| rows | regressors | weights | peak | allowed | seconds, 3 iterations "
+        "|\n|---|---|---|---|---|---|"
+    )
     print(f"| {ROWS} | 6 | 257 | {peak} GB | {ALLOWED} GB | {seconds} |")
 
 

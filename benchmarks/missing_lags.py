@@ -19,7 +19,9 @@ from orthaug.analysis.missing_lags import missing_lags
 
 SAMPLES, NOISE = 1000, 0.02
 THETA = (1.5, -0.7, 0.3)
-BASELINE = oa.Baseline.from_terms([oa.Term(*term) for term in (("a", "y[k-1]"), ("b", "y[k-2]"), ("c", "u[k-1]"))])
+BASELINE = oa.Baseline.from_terms(
+    [oa.Term(*term) for term in (("a", "y[k-1]"), ("b", "y[k-2]"), ("c", "u[k-1]"))]
+)
 CASES = (  # noise, coefficient of y³, coefficient of u²
     ("white", 0.0, 0.0),
     ("uneven", 0.0, 0.0),
@@ -49,7 +51,9 @@ def p_values(case: tuple[str, float, float], draws: int) -> np.ndarray:
     learner, solver = oa.MLP((8,), inputs=("y[k-1]-y[k-2]",)), oa.LevenbergMarquardt(40)
     found = []
     for seed in range(draws):
-        tests = missing_lags(oa.estimate(record(seed, *case), BASELINE, learner=learner, solver=solver, seed=0))
+        tests = missing_lags(
+            oa.estimate(record(seed, *case), BASELINE, learner=learner, solver=solver, seed=0)
+        )
         found.append(min(test.p for test in tests.tests) * len(tests.tests) if tests else 1.0)
     return np.array(found)
 
@@ -65,7 +69,10 @@ def main(draws: int) -> None:
     began = time.perf_counter()
     print("| noise | y³ | u² | rejected at 5 % | at 1 % |\n|---|---|---|---|---|")
     for case, row in zip(CASES, table(draws), strict=True):
-        print(f"| {' | '.join(map(str, case))} | {' | '.join(f'{v:.1f} %' for v in row)} |", flush=True)
+        print(
+            f"| {' | '.join(map(str, case))} | {' | '.join(f'{v:.1f} %' for v in row)} |",
+            flush=True,
+        )
     print(f"\n{draws} draws, {time.perf_counter() - began:.0f} s")
 
 

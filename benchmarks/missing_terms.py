@@ -71,7 +71,9 @@ def record(case: Case, draw: int) -> oa.Record:
     position = np.array(found)
     white = random.normal(size=ROWS)
     noise = np.sqrt(1 - case.colour**2) * scipy.signal.lfilter([1.0], [1.0, -case.colour], white)
-    return oa.Record.from_arrays(u=force, y=position + case.noise * position.std() * noise, sampling_time=TS)
+    return oa.Record.from_arrays(
+        u=force, y=position + case.noise * position.std() * noise, sampling_time=TS
+    )
 
 
 def motion(learned: bool) -> oa.Motion:
@@ -82,7 +84,10 @@ def motion(learned: bool) -> oa.Motion:
         ],
         outputs=[oa.Output("y", "x")],
         inputs=["u"],
-        parameters=[oa.PhysicalParameter(*given, min=0) for given in zip("mck", (1.2, 1.2, 30.0), strict=True)],
+        parameters=[
+            oa.PhysicalParameter(*given, min=0)
+            for given in zip("mck", (1.2, 1.2, 30.0), strict=True)
+        ],
     )
 
 
@@ -103,7 +108,9 @@ def outcome(case: Case, draws: int) -> Outcome:
     for draw in range(draws):
         learner = oa.MLP((4,), inputs=("v",)) if case.learner else None
         options = {"learner": learner, "blocks": 0, "fallback": False, "seed": draw}
-        fit = oa.estimate(record(case, draw), motion(case.learner), criterion=oa.Simulation(0, 0), **options)
+        fit = oa.estimate(
+            record(case, draw), motion(case.learner), criterion=oa.Simulation(0, 0), **options
+        )
         found = missing_terms(fit)
         if found is None:  # the fit ended nowhere
             told.append([False] * len(LEVELS))
@@ -116,7 +123,11 @@ def outcome(case: Case, draws: int) -> Outcome:
             shaped += (best.equation, best.variable, best.shape) == case.truth
     parts = tuple(float(100 * share) for share in np.mean(told, axis=0))
     return Outcome(
-        parts, 100 * named / draws, 100 * shaped / draws, 100 * float(np.median(shares)), draws - len(shares)
+        parts,
+        100 * named / draws,
+        100 * shaped / draws,
+        100 * float(np.median(shares)),
+        draws - len(shares),
     )
 
 
@@ -128,12 +139,17 @@ def table(draws: int = DRAWS) -> list[list[float]]:
 
 def main(draws: int) -> None:
     print(describe())
-    print(f"\n{draws} draws\n\n| case | p < 5 % | p < 1 % | right equation and variable | right shape | share |")
+    print(
+        f"\n{draws} draws\n\n| case | p < 5 % | p < 1 % | right equation and variable | right "
+        "shape | share |"
+    )
     print(6 * "|---" + "|")
     for case, row in zip(CASES, table(draws), strict=True):
         shown = " | ".join(f"{value:.1f} %" for value in row)
         print(f"| {case.name} | {shown} |")
-    print("not tested:", ", ".join(f"{case.name} {outcome(case, draws).untested}" for case in CASES))
+    print(
+        "not tested:", ", ".join(f"{case.name} {outcome(case, draws).untested}" for case in CASES)
+    )
 
 
 if __name__ == "__main__":

@@ -26,7 +26,9 @@ TS, ROWS, HELD, FINE = 0.01, 1000, 25, 10
 NOISE = 10**-1.5  # over the output's deviation
 NAMES = ("m", "c", "k")
 DRAWS = 200
-SPEEDS = np.linspace(-4, 4, 17)  # m/s, nearly the reach of the data; friction turns over within 0.1 m/s of 0
+SPEEDS = np.linspace(
+    -4, 4, 17
+)  # m/s, nearly the reach of the data; friction turns over within 0.1 m/s of 0
 
 
 class Plant(NamedTuple):
@@ -73,7 +75,10 @@ def motion() -> oa.Motion:
         ],
         outputs=[oa.Output("position", "x")],
         inputs=["force"],
-        parameters=[oa.PhysicalParameter(*given, min=0) for given in zip(NAMES, (1.2, 1.2, 120.0), strict=True)],
+        parameters=[
+            oa.PhysicalParameter(*given, min=0)
+            for given in zip(NAMES, (1.2, 1.2, 120.0), strict=True)
+        ],
     )
 
 
@@ -128,7 +133,9 @@ def damper_alone(fit: oa.MotionEstimate) -> tuple[float, float, float]:
 def drawn(draws: int) -> Draws:
     found, without = [], 0
     for draw in range(draws):
-        fit = oa.estimate(plant().record(draw), motion(), learner=oa.MLP((6,), inputs=("v",)), blocks=0, seed=draw)
+        fit = oa.estimate(
+            plant().record(draw), motion(), learner=oa.MLP((6,), inputs=("v",)), blocks=0, seed=draw
+        )
         if fit.std is None or fit.interval is None or np.isnan(fit.std).any():
             without += 1
             continue
@@ -141,7 +148,10 @@ def drawn(draws: int) -> Draws:
 def table() -> list[list[float]]:
     """Bias, scatter and coverage of each parameter, as in benchmarks/README.md."""
     found = drawn(DRAWS)
-    return [[float(v) for v in row] for row in zip(found.bias, found.scatter, found.coverage, strict=True)]
+    return [
+        [float(v) for v in row]
+        for row in zip(found.bias, found.scatter, found.coverage, strict=True)
+    ]
 
 
 def band() -> list[float]:
@@ -163,23 +173,32 @@ def main(draws: int) -> None:
     found = drawn(draws)
     seconds = (time.perf_counter() - began) / draws
     print(
-        f"\n{draws} draws, {found.without} without intervals, {seconds:.1f} s a draw; a coverage of 95 % is seen with"
+        f"\n{draws} draws, {found.without} without intervals, {seconds:.1f} s a draw; a "
+        "coverage of 95 % is seen with"
     )
     print(f"a standard error of {100 * np.sqrt(0.0475 / draws):.1f} %.\n")
-    print("| parameter | true | bias / standard error | scatter / standard error | coverage |\n" + 5 * "|---" + "|")
+    print(
+        "| parameter | true | bias / standard error | scatter / standard error | coverage |\n"
+        + 5 * "|---"
+        + "|"
+    )
     rows = zip(NAMES, plant().true, found.bias, found.scatter, found.coverage, strict=True)
     for name, true, bias, scatter, coverage in rows:
         print(f"| {name} | {true:.3f} | {bias:.2f} | {scatter:.2f} | {coverage:.1f} % |")
     near = np.abs(SPEEDS) <= 0.5
     smooth, turn = (100 * found.curve[:, part].mean() for part in (~near, near))
     print(
-        f"\nThe band of the learned curve holds the true one at {smooth:.0f} % of the speeds beyond 0.5 m/s, at ",
+        f"\nThe band of the learned curve holds the true one at {smooth:.0f} % of the speeds "
+        "beyond 0.5 m/s, at ",
         end="",
     )
     print(f"{turn:.0f} % of those within.")
     named, low, high = found.named.T
     inside = 100 * ((low <= C) & (high >= C)).mean()
-    print(f"Dry friction is named in {100 * named.mean():.0f} % of the draws; the interval of the damper itself that ")
+    print(
+        f"Dry friction is named in {100 * named.mean():.0f} % of the draws; the interval of "
+        "the damper itself that "
+    )
     print(f"counts it holds {C} in {inside:.0f} %, median width {np.nanmedian(high - low):.2g}.")
 
 

@@ -61,13 +61,17 @@ def problem(seed: int) -> Problem:
     train = record(case, seed)
     returned = oa.estimate(train, motion(True), blocks=BLOCKS, **options)
     kept = returned.model.form.bound is not None
-    fit = returned if kept else oa.estimate(train, motion(True), blocks=0, fallback=False, **options)
+    fit = (
+        returned if kept else oa.estimate(train, motion(True), blocks=0, fallback=False, **options)
+    )
     alone = oa.estimate(train, motion(False), learner=None, criterion=oa.Simulation(0, 0))
     held = returned.held_out
     assert held is not None
     squares = [mean_square(held.runs[held.chosen]), mean_square(held.alone)]
     new = record(case._replace(noise=0.0), seed + 10_000)
-    errors = [float(np.sqrt(np.mean(one.model.simulate(new).scores().rmse ** 2))) for one in (fit, alone)]
+    errors = [
+        float(np.sqrt(np.mean(one.model.simulate(new).scores().rmse ** 2))) for one in (fit, alone)
+    ]
     start = fit.status.start_loss
     return Problem(
         above=start is None or not fit.status.loss <= start * (1 + _ROUNDING),
@@ -98,9 +102,15 @@ def table(problems: int = PROBLEMS) -> list[list[float]]:
 def main(problems: int) -> None:
     print(describe())
     above, below = worse(problems)
-    print(f"\n{problems} problems: {above} ended above the training loss of physics alone, of {below} the returned")
+    print(
+        f"\n{problems} problems: {above} ended above the training loss of physics alone, of "
+        f"{below} the returned"
+    )
     print("start is worse than physics alone on the held-out blocks.\n")
-    print("| rule | learner kept | kept, but worse on new rows | dropped, but better there | mean ratio |")
+    print(
+        "| rule | learner kept | kept, but worse on new rows | dropped, but better there | "
+        "mean ratio |"
+    )
     print(5 * "|---" + "|")
     for name, row in zip(("surely better", "better by 2 %"), table(problems), strict=True):
         print(f"| {name} | {row[0]} | {row[1]} | {row[2]} | {row[3]:.3f} |")

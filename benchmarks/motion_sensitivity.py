@@ -51,7 +51,9 @@ def motion(integrator: str, substeps: int, learned: bool) -> oa.Motion:
 def ratio(rows: int, neurons: int, integrator: str, substeps: int) -> tuple[int, float, float]:
     """Unknowns, seconds of a free run and of a linearisation."""
     rng = np.random.default_rng(0)
-    record = oa.Record.from_arrays(u=rng.normal(size=rows), y=0.01 * rng.normal(size=rows), sampling_time=0.01)
+    record = oa.Record.from_arrays(
+        u=rng.normal(size=rows), y=0.01 * rng.normal(size=rows), sampling_time=0.01
+    )
     problem = pose_motion(record, motion(integrator, substeps, neurons > 0), ["v"])
     task = MotionTask.of(problem, oa.MLP((neurons,)) if neurons else None, oa.Simulation(512, 0))
     weights = np.zeros(0) if task.bound is None else np.asarray(task.bound.init(jax.random.key(0)))
@@ -69,7 +71,11 @@ def ratio(rows: int, neurons: int, integrator: str, substeps: int) -> tuple[int,
 
 def main() -> None:
     print(describe())
-    print("| rows | unknowns | integrator | substeps | free run | linearisation | ratio |\n" + 7 * "|---" + "|")
+    print(
+        "| rows | unknowns | integrator | substeps | free run | linearisation | ratio |\n"
+        + 7 * "|---"
+        + "|"
+    )
     for rows, neurons, integrator, substeps in CASES:
         unknowns, plain, whole = ratio(rows, neurons, integrator, substeps)
         times = f"{1e3 * plain:.2f} ms | {1e3 * whole:.2f} ms | {whole / plain:.1f}"

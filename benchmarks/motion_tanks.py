@@ -35,7 +35,10 @@ def fits(free_rim: bool, starts: int) -> list[MotionEstimate]:
         motion = problem.motion
         rim = oa.PhysicalParameter(RIM, dict(motion.constants)[RIM], "V", min=0)
         constants = tuple(pair for pair in motion.constants if pair[0] != RIM)
-        problem = replace(problem, motion=replace(motion, parameters=(*motion.parameters, rim), constants=constants))
+        problem = replace(
+            problem,
+            motion=replace(motion, parameters=(*motion.parameters, rim), constants=constants),
+        )
     options = {"learner": spec.declared_learner(), "criterion": spec.declared_criterion()}
     options |= {"solver": spec.declared_solver(), "blocks": 0, "fallback": False}
     return [fit_motion(problem, seed=seed, **options) for seed in range(starts)]
@@ -63,7 +66,10 @@ def main(starts: int) -> None:
         errors = test_errors(free, starts)
         if not errors:
             sys.exit("The data are absent.")
-        print(f"\n{what}: median {np.median(errors):.3f} V, largest {max(errors):.3f} V of {starts} starts")
+        print(
+            f"\n{what}: median {np.median(errors):.3f} V, largest {max(errors):.3f} V of "
+            f"{starts} starts"
+        )
         print("test errors:", ", ".join(f"{error:.3f}" for error in errors))
         found = fits(free, starts)
         for i, name in enumerate(found[0].problem.motion.names):
@@ -72,7 +78,8 @@ def main(starts: int) -> None:
             missing = int(np.isnan(std).sum())
             error = f"{np.nanmedian(std):.2g}" if missing < starts else "none"
             print(
-                f"  {name:5} {min(values):9.4g} to {max(values):9.4g}, median standard error {error}, without {missing}"
+                f"  {name:5} {min(values):9.4g} to {max(values):9.4g}, median standard error "
+                f"{error}, without {missing}"
             )
 
 

@@ -29,7 +29,9 @@ LEVELS = {"equation": (0.1, 0.0), "sensor": (0.0, 0.1), "both": (0.1, 0.1)}
 def lagged(baseline: list[oa.Term], learner: Any, record: oa.Record, sensor: bool) -> Any:
     """A fit of lagged physics, on the free run where the sensor is noisy."""
     criterion = oa.Simulation(segment=0, washout=0) if sensor else oa.Prediction()
-    return oa.estimate(record, oa.Baseline.from_terms(baseline), learner=learner, criterion=criterion)
+    return oa.estimate(
+        record, oa.Baseline.from_terms(baseline), learner=learner, criterion=criterion
+    )
 
 
 def motion(*, cube: bool) -> oa.Motion:
@@ -37,7 +39,10 @@ def motion(*, cube: bool) -> oa.Motion:
     force = "u - c*v - k*x - h*x**3" if cube else "u - c*v - k*x"
     given = (("c", 0.6), ("k", 4.0), *((("h", 2.0),) if cube else ()))
     return oa.Motion.from_equations(
-        states=[oa.State("x", "v", start="y"), oa.State("v", force, start="derivative of y", learned=not cube)],
+        states=[
+            oa.State("x", "v", start="y"),
+            oa.State("v", force, start="derivative of y", learned=not cube),
+        ],
         outputs=[oa.Output("y", "x")],
         parameters=[oa.PhysicalParameter(name, value) for name, value in given],
         inputs=["u"],
@@ -67,7 +72,11 @@ class Plant(NamedTuple):
             state, y = self.enters(*map(np.array, step(state, np.array([value]))), w)
             outputs.append(y)
         measured = np.array(outputs) + sensor * rng.normal(size=(ROWS, 1))
-        return Draw(oa.Record.from_arrays(u, measured, sampling_time=TS), np.array(outputs), np.array(states))
+        return Draw(
+            oa.Record.from_arrays(u, measured, sampling_time=TS),
+            np.array(outputs),
+            np.array(states),
+        )
 
 
 def lagged_plant() -> Plant:
@@ -75,7 +84,12 @@ def lagged_plant() -> Plant:
     rng, y = np.random.default_rng(0), np.zeros(200)
     u = rng.normal(size=200)
     for k in range(2, 200):
-        y[k] = TRUE["a"] * y[k - 1] + TRUE["b"] * y[k - 2] + TRUE["g"] * u[k - 1] + TRUE["h"] * y[k - 1] ** 3
+        y[k] = (
+            TRUE["a"] * y[k - 1]
+            + TRUE["b"] * y[k - 2]
+            + TRUE["g"] * u[k - 1]
+            + TRUE["h"] * y[k - 1] ** 3
+        )
     record = oa.Record.from_arrays(u, y, sampling_time=TS)
 
     def enters(state: np.ndarray, y: np.ndarray, w: float) -> tuple[np.ndarray, np.ndarray]:
@@ -89,8 +103,12 @@ def motion_plant() -> Plant:
     """Of the motion with the cube; the disturbance moves its velocity."""
     u = np.repeat(np.random.default_rng(0).normal(size=50), 4)
     exact = motion(cube=True)
-    begun = oa.estimate(oa.Record.from_arrays(u, np.sin(np.arange(200.0)), sampling_time=TS), exact, learner=None).model
-    model = begun.__class__(**{**vars(begun), "numbers": begun.numbers._replace(theta=exact.coordinates.initial)})
+    begun = oa.estimate(
+        oa.Record.from_arrays(u, np.sin(np.arange(200.0)), sampling_time=TS), exact, learner=None
+    ).model
+    model = begun.__class__(
+        **{**vars(begun), "numbers": begun.numbers._replace(theta=exact.coordinates.initial)}
+    )
 
     def enters(state: np.ndarray, y: np.ndarray, w: float) -> tuple[np.ndarray, np.ndarray]:
         return state + [0.0, w], y
@@ -151,8 +169,16 @@ def shares(draws: int = 5) -> list[list[float]]:
         for seed in range(draws):
             model = fitted(plant, plant.draw(1000 + seed, 0.0, sensor).record, True).model
             held = plant.draw(seed, 0.0, sensor)
-            observers = [oa.Observer(model, with_share(model, model.statistics.noise, share)) for share in SHARES]
-            rows.append([[*judged(o, held)[::3], o.predict(held.record).scores().rmse[0] / sensor] for o in observers])
+            observers = [
+                oa.Observer(model, with_share(model, model.statistics.noise, share))
+                for share in SHARES
+            ]
+            rows.append(
+                [
+                    [*judged(o, held)[::3], o.predict(held.record).scores().rmse[0] / sensor]
+                    for o in observers
+                ]
+            )
         found.append(np.mean(rows, axis=0))
     return np.concatenate(found, axis=1).tolist()
 
@@ -163,9 +189,13 @@ def rows(draws: int) -> Iterator[list[float]]:
     for kind, noises in CASES:
         count = draws if kind == "lagged" else draws // 2
         found = (
-            known(plants[kind], 10 * draws) if noises == "known" else told_by_a_fit(plants[kind], LEVELS[noises], count)
+            known(plants[kind], 10 * draws)
+            if noises == "known"
+            else told_by_a_fit(plants[kind], LEVELS[noises], count)
         )
-        yield [float(value) for value in np.mean(found, axis=0) if not np.isnan(value)]  # lagged physics has no states
+        yield [
+            float(value) for value in np.mean(found, axis=0) if not np.isnan(value)
+        ]  # lagged physics has no states
 
 
 def table(draws: int = 10) -> list[list[float]]:
@@ -184,7 +214,10 @@ CASES = (
 def main(draws: int) -> None:
     print(describe())
     began = time.perf_counter()
-    print("| case | NIS | in its interval | white | outputs | measurements | states |\n|---|---|---|---|---|---|---|")
+    print(
+        "| case | NIS | in its interval | white | outputs | measurements | states "
+        "|\n|---|---|---|---|---|---|---|"
+    )
     for (kind, noises), row in zip(CASES, rows(draws), strict=True):
         cells = [f"{value:.1f} %" for value in row[1:]] + ["–"] * (6 - len(row))
         case = "exact, noises known" if noises == "known" else f"fitted, {noises}"

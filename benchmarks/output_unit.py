@@ -22,7 +22,9 @@ from orthaug.studies import synthetic
 UNITS, NOISELESS = (1, 3, 10, 30, 100), 3
 
 
-def test_rmse(example: synthetic.Example, unit: float, seed: int, regularization: str, iterations: int) -> float:
+def test_rmse(
+    example: synthetic.Example, unit: float, seed: int, regularization: str, iterations: int
+) -> float:
     """RMSE of the one-step prediction on the test record."""
     problem = pose(example.train, example.baseline)
     usual = OneStepTask.of(problem, oa.MLP())
@@ -44,7 +46,9 @@ def noisy(data_set: int, draw: int) -> synthetic.Example:
     example = synthetic.static(data_set)
     experiment = example.train.experiments[0]
     noise = np.random.default_rng(draw).normal(0.0, synthetic.NOISE_30_DB, experiment.outputs.shape)
-    return dataclasses.replace(example, train=oa.Record.from_arrays(experiment.inputs, experiment.outputs + noise))
+    return dataclasses.replace(
+        example, train=oa.Record.from_arrays(experiment.inputs, experiment.outputs + noise)
+    )
 
 
 def rows() -> Iterator[tuple[int, list[tuple[float, float]]]]:
@@ -79,7 +83,9 @@ def noiseless() -> list[tuple[float, float]]:
 
 def default() -> list[float]:
     """By how many per cent the median of the default is above the best unit's: largest of the others, last column."""
-    medians = {unit: np.array([median for median, _ in columns]) for unit, columns in measured().items()}
+    medians = {
+        unit: np.array([median for median, _ in columns]) for unit, columns in measured().items()
+    }
     above = 100 * (medians[OUTPUT_UNIT] / np.min(list(medians.values()), axis=0) - 1)
     return [float(above[:-1].max()), float(above[-1])]
 
@@ -87,7 +93,8 @@ def default() -> list[float]:
 def main() -> None:
     print(describe())
     print(
-        "| unit | set 1, noise | set 3, noise | set 1, 10 starts, paper's draw | set 1, no noise | MSD, no reg. | MSD |"
+        "| unit | set 1, noise | set 3, noise | set 1, 10 starts, paper's draw | set 1, no "
+        "noise | MSD, no reg. | MSD |"
     )
     print("|---|---|---|---|---|---|---|")
     for unit, columns in rows():

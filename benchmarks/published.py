@@ -17,20 +17,34 @@ from orthaug.studies.study import run
 sys.path.append(str(ROOT / "examples"))
 import static_example
 
-SCRIPTS = {"no noise": 1.47e-4, "30 dB": 7.04e-4, "mass-spring-damper": 9.7e-5}  # mean test RMSE of their starts
+SCRIPTS = {
+    "no noise": 1.47e-4,
+    "30 dB": 7.04e-4,
+    "mass-spring-damper": 9.7e-5,
+}  # mean test RMSE of their starts
 
 
 def picture() -> float:
     """The largest test RMSE of either structure over the ten starts of examples/static_example.py."""
     example = oa.synthetic.static(1)
-    return max(static_example.largest_rmse(example, fits) for fits in static_example.estimates(example).values())
+    return max(
+        static_example.largest_rmse(example, fits)
+        for fits in static_example.estimates(example).values()
+    )
 
 
 def rmse(name: str, **options: object) -> float:
     """Mean one-step test RMSE over as many starts as the scripts had."""
     machine = name == "mass-spring-damper"
-    example = oa.synthetic.mass_spring_damper() if machine else oa.synthetic.static(1, noise=name == "30 dB")
-    fits = [oa.estimate(example.train, example.baseline, seed=s, **options) for s in range(5 if machine else 10)]  # type: ignore[arg-type]
+    example = (
+        oa.synthetic.mass_spring_damper()
+        if machine
+        else oa.synthetic.static(1, noise=name == "30 dB")
+    )
+    fits = [
+        oa.estimate(example.train, example.baseline, seed=s, **options)
+        for s in range(5 if machine else 10)
+    ]  # type: ignore[arg-type]
     return float(np.mean([fit.model.predict(example.test).scores().rmse[0] for fit in fits]))
 
 
@@ -59,7 +73,10 @@ def main() -> None:
     print(f"Largest test RMSE of the picture's twenty fits: {picture():.2g}")
     for name, row in zip(SCRIPTS, accuracy(), strict=True):
         print(f"{name}: {', '.join(f'{value:.3g}' for value in row)} (scripts {SCRIPTS[name]:.3g})")
-    print("Coverage, set 1, set 3, set 3 uniform:", ", ".join(f"{value:.1f} %" for value in coverage()))
+    print(
+        "Coverage, set 1, set 3, set 3 uniform:",
+        ", ".join(f"{value:.1f} %" for value in coverage()),
+    )
 
 
 if __name__ == "__main__":

@@ -44,8 +44,14 @@ def equal() -> list[float]:
     more, again = oa.Recursive(fit), oa.Recursive(fit, start="empty")
     more.update(new)
     again.update(fit.problem.record)
-    one, other = np.abs(more.theta / batch(fit, new) - 1).max(), np.abs(again.theta / fit.theta - 1).max()
-    print(f"forgetting 1: {one:.1e} of the batch fit after {ROWS} rows; empty, fed the training rows: {other:.1e}")
+    one, other = (
+        np.abs(more.theta / batch(fit, new) - 1).max(),
+        np.abs(again.theta / fit.theta - 1).max(),
+    )
+    print(
+        f"forgetting 1: {one:.1e} of the batch fit after {ROWS} rows; empty, fed the training "
+        f"rows: {other:.1e}"
+    )
     return [float(one), float(other)]
 
 
@@ -62,7 +68,8 @@ def drift(draws: int = 20) -> list[float]:
             errors.append(100 * np.abs(course.m / mass[course.index] - 1))
         told += [memory, float(np.median(errors)), float(np.max(errors)), 100 * alarms / draws]
         print(
-            f"memory {memory} s: error of m {told[-3]:.2f} % median, {told[-2]:.2f} % largest; alarms {told[-1]:.0f} %"
+            f"memory {memory} s: error of m {told[-3]:.2f} % median, {told[-2]:.2f} % largest; "
+            f"alarms {told[-1]:.0f} %"
         )
     return told
 
@@ -83,8 +90,8 @@ def friction(draws: int = DRAWS) -> list[float]:
             found = [d for d in delays if np.isfinite(d)] or [np.nan]
             told += [float(np.median(found)), float(np.max(found)), float(soon), float(seen)]
             which = "forgets nothing" if memory is None else f"memory {memory} s"
-            print(f"friction +{100 * (step - 1):.0f} %, {which}: {told[-4]:.2f} s median, {told[-3]:.2f} s largest, "
-                  f"{soon:.1f} % within 2 s, {seen:.1f} % at all")  # fmt: skip
+            print(f"friction +{100 * (step - 1):.0f} %, {which}: {told[-4]:.2f} s median, "
+                f"{told[-3]:.2f} s largest, {soon:.1f} % within 2 s, {seen:.1f} % at all")  # fmt: skip
     return told
 
 
@@ -98,7 +105,10 @@ def quiet(draws: int = DRAWS) -> list[float]:
                 online = oa.Recursive(fit_of(draw, case), memory=memory)
                 raised += bool(online.update(Plant(**options).record(40_000 + draw)))
             told.append(100 * raised / draws)
-            print(f"no change, noise {case}, memory {memory}: {told[-1]:.1f} % of {draws} records raise an alarm")
+            print(
+                f"no change, noise {case}, memory {memory}: {told[-1]:.1f} % of {draws} "
+                "records raise an alarm"
+            )
     return told
 
 
@@ -116,12 +126,15 @@ def coverage(draws: int = DRAWS) -> list[float]:
                              ((MASS, told_now["m"]), (100.0, told_now["ks"]))])  # fmt: skip
             told += (100 * np.mean(hits, axis=0)).tolist()
             print(
-                f"noise {case}, memory {memory}: intervals of m hold it in {told[-2]:.1f} %, of k in {told[-1]:.1f} %"
+                f"noise {case}, memory {memory}: intervals of m hold it in {told[-2]:.1f} %, "
+                f"of k in {told[-1]:.1f} %"
             )
     return told
 
 
-def directional(phi: np.ndarray, target: np.ndarray, theta: np.ndarray, r: np.ndarray, factor: float) -> np.ndarray:
+def directional(
+    phi: np.ndarray, target: np.ndarray, theta: np.ndarray, r: np.ndarray, factor: float
+) -> np.ndarray:
     """θ after every row with directional forgetting (Cao and Schwartz 2000): only along the new row."""
     course = []
     for row, y in zip(phi, target, strict=True):
@@ -142,7 +155,13 @@ def windup(draws: int = 20) -> list[float]:
     mass = np.linspace(MASS, 1.2 * MASS, rows)
     rest = np.where((np.arange(rows) >= 1000) & (np.arange(rows) < 4000), 0.0, 1.0)
     told = []
-    for name, floor in (("none", 0.0), ("0.01", 0.01), ("0.1", 0.1), ("0.3", 0.3), ("directional", None)):
+    for name, floor in (
+        ("none", 0.0),
+        ("0.01", 0.01),
+        ("0.1", 0.1),
+        ("0.3", 0.3),
+        ("directional", None),
+    ):
         idle, slow = [], []
         for draw in range(draws):
             fit = fit_of(draw)
@@ -154,7 +173,9 @@ def windup(draws: int = 20) -> list[float]:
                 if floor is None:
                     x = oa.data.regressors.stack_rows(record, fit.model.form.layout)
                     phi, target, _ = whitened_rows(fit.model, x.x, x.y)
-                    course = directional(phi[:, 0], target[:, 0], start, inner.factor_now.copy(), inner.forgetting)
+                    course = directional(
+                        phi[:, 0], target[:, 0], start, inner.factor_now.copy(), inner.forgetting
+                    )
                 else:
                     inner.floor = np.sqrt(floor / 0.1) * inner.floor if floor else None
                     online.update(record)
@@ -162,7 +183,10 @@ def windup(draws: int = 20) -> list[float]:
                 error = 100 * np.abs(TS**2 / course[:, 2] / truth[-len(course) :] - 1)
                 kept.append(error[1000:4100].max() if kept is idle else np.median(error))
         told += [float(np.median(idle)), float(np.max(idle)), float(np.median(slow))]
-        print(f"floor {name}: without force {told[-3]:.2f} % median, {told[-2]:.2f} % largest; drift {told[-1]:.2f} %")
+        print(
+            f"floor {name}: without force {told[-3]:.2f} % median, {told[-2]:.2f} % largest; "
+            f"drift {told[-1]:.2f} %"
+        )
     return told
 
 
@@ -191,8 +215,9 @@ def times() -> list[float]:
             online.update(u=experiment.inputs[k], y=experiment.outputs[k])
         seconds["single"].append((time.perf_counter() - began) / 500)
     bare, block, single = (float(np.median(seconds[name])) for name in ("bare", "block", "single"))
-    print(f"a row: bare NumPy {1e6 * bare:.1f} us; in a block {1e6 * block:.0f} us ({block / bare:.0f} times); "
-          f"one a call {1e6 * single:.0f} us ({single / bare:.0f} times)")  # fmt: skip
+    print(f"a row: bare NumPy {1e6 * bare:.1f} us; in a block {1e6 * block:.0f} us "
+        f"({block / bare:.0f} times); one a call {1e6 * single:.0f} us ({single / bare:.0f} "
+        "times)")  # fmt: skip
     return [block / bare, single / bare]
 
 

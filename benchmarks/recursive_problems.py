@@ -38,7 +38,9 @@ class Plant:
         x = np.zeros(rows)
         for k in range(2, rows):
             v = (x[k - 1] - x[k - 2]) / TS
-            push = force[k - 1] - DAMPING * v - STIFFNESS * x[k - 1] - f[k] * np.tanh(v / 0.05) + w[k]
+            push = (
+                force[k - 1] - DAMPING * v - STIFFNESS * x[k - 1] - f[k] * np.tanh(v / 0.05) + w[k]
+            )
             x[k] = 2 * x[k - 1] - x[k - 2] + TS**2 * push / m[k]
         channels = {"inputs": [oa.Channel("force", "N")], "outputs": [oa.Channel("position", "m")]}
         return oa.Record.from_arrays(force, x, sampling_time=TS, **channels)

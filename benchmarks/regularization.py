@@ -57,7 +57,9 @@ def mr_damper() -> list[Case] | None:
     """The physics and the learner of the free-run problem, one step ahead; five starts."""
     if not (data_folder() / "mr_damper").is_dir():
         return None
-    p = next(problem for problem in (make() for make in MEASURED[1:2]) if problem.name == "MR damper")
+    p = next(
+        problem for problem in (make() for make in MEASURED[1:2]) if problem.name == "MR damper"
+    )
     return [Case(p.train, p.held_out, p.baseline, seed, p.learner, p.lags) for seed in range(5)]
 
 
@@ -80,7 +82,9 @@ def generated(name: str, noise: float, draw: int, rows: int = ROWS) -> Case:
             y[k] = SYSTEMS[name](y[k - 1], u[k - 1], u[k]) + size * rng.normal()
         records.append(oa.Record.from_arrays(u, y))
     texts = ("y[k-1]", "u[k-1]", "u[k]")[: 3 if name == "saturation" else 2]
-    return Case(*records, oa.Baseline.from_terms([oa.Term(f"p{i}", text) for i, text in enumerate(texts)]))
+    return Case(
+        *records, oa.Baseline.from_terms([oa.Term(f"p{i}", text) for i, text in enumerate(texts)])
+    )
 
 
 def problems() -> Iterator[tuple[str, Sequence[Case] | None]]:
@@ -88,17 +92,32 @@ def problems() -> Iterator[tuple[str, Sequence[Case] | None]]:
     for data_set in (1, 3):
         clean = oa.synthetic.static(data_set)
         yield f"static, set {data_set}, no noise, 5 starts", [of(clean, seed) for seed in range(5)]
-    yield "static, set 1, 30 dB, the paper's draw, 10 starts", [of(noisy(1, 0), seed) for seed in range(10)]
+    yield (
+        "static, set 1, 30 dB, the paper's draw, 10 starts",
+        [of(noisy(1, 0), seed) for seed in range(10)],
+    )
     for data_set in (1, 3):
-        yield f"static, set {data_set}, 30 dB, 8 draws", [of(noisy(data_set, draw)) for draw in range(1, 9)]
+        yield (
+            f"static, set {data_set}, 30 dB, 8 draws",
+            [of(noisy(data_set, draw)) for draw in range(1, 9)],
+        )
     machine = oa.synthetic.mass_spring_damper()
     yield "mass-spring-damper, 5 starts", [of(machine, seed) for seed in range(5)]
-    yield "the same, 5 pieces of 500 rows", [of(machine, 0, slice(a, a + 500)) for a in (0, 500, 1000, 2000, 6000)]
+    yield (
+        "the same, 5 pieces of 500 rows",
+        [of(machine, 0, slice(a, a + 500)) for a in (0, 500, 1000, 2000, 6000)],
+    )
     for noise in (0.003, 0.1):
         for name in SYSTEMS:
-            yield f"{name}, noise {noise}, 5 draws", [generated(name, noise, draw) for draw in range(5)]
+            yield (
+                f"{name}, noise {noise}, 5 draws",
+                [generated(name, noise, draw) for draw in range(5)],
+            )
     for name in SYSTEMS:
-        yield f"{name}, noise 0.03, 5 draws of 150 rows", [generated(name, 0.03, draw, 150) for draw in range(5)]
+        yield (
+            f"{name}, noise 0.03, 5 draws of 150 rows",
+            [generated(name, 0.03, draw, 150) for draw in range(5)],
+        )
     yield "MR damper, 5 starts [N]", mr_damper()
     yield "Silverbox, 2 starts [V]", silverbox()
 
@@ -117,7 +136,12 @@ def rows() -> list[tuple[str, list[float | None]]]:
     return [
         (
             name,
-            [None if cases is None else float(np.median([test_rmse(case, one) for case in cases])) for one in TRIED],
+            [
+                None
+                if cases is None
+                else float(np.median([test_rmse(case, one) for case in cases]))
+                for one in TRIED
+            ],
         )
         for name, cases in problems()
     ]
@@ -138,7 +162,11 @@ def main() -> None:
     print(describe())
     print(f"| example | {' | '.join(TRIED)} |\n|---|---|---|---|---|")
     for name, found in rows():
-        print(f"| {name} | {' | '.join('absent' if one is None else f'{one:.3g}' for one in found)} |", flush=True)
+        print(
+            f"| {name} | "
+            f"{' | '.join('absent' if one is None else f'{one:.3g}' for one in found)} |",
+            flush=True,
+        )
     print(f"\nauto is at most {default():.1f} % above the best single choice")
 
 

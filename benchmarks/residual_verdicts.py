@@ -27,7 +27,10 @@ from orthaug.analysis.changes import Change
 from orthaug.analysis.diagnosis import diagnose
 from orthaug.data.expressions import Lag
 
-FELL, HELPED = 0.01, 0.05  # of the held-out error: a change that helps; one that a verdict of none must not miss
+FELL, HELPED = (
+    0.01,
+    0.05,
+)  # of the held-out error: a change that helps; one that a verdict of none must not miss
 PREDICTION, SIMULATION = oa.Prediction(), oa.Simulation(512, 40)
 SOLVER, SKIP, NEURONS = oa.LevenbergMarquardt(60), 40, 10
 
@@ -50,12 +53,21 @@ class Case:
         return "simulation" if self.criterion.simulates else "prediction"
 
     def fit(self) -> oa.Estimate:
-        options = {"lags": self.lags, "learner": self.learner, "criterion": self.criterion, "solver": SOLVER}
+        options = {
+            "lags": self.lags,
+            "learner": self.learner,
+            "criterion": self.criterion,
+            "solver": SOLVER,
+        }
         return oa.estimate(self.train, self.baseline, blocks=0, **options)
 
     def error(self, fit: oa.Estimate, of: str) -> float:
         """Held-out RMS error in the training outputs' deviations."""
-        response = fit.model.simulate(self.held_out) if of == "simulation" else fit.model.predict(self.held_out)
+        response = (
+            fit.model.simulate(self.held_out)
+            if of == "simulation"
+            else fit.model.predict(self.held_out)
+        )
         if not fit.status.ok or any(t.diverged for t in response.trajectories):
             return math.inf
         return float(np.sqrt(np.mean((response.scores(SKIP).rmse / fit.problem.deviation) ** 2)))
@@ -63,7 +75,9 @@ class Case:
     def changed(self, change: Change) -> Case:
         """With the change made."""
         if change.kind == "criterion":
-            return replace(self, criterion=SIMULATION if change.what == "simulation" else PREDICTION)
+            return replace(
+                self, criterion=SIMULATION if change.what == "simulation" else PREDICTION
+            )
         if change.kind == "learner":
             return replace(self, learner=self._larger())
         term = oa.Term("further", change.what, output=change.output)
@@ -158,7 +172,13 @@ def records(
         v = lfilter([np.sqrt(1 - pole**2)], [1.0, -pole], v)
         y = np.zeros(rows + 200)
         for k in range(10, rows + 200):
-            y[k] = 1.5 * y[k - 1] - 0.7 * y[k - 2] + u[k - delay] + further * u[k - delay - 1] + third * y[k - 3]
+            y[k] = (
+                1.5 * y[k - 1]
+                - 0.7 * y[k - 2]
+                + u[k - delay]
+                + further * u[k - delay - 1]
+                + third * y[k - 3]
+            )
             y[k] += offset + equation * e[k] - friction * np.tanh(2 * (y[k - 1] - y[k - 2]))
         made.append(oa.Record.from_arrays(u[200:], (y + sensor * v)[200:]))
     return made[0], made[1]
@@ -170,7 +190,15 @@ def known(seed: int = 17) -> Iterator[Case]:
     network, blind = oa.MLP((8,)), oa.MLP((8,), inputs=("y[k-1]",))
 
     def case(cause: str, criterion: Any, learner: oa.MLP | None = None, **system: Any) -> Case:
-        return Case("generated", *records(seed=seed, **system), baseline, oa.Lags(2, 1, 1), learner, criterion, cause)
+        return Case(
+            "generated",
+            *records(seed=seed, **system),
+            baseline,
+            oa.Lags(2, 1, 1),
+            learner,
+            criterion,
+            cause,
+        )
 
     for criterion, noise in ((PREDICTION, {"equation": 0.1}), (SIMULATION, {"sensor": 0.3})):
         yield case("a further input lag", criterion, further=0.5, **noise)
@@ -213,9 +241,20 @@ def outcomes() -> list[Outcome]:
         one = outcome(case)
         found.append(one)
         learner = "physics" if case.learner is None else "learner"
-        change = f"{one.change.kind} {one.change.what}" if one.change else f"none (best: {one.tried})"
+        change = (
+            f"{one.change.kind} {one.change.what}" if one.change else f"none (best: {one.tried})"
+        )
         by = f"{100 * one.change.fall:.0f} %" if one.change else "–"
-        cells = (case.name, learner, case.of, case.cause, one.verdict, change, by, f"{100 * one.fall:.0f} %")
+        cells = (
+            case.name,
+            learner,
+            case.of,
+            case.cause,
+            one.verdict,
+            change,
+            by,
+            f"{100 * one.fall:.0f} %",
+        )
         print(f"| {' | '.join(cells)} | {'right' if one.right else 'wrong'} |", flush=True)
     return found
 
@@ -225,12 +264,24 @@ def summary() -> list[int]:
     named = [one.right for one in outcomes() if one.change]
     none = [one.right for one in outcomes() if not one.change]
     unmodelled = sum(one.verdict == "unmodelled" for one in outcomes())
-    return [sum(named), len(named), sum(none), len(none), sum(named + none), len(named + none), unmodelled]
+    return [
+        sum(named),
+        len(named),
+        sum(none),
+        len(none),
+        sum(named + none),
+        len(named + none),
+        unmodelled,
+    ]
 
 
 def kinds() -> list[int]:
     """Right and all of the measured sets, and of the systems with a known cause."""
-    measured = [one.right for one in outcomes() if one.case.name.startswith(("silverbox", "MR damper", "tanks,"))]
+    measured = [
+        one.right
+        for one in outcomes()
+        if one.case.name.startswith(("silverbox", "MR damper", "tanks,"))
+    ]
     causes = [one.right for one in outcomes() if one.case.cause]
     return [sum(measured), len(measured), sum(causes), len(causes)]
 
@@ -243,14 +294,20 @@ def fresh() -> list[int]:
 
 def falls() -> list[list[float]]:
     """In per cent, of every case: the predicted fall, where there is one, and the measured one."""
-    return [[100 * fall for fall in (*([one.change.fall] if one.change else []), one.fall)] for one in outcomes()]
+    return [
+        [100 * fall for fall in (*([one.change.fall] if one.change else []), one.fall)]
+        for one in outcomes()
+    ]
 
 
 def main() -> None:
     print(describe())
     began = time.perf_counter()
     a, b, c, d, e, f, g = summary()
-    print(f"\nA change is named: right {a} of {b}. None needed: right {c} of {d}. Together {e} of {f}.")
+    print(
+        f"\nA change is named: right {a} of {b}. None needed: right {c} of {d}. Together {e} "
+        f"of {f}."
+    )
     print(f"unmodelled {g} of {f}; {time.perf_counter() - began:.0f} s")
 
 

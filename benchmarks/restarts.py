@@ -24,7 +24,10 @@ SEEDS, ITERATIONS = range(4), 100
 
 def main() -> None:
     print(describe())
-    print("| example | loop | threads | loop / threads | vmap | loop / vmap |\n|---|---|---|---|---|---|")
+    print(
+        "| example | loop | threads | loop / threads | vmap | loop / vmap "
+        "|\n|---|---|---|---|---|---|"
+    )
     solver = LevenbergMarquardt(ITERATIONS, tolerance=0.0)
     for name, example in (
         ("static", synthetic.static(1, noise=True)),
@@ -39,7 +42,9 @@ def main() -> None:
         criterion = OneStep(task.bound)
 
         @jax.jit
-        def batched(ws: object, criterion=criterion, arguments=arguments, overlap=overlap, options=options) -> object:
+        def batched(
+            ws: object, criterion=criterion, arguments=arguments, overlap=overlap, options=options
+        ) -> object:
             def one(w: object) -> object:
                 state = _begun(w, linearise(criterion, w, arguments, overlap), jnp.asarray(0.0))
                 return _advance(criterion, state, arguments, options, jnp.asarray(ITERATIONS))
@@ -57,7 +62,10 @@ def main() -> None:
         stacked = jnp.stack(starts)
         one, two = alternate(loop, threads, 7)
         again, three = alternate(loop, lambda s=stacked, b=batched: jax.block_until_ready(b(s)), 7)
-        print(f"| {name} | {one:.3f} s | {two:.3f} s | {one / two:.2f} | {three:.3f} s | {again / three:.2f} |")
+        print(
+            f"| {name} | {one:.3f} s | {two:.3f} s | {one / two:.2f} | {three:.3f} s | "
+            f"{again / three:.2f} |"
+        )
 
 
 if __name__ == "__main__":

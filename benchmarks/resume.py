@@ -25,13 +25,22 @@ def command(folder: Path, name: str) -> subprocess.Popen[str]:
     main = "import sys; from orthaug.commands.cli import main; sys.argv[0] = 'orthaug'; main()"
     arguments = ["reproduce", "--small", "--out", str(folder / "out")]
     environment = {**os.environ, "XDG_CACHE_HOME": str(folder / name)}
-    options = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "text": True, "env": environment}
+    options = {
+        "stdout": subprocess.DEVNULL,
+        "stderr": subprocess.DEVNULL,
+        "text": True,
+        "env": environment,
+    }
     return subprocess.Popen([sys.executable, "-c", main, *arguments], **options)
 
 
 def runs(folder: Path) -> dict[str, bytes]:
     """Every study's runs as they were written."""
-    return {path.parent.name: path.read_bytes() for path in folder.glob("out/*/runs.csv") if path.parent.name != TIMED}
+    return {
+        path.parent.name: path.read_bytes()
+        for path in folder.glob("out/*/runs.csv")
+        if path.parent.name != TIMED
+    }
 
 
 def main() -> int:

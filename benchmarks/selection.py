@@ -68,7 +68,10 @@ class Narx:
                 return
 
     def _terms(self, u: np.ndarray, y: np.ndarray, k: int) -> list[float]:
-        return [float(np.prod([(y if f < 3 else u)[k - f % 3 - 1] for f in product])) for product in self.products]
+        return [
+            float(np.prod([(y if f < 3 else u)[k - f % 3 - 1] for f in product]))
+            for product in self.products
+        ]
 
     def _felt(self, u: np.ndarray, y: np.ndarray) -> bool:
         """Whether each term moves the output by a hundredth of its deviation."""
@@ -81,7 +84,10 @@ class Narx:
         u, y = rng.uniform(-1, 1, rows + BEFORE), np.zeros(rows + BEFORE)
         for k in range(3, len(y)):
             y[k] = (
-                self.a * y[k - 1] + self.b * u[k - 1] + self.coefficients @ self._terms(u, y, k) + noise * rng.normal()
+                self.a * y[k - 1]
+                + self.b * u[k - 1]
+                + self.coefficients @ self._terms(u, y, k)
+                + noise * rng.normal()
             )
             if abs(y[k]) > 20:
                 return None
@@ -136,11 +142,15 @@ def terms(count: int = 20) -> dict[str, list[float]]:
         rows = []
         for one in systems(count):
             began = time.monotonic()
-            chosen = oa.select(one.record(kind, db), PHYSICS, lags=LAGS, criterion=criterion).learner
+            chosen = oa.select(
+                one.record(kind, db), PHYSICS, lags=LAGS, criterion=criterion
+            ).learner
             got = set() if chosen is None else set(chosen.terms)
             true = set(one.texts)
             took = time.monotonic() - began
-            rows.append((100 * len(got & true) / TRUE_TERMS, len(got - true), 100 * (got == true), took))
+            rows.append(
+                (100 * len(got & true) / TRUE_TERMS, len(got - true), 100 * (got == true), took)
+            )
         found[name] = np.mean(rows, axis=0).tolist()
         frols = [_frols(one.record(kind, db), one) for one in systems(count)]
         if all(row is not None for row in frols):
@@ -158,8 +168,15 @@ def _frols(record: oa.Record, system: Narx) -> tuple[float, float, float, float]
         return None
     began = time.monotonic()
     u, y = record.experiments[0].inputs, record.experiments[0].outputs
-    options = {"order_selection": True, "n_info_values": 20, "info_criteria": "bic", "err_tol": None}
-    model = FROLS(ylag=3, xlag=3, basis_function=Polynomial(degree=3), estimator=LeastSquares(), **options)
+    options = {
+        "order_selection": True,
+        "n_info_values": 20,
+        "info_criteria": "bic",
+        "err_tol": None,
+    }
+    model = FROLS(
+        ylag=3, xlag=3, basis_function=Polynomial(degree=3), estimator=LeastSquares(), **options
+    )
     model.fit(X=u, y=y)
     got = set()
     for code in model.final_model:
@@ -179,7 +196,9 @@ def orders(count: int = 20) -> dict[str, float]:
         right = []
         for number in range(count):
             record = linear_record(number, kind, db)
-            chosen = oa.select(record, None, learner=None, lags=oa.Lags(5, 8, 0), criterion=criterion).orders.chosen
+            chosen = oa.select(
+                record, None, learner=None, lags=oa.Lags(5, 8, 0), criterion=criterion
+            ).orders.chosen
             right.append((chosen.na, chosen.nb[0], chosen.nk[0]) == linear(number)[0])
         found[name] = 100 * float(np.mean(right))
     return found
@@ -189,7 +208,9 @@ def level(draws: int = 2000) -> dict[str, float]:
     """% of linear records with true orders for which something nonlinear is said to be missing, at the level of 5 %."""
     found = {}
     for kind in ("equation", "sensor"):
-        told = [_tested(number, linear_record(number, kind, 30, 600, 66)) for number in range(draws)]
+        told = [
+            _tested(number, linear_record(number, kind, 30, 600, 66)) for number in range(draws)
+        ]
         found[f"{kind} noise"] = 100 * float(np.mean(told))
     return found
 
@@ -231,20 +252,27 @@ def coverage(draws: int = 200) -> dict[str, float]:
             chosen = oa.select(record, PHYSICS, lags=LAGS, criterion=oa.Prediction(), halves=halves)
             if chosen.learner is None:
                 continue
-            table = chosen.estimate().terms
+            data = (
+                record if name == "same data" else chosen.record
+            )  # which `chosen.estimate()` gives no intervals
+            table = oa.estimate(data, PHYSICS, **chosen.options).terms
             for term, row in table.iterrows():
                 true = truth.get(str(term), 0.0)
                 held[name].append(row["ci95_low"] <= true <= row["ci95_high"])
     return {name: 100 * float(np.mean(rows)) for name, rows in held.items()}
 
 
-HEAT = oa.Baseline.from_terms([oa.Term("a1", "y[k-1]"), oa.Term("b1", "u[k-1]"), oa.Term("b0", "1")])
+HEAT = oa.Baseline.from_terms(
+    [oa.Term("a1", "y[k-1]"), oa.Term("b1", "u[k-1]"), oa.Term("b0", "1")]
+)
 
 
 def exchanger(seed: int, noise: float, mean: float, rows: int = 1500) -> oa.Record:
     """A slow plant with a persistent input: a saturating gain, a wall that stores heat, a drift."""
     rng = np.random.default_rng(seed)
-    u = 0.4 + 0.2 * np.tanh(scipy.signal.lfilter([1], [1, -0.97], rng.normal(size=rows + 300))[300:] / 4)
+    u = 0.4 + 0.2 * np.tanh(
+        scipy.signal.lfilter([1], [1, -0.97], rng.normal(size=rows + 300))[300:] / 4
+    )
     drift = scipy.signal.lfilter([0.02], [1, -0.995], rng.normal(size=rows))
     y, wall = np.zeros(rows), 0.0
     for k in range(1, rows):
@@ -264,7 +292,11 @@ def collinear(seeds: int = 4) -> dict[str, list[float]]:
                 record = exchanger(seed, noise, mean)
                 one = oa.select(record, HEAT, criterion=oa.Prediction(), most=40, collinear=limit)
                 assert one.physics is not None and one.terms is not None
-                widened = max(s.after_std / s.before_std for s in one.physics.shifts if s.after_std and s.before_std)
+                widened = max(
+                    s.after_std / s.before_std
+                    for s in one.physics.shifts
+                    if s.after_std and s.before_std
+                )
                 rows.append((widened, one.terms.chosen.score / one.terms.rungs[0].score))
         widened, better = np.array(rows).T
         scale = float(np.exp(np.mean(np.log(better))))

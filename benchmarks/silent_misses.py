@@ -1,9 +1,10 @@
 """How often is the truth outside every interval that is shown, and nothing warns of it? One table of all such trials.
 
-Four files have the systems: what a missing term moves (`coverage_causes`), columns that a learner could imitate
-(`coverage_shared`), states that the physics lacks (`coverage_hidden`), and noise that breaks an assumption
-(`coverage_noise`). A row is a system, its noise and what the learner sees; held, silent misses and the median width
-relative to the value. Allowed: silent misses of 5 %, with the standard error of so many draws.
+Five files have the systems: what a missing term moves (`coverage_causes`), columns that a learner could imitate
+(`coverage_shared`), states that the physics lacks (`coverage_hidden`), noise that breaks an assumption
+(`coverage_noise`), and terms that `select` chose (`coverage_choice`). A row is a system, its noise and what the learner
+sees; held, silent misses and the median width relative to the value. Allowed: silent misses of 5 %, with the standard
+error of so many draws.
 Run: python benchmarks/silent_misses.py [lagged draws, default 100] [draws of motions, default 30]; with few draws it
 tells of gross misses only.
 """
@@ -16,6 +17,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import coverage_causes
+import coverage_choice
 import coverage_hidden
 import coverage_noise
 import coverage_shared
@@ -47,32 +49,73 @@ def rows(lagged: int = 100, motions: int = 30) -> Iterator[Row]:
     for one in coverage_noise.lagged_rows(lagged):
         yield Row(one.system, one.noise, one.learner, one.draws, one.held, one.silent, one.width)
     for one in coverage_noise.motion_rows(motions):
-        yield Row(f"motion, {one.system}", one.noise, one.learner, one.draws, one.held, one.silent, one.width)
+        yield Row(
+            f"motion, {one.system}",
+            one.noise,
+            one.learner,
+            one.draws,
+            one.held,
+            one.silent,
+            one.width,
+        )
+    for one in coverage_choice.rows(lagged, motions):
+        yield Row(
+            f"chosen terms, {one.system}",
+            one.noise,
+            one.sees,
+            one.draws,
+            one.held,
+            one.silent,
+            one.width,
+        )
     for one in coverage_causes.rows(lagged, motions):
-        yield Row(one.system, f"{one.noise:g}", one.sees, one.draws, one.held, one.silent, 100 * one.width)
+        yield Row(
+            one.system, f"{one.noise:g}", one.sees, one.draws, one.held, one.silent, 100 * one.width
+        )
     for one in coverage_shared.rows(lagged):
         share = 100 / one.draws
         width = 100 * one.width
-        yield Row(one.system, one.noise, one.sees, one.draws, share * one.held, share * one.silent, width)
+        yield Row(
+            one.system, one.noise, one.sees, one.draws, share * one.held, share * one.silent, width
+        )
     for words, draws in (("lagged", lagged), ("motion", motions)):
         for one in coverage_hidden.rows(draws, words):
             share, value = 100 / one.draws, coverage_hidden.SYSTEMS[one.system][4]
             width = 100 * one.width / value
-            yield Row(one.system, one.noise, one.sees, one.draws, share * one.held, share * one.silent, width)
+            yield Row(
+                one.system,
+                one.noise,
+                one.sees,
+                one.draws,
+                share * one.held,
+                share * one.silent,
+                width,
+            )
 
 
 def main(lagged: int, motions: int) -> int:
     print(describe())
-    print("\n| system | noise | learner sees | draws | held | silent misses | width |\n" + 7 * "|---" + "|")
+    print(
+        "\n| system | noise | learner sees | draws | held | silent misses | width |\n"
+        + 7 * "|---"
+        + "|"
+    )
     began, missed = time.perf_counter(), []
     for row in rows(lagged, motions):
-        shown = [f"{row.held:.0f} %", f"{row.silent:.0f} %", "" if np.isnan(row.width) else f"{row.width:.2g} %"]
-        print(f"| {row.system} | {row.noise} | {row.sees} | {row.draws} | {' | '.join(shown)} |", flush=True)
+        figures = (f"{row.held:.0f} %", f"{row.silent:.0f} %", f"{row.width:.2g} %")
+        shown = ["" if figure.startswith("nan") else figure for figure in figures]
+        print(
+            f"| {row.system} | {row.noise} | {row.sees} | {row.draws} | {' | '.join(shown)} |",
+            flush=True,
+        )
         missed += [row] if row.silent > row.most else []
     minutes = (time.perf_counter() - began) / 60
     print(f"\n{minutes:.0f} min; rows above {ALLOWED:g} % by two standard errors: {len(missed)}")
     for row in missed:
-        print(f"- {row.system}, {row.noise}, learner sees {row.sees}: {row.silent:.0f} % of {row.draws}")
+        print(
+            f"- {row.system}, {row.noise}, learner sees {row.sees}: {row.silent:.0f} % of "
+            f"{row.draws}"
+        )
     return bool(missed)
 
 

@@ -35,26 +35,35 @@ def main() -> None:
     problem = pose(record(), baseline, None, ("y[k-1]", "y[k-2]"))
     task = OneStepTask.of(problem, MLP((10,)))
     start = task.bound.init(jax.random.key(0))
-    flight = FreeRunTask.of(task, Simulation(segment=512, washout=40))
+    free_fit = FreeRunTask.of(task, Simulation(segment=512, washout=40))
     c = problem.projection.solve(problem.whitened_target - task.values(start) / problem.deviation)
-    numbers, states = flight.numbers(c, start), jnp.asarray(flight.segments.start)
+    numbers, states = free_fit.numbers(c, start), jnp.asarray(free_fit.segments.start)
 
     def train(iterations: int) -> None:
         with one_blas_thread():  # as `estimate` trains
-            run = flight.run(LevenbergMarquardt(iterations, tolerance=0.0), start, Orthogonal(), "evidence")
+            run = free_fit.run(
+                LevenbergMarquardt(iterations, tolerance=0.0), start, Orthogonal(), "evidence"
+            )
         assert run.end.iterations == iterations, "training ended early"
 
     plain = median_seconds(
-        lambda: jax.block_until_ready(respond(flight.dynamics, numbers, flight.segments, states)), 5 * REPEATS
+        lambda: jax.block_until_ready(
+            respond(free_fit.dynamics, numbers, free_fit.segments, states)
+        ),
+        5 * REPEATS,
     )
     # a run's beginning (one-step training, the first linearisation) is paid once: take the difference of two lengths
-    short, long = median_seconds(lambda: train(SHORT), REPEATS), median_seconds(lambda: train(LONG), REPEATS)
+    short, long = (
+        median_seconds(lambda: train(SHORT), REPEATS),
+        median_seconds(lambda: train(LONG), REPEATS),
+    )
     one = (long - short) / (LONG - SHORT)
     print(describe())
     print("| rows | weights | iteration | free run | ratio | allowed |\n|---|---|---|---|---|---|")
     weights = task.bound.size
     print(
-        f"| {ROWS} | {weights} | {1e3 * one:.1f} ms | {1e3 * plain:.2f} ms | {one / plain:.1f} | {ALLOWED * weights} |"
+        f"| {ROWS} | {weights} | {1e3 * one:.1f} ms | {1e3 * plain:.2f} ms | {one / plain:.1f} "
+        f"| {ALLOWED * weights} |"
     )
 
 

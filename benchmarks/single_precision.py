@@ -19,7 +19,7 @@ from machine import alternate, describe
 import orthaug as oa
 from orthaug._base.jax import jax, jnp
 from orthaug._base.parallel import one_blas_thread
-from orthaug.fitting.normal_equations import Blocks, Hold, Summed, collect
+from orthaug.fitting.normal_equations import Blocks, Hold, SummedOneStep, collect
 from orthaug.fitting.one_step import OneStepTask
 from orthaug.models.learners import Bound
 from orthaug.models.rows import Chunk, InMemory, Overlap
@@ -56,7 +56,12 @@ def task_of(rows: int, neurons: int) -> OneStepTask:
     rng = np.random.default_rng(0)
     u, y = rng.uniform(-1, 1, rows), np.zeros(rows)
     for k in range(3, rows):
-        y[k] = 1.5 * y[k - 1] - 0.7 * y[k - 2] + 0.1 * u[k - 1] - 0.05 * np.tanh(8 * (y[k - 1] - y[k - 2]))
+        y[k] = (
+            1.5 * y[k - 1]
+            - 0.7 * y[k - 2]
+            + 0.1 * u[k - 1]
+            - 0.05 * np.tanh(8 * (y[k - 1] - y[k - 2]))
+        )
     record = oa.Record.from_arrays(u=u, y=y + 1e-3 * rng.normal(size=rows))
     terms = [oa.Term("a", "y[k-1]"), oa.Term("b", "y[k-2]"), oa.Term("c", "u[k-1]")]
     problem = pose(record, oa.Baseline.from_terms(terms), oa.Lags(na=3, nb=3, nk=1))
@@ -68,9 +73,11 @@ def passes(task: OneStepTask, rough: bool) -> Callable[[Any, Overlap], Any]:
     nt = len(task.problem.baseline.names)
     hold = Hold(jnp.zeros((nt, nt)), jnp.zeros(nt))
     if not rough:
-        return Summed(task.engine, task.bound, task.rows, hold)
+        return SummedOneStep(task.engine, task.bound, task.rows, hold)
     made = jax.jit(collect)
-    return lambda w, before: made(InMemory().sum(SingleBlocks(task.bound), task.rows, w, before), hold, before)
+    return lambda w, before: made(
+        InMemory().sum(SingleBlocks(task.bound), task.rows, w, before), hold, before
+    )
 
 
 def _once(way: Any, w: Any, nothing: Overlap) -> None:
@@ -92,7 +99,10 @@ def main() -> None:
         solver = oa.LevenbergMarquardt(60, tolerance=1e-13)
         ends = [solver.drive(way, w, nothing, samples=rows - nt, ridge=ALPHA) for way in ways]
         factor = task.problem.projection
-        thetas = [task.problem.least_squares - factor.from_coordinates(task.coordinates(end)) for end in ends]
+        thetas = [
+            task.problem.least_squares - factor.from_coordinates(task.coordinates(end))
+            for end in ends
+        ]
         apart = np.max(np.abs(thetas[1] - thetas[0]) / np.abs(thetas[0]))
         losses = [float(end.normal.loss) for end in ends]
         steps = " / ".join(str(end.iterations) for end in ends)

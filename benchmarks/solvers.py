@@ -32,7 +32,10 @@ def iterations_to(task: OneStepTask, w: object, loss: float) -> int | None:
             return None
     while high - low > 1:
         middle = (low + high) // 2
-        if task.run(LevenbergMarquardt(middle, tolerance=0.0, longest=middle), w).normal.loss > loss:
+        if (
+            task.run(LevenbergMarquardt(middle, tolerance=0.0, longest=middle), w).normal.loss
+            > loss
+        ):
             low = middle
         else:
             high = middle
@@ -57,16 +60,24 @@ def table() -> None:
             target = float(task.run(pipeline, w, Orthogonal()).normal.loss)
             count = iterations_to(task, w, target)
             if count is None:
-                print(f"| {name} | {seed} | LM does not reach the loss within 4096 iterations | | | | |")
+                print(
+                    f"| {name} | {seed} | LM does not reach the loss within 4096 iterations | "
+                    "| | | |"
+                )
                 continue
             slow, fast = alternate(
                 lambda t=task, w=w, p=pipeline: t.run(p, w, Orthogonal()),
-                lambda t=task, w=w, n=count: t.run(LevenbergMarquardt(n, tolerance=0.0, longest=n), w),
+                lambda t=task, w=w, n=count: t.run(
+                    LevenbergMarquardt(n, tolerance=0.0, longest=n), w
+                ),
                 3,
             )
             ratios.append(slow / fast)
             loss, ratio = task.mean_square(target), slow / fast
-            print(f"| {name} | {seed} | {slow:.3f} s | {loss:.4g} | {1e3 * fast:.1f} ms | {count} | {ratio:.0f} |")
+            print(
+                f"| {name} | {seed} | {slow:.3f} s | {loss:.4g} | {1e3 * fast:.1f} ms | "
+                f"{count} | {ratio:.0f} |"
+            )
         print(f"| {name} | median | | | | | {np.median(ratios):.0f} |", flush=True)
 
 

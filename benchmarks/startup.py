@@ -44,14 +44,26 @@ def main(repeats: int = 7) -> None:
     print(describe())
     with tempfile.TemporaryDirectory() as folder:
         commands = {f"import {name}": [f"import {name}"] for name in IMPORTS}
-        commands |= {"import all three": [f"import {', '.join(IMPORTS)}"], "help": [COMMAND, "--help"]}
+        commands |= {
+            "import all three": [f"import {', '.join(IMPORTS)}"],
+            "help": [COMMAND, "--help"],
+        }
         for name, spec in write_cases(Path(folder)).items():
-            commands[f"fit, {name}"] = [COMMAND, "fit", str(spec), "--out", str(spec.parent / "out")]
+            commands[f"fit, {name}"] = [
+                COMMAND,
+                "fit",
+                str(spec),
+                "--out",
+                str(spec.parent / "out"),
+            ]
         times = in_turn(commands, repeats, environment(folder))
     wall, processor = times["import all three"]
     print("| process | wall | ratio | processor | ratio |\n|---|---|---|---|---|")
     for name, (seconds, busy) in times.items():
-        print(f"| {name} | {seconds:.2f} s | {seconds / wall:.2f} | {busy:.2f} s | {busy / processor:.2f} |")
+        print(
+            f"| {name} | {seconds:.2f} s | {seconds / wall:.2f} | {busy:.2f} s | "
+            f"{busy / processor:.2f} |"
+        )
 
 
 def write_cases(folder: Path) -> dict[str, Path]:
@@ -64,7 +76,9 @@ def write_cases(folder: Path) -> dict[str, Path]:
     damper = synthetic.mass_spring_damper()
     spec, train, test = many_terms()
     return {
-        "static": write_case(folder / "static", STATIC.format(inputs='["u"]', terms=terms), static.train, static.test),
+        "static": write_case(
+            folder / "static", STATIC.format(inputs='["u"]', terms=terms), static.train, static.test
+        ),
         "mass-spring-damper": write_case(folder / "damper", DAMPER, damper.train, damper.test),
         "56 terms": write_case(folder / "many", spec, train, test),
     }
@@ -75,7 +89,9 @@ def write_case(folder: Path, spec: str, train: Record, test: Record) -> Path:
     for name, record in (("train", train), ("test", test)):
         header = ",".join(channel.name for channel in (*record.inputs, *record.outputs))
         rows = np.column_stack([record.experiments[0].inputs, record.experiments[0].outputs])
-        np.savetxt(folder / f"{name}.csv", rows, fmt="%.17g", delimiter=",", header=header, comments="")
+        np.savetxt(
+            folder / f"{name}.csv", rows, fmt="%.17g", delimiter=",", header=header, comments=""
+        )
     (folder / "spec.toml").write_text(spec, encoding="utf-8")
     return folder / "spec.toml"
 
@@ -84,7 +100,11 @@ def many_terms() -> tuple[str, Record, Record]:
     """A static map of five inputs, with physics of all 56 monomials up to the third degree; 4000 rows."""
     rng = np.random.default_rng(56)
     names = [f"u{i}" for i in range(1, 6)]
-    monomials = [product for degree in range(4) for product in combinations_with_replacement(range(5), degree)]
+    monomials = [
+        product
+        for degree in range(4)
+        for product in combinations_with_replacement(range(5), degree)
+    ]
     theta = rng.normal(size=len(monomials))
 
     def record(rows: int, noise: float) -> Record:
@@ -94,7 +114,11 @@ def many_terms() -> tuple[str, Record, Record]:
         return Record.from_arrays(u, y, inputs=names, outputs=["y"])
 
     terms = "".join(
-        TERM.format(name=f"c{i}", regressor=" * ".join(f"{names[j]}[k]" for j in product) or "1", initial=0.0)
+        TERM.format(
+            name=f"c{i}",
+            regressor=" * ".join(f"{names[j]}[k]" for j in product) or "1",
+            initial=0.0,
+        )
         for i, product in enumerate(monomials)
     )
     inputs = str(names).replace("'", '"')
@@ -104,12 +128,19 @@ def many_terms() -> tuple[str, Record, Record]:
 def environment(folder: str) -> dict[str, str]:
     """That of this process, with caches of bytecode and programs that only these processes fill."""
     kept = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
-    return kept | {"PYTHONPYCACHEPREFIX": f"{folder}/bytecode", "JAX_COMPILATION_CACHE_DIR": f"{folder}/programs"}
+    return kept | {
+        "PYTHONPYCACHEPREFIX": f"{folder}/bytecode",
+        "JAX_COMPILATION_CACHE_DIR": f"{folder}/programs",
+    }
 
 
-def in_turn(commands: dict[str, list[str]], repeats: int, environment: dict[str, str]) -> dict[str, np.ndarray]:
+def in_turn(
+    commands: dict[str, list[str]], repeats: int, environment: dict[str, str]
+) -> dict[str, np.ndarray]:
     """Median seconds of each process, by the clock and of processor time; the first round compiles and is left out."""
-    rounds = [[measured(code, environment) for code in commands.values()] for _ in range(repeats + 1)]
+    rounds = [
+        [measured(code, environment) for code in commands.values()] for _ in range(repeats + 1)
+    ]
     return dict(zip(commands, np.median(rounds[1:], axis=0), strict=True))
 
 

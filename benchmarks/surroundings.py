@@ -44,7 +44,10 @@ samples = 40
 amplitude = 1.0
 [learner]
 """
-RAW = re.compile(r"Traceback|Exception ignored|Warning|^\w*Error\b|Bad key|terminate called|core dumped", re.MULTILINE)
+RAW = re.compile(
+    r"Traceback|Exception ignored|Warning|^\w*Error\b|Bad key|terminate called|core dumped",
+    re.MULTILINE,
+)
 PRELUDE = r"""set -u
 O() { "$PYTHON" -c "$MAIN" "$@"; }
 four() { for i in 1 2 3 4; do O "$@" >/dev/null & p="${p-} $!"; done; for i in $p; do wait $i || return; done; }
@@ -66,12 +69,21 @@ class Trial(NamedTuple):
 TRIALS = [
     # what is there is kept
     Trial("folder unchanged", "cp -r fit out; O fit plant.toml --out out"),
-    Trial("folder with notes", "cp -r fit out; echo > out/note; O fit plant.toml --out out", 2, "note.*--force"),
     Trial(
-        "folder with a changed file", "cp -r fit out; echo >> out/report.html; O fit plant.toml --out out", 2, "--force"
+        "folder with notes",
+        "cp -r fit out; echo > out/note; O fit plant.toml --out out",
+        2,
+        "note.*--force",
     ),
     Trial(
-        "folder by force", "cp -r fit out; echo > out/note; O fit plant.toml --out out --force && test ! -e out/note"
+        "folder with a changed file",
+        "cp -r fit out; echo >> out/report.html; O fit plant.toml --out out",
+        2,
+        "--force",
+    ),
+    Trial(
+        "folder by force",
+        "cp -r fit out; echo > out/note; O fit plant.toml --out out --force && test ! -e out/note",
     ),
     Trial(
         "foreign result.json",
@@ -94,13 +106,32 @@ TRIALS = [
     ),
     Trial("working folder by force", "O fit plant.toml --out . --force", 2, "working folder"),
     Trial(
-        "home by force", "mkdir -p h/x; cd h/x; HOME=.. O fit ../../plant.toml --out .. --force", 2, "working folder"
+        "home by force",
+        "mkdir -p h/x; cd h/x; HOME=.. O fit ../../plant.toml --out .. --force",
+        2,
+        "working folder",
     ),
-    Trial("compare onto its model", "cp -r fit out; O compare plant.toml --model out --out out --force", 2, "reads"),
-    Trial("link to a folder", "cp -r fit out; ln -s out link; O fit plant.toml --out link && test -L link"),
+    Trial(
+        "compare onto its model",
+        "cp -r fit out; O compare plant.toml --model out --out out --force",
+        2,
+        "reads",
+    ),
+    Trial(
+        "link to a folder",
+        "cp -r fit out; ln -s out link; O fit plant.toml --out link && test -L link",
+    ),
     Trial("link to nowhere", "ln -s nowhere link; O fit plant.toml --out link", 2, "not a folder"),
-    Trial("simulate onto a file", "echo >s; chmod 444 s; O simulate fit run.csv --out s", 2, "s: exists.*--force"),
-    Trial("simulate by force", "echo >s; O simulate fit run.csv --out s --force && test $(wc -l <s) = 121"),
+    Trial(
+        "simulate onto a file",
+        "echo >s; chmod 444 s; O simulate fit run.csv --out s",
+        2,
+        "s: exists.*--force",
+    ),
+    Trial(
+        "simulate by force",
+        "echo >s; O simulate fit run.csv --out s --force && test $(wc -l <s) = 121",
+    ),
     Trial(
         "simulate onto its model",
         "cp -r fit out; O simulate out run.csv --out out/model/model.json --force",
@@ -109,9 +140,14 @@ TRIALS = [
     ),
     Trial(
         "simulate onto a link by force",
-        "echo >s; ln -s s l; O simulate fit run.csv --out l --force && test -L l -a $(wc -l <s) = 121",
+        "echo >s; ln -s s l; O simulate fit run.csv --out l --force && test -L l -a $(wc -l "
+        "<s) = 121",
     ),
-    Trial("simulate into a pipe", "O simulate fit run.csv --out /dev/stdout | cat && test -c /dev/null", say="y_model"),
+    Trial(
+        "simulate into a pipe",
+        "O simulate fit run.csv --out /dev/stdout | cat && test -c /dev/null",
+        say="y_model",
+    ),
     Trial("predict onto a file", "echo >s; O predict fit run.csv --out s", 2, "--force"),
     Trial("design onto a file", "echo >s; O design plant.toml --out s", 2, "--force"),
     Trial("check onto a figure", "echo >s.png; O check plant.toml --figure s.png", 2, "--force"),
@@ -125,7 +161,10 @@ TRIALS = [
         "four fits at once",
         "four fit plant.toml --out out && test -d out/model",
     ),
-    Trial("what a dead process left", "mkdir .orthaug-partial-$HOST-999999999-0; O fit plant.toml --out out"),
+    Trial(
+        "what a dead process left",
+        "mkdir .orthaug-partial-$HOST-999999999-0; O fit plant.toml --out out",
+    ),
     # signals
     *(
         Trial(
@@ -139,7 +178,12 @@ TRIALS = [
     ),
     # places and limits
     Trial("name of 240 letters", "O fit plant.toml --out $(printf 'x%.0s' $(seq 240))"),
-    Trial("name of 300 letters", "O simulate fit run.csv --out $(printf 'x%.0s' $(seq 300))", 2, "too long"),
+    Trial(
+        "name of 300 letters",
+        "O simulate fit run.csv --out $(printf 'x%.0s' $(seq 300))",
+        2,
+        "too long",
+    ),
     Trial(
         "file size limit of a fit",
         "ulimit -f 20; O fit plant.toml --out out; c=$?; test ! -e out && exit $c",
@@ -152,12 +196,19 @@ TRIALS = [
         2,
         "s: cannot be written.*too large",
     ),
-    Trial("working folder gone", "mkdir w; cd w; rmdir ../w; O fit ../plant.toml", 2, "working folder"),
+    Trial(
+        "working folder gone", "mkdir w; cd w; rmdir ../w; O fit ../plant.toml", 2, "working folder"
+    ),
     Trial("memory limit", "ulimit -v 1500000; O fit net.toml", 2, "memory"),
-    Trial("larger memory limit", "ulimit -v 3000000; O fit net.toml --out out; c=$?; test $c = 0 -o $c = 2"),
+    Trial(
+        "larger memory limit",
+        "ulimit -v 3000000; O fit net.toml --out out; c=$?; test $c = 0 -o $c = 2",
+    ),
     # streams
     *(
-        Trial(f"encoding {name}", f"PYTHONIOENCODING={name} O fit greek.toml --out out", say="theta")
+        Trial(
+            f"encoding {name}", f"PYTHONIOENCODING={name} O fit greek.toml --out out", say="theta"
+        )
         for name in ("latin-1", "cp437", "ascii")
     ),
     Trial(
@@ -173,30 +224,51 @@ TRIALS = [
         2,
         "standard output.*space",
     ),
-    Trial("response to a full output", "O simulate fit run.csv >/dev/full", 2, "standard output.*space"),
+    Trial(
+        "response to a full output",
+        "O simulate fit run.csv >/dev/full",
+        2,
+        "standard output.*space",
+    ),
     Trial("help to a full output", "O --help >/dev/full", 2, "standard output"),
     Trial("standard output closed", "O simulate fit run.csv >&-", 2, "standard output"),
     Trial("standard error closed", "O fit absent.toml 2>&-", 2),
     Trial("standard error full", "O fit absent.toml 2>/dev/full", 2),
     Trial("all closed", "O simulate fit run.csv --out s <&- >&- 2>&-; test $(wc -l <s) = 121"),
     # settings
-    Trial("matplotlib usetex", "echo 'text.usetex: true' >matplotlibrc; O fit plant.toml --out out"),
+    Trial(
+        "matplotlib usetex", "echo 'text.usetex: true' >matplotlibrc; O fit plant.toml --out out"
+    ),
     Trial(
         "matplotlib broken",
-        "printf 'banana: 1\\nlines.linewidth: x\\nno colon\\n' >matplotlibrc; O fit plant.toml --out out",
+        "printf 'banana: 1\\nlines.linewidth: x\\nno colon\\n' >matplotlibrc; O fit plant.toml "
+        "--out out",
     ),
-    Trial("matplotlib no UTF-8", "printf '\\377\\376' >matplotlibrc; O fit plant.toml --out out", 2, "matplotlibrc"),
+    Trial(
+        "matplotlib no UTF-8",
+        "printf '\\377\\376' >matplotlibrc; O fit plant.toml --out out",
+        2,
+        "matplotlibrc",
+    ),
     Trial("MPLBACKEND", "MPLBACKEND=banana O fit plant.toml --out out"),
     Trial("JAX_PLATFORMS", "JAX_PLATFORMS=cuda O fit net.toml --out out", 2, "JAX_PLATFORMS=cuda"),
     Trial(
         "JAX strict",
-        "JAX_NUMPY_DTYPE_PROMOTION=strict JAX_NUMPY_RANK_PROMOTION=raise JAX_DEBUG_NANS=1 O fit net.toml --out out",
+        "JAX_NUMPY_DTYPE_PROMOTION=strict JAX_NUMPY_RANK_PROMOTION=raise JAX_DEBUG_NANS=1 O "
+        "fit net.toml --out out",
     ),
-    Trial("JAX_ENABLE_X64", "JAX_ENABLE_X64=banana O fit net.toml --out out", 2, "JAX_ENABLE_X64=banana"),
+    Trial(
+        "JAX_ENABLE_X64",
+        "JAX_ENABLE_X64=banana O fit net.toml --out out",
+        2,
+        "JAX_ENABLE_X64=banana",
+    ),
     Trial("PYTHONWARNINGS", "PYTHONWARNINGS=error O fit net.toml --out out"),
     Trial("home is a file", "echo >h; HOME=$PWD/h XDG_CACHE_HOME= O fit net.toml --out out"),
     Trial("cache is a file", "echo >h; JAX_COMPILATION_CACHE_DIR=$PWD/h O fit net.toml --out out"),
-    Trial("cache cannot be made", "JAX_COMPILATION_CACHE_DIR=/proc/nowhere O fit net.toml --out out"),
+    Trial(
+        "cache cannot be made", "JAX_COMPILATION_CACHE_DIR=/proc/nowhere O fit net.toml --out out"
+    ),
     # stores
     Trial(
         "cache of swapped programs",
@@ -245,11 +317,18 @@ def settings(base: Path) -> dict[str, str]:
     from orthaug._base.folders import _HOST
 
     kept = {key: value for key, value in os.environ.items() if not key.startswith("JAX_")}
-    mine = {"PYTHON": sys.executable, "MAIN": MAIN, "HOST": _HOST, "JAX_COMPILATION_CACHE_DIR": str(base / "cache")}
+    mine = {
+        "PYTHON": sys.executable,
+        "MAIN": MAIN,
+        "HOST": _HOST,
+        "JAX_COMPILATION_CACHE_DIR": str(base / "cache"),
+    }
     return kept | mine
 
 
-def shell(script: str, folder: Path, environment: dict[str, str]) -> subprocess.CompletedProcess[str]:
+def shell(
+    script: str, folder: Path, environment: dict[str, str]
+) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         ["bash", "-c", PRELUDE + script], cwd=folder, env=environment, capture_output=True, text=True, errors="replace",
         timeout=300, check=False,
@@ -284,7 +363,9 @@ def faults(trial: Trial, base: Path, environment: dict[str, str]) -> list[str]:
         return [*found, done.stderr[:1500]] if found else []
 
 
-def interrupts(base: Path, environment: dict[str, str], waits: list[float]) -> tuple[list[str], float]:
+def interrupts(
+    base: Path, environment: dict[str, str], waits: list[float]
+) -> tuple[list[str], float]:
     """Ctrl-C after so many seconds, from imports to training: what does not hold, and the longest wait for the end."""
     found, longest = [], 0.0
     with tempfile.TemporaryDirectory() as name:
@@ -306,7 +387,9 @@ def interrupts(base: Path, environment: dict[str, str], waits: list[float]) -> t
                 or "interrupted" not in err
                 or (Path(name) / "deep").exists()
             ):
-                found.append(f"Ctrl-C after {wait:.2f} s: exit code {process.returncode}, {err[-300:]!r}")
+                found.append(
+                    f"Ctrl-C after {wait:.2f} s: exit code {process.returncode}, {err[-300:]!r}"
+                )
     return found, longest
 
 

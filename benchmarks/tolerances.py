@@ -27,7 +27,11 @@ WEAK, STRONG = 1e-5, 1e-3  # first dampings
 
 
 def example(name: str) -> synthetic.Example:
-    return synthetic.mass_spring_damper() if name == "MSD" else synthetic.static(1, noise="30 dB" in name)
+    return (
+        synthetic.mass_spring_damper()
+        if name == "MSD"
+        else synthetic.static(1, noise="30 dB" in name)
+    )
 
 
 def median_run(name: str, regularization: str, tolerance: float) -> tuple[float, float]:
@@ -35,7 +39,9 @@ def median_run(name: str, regularization: str, tolerance: float) -> tuple[float,
     given, runs = example(name), []
     for seed in SEEDS:
         solver = oa.LevenbergMarquardt(300, tolerance, longest=300)
-        fit = oa.estimate(given.train, given.baseline, solver=solver, regularization=regularization, seed=seed)
+        fit = oa.estimate(
+            given.train, given.baseline, solver=solver, regularization=regularization, seed=seed
+        )
         runs.append((fit.model.predict(given.test).scores().rmse[0], fit.status.iterations))
     rmse, iterations = np.median(runs, axis=0)
     return float(rmse), float(iterations)
@@ -72,7 +78,10 @@ def main() -> None:
     for tolerance, cells in zip(TOLERANCES, rows(), strict=True):
         told = (f"{rmse:.3g}, {iterations:.0f}" for rmse, iterations in cells)
         print(f"| {tolerance:.0e} | {' | '.join(told)} |", flush=True)
-    print(f"\nA first damping of {STRONG:.0e} takes {first_damping():.0f} % more iterations than {WEAK:.0e}.")
+    print(
+        f"\nA first damping of {STRONG:.0e} takes {first_damping():.0f} % more iterations than "
+        f"{WEAK:.0e}."
+    )
 
 
 if __name__ == "__main__":

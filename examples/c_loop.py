@@ -64,10 +64,16 @@ def for_arm(folder: Path) -> str:
     compiler, size = shutil.which("arm-none-eabi-gcc"), shutil.which("arm-none-eabi-size")
     if compiler is None or size is None:
         return "no arm-none-eabi-gcc here: not compiled for a microcontroller"
-    tried = subprocess.run([compiler, "-E", "-"], input="#include <math.h>", capture_output=True, text=True)
+    tried = subprocess.run(
+        [compiler, "-E", "-"], input="#include <math.h>", capture_output=True, text=True
+    )
     if tried.returncode:
-        return "arm-none-eabi-gcc has no C library here (newlib): not compiled for a microcontroller"
-    subprocess.run([compiler, *STRICT, *CORTEX_M4, "-c", "plant.c", "-o", "plant.o"], cwd=folder, check=True)
+        return (
+            "arm-none-eabi-gcc has no C library here (newlib): not compiled for a microcontroller"
+        )
+    subprocess.run(
+        [compiler, *STRICT, *CORTEX_M4, "-c", "plant.c", "-o", "plant.o"], cwd=folder, check=True
+    )
     told = subprocess.run([size, "plant.o"], cwd=folder, check=True, capture_output=True, text=True)
     text, data, bss = told.stdout.splitlines()[1].split()[:3]
     return f"Cortex-M4, single precision: {text} bytes of code and constants, {int(data) + int(bss)} of data"
@@ -88,7 +94,9 @@ def main(place: str | None = None) -> dict[str, float]:
         for precision, options in (("double", ()), ("float", ("-DPLANT_FLOAT",))):
             outputs = run(compiled(folder, *options), force)
             found[precision] = float(np.abs(outputs - expected).max() / np.abs(expected).max())
-            print(f"{precision}: {len(outputs)} samples, deviation {found[precision]:.1e} of the largest output")
+            print(
+                f"{precision}: {len(outputs)} samples, deviation {found[precision]:.1e} of the largest output"
+            )
         print(for_arm(folder))
     return found
 

@@ -37,7 +37,10 @@ class System(NamedTuple):
     def steps(self, rows: int, seed: int) -> np.ndarray:
         """Inputs (N, nu) that step at random."""
         random, count = np.random.default_rng(seed), -(-rows // self.held)
-        drawn = [np.repeat(random.uniform(-level, level, count), self.held)[:rows] for level in self.levels]
+        drawn = [
+            np.repeat(random.uniform(-level, level, count), self.held)[:rows]
+            for level in self.levels
+        ]
         return np.stack(drawn, axis=1)
 
     def run(self, inputs: np.ndarray) -> np.ndarray:
@@ -57,7 +60,11 @@ class System(NamedTuple):
         inputs = self.steps(rows, seed)
         states = self.run(inputs)
         outputs = states[:, self.measured]
-        noise = np.random.default_rng([seed, 1]).normal(size=outputs.shape) * self.noise * outputs.std(axis=0)
+        noise = (
+            np.random.default_rng([seed, 1]).normal(size=outputs.shape)
+            * self.noise
+            * outputs.std(axis=0)
+        )
         return np.concatenate([inputs, outputs + noise], axis=1), states
 
 
@@ -84,7 +91,9 @@ def drag(w: np.ndarray) -> np.ndarray:
 
 def motor(x: np.ndarray, u: np.ndarray) -> np.ndarray:
     p, (i, w) = MOTOR, x
-    return np.array([(u[0] - p["R"] * i - p["K"] * w) / p["L"], (p["K"] * i - p["b"] * w - drag(w)) / p["J"]])
+    return np.array(
+        [(u[0] - p["R"] * i - p["K"] * w) / p["L"], (p["K"] * i - p["b"] * w - drag(w)) / p["J"]]
+    )
 
 
 ARM = {"a1": 0.425, "a2": 0.06, "b1": 1.0, "b2": 0.2, "d1": 0.3, "d2": 0.05, "l1": 0.5, "g": 9.81}
@@ -110,7 +119,9 @@ def arm(x: np.ndarray, u: np.ndarray) -> np.ndarray:
 SYSTEMS = {
     "motion_friction": System(mass, 2, (0,), ("force", "position"), 0.01, (20.0,), 25, 10**-1.5),
     "dc_motor": System(motor, 2, (1,), ("voltage", "speed"), 0.002, (12.0,), 40, 0.01),
-    "two_link_arm": System(arm, 4, (0, 1), ("torque1", "torque2", "angle1", "angle2"), 0.02, (5.0, 1.0), 20, 0.01),
+    "two_link_arm": System(
+        arm, 4, (0, 1), ("torque1", "torque2", "angle1", "angle2"), 0.02, (5.0, 1.0), 20, 0.01
+    ),
 }
 SEEDS = {"train": 1, "test": 2}
 TRAINED = {"motion_friction": 1000, "dc_motor": 1000, "two_link_arm": 2000}
@@ -126,7 +137,14 @@ def write(folder: Path) -> list[Path]:
             rows = TRAINED[name] if part == "train" else TESTED
             written.append(folder / f"{name}_{part}.csv")
             header = ",".join(system.names)
-            np.savetxt(written[-1], system.record(rows, seed)[0], delimiter=",", header=header, comments="", fmt="%.9g")
+            np.savetxt(
+                written[-1],
+                system.record(rows, seed)[0],
+                delimiter=",",
+                header=header,
+                comments="",
+                fmt="%.9g",
+            )
     return written
 
 

@@ -59,14 +59,18 @@ def record(rows: int = 3000, seed: int = 0) -> oa.Record:
         position.append(state[0])
         state = advance(state, f)
     measured = np.array(position) + NOISE * rng.normal(size=rows)
-    return oa.Record.from_arrays(force, measured, sampling_time=TS, inputs=["force"], outputs=["position"])
+    return oa.Record.from_arrays(
+        force, measured, sampling_time=TS, inputs=["force"], outputs=["position"]
+    )
 
 
 def fitted() -> dict[str, oa.Model]:
     """Physics alone, and with a learned correction; from the same record."""
     data = record()
     names = ("position[k-1]", "position[k-2]", "force[k-1]", "force[k-2]")
-    physics = oa.Baseline.from_terms([oa.Term(f"theta{i + 1}", name) for i, name in enumerate(names)])
+    physics = oa.Baseline.from_terms(
+        [oa.Term(f"theta{i + 1}", name) for i, name in enumerate(names)]
+    )
     velocity = f"(position[k-1] - position[k-2])/{TS}"
     network = oa.MLP((16,), inputs=(velocity, "position[k-1]", "force[k-1]", "force[k-2]"))
     alone = oa.estimate(data, physics, learner=None)
@@ -77,7 +81,9 @@ def fitted() -> dict[str, oa.Model]:
 def exported(model: oa.Model, folder: Path) -> Any:
     """The model's step as a CasADi function: (state, force) → (next state, position)."""
     oa.export(model, folder, "casadi", name="plant")
-    spec = importlib.util.spec_from_file_location(folder.name.replace(" ", "_"), folder / "plant.py")
+    spec = importlib.util.spec_from_file_location(
+        folder.name.replace(" ", "_"), folder / "plant.py"
+    )
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -137,7 +143,9 @@ def reference(steps: int) -> np.ndarray:
     t = TS * np.arange(steps)
     swing = 0.04 * np.sin(2 * np.pi * 0.5 * t) + 0.02 * np.sin(2 * np.pi * 0.23 * t)
     levels = np.interp(t, [0, 3.0, 3.2, 4.0, 4.2, 9.0], [0, 0, 0.05, 0.05, -0.03, -0.03])
-    return np.where(t < 3.0, swing, swing[np.searchsorted(t, 3.0) - 1] * np.exp(-(t - 3) / 0.1) + levels)
+    return np.where(
+        t < 3.0, swing, swing[np.searchsorted(t, 3.0) - 1] * np.exp(-(t - 3) / 0.1) + levels
+    )
 
 
 def controlled(step: Any, wanted: np.ndarray, seed: int = 1) -> Run:
@@ -159,7 +167,10 @@ def main(picture: str | None = None) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as folder:
         for name, model in fitted().items():
             runs[name] = controlled(exported(model, Path(folder) / name.split()[0]), wanted)
-    errors = {name: float(np.sqrt(np.mean((run.position - wanted[:STEPS]) ** 2))) for name, run in runs.items()}
+    errors = {
+        name: float(np.sqrt(np.mean((run.position - wanted[:STEPS]) ** 2)))
+        for name, run in runs.items()
+    }
     for name, error in errors.items():
         print(f"{name:<22} tracking error {1000 * error:.3f} mm (RMS)")
     if picture:
@@ -174,17 +185,31 @@ def draw(runs: dict[str, Run], wanted: np.ndarray, errors: dict[str, float]) -> 
     figure = Figure(figsize=(8.0, 6.4), layout="constrained")
     above, middle, below = figure.subplots(3, 1, sharex=True)
     time = TS * np.arange(STEPS)
-    above.plot(time, 1000 * wanted, color="#000000", linestyle=(0, (4, 3)), linewidth=1.4, label="reference", zorder=3)
+    above.plot(
+        time,
+        1000 * wanted,
+        color="#000000",
+        linestyle=(0, (4, 3)),
+        linewidth=1.4,
+        label="reference",
+        zorder=3,
+    )
     for (name, run), color in zip(runs.items(), ("#E69F00", "#0072B2"), strict=True):
         above.plot(time, 1000 * run.position, color=color, linewidth=1.4, label=name)
         label = f"{name}: {1000 * errors[name]:.2f} mm RMS"
         middle.plot(time, 1000 * (run.position - wanted), color=color, linewidth=1.2, label=label)
         below.step(time, run.force, color=color, linewidth=1.0, where="post", label=name)
-    for axis, label in ((above, "position [mm]"), (middle, "tracking error [mm]"), (below, "force [N]")):
+    for axis, label in (
+        (above, "position [mm]"),
+        (middle, "tracking error [mm]"),
+        (below, "force [N]"),
+    ):
         axis.set_ylabel(label)
         axis.grid(alpha=0.25)
         axis.spines[["top", "right"]].set_visible(False)
-        axis.legend(fontsize=8, frameon=False, ncols=3, loc="lower right", bbox_to_anchor=(1.0, 0.98))
+        axis.legend(
+            fontsize=8, frameon=False, ncols=3, loc="lower right", bbox_to_anchor=(1.0, 0.98)
+        )
     below.set_xlabel("time [s]")
     return figure
 

@@ -14,7 +14,11 @@ import orthaug as oa
 
 TS, ROWS = 0.01, 3000
 STEP = 2000  # the row at which friction doubles
-CHANNELS = {"inputs": [oa.Channel("force", "N")], "outputs": [oa.Channel("position", "m")], "sampling_time": TS}
+CHANNELS = {
+    "inputs": [oa.Channel("force", "N")],
+    "outputs": [oa.Channel("position", "m")],
+    "sampling_time": TS,
+}
 
 
 def measured(seed: int, mass, friction) -> oa.Record:
@@ -34,7 +38,9 @@ def main(folder: Path) -> dict[str, float]:
     """Fit, follow, save and go on; what was found by name."""
     terms = [("theta1", "position[k-1]"), ("theta2", "position[k-2]"), ("theta3", "force[k-1]")]
     baseline = oa.Baseline.from_terms([oa.Term(*term) for term in terms])
-    learner = oa.MLP((8,), inputs=("(position[k-1] - position[k-2])/Ts",))  # it sees the velocity, and finds friction
+    learner = oa.MLP(
+        (8,), inputs=("(position[k-1] - position[k-2])/Ts",)
+    )  # it sees the velocity, and finds friction
     fit = oa.estimate(measured(0, 1.0, 3.0), baseline, learner=learner)
     physics = oa.PhysicsMap.of(
         [
@@ -63,9 +69,15 @@ def main(folder: Path) -> dict[str, float]:
 
     print(followed)
     print(online.summary())
-    oa.plot(online, title="mass grows until 20 s, then friction doubles", path=folder / "online.png")
+    oa.plot(
+        online, title="mass grows until 20 s, then friction doubles", path=folder / "online.png"
+    )
     delay = alarms[0].time - STEP * TS if alarms else np.inf
-    return {"m": float(followed.value[0]), "delay": float(delay), "early": float(len(online.alarms) - len(alarms))}
+    return {
+        "m": float(followed.value[0]),
+        "delay": float(delay),
+        "early": float(len(online.alarms) - len(alarms)),
+    }
 
 
 if __name__ == "__main__":

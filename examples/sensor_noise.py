@@ -14,7 +14,10 @@ import orthaug as oa
 TS = 0.002
 GAMMA = f"(m + cd*{TS} + ks*{TS}**2)"
 PHYSICS = oa.PhysicsMap.of(
-    [oa.PhysicalParameter(n, v, u) for n, v, u in (("m", 1.2, "kg"), ("cd", 80, "N s/m"), ("ks", 900, "N/m"))],
+    [
+        oa.PhysicalParameter(n, v, u)
+        for n, v, u in (("m", 1.2, "kg"), ("cd", 80, "N s/m"), ("ks", 900, "N/m"))
+    ],
     {"a1": f"(2*m + cd*{TS}) / {GAMMA}", "a2": f"-m / {GAMMA}", "b": f"{TS}**2 / {GAMMA}"},
 )
 BASELINE = oa.Baseline.from_terms(
@@ -30,7 +33,9 @@ def record(seed: int, samples: int = 10_000) -> oa.Record:
     for k in range(2, samples):
         position[k] = theta @ (position[k - 1], position[k - 2], force[k - 1])
     measured = position + rng.normal(0, position.std() * 10**-1.5, samples)
-    return oa.Record.from_arrays(force, measured, sampling_time=TS, inputs=["force"], outputs=["position"])
+    return oa.Record.from_arrays(
+        force, measured, sampling_time=TS, inputs=["force"], outputs=["position"]
+    )
 
 
 def main() -> dict[str, np.ndarray]:

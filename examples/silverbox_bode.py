@@ -25,7 +25,9 @@ def training() -> oa.Record:
     """The multisines of the training part."""
     folder = Path(os.environ.get("ORTHAUG_DATA", HERE.parents[1] / "shared" / "data"))
     volt = {"inputs": [oa.Channel("V1", "V")], "outputs": [oa.Channel("V2", "V")]}
-    return oa.read_record(folder / "silverbox" / "SNLS80mV.csv", **volt, sampling_time=0.001638468, rows=ROWS)
+    return oa.read_record(
+        folder / "silverbox" / "SNLS80mV.csv", **volt, sampling_time=0.001638468, rows=ROWS
+    )
 
 
 def main(folder: Path | None = None) -> oa.Linearization:
@@ -45,7 +47,9 @@ def main(folder: Path | None = None) -> oa.Linearization:
     (low, high), (least, most) = resonance.hertz_ci95, resonance.damping_ci95
     print(f"resonance {resonance.hertz:.3f} Hz, 95 % interval {low:.3f} to {high:.3f}")
     print(f"damping {resonance.damping:.4f}, 95 % interval {least:.4f} to {most:.4f}")
-    print(f"against data alone: {agreement.decibel:.2f} dB, {agreement.degrees:.2f} degrees (medians)")
+    print(
+        f"against data alone: {agreement.decibel:.2f} dB, {agreement.degrees:.2f} degrees (medians)"
+    )
     out = Path("orthaug-out") if folder is None else folder
     out.mkdir(parents=True, exist_ok=True)
     oa.plot(found, "bode", path=out / "silverbox_bode.png")

@@ -24,7 +24,13 @@ def estimates(example: oa.synthetic.Example) -> dict[str, list[oa.Estimate]]:
     """Each structure from every initialisation."""
     return {
         structure.name: [
-            oa.estimate(example.train, example.baseline, structure=structure, seed=seed, regularization="none")
+            oa.estimate(
+                example.train,
+                example.baseline,
+                structure=structure,
+                seed=seed,
+                regularization="none",
+            )
             for seed in SEEDS
         ]
         for structure in (oa.Additive(from_initial=True), oa.Orthogonal())
@@ -43,7 +49,9 @@ def main(picture: str | None = None) -> dict[str, np.ndarray]:
     for name, group in fits.items():
         thetas = np.array([fit.theta for fit in group])
         spread = ", ".join(f"{t.min():.6f} … {t.max():.6f}" for t in thetas.T)
-        print(f"{name:<11} θ = {spread}; true {example.theta}; test RMSE ≤ {largest_rmse(example, group):.1e}")
+        print(
+            f"{name:<11} θ = {spread}; true {example.theta}; test RMSE ≤ {largest_rmse(example, group):.1e}"
+        )
     if picture:
         draw(example, fits).savefig(picture, dpi=160)
     return {name: np.array([fit.theta for fit in group]) for name, group in fits.items()}
@@ -59,16 +67,35 @@ def draw(example: oa.synthetic.Example, fits: dict[str, list[oa.Estimate]]) -> F
         for i, fit in enumerate(fits[name]):
             learner = fit.model.components(grid).trajectories[0].learner[:, 0]
             label = f"network, {name}, {len(SEEDS)} initialisations" if i == 0 else None
-            left.plot(u, learner, color=color, linewidth=1.0 if name == "additive" else 2.2, label=label)
-    left.plot(u, 0.01 - 0.5 * u**2, color=BLACK, linestyle=(0, (4, 3)), linewidth=1.4, label="true, not in the physics")
+            left.plot(
+                u, learner, color=color, linewidth=1.0 if name == "additive" else 2.2, label=label
+            )
+    left.plot(
+        u,
+        0.01 - 0.5 * u**2,
+        color=BLACK,
+        linestyle=(0, (4, 3)),
+        linewidth=1.4,
+        label="true, not in the physics",
+    )
     left.set_xlabel("input u")
     left.set_ylabel("output of the network")
     left.legend(fontsize=8, frameon=False, loc="lower center")
     for row, (name, color) in enumerate((("additive", ORANGE), ("orthogonal", BLUE))):
         thetas = np.array([fit.theta for fit in fits[name]])
         right.scatter(thetas[:, 0], thetas[:, 1], s=28, color=color, label=name, zorder=2 + row)
-    right.scatter(*example.baseline.initial, marker="x", s=60, color=BLACK, linewidth=1.2, label="θ⁰, start", zorder=5)
-    right.scatter(*example.theta, marker="+", s=160, color=BLACK, linewidth=1.6, label="true", zorder=5)
+    right.scatter(
+        *example.baseline.initial,
+        marker="x",
+        s=60,
+        color=BLACK,
+        linewidth=1.2,
+        label="θ⁰, start",
+        zorder=5,
+    )
+    right.scatter(
+        *example.theta, marker="+", s=160, color=BLACK, linewidth=1.6, label="true", zorder=5
+    )
     right.set_xlabel("estimated θ1")
     right.set_ylabel("estimated θ3")
     right.legend(fontsize=8, frameon=False)

@@ -22,7 +22,9 @@ def main() -> None:
         size = Path(wheel).stat().st_size
         _check(size <= WHEEL_LIMIT, f"the wheel has {size} bytes, at most {WHEEL_LIMIT}")
     seconds = min(float(_output("-c", IMPORT)) for _ in range(3))
-    _check(seconds <= IMPORT_LIMIT, f"import orthaug takes {seconds:.3f} s, at most {IMPORT_LIMIT} s")
+    _check(
+        seconds <= IMPORT_LIMIT, f"import orthaug takes {seconds:.3f} s, at most {IMPORT_LIMIT} s"
+    )
     with tempfile.TemporaryDirectory() as folder:
         os.chdir(folder)
         try:
@@ -36,19 +38,34 @@ def _commands() -> None:
     """Demo, fit, prediction and export from the command line."""
     import orthaug
 
-    _check(_orthaug("--version").split() == ["orthaug", orthaug.__version__], f"version {orthaug.__version__}")
+    _check(
+        _orthaug("--version").split() == ["orthaug", orthaug.__version__],
+        f"version {orthaug.__version__}",
+    )
     _orthaug("demo", "--out", "demo")
-    _check(Path("demo/report.html").is_file() and Path("demo/figures").is_dir(), "orthaug demo writes a result")
-    spec = Path("demo/spec.toml").read_text(encoding="utf-8").replace("iterations = 100", "iterations = 5")
+    _check(
+        Path("demo/report.html").is_file() and Path("demo/figures").is_dir(),
+        "orthaug demo writes a result",
+    )
+    spec = (
+        Path("demo/spec.toml")
+        .read_text(encoding="utf-8")
+        .replace("iterations = 100", "iterations = 5")
+    )
     for name in ("train", "test"):
         spec = spec.replace(f'"{name}.csv"', f'"demo/{name}.csv"')
     Path("short.toml").write_text(spec, encoding="utf-8")
     _orthaug("fit", "short.toml", "--out", "short")
     _check(Path("short/result.json").is_file(), "orthaug fit writes a result")
     lines = _orthaug("predict", "short", "demo/test.csv").splitlines()
-    _check(len(lines) == 1 + len(Path("demo/test.csv").read_text(encoding="utf-8").splitlines()[1:]), "orthaug predict")
+    _check(
+        len(lines) == 1 + len(Path("demo/test.csv").read_text(encoding="utf-8").splitlines()[1:]),
+        "orthaug predict",
+    )
     _orthaug("export", "short", "--to", "c", "--out", "code")
-    _check("model_step" in Path("code/model.c").read_text(encoding="utf-8"), "orthaug export --to c")
+    _check(
+        "model_step" in Path("code/model.c").read_text(encoding="utf-8"), "orthaug export --to c"
+    )
 
 
 def _library() -> None:
@@ -67,7 +84,12 @@ def _library() -> None:
     _check(fit.status.ok and fit.parameters.shape[0] == 2, "oa.estimate")
     oa.save(fit.model, "saved")
     again = oa.load("saved").predict(record).trajectories[0].model
-    _check(bool(np.array_equal(again, fit.model.predict(record).trajectories[0].model, equal_nan=True)), "oa.load")
+    _check(
+        bool(
+            np.array_equal(again, fit.model.predict(record).trajectories[0].model, equal_nan=True)
+        ),
+        "oa.load",
+    )
     oa.export(fit.model, "code-from-python", to="c")
     _check(Path("code-from-python/model.c").is_file(), "oa.export")
 
@@ -84,7 +106,9 @@ def _output(*arguments: str) -> str:
     surroundings = {**os.environ, "PATH": "", "PYTHONUTF8": "1"}
     surroundings.pop("PYTHONPATH", None)
     command = [sys.executable, *arguments]
-    done = subprocess.run(command, env=surroundings, capture_output=True, encoding="utf-8", timeout=600, check=False)
+    done = subprocess.run(
+        command, env=surroundings, capture_output=True, encoding="utf-8", timeout=600, check=False
+    )
     _check(done.returncode == 0, f"{' '.join(arguments)}\n{done.stderr}", quiet=True)
     return done.stdout
 

@@ -55,20 +55,28 @@ def differences(
     if key in ASIDE:
         return
     if key == "warnings" and isinstance(before, list) and isinstance(after, list):
-        before, after = ([w["text"] if "text" in w else w for w in warnings] for warnings in (before, after))
+        before, after = (
+            [w["text"] if isinstance(w, dict) else w for w in warnings]
+            for warnings in (before, after)
+        )
     if isinstance(before, dict) and isinstance(after, dict):
-        for name in {**before, **after}:
-            place, pair = f"{where}.{name}" if where else name, [d.get(name, ABSENT) for d in (before, after)]
-            yield from differences(*pair, place, scale(before, name), relative, floor)
-    elif isinstance(before, list) and isinstance(after, list) and len(before) == len(after):
-        for i, pair in enumerate(zip(before, after, strict=True)):
-            yield from differences(*pair, f"{where}[{i}]", largest(before), relative, floor)
+        yield from (f"{where}.{name}: only in one of them" for name in before.keys() ^ after.keys())
+        for name in (name for name in before if name in after):
+            yield from differences(
+                before[name], after[name], f"{where}.{name}" if where else name, largest(before)
+            )
     elif isinstance(before, list) and isinstance(after, list):
-        yield Difference(where, Note(f"{len(before)} entries"), Note(len(after)))
-    else:
-        allowed = SEARCH if "stability.contraction" in where else relative
-        if not same(before, after, rounding(where, beside, floor), allowed):
-            yield Difference(where, before, after, apart(before, after))
+        if len(before) != len(after):
+            yield f"{where}: {len(before)} entries, then {len(after)}"
+        for i, (one, other) in enumerate(zip(before, after, strict=False)):
+            yield from differences(one, other, f"{where}[{i}]", largest(before))
+    elif not same(
+        before,
+        after,
+        allowed(where, beside),
+        SEARCH if "stability.contraction" in where else RELATIVE,
+    ):
+        yield f"{where}: {before!r}, then {after!r}"
 
 
 def is_number(value: Any) -> bool:
@@ -85,7 +93,11 @@ def apart(before: Any, after: Any) -> float:
 def largest(values: Any) -> float:
     """The largest number among the entries of a list or a mapping by parameter; fields of other meanings have none."""
     if isinstance(values, dict):
-        values = [] if {"name", "value", "p", "rmse", "where", "kind", "code"} & values.keys() else values.values()
+        values = (
+            []
+            if {"name", "value", "p", "rmse", "where", "kind", "code"} & values.keys()
+            else values.values()
+        )
     return max((abs(value) for value in values if is_number(value)), default=0.0)
 
 
@@ -110,10 +122,13 @@ def same(before: Any, after: Any, absolute: float, relative: float = RELATIVE) -
 
 def main(before: str, after: str) -> int:
     """Print the differences; 1 if there are any."""
-    results = (json.loads((Path(folder) / "result.json").read_text(encoding="utf-8")) for folder in (before, after))
-    found = list(differences(*results))
-    print("\n".join(map(str, found)) or "equal")
-    return 1 if found else 0
+    results = (
+        json.loads((Path(folder) / "result.json").read_text(encoding="utf-8"))
+        for folder in (before, after)
+    )
+    told = list(differences(*results))
+    print("\n".join(told) or "equal")
+    return 1 if told else 0
 
 
 if __name__ == "__main__":

@@ -12,7 +12,9 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 # What several files compile is compiled once: the workers share their programs, as the command line does between runs.
-os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".pytest_cache" / "programs"))
+os.environ.setdefault(
+    "JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".pytest_cache" / "programs")
+)
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 
@@ -69,11 +71,20 @@ def pytest_collection_finish() -> None:
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     """What the proofs have measured, as the table of benchmarks/README.md."""
-    ended = [report for outcome in ("passed", "failed") for report in terminalreporter.getreports(outcome)]
+    ended = [
+        report
+        for outcome in ("passed", "failed")
+        for report in terminalreporter.getreports(outcome)
+    ]
     for report in sorted(ended, key=lambda report: report.nodeid):
         if "proof" in report.keywords and report.when == "call":
-            measured = "; ".join(f"{name}: {value}" for name, value in report.user_properties) or report.outcome
-            terminalreporter.write_line(f"| {report.nodeid.rpartition('test_')[2].replace('_', ' ')} | {measured} |")
+            measured = (
+                "; ".join(f"{name}: {value}" for name, value in report.user_properties)
+                or report.outcome
+            )
+            terminalreporter.write_line(
+                f"| {report.nodeid.rpartition('test_')[2].replace('_', ' ')} | {measured} |"
+            )
 
 
 @pytest.fixture(autouse=True, scope="module")

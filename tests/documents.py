@@ -101,7 +101,10 @@ def pattern(expected: str) -> tuple[str, list[str]]:
             at = 0
             for found in NUMBER.finditer(piece):
                 numbers.append(found[0])
-                parts += [re.escape(piece[at : found.start()]), r"([-+−]?\d+(?:\.\d+)?(?:e[-+]?\d+)?)"]
+                parts += [
+                    re.escape(piece[at : found.start()]),
+                    r"([-+−]?\d+(?:\.\d+)?(?:e[-+]?\d+)?)",
+                ]
                 at = found.end()
             parts.append(re.escape(piece[at:]))
         parts.append(r"\s*")
@@ -148,7 +151,9 @@ def shell(line: str) -> tuple[int, str]:
         done = run(*words[1:])
         return done.code, done.out + done.err
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
-    ended = subprocess.run(["bash", "-c", line], capture_output=True, text=True, env={**os.environ, "PATH": path})
+    ended = subprocess.run(
+        ["bash", "-c", line], capture_output=True, text=True, env={**os.environ, "PATH": path}
+    )
     return ended.returncode, ended.stdout + ended.stderr
 
 
@@ -191,7 +196,9 @@ class Page:
         elif block.language in SHELLS:
             return "".join(self.commanded(block))
         else:
-            raise AssertionError(f"{self.path.name}:{block.line}: a block in '{block.language}' cannot be run")
+            raise AssertionError(
+                f"{self.path.name}:{block.line}: a block in '{block.language}' cannot be run"
+            )
         return ""
 
     def commanded(self, block: Block) -> Iterator[str]:
@@ -199,8 +206,12 @@ class Page:
         for i, (line, expected) in enumerate(told):
             code, printed = shell(line)
             wanted = block.exits if i == len(told) - 1 else 0
-            assert code == wanted, f"{self.path.name}:{block.line}: `{line}` ends with {code}\n{printed}"
-            assert expected is None or not differences(expected, printed), differences(expected or "", printed)
+            assert code == wanted, (
+                f"{self.path.name}:{block.line}: `{line}` ends with {code}\n{printed}"
+            )
+            assert expected is None or not differences(expected, printed), differences(
+                expected or "", printed
+            )
             yield printed
 
 
@@ -215,7 +226,10 @@ def main() -> None:
                     continue
                 begin = time.perf_counter()
                 printed = page.printed(block)
-                print(f"=== {name}:{block.line} {block.language}, {time.perf_counter() - begin:.2f} s\n{printed}")
+                print(
+                    f"=== {name}:{block.line} {block.language}, "
+                    f"{time.perf_counter() - begin:.2f} s\n{printed}"
+                )
                 if block.prints is not None:
                     print("\n".join(f"!!! {one}" for one in differences(block.prints, printed)))
 

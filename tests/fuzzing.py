@@ -36,8 +36,34 @@ _EXTREMES = (
     b"nan",
 )
 _TEXTS = (
-    *("", "-1", "0", "1e308", "1e999", "nan", "inf", "true", '""', "'x'", "[]", "{}", "[[0, 1], 2]", "9" * 40, "0.5"),
-    *('"y[k]"', '"u[k-99999]"', '"1/0*u[k]"', '"u[k"', '"\\u0000"', '"a\\nb"', "[" * 3000, "1979-05-27", '"auto"'),
+    *(
+        "",
+        "-1",
+        "0",
+        "1e308",
+        "1e999",
+        "nan",
+        "inf",
+        "true",
+        '""',
+        "'x'",
+        "[]",
+        "{}",
+        "[[0, 1], 2]",
+        "9" * 40,
+        "0.5",
+    ),
+    *(
+        '"y[k]"',
+        '"u[k-99999]"',
+        '"1/0*u[k]"',
+        '"u[k"',
+        '"\\u0000"',
+        '"a\\nb"',
+        "[" * 3000,
+        "1979-05-27",
+        '"auto"',
+    ),
 )
 
 
@@ -72,7 +98,9 @@ def write_original(kind: str, path: Path) -> None:
         import pyarrow.parquet as pq
 
         table = pa.table({"u": u, "y": y})
-        pq.write_table(table, path, write_page_checksum=True, compression="none", use_dictionary=False)
+        pq.write_table(
+            table, path, write_page_checksum=True, compression="none", use_dictionary=False
+        )
     elif kind == "npz":
         np.savez(path, u=u, y=y)
     elif kind == "v5.mat":
@@ -85,7 +113,9 @@ def write_original(kind: str, path: Path) -> None:
         with h5py.File(path, "w", userblock_size=512 if kind == "v73.mat" else 0) as file:
             file["u"], file["y"] = u, y
         if kind == "v73.mat":
-            path.write_bytes(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + path.read_bytes()[128:])
+            path.write_bytes(
+                b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + path.read_bytes()[128:]
+            )
 
 
 def mutated(content: bytes, rng: np.random.Generator) -> bytes:
@@ -119,7 +149,9 @@ def mutated_member(content: bytes, rng: np.random.Generator) -> bytes:
             if name != victim:
                 archive.writestr(name, part)
             elif not drop:
-                archive.writestr(name, _digits(part, rng) if rng.random() < 0.5 else mutated(part, rng))
+                archive.writestr(
+                    name, _digits(part, rng) if rng.random() < 0.5 else mutated(part, rng)
+                )
     return out.getvalue()
 
 
@@ -158,8 +190,13 @@ def try_file(kind: str, seed: int, original: bytes, folder: Path) -> str:
         found = {"u": record.experiments[0].inputs[:, 0], "y": record.experiments[0].outputs[:, 0]}
         try:
             expected = plain(path)
-        except Exception as error:  # it does not know what else a format may hold, nor what it may leave out
-            if all(found[name].tolist() == own.tolist() for name, own in zip(NAMES, signals(), strict=True)):
+        except (
+            Exception
+        ) as error:  # it does not know what else a format may hold, nor what it may leave out
+            if all(
+                found[name].tolist() == own.tolist()
+                for name, own in zip(NAMES, signals(), strict=True)
+            ):
                 return "equal"
             return f"read, but plainly not: {type(error).__name__}: {error}"[:300]
         same = all(found[name].tolist() == expected[name] for name in NAMES)
@@ -212,12 +249,22 @@ def _spec_changed(text: str, rng: np.random.Generator) -> str:
 def _agrees(given: object, kept: object) -> bool:
     """Whether every value of a TOML file stands in what was read from it."""
     if isinstance(given, dict):
-        return isinstance(kept, dict) and all(k in kept and _agrees(v, kept[k]) for k, v in given.items())
+        return isinstance(kept, dict) and all(
+            k in kept and _agrees(v, kept[k]) for k, v in given.items()
+        )
     if isinstance(given, list):
-        return isinstance(kept, list | tuple) and len(kept) == len(given) and all(map(_agrees, given, kept))
+        return (
+            isinstance(kept, list | tuple)
+            and len(kept) == len(given)
+            and all(map(_agrees, given, kept))
+        )
     if isinstance(given, float) and isinstance(kept, float):
         return given == kept or (math.isnan(given) and math.isnan(kept))
-    return type(given) is type(kept) and given == kept or (isinstance(given, int) and kept == float(given))
+    return (
+        type(given) is type(kept)
+        and given == kept
+        or (isinstance(given, int) and kept == float(given))
+    )
 
 
 def try_model(seed: int, original: dict[str, bytes], folder: Path) -> str:
@@ -229,7 +276,11 @@ def try_model(seed: int, original: dict[str, bytes], folder: Path) -> str:
     forged = seed % 5 == 0
     for name, content in original.items():
         if name == victim and not forged:
-            content = _digits(content, rng) if name.endswith("json") and seed % 2 else mutated(content, rng)
+            content = (
+                _digits(content, rng)
+                if name.endswith("json") and seed % 2
+                else mutated(content, rng)
+            )
         (folder / name).write_bytes(content)
     if forged:
         declared = _json_changed(json.loads(original["model.json"]), rng)
@@ -325,7 +376,31 @@ def model_files(folder: Path) -> dict[str, bytes]:
 
     u, y = signals()
     record = oa.Record.from_arrays(u, y, outputs=[Channel("y", "m")])
-    baseline = oa.Baseline.from_terms([oa.Term("a", "y[k-1]"), oa.Term("b", "g*u[k]", 0.5, "m")], {"g": 2.0})
+    baseline = oa.Baseline.from_terms(
+        [oa.Term("a", "y[k-1]"), oa.Term("b", "g*u[k]", 0.5, "m")], {"g": 2.0}
+    )
     solver = oa.LevenbergMarquardt(iterations=2)
     oa.save(oa.estimate(record, baseline, learner=oa.MLP(hidden=(2,)), solver=solver).model, folder)
-    return {path.name: path.read_bytes() for path in folder.iterdir() if path.name != "manifest.json"}
+    return {
+        path.name: path.read_bytes() for path in folder.iterdir() if path.name != "manifest.json"
+    }
+
+
+def motion_files(folder: Path) -> dict[str, bytes]:
+    """A small fitted motion as it is saved."""
+    import orthaug as oa
+
+    u, y = signals()
+    motion = oa.Motion.from_equations(
+        [oa.State("x", "a*(u - d)", start="y", learned=True)],
+        [oa.Output("y", "x")],
+        [oa.PhysicalParameter("a", 1.0, "1/s", min=0)],
+        ["u"],
+        define={"d": "x/2"},
+    )
+    solver = oa.LevenbergMarquardt(iterations=2)
+    record = oa.Record.from_arrays(u, y, sampling_time=0.1)
+    oa.save(oa.estimate(record, motion, learner=oa.MLP(hidden=(2,)), solver=solver).model, folder)
+    return {
+        path.name: path.read_bytes() for path in folder.iterdir() if path.name != "manifest.json"
+    }

@@ -5,8 +5,14 @@ With atheris, which is no dependency: `python benchmarks/fuzz.py --guided expres
 
 from __future__ import annotations
 
+import json
 import tempfile
+from functools import cache
 from pathlib import Path
+from typing import Any
+
+import fuzzing
+from safetensors.numpy import load as load_arrays
 
 from orthaug._base.errors import InputError
 from orthaug.data.expressions import parse_named
@@ -37,19 +43,23 @@ def header(data: bytes) -> None:
 
 
 def model(data: bytes) -> None:
-    """Load a model whose declaration is these bytes, its checksum made right."""
-    import json
-
+    """Load a model whose declaration is these bytes, its checksum made right, with the arrays of a fitted one."""
     with tempfile.TemporaryDirectory() as folder:
         try:
             declared = json.loads(data)
         except (ValueError, RecursionError):
             declared = None
         if isinstance(declared, dict):
-            said = {k: v for k, v in declared.items() if k not in ("format", "orthaug", "arrays_sha256", "checksum")}
-            packed = storage.pack(storage.FORMAT, said, {})
+            said = {
+                k: v
+                for k, v in declared.items()
+                if k not in ("format", "orthaug", "arrays_sha256", "checksum")
+            }
+            packed = storage.pack(storage.FORMAT, said, _arrays("motion" in declared))
             try:
-                storage.write_packed(packed, Path(folder, "model.json"), Path(folder, "arrays.safetensors"))
+                storage.write_packed(
+                    packed, Path(folder, "model.json"), Path(folder, "arrays.safetensors")
+                )
             except UnicodeEncodeError:  # a lone surrogate is no text that a file holds
                 return
         else:
@@ -59,6 +69,16 @@ def model(data: bytes) -> None:
             storage.load(folder)
         except InputError:
             return
+
+
+@cache
+def _arrays(motion: bool) -> dict[str, Any]:
+    """The arrays of a small fitted model."""
+    with tempfile.TemporaryDirectory() as folder:
+        content = (
+            fuzzing.motion_files(Path(folder)) if motion else fuzzing.model_files(Path(folder))
+        )
+    return load_arrays(content["arrays.safetensors"])
 
 
 TARGETS = {"expression": expression, "header": header, "model": model}

@@ -17,11 +17,75 @@ import numpy as np
 from fuzzing import _json_changed, mutated, refusal_or, signals
 
 WORDS = (
-    *("fit", "check", "init", "simulate", "predict", "explain", "split", "export", "compare", "select", "design"),
-    *("linearize", "track", "schema", "keys", "model", "run.csv", "spec.toml", "out", "nowhere", "--out", "--to"),
-    *("c", "numpy", "latex", "--json", "--force", "--rows", "1:5", "5:1", "--every", "0", "-1", "nan", "--column"),
-    *("y=u", "y=", "--initial", "zero", "x", "--missing", "skip", "--model", "physics", "--observer", "--horizon"),
-    *("", "\u00e9", "--", "-", "--nonsense", "9" * 30, "/", ".", "..", "\u202e", "' ; rm", "--name", "1a"),
+    *(
+        "fit",
+        "check",
+        "init",
+        "simulate",
+        "predict",
+        "explain",
+        "split",
+        "export",
+        "compare",
+        "select",
+        "design",
+    ),
+    *(
+        "linearize",
+        "track",
+        "schema",
+        "keys",
+        "model",
+        "run.csv",
+        "spec.toml",
+        "out",
+        "nowhere",
+        "--out",
+        "--to",
+    ),
+    *(
+        "c",
+        "numpy",
+        "latex",
+        "--json",
+        "--force",
+        "--rows",
+        "1:5",
+        "5:1",
+        "--every",
+        "0",
+        "-1",
+        "nan",
+        "--column",
+    ),
+    *(
+        "y=u",
+        "y=",
+        "--initial",
+        "zero",
+        "x",
+        "--missing",
+        "skip",
+        "--model",
+        "physics",
+        "--observer",
+        "--horizon",
+    ),
+    *(
+        "",
+        "\u00e9",
+        "--",
+        "-",
+        "--nonsense",
+        "9" * 30,
+        "/",
+        ".",
+        "..",
+        "\u202e",
+        "' ; rm",
+        "--name",
+        "1a",
+    ),
 )
 NOT_RUN = {
     "fit",
@@ -31,7 +95,16 @@ NOT_RUN = {
     "demo",
     "reproduce",
 }  # they train, or serve, where the arguments are right
-LETTERS = (*"ab_{}\\~^%&#$|<>\"`'*/;\n\0\u00e9\u03b8\u2028", "*/", "\\input{x}", "^^5c", '"""', "{{", "%s", "<script>")
+LETTERS = (
+    *"ab_{}\\~^%&#$|<>\"`'*/;\n\0\u00e9\u03b8\u2028",
+    "*/",
+    "\\input{x}",
+    "^^5c",
+    '"""',
+    "{{",
+    "%s",
+    "<script>",
+)
 
 
 def try_forged(seed: int, original: dict[str, bytes], folder: Path) -> str:
@@ -89,7 +162,11 @@ def try_command(seed: int, folder: Path) -> str:
         code = None
         with contextlib.ExitStack() as stack:
             stack.enter_context(patch.object(sys, "argv", ["orthaug", *words]))
-            for context in (contextlib.chdir(folder), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err)):
+            for context in (
+                contextlib.chdir(folder),
+                contextlib.redirect_stdout(out),
+                contextlib.redirect_stderr(err),
+            ):
                 stack.enter_context(context)
             try:
                 cli.main()
@@ -112,7 +189,9 @@ def try_state(seed: int, folder: Path) -> str:
     checkpoints = Checkpoints(folder / "kept", "fuzz", every=0.0)
     kept = checkpoints.of_run("x", form=OF_DESCENT)
     leaves = [rng.normal(size=rng.integers(1, 5)) for _ in range(13)]
-    state = OF_DESCENT._replace(flown=tuple(leaves[:5]), **dict(zip(OF_DESCENT._fields[1:], leaves[5:], strict=True)))
+    state = OF_DESCENT._replace(
+        point=tuple(leaves[:5]), **dict(zip(OF_DESCENT._fields[1:], leaves[5:], strict=True))
+    )
     kept.keep(state)
     content = kept.path.read_bytes()
     kept.path.write_bytes(content if seed % 10 == 0 else mutated(content, rng))
@@ -122,8 +201,12 @@ def try_state(seed: int, folder: Path) -> str:
         found = kept.state()
         if found is None:
             return "refused" if checkpoints.spoilt and not same else "a sound state was dropped"
-        held = [*found.flown, *found[1:]]
-        return "equal" if same and all(map(np.array_equal, held, leaves)) else "a spoilt state was taken"
+        held = [*found.point, *found[1:]]
+        return (
+            "equal"
+            if same and all(map(np.array_equal, held, leaves))
+            else "a spoilt state was taken"
+        )
 
     return refusal_or(judge)
 
@@ -165,7 +248,11 @@ def try_folder(seed: int, folder: Path) -> str:
         return "a file of someone was replaced" if kept else "equal"
 
     end = refusal_or(judge)
-    lost = [path.name for path, content in kept.items() if not path.exists() or path.read_bytes() != content]
+    lost = [
+        path.name
+        for path, content in kept.items()
+        if not path.exists() or path.read_bytes() != content
+    ]
     return f"lost {lost}" if lost else end
 
 
@@ -196,7 +283,12 @@ def _safe(target: str, code: Path) -> str:
         rows = text[text.index(r"\begin{tabular}") : text.index(r"\end{tabular}")].splitlines()[1:]
         for row in rows:
             plain = row.replace(r"\{", "").replace(r"\}", "")
-            if plain.count("{") != plain.count("}") or r"\input" in row or row.count(r" & ") < 2 or "^^" in row:
+            if (
+                plain.count("{") != plain.count("}")
+                or r"\input" in row
+                or row.count(r" & ") < 2
+                or "^^" in row
+            ):
                 return f"not text: {row!r}"
     else:
         for path in code.glob("*.[ch]"):

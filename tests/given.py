@@ -18,7 +18,13 @@ def measured(rows: int = 300, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
     u, y = np.repeat(rng.normal(size=rows // 4), 4), np.zeros(rows)
     for k in range(2, rows):
-        y[k] = 1.5 * y[k - 1] - 0.7 * y[k - 2] + 0.1 * u[k - 1] - 0.1 * y[k - 1] ** 3 + 0.001 * rng.normal()
+        y[k] = (
+            1.5 * y[k - 1]
+            - 0.7 * y[k - 2]
+            + 0.1 * u[k - 1]
+            - 0.1 * y[k - 1] ** 3
+            + 0.001 * rng.normal()
+        )
     return u, y
 
 

@@ -44,7 +44,12 @@ class Problem(NamedTuple):
 
 
 def problem(
-    learner: Learner, z: np.ndarray, y: np.ndarray, phi: np.ndarray, gain: np.ndarray | None = None, limit: int = 64
+    learner: Learner,
+    z: np.ndarray,
+    y: np.ndarray,
+    phi: np.ndarray,
+    gain: np.ndarray | None = None,
+    limit: int = 64,
 ) -> Problem:
     """Rows in chunks of at most about `limit`, padded; no share of the learner is held."""
     rows, ny, nt = phi.shape
@@ -54,7 +59,12 @@ def problem(
         e = e - q @ np.tensordot(q, e, axes=([0, 1], [0, 1]))
     gain = np.ones_like(y) if gain is None else gain
     shape = chunk_shape(rows, limit)
-    laid = Chunk(*(jnp.asarray(in_chunks(values, shape)) for values in (z, q, e, gain[..., None] * np.eye(ny))))
+    laid = Chunk(
+        *(
+            jnp.asarray(in_chunks(values, shape))
+            for values in (z, q, e, gain[..., None] * np.eye(ny))
+        )
+    )
     hold = Hold(jnp.zeros((nt, nt)), jnp.zeros(nt))
     return Problem(OneStep(Bound(learner, z.shape[1], ny)), z, q, e, gain, laid, hold)
 
@@ -62,7 +72,9 @@ def problem(
 def linear_columns(given: Problem) -> np.ndarray:
     """P⊥J (N ny, nw) of a learner that is linear in its weights, by automatic differentiation at zero."""
     w = jnp.zeros(given.bound.size)
-    slope = jax.jacrev(lambda w: given.gain * jax.vmap(lambda row: given.bound.values(w, row))(given.z))
+    slope = jax.jacrev(
+        lambda w: given.gain * jax.vmap(lambda row: given.bound.values(w, row))(given.z)
+    )
     jacobian = jax.jit(slope)(w)
     columns = np.asarray(jacobian).reshape(given.e.size, -1)
     q = given.q.reshape(given.e.size, -1)

@@ -11,19 +11,27 @@ from orthaug.models.model import Model
 FUNCTIONS = {name: getattr(np, name) for name in ("sin", "cos", "exp", "abs", "sign", "tanh")}
 
 
-def row(model: Model, signals: dict[str, np.ndarray], k: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def row(
+    model: Model, signals: dict[str, np.ndarray], k: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(φθ + fixed terms, f − φθ_aux, f) at time k, each (ny,), from the signals before k (inputs up to k)."""
     form, numbers = model.form, model.numbers
     names = {**FUNCTIONS, **dict(form.baseline.constants), **signals, "k": k}
     inside, share = names, 1.0  # where the correction is read, and how much of it is left
     baseline, moved, raw = np.zeros((3, len(form.outputs)))
     if form.bound is not None:
-        z = np.array([float(eval(str(e), {"__builtins__": {}}, names)) for e in form.features.entries])
+        z = np.array(
+            [float(eval(str(e), {"__builtins__": {}}, names)) for e in form.features.entries]
+        )
         if numbers.limits is not None:
             low, high = numbers.limits
             held = np.minimum(np.maximum(z, low), high)
             apart = (z - held) / ((high - low) / 2)
-            share = float(np.exp(-((np.linalg.norm(apart) / 0.25) ** 2))) if form.beyond == "fade" else 1.0
+            share = (
+                float(np.exp(-((np.linalg.norm(apart) / 0.25) ** 2)))
+                if form.beyond == "fade"
+                else 1.0
+            )
             inside = names | {name: values.copy() for name, values in signals.items()}
             for lag, move in zip(form.layout, numbers.pull @ (held - z), strict=True):
                 inside[lag.channel][k - lag.lag] += move

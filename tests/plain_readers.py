@@ -15,7 +15,18 @@ import numpy as np
 
 Columns = dict[str, list[float]]
 NAMES = ("u", "y")
-_KINDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
+_KINDS = {
+    1: "i1",
+    2: "u1",
+    3: "i2",
+    4: "u2",
+    5: "i4",
+    6: "u4",
+    7: "f4",
+    9: "f8",
+    12: "i8",
+    13: "u8",
+}
 
 
 def plain(path: Path) -> Columns:
@@ -39,19 +50,27 @@ def plain(path: Path) -> Columns:
 
 
 def _text(content: bytes, separator: str | None) -> Columns:
-    text = content.decode("utf-8-sig")
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError:  # as files of old programs are; `fit` warns of it
+        text = content.decode("cp1252")
     lines = text.splitlines(keepends=True)
     top = next(i for i, line in enumerate(lines) if line.strip())
     if separator is None:
-        separator = ";" if ";" in lines[top] and "," not in re.sub(r'"[^"]*"', "", lines[top]) else ","
-    header, *rows = list(csv.reader(io.StringIO("".join(lines[top:]), newline=""), delimiter=separator))
+        separator = (
+            ";" if ";" in lines[top] and "," not in re.sub(r'"[^"]*"', "", lines[top]) else ","
+        )
+    header, *rows = list(
+        csv.reader(io.StringIO("".join(lines[top:]), newline=""), delimiter=separator)
+    )
     places = {name: [cell.strip() for cell in header].index(name) for name in NAMES}
     commas = separator == ";"
     table = [[row[i].strip() if i < len(row) else "" for i in places.values()] for row in rows]
     while table and not any(table[-1]):
         table.pop()
     return {
-        name: [float(row[j].replace(",", ".") if commas else row[j]) for row in table] for j, name in enumerate(NAMES)
+        name: [float(row[j].replace(",", ".") if commas else row[j]) for row in table]
+        for j, name in enumerate(NAMES)
     }
 
 
@@ -66,10 +85,15 @@ def _sheet(content: bytes) -> Columns:
 
     first = next(e for e in tree("xl/workbook.xml").iter() if local(e) == "sheet")
     wanted = next(value for key, value in first.attrib.items() if key.endswith("}id"))
-    target = next(e.get("Target") for e in tree("xl/_rels/workbook.xml.rels") if e.get("Id") == wanted)
+    target = next(
+        e.get("Target") for e in tree("xl/_rels/workbook.xml.rels") if e.get("Id") == wanted
+    )
     shared = []
     if "xl/sharedStrings.xml" in archive.namelist():
-        shared = ["".join(t.text or "" for t in e.iter() if local(t) == "t") for e in tree("xl/sharedStrings.xml")]
+        shared = [
+            "".join(t.text or "" for t in e.iter() if local(t) == "t")
+            for e in tree("xl/sharedStrings.xml")
+        ]
     cells: dict[tuple[int, str], str] = {}
     for cell in tree("xl/" + (target or "").removeprefix("/xl/")).iter():
         if local(cell) == "c":
@@ -84,7 +108,9 @@ def _sheet(content: bytes) -> Columns:
     top = min(row for row, _ in cells)
     place = {text.strip(): column for (row, column), text in cells.items() if row == top}
     last = max([row for row, column in cells if column in (place["u"], place["y"])])
-    return {name: [float(cells[row, place[name]]) for row in range(top + 1, last + 1)] for name in NAMES}
+    return {
+        name: [float(cells[row, place[name]]) for row in range(top + 1, last + 1)] for name in NAMES
+    }
 
 
 def _mat(content: bytes) -> Columns:
@@ -127,5 +153,7 @@ def _hdf5(path: Path, content: bytes) -> Columns:
             if begin is None:
                 columns[name] = np.asarray(data, float).ravel().tolist()
             else:
-                columns[name] = np.frombuffer(content, data.dtype, data.size, begin).astype(float).tolist()
+                columns[name] = (
+                    np.frombuffer(content, data.dtype, data.size, begin).astype(float).tolist()
+                )
     return columns

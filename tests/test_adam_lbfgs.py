@@ -18,7 +18,9 @@ from orthaug.physics.baseline import Baseline, Term
 from orthaug.physics.problem import pose
 
 STRUCTURES = (Orthogonal(), Additive(), OrthogonalPenalty(0.5), BaselinePenalty(0.5))
-LINEAR = Function(lambda w, z: w @ jnp.stack([z[0] ** 2, z[1] ** 2]), lambda key: 0.1 * jnp.ones((1, 2)))
+LINEAR = Function(
+    lambda w, z: w @ jnp.stack([z[0] ** 2, z[1] ** 2]), lambda key: 0.1 * jnp.ones((1, 2))
+)
 BROKEN = Function(lambda w, z: w * jnp.log(z[:1] - 5), lambda key: jnp.ones(1))
 NET = MLP(hidden=(3,))
 INITIAL = np.array([0.8, -0.3])
@@ -35,7 +37,9 @@ RECORD = Record.from_arrays(*signals())
 
 
 def fit(structure, solver, learner=NET, **options):
-    return estimate(RECORD, BASELINE, learner=learner, structure=structure, solver=solver, **options)
+    return estimate(
+        RECORD, BASELINE, learner=learner, structure=structure, solver=solver, **options
+    )
 
 
 def least_squares(structure):
@@ -43,10 +47,16 @@ def least_squares(structure):
     u, y = signals()
     z = 2 * (u - u.min(axis=0)) / np.ptp(u, axis=0) - 1
     psi = z**2
-    moved = psi - u @ np.linalg.lstsq(u, psi, rcond=None)[0] if isinstance(structure, Orthogonal) else psi
+    moved = (
+        psi - u @ np.linalg.lstsq(u, psi, rcond=None)[0]
+        if isinstance(structure, Orthogonal)
+        else psi
+    )
     rows, right = [np.hstack([u, moved])], [y]
     if isinstance(structure, OrthogonalPenalty):
-        rows.append(np.sqrt(structure.weight) * np.hstack([np.zeros((2, 2)), np.linalg.qr(u)[0].T @ psi]))
+        rows.append(
+            np.sqrt(structure.weight) * np.hstack([np.zeros((2, 2)), np.linalg.qr(u)[0].T @ psi])
+        )
         right.append(np.zeros(2))
     if isinstance(structure, BaselinePenalty):
         rows.append(np.sqrt(structure.weight) * np.hstack([np.diag(1 / INITIAL), np.zeros((2, 2))]))
@@ -61,7 +71,9 @@ def test_linear_learner_ends_at_least_squares(structure):
     theta, fitted = least_squares(structure)
     assert found.status.code == "converged" and found.status.iterations < 320
     np.testing.assert_allclose(found.theta, theta, rtol=1e-6)
-    np.testing.assert_allclose(found.model.predict(RECORD).trajectories[0].model[:, 0], fitted, atol=1e-6)
+    np.testing.assert_allclose(
+        found.model.predict(RECORD).trajectories[0].model[:, 0], fitted, atol=1e-6
+    )
 
 
 @pytest.fixture
@@ -104,7 +116,9 @@ def test_the_joint_criterion_is_the_plain_formula(structure, seen):
         found = float(criterion((jnp.asarray(v), w), rows, physics)) * (task.rms * y.std()) ** 2
         assert found == pytest.approx(raw_criterion(structure, task, theta, w), rel=1e-10)
         if isinstance(structure, Orthogonal):  # θ is solved, not an unknown (F1)
-            np.testing.assert_allclose(theta, task.problem.projection.solve(task.problem.whitened_target), rtol=1e-10)
+            np.testing.assert_allclose(
+                theta, task.problem.projection.solve(task.problem.whitened_target), rtol=1e-10
+            )
         elif not v.any():
             np.testing.assert_allclose(theta, INITIAL, rtol=1e-12)
 
@@ -123,7 +137,9 @@ def test_a_ridge_is_the_same_as_for_levenberg_marquardt(seen):
 
 @pytest.mark.parametrize("structure", [Orthogonal(), Additive()], ids=lambda s: s.name)
 def test_lbfgs_goes_on_from_adam(structure):
-    start, adam, both = (fit(structure, AdamLBFGS(*steps)).status for steps in ((1, 0), (40, 0), (40, 40)))
+    start, adam, both = (
+        fit(structure, AdamLBFGS(*steps)).status for steps in ((1, 0), (40, 0), (40, 40))
+    )
     assert both.loss < adam.loss < start.loss
     assert adam.iterations == 40 and both.iterations <= 80
 
@@ -131,7 +147,11 @@ def test_lbfgs_goes_on_from_adam(structure):
 def test_the_loss_never_rises_under_lbfgs(monkeypatch):
     monkeypatch.setattr(adam_lbfgs, "burst_length", lambda burst, spent: 1)
     told = []
-    fit(Additive(), AdamLBFGS(0, 40), progress=lambda run, iteration, loss: told.append((iteration, loss)))
+    fit(
+        Additive(),
+        AdamLBFGS(0, 40),
+        progress=lambda run, iteration, loss: told.append((iteration, loss)),
+    )
     iterations, losses = zip(*told, strict=True)
     assert iterations == tuple(range(1, len(told) + 1))
     assert np.all(np.diff(losses) <= 0)

@@ -94,7 +94,10 @@ def test_the_right_term_is_advised_with_its_figure_in_text_page_and_numbers(tmp_
     term = next(a for a in told["advice"] if "the term sign(v[k-1]) in the physics" in a["text"])
     assert term["after"] < 0.5 * term["before"]
     assert errors(term["text"]) == pytest.approx((term["before"], term["after"]), rel=5e-3)
-    assert term["change"]["baseline.terms"][-1] == {"parameter": "size", "regressor": "sign(v[k-1])"}
+    assert term["change"]["baseline.terms"][-1] == {
+        "parameter": "size",
+        "regressor": "sign(v[k-1])",
+    }
     assert told["advice"] == sorted(told["advice"], key=lambda a: a["after"])
     first = told["advice"][0]["text"]
     assert f"Next: {first}" in printed and told["advice_trials"]["text"] in printed
@@ -103,7 +106,9 @@ def test_the_right_term_is_advised_with_its_figure_in_text_page_and_numbers(tmp_
 
 def test_advice_that_is_followed_does_what_it_says(tmp_path):
     """The change as it stands in result.json makes the spec whose free run is better on a test as well."""
-    text = LAGGED.replace("[[baseline", 'tests.other = { files = ["run.csv"], rows = [600, 900] }\n[[baseline', 1)
+    text = LAGGED.replace(
+        "[[baseline", 'tests.other = { files = ["run.csv"], rows = [600, 900] }\n[[baseline', 1
+    )
     text = text.replace('files = ["run.csv"] }', 'files = ["run.csv"], rows = [0, 600] }', 1)
     spec = put(tmp_path, text, driven(with_friction))
     fitted = oa.fit_spec(str(spec))
@@ -125,18 +130,26 @@ def test_a_term_that_looks_best_but_hurts_where_nothing_was_fitted_is_not_advise
     more = suspect("expression", "u[k-1]**2 - 1/3") + suspect("cubic", "v[k-1]")
     fitted = oa.fit_spec(str(put(tmp_path, LAGGED + more, driven(turning))))
     assert fitted.result.advice_trials is not None
-    assert "the term u[k-1]**2 - 1/3 in the physics (" in fitted.result.advice_trials.text  # among those without gain
+    assert (
+        "the term u[k-1]**2 - 1/3 in the physics (" in fitted.result.advice_trials.text
+    )  # among those without gain
     assert not any("u[k-1]**2" in a.text for a in fitted.result.advice)
     assert "u[k-1]**2" not in fit_verdict(fitted.result).then
 
 
 def test_what_the_spec_has_is_never_advised(tmp_path):
     """A term of the physics that is a suspect, too; the focus that was tried; a learner that sees all lags."""
-    text = LAGGED.replace("[learner]", '[[baseline.terms]]\nparameter = "d"\nregressor = "sign( v[k-1] )"\n[learner]')
+    text = LAGGED.replace(
+        "[learner]", '[[baseline.terms]]\nparameter = "d"\nregressor = "sign( v[k-1] )"\n[learner]'
+    )
     text = text.replace('kind = "none"', 'kind = "mlp"\nhidden = [3]\n[validation]\nblocks = 0\n')
-    fitted = oa.fit_spec(str(put(tmp_path, text + suspect("coulomb", "v[k-1]"), driven(with_friction, 400))))
+    fitted = oa.fit_spec(
+        str(put(tmp_path, text + suspect("coulomb", "v[k-1]"), driven(with_friction, 400)))
+    )
     trials = "" if fitted.result.advice_trials is None else fitted.result.advice_trials.text
-    told = " ".join([a.text for a in fitted.result.advice] + [trials, fit_verdict(fitted.result).then])
+    told = " ".join(
+        [a.text for a in fitted.result.advice] + [trials, fit_verdict(fitted.result).then]
+    )
     assert "sign(" not in told and "also sees" not in told and "focus" not in told
 
 
@@ -144,7 +157,9 @@ def dead(u: float, width: float = 0.4) -> float:
     return u - np.clip(u, -width, width)
 
 
-@pytest.mark.parametrize(("beyond", "advised"), [(0.1, True), (-0.08, False)], ids=["dead zone", "limit"])
+@pytest.mark.parametrize(
+    ("beyond", "advised"), [(0.1, True), (-0.08, False)], ids=["dead zone", "limit"]
+)
 def test_a_dead_zone_of_negative_size_is_never_advised(tmp_path, beyond: float, advised: bool):
     """Where the slope falls beyond the width, the same columns would fit as well, but that is no dead zone."""
     slope = 0.02 if advised else 0.1
@@ -163,7 +178,9 @@ def moved(tmp_path_factory) -> Any:
 
 def test_the_right_term_of_a_motion_is_advised_with_its_figure(moved):
     first = moved.result.advice[0]
-    assert "the term sign(v) in the equation of v" in first.text and first.after < 0.7 * first.before
+    assert (
+        "the term sign(v) in the equation of v" in first.text and first.after < 0.7 * first.before
+    )
     assert first.change["motion.states.v.derivative"] == "(force - c*v - k*x)/m + size*(sign(v))"
     assert fit_verdict(moved.result).then == first.text
     trials = moved.result.advice_trials
@@ -173,8 +190,12 @@ def test_the_right_term_of_a_motion_is_advised_with_its_figure(moved):
 def test_a_motion_is_not_advised_the_hold_or_the_learner_input_that_it_has(moved, tmp_path):
     changes = [a.change for a in moved.result.advice]
     assert not any(change.get("motion.hold") == "zero-order" for change in changes)
-    text = MOTION.replace('"derivative of position" }', '"derivative of position", learned = true }')
-    text = text.replace('kind = "none"', 'hidden = [3]\ninputs = ["v"]\n[training]\niterations = 5\n')
+    text = MOTION.replace(
+        '"derivative of position" }', '"derivative of position", learned = true }'
+    )
+    text = text.replace(
+        'kind = "none"', 'hidden = [3]\ninputs = ["v"]\n[training]\niterations = 5\n'
+    )
     text += "[validation]\nblocks = 0\n"
     fitted = oa.fit_spec(str(put(tmp_path, text, friction(300, 3), "force,position")))
     told = [

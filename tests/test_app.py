@@ -26,11 +26,11 @@ from test_cli import run, signals, write_csv
 from orthaug._base.errors import InputError
 from orthaug.commands.app import spec_text
 from orthaug.commands.app.gate import Gate
-from orthaug.commands.app.processes import Command, Desk, Run
+from orthaug.commands.app.processes import Command, Run, WorkerPool
 from orthaug.commands.app.session import Session, Sessions
 from orthaug.commands.app.worker import thinned
 from orthaug.commands.bars import training_bar
-from orthaug.commands.job import ALONE, AS_DECLARED, Variant
+from orthaug.commands.job import AS_DECLARED, PHYSICS_ONLY, Variant
 from orthaug.commands.kinds import open_job
 from orthaug.commands.parts import expanded
 
@@ -40,7 +40,8 @@ HAS_PAGE = importlib.util.find_spec("nicegui") is not None
 HAS_BROWSER = importlib.util.find_spec("playwright") is not None and CHROMIUM is not None
 served = pytest.mark.skipif(not HAS_PAGE or os.name != "posix", reason="no NiceGUI, or no SIGINT")
 browsed = pytest.mark.skipif(
-    not (HAS_PAGE and HAS_BROWSER) or os.name != "posix", reason="no NiceGUI, Playwright or Chromium, or no SIGINT"
+    not (HAS_PAGE and HAS_BROWSER) or os.name != "posix",
+    reason="no NiceGUI, Playwright or Chromium, or no SIGINT",
 )
 MAIN = """
 import signal
@@ -79,8 +80,15 @@ def answer(gate: Gate, kind: str = "http", **given: Any) -> tuple[int, dict[str,
 
     gate.app = behind
     headers = {"host": f"127.0.0.1:{gate.port}", **given.get("headers", {})}
-    scope = {"type": kind, "path": given.get("path", "/"), "query_string": given.get("query", "").encode()}
-    scope |= {"headers": [(k.encode(), v.encode()) for k, v in headers.items()], "method": given.get("method", "GET")}
+    scope = {
+        "type": kind,
+        "path": given.get("path", "/"),
+        "query_string": given.get("query", "").encode(),
+    }
+    scope |= {
+        "headers": [(k.encode(), v.encode()) for k, v in headers.items()],
+        "method": given.get("method", "GET"),
+    }
     asyncio.run(gate(scope, None, send))  # type: ignore[arg-type]
     first = sent[0] if sent else {}
     told = {k.decode(): v.decode() for k, v in first.get("headers", [])}
@@ -89,7 +97,9 @@ def answer(gate: Gate, kind: str = "http", **given: Any) -> tuple[int, dict[str,
 
 def test_only_the_token_opens_the_gate():
     gate = Gate(None, 8123, token="sesame")  # type: ignore[arg-type]
-    kept = {"cookie": f"a=b; {answer(gate, query='token=sesame')[1]['set-cookie'].partition(';')[0]}"}
+    kept = {
+        "cookie": f"a=b; {answer(gate, query='token=sesame')[1]['set-cookie'].partition(';')[0]}"
+    }
     assert "sesame" not in kept["cookie"]
     assert gate.url == "http://127.0.0.1:8123/?token=sesame"
     for kind, refusal in (("http", 403), ("websocket", 1008)):
@@ -100,11 +110,20 @@ def test_only_the_token_opens_the_gate():
             ("", "orthaug-8123=x"),
             ("", "orthaug-1=sesame"),
         ):
-            assert answer(gate, kind, query=query, headers={"cookie": cookie})[::2] == (refusal, False)
+            assert answer(gate, kind, query=query, headers={"cookie": cookie})[::2] == (
+                refusal,
+                False,
+            )
         assert answer(gate, kind, headers=kept)[2]
-        for header in ({"host": "evil.example:8123"}, {"host": "127.0.0.1:1"}, {"origin": "http://evil.example"}):
+        for header in (
+            {"host": "evil.example:8123"},
+            {"host": "127.0.0.1:1"},
+            {"origin": "http://evil.example"},
+        ):
             assert answer(gate, kind, headers=kept | header)[::2] == (refusal, False)
-        assert answer(gate, kind, headers=kept | {"host": "localhost:8123", "origin": "http://localhost:8123"})[2]
+        assert answer(
+            gate, kind, headers=kept | {"host": "localhost:8123", "origin": "http://localhost:8123"}
+        )[2]
     code, told, reached = answer(gate, query="token=sesame&show=true", path="//evil.example/x")
     assert (code, told["location"], reached) == (303, "/evil.example/x?show=true", False)
     _, told, _ = answer(gate, query="token=sesame", path="/\\evil.example/\r\nx: y")
@@ -118,21 +137,29 @@ def test_forms_change_a_spec_and_nothing_else(tmp_path):
     steps = ("data", "prepare")
     spec = spec_text.with_row(SPEC, steps, {"step": "detrend"})
     spec = spec_text.with_row(spec, steps, {"step": "lowpass", "cutoff": 2.0})
-    spec = spec_text.with_told(spec, steps, 1, "order", "2")
-    assert spec_text.rows_of(spec, steps) == [{"step": "detrend"}, {"step": "lowpass", "cutoff": 2.0, "order": 2}]
+    spec = spec_text.with_field(spec, steps, 1, "order", "2")
+    assert spec_text.rows_of(spec, steps) == [
+        {"step": "detrend"},
+        {"step": "lowpass", "cutoff": 2.0, "order": 2},
+    ]
     spec = spec_text.without_row(spec_text.without_row(spec, steps, 0), steps, 0)
     assert tomllib.loads(spec) == tomllib.loads(SPEC) and "# kept too" in spec
     spec = spec_text.with_value(spec, ("training", "restarts"), 3)
     assert tomllib.loads(spec)["training"] == {"restarts": 3}
     inline = spec_text.with_row(
-        '[baseline]\nterms = [{ parameter = "a", regressor = "1" }]', ("baseline", "terms"), {"x": 1}
+        '[baseline]\nterms = [{ parameter = "a", regressor = "1" }]',
+        ("baseline", "terms"),
+        {"x": 1},
     )
     assert spec_text.rows_of(inline, ("baseline", "terms"))[1] == {"x": 1}
     data = tomllib.loads(spec_text.absolute(SPEC, tmp_path / "in"))["data"]
     assert data["train"]["files"] == [(tmp_path / "in/run.csv").as_posix(), "/there/b.csv"]
     assert data["tests"]["one"]["files"] == [(tmp_path / "c.csv").as_posix()]
     tested = spec_text.with_value(spec, ("data", "tests", "new"), {"files": ["d.csv"]})
-    assert tomllib.loads(tested)["data"]["tests"] == {"one": {"files": ["../c.csv"]}, "new": {"files": ["d.csv"]}}
+    assert tomllib.loads(tested)["data"]["tests"] == {
+        "one": {"files": ["../c.csv"]},
+        "new": {"files": ["d.csv"]},
+    }
     moving = tomllib.loads(spec_text.as_motion(SPEC))
     assert moving["motion"]["outputs"] == {"y": "x"} and "baseline" not in moving
     with pytest.raises(InputError, match="broken TOML"):
@@ -196,7 +223,7 @@ def test_the_address_in_the_browsers_arguments_opens_the_page_once():
 
 
 def test_each_dropped_file_keeps_its_content(tmp_path):
-    session = Session("key", tmp_path, Desk())
+    session = Session("key", tmp_path, WorkerPool())
 
     def drop(name: str, content: str) -> tuple[str, str]:
         partial = session.begin_file(name)
@@ -232,21 +259,27 @@ def test_a_file_beyond_the_limit_is_refused_before_it_comes(tmp_path, monkeypatc
             return {"type": "http.request", "body": pieces.pop(0), "more_body": bool(pieces)}
 
         headers = [(name.encode(), value.encode()) for name, value in declared.items()]
-        scope = {"type": "http", "method": "PUT", "headers": headers, "path": "/", "query_string": b""}
+        scope = {
+            "type": "http",
+            "method": "PUT",
+            "headers": headers,
+            "path": "/",
+            "query_string": b"",
+        }
         reply = asyncio.run(routes._kept(sessions, session.key, "run.csv", Request(scope, receive)))  # type: ignore
         return reply.status_code, bytes(reply.body).decode()
 
     for code, text in (dropped(b"x" * 40), dropped(b"", **{"content-length": "11"})):
-        assert code == 413 and "larger than 10 bytes" in text and "name its path" in text
+        assert code == 413 and "larger than 10 bytes" in text and "give its path" in text
     assert list(session.folder.iterdir()) == []
 
 
 def test_a_session_keeps_to_its_folder(tmp_path):
-    session = Session("key", tmp_path, Desk())
+    session = Session("key", tmp_path, WorkerPool())
     assert session.place_for("../../etc/run one.csv") == tmp_path / "run one.csv"
     assert session.place_for("C:\\data\\<b>.CSV").parent == tmp_path
     for name in ("run.exe", ".csv", "", "spec.toml"):
-        with pytest.raises(InputError, match="no data file that is known"):
+        with pytest.raises(InputError, match="unknown type of data file"):
             session.place_for(name)
     for name in ("../x", "spec.toml", "model.zip", "c.zip", "/etc/passwd"):
         with pytest.raises(InputError, match="there is nothing of that name yet"):
@@ -257,7 +290,10 @@ def test_a_command_that_cannot_start_has_failed(monkeypatch):
     monkeypatch.setattr(sys, "executable", "/absent")
     command = Command(["fit"], lambda: None)
     asyncio.run(command.run())
-    assert (command.running, command.complaint) == (False, "the command cannot start (No such file or directory).")
+    assert (command.running, command.complaint) == (
+        False,
+        "the command cannot start (No such file or directory).",
+    )
 
 
 def test_lines_of_progress_say_what_each_run_is(csv, tmp_path, monkeypatch, capsys):
@@ -269,9 +305,16 @@ def test_lines_of_progress_say_what_each_run_is(csv, tmp_path, monkeypatch, caps
     job = open_job(tmp_path / "spec.toml")
     runs = job.planned(AS_DECLARED)
     assert [tuple(run.values()) for run in runs] == [
-        *(("orthogonal", 1, "none"), ("orthogonal", 2, "none"), ("orthogonal", 1, "ard"), ("orthogonal", 2, "ard"))
+        *(
+            ("orthogonal", 1, "none"),
+            ("orthogonal", 2, "none"),
+            ("orthogonal", 1, "ard"),
+            ("orthogonal", 2, "ard"),
+        )
     ]
-    assert len(runs) == job.run_count and job.planned(Variant(ALONE)) == ({"structure": ALONE},)
+    assert len(runs) == job.run_count and job.planned(Variant(PHYSICS_ONLY)) == (
+        {"structure": PHYSICS_ONLY},
+    )
     penalised = job.planned(Variant("baseline-penalty"))
     assert {run["structure"] for run in penalised} == {"baseline-penalty"} and len(penalised) == 4
     monkeypatch.setenv("ORTHAUG_PROGRESS", "json")
@@ -282,43 +325,62 @@ def test_lines_of_progress_say_what_each_run_is(csv, tmp_path, monkeypatch, caps
             own.planned(plan)
             own(1, 3, 0.5)
         own(4, 3, 0.5)  # made again: nothing was planned of it
-    lines = [json.loads(line) for line in capsys.readouterr().err.splitlines() if line.startswith("{")]
-    told = [Run.told(line) for line in lines]
+    lines = [
+        json.loads(line) for line in capsys.readouterr().err.splitlines() if line.startswith("{")
+    ]
+    told = [Run.of(line) for line in lines]
     assert told == [Run(2, "orthogonal", 2, "none"), Run(6, "baseline-penalty", 2, "none"), Run(9)]
 
 
 @served
 def test_curves_of_the_loss_are_named_by_start_or_by_structure():
-    from orthaug.commands.app.view_training import _runs_told
+    from orthaug.commands.app.view_training import _runs_caption
     from orthaug.commands.app.widgets import loss_figure
 
     def drawn(runs: list[Run]) -> tuple[list[str], list[str], dict[str, Any]]:
         figure = loss_figure([(run, i, 0.5**i) for i in range(3) for run in runs])
         legend = [trace["name"] for trace in figure["data"] if trace["showlegend"]]
-        return legend, [trace["hovertemplate"].partition("<br>")[0] for trace in figure["data"]], figure["layout"]
+        return (
+            legend,
+            [trace["hovertemplate"].partition("<br>")[0] for trace in figure["data"]],
+            figure["layout"],
+        )
 
     plan = [(start, kind) for kind in ("none", "ard") for start in (1, 2, 3)]
     fit = [Run(i, "orthogonal", *own) for i, own in enumerate(plan, 1)]
     legend, names, layout = drawn(fit)
     assert legend == names == [f"start {start}, {kind}" for start, kind in plan]
-    assert layout["legend"]["yanchor"] == "bottom" and layout["margin"]["b"] >= 40 + 6 * 19  # below the axis
+    assert (
+        layout["legend"]["yanchor"] == "bottom" and layout["margin"]["b"] >= 40 + 6 * 19
+    )  # below the axis
     assert drawn(fit[:3])[0] == ["start 1", "start 2", "start 3"]
     kinds = ("orthogonal", "additive", "<i>own</i>")
     compared = [Run(0, "physics alone")]
-    compared += [Run(6 * i + run.number, kind, *run[2:]) for i, kind in enumerate(kinds) for run in fit]
+    compared += [
+        Run(6 * i + run.number, kind, *run[2:]) for i, kind in enumerate(kinds) for run in fit
+    ]
     legend, names, _ = drawn(compared)
     assert legend == ["physics alone", "orthogonal", "additive", "&lt;i&gt;own&lt;/i&gt;"]
-    assert names[0] == "physics alone" and names[1] == "orthogonal, start 1, none" and len(set(names)) == 19
-    assert drawn([Run(1), Run(2)])[0] == ["run 1", "run 2"] and drawn([Run(1, "orthogonal", 1, "ard")])[0] == []
-    assert "(ard, none)" in _runs_told(set(fit)) and "The colour tells" in _runs_told(set(compared))
-    assert _runs_told({Run(1)}) == "Each curve is a run: one training."
+    assert (
+        names[0] == "physics alone"
+        and names[1] == "orthogonal, start 1, none"
+        and len(set(names)) == 19
+    )
+    assert (
+        drawn([Run(1), Run(2)])[0] == ["run 1", "run 2"]
+        and drawn([Run(1, "orthogonal", 1, "ard")])[0] == []
+    )
+    assert "(ard, none)" in _runs_caption(set(fit)) and "The colour shows" in _runs_caption(
+        set(compared)
+    )
+    assert _runs_caption({Run(1)}) == "Each curve is a run: one training."
 
 
 @served
 def test_a_part_of_the_page_that_fails_keeps_no_other_from_what_is_new(tmp_path, monkeypatch):
     from orthaug.commands.app.routes import Page
 
-    session = Session("key", tmp_path, Desk())
+    session = Session("key", tmp_path, WorkerPool())
     page, told, seen = Page(session), [], []
     monkeypatch.setattr(page, "_complain", told.append)
     monkeypatch.setattr(page, "_name", lambda: None)
@@ -337,7 +399,7 @@ def test_a_process_that_cannot_start_is_told(tmp_path, monkeypatch):
         raise OSError(errno.EAGAIN, "Resource temporarily unavailable")
 
     async def looked() -> str:
-        session = Session("key", tmp_path, Desk())
+        session = Session("key", tmp_path, WorkerPool())
         session.desk.prepare()
         session.open_file(tmp_path / "run.csv")
         await session._look
@@ -345,14 +407,14 @@ def test_a_process_that_cannot_start_is_told(tmp_path, monkeypatch):
         return session.trouble
 
     monkeypatch.setattr("orthaug.commands.app.processes._started", refused)
-    assert asyncio.run(looked()) == "no process can be started for that (Resource temporarily unavailable)."
+    assert asyncio.run(looked()) == "no process can be started (Resource temporarily unavailable)."
     monkeypatch.setattr("orthaug.commands.app.session.Session.worded", lambda *_: 1 / 0)
     assert asyncio.run(failed(tmp_path)) == "this did not work (ZeroDivisionError)."
 
 
 async def failed(tmp_path) -> str:
     """What is told of a task that fails with what nobody expected."""
-    session = Session("key", tmp_path, Desk())
+    session = Session("key", tmp_path, WorkerPool())
     session.open_file(tmp_path / "run.csv")
     with pytest.raises(ZeroDivisionError):
         await session._look
@@ -369,7 +431,7 @@ def test_a_question_that_is_taken_back_leaves_its_process_to_the_next(tmp_path, 
         raise OSError(errno.EAGAIN, "later")
 
     async def twice() -> None:
-        desk = Desk()
+        desk = WorkerPool()
         desk.prepare()
         first = asyncio.ensure_future(desk.ask("look"))
         await asyncio.sleep(0.01)
@@ -390,19 +452,32 @@ def test_sessions_that_nobody_used_make_room(tmp_path):
     first, second = sessions.new(), sessions.new()
     first.data = tmp_path / "run.csv"
     keys = {sessions.new().key for _ in range(48 + 20)}
-    assert sessions.find(first.key) is first and sessions.find(second.key) is None and len(keys) == 68
+    assert (
+        sessions.find(first.key) is first and sessions.find(second.key) is None and len(keys) == 68
+    )
     for key in keys:
         if (session := sessions.find(key)) is not None:
             session.data = first.data
-    with pytest.raises(InputError, match="50 pieces of work are open"):
+    with pytest.raises(InputError, match="50 sessions are open"):
         sessions.new()
 
 
 def looked(**given: Any) -> dict[str, Any]:
     """What a look at a file with the columns left and right gives."""
-    columns = [{"header": head, "kind": "", "usable": True, "timed": False, "told": ""} for head in ("left", "right")]
+    columns = [
+        {"header": head, "kind": "", "usable": True, "timed": False, "description": ""}
+        for head in ("left", "right")
+    ]
     curves = {head: {"x": [0.0, 1.0], "y": [0.0, 1.0]} for head in ("left", "right")}
-    plain = {"columns": columns, "curves": curves, "rows": 2, "timed": "", "step": None, "account": "", "open": ""}
+    plain = {
+        "columns": columns,
+        "curves": curves,
+        "rows": 2,
+        "timed": "",
+        "step": None,
+        "account": "",
+        "open": "",
+    }
     return plain | {"spec": None} | given
 
 
@@ -448,7 +523,9 @@ def test_a_further_file_leaves_the_spec_and_may_be_a_test_of_it(started, tells):
     async def worked() -> None:
         session = started(tells=tells)
         await look(session, "motor_train.csv")
-        assert session.title == "motor_train.csv" and bool(session.spec) == tells and not session.apart
+        assert (
+            session.title == "motor_train.csv" and bool(session.spec) == tells and not session.apart
+        )
         if not tells:
             session.choose(["left"], ["right"], None)
             await session._look
@@ -466,12 +543,18 @@ def test_a_further_file_leaves_the_spec_and_may_be_a_test_of_it(started, tells):
         await look(session, "other.csv")
         session.choose(["right"], ["left"], None)
         await session._look
-        assert tomllib.loads(session.spec)["data"]["train"]["files"] == ["other.csv"] and not session.apart
+        assert (
+            tomllib.loads(session.spec)["data"]["train"]["files"] == ["other.csv"]
+            and not session.apart
+        )
         assert session.title == "other.csv" and {path.name for path in session.raw} >= {"other.csv"}
         await session.close()
 
     asyncio.run(worked())
-    assert sorted(map(spec_text.kept_title, spec_text.earlier())) == ["motor_train.csv", "other.csv"]
+    assert sorted(map(spec_text.kept_title, spec_text.earlier())) == [
+        "motor_train.csv",
+        "other.csv",
+    ]
 
 
 def test_a_file_that_is_dropped_again_begins_a_spec_that_nobody_worked_on_anew(started):
@@ -522,11 +605,16 @@ def test_the_channels_and_the_grey_curves_are_those_of_the_spec(started):
     view._take_uses(session.found)
     assert view.uses == {"left": "input", "right": "output"} and view._lacking(session.found) == []
     session.checked = {"files": [str(session.folder / "motor_train.csv")]}
-    assert view._whole_file() == ("motor_train.csv", session.raw[session.folder / "motor_train.csv"])
+    assert view._whole_file() == (
+        "motor_train.csv",
+        session.raw[session.folder / "motor_train.csv"],
+    )
     session.raw.clear()
     assert view._whole_file() == ("", {})
     assert export._beside() == ["motor_train.csv"]
-    session.spec = spec_text.with_value(session.spec, ("data", "tests", "a"), {"files": ["motor_test.csv", "/b.csv"]})
+    session.spec = spec_text.with_value(
+        session.spec, ("data", "tests", "a"), {"files": ["motor_test.csv", "/b.csv"]}
+    )
     assert export._beside() == ["motor_train.csv", "motor_test.csv"]
     session.spec = session.spec.replace('"left"', '"up"')
     assert view._lacking(session.found) == ["up"]
@@ -552,7 +640,9 @@ class Server:
     """`orthaug app` in a process of its own."""
 
     def __init__(self, folder: Path, *arguments: object) -> None:
-        setting = {k: v for k, v in os.environ.items() if k != "PYTEST_CURRENT_TEST"} | {"TMPDIR": str(folder)}
+        setting = {k: v for k, v in os.environ.items() if k != "PYTEST_CURRENT_TEST"} | {
+            "TMPDIR": str(folder)
+        }
         setting |= {"XDG_STATE_HOME": str(folder / "state")}
         program = [sys.executable, "-c", MAIN, "app", "--no-browser", *map(str, arguments)]
         pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
@@ -606,7 +696,9 @@ def browser():
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as started:
-        browser = started.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--disable-gpu"])
+        browser = started.chromium.launch(
+            executable_path=CHROMIUM, args=["--no-sandbox", "--disable-gpu"]
+        )
         yield browser
         browser.close()
 
@@ -631,7 +723,10 @@ class Tab:
         self.page, self.told, self.server = self.context.new_page(), [], server
         self.page.set_default_timeout(LATE)
         self.asked: set[str] = set()
-        self.page.on("console", lambda m: self.told.append(m.text) if m.type in ("error", "warning") else None)
+        self.page.on(
+            "console",
+            lambda m: self.told.append(m.text) if m.type in ("error", "warning") else None,
+        )
         self.page.on("pageerror", lambda error: self.told.append(str(error)))
         self.page.on("request", lambda r: self.asked.add(r.url))
         self.page.on("websocket", lambda w: self.asked.add(w.url.replace("ws://", "http://")))
@@ -652,7 +747,9 @@ class Tab:
         editor = self.page.get_by_label("spec in TOML")
         self.page.wait_for_function("document.querySelector('.editor textarea')?.value")
         spec = change(editor.input_value())
-        self.page.evaluate("document.querySelectorAll('.note').forEach(note => note.dataset.old = '1')")
+        self.page.evaluate(
+            "document.querySelectorAll('.note').forEach(note => note.dataset.old = '1')"
+        )
         editor.fill(spec)  # "Checking …" may be gone before it is seen
         self.page.wait_for_selector(".note.good:not([data-old]), .note.bad:not([data-old])")
         return spec
@@ -683,7 +780,9 @@ class Tab:
     def close(self) -> None:
         self.leave()
         assert self.told == []
-        assert {url for url in self.asked if not url.startswith((self.server.base, "data:", "blob:"))} == set()
+        assert {
+            url for url in self.asked if not url.startswith((self.server.base, "data:", "blob:"))
+        } == set()
 
 
 @pytest.fixture(autouse=True)
@@ -699,23 +798,38 @@ def _tell_of_tabs_left_open() -> Iterator[None]:
 def test_the_server_listens_on_this_machine_alone_and_asks_for_the_token(server):
     def status(url: str, **headers: str) -> int:
         try:
-            with urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=10) as told:
+            with urllib.request.urlopen(
+                urllib.request.Request(url, headers=headers), timeout=10
+            ) as told:
                 return told.status
         except urllib.error.HTTPError as error:
             return error.code
 
     assert server.base.startswith("http://127.0.0.1:")
-    places = ("", "session/x", "session/x/get/spec.toml", "_nicegui_ws/socket.io/?EIO=4&transport=polling")
+    places = (
+        "",
+        "session/x",
+        "session/x/get/spec.toml",
+        "_nicegui_ws/socket.io/?EIO=4&transport=polling",
+    )
     assert [status(server.base + place) for place in places] == [403] * 4
     assert status(server.url + "x") == 403 and status(server.url, Host="evil.example") == 403
     port = server.base.rstrip("/").rpartition(":")[2]
-    listening = Path("/proc/net/tcp").read_text().splitlines() if os.path.exists("/proc/net/tcp") else []
-    own = [line.split()[1] for line in listening if line.split()[1].endswith(f":{int(port):04X}") and " 0A " in line]
+    listening = (
+        Path("/proc/net/tcp").read_text().splitlines() if os.path.exists("/proc/net/tcp") else []
+    )
+    own = [
+        line.split()[1]
+        for line in listening
+        if line.split()[1].endswith(f":{int(port):04X}") and " 0A " in line
+    ]
     assert set(own) <= {f"0100007F:{int(port):04X}"}
 
 
 @browsed
-def test_from_a_file_to_code_with_the_numbers_of_the_command_line(server, browser, csv, tmp_path, without_figures):
+def test_from_a_file_to_code_with_the_numbers_of_the_command_line(
+    server, browser, csv, tmp_path, without_figures
+):
     tab, other = Tab(browser, server), Tab(browser, server, 390, "dark")
     page = tab.page
     tab.drop(csv)
@@ -730,9 +844,13 @@ def test_from_a_file_to_code_with_the_numbers_of_the_command_line(server, browse
     assert page.get_by_text("Unit of").count() == 0
     page.get_by_label("unit").first.fill("m")
     page.get_by_label("unit").first.press("Tab")
-    page.wait_for_function("document.querySelector('.editor textarea').value.includes('unit = \"m\"')")
+    page.wait_for_function(
+        "document.querySelector('.editor textarea').value.includes('unit = \"m\"')"
+    )
     spec = tab.write(
-        lambda text: text.replace("restarts = 3", "restarts = 200\niterations = 4000\nregularization = 0.0")
+        lambda text: text.replace(
+            "restarts = 3", "restarts = 200\niterations = 4000\nregularization = 0.0"
+        )
     )
     assert 'unit = "m"' in spec and '[[data.prepare]]\nstep = "detrend"' in spec
 
@@ -742,7 +860,7 @@ def test_from_a_file_to_code_with_the_numbers_of_the_command_line(server, browse
     second = csv.with_name("second.csv")
     write_csv(second, left=np.arange(40.0) % 7, right=np.arange(40.0) % 5)
     other.page.set_input_files("#dropped", second)
-    other.page.wait_for_selector("text=The names of the columns do not say")
+    other.page.wait_for_selector("text=The names of the columns do not show")
     assert other.page.url != page.url and "plant.csv" not in other.page.inner_text("body")
 
     # a reload in the middle finds it again, and it can be stopped
@@ -762,7 +880,11 @@ def test_from_a_file_to_code_with_the_numbers_of_the_command_line(server, browse
     assert "stopped" in [warning["code"] for warning in kept["warnings"]]
 
     tab.go("Model")
-    tab.write(lambda text: text.replace("restarts = 200\niterations = 4000", "restarts = 1\niterations = 20"))
+    tab.write(
+        lambda text: text.replace(
+            "restarts = 200\niterations = 4000", "restarts = 1\niterations = 20"
+        )
+    )
     tab.go("Training")
     page.get_by_role("button", name="Train").click()
     page.wait_for_selector("text=Training is done")
@@ -823,7 +945,9 @@ class Keys:
             now = self.page.evaluate(self.NOW)
             if now["name"] == name and now["group"] == group:
                 assert now["seen"], now
-                self.page.wait_for_function(f"({self.NOW})().marked")  # a frame takes its colour in a moment
+                self.page.wait_for_function(
+                    f"({self.NOW})().marked"
+                )  # a frame takes its colour in a moment
                 return
         raise AssertionError(f"{name} is not reached by Tab")
 
@@ -837,7 +961,9 @@ class Keys:
         self.page.wait_for_selector(f"[role=tab][aria-selected=true]:has-text('{name}')")
 
     def write(self, text: str, first: str = "Control+a") -> None:
-        self.page.evaluate("document.querySelectorAll('.note').forEach(note => note.dataset.old = '1')")
+        self.page.evaluate(
+            "document.querySelectorAll('.note').forEach(note => note.dataset.old = '1')"
+        )
         self.press(first)
         self.page.keyboard.type(text)
         self.press("Enter")
@@ -958,7 +1084,7 @@ def test_what_is_wrong_is_told_on_the_page(server, browser, csv, tmp_path):
     page.wait_for_selector("text=no such file")
     (tmp_path / "run.docx").write_text("no data")
     page.set_input_files("#dropped", tmp_path / "run.docx")
-    page.wait_for_selector("text=no data file that is known")
+    page.wait_for_selector("text=unknown type of data file")
     tab.told.clear()  # the browser tells of the 422
     (tmp_path / "own.csv").write_text(csv.read_text().replace("u,y", "force,<i>way</i>"))
     page.get_by_label("or its path").fill(str(tmp_path / "own.csv"))
@@ -971,7 +1097,11 @@ def test_what_is_wrong_is_told_on_the_page(server, browser, csv, tmp_path):
     tab.write(lambda text: text.replace("[learner]", "[learner"))
     assert "Broken TOML" in page.inner_text(".note.bad")
     broken = page.get_by_label("spec in TOML").input_value()
-    tab.write(lambda _: "learner = 3\nbaseline = 4\n[data]\ninputs = 1\noutputs = [2]\n[motion]\nstates = 5\n")
+    tab.write(
+        lambda _: (
+            "learner = 3\nbaseline = 4\n[data]\ninputs = 1\noutputs = [2]\n[motion]\nstates = 5\n"
+        )
+    )
     assert page.locator(".q-notification").count() == 0  # forms read what they can
     tab.go("Training")
     assert page.get_by_role("button", name="Train").is_disabled()
@@ -987,26 +1117,34 @@ def test_what_is_wrong_is_told_on_the_page(server, browser, csv, tmp_path):
     page.get_by_role("button", name="Remove step 1").click()
     own = page.inner_text(".head .hint")
     tab.drop(tmp_path / "own.csv")
-    page.wait_for_selector("text=own.csv is no part of them")
-    assert page.inner_text(".head .hint") == own and page.get_by_text("The names of the columns").count() == 0
-    assert [page.get_by_label(f"use of {name}").input_value() for name in ("force", "<i>way</i>")] == [
-        *("input", "output")
-    ]
-    page.get_by_role("button", name="Take it as a test").click()
+    page.wait_for_selector("text=own.csv is not among them")
+    assert (
+        page.inner_text(".head .hint") == own
+        and page.get_by_text("The names of the columns").count() == 0
+    )
+    assert [
+        page.get_by_label(f"use of {name}").input_value() for name in ("force", "<i>way</i>")
+    ] == [*("input", "output")]
+    page.get_by_role("button", name="Use it as a test").click()
     page.wait_for_selector("text=tests.own")
     tab.go("Export")
-    page.wait_for_selector("text=The spec names own.csv: let the two stand in one folder")
+    page.wait_for_selector("text=The spec names own.csv: keep the two in one folder")
     added = tab.fetch("spec.toml").decode()
-    assert tomllib.loads(added)["data"]["tests"].pop("own") == {"files": ["own.csv"]} and kept.splitlines()[0] in added
+    assert (
+        tomllib.loads(added)["data"]["tests"].pop("own") == {"files": ["own.csv"]}
+        and kept.splitlines()[0] in added
+    )
     assert tab.get("spec.toml?show=true").headers["content-disposition"][:10] == "attachment"
     assert tab.fetch("../x") and tab.get("result.zip").status == 404
     gone = tab.context.request.get(f"{server.base}session/absent")
-    assert gone.status == 404 and "not open any more" in gone.text()
+    assert gone.status == 404 and "this session has ended" in gone.text()
     tab.close()
 
 
 @browsed
-def test_a_wrong_sampling_time_is_told_under_it_and_takes_nothing_away(server, browser, csv, tmp_path):
+def test_a_wrong_sampling_time_is_told_under_it_and_takes_nothing_away(
+    server, browser, csv, tmp_path
+):
     tab = Tab(browser, server)
     page = tab.page
     (tmp_path / "rig.csv").write_text(csv.read_text().replace("u,y", "left,right"))
@@ -1016,14 +1154,20 @@ def test_a_wrong_sampling_time_is_told_under_it_and_takes_nothing_away(server, b
     tab.go("Data")
     page.get_by_label("use of left").select_option("input")
     page.get_by_label("use of right").select_option("output")
-    for wrong, told in (("-1", "must be a positive number of seconds"), ("ten", "a number of seconds, such as 0.01")):
+    for wrong, told in (
+        ("-1", "must be a positive number of seconds"),
+        ("ten", "a number of seconds, such as 0.01"),
+    ):
         page.get_by_label("sampling time").fill(wrong)
         page.get_by_role("button", name="Begin with these").click()
         page.wait_for_selector(f".q-field__messages:has-text('{told}')")
     page.get_by_label("sampling time").fill("0.5")
     page.get_by_role("button", name="Begin with these").click()
     page.wait_for_selector("text=first physics")
-    assert [page.get_by_label(f"use of {name}").input_value() for name in ("left", "right")] == ["input", "output"]
+    assert [page.get_by_label(f"use of {name}").input_value() for name in ("left", "right")] == [
+        "input",
+        "output",
+    ]
     assert page.get_by_label("sampling time").input_value() == "0.5"
     assert tomllib.loads(tab.fetch("spec.toml").decode())["data"]["sampling_time"] == 0.5
 
@@ -1062,7 +1206,9 @@ def test_the_spec_of_a_server_that_was_killed_is_offered_by_the_next(serve, brow
     tab.drop(csv)
     tab.page.wait_for_selector(".account")
     tab.go("Model")
-    spec = tab.write(lambda text: text.replace("restarts = 3", "restarts = 7").replace("[learner]", "[learner"))
+    spec = tab.write(
+        lambda text: text.replace("restarts = 3", "restarts = 7").replace("[learner]", "[learner")
+    )
     assert '"plant.csv"' in spec and "Broken TOML" in tab.page.inner_text(".note.bad")
     killed.process.kill()
     killed.process.communicate()
@@ -1077,7 +1223,9 @@ def test_the_spec_of_a_server_that_was_killed_is_offered_by_the_next(serve, brow
     tab.page.wait_for_selector("text=Broken TOML")
     assert tab.page.get_by_label("spec in TOML").input_value() == spec
     tab.write(lambda text: text.replace("[learner", "[learner]"))
-    assert "plant.csv: no such file" in tab.page.inner_text(".note.bad")  # what was dropped is dropped again
+    assert "plant.csv: no such file" in tab.page.inner_text(
+        ".note.bad"
+    )  # what was dropped is dropped again
     tab.go("Data")
     tab.drop(csv)
     tab.go("Model")

@@ -38,9 +38,58 @@ ONLY_IN = {
     "matplotlib": {"reports.drawing", "studies"},
     "typer": {"commands.cli", "commands.model_cli", "commands.program"},
 }  # a room, or a file
-UNSAFE_MODULES = ("pickle", "cPickle", "_pickle", "cloudpickle", "dill", "joblib", "marshal", "shelve")
+UNSAFE_MODULES = (
+    "pickle",
+    "cPickle",
+    "_pickle",
+    "cloudpickle",
+    "dill",
+    "joblib",
+    "marshal",
+    "shelve",
+)
 UNSAFE_CALLS = ("eval", "exec", "read_pickle", "to_pickle")
-MOST_LINES, MOST_FUNCTION_LINES = 600, 60  # of a file; of a function, its docstring aside
+MOST_NAMES = 17  # of a room's face
+ENTRIES = {
+    "studies.": "a study is an entry of `orthaug reproduce`",
+    "export.": "a target is an entry of `orthaug export --to`",
+    "commands.": "a command, or a part of the page, has a file of its own",
+}
+CONCEPTS = {
+    "analysis.contraction": "a norm in which a free run forgets its start",
+    "analysis.free_run_stability": "all checks of stability together",
+    "analysis.inconsistency": "a test of one-step θ",
+    "analysis.independence": "a test of residuals",
+    "analysis.lipschitz": "how steep the predictor is",
+    "analysis.memory": "the catalogue of terms with memory",
+    "analysis.missing_lags": "a test of lags",
+    "analysis.motion_design": "experiments for a motion",
+    "analysis.motion_identifiability": "identifiability before training",
+    "analysis.motion_modes": "eigenvalues along a run",
+    "analysis.observer": "the verb `observe`",
+    "analysis.output_response": "a free run linearised, for any dynamics",
+    "analysis.signals": "excitation signals",
+    "analysis.wild_effect": "what wild samples do to θ",
+    "data.matlab": "a reader of MATLAB's v5 files",
+    "fitting.focus": "the choice of `Auto`",
+    "fitting.free_run": "training on the free run",
+    "fitting.recursive_storage": "the format of a saved recursive estimate",
+    "fitting.segmented_streamed": "segments of rows that remain in a source",
+    "models.devices": "an engine, an entry of the registry",
+    "models.lagged_storage": "the format of a saved lagged model",
+    "models.motion_storage": "the format of a saved motion",
+    "reports.figures": "figures from Python",
+    "reports.linear_text": "linear views in words",
+    "reports.page_findings": "a section of the page",
+    "reports.page_learned": "a section of the page",
+    "selection.candidates": "which terms can be chosen",
+    "selection.explaining": "the regression behind `explain`",
+    "selection.explanation": "the verb `explain`",
+    "selection.first_orders": "orders for a first spec",
+    "selection.nonlinearity": "a test",
+    "selection.rivals": "candidates that a chosen term may replace",
+    "selection.selecting": "the verb `select`",
+}
 
 
 def module_name(path: Path) -> str:
@@ -49,7 +98,9 @@ def module_name(path: Path) -> str:
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-FILES = {module_name(path): path for path in sorted(SOURCE.rglob("*.py")) if path.name != "__main__.py"}
+FILES = {
+    module_name(path): path for path in sorted(SOURCE.rglob("*.py")) if path.name != "__main__.py"
+}
 
 
 def imports_of(name: str, tree: ast.AST, is_package: bool) -> Iterator[tuple[int, str]]:
@@ -110,9 +161,12 @@ def breaches(name: str, tree: ast.AST, is_package: bool = False) -> list[str]:
             found.append(f"line {line} imports a computed name, which no one can check")
         target = own(imported)
         if target is not None and (
-            room_of(target) not in ROOMS or (name and ROOMS.index(room_of(target)) > ROOMS.index(room_of(name)))
+            room_of(target) not in ROOMS
+            or (name and ROOMS.index(room_of(target)) > ROOMS.index(room_of(name)))
         ):
-            found.append(f"line {line} imports {imported}, which is not to the left of {name or 'orthaug'}")
+            found.append(
+                f"line {line} imports {imported}, which is not to the left of {name or 'orthaug'}"
+            )
     return found
 
 
@@ -143,19 +197,28 @@ def handed_on(room: str) -> dict[str, str]:
     }
 
 
-def in_files(found: Callable[[str], list[str]], names: Iterable[str] = FILES) -> dict[str, list[str]]:
+def in_files(
+    found: Callable[[str], list[str]], names: Iterable[str] = FILES
+) -> dict[str, list[str]]:
     """What is found in each file where there is anything."""
     return {name: told for name in names if (told := found(name))}
 
 
 def test_the_rooms_are_those_of_the_list() -> None:
-    folders = {path.name for path in SOURCE.iterdir() if path.is_dir() and path.name != "__pycache__"}
+    folders = {
+        path.name for path in SOURCE.iterdir() if path.is_dir() and path.name != "__pycache__"
+    }
     assert folders == set(ROOMS)
     assert {name for name in FILES if "." not in name} == {"", *ROOMS}, "a file belongs into a room"
 
 
 def test_imports_point_to_the_left() -> None:
-    assert in_files(lambda name: breaches(name, parsed(FILES[name]), FILES[name].name == "__init__.py")) == {}
+    assert (
+        in_files(
+            lambda name: breaches(name, parsed(FILES[name]), FILES[name].name == "__init__.py")
+        )
+        == {}
+    )
 
 
 def test_no_files_import_each_other() -> None:
@@ -205,7 +268,11 @@ def test_an_import_from_the_left_is_let_pass(name: str, text: str) -> None:
 
 def test_numerical_rooms_know_no_pictures_and_no_user() -> None:
     def pictures(name: str) -> list[str]:
-        return [what for _, what in all_imports(name) if any(within(what, package) for package in NOT_NUMERICAL)]
+        return [
+            what
+            for _, what in all_imports(name)
+            if any(within(what, package) for package in NOT_NUMERICAL)
+        ]
 
     numerical = [name for name in FILES if room_of(name) in NUMERICAL]
     assert len(numerical) > 100 and in_files(pictures, numerical) == {}
@@ -214,7 +281,9 @@ def test_numerical_rooms_know_no_pictures_and_no_user() -> None:
 @pytest.mark.parametrize("package", ONLY_IN)
 def test_one_place_imports_it(package: str) -> None:
     users = {name for name in FILES if any(within(what, package) for _, what in all_imports(name))}
-    assert {name for name in users if not any(within(name, place) for place in ONLY_IN[package])} == set()
+    assert {
+        name for name in users if not any(within(name, place) for place in ONLY_IN[package])
+    } == set()
 
 
 def test_nothing_prints_or_runs_text_as_code() -> None:
@@ -223,14 +292,19 @@ def test_nothing_prints_or_runs_text_as_code() -> None:
 
 def unsafe(name: str) -> list[str]:
     found = [
-        f"line {line}: {what}" for line, what in all_imports(name) if any(within(what, one) for one in UNSAFE_MODULES)
+        f"line {line}: {what}"
+        for line, what in all_imports(name)
+        if any(within(what, one) for one in UNSAFE_MODULES)
     ]
     for node in ast.walk(parsed(FILES[name])):
         if isinstance(node, ast.Call):
             verb = called(node)
             if verb in UNSAFE_CALLS or (verb == "print" and isinstance(node.func, ast.Name)):
                 found.append(f"line {node.lineno}: {verb}(…)")
-            if any(keyword.arg == "allow_pickle" and not is_false(keyword.value) for keyword in node.keywords):
+            if any(
+                keyword.arg == "allow_pickle" and not is_false(keyword.value)
+                for keyword in node.keywords
+            ):
                 found.append(f"line {node.lineno}: allow_pickle")
         elif isinstance(node, ast.ExceptHandler) and node.type is None:
             found.append(f"line {node.lineno}: a bare except")
@@ -241,33 +315,46 @@ def is_false(node: ast.expr) -> bool:
     return isinstance(node, ast.Constant) and node.value is False
 
 
-def lines_of(node: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
-    """Lines of a function, its docstring aside."""
-    first = node.body[0]
-    docstring = (
-        isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant) and isinstance(first.value.value, str)
-    )
-    said = (first.end_lineno or 0) - first.lineno + 1 if docstring else 0
-    return (node.end_lineno or node.lineno) - node.lineno + 1 - said
-
-
-def test_files_and_functions_are_short() -> None:
-    assert in_files(too_long) == {}
-
-
-def too_long(name: str) -> list[str]:
-    lines = len(FILES[name].read_text(encoding="utf-8").splitlines())
-    found = [f"{lines} lines: there are two concepts in it"] if lines > MOST_LINES else []
-    for node in ast.walk(parsed(FILES[name])):
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and lines_of(node) > MOST_FUNCTION_LINES:
-            found.append(f"{node.name} has {lines_of(node)} lines: there are two functions in it")
+def importers() -> dict[str, set[str]]:
+    """Return the files that import each file, by their dotted names; a room's own face does not count."""
+    found: dict[str, set[str]] = {name: set() for name in FILES}
+    for name, path in FILES.items():
+        for _, dotted in imports_of(name, parsed(path), path.name == "__init__.py"):
+            parts = dotted.removeprefix("orthaug.").split(".")
+            for end in range(len(parts), 0, -1):
+                target = ".".join(parts[:end])
+                if target in FILES and target != name:
+                    found[target].add(name)
+                    break
     return found
+
+
+def test_a_file_that_one_file_imports_is_a_concept() -> None:
+    """Cut a file where a concept ends, not where it is long: what only one file uses is part of it."""
+    single = {
+        name
+        for name, others in importers().items()
+        if len(others) == 1 and FILES[name].name != "__init__.py"
+    }
+    entries = {name for name in single if name.startswith(tuple(ENTRIES))}
+    assert single - entries - set(CONCEPTS) == set()
+    assert set(CONCEPTS) - single == set(), (
+        "these are imported elsewhere, too: strike them from the list"
+    )
+
+
+def test_a_face_has_few_names() -> None:
+    for room in ROOMS:
+        face = (SOURCE / room / "__init__.pyi").read_text(encoding="utf-8")
+        assert face.count(" as ") <= MOST_NAMES, room
 
 
 def loaded_by(code: str) -> dict[str, object]:
     """What `code` leaves in the dictionary `report`, run in an interpreter of its own."""
     program = f"import json, sys\nreport = {{}}\n{code}\nprint('\\n' + json.dumps(report))"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=False
+    )
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout.splitlines()[-1])
 
@@ -293,18 +380,21 @@ def test_the_import_and_the_help_page_load_nothing_heavy() -> None:
 def test_what_a_fit_seldom_needs_is_not_loaded_for_it(tmp_path: Path) -> None:
     (tmp_path / "run.csv").write_text("u,y\n1,2\n3,4\n", encoding="utf-8")
     report = loaded_by(
-        "from pathlib import Path\n"
-        "import orthaug.commands.fit, orthaug.fitting.estimation, orthaug.analysis.diagnosis\n"
-        "import orthaug.analysis.free_run_stability, orthaug.analysis.validation\n"
-        "from orthaug.data.tables import read_table\n"
-        f"report['rows'] = len(read_table(Path({str(tmp_path / 'run.csv')!r}), ('u', 'y')).columns['u'])\n"
-        "report['loaded'] = [n for n in ('pandas', 'optax', 'scipy.optimize', 'scipy.stats') if n in sys.modules]"
+        "from pathlib import Path\nimport orthaug.commands.fit, orthaug.fitting.estimation, "
+        "orthaug.analysis.diagnosis\nimport orthaug.analysis.free_run_stability, "
+        "orthaug.analysis.validation\nfrom orthaug.data.tables import read_table\n"
+        f"report['rows'] = len(read_table(Path({str(tmp_path / 'run.csv')!r}), ('u', "
+        "'y')).columns['u'])\nreport['loaded'] = [n for n in ('pandas', 'optax', "
+        "'scipy.optimize', 'scipy.stats') if n in sys.modules]"
     )
     assert report == {"rows": 2, "loaded": []}
 
 
 def test_reading_a_spec_and_its_data_does_not_load_jax() -> None:
-    names = [n for n in FILES if room_of(n) in ("data", "physics")] + ["commands.kinds", "commands.run"]
+    names = [n for n in FILES if room_of(n) in ("data", "physics")] + [
+        "commands.kinds",
+        "commands.run",
+    ]
     report = loaded_by(
         "import importlib\n"
         f"for name in {names!r}:\n"
@@ -338,4 +428,8 @@ def test_programs_beside_the_package_import_what_is_there(folder: str) -> None:
     for path in sorted((SOURCE.parents[1] / folder).glob("*.py")):
         for module, name in _imported(path):
             found = importlib.import_module(module)
-            assert hasattr(found, name) or importlib.import_module(f"{module}.{name}"), (path.name, module, name)
+            assert hasattr(found, name) or importlib.import_module(f"{module}.{name}"), (
+                path.name,
+                module,
+                name,
+            )

@@ -17,7 +17,11 @@ Y1, Y2, U1 = X.T
 
 @pytest.mark.parametrize("xp", [np, jnp], ids=["numpy", "jax"])
 def test_phi_of_terms(xp):
-    terms = [Term("a", "y[k-1]", initial=0.5, unit="1"), Term("b", "sign(u[k-1])*u[k-1]**2"), Term("c", "1")]
+    terms = [
+        Term("a", "y[k-1]", initial=0.5, unit="1"),
+        Term("b", "sign(u[k-1])*u[k-1]**2"),
+        Term("c", "1"),
+    ]
     baseline = Baseline.from_terms(terms)
     assert baseline.names == ("a", "b", "c")
     assert baseline.parameters[0] == Parameter("a", 0.5, "1")
@@ -26,7 +30,9 @@ def test_phi_of_terms(xp):
     phi = baseline.phi(xp.asarray(X), LAYOUT, ("y",), xp)
     expected = np.stack([Y1, np.sign(U1) * U1**2, np.ones(5)], axis=1)[:, None]
     np.testing.assert_allclose(phi, expected, rtol=1e-15)
-    np.testing.assert_allclose(baseline.phi(xp.asarray(X[2]), LAYOUT, ("y",), xp), expected[2], rtol=1e-15)
+    np.testing.assert_allclose(
+        baseline.phi(xp.asarray(X[2]), LAYOUT, ("y",), xp), expected[2], rtol=1e-15
+    )
 
 
 def test_phi_in_compiled_code():
@@ -72,8 +78,13 @@ def test_repr():
         Term("b", "u[k-1]**2", output="y"),
         Term("g", "1", 9.81, output="z", fixed=True),
     ]
-    assert repr(Baseline.from_terms(terms)) == "Baseline(y = a*y[k-1] + b*(u[k-1]**2); z = 9.81*(1))"
-    assert repr(Baseline.from_function(abs, ["a", "b"])) == "Baseline(a function of the regressor, θ: a, b)"
+    assert (
+        repr(Baseline.from_terms(terms)) == "Baseline(y = a*y[k-1] + b*(u[k-1]**2); z = 9.81*(1))"
+    )
+    assert (
+        repr(Baseline.from_function(abs, ["a", "b"]))
+        == "Baseline(a function of the regressor, θ: a, b)"
+    )
 
 
 def test_all_terms_fixed():
@@ -86,17 +97,24 @@ def test_all_terms_fixed():
 def test_constants():
     baseline = Baseline.from_terms([Term("a", "Ts**2*u[k-1]")], {"Ts": 0.1, "unused": 1.0})
     np.testing.assert_allclose(baseline.phi(X, LAYOUT, ("y",), np)[:, 0, 0], 0.01 * U1)
-    assert hash(baseline) == hash(Baseline.from_terms([Term("a", "Ts**2*u[k-1]")], {"unused": 1.0, "Ts": 0.1}))
+    assert hash(baseline) == hash(
+        Baseline.from_terms([Term("a", "Ts**2*u[k-1]")], {"unused": 1.0, "Ts": 0.1})
+    )
 
 
 def test_function_and_terms_agree():
     terms = Baseline.from_terms([Term("a", "y[k-1]**2"), Term("b", "sin(u[k-1])")])
-    function = Baseline.from_function(lambda x: jnp.stack([x[0] ** 2, jnp.sin(x[2])])[None], ["a", Parameter("b")])
+    function = Baseline.from_function(
+        lambda x: jnp.stack([x[0] ** 2, jnp.sin(x[2])])[None], ["a", Parameter("b")]
+    )
     assert function.names == terms.names
     assert function.lags == ()
     for x in (X, X[0]):
         np.testing.assert_allclose(
-            function.phi(x, LAYOUT, ("y",), np), terms.phi(x, LAYOUT, ("y",), np), rtol=1e-14, atol=1e-15
+            function.phi(x, LAYOUT, ("y",), np),
+            terms.phi(x, LAYOUT, ("y",), np),
+            rtol=1e-14,
+            atol=1e-15,
         )
     assert isinstance(function.phi(X, LAYOUT, ("y",), np), np.ndarray)
 
@@ -104,12 +122,16 @@ def test_function_and_terms_agree():
 @pytest.mark.parametrize("x", [X, X[0]], ids=["rows", "row"])
 def test_function_of_the_wrong_shape(x):
     baseline = Baseline.from_function(lambda x: x[:2], ["a", "b"])
-    with pytest.raises(InputError, match=r"returned shape \(2,\) for one row; expected \(ny, nθ\) = \(1, 2\)"):
+    with pytest.raises(
+        InputError, match=r"returned shape \(2,\) for one row; expected \(ny, nθ\) = \(1, 2\)"
+    ):
         baseline.phi(x, LAYOUT, ("y",), jnp)
 
 
 def test_what_one_term_says_holds_for_all_of_its_parameter():
-    baseline = Baseline.from_terms([Term("a", "y[k-1]"), Term("a", "u[k]", initial=0.5, unit="1/s"), Term("b", "1")])
+    baseline = Baseline.from_terms(
+        [Term("a", "y[k-1]"), Term("a", "u[k]", initial=0.5, unit="1/s"), Term("b", "1")]
+    )
     assert baseline.parameters == (Parameter("a", 0.5, "1/s"), Parameter("b"))
 
 
@@ -118,10 +140,26 @@ REFUSED = [
     ([Term("a", "y[k+1]")], {}, "baseline term 'a': .*looks ahead"),
     ([Term("a", "y[k-1] + eval(1)")], {}, "baseline term 'a': .*unknown function 'eval'"),
     ([Term("a", "")], {}, "baseline term 'a': An expression is empty"),
-    ([Term("a", "1", initial=1.0), Term("a", "u[k]", initial=2.0)], {}, "'a' disagree on `initial`: 1.0 and 2.0"),
-    ([Term("a", "1", unit="m"), Term("a", "u[k]", unit="mm")], {}, "'a' disagree on `unit`: 'm' and 'mm'"),
-    ([Term("a", "1", fixed=True), Term("a", "u[k]")], {}, "'a' disagree on `fixed`: True and False"),
-    ([Term("a", "1", initial=float("nan"))], {}, "the initial value of 'a' must be .*finite.*; got nan"),
+    (
+        [Term("a", "1", initial=1.0), Term("a", "u[k]", initial=2.0)],
+        {},
+        "'a' disagree on `initial`: 1.0 and 2.0",
+    ),
+    (
+        [Term("a", "1", unit="m"), Term("a", "u[k]", unit="mm")],
+        {},
+        "'a' disagree on `unit`: 'm' and 'mm'",
+    ),
+    (
+        [Term("a", "1", fixed=True), Term("a", "u[k]")],
+        {},
+        "'a' disagree on `fixed`: True and False",
+    ),
+    (
+        [Term("a", "1", initial=float("nan"))],
+        {},
+        "the initial value of 'a' must be .*finite.*; got nan",
+    ),
     ([Term("a", "1", initial=True)], {}, "the initial value of 'a' must be .*finite.*; got True"),
     ([Term("a", "1", min=False)], {}, "the lower bound of 'a' must be .*finite.*; got False"),
     ([Term("a", "1")], {"c": True}, "the constant 'c' must be a finite number; got True"),
@@ -152,7 +190,11 @@ def test_parameter_given_twice():
 @pytest.mark.parametrize(
     ("term", "outputs", "message"),
     [
-        (Term("a", "w[k-1]"), ["y"], r"baseline term 'a' = w\[k-1\]: .*unknown channel 'w'; known are y, u"),
+        (
+            Term("a", "w[k-1]"),
+            ["y"],
+            r"baseline term 'a' = w\[k-1\]: .*unknown channel 'w'; known are y, u",
+        ),
         (Term("a", "y[k]"), ["y"], r"baseline term 'a' = y\[k\]: .*outputs are used from lag 1"),
         (Term("a", "y[k-1]"), ["y", "z"], "`output` is missing; one of y, z"),
         (Term("a", "y[k-1]", output="w"), ["y", "z"], "unknown output 'w'; known are y, z"),
@@ -165,4 +207,6 @@ def test_channels_refused(term, outputs, message):
 
 
 def test_one_output_needs_no_name():
-    Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "u[k]", output="y")]).check_channels(["y"], ["u"])
+    Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "u[k]", output="y")]).check_channels(
+        ["y"], ["u"]
+    )

@@ -17,7 +17,13 @@ def plant(rows=600, amplitude=1.0, seed=0, noise=0.0) -> oa.Record:
     u = amplitude * np.repeat(rng.uniform(-1, 1, rows // 5 + 1), 5)[:rows]
     y = np.zeros(rows)
     for k in range(2, rows):
-        y[k] = 1.5 * y[k - 1] - 0.6 * y[k - 2] + 0.1 * u[k - 1] - 0.05 * y[k - 1] ** 3 + noise * rng.normal()
+        y[k] = (
+            1.5 * y[k - 1]
+            - 0.6 * y[k - 2]
+            + 0.1 * u[k - 1]
+            - 0.05 * y[k - 1] ** 3
+            + noise * rng.normal()
+        )
     return oa.Record.from_arrays(u=u, y=y)
 
 
@@ -27,7 +33,9 @@ def louder(times: float) -> oa.Record:
     return oa.Record.from_arrays(u=times * experiment.inputs[:, 0], y=experiment.outputs[:, 0])
 
 
-PHYSICS = oa.Baseline.from_terms([oa.Term("a1", "y[k-1]"), oa.Term("a2", "y[k-2]"), oa.Term("b", "u[k-1]")])
+PHYSICS = oa.Baseline.from_terms(
+    [oa.Term("a1", "y[k-1]"), oa.Term("a2", "y[k-2]"), oa.Term("b", "u[k-1]")]
+)
 
 
 def fitted(**learner) -> oa.Model:
@@ -37,7 +45,10 @@ def fitted(**learner) -> oa.Model:
 def far(model: oa.Model, scale: float) -> tuple[np.ndarray, np.ndarray]:
     """Physics and learner one step ahead of outputs and inputs `scale` times as large as those of training."""
     record = plant()
-    y, u = (scale * np.asarray(part) for part in (record.experiments[0].outputs, record.experiments[0].inputs))
+    y, u = (
+        scale * np.asarray(part)
+        for part in (record.experiments[0].outputs, record.experiments[0].inputs)
+    )
     found = model.predict(oa.Record.from_arrays(u=u[:, 0], y=y[:, 0])).trajectories[0]
     return found.baseline[2:, 0], found.learner[2:, 0]
 
@@ -61,7 +72,9 @@ def test_a_correction_that_fades_leaves_the_physics_alone():
 def test_within_its_training_nothing_is_changed(beyond):
     held, free = fitted(beyond=beyond), fitted(beyond="free")
     for what in ("predict", "simulate"):
-        found, expected = (getattr(model, what)(plant()).trajectories[0].model for model in (held, free))
+        found, expected = (
+            getattr(model, what)(plant()).trajectories[0].model for model in (held, free)
+        )
         np.testing.assert_allclose(found[2:], expected[2:], rtol=1e-12, atol=1e-13)
 
 
@@ -80,9 +93,12 @@ def test_a_learner_of_a_difference_is_held_in_the_difference():
         x[k] = x[k - 1] + 0.9 * v + 0.01 * u[k - 1] - 0.01 * np.tanh(v / 0.02)
     terms = [oa.Term("p", "y[k-1]"), oa.Term("v", "y[k-1] - y[k-2]"), oa.Term("b", "u[k-1]")]
     learner = oa.MLP(hidden=(6,), inputs=("y[k-1] - y[k-2]",))
-    model = oa.estimate(oa.Record.from_arrays(u=u, y=x), oa.Baseline.from_terms(terms), learner=learner).model
+    model = oa.estimate(
+        oa.Record.from_arrays(u=u, y=x), oa.Baseline.from_terms(terms), learner=learner
+    ).model
     here, there = (
-        model.predict(oa.Record.from_arrays(u=u, y=x + moved)).trajectories[0].learner[2:] for moved in (0, 1e3)
+        model.predict(oa.Record.from_arrays(u=u, y=x + moved)).trajectories[0].learner[2:]
+        for moved in (0, 1e3)
     )
     np.testing.assert_allclose(there, here, atol=1e-9 * np.abs(here).max() + 1e-10)
 
@@ -100,7 +116,10 @@ def test_a_saved_model_holds_as_well(tmp_path):
     oa.save(model, tmp_path / "model")
     record = louder(50.0)
     for what in ("predict", "simulate"):
-        found, expected = (getattr(m, what)(record).trajectories[0].model for m in (oa.load(tmp_path / "model"), model))
+        found, expected = (
+            getattr(m, what)(record).trajectories[0].model
+            for m in (oa.load(tmp_path / "model"), model)
+        )
         np.testing.assert_array_equal(found, expected)
 
 
@@ -109,7 +128,11 @@ def test_the_gradient_of_a_step_is_that_of_what_is_held():
     from orthaug._base.jax import jax
 
     model = fitted()
-    slope = np.asarray(jax.jacobian(lambda s: model.step(s, np.array([1e3]))[1])(np.full(len(model.state_names), 1e3)))
+    slope = np.asarray(
+        jax.jacobian(lambda s: model.step(s, np.array([1e3]))[1])(
+            np.full(len(model.state_names), 1e3)
+        )
+    )
     by_name = dict(zip(model.state_names, slope[0], strict=True))
     np.testing.assert_allclose([by_name["y[k-1]"], by_name["y[k-2]"]], model.theta[:2], rtol=1e-9)
 
@@ -144,7 +167,9 @@ blocks = 0
     assert run("fit", "wrong.toml").code == 2
     (tmp_path / "spec.toml").write_text(text.replace("WHAT", "free"))
     assert run("fit", "spec.toml", "--out", "out").code == 0
-    assert json.loads((tmp_path / "out/model/model.json").read_text())["learner"]["beyond"] == "free"
+    assert (
+        json.loads((tmp_path / "out/model/model.json").read_text())["learner"]["beyond"] == "free"
+    )
     assert oa.load(tmp_path / "out").numbers.limits is None
 
 
@@ -158,7 +183,10 @@ def test_a_motion_fades():
             v += step / 5 * (u[k] - 4.0 * x - 0.5 * v - 0.4 * np.tanh(v / 0.1))
             x += step / 5 * v
     motion = oa.Motion.from_equations(
-        states=[oa.State("x", "v", start="y"), oa.State("v", "u - k*x - c*v", learned=True, start="derivative of y")],
+        states=[
+            oa.State("x", "v", start="y"),
+            oa.State("v", "u - k*x - c*v", learned=True, start="derivative of y"),
+        ],
         outputs=[oa.Output("y", "x")],
         inputs=["u"],
         parameters=[oa.PhysicalParameter("k", 3.0, min=0), oa.PhysicalParameter("c", 1.0, min=0)],
@@ -169,7 +197,9 @@ def test_a_motion_fades():
     model = fit.model
     assert model.form.beyond == "fade" and model.numbers.limits is not None
     p = model.parameters
-    slow, fast = (np.asarray(model.step(np.array([0.0, speed]), np.zeros(1))[0]) for speed in (0.0, 1e3))
+    slow, fast = (
+        np.asarray(model.step(np.array([0.0, speed]), np.zeros(1))[0]) for speed in (0.0, 1e3)
+    )
     physics = np.asarray(model.alone.step(np.array([0.0, 1e3]), np.zeros(1))[0])
     np.testing.assert_allclose(fast, physics, rtol=1e-9)
     assert p["k"] > 0 and np.isfinite(slow).all()
@@ -182,7 +212,13 @@ def test_a_bounded_correction_on_stable_physics_is_a_proof(tmp_path, monkeypatch
     u, y = rng.standard_normal(rows), np.zeros(rows)
     for k in range(2, rows):
         v = y[k - 1] - y[k - 2]
-        y[k] = 1.2 * y[k - 1] - 0.5 * y[k - 2] + 0.3 * u[k - 1] - 0.1 * np.tanh(3 * v) + 1e-3 * rng.standard_normal()
+        y[k] = (
+            1.2 * y[k - 1]
+            - 0.5 * y[k - 2]
+            + 0.3 * u[k - 1]
+            - 0.1 * np.tanh(3 * v)
+            + 1e-3 * rng.standard_normal()
+        )
     Path("d.csv").write_text("u,y\n" + "\n".join(f"{a},{b}" for a, b in zip(u, y, strict=True)))
     terms = [("a1", "y[k-1]"), ("a2", "y[k-2]"), ("b1", "u[k-1]")]
     spec = '[data]\ntrain = { files = ["d.csv"] }\nsampling_time = 1.0\ninputs = ["u"]\noutputs = ["y"]\n'

@@ -22,7 +22,9 @@ from orthaug.inference.measures import Symmetrized, Training
 from orthaug.physics.baseline import Baseline, Term
 
 THETA = np.array([1.5, -0.7, 0.3, 0.2])
-PHYSICS = Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "y[k-2]"), Term("g", "u[k-1]"), Term("o", "1")])
+PHYSICS = Baseline.from_terms(
+    [Term("a", "y[k-1]"), Term("b", "y[k-2]"), Term("g", "u[k-1]"), Term("o", "1")]
+)
 
 
 def scores_of(name, free):
@@ -32,7 +34,9 @@ def scores_of(name, free):
     slope = eliminated(name, free)[3]
     prior = start_rows(name).T @ start_rows(name)
     pull = np.moveaxis(states.measured - given.states, -1, 1) @ prior if free else None
-    return FreeRunScores(given.form, given.numbers, given.segments, given.states, given.weight, 1.0, slope, pull)
+    return FreeRunScores(
+        given.form, given.numbers, given.segments, given.states, given.weight, 1.0, slope, pull
+    )
 
 
 @pytest.mark.parametrize("steps", [1, 2, 3, 50])
@@ -58,13 +62,19 @@ def test_with_the_states_eliminated_all_blocks_add_up_to_the_eliminated_gradient
 
 @pytest.mark.parametrize("name", CASES)
 def test_without_their_elimination_they_add_up_to_the_gradient(name):
-    assert_close(scores_of(name, free=False).blocks(2).sum(axis=0), np.asarray(found_of(name).shared)[:-1, -1], 1e-8)
+    assert_close(
+        scores_of(name, free=False).blocks(2).sum(axis=0),
+        np.asarray(found_of(name).shared)[:-1, -1],
+        1e-8,
+    )
 
 
 # --- how long errors remember
 
 
-@pytest.mark.parametrize(("poles", "least", "most"), [((0.0,), 1, 3), ((0.9,), 12, 45), ((0.98,), 60, 250)])
+@pytest.mark.parametrize(
+    ("poles", "least", "most"), [((0.0,), 1, 3), ((0.9,), 12, 45), ((0.98,), 60, 250)]
+)
 def test_the_correlation_length(poles, least, most):
     e = lfilter([1.0], np.poly(poles), np.random.default_rng(0).normal(size=20000))
     assert least <= correlation_length(e[None]) <= most
@@ -73,12 +83,16 @@ def test_the_correlation_length(poles, least, most):
 def test_a_resonance_is_not_cut_where_its_correlation_is_zero():
     """Of period 40 and a decay by e in 50: the correlation is zero at 10 already."""
     pole = np.exp(-1 / 50 + 2j * np.pi / 40)
-    e = lfilter([1.0], np.poly([pole, pole.conj()]).real, np.random.default_rng(1).normal(size=20000))
+    e = lfilter(
+        [1.0], np.poly([pole, pole.conj()]).real, np.random.default_rng(1).normal(size=20000)
+    )
     assert correlation_length(e[None]) > 60
 
 
 def test_errors_that_remember_for_long_have_no_length():
-    assert correlation_length(np.cumsum(np.random.default_rng(2).normal(size=(1, 400)))[None]) is None
+    assert (
+        correlation_length(np.cumsum(np.random.default_rng(2).normal(size=(1, 400)))[None]) is None
+    )
     assert correlation_length(np.zeros((1, 400))) is None
 
 
@@ -89,7 +103,9 @@ def record(seed, pole, samples=2000, uneven=False):
     """A slow input, noise of deviation 0.5 on the sensor."""
     rng = np.random.default_rng([seed, 12])
     u = lfilter([1.0], [1.0, -0.8], rng.normal(size=samples + 200))
-    y = lfilter([0.0, THETA[2]], [1.0, -THETA[0], -THETA[1]], u) + THETA[3] / (1 - THETA[0] - THETA[1])
+    y = lfilter([0.0, THETA[2]], [1.0, -THETA[0], -THETA[1]], u) + THETA[3] / (
+        1 - THETA[0] - THETA[1]
+    )
     e = lfilter([np.sqrt(1 - pole**2)], [1.0, -pole], rng.normal(size=samples + 200))
     e = e * np.abs(u) / u.std() if uneven else e
     return Record.from_arrays(u[200:], (y + 0.5 * e)[200:])
@@ -97,7 +113,12 @@ def record(seed, pole, samples=2000, uneven=False):
 
 @cache
 def flown(seed, pole=0.9, segment=0, samples=2000, uneven=False):
-    return estimate(record(seed, pole, samples, uneven), PHYSICS, learner=None, criterion=Simulation(segment, 40))
+    return estimate(
+        record(seed, pole, samples, uneven),
+        PHYSICS,
+        learner=None,
+        criterion=Simulation(segment, 40),
+    )
 
 
 def test_blocks_cover_where_plain_intervals_do_not():
@@ -120,7 +141,10 @@ def test_coloured_errors_have_robust_intervals_by_default(segment):
     np.testing.assert_array_equal(fit.plain_covariance, plain.covariance)
     np.testing.assert_array_equal(fit.theta, plain.theta)
     assert (fit.std > 1.2 * plain.std).any() and 19 <= fit.freedom < 100
-    assert "std         robust (batch means), for the errors of the free run are coloured" in fit.summary()
+    assert (
+        "std         robust (batch means), because the errors of the free run are coloured"
+        in fit.summary()
+    )
     assert default(fit).freedom == fit.freedom  # robust errors of robust errors are the same
     np.testing.assert_array_equal(fit.robust(90).plain_covariance, plain.covariance)
 
@@ -150,7 +174,7 @@ def test_a_record_that_is_too_short_for_blocks_has_the_errors_of_its_colour():
             inside[i] += np.mean((fit.interval[:, 0] <= THETA) & (fit.interval[:, 1] >= THETA)) / 40
     assert inside[0] < 0.75 and 0.88 < inside[1] <= 0.99
     fit = default(flown(0, 0.9, 50))
-    assert fit.std_kind == "autoregressive" and "an autoregressive model of the errors" in fit.summary()
+    assert fit.std_kind == "autoregressive" and "robust (autoregressive errors)" in fit.summary()
 
 
 def test_errors_that_remember_for_too_long_have_no_interval():
@@ -160,21 +184,26 @@ def test_errors_that_remember_for_too_long_have_no_interval():
     assert fit.std is None and fit.interval is None and fit.std_kind == "none"
     np.testing.assert_array_equal(fit.plain_covariance, plain.covariance)
     text = dict(fit.warnings)["too_long_memory"]
-    assert "no standard errors and no intervals" in text and "Longer segments" in text
+    assert "no standard errors and no intervals" in text and "longer segments" in text
     assert "std         none" in fit.summary() and fit.split(Training()).std is None
     assert default(fit) is fit
 
 
 def test_white_errors_of_uneven_size_have_batch_means_by_default():
     fit = default(flown(0, 0.0, uneven=True))
-    assert fit.std_kind == "batch-means-uneven" and (fit.std > 1.15 * flown(0, 0.0, uneven=True).std).any()
+    assert (
+        fit.std_kind == "batch-means-uneven"
+        and (fit.std > 1.15 * flown(0, 0.0, uneven=True).std).any()
+    )
 
 
 def test_the_sensitivities_of_every_step_make_the_scores():
     scores = flown(0, 0.9, segment=512).scores
     rows = np.einsum("kon,ko->n", scores.slopes(), scores.whitened())
     every = scores.unit * scores.blocks(1).sum(axis=0)
-    np.testing.assert_allclose(rows, every, atol=1e-6 * np.abs(scores.slopes()).sum(axis=(0, 1)).max())
+    np.testing.assert_allclose(
+        rows, every, atol=1e-6 * np.abs(scores.slopes()).sum(axis=(0, 1)).max()
+    )
 
 
 def test_for_white_errors_they_are_the_plain_ones():
@@ -183,7 +212,7 @@ def test_for_white_errors_they_are_the_plain_ones():
 
 def test_errors_that_never_forget_are_refused():
     fit = flown(0, 0.97, 0, 200)
-    with pytest.raises(InputError, match="remember each other for too long"):
+    with pytest.raises(InputError, match="correlated over too many steps"):
         fit.robust()
     with pytest.raises(InputError, match="`lags`"):
         fit.robust(0)

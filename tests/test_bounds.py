@@ -29,7 +29,9 @@ NAMES, INITIAL, ROWS = ("a", "b", "c"), np.array([0.7, -0.4, 0.2]), 90
 LM, GRADIENT = LevenbergMarquardt(60, tolerance=1e-14), AdamLBFGS(20, 400)
 JOINT = (Additive(), OrthogonalPenalty(0.5), BaselinePenalty(0.5))
 BOX = {"a": (0.0, 0.8), "c": (0.1, np.inf)}  # both active: least squares is near (1.2, -0.5, -0.4)
-LINEAR = Function(lambda w, z: w @ jnp.stack([z[0] ** 2, z[0] * z[1]]), lambda key: 0.1 * jnp.ones((1, 2)))
+LINEAR = Function(
+    lambda w, z: w @ jnp.stack([z[0] ** 2, z[0] * z[1]]), lambda key: 0.1 * jnp.ones((1, 2))
+)
 
 
 def signals(ny=1):
@@ -49,9 +51,13 @@ def physics(box=BOX, ny=1, factor=(1.0, 40.0)):
     terms = []
     for output, size in zip(["y1", "y2"][:ny], factor, strict=False):
         for i, (name, initial) in enumerate(zip(NAMES, INITIAL, strict=True)):
-            low, high = (side if np.isfinite(side) else None for side in box.get(name, (-np.inf, np.inf)))
+            low, high = (
+                side if np.isfinite(side) else None for side in box.get(name, (-np.inf, np.inf))
+            )
             initial = float(np.clip(initial, *box.get(name, (-np.inf, np.inf))))
-            terms.append(Term(name, f"{size} * u{i + 1}[k]", initial, output=output, min=low, max=high))
+            terms.append(
+                Term(name, f"{size} * u{i + 1}[k]", initial, output=output, min=low, max=high)
+            )
     return Baseline.from_terms(terms)
 
 
@@ -112,11 +118,19 @@ def test_the_solver_of_scipy_agrees():
 
 
 @pytest.mark.parametrize(
-    ("solver", "ny"), [(LevenbergMarquardt(8), 1), (LevenbergMarquardt(8), 2), (AdamLBFGS(5, 5), 2)], ids=str
+    ("solver", "ny"),
+    [(LevenbergMarquardt(8), 1), (LevenbergMarquardt(8), 2), (AdamLBFGS(5, 5), 2)],
+    ids=str,
 )
 def test_orthogonal_structure_is_bounded_least_squares_and_its_learner_does_not_know(ny, solver):
     both = [
-        estimate(record(ny), physics(box, ny), learner=MLP(hidden=(3,)), structure=Orthogonal(), solver=solver)
+        estimate(
+            record(ny),
+            physics(box, ny),
+            learner=MLP(hidden=(3,)),
+            structure=Orthogonal(),
+            solver=solver,
+        )
         for box in (BOX, {})
     ]
     np.testing.assert_allclose(both[0].theta, bounded(*raw_rows(ny), *limits(BOX)), rtol=1e-9)
@@ -146,7 +160,14 @@ def joint_rows(structure):
 
 
 def joint(structure, solver, box=BOX):
-    return estimate(record(), physics(box), learner=LINEAR, structure=structure, solver=solver, regularization="none")
+    return estimate(
+        record(),
+        physics(box),
+        learner=LINEAR,
+        structure=structure,
+        solver=solver,
+        regularization="none",
+    )
 
 
 def unknowns(fit):
@@ -154,14 +175,21 @@ def unknowns(fit):
     return np.concatenate([fit.theta, fit.model.numbers.weights * fit.model.numbers.gain[0]])
 
 
-@pytest.mark.parametrize(("solver", "relative"), [(LM, 1e-9), (GRADIENT, 1e-5)], ids=["lm", "adam-lbfgs"])
+@pytest.mark.parametrize(
+    ("solver", "relative"), [(LM, 1e-9), (GRADIENT, 1e-5)], ids=["lm", "adam-lbfgs"]
+)
 @pytest.mark.parametrize("structure", JOINT, ids=lambda s: s.name)
 def test_joint_structures_end_at_the_bounded_optimum(structure, solver, relative):
     matrix, right = joint_rows(structure)
-    low, high = (np.concatenate([side, [end, end]]) for side, end in zip(limits(BOX), (-np.inf, np.inf), strict=True))
+    low, high = (
+        np.concatenate([side, [end, end]])
+        for side, end in zip(limits(BOX), (-np.inf, np.inf), strict=True)
+    )
     expected = bounded(matrix, right, low, high)
     found = joint(structure, solver)
-    np.testing.assert_allclose(unknowns(found), expected, rtol=relative, atol=relative * np.abs(expected).max())
+    np.testing.assert_allclose(
+        unknowns(found), expected, rtol=relative, atol=relative * np.abs(expected).max()
+    )
     assert found.at_bound and found.status.ok
     for name, value in found.at_bound.items():
         assert found.theta[NAMES.index(name)] == value
@@ -188,7 +216,9 @@ def test_no_theta_in_the_box_is_better(structure):
     """Against a learner trained anew for each θ of a grid."""
     matrix, right = joint_rows(structure)
     found = np.sum((right - matrix @ unknowns(joint(structure, LM))) ** 2)
-    grid = np.stack(np.meshgrid([0.0, 0.4, 0.8], [-0.6, -0.5, -0.4], [0.1, 0.2]), axis=-1).reshape(-1, 3)
+    grid = np.stack(np.meshgrid([0.0, 0.4, 0.8], [-0.6, -0.5, -0.4], [0.1, 0.2]), axis=-1).reshape(
+        -1, 3
+    )
     others = []
     for theta in grid:
         rest = right - matrix[:, :3] @ theta
@@ -196,7 +226,9 @@ def test_no_theta_in_the_box_is_better(structure):
     assert found <= min(others) * (1 + 1e-12)
 
 
-@pytest.mark.parametrize("start", [(0.7, -0.4, 0.2), (0.8, -0.6, 0.4)], ids=["inside", "in a corner"])
+@pytest.mark.parametrize(
+    "start", [(0.7, -0.4, 0.2), (0.8, -0.6, 0.4)], ids=["inside", "in a corner"]
+)
 @pytest.mark.parametrize("steps", [(0, 1), (3, 0), (30, 30)], ids=str)
 @pytest.mark.parametrize("structure", [JOINT[0], JOINT[2]], ids=lambda s: s.name)
 def test_theta_is_inside_the_box_however_early_training_stops(structure, steps, start):
@@ -205,7 +237,11 @@ def test_theta_is_inside_the_box_however_early_training_stops(structure, steps, 
     terms = [Term(t.parameter, t.regressor, v, output=t.output, min=t.min, max=t.max)
              for t, v in zip(declared.terms, start, strict=True)]  # fmt: skip
     found = estimate(
-        record(), Baseline.from_terms(terms), learner=LINEAR, structure=structure, solver=AdamLBFGS(*steps)
+        record(),
+        Baseline.from_terms(terms),
+        learner=LINEAR,
+        structure=structure,
+        solver=AdamLBFGS(*steps),
     )
     low, high = limits(box)
     assert np.all(found.theta >= low) and np.all(found.theta <= high)
@@ -241,7 +277,9 @@ def heated(ny=1, fixed=None):
     y = np.zeros((len(u), ny))
     gains = np.array([0.5, -0.3])[:ny]
     for k in range(1, len(u)):
-        y[k] = 0.9 * y[k - 1] - 0.15 * y[k - 1] ** 3 + gains * u[k - 1] + 0.003 * rng.normal(size=ny)
+        y[k] = (
+            0.9 * y[k - 1] - 0.15 * y[k - 1] ** 3 + gains * u[k - 1] + 0.003 * rng.normal(size=ny)
+        )
     terms, names = [], ["y1", "y2"][:ny]
     for i, name in enumerate(names, 1):
         side = {"min": -0.06, "max": 0.0} if fixed is None else {"fixed": True}
@@ -262,14 +300,18 @@ def of(names, fit):
     return fit.theta[order], fit.std[order]
 
 
-@pytest.mark.parametrize("criterion", [Prediction(), Simulation(40, 5)], ids=["one step", "free run"])
+@pytest.mark.parametrize(
+    "criterion", [Prediction(), Simulation(40, 5)], ids=["one step", "free run"]
+)
 @pytest.mark.parametrize("ny", [1, 2])
 def test_a_bound_leaves_the_others_as_a_fixed_term_does(ny, criterion):
     """The loss is steeper than the bound allows: the learner has to express the rest, for nothing else can."""
     fits = []
     for fixed in (None, -0.06):
         given, baseline, learner = heated(ny, fixed)
-        fits.append(estimate(given, baseline, learner=learner, criterion=criterion, blocks=0, **OPTIONS))
+        fits.append(
+            estimate(given, baseline, learner=learner, criterion=criterion, blocks=0, **OPTIONS)
+        )
     found, known = fits
     gains = [f"gain{i}" for i in range(1, ny + 1)]
     assert dict(found.at_bound) == {f"loss{i}": -0.06 for i in range(1, ny + 1)}
@@ -287,7 +329,7 @@ def test_what_the_learner_could_imitate_is_told_of_the_others():
     fit = estimate(given, baseline, learner=learner, **OPTIONS)
     told = imitation(fit.problem, others=False, held=tuple(fit.at_bound))
     assert told.determined == ("gain1",) and told.directions == () and not fit.model.shared.size
-    assert told.text.startswith("loss1 stands at a bound: θ is not split off along it.")
+    assert told.text.startswith("loss1 is at a bound: the orthogonal split does not move it.")
     assert "imitate nothing of the other physics" in told.text
     (warning,) = (str(text) for text in fit.warnings if text.code == "at_a_bound")
     assert "is a known term" in warning and "the learner is not made orthogonal to it" in warning
@@ -306,7 +348,11 @@ def test_predictions_have_the_errors_of_a_fit_with_that_term_fixed():
     stds = []
     for fixed in (None, -0.06):
         given, baseline, learner = heated(fixed=fixed)
-        stds.append(prediction_std(estimate(given, baseline, learner=learner, **OPTIONS).model, given)[0][2:])
+        stds.append(
+            prediction_std(estimate(given, baseline, learner=learner, **OPTIONS).model, given)[0][
+                2:
+            ]
+        )
     np.testing.assert_allclose(stds[0], stds[1], rtol=1e-6)
 
 
@@ -329,8 +375,13 @@ def two_inputs(box, fixed=None):
 
 
 CURVED = powers(1, ("u2[k]",))
-ALIKE = {True: 1e-4, False: 1 / 300}  # the free run counts what has bounds among its 400 degrees of freedom
-CRITERIA = pytest.mark.parametrize("criterion", [Prediction(), Simulation(40, 0)], ids=["one step", "free run"])
+ALIKE = {
+    True: 1e-4,
+    False: 1 / 300,
+}  # the free run counts what has bounds among its 400 degrees of freedom
+CRITERIA = pytest.mark.parametrize(
+    "criterion", [Prediction(), Simulation(40, 0)], ids=["one step", "free run"]
+)
 ALONE = {
     "found by the fit": {"a": (None, 1.2)},
     "shared": {"b": (0.8, None)},
@@ -339,7 +390,14 @@ BESIDE = {"found by the fit": {"a": (1.2, None)}, "shared": {"b": (None, 0.75)}}
 
 
 def partly(box, criterion, learner=CURVED, fixed=None):
-    return estimate(seen_in_part(), two_inputs(box, fixed), learner=learner, criterion=criterion, blocks=0, **OPTIONS)
+    return estimate(
+        seen_in_part(),
+        two_inputs(box, fixed),
+        learner=learner,
+        criterion=criterion,
+        blocks=0,
+        **OPTIONS,
+    )
 
 
 @CRITERIA
@@ -396,7 +454,12 @@ def test_what_stands_at_a_bound_is_named(learner):
 def test_the_others_have_the_standard_errors_of_a_fit_with_that_term_fixed():
     found = estimate(record(), physics(), learner=None)
     terms = [
-        Term(t.parameter, t.regressor, found.at_bound.get(t.parameter, t.initial), fixed=t.parameter in found.at_bound)
+        Term(
+            t.parameter,
+            t.regressor,
+            found.at_bound.get(t.parameter, t.initial),
+            fixed=t.parameter in found.at_bound,
+        )
         for t in physics().terms
     ]
     refit = estimate(record(), Baseline.from_terms(terms), learner=None)
@@ -456,7 +519,9 @@ kind = "none"
 def project(folder, spec=SPEC):
     u, y = signals()
     columns = np.column_stack([u, y])
-    np.savetxt(folder / "run.csv", columns, delimiter=",", header="u1,u2,u3,y1", comments="", fmt="%.17g")
+    np.savetxt(
+        folder / "run.csv", columns, delimiter=",", header="u1,u2,u3,y1", comments="", fmt="%.17g"
+    )
     (folder / "plant.toml").write_text(spec)
     return folder / "plant.toml"
 
@@ -468,7 +533,9 @@ def test_a_spec_carries_bounds(tmp_path):
 
 @pytest.mark.parametrize("kind", ["none", "mlp"])
 def test_a_fit_from_a_spec(tmp_path, kind):
-    spec = project(tmp_path, SPEC.replace('"none"', f'"{kind}"\nhidden = [3]\n[training]\niterations = 5'))
+    spec = project(
+        tmp_path, SPEC.replace('"none"', f'"{kind}"\nhidden = [3]\n[training]\niterations = 5')
+    )
     done = run("fit", spec, "--out", tmp_path / "out")
     assert done.code == 0, done.err
     result = json.loads((tmp_path / "out" / "result.json").read_text(encoding="utf-8"))

@@ -72,7 +72,13 @@ def system(seed, rows=1200, noise=0.0, sensor=0.2, further=0.0, cubic=0.0):
     u, e, v = rng.normal(size=(3, rows))
     y = np.zeros(rows)
     for k in range(3, rows):
-        y[k] = 1.5 * y[k - 1] - 0.7 * y[k - 2] + 0.5 * u[k - 1] + further * u[k - 3] + cubic * y[k - 1] ** 3
+        y[k] = (
+            1.5 * y[k - 1]
+            - 0.7 * y[k - 2]
+            + 0.5 * u[k - 1]
+            + further * u[k - 3]
+            + cubic * y[k - 1] ** 3
+        )
         y[k] += noise * e[k]
     return Record.from_arrays(u, y + sensor * v)
 
@@ -106,14 +112,21 @@ def test_columns_of_a_free_run_are_its_derivatives():
 def fitted(criterion=None, learner=None, **system_options):
     record = system(0, **system_options)
     given = {"criterion": criterion} if criterion else {}
-    return estimate(record, PHYSICS, learner=learner, blocks=0, solver=LevenbergMarquardt(40), **given)
+    return estimate(
+        record, PHYSICS, learner=learner, blocks=0, solver=LevenbergMarquardt(40), **given
+    )
 
 
 def changes_of(fit):
     simulated = fit.criterion.simulates
-    one_step, free_run = fit.model.predict(fit.problem.record), fit.model.simulate(fit.problem.record)
+    one_step, free_run = (
+        fit.model.predict(fit.problem.record),
+        fit.model.simulate(fit.problem.record),
+    )
     skip = fit.criterion.washout
-    return model_changes(fit, free_run if simulated else one_step, flown=simulated, skip=skip, one_step=one_step)
+    return model_changes(
+        fit, free_run if simulated else one_step, simulates=simulated, skip=skip, one_step=one_step
+    )
 
 
 @pytest.mark.parametrize("criterion", [None, Simulation(0, 40)], ids=["one step", "free run"])
@@ -127,7 +140,9 @@ def test_a_learner_is_named_with_what_it_does_not_see():
     blind = fitted(learner=MLP((3,), inputs=("u[k-1]",)), cubic=-0.01, noise=0.1, sensor=0.0)
     (change,) = (one for one in changes_of(blind) if one.kind == "learner")
     assert change.what == "a learner that also sees y[k-1], y[k-2]"
-    assert str(change).startswith("with a learner that also sees y[k-1], y[k-2] its error one step ahead is")
+    assert str(change).startswith(
+        "with a learner that also sees y[k-1], y[k-2] its error one step ahead is"
+    )
 
 
 @pytest.mark.parametrize("criterion", [None, Simulation(0, 40)], ids=["one step", "free run"])
@@ -140,11 +155,16 @@ def test_the_output_that_lacks_a_term_is_told():
     rng = np.random.default_rng(4)
     u, y = rng.normal(size=(900, 2)), np.zeros((900, 2))
     for k in range(2, 900):
-        y[k] = [0.8 * y[k - 1, 0] + u[k - 1, 0], 0.5 * y[k - 1, 1] + u[k - 1, 1] + 0.4 * u[k - 2, 0]]
+        y[k] = [
+            0.8 * y[k - 1, 0] + u[k - 1, 0],
+            0.5 * y[k - 1, 1] + u[k - 1, 1] + 0.4 * u[k - 2, 0],
+        ]
         y[k] += 0.1 * rng.normal(size=2)
     terms = [Term("a", "y1[k-1]", output="y1"), Term("b", "u1[k-1]", output="y1"), Term("c", "y2[k-1]", output="y2"),
              Term("d", "u2[k-1]", output="y2")]  # fmt: skip
-    change = changes_of(estimate(Record.from_arrays(u, y), Baseline.from_terms(terms), learner=None))[0]
+    change = changes_of(
+        estimate(Record.from_arrays(u, y), Baseline.from_terms(terms), learner=None)
+    )[0]
     assert (change.what, change.output) == ("u1[k-2]", "y2")
     assert "the further input lag u1[k-2] in the physics of y2 (or the learner)" in str(change)
 
@@ -152,14 +172,18 @@ def test_the_output_that_lacks_a_term_is_told():
 def test_long_records_are_looked_at_in_stretches():
     fit = fitted(rows=60_000, further=0.2, noise=0.1, sensor=0.0)
     found = Candidates(fit, fit.model.predict(fit.problem.record), False, 0)
-    assert len(found.stretches) == 8 and len(found._rows(*found.stretches[3])[0]) == pytest.approx(2500, abs=3)
+    assert len(found.stretches) == 8 and len(found._rows(*found.stretches[3])[0]) == pytest.approx(
+        2500, abs=3
+    )
     assert changes_of(fit)[0].what == "u[k-3]"
 
 
 def test_what_could_be_predicted_is_told_per_output():
     fit = fitted(further=0.2, noise=0.1, sensor=0.0)
     (one,) = predictable(fit.problem, fit.model.predict(fit.problem.record))
-    assert one.name == "y" and one.rms == pytest.approx(fit.model.statistics.noise[0, 0] ** 0.5, rel=0.01)
+    assert one.name == "y" and one.rms == pytest.approx(
+        fit.model.statistics.noise[0, 0] ** 0.5, rel=0.01
+    )
     assert one.inputs > 0.5 and one.functions == 0 and one.largest() == one.inputs
 
 
@@ -170,8 +194,14 @@ def test_too_few_rows_name_nothing(rows):
 
 def test_a_change_in_words():
     criterion = Change("criterion", "simulation", 0.123, "simulation")
-    assert str(criterion) == 'with focus = "simulation" the error of its free run is predicted to fall by 12 %'
+    assert (
+        str(criterion)
+        == 'with focus = "simulation" the error of its free run is predicted to fall by 12 %'
+    )
     told = str(Change("criterion", "simulation", 0.0, "simulation"))
-    assert told.startswith('with focus = "simulation" the parameters would not be biased so') and "%" not in told
+    assert (
+        told.startswith('with focus = "simulation" the parameters would not be biased so')
+        and "%" not in told
+    )
     assert "not predicted to fall" in told
     assert Change("offset", "1", 0.2, "prediction", "y2").name == "an offset in the physics of y2"

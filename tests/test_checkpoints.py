@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import errno
+import hashlib
 import os
+from functools import partial
 
 import numpy as np
 import pytest
+from safetensors.numpy import load, save
 from test_engine import Streaming, posed
 from test_engines import BASELINE, FLIGHT, SPEC, fitted, folder, from_files  # noqa: F401  (a fixture)
 from typer.testing import CliRunner
@@ -15,7 +18,7 @@ import orthaug as oa
 from orthaug._base.folders import PARTIALS
 from orthaug._base.progress import Progress
 from orthaug.commands.cli import app
-from orthaug.commands.fit import fit_job, keeping, write_result
+from orthaug.commands.fit import fit_job, keep_states, write_result
 from orthaug.commands.kinds import open_job
 from orthaug.fitting.checkpoints import Checkpoints
 from orthaug.fitting.estimation import fit
@@ -59,10 +62,15 @@ def test_a_run_that_was_ended_goes_on_bit_by_bit(tmp_path, engine, step):
         fit(posed(1), **chosen, checkpoints=kept.opened(resume=False), progress=dies_at(step))
     steps = []
     again = Checkpoints(tmp_path / "kept", "this fit", every=0.0).opened(resume=True)
-    found = fit(posed(1), **chosen, checkpoints=again, progress=lambda run, i, loss: steps.append(i))
+    found = fit(
+        posed(1), **chosen, checkpoints=again, progress=lambda run, i, loss: steps.append(i)
+    )
     np.testing.assert_array_equal(found.model.numbers.weights, whole.model.numbers.weights)
     np.testing.assert_array_equal(found.theta, whole.theta)
-    assert found.status.loss == whole.status.loss and found.status.iterations == whole.status.iterations
+    assert (
+        found.status.loss == whole.status.loss
+        and found.status.iterations == whole.status.iterations
+    )
     assert steps[0] > 1 or step == 1
 
 
@@ -78,14 +86,21 @@ def test_a_run_that_was_ended_past_its_limit_goes_on_bit_by_bit(tmp_path, engine
     again = Checkpoints(tmp_path / "kept", "this fit", every=0.0).opened(resume=True)
     found = fit(posed(1), **chosen, checkpoints=again)
     np.testing.assert_array_equal(found.model.numbers.weights, whole.model.numbers.weights)
-    assert found.status.iterations == whole.status.iterations and found.status.message == whole.status.message
+    assert (
+        found.status.iterations == whole.status.iterations
+        and found.status.message == whole.status.message
+    )
 
 
 @pytest.mark.parametrize("engine", [Stream(), InMemory()], ids=["stream", "memory"])
 def test_a_free_run_goes_on_bit_by_bit(folder, tmp_path, engine):  # noqa: F811
     """Killed once in the run of physics alone, once in that of the learner."""
     problem = pose(from_files(folder), BASELINE, oa.Lags(na=2, nb=2))
-    chosen = {"learner": MLP(hidden=(3,)), "criterion": oa.Simulation(40, 20, start_iterations=0), "engine": engine}
+    chosen = {
+        "learner": MLP(hidden=(3,)),
+        "criterion": oa.Simulation(40, 20, start_iterations=0),
+        "engine": engine,
+    }
     chosen |= FLIGHT | {"solver": oa.LevenbergMarquardt(20)}
     whole = fit(problem, **chosen)
     for step in (2, 17):
@@ -132,7 +147,12 @@ def test_a_full_disk_leaves_the_last_good_state(tmp_path, monkeypatch):
     assert not list((tmp_path / "kept").glob("*.partial"))
     steps = []
     again = Checkpoints(tmp_path / "kept", "this fit", every=0.0).opened(resume=True)
-    found = fit(posed(1), **options(Streaming()), checkpoints=again, progress=lambda run, i, loss: steps.append(i))
+    found = fit(
+        posed(1),
+        **options(Streaming()),
+        checkpoints=again,
+        progress=lambda run, i, loss: steps.append(i),
+    )
     assert steps[0] == 5  # the state after the fourth step stood
     np.testing.assert_array_equal(found.theta, whole.theta)
 
@@ -153,12 +173,57 @@ def test_a_spoilt_state_is_none(tmp_path):
         assert kept.spoilt[:1] == [file.name], "and it is said"
 
 
+def forged(content, change):
+    """A state with changed arrays and the checksum that they ask for."""
+    head = content.index(b"\n") + 1
+    arrays = {name: np.array(values) for name, values in load(content[head:]).items()}
+    change(arrays)
+    body = save(arrays)
+    return content[:16] + hashlib.sha256(body).hexdigest().encode() + b"\n" + body
+
+
+def no_number(arrays, value=np.nan):
+    arrays["0"].flat[0] = value
+
+
+def other_shape(arrays):
+    arrays["0"] = np.append(arrays["0"], 1.0)
+
+
+def fewer(arrays):
+    del arrays[str(len(arrays) - 1)]
+
+
+@pytest.mark.parametrize(
+    "change", [no_number, partial(no_number, value=np.inf), other_shape, fewer]
+)
+@pytest.mark.parametrize("driven", [False, True], ids=["compiled", "driven"])
+def test_a_forged_state_with_its_checksum_is_none(tmp_path, change, driven):
+    chosen = options(InMemory()) | (
+        {"criterion": oa.Simulation(segment=20, washout=2)} if driven else {}
+    )
+    kept = Checkpoints(tmp_path / "kept", "this fit", every=0.0).opened(resume=False)
+    with pytest.raises(Killed):
+        fit(posed(1), **chosen, checkpoints=kept, progress=dies_at(5))
+    (file,) = (tmp_path / "kept").glob("*.safetensors")
+    whole = file.read_bytes()
+    file.write_bytes(forged(whole, lambda arrays: None))
+    expected = fit(posed(1), **chosen, checkpoints=kept)
+    assert kept.spoilt == [], "what is only copied is sound"
+    file.write_bytes(forged(whole, change))
+    found = fit(posed(1), **chosen, checkpoints=kept)
+    assert kept.spoilt[:1] == [file.name]
+    np.testing.assert_array_equal(found.theta, expected.theta)
+
+
 def test_states_of_another_fit_are_refused(tmp_path):
     place = tmp_path / "kept"
     with pytest.raises(Killed):
         kept = Checkpoints(place, "one fit", every=0.0).opened(resume=False)
         fit(posed(1), **options(Streaming()), checkpoints=kept, progress=dies_at(3))
-    with pytest.raises(oa.InputError, match="is the state of another spec, other data or another version"):
+    with pytest.raises(
+        oa.InputError, match="is the state of another spec, other data or another version"
+    ):
         Checkpoints(place, "another fit").opened(resume=True)
     Checkpoints(place, "another fit").opened(resume=False)
     assert not place.exists()
@@ -175,7 +240,7 @@ def test_a_command_that_was_killed_goes_on(folder, tmp_path, without_figures):  
     path.write_text(f"{text}checkpoint = 0.0\n", encoding="utf-8")
     out = tmp_path / "out"
     with pytest.raises(Killed):
-        fit_job(keeping(open_job(path), out), Progress(dies_at(5)))
+        fit_job(keep_states(open_job(path), out), Progress(dies_at(5)))
     assert (tmp_path / "out.training" / "training.json").exists()
     assert tmp_path / "out.training" in PARTIALS.placed, "Ctrl-C names it"
     run = CliRunner().invoke(app, ["fit", str(path), "--out", str(out), "--resume"])
@@ -184,10 +249,10 @@ def test_a_command_that_was_killed_goes_on(folder, tmp_path, without_figures):  
     model = oa.load(out / "model")
     assert [p["value"] for p in expected["parameters"]] == list(model.theta)
     with pytest.raises(Killed):
-        fit_job(keeping(open_job(path), out), Progress(dies_at(5)))
+        fit_job(keep_states(open_job(path), out), Progress(dies_at(5)))
     path.write_text(f"{text}checkpoint = 1.0\n", encoding="utf-8")
     run = CliRunner().invoke(app, ["fit", str(path), "--out", str(out), "--force", "--resume"])
     assert run.exit_code == 2 or isinstance(run.exception, oa.InputError)
-    fitted_again = fit_job(keeping(open_job(path), out))
+    fitted_again = fit_job(keep_states(open_job(path), out))
     write_result(fitted_again, out, force=True)
     assert not (tmp_path / "out.training").exists()

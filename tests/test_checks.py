@@ -11,14 +11,28 @@ from orthaug._base.checks import check_number, finite_or_none, is_number
 from orthaug._base.errors import InputError
 
 
-@pytest.mark.parametrize("value", [0, -1.5, np.float32(2.0), np.int8(-128), np.uint64(2**63), 10**300])
+@pytest.mark.parametrize(
+    "value", [0, -1.5, np.float32(2.0), np.int8(-128), np.uint64(2**63), 10**300]
+)
 def test_finite_real_numbers_are_numbers(value):
     assert is_number(value)
 
 
 @pytest.mark.parametrize(
     "value",
-    [True, np.True_, None, "1", 1j, np.complex128(1), float("nan"), -np.inf, 10**400, np.ones(1), Fraction(1, 2)],
+    [
+        True,
+        np.True_,
+        None,
+        "1",
+        1j,
+        np.complex128(1),
+        float("nan"),
+        -np.inf,
+        10**400,
+        np.ones(1),
+        Fraction(1, 2),
+    ],
 )
 def test_what_is_no_number(value):
     assert not is_number(value)
@@ -27,4 +41,7 @@ def test_what_is_no_number(value):
 
 
 def test_finite_or_none():
-    assert finite_or_none(1.5) == 1.5 and finite_or_none(float("inf")) is finite_or_none(float("nan")) is None
+    assert (
+        finite_or_none(1.5) == 1.5
+        and finite_or_none(float("inf")) is finite_or_none(float("nan")) is None
+    )

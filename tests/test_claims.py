@@ -29,13 +29,21 @@ def block(text: str) -> Block:
 def test_every_number_that_looks_measured_has_an_anchor() -> None:
     found = claims.all_blocks()
     assert {block.page for block in found} == set(NAMES)
-    assert {f"{block.page}:{block.line}": block.unexplained() for block in found if block.unexplained()} == {}
+    assert {
+        f"{block.page}:{block.line}": block.unexplained() for block in found if block.unexplained()
+    } == {}
 
 
 def test_every_comment_is_an_anchor() -> None:
-    lines = [(name, line.strip()) for name in NAMES for line in (ROOT / name).read_text(encoding="utf-8").splitlines()]
+    lines = [
+        (name, line.strip())
+        for name in NAMES
+        for line in (ROOT / name).read_text(encoding="utf-8").splitlines()
+    ]
     comments = [(name, line) for name, line in lines if line.startswith("<!--")]
-    assert [one for one in comments if not ANCHOR.fullmatch(one[1]) and not COMMENT.fullmatch(one[1])] == []
+    assert [
+        one for one in comments if not ANCHOR.fullmatch(one[1]) and not COMMENT.fullmatch(one[1])
+    ] == []
 
 
 def test_every_anchor_names_a_function_and_numbers() -> None:
@@ -43,13 +51,19 @@ def test_every_anchor_names_a_function_and_numbers() -> None:
     for claim in claims.all_claims():
         file, _, function = claim.function.partition(".")
         tree = ast.parse((ROOT / "benchmarks" / f"{file}.py").read_text(encoding="utf-8"))
-        (found,) = (node for node in tree.body if isinstance(node, ast.FunctionDef) and node.name == function)
+        (found,) = (
+            node
+            for node in tree.body
+            if isinstance(node, ast.FunctionDef) and node.name == function
+        )
         assert len(found.args.defaults) == len(found.args.args), f"{claim.function} needs arguments"
         assert claim.numbers, f"{claim.place} chooses no number"
 
 
 def test_every_command_of_a_number_that_depends_on_the_machine_exists() -> None:
-    told = [text for block in claims.all_blocks() for kind, text in block.anchors if kind == "machine"]
+    told = [
+        text for block in claims.all_blocks() for kind, text in block.anchors if kind == "machine"
+    ]
     files = {file for text in told for file in re.findall(r"[\w/]+\.(?:py|toml)", text)}
     assert len(files) > 4
     assert {file for file in files if not (ROOT / file).is_file()} == set()
@@ -61,7 +75,9 @@ def test_the_cheapest_hold(name: str) -> None:
     (claim,) = claims.chosen([name])[name]
     held, line = claims.compare(claim, values)
     assert held, line
-    assert not claims.compare(claim, [value * 1.5 + 0.1 for value in values if value is not None])[0]
+    assert not claims.compare(claim, [value * 1.5 + 0.1 for value in values if value is not None])[
+        0
+    ]
 
 
 @pytest.mark.parametrize(
@@ -75,7 +91,9 @@ def test_the_cheapest_hold(name: str) -> None:
 )
 def test_numbers_of_a_text(text: str, values: list[float]) -> None:
     assert [number.value for number in numbers_in(text)] == values
-    assert all(text[number.start : number.end].strip("<≤ ")[-1].isdigit() for number in numbers_in(text))
+    assert all(
+        text[number.start : number.end].strip("<≤ ")[-1].isdigit() for number in numbers_in(text)
+    )
 
 
 @pytest.mark.parametrize(
@@ -111,7 +129,9 @@ def test_numbers_are_chosen_by_columns_and_by_quoted_texts() -> None:
     )
     assert [number.value for number in table.claims[0].numbers] == [2, 3, 4, 6]
     assert table.claims[0].tolerance == Tolerance(share=0.05)
-    text = block('<!-- measured: a.b; "was # of", "gave #." -->\nIt was\n7 of 9 in 3 s and\ngave 5.5.')
+    text = block(
+        '<!-- measured: a.b; "was # of", "gave #." -->\nIt was\n7 of 9 in 3 s and\ngave 5.5.'
+    )
     assert [number.value for number in text.claims[0].numbers] == [7, 5.5]
     assert text.unexplained() == ["It was · of 9 in 3 s and gave "]
     assert block("<!-- measured: a.b -->\n7 of 9 took 3 s").unexplained() == []
@@ -187,7 +207,9 @@ def project(tmp_path, monkeypatch) -> Path:
     )
     monkeypatch.setattr(claims, "ROOT", tmp_path)
     monkeypatch.setattr(claims, "STORE", tmp_path / "out" / "claims.json")
-    monkeypatch.setattr(claims, "function_of", {"one.value": lambda: 1.0, "two.rows": lambda: [[2.0], (3.0,)]}.get)
+    monkeypatch.setattr(
+        claims, "function_of", {"one.value": lambda: 1.0, "two.rows": lambda: [[2.0], (3.0,)]}.get
+    )
     return tmp_path
 
 

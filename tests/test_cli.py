@@ -51,8 +51,27 @@ kind = "none"
 MAIN = "from orthaug.commands.cli import main; main()"
 MLP = 'kind = "mlp"\nhidden = [4]\n[training]\niterations = 5\n'
 RESULT_KEYS = {
-    *("schema", "orthaug", "spec", "data", "status", "restarts", "parameters", "physical_parameters", "structure"),
-    *("measure", "orthogonality_defect", "excitation", "scores", "bias", "residuals", "validation", "warnings"),
+    *(
+        "schema",
+        "orthaug",
+        "spec",
+        "data",
+        "status",
+        "restarts",
+        "parameters",
+        "physical_parameters",
+        "structure",
+    ),
+    *(
+        "measure",
+        "orthogonality_defect",
+        "excitation",
+        "scores",
+        "bias",
+        "residuals",
+        "validation",
+        "warnings",
+    ),
 }
 
 
@@ -67,7 +86,11 @@ class Done(NamedTuple):
 def run(*arguments: object) -> Done:
     """The command in this process, with standard output and error caught."""
     out, err = io.StringIO(), io.StringIO()
-    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+    ):
         patch.setattr(sys, "argv", ["orthaug", *map(str, arguments)])
         patch.setattr(
             "orthaug._base.jax.use_compilation_cache", lambda: None
@@ -146,7 +169,9 @@ def shell(*arguments: object, cwd: Path, **environment: str) -> subprocess.Compl
     """The command in a process of its own, its compilation cache below `cwd`."""
     settings = {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(cwd / "cache"), **environment}
     command = [sys.executable, "-c", MAIN, *map(str, arguments)]
-    return subprocess.run(command, cwd=cwd, env=settings, capture_output=True, text=True, timeout=120, check=False)
+    return subprocess.run(
+        command, cwd=cwd, env=settings, capture_output=True, text=True, timeout=120, check=False
+    )
 
 
 # --- help and version
@@ -190,7 +215,11 @@ for arguments in (["--help"], ["fit", "absent.toml"], ["fit", "plant.toml"], ["c
 """
     project.write_text(SPEC.replace("u[k-1]", "v[k-1]"))
     done = subprocess.run(
-        [sys.executable, "-c", program], cwd=project.parent, capture_output=True, text=True, check=False
+        [sys.executable, "-c", program],
+        cwd=project.parent,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     ends = [line for line in done.stdout.splitlines() if line.startswith("ended ")]
     assert ends == ["ended 0 False", *["ended 2 False"] * 3], done.stderr
@@ -202,7 +231,16 @@ for arguments in (["--help"], ["fit", "absent.toml"], ["fit", "plant.toml"], ["c
 def test_demo_prints_the_comparison(demo):
     done, _ = demo
     assert (done.code, done.err) == (0, "")
-    for words in ("true", "initial", "orthogonal", "additive", "theta1", "theta3", "relative error of θ", "RMSE"):
+    for words in (
+        "true",
+        "initial",
+        "orthogonal",
+        "additive",
+        "theta1",
+        "theta3",
+        "relative error of θ",
+        "RMSE",
+    ):
         assert words in done.out
     assert "0.471698" in done.out
     assert done.out.rstrip().endswith("out")
@@ -210,10 +248,16 @@ def test_demo_prints_the_comparison(demo):
 
 def test_the_demo_keeps_files_that_only_look_like_a_result(tmp_path):
     """A `result.json` with two keys and known names beside it, but no manifest: an edited copy of someone's own."""
-    for name, text in (("result.json", '{"schema": 1, "orthaug": "0"}'), ("train.csv", "mine"), ("spec.toml", "mine")):
+    for name, text in (
+        ("result.json", '{"schema": 1, "orthaug": "0"}'),
+        ("train.csv", "mine"),
+        ("spec.toml", "mine"),
+    ):
         (tmp_path / name).write_text(text)
     done = run("demo", "--out", tmp_path)
-    assert done.code == 2 and one_line(done.err, "holds result.json and no manifest.json", "--force")
+    assert done.code == 2 and one_line(
+        done.err, "holds result.json and no manifest.json", "--force"
+    )
     assert (tmp_path / "train.csv").read_text() == (tmp_path / "spec.toml").read_text() == "mine"
 
 
@@ -250,7 +294,7 @@ def test_check(project):
     assert "y[k-1], y[k-2], u[k-1]" in done.out
     assert "118" in done.out
     assert "rank 3 of 3" in done.out
-    assert "can be told apart" in done.out
+    assert "can be distinguished" in done.out
     assert listing(project.parent) == before
 
 
@@ -272,7 +316,9 @@ DEPENDENT = [  # a third regressor, whether its parameter can be identified by a
 
 
 @pytest.mark.parametrize(("regressor", "identifiable", "words"), DEPENDENT)
-def test_check_of_rank_deficient_physics_reports_and_exits_with_2(project, regressor, identifiable, words):
+def test_check_of_rank_deficient_physics_reports_and_exits_with_2(
+    project, regressor, identifiable, words
+):
     project.write_text(SPEC.replace('"u[k-1]"', f'"{regressor}"'))
     done = run("check", project)
     assert done.code == 2
@@ -282,7 +328,12 @@ def test_check_of_rank_deficient_physics_reports_and_exits_with_2(project, regre
     done = run("check", project, "--json")
     report = finite_json(done.out)
     assert done.code == 2
-    assert report["excitation"] | {"collinear": []} == {"rank": 2, "columns": 3, "condition": None, "collinear": []}
+    assert report["excitation"] | {"collinear": []} == {
+        "rank": 2,
+        "columns": 3,
+        "condition": None,
+        "collinear": [],
+    }
     assert report["identifiability"]["identifiable"] is identifiable
 
 
@@ -291,7 +342,9 @@ def test_check_warns_of_rows_left_out(project):
     done = run("check", project)
     assert done.code == 2  # the tests are sampled otherwise
     assert one_line(done.err, "tests.steps", "sampled every 0.5 s")
-    project.write_text(SPEC.replace('["run.csv"] }', '["run.csv"], every = 2 }').replace("skip = 5", "every = 2"))
+    project.write_text(
+        SPEC.replace('["run.csv"] }', '["run.csv"], every = 2 }').replace("skip = 5", "every = 2")
+    )
     done = run("check", project)
     assert done.code == 0
     assert "warning: train: one row in 2 is kept without a filter" in done.out
@@ -304,7 +357,10 @@ def test_fit_writes_the_folder_of_the_contract(fitted):
     for name in ("physics", "mlp"):
         out = fitted / name
         assert {path.name for path in out.iterdir()} >= {"result.json", "model", "figures"}
-        assert sorted(path.name for path in (out / "model").iterdir()) == ["arrays.safetensors", "model.json"]
+        assert sorted(path.name for path in (out / "model").iterdir()) == [
+            "arrays.safetensors",
+            "model.json",
+        ]
         assert all(path.read_bytes().startswith(b"\x89PNG") for path in (out / "figures").iterdir())
         assert list((out / "figures").iterdir())
     assert not [name for name in listing(fitted) if "partial" in name or "-old-" in name]
@@ -320,7 +376,9 @@ def test_result_of_physics_alone(fitted):
     assert result["status"]["code"] == "exact"
     assert result["status"]["iterations"] == 0
     assert result["validation"] is None and result["bias"] and result["residuals"]["verdict"]
-    assert [entry["certificate"] for entry in result["bias"]] == [None] * len(result["bias"])  # of none that is named
+    assert [entry["certificate"] for entry in result["bias"]] == [None] * len(
+        result["bias"]
+    )  # of none that is named
     assert result["orthogonality_defect"] is None
     assert result["excitation"]["rank"] == 3
     assert [(p["name"], p["unit"], p["initial"]) for p in result["parameters"]] == [
@@ -359,15 +417,23 @@ def test_result_of_a_network(fitted):
     (restart,) = result["restarts"]
     assert (restart["seed"], restart["chosen"]) == (0, True)
     assert restart["loss"] == pytest.approx(result["status"]["loss"])
-    np.testing.assert_allclose(*[[p["value"] for p in r["parameters"]] for r in (result, alone)], rtol=1e-10)
-    assert result["scores"]["train"]["prediction"]["rmse"] < alone["scores"]["train"]["prediction"]["rmse"]
+    np.testing.assert_allclose(
+        *[[p["value"] for p in r["parameters"]] for r in (result, alone)], rtol=1e-10
+    )
+    assert (
+        result["scores"]["train"]["prediction"]["rmse"]
+        < alone["scores"]["train"]["prediction"]["rmse"]
+    )
 
 
 def test_scores_are_the_library_s(fitted):
     model = load(fitted / "mlp")
     record = read_record(fitted / "steps.csv", inputs=["u"], outputs=["y"], sampling_time=0.5)
     scores = finite_json((fitted / "mlp" / "result.json").read_text())["scores"]["tests.steps"]
-    for kind, response in (("prediction", model.predict(record)), ("simulation", model.simulate(record))):
+    for kind, response in (
+        ("prediction", model.predict(record)),
+        ("simulation", model.simulate(record)),
+    ):
         assert scores[kind] == ScoreResult.model_validate(response.scores(5)).content()
         error = response.model[5:, 0] - record.experiments[0].outputs[5:, 0]
         assert scores[kind]["rmse"][0] == pytest.approx(np.sqrt(np.mean(error**2)), rel=1e-12)
@@ -376,7 +442,15 @@ def test_scores_are_the_library_s(fitted):
 def test_fit_prints_a_summary_and_writes_to_its_default_folder(project):
     done = run("fit", project)
     assert (done.code, done.err) == (0, "")
-    for words in ("parameter", "95 % interval", "tests.steps", "simulation", "RMSE", "FIT %", "orthaug-out/plant"):
+    for words in (
+        "parameter",
+        "95 % interval",
+        "tests.steps",
+        "simulation",
+        "RMSE",
+        "FIT %",
+        "orthaug-out/plant",
+    ):
         assert words in done.out
     assert (project.parent / "orthaug-out" / "plant" / "result.json").is_file()
 
@@ -416,10 +490,15 @@ def test_a_result_that_holds_the_spec_or_its_data_is_not_replaced(project, insid
 
 
 def test_several_files_ranges_and_parts(project):
-    text = SPEC.replace('files = ["run.csv"]', 'files = ["run.csv", "steps.csv"], rows = [[0, 30], [40, 60]]')
+    text = SPEC.replace(
+        'files = ["run.csv"]', 'files = ["run.csv", "steps.csv"], rows = [[0, 30], [40, 60]]'
+    )
     project.write_text(text + '[data.tests.late]\nfiles = ["run.csv"]\nrows = [60, 120]\n')
     result = finite_json(run("fit", project, "--json").out)
-    assert [(f["file"], f["rows"]) for f in result["data"]["train"]] == [("run.csv", 50), ("steps.csv", 50)]
+    assert [(f["file"], f["rows"]) for f in result["data"]["train"]] == [
+        ("run.csv", 50),
+        ("steps.csv", 50),
+    ]
     assert set(result["scores"]) == {"train", "tests.steps", "tests.late"}
 
 
@@ -435,7 +514,9 @@ def test_a_constant_test_output_has_no_fit_but_a_sentence(project):
     result = finite_json(done.out)
     assert done.code == 0
     assert result["scores"]["tests.steps"]["prediction"]["nrmse"] is None
-    assert any(w["code"] == "constant_output" and "tests.steps" in w["text"] for w in result["warnings"])
+    assert any(
+        w["code"] == "constant_output" and "tests.steps" in w["text"] for w in result["warnings"]
+    )
 
 
 def test_a_free_run_that_diverges_is_no_error(project):
@@ -446,7 +527,9 @@ def test_a_free_run_that_diverges_is_no_error(project):
         y[k] = 1.1 * y[k - 1] + u[k - 1]
     write_csv(project.parent / "run.csv", u=u, y=y)
     write_csv(project.parent / "steps.csv", u=rng.normal(size=400), y=rng.normal(size=400))
-    project.write_text(SPEC.replace('[[baseline.terms]]\nparameter = "b"\nregressor = "y[k-2]"\n', ""))
+    project.write_text(
+        SPEC.replace('[[baseline.terms]]\nparameter = "b"\nregressor = "y[k-2]"\n', "")
+    )
     done = run("fit", project, "--out", "out")
     assert (done.code, done.err) == (0, "")
     result = finite_json(Path("out/result.json").read_text(encoding="utf-8"))
@@ -484,7 +567,9 @@ def test_training_that_fails_leaves_an_account_without_a_model(project, monkeypa
     small_run(monkeypatch, lambda go, _: go()._replace(ending=Ending.NON_FINITE))
     done = run("fit", project, "--out", "out", *(["--json"] if as_json else []))
     assert done.code == 1
-    assert one_line(done.err, "training failed", "not finite", "Rescale the channels", "result.json")
+    assert one_line(
+        done.err, "training failed", "not finite", "Rescale the channels", "result.json"
+    )
     assert listing(Path("out")) == ["manifest.json", "result.json"]
     result = finite_json(Path("out/result.json").read_text(encoding="utf-8"))
     assert result["status"]["code"] == "non_finite"
@@ -508,7 +593,9 @@ def test_ctrl_c_during_training_leaves_nothing(project, monkeypatch, before):
     kept = {path: path.read_bytes() for path in project.parent.rglob("*") if path.is_file()}
     done = run("fit", project, "--out", "deep/out")
     assert (done.code, done.out) == (130, "")
-    assert one_line(done.err, "interrupted", " of 4", "iteration 3", "nothing is written")  # whichever thread was first
+    assert one_line(
+        done.err, "interrupted", " of 4", "iteration 3", "nothing is written"
+    )  # whichever thread was first
     assert {path: path.read_bytes() for path in project.parent.rglob("*") if path.is_file()} == kept
     assert before or not Path("deep").exists()
 
@@ -539,9 +626,12 @@ def test_ctrl_c_while_the_result_is_written(project, monkeypatch):
 
 @pytest.mark.parametrize("model", ["mlp", "mlp/model"])
 @pytest.mark.parametrize(
-    ("command", "first"), [(["simulate"], 2), (["predict", "--horizon", "1"], 2), (["predict", "--horizon", "7"], 8)]
+    ("command", "first"),
+    [(["simulate"], 2), (["predict", "--horizon", "1"], 2), (["predict", "--horizon", "7"], 8)],
 )
-def test_responses_have_a_row_per_data_row_and_the_library_s_numbers(fitted, tmp_path, model, command, first):
+def test_responses_have_a_row_per_data_row_and_the_library_s_numbers(
+    fitted, tmp_path, model, command, first
+):
     done = run(*command, fitted / model, fitted / "steps.csv", "--out", tmp_path / "out.csv")
     assert (done.code, done.err) == (0, "")
     frame = pd.read_csv(tmp_path / "out.csv")
@@ -554,7 +644,11 @@ def test_responses_have_a_row_per_data_row_and_the_library_s_numbers(fitted, tmp
         assert frame[column].isna().tolist() == [row < first for row in range(60)]
     record = read_record(fitted / "steps.csv", inputs=["u"], outputs=["y"], sampling_time=0.5)
     whole = load(fitted / "mlp")
-    response = whole.simulate(record) if command == ["simulate"] else whole.predict(record, int(command[-1]))
+    response = (
+        whole.simulate(record)
+        if command == ["simulate"]
+        else whole.predict(record, int(command[-1]))
+    )
     np.testing.assert_array_equal(frame["y_model"], response.model[:, 0])
     np.testing.assert_array_equal(frame["y_learner"], response.trajectories[0].learner[:, 0])
     np.testing.assert_array_equal(frame["y"], record.experiments[0].outputs[:, 0])
@@ -568,7 +662,9 @@ def test_responses_have_a_row_per_data_row_and_the_library_s_numbers(fitted, tmp
 
 def test_standard_output_without_a_file(fitted):
     done = run("simulate", fitted / "physics", fitted / "steps.csv")
-    assert done.code == 0 and done.err.startswith("free run, 58 rows")  # the scores stay out of the CSV
+    assert done.code == 0 and done.err.startswith(
+        "free run, 58 rows"
+    )  # the scores stay out of the CSV
     frame = pd.read_csv(io.StringIO(done.out))
     assert len(frame) == 60
     np.testing.assert_allclose(frame["y_learner"].dropna(), 0.0)
@@ -592,8 +688,12 @@ def test_initial_values(fitted, tmp_path):
     write_csv(tmp_path / "lags.csv", y=y[:2])
     measured, zero = simulated(model, data), simulated(model, data, "--initial", "zero")
     np.testing.assert_array_equal(simulated(model, data, "--initial", "measured"), measured)
-    np.testing.assert_array_equal(simulated(model, data, "--initial", tmp_path / "lags.csv"), measured)
-    np.testing.assert_array_equal(simulated(model, tmp_path / "u.csv", "--initial", tmp_path / "lags.csv"), measured)
+    np.testing.assert_array_equal(
+        simulated(model, data, "--initial", tmp_path / "lags.csv"), measured
+    )
+    np.testing.assert_array_equal(
+        simulated(model, tmp_path / "u.csv", "--initial", tmp_path / "lags.csv"), measured
+    )
     np.testing.assert_array_equal(simulated(model, tmp_path / "u.csv"), zero)
     assert not np.array_equal(measured[2:], zero[2:])
     theta = load(model).theta
@@ -606,7 +706,8 @@ def test_without_measured_outputs_there_is_no_measured_column(fitted, tmp_path):
     done = run("simulate", fitted / "mlp", tmp_path / "u.csv")
     assert (
         done.err
-        == f"note: {tmp_path / 'u.csv'} has no y: the free run starts from 0; --initial CSV gives other outputs.\n"
+        == f"note: {tmp_path / 'u.csv'} has no y: the free run starts from 0; --initial CSV "
+        "gives other outputs.\n"
     )
     frame = pd.read_csv(io.StringIO(done.out))
     assert list(frame.columns) == ["time", "y_model", "y_baseline", "y_learner", "extrapolates"]
@@ -645,11 +746,23 @@ ROWS = "".join(f"{(k * 7) % 5},{(k * 3) % 11}\n" for k in range(20))
 BAD = {  # what is put in the place of files ("" replaces a piece of the spec), and words of the message
     "missing column": (data(ROWS, "u,position"), ["run.csv", "no column 'y'", "'position'"]),
     "unequal lengths": (data(ROWS + "1,\n"), ["run.csv", "unequal lengths", "'u' 21", "'y' 20"]),
-    "NaN cell": (data(ROWS + "1,NaN\n3,4\n"), ["run.csv", "line 22 (row 20)", "column 'y'", "'NaN'", "finite number"]),
-    "inf cell": (data(ROWS + "-inf,1\n3,4\n"), ["run.csv", "line 22 (row 20)", "column 'u'", "'-inf'"]),
-    "text in a number column": (data(ROWS + "1,high\n3,4\n"), ["line 22 (row 20)", "column 'y'", "'high'"]),
+    "NaN cell": (
+        data(ROWS + "1,NaN\n3,4\n"),
+        ["run.csv", "line 22 (row 20)", "column 'y'", "'NaN'", "finite number"],
+    ),
+    "inf cell": (
+        data(ROWS + "-inf,1\n3,4\n"),
+        ["run.csv", "line 22 (row 20)", "column 'u'", "'-inf'"],
+    ),
+    "text in a number column": (
+        data(ROWS + "1,high\n3,4\n"),
+        ["line 22 (row 20)", "column 'y'", "'high'"],
+    ),
     "empty cell": (data(ROWS + ",1\n3,4\n"), ["line 22 (row 20)", "column 'u'", "empty"]),
-    "fewer rows than parameters": (data("1,2\n2,5\n3,3\n4,4\n"), ["plant.toml", "2 usable rows for 3 parameters"]),
+    "fewer rows than parameters": (
+        data("1,2\n2,5\n3,3\n4,4\n"),
+        ["plant.toml", "2 usable rows for 3 parameters"],
+    ),
     "fewer rows than lags": (data("1,2\n2,5\n"), ["run.csv", "2 rows, too few", "3"]),
     "constant input": (data(ROWS.replace(",", ",7,"), "u0,u,y"), ["'u' is constant (7)"]),
     "constant output": (data("".join(f"{k % 3},5\n" for k in range(20))), ["'y' is constant (5)"]),
@@ -657,35 +770,80 @@ BAD = {  # what is put in the place of files ("" replaces a piece of the spec), 
     "blank file": ({"run.csv": "\n\n"}, ["run.csv", "blank lines"]),
     "header only": ({"run.csv": "u,y\n"}, ["run.csv", "no data rows"]),
     "binary file": ({"run.csv": "\0\x01\x02"}, ["run.csv", "UTF-8 text"]),
-    "wrong file type": ({"": ('["run.csv"]', '["plant.toml"]')}, ["plant.toml", "unknown file type '.toml'", ".csv"]),
+    "wrong file type": (
+        {"": ('["run.csv"]', '["plant.toml"]')},
+        ["plant.toml", "unknown file type '.toml'", ".csv"],
+    ),
     "missing file": ({"": ('["run.csv"]', '["absent.csv"]')}, ["absent.csv", "no such file"]),
-    "unknown channel": ({"": ("u[k-1]", "v[k-1]")}, ["plant.toml", "'c'", "unknown channel 'v'", "y, u"]),
-    "unknown function": ({"": ("u[k-1]", "sgn(u[k-1])")}, ["unknown function 'sgn'", "did you mean 'sign'"]),
+    "unknown channel": (
+        {"": ("u[k-1]", "v[k-1]")},
+        ["plant.toml", "'c'", "unknown channel 'v'", "y, u"],
+    ),
+    "unknown function": (
+        {"": ("u[k-1]", "sgn(u[k-1])")},
+        ["unknown function 'sgn'", "did you mean 'sign'"],
+    ),
     "code": ({"": ("u[k-1]", "__import__('os').remove('run.csv')")}, ["'c'", "not allowed"]),
     "attribute": ({"": ("u[k-1]", "u[k-1].real")}, ["'c'", "not allowed"]),
     "look-ahead": ({"": ("u[k-1]", "u[k+1]")}, ["plant.toml", "'u[k+1]'", "looks ahead"]),
-    "output at lag 0": ({"": ("y[k-2]", "y[k]")}, ["'y[k]' is the output that is to be predicted", "y[k-1]"]),
+    "output at lag 0": (
+        {"": ("y[k-2]", "y[k]")},
+        ["'y[k]' is the output that is to be predicted", "y[k-1]"],
+    ),
     "learner input at lag 0": (
         {"": ('kind = "none"', 'inputs = ["y[k]"]')},
         ["learner input", "'y[k]' is the output that is to be predicted"],
     ),
-    "learner input unknown": ({"": ('kind = "none"', 'inputs = ["w[k]"]')}, ["learner input", "channel 'w'"]),
-    "lags for other channels": ({"": ('kind = "none"', "[lags]\nna = [1, 1]")}, ["`na` has 2 numbers", "1 outputs"]),
-    "unknown key": ({"": ("skip = 5", "skipp = 5")}, ["plant.toml", "data.tests.steps.skipp", "did you mean 'skip'"]),
+    "learner input unknown": (
+        {"": ('kind = "none"', 'inputs = ["w[k]"]')},
+        ["learner input", "channel 'w'"],
+    ),
+    "lags for other channels": (
+        {"": ('kind = "none"', "[lags]\nna = [1, 1]")},
+        ["`na` has 2 numbers", "1 outputs"],
+    ),
+    "unknown key": (
+        {"": ("skip = 5", "skipp = 5")},
+        ["plant.toml", "data.tests.steps.skipp", "did you mean 'skip'"],
+    ),
     "missing key": ({"": ('outputs = ["y"]', "")}, ["plant.toml", "'data.outputs' is missing"]),
-    "wrong value": ({"": ("skip = 5", 'skip = "5 s"')}, ["plant.toml", "'data.tests.steps.skip'", '"5 s"', "integer"]),
+    "wrong value": (
+        {"": ("skip = 5", 'skip = "5 s"')},
+        ["plant.toml", "'data.tests.steps.skip'", '"5 s"', "integer"],
+    ),
     "broken TOML": ({"": ("[data]", "[data")}, ["plant.toml", "broken TOML", "line 2"]),
-    "channel twice": ({"": ('inputs = ["u"]', 'inputs = ["u", "y"]')}, ["plant.toml", "channel 'y' is given twice"]),
-    "channel with a strange name": ({"": ('inputs = ["u"]', 'inputs = ["u 1"]')}, ["plant.toml", "'u 1' cannot name"]),
-    "scale of zero": ({"": ('unit = "m"', "scale = 0")}, ["plant.toml", "channel 'y'", "`scale` must be finite"]),
-    "rank-deficient": ({"": ("u[k-1]", "2*y[k-1]")}, ["plant.toml", "rank-deficient", "a, c are linearly dependent"]),
+    "channel twice": (
+        {"": ('inputs = ["u"]', 'inputs = ["u", "y"]')},
+        ["plant.toml", "channel 'y' is given twice"],
+    ),
+    "channel with a strange name": (
+        {"": ('inputs = ["u"]', 'inputs = ["u 1"]')},
+        ["plant.toml", "'u 1' cannot name"],
+    ),
+    "scale of zero": (
+        {"": ('unit = "m"', "scale = 0")},
+        ["plant.toml", "channel 'y'", "`scale` must be finite"],
+    ),
+    "rank-deficient": (
+        {"": ("u[k-1]", "2*y[k-1]")},
+        ["plant.toml", "rank-deficient", "a, c are linearly dependent"],
+    ),
     "term without a value": (
         {"": ("u[k-1]", "log(u[k-1])")},
         ["run.csv: line 5 (row 3)", "the regressor of c", "not finite"],
     ),
-    "rows beyond the end": ({"": ('["run.csv"]', '["run.csv"], rows = [0, 500]')}, ["run.csv", "[0, 500]", "120 data"]),
-    "test part too short": ({"steps.csv": "u,y\n1,2\n1,3\n"}, ["steps.csv", "data.tests.steps", "2 rows, too few"]),
-    "skip longer than the part": ({"": ("skip = 5", "skip = 60")}, ["steps.csv", "60 rows, too few", "first 60"]),
+    "rows beyond the end": (
+        {"": ('["run.csv"]', '["run.csv"], rows = [0, 500]')},
+        ["run.csv", "[0, 500]", "120 data"],
+    ),
+    "test part too short": (
+        {"steps.csv": "u,y\n1,2\n1,3\n"},
+        ["steps.csv", "data.tests.steps", "2 rows, too few"],
+    ),
+    "skip longer than the part": (
+        {"": ("skip = 5", "skip = 60")},
+        ["steps.csv", "60 rows, too few", "first 60"],
+    ),
     "columns of an unknown channel": (
         {"": ("skip = 5", 'columns = { z = "y" }')},
         ["plant.toml", "data.tests.steps.columns", "'z' is neither an input nor an output"],
@@ -714,7 +872,9 @@ def test_bad_input(project, command, changes, words):
     assert listing(project.parent) == before
 
 
-@pytest.mark.parametrize("name", ["missing column", "broken TOML", "unknown channel", "0-byte file"])
+@pytest.mark.parametrize(
+    "name", ["missing column", "broken TOML", "unknown channel", "0-byte file"]
+)
 def test_bad_input_of_a_spec_in_the_current_folder(project, name):
     """Relative paths: the message still names spec or data file."""
     changes, words = BAD[name]
@@ -735,12 +895,18 @@ ARGUMENTS = [
     (["fot"], ["No such command 'fot'", "fit"]),
     (["compare", "absent.toml"], ["absent.toml", "no such file"]),
     (["compare", "plant.toml", "--out", "theirs"], ["theirs", "no manifest.json"]),
-    (["compare", "plant.toml", "--out", "x", "--model", "theirs"], ["theirs", "no saved model there"]),
+    (
+        ["compare", "plant.toml", "--out", "x", "--model", "theirs"],
+        ["theirs", "no saved model there"],
+    ),
     (["design", "plant.toml"], ["Missing option", "--out"]),
     (["export", "out", "--to", "c"], ["Missing option", "--out"]),
     (["reproduce", "static_eror"], ["no study", "static_errors"]),
     (["fit", "plant.toml", "--out", "run.csv"], ["run.csv", "not a folder"]),
-    (["fit", "plant.toml", "--out", "run.csv/out"], ["run.csv/out", "cannot be written", "is not a folder"]),
+    (
+        ["fit", "plant.toml", "--out", "run.csv/out"],
+        ["run.csv/out", "cannot be written", "is not a folder"],
+    ),
     (["fit", "plant.toml", "--out", "theirs"], ["theirs", "no manifest.json"]),
     (["fit", "plant.toml", "--out", "."], ["no manifest.json"]),
     (["demo", "--out", "theirs"], ["theirs", "no manifest.json"]),
@@ -751,7 +917,9 @@ ARGUMENTS = [
 ]
 
 
-@pytest.mark.parametrize(("arguments", "words"), ARGUMENTS, ids=[" ".join(a) or "nothing" for a, _ in ARGUMENTS])
+@pytest.mark.parametrize(
+    ("arguments", "words"), ARGUMENTS, ids=[" ".join(a) or "nothing" for a, _ in ARGUMENTS]
+)
 def test_bad_arguments(project, arguments, words):
     Path("theirs").mkdir()
     Path("theirs/result.json").write_text('{"schema": "of another tool"}')
@@ -763,7 +931,10 @@ def test_bad_arguments(project, arguments, words):
 
 
 RUNS = [
-    (["predict", "M", "D", "--horizon", "0"], ["`horizon` must be a whole number of steps, 1 or more; got 0"]),
+    (
+        ["predict", "M", "D", "--horizon", "0"],
+        ["`horizon` must be a whole number of steps, 1 or more; got 0"],
+    ),
     (["predict", "M", "D", "--horizon", "-1"], ["1 or more; got -1"]),
     (["predict", "M", "D", "--horizon", "two"], ["--horizon", "integer"]),
     (["predict", "M", "D", "--horizon", "59"], ["steps.csv", "60 rows, too few"]),
@@ -774,7 +945,10 @@ RUNS = [
     (["simulate", "M", "nan.csv"], ["nan.csv", "line 3 (row 1)", "column 'u'"]),
     (["simulate", "M", "nan_y.csv"], ["nan_y.csv", "line 3 (row 1)", "column 'y'"]),
     (["simulate", "M", "empty.csv"], ["empty.csv", "0 bytes"]),
-    (["simulate", "M", "u.csv", "--initial", "measured"], ["u.csv", "no measured outputs", "--initial zero"]),
+    (
+        ["simulate", "M", "u.csv", "--initial", "measured"],
+        ["u.csv", "no measured outputs", "--initial zero"],
+    ),
     (["simulate", "M", "u.csv", "--initial", "absent.csv"], ["absent.csv", "no such file"]),
     (["simulate", "M", "u.csv", "--initial", "mesured"], ["mesured", "measured, zero"]),
     (["simulate", "M", "u.csv", "--initial", "u.csv"], ["u.csv", "no column 'y'"]),
@@ -787,7 +961,9 @@ RUNS = [
 ]
 
 
-@pytest.mark.parametrize(("arguments", "words"), RUNS, ids=[" ".join(arguments) for arguments, _ in RUNS])
+@pytest.mark.parametrize(
+    ("arguments", "words"), RUNS, ids=[" ".join(arguments) for arguments, _ in RUNS]
+)
 def test_bad_runs(fitted, tmp_path, monkeypatch, arguments, words):
     monkeypatch.chdir(tmp_path)
     contents = {
@@ -817,15 +993,22 @@ def test_a_file_with_some_of_the_outputs(project):
     u, y = signals(120, 1)
     for name in ("run", "steps"):
         write_csv(project.parent / f"{name}.csv", u=u, y=y, z=y**2)
-    text = SPEC.replace('outputs = ["y"]', 'outputs = ["y", "z"]').replace("regressor", 'output = "y"\nregressor')
-    project.write_text(text + '[[baseline.terms]]\nparameter = "d"\nregressor = "z[k-1]"\noutput = "z"\n')
+    text = SPEC.replace('outputs = ["y"]', 'outputs = ["y", "z"]').replace(
+        "regressor", 'output = "y"\nregressor'
+    )
+    project.write_text(
+        text + '[[baseline.terms]]\nparameter = "d"\nregressor = "z[k-1]"\noutput = "z"\n'
+    )
     assert run("fit", project, "--out", "out").code == 0
     write_csv(Path("some.csv"), u=u, y=y)
     done = run("simulate", "out", "some.csv")
     assert (done.code, done.out) == (2, "")
     assert one_line(done.err, "some.csv", "some of the model's outputs", "z", "all or none")
     done = run("simulate", "out", "run.csv")
-    assert done.out.splitlines()[0] == "time,y,y_model,y_baseline,y_learner,z,z_model,z_baseline,z_learner"
+    assert (
+        done.out.splitlines()[0]
+        == "time,y,y_model,y_baseline,y_learner,z,z_model,z_baseline,z_learner"
+    )
 
 
 def test_a_model_without_inputs_on_a_file_without_its_channels(project):
@@ -867,7 +1050,13 @@ def test_a_reader_that_goes_away_is_no_error(fitted, tmp_path):
     write_csv(fitted / "long.csv", u=u, y=y)
     environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(tmp_path / "cache")}
     done = subprocess.run(
-        f"{command} | head -n 2", shell=True, env=environment, capture_output=True, text=True, timeout=120, check=False
+        f"{command} | head -n 2",
+        shell=True,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
     )
     assert done.stderr == ""
     assert len(done.stdout.splitlines()) == 2

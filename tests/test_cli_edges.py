@@ -74,7 +74,11 @@ def test_ctrl_c_of_a_real_process(tmp_path, tmp_path_factory):
     )
     try:
         patience = time.monotonic() + 60
-        while not list(cache.glob("*_advance*")) and time.monotonic() < patience and process.poll() is None:
+        while (
+            not list(cache.glob("*_advance*"))
+            and time.monotonic() < patience
+            and process.poll() is None
+        ):
             time.sleep(0.1)
         time.sleep(3)  # compiled: iterations follow
         assert process.poll() is None
@@ -85,7 +89,9 @@ def test_ctrl_c_of_a_real_process(tmp_path, tmp_path_factory):
     finally:
         process.kill()
     assert (process.returncode, out) == (130, "")
-    assert one_line(err, "interrupted during run ", " of 2, iteration ", "loss ", "; nothing is written")
+    assert one_line(
+        err, "interrupted during run ", " of 2, iteration ", "loss ", "; nothing is written"
+    )
     assert contents(tmp_path) == before
     assert not (tmp_path / "deep").exists()
 
@@ -104,7 +110,9 @@ def test_the_result_never_replaces_what_is_read(project, command, inside):
                 project.write_text(SPEC.replace(f'"{name}"', f'"out/{name}"'))
     spec = "out/plant.toml" if inside == "plant.toml" else project
     Path("link").symlink_to("out")
-    assert inside in refused(command, spec, "--out", "out") and inside in refused(command, spec, "--out", "link")
+    assert inside in refused(command, spec, "--out", "out") and inside in refused(
+        command, spec, "--out", "link"
+    )
     words = refused(command, spec, "--out", "out", "--force")
     assert f"out: holds {inside}, which this fit reads; give another folder" in words
     assert inside in refused(command, spec, "--out", "link", "--force")
@@ -118,17 +126,26 @@ def test_the_output_never_replaces_what_is_read(fitted, tmp_path, monkeypatch, c
     write_csv(Path("init.csv"), y=y[:2])
     Path("link.csv").symlink_to("data.csv")
     for out in ("data.csv", "./data.csv", tmp_path / "data.csv", "link.csv"):
-        assert "is read by this run; give another name" in refused(command, fitted / "out", "data.csv", "--out", out)
-    message = refused(command, fitted / "out", "data.csv", "--initial", "init.csv", "--out", "init.csv")
+        assert "is read by this run; give another name" in refused(
+            command, fitted / "out", "data.csv", "--out", out
+        )
+    message = refused(
+        command, fitted / "out", "data.csv", "--initial", "init.csv", "--out", "init.csv"
+    )
     assert "init.csv: is read by this run" in message
-    assert run(command, fitted / "out", "data.csv", "--initial", "init.csv", "--out", "other.csv").code == 0
+    assert (
+        run(command, fitted / "out", "data.csv", "--initial", "init.csv", "--out", "other.csv").code
+        == 0
+    )
 
 
 @pytest.mark.parametrize("command", ["simulate", "predict"])
-def test_an_output_column_that_stands_twice_is_not_taken_as_absent(fitted, tmp_path, monkeypatch, command):
+def test_an_output_column_that_stands_twice_is_not_taken_as_absent(
+    fitted, tmp_path, monkeypatch, command
+):
     monkeypatch.chdir(tmp_path)
     Path("twice.csv").write_text("u,y,y\n" + "1,2,3\n4,5,7\n" * 5)
-    assert "twice.csv: the column 'y' stands 2 times; names must differ" in refused(
+    assert "twice.csv: the header has the column 'y' 2 times; names must differ" in refused(
         command, fitted / "out", "twice.csv"
     )
 
@@ -171,7 +188,9 @@ def test_the_step_of_the_time_column_is_checked(project, timed_model):
     write_csv(Path("new.csv"), u=u, y=y)
     assert "new.csv: no column 't'" in refused("simulate", timed_model, "new.csv")
     timed("steps.csv", 0.1002)
-    assert "tests.steps: sampled every 0.1002 s, the training data every 0.1 s" in refused("fit", project)
+    assert "tests.steps: sampled every 0.1002 s, the training data every 0.1 s" in refused(
+        "fit", project
+    )
 
 
 # --- --initial of predict
@@ -212,16 +231,29 @@ def with_a_negative_input(path: str, row: int, rows: int, seed: int) -> None:
 
 def test_a_test_part_on_which_an_expression_has_no_value(project):
     with_a_negative_input("run.csv", 0, 120, 1)  # before the first row that is used
-    project.write_text(SPEC.replace('"u[k-1]"', '"log(u[k-1])"').replace('["run.csv"]', '["run.csv"], rows = [1, 120]'))
+    project.write_text(
+        SPEC.replace('"u[k-1]"', '"log(u[k-1])"').replace(
+            '["run.csv"]', '["run.csv"], rows = [1, 120]'
+        )
+    )
     with_a_negative_input("steps.csv", 59, 60, 2)  # the last row is no regressor of any
     assert run("fit", project, "--out", "out").code == 0
     with_a_negative_input("steps.csv", 10, 60, 2)
     message = refused("fit", project)
-    assert "steps.csv: line 13 (row 11): the regressor of c (log(u[k-1])) is not finite there" in message
+    assert (
+        "steps.csv: line 13 (row 11): the regressor of c (log(u[k-1])) is not finite there"
+        in message
+    )
     learner = 'kind = "mlp"\nhidden = [4]\ninputs = ["log(u[k-1])"]\n'
-    project.write_text(SPEC.replace('kind = "none"\n', learner).replace('["run.csv"]', '["run.csv"], rows = [1, 120]'))
+    project.write_text(
+        SPEC.replace('kind = "none"\n', learner).replace(
+            '["run.csv"]', '["run.csv"], rows = [1, 120]'
+        )
+    )
     message = refused("fit", project)
-    assert "steps.csv: line 13 (row 11): the learner input log(u[k-1]) is not finite there" in message
+    assert (
+        "steps.csv: line 13 (row 11): the learner input log(u[k-1]) is not finite there" in message
+    )
 
 
 @pytest.mark.parametrize("part", ["train", "test"])
@@ -262,7 +294,9 @@ def extreme(project: Path, column: str, size: float, learner: str) -> None:
 
 
 @pytest.mark.parametrize("learner", ['kind = "none"\n', NETWORK], ids=["none", "mlp"])
-@pytest.mark.parametrize(("column", "size"), [("u", 1e-320), ("y", 1e-320), ("y", 1e-200), ("y", 1e200), ("y", 1e307)])
+@pytest.mark.parametrize(
+    ("column", "size"), [("u", 1e-320), ("y", 1e-320), ("y", 1e-200), ("y", 1e200), ("y", 1e307)]
+)
 def test_columns_too_large_or_too_small(project, column, size, learner):
     extreme(project, column, size, learner)
     assert "scale" in refused("fit", project)
@@ -281,7 +315,9 @@ def test_inputs_of_extreme_size_are_refused_or_right(project, size, learner):
     u, y = signals(120, 1)
     theta = np.linalg.lstsq(np.stack([y[1:-1], y[:-2], u[1:-1]], axis=1), y[2:], rcond=None)[0]
     parameters = json.loads(done.out)["parameters"]
-    np.testing.assert_allclose([p["value"] for p in parameters] / np.array([1, 1, 1 / size]), theta, rtol=1e-8)
+    np.testing.assert_allclose(
+        [p["value"] for p in parameters] / np.array([1, 1, 1 / size]), theta, rtol=1e-8
+    )
     assert all(p["std"] > 0 for p in parameters)
 
 
@@ -318,7 +354,8 @@ def test_data_files_of_300_characters(project):
 
 
 @pytest.mark.parametrize(
-    "column", ["u[²]", "u[-1]", "u[]", "u[1.0]", "u[9]", "u[99999999999999999999]", "u[0][0]", "[0]"]
+    "column",
+    ["u[²]", "u[-1]", "u[]", "u[1.0]", "u[9]", "u[99999999999999999999]", "u[0][0]", "[0]"],
 )
 def test_columns_of_matrices(project, column):
     u, y = signals(120, 1)
@@ -346,9 +383,18 @@ def test_a_declaration_nested_too_deeply(tmp_path, monkeypatch, text):
     [
         (('outputs = ["y"]', 'outputs = ["y", "time"]'), "an output cannot be called 'time'"),
         (('outputs = ["y"]', 'outputs = ["y", "y_model"]'), "an output cannot be called 'y_model'"),
-        (("[learner]", "[baseline.constants]\nu = 2.0\n[learner]"), "'u' is a constant and a channel"),
-        (("[learner]", "[baseline.constants]\ny = 2.0\n[learner]"), "'y' is a constant and a channel"),
-        (('parameter = "c"', 'parameter = "c\\nd"'), "cannot name a parameter; use letters, digits"),
+        (
+            ("[learner]", "[baseline.constants]\nu = 2.0\n[learner]"),
+            "'u' is a constant and a channel",
+        ),
+        (
+            ("[learner]", "[baseline.constants]\ny = 2.0\n[learner]"),
+            "'y' is a constant and a channel",
+        ),
+        (
+            ('parameter = "c"', 'parameter = "c\\nd"'),
+            "cannot name a parameter; use letters, digits",
+        ),
         (('parameter = "c"', 'parameter = "  "'), "cannot name a parameter"),
         (
             ('["run.csv"] }', '["run.csv"], rows = [[0, 60], [50, 120]] }'),
@@ -377,7 +423,9 @@ def test_a_long_file_is_written_piece_by_piece(fitted, tmp_path, monkeypatch, co
     """The table and the scores are those of the file read at once; a run that leaves all bounds ends in both."""
     pytest.importorskip("pyarrow")
     rng = np.random.default_rng(3)
-    pd.DataFrame({"u": rng.uniform(-1, 1, 500), "y": rng.normal(size=500)}).to_parquet(tmp_path / "long.parquet")
+    pd.DataFrame({"u": rng.uniform(-1, 1, 500), "y": rng.normal(size=500)}).to_parquet(
+        tmp_path / "long.parquet"
+    )
     monkeypatch.chdir(tmp_path)
     whole = run(command, fitted / "out", "long.parquet", "--out", "whole.csv")
     monkeypatch.setattr("orthaug.commands.long_run.LONG", 100)
@@ -385,7 +433,9 @@ def test_a_long_file_is_written_piece_by_piece(fitted, tmp_path, monkeypatch, co
     pieces = run(command, fitted / "out", "long.parquet", "--out", "pieces.csv")
     assert (whole.code, pieces.code, whole.err) == (0, 0, pieces.err)
     assert pieces.out == whole.out.replace("whole.csv", "pieces.csv")
-    pd.testing.assert_frame_equal(pd.read_csv("pieces.csv"), pd.read_csv("whole.csv"), rtol=1e-9, atol=1e-12)
+    pd.testing.assert_frame_equal(
+        pd.read_csv("pieces.csv"), pd.read_csv("whole.csv"), rtol=1e-9, atol=1e-12
+    )
     streamed = run(command, fitted / "out", "long.parquet")
     assert streamed.out == Path("pieces.csv").read_text(encoding="utf-8")
     assert run(command, fitted / "out", "long.parquet", "--out", "long.parquet").code == 2
@@ -394,10 +444,14 @@ def test_a_long_file_is_written_piece_by_piece(fitted, tmp_path, monkeypatch, co
 def test_a_long_run_that_leaves_all_bounds_has_no_more_values(fitted, tmp_path, monkeypatch):
     pytest.importorskip("pyarrow")
     model = load(fitted / "out")
-    numbers = model.numbers._replace(theta=np.array([1.2, 0.0, 0.5]), theta_aux=np.zeros_like(model.theta))
+    numbers = model.numbers._replace(
+        theta=np.array([1.2, 0.0, 0.5]), theta_aux=np.zeros_like(model.theta)
+    )
     save(replace(model, numbers=numbers), tmp_path / "wild")
     rng = np.random.default_rng(3)
-    pd.DataFrame({"u": rng.uniform(-1, 1, 300), "y": rng.normal(size=300)}).to_parquet(tmp_path / "l.parquet")
+    pd.DataFrame({"u": rng.uniform(-1, 1, 300), "y": rng.normal(size=300)}).to_parquet(
+        tmp_path / "l.parquet"
+    )
     monkeypatch.chdir(tmp_path)
     whole = run("simulate", "wild", "l.parquet", "--out", "whole.csv")
     monkeypatch.setattr("orthaug.commands.long_run.LONG", 100)

@@ -45,7 +45,9 @@ def system(seed, rows, *, square=0.0, equation=0.0, sensor=0.0, scale=1.0):
     rng = np.random.default_rng([5, seed])
     u, y, e = scale * rng.normal(size=rows), np.zeros(rows), rng.normal(size=(2, rows))
     for k in range(2, rows):
-        y[k] = 1.5 * y[k - 1] - 0.7 * y[k - 2] + u[k - 1] + square * u[k - 1] ** 2 + equation * e[0, k]
+        y[k] = (
+            1.5 * y[k - 1] - 0.7 * y[k - 2] + u[k - 1] + square * u[k - 1] ** 2 + equation * e[0, k]
+        )
     return {"u": u, "y": y + sensor * e[1]}
 
 
@@ -85,7 +87,10 @@ def free(tmp_path_factory) -> dict:
 
 def test_the_result_has_all_its_keys(free):
     assert set(free) >= RESULT_KEYS
-    assert [(r["seed"], r["regularization"]) for r in free["restarts"]] == [(0, "evidence"), (1, "evidence")]
+    assert [(r["seed"], r["regularization"]) for r in free["restarts"]] == [
+        (0, "evidence"),
+        (1, "evidence"),
+    ]
     assert sum(r["chosen"] for r in free["restarts"]) == 1
     assert free["orthogonality_defect"] < 1e-12
 
@@ -100,13 +105,17 @@ def test_theta_has_standard_errors(free):
 
 def test_the_noise_has_a_verdict_with_a_text(free):
     assert free["residuals"]["verdict"] in ("white", "equation_noise", "sensor_noise", "unmodelled")
-    assert free["residuals"]["text"].endswith(".") and "inconsistent" not in free["residuals"]["text"]
+    assert (
+        free["residuals"]["text"].endswith(".") and "inconsistent" not in free["residuals"]["text"]
+    )
 
 
 def test_the_learner_has_a_verdict_from_blocks(free):
     """Without test parts, blocked cross-validation asks whether the learner earns its place."""
     assert free["validation"]["verdict"] == "helps"
-    assert [trial["where"] for trial in free["validation"]["trials"]] == [f"block {i} of 4" for i in (1, 2, 3, 4)]
+    assert [trial["where"] for trial in free["validation"]["trials"]] == [
+        f"block {i} of 4" for i in (1, 2, 3, 4)
+    ]
     assert "4 blocks" in free["validation"]["text"]
 
 
@@ -118,7 +127,9 @@ def test_the_free_run_is_better_than_after_one_step_training(free, tmp_path):
 
 WAYS = {
     "whole": FREE.replace("segment = 64", "segment = 0"),
-    "exact": FREE.replace("washout = 8", "washout = 0").replace("start_iterations = 5", "start_iterations = 0"),
+    "exact": FREE.replace("washout = 8", "washout = 0").replace(
+        "start_iterations = 5", "start_iterations = 0"
+    ),
     "five steps": "[training]\nhorizon = 5\n",
     "ensemble": FREE + "ensemble = true\nrestarts = 2\n",
 }
@@ -147,7 +158,9 @@ def test_one_step_with_sensor_noise_is_told(tmp_path):
     assert result["residuals"]["verdict"] == "sensor_noise"
     told = [w["text"] for w in result["warnings"]]
     assert any("intervals do not cover" in text and 'focus = "simulation"' in text for text in told)
-    assert result["residuals"]["text"] in unfolded(printed) and f"warning: {told[0]}" in unfolded(printed)
+    assert result["residuals"]["text"] in unfolded(printed) and f"warning: {told[0]}" in unfolded(
+        printed
+    )
 
 
 def test_the_verdicts_are_printed(tmp_path):
@@ -161,20 +174,35 @@ def test_the_verdicts_are_printed(tmp_path):
 # --- what is refused
 
 REFUSED = [
-    (FREE.replace("washout = 8", "washout = 64"), ["`training.washout`: found 64; expected less than the segment, 64"]),
+    (
+        FREE.replace("washout = 8", "washout = 64"),
+        ["`training.washout`: found 64; expected less than the segment, 64"],
+    ),
     (FREE.replace("washout = 8", "washout = 99"), ["`training.washout`: found 99"]),
     (FREE + 'solver = "adam-lbfgs"\n', ["`training.solver`", "adam-lbfgs", "levenberg-marquardt"]),
     ("[training]\nhorizon = 0\n", ["'training.horizon': found 0", "1"]),
-    ('[training]\nhorizon = 3\nsolver = "adam-lbfgs"\n', ["`training.solver`", "levenberg-marquardt"]),
-    ('[training]\nfocus = "free"\n', ["'training.focus': found \"free\"", "'prediction' or 'simulation'"]),
+    (
+        '[training]\nhorizon = 3\nsolver = "adam-lbfgs"\n',
+        ["`training.solver`", "levenberg-marquardt"],
+    ),
+    (
+        '[training]\nfocus = "free"\n',
+        ["'training.focus': found \"free\"", "'prediction' or 'simulation'"],
+    ),
     ("[training]\nsegments = 3\n", ["unknown key 'training.segments'", "did you mean 'segment'"]),
     ("[training]\nsegment = -1\n", ["'training.segment': found -1"]),
     ("[training]\nwashout = 2.5\n", ["'training.washout': found 2.5", "an integer"]),
     ("[validation]\nblocks = 1\n", ["`validation.blocks`: found 1; expected 2 or more, or 0"]),
     ("[validation]\nblocks = -2\n", ["'validation.blocks': found -2"]),
     ("[validation]\nblock = 4\n", ["unknown key 'validation.block'", "did you mean 'blocks'"]),
-    (FREE.replace("segment = 64", "segment = 0").replace("washout = 8", "washout = 299"), ["washout"]),
-    (FREE.replace("segment = 64", "segment = 512").replace("washout = 8", "washout = 400"), ["washout"]),
+    (
+        FREE.replace("segment = 64", "segment = 0").replace("washout = 8", "washout = 299"),
+        ["washout"],
+    ),
+    (
+        FREE.replace("segment = 64", "segment = 512").replace("washout = 8", "washout = 400"),
+        ["washout"],
+    ),
     ("[training]\nhorizon = 400\niterations = 5\n", ["horizon"]),
 ]
 
@@ -189,8 +217,15 @@ def test_refused(tmp_path, training, words):
 
 
 def test_compare_refuses_the_same(tmp_path):
-    done = run("compare", project(tmp_path / "p", SMALL, "[validation]\nblocks = 1\n"), "--out", tmp_path / "out")
-    assert (done.code, done.out) == (2, "") and one_line(done.err, "error: ", "plant.toml", "`validation.blocks`")
+    done = run(
+        "compare",
+        project(tmp_path / "p", SMALL, "[validation]\nblocks = 1\n"),
+        "--out",
+        tmp_path / "out",
+    )
+    assert (done.code, done.out) == (2, "") and one_line(
+        done.err, "error: ", "plant.toml", "`validation.blocks`"
+    )
 
 
 def test_a_question_ends_with_its_own_mark(tmp_path):
@@ -204,7 +239,9 @@ def test_a_question_ends_with_its_own_mark(tmp_path):
 @pytest.fixture(scope="module")
 def overfitted(tmp_path_factory):
     """151 weights on 60 noisy rows of a linear system, tested far outside: the spec."""
-    spec = project(tmp_path_factory.mktemp("over") / "p", UNBOUNDED, QUICK, FAR, **system(3, 60, equation=0.3))
+    spec = project(
+        tmp_path_factory.mktemp("over") / "p", UNBOUNDED, QUICK, FAR, **system(3, 60, equation=0.3)
+    )
     write_csv(spec.parent / "far.csv", **system(4, 200, equation=0.3, scale=4.0))
     return spec
 
@@ -215,18 +252,33 @@ def diverged(overfitted) -> dict:
 
 
 def test_a_free_run_that_diverges_is_null_with_a_warning(diverged):
-    assert diverged["scores"]["tests.far"]["simulation"] == {"rmse": None, "nrmse": None, "fit": None}
+    assert diverged["scores"]["tests.far"]["simulation"] == {
+        "rmse": None,
+        "nrmse": None,
+        "fit": None,
+    }
     assert diverged["scores"]["tests.far"]["prediction"]["rmse"][0] > 0
     told = [w["text"] for w in diverged["warnings"] if w["code"] == "free_run_diverged"]
-    assert any(re.match(r"tests\.far: the free run diverged in output 'y' at step \d+", text) for text in told)
+    assert any(
+        re.match(r"tests\.far: the free run diverged in output 'y' at step \d+", text)
+        for text in told
+    )
 
 
 def test_it_hurts_in_extrapolation(diverged):
     verdict = diverged["validation"]
-    assert verdict["verdict"] == "hurts" and {"code": "learner_hurts", "text": verdict["text"]} in diverged["warnings"]
-    assert verdict["text"].startswith("The learner hurts in extrapolation") and "tests.far leaves" in verdict["text"]
+    assert (
+        verdict["verdict"] == "hurts"
+        and {"code": "learner_hurts", "text": verdict["text"]} in diverged["warnings"]
+    )
+    assert (
+        verdict["text"].startswith("The learner hurts in extrapolation")
+        and "tests.far leaves" in verdict["text"]
+    )
     (trial,) = verdict["trials"]
-    assert trial["where"] == "tests.far" and trial["model"] is None and 0 < trial["physics_alone"] < 1
+    assert (
+        trial["where"] == "tests.far" and trial["model"] is None and 0 < trial["physics_alone"] < 1
+    )
     assert {entry["regressor"] for entry in verdict["extrapolation"]} == {"y[k-1]", "u[k-1]"}
 
 
@@ -237,20 +289,33 @@ def test_what_is_worse_than_physics_alone_on_a_part_never_helps(seed, tmp_path):
     result = fit(spec)
     (trial,) = result["validation"]["trials"]
     model = result["scores"]["tests.far"]["simulation"]["nrmse"]
-    assert model is None or model[0] > trial["physics_alone"]  # it leaves the training range and is worse there
+    assert (
+        model is None or model[0] > trial["physics_alone"]
+    )  # it leaves the training range and is worse there
     assert result["validation"]["verdict"] == "hurts"
 
 
 def test_a_learner_that_finds_the_square_helps(tmp_path):
-    spec = project(tmp_path / "p", SMALL, QUICK, FAR, "[validation]\nblocks = 4\n", **system(0, 300, square=0.3))
+    spec = project(
+        tmp_path / "p",
+        SMALL,
+        QUICK,
+        FAR,
+        "[validation]\nblocks = 4\n",
+        **system(0, 300, square=0.3),
+    )
     write_csv(spec.parent / "far.csv", **system(1, 150, square=0.3))
     verdict = fit(spec)["validation"]
     assert verdict["verdict"] == "helps"
-    assert [t["where"] for t in verdict["trials"]] == [f"block {i} of 4" for i in (1, 2, 3, 4)] + ["tests.far"]
+    assert [t["where"] for t in verdict["trials"]] == [f"block {i} of 4" for i in (1, 2, 3, 4)] + [
+        "tests.far"
+    ]
     assert all(t["model"] < 0.5 * t["physics_alone"] for t in verdict["trials"])
 
 
-@pytest.mark.parametrize("blocks", ["", "[validation]\nblocks = 40\n"], ids=["few rows", "many blocks"])
+@pytest.mark.parametrize(
+    "blocks", ["", "[validation]\nblocks = 40\n"], ids=["few rows", "many blocks"]
+)
 def test_a_record_too_short_for_blocks_is_told(tmp_path, blocks):
     """No verdict, and a sentence that says why."""
     rows, learner = (300, SMALL) if blocks else (60, GREEDY)
@@ -273,7 +338,9 @@ def test_a_record_too_short_for_blocks_is_told(tmp_path, blocks):
 @pytest.fixture(scope="module")
 def compared(tmp_path_factory):
     """The spec, the printed text and the rows of a comparison on the free run with a test part."""
-    spec = project(tmp_path_factory.mktemp("compare") / "p", SMALL, FREE.replace("= 25", "= 10"), FAR)
+    spec = project(
+        tmp_path_factory.mktemp("compare") / "p", SMALL, FREE.replace("= 25", "= 10"), FAR
+    )
     write_csv(spec.parent / "far.csv", **system(1, 150, square=0.3, sensor=0.3))
     done = run("compare", spec, "--out", spec.parent / "out")
     assert (done.code, done.err) == (0, "")
@@ -289,7 +356,9 @@ def test_compare_shows_the_verdicts_of_every_row(compared):
         if name == "physics alone":
             assert row["validation"] is None
         else:
-            (told,) = (line for line in text.splitlines() if line.startswith(f"{name}: The learner"))
+            (told,) = (
+                line for line in text.splitlines() if line.startswith(f"{name}: The learner")
+            )
             assert row["validation"]["text"].startswith(told.removeprefix(f"{name}: "))
             wheres = [trial["where"] for trial in row["validation"]["trials"]]
             assert wheres == ["tests.far"]  # as in `fit`: blocks only where no part is held out
@@ -310,7 +379,9 @@ def test_all_rows_are_judged_against_the_same_physics_alone(compared):
         if row["validation"] is not None:
             trial = row["validation"]["trials"][-1]
             assert trial["physics_alone"] == pytest.approx(alone)
-            assert trial["model"] == pytest.approx(row["scores"]["tests.far"]["simulation"]["nrmse"][0]), name
+            assert trial["model"] == pytest.approx(
+                row["scores"]["tests.far"]["simulation"]["nrmse"][0]
+            ), name
 
 
 def test_no_blocks_switch_cross_validation_off(compared, tmp_path):

@@ -51,7 +51,13 @@ def test_the_table(project):
     project.write_text(NETWORK)  # θ⁰ = 0 of two parameters: nothing to hold them to
     done = run("compare", project)
     assert (done.code, done.err) == (0, "")
-    for words in ("physics alone", "orthogonal-penalty", "tests.steps", "free-run NRMSE", "left out: baseline-penalty"):
+    for words in (
+        "physics alone",
+        "orthogonal-penalty",
+        "tests.steps",
+        "free-run NRMSE",
+        "left out: baseline-penalty",
+    ):
         assert words in done.out
     assert (project.parent / "orthaug-out" / "plant" / "result.json").is_file()
 
@@ -60,10 +66,14 @@ def test_with_a_validation_part_the_lowest_error_there_is_marked(project):
     u, y = signals(80, 3)
     write_csv(Path("valid.csv"), u=u, y=y)
     project.write_text(
-        STARTED.replace("[data.channels.y]", '[data.validation]\nfiles = ["valid.csv"]\n[data.channels.y]')
+        STARTED.replace(
+            "[data.channels.y]", '[data.validation]\nfiles = ["valid.csv"]\n[data.channels.y]'
+        )
     )
     result = json.loads(run("compare", project, "--json").out)
-    errors = {r["name"]: r["scores"]["validation"]["prediction"]["rmse"][0] for r in result["comparison"]}
+    errors = {
+        r["name"]: r["scores"]["validation"]["prediction"]["rmse"][0] for r in result["comparison"]
+    }
     assert result["chosen"] == min(errors, key=errors.__getitem__)
 
 
@@ -78,7 +88,9 @@ def test_a_saved_model_of_other_outputs_is_refused(project):
     for name in ("run", "steps"):
         u, y = signals(120, 1)
         write_csv(Path(f"{name}.csv"), u=u, z=y)
-    project.write_text(STARTED.replace('["y"]', '["z"]').replace("y[k", "z[k").replace("channels.y", "channels.z"))
+    project.write_text(
+        STARTED.replace('["y"]', '["z"]').replace("y[k", "z[k").replace("channels.y", "channels.z")
+    )
     before = listing(Path())
     done = run("compare", project, "--model", "fit")
     assert (done.code, done.out) == (2, "")
@@ -93,7 +105,10 @@ def test_a_saved_model_of_other_outputs_is_refused(project):
 def compared(tmp_path_factory):
     """A folder whose comparison, with a validation part, lies in `out`; tests leave it as it is."""
     folder = tmp_path_factory.mktemp("compared")
-    spec = make_project(folder, STARTED.replace("[data.tests", '[data.validation]\nfiles = ["valid.csv"]\n[data.tests'))
+    spec = make_project(
+        folder,
+        STARTED.replace("[data.tests", '[data.validation]\nfiles = ["valid.csv"]\n[data.tests'),
+    )
     u, y = signals(80, 3)
     write_csv(folder / "valid.csv", u=u, y=y)
     done = run("compare", spec, "--out", folder / "out")
@@ -106,10 +121,14 @@ def rows_of(folder: Path) -> dict:
     return {row["name"]: row for row in result["comparison"]}
 
 
-@pytest.mark.parametrize("kind", ["orthogonal", "additive", "orthogonal-penalty", "baseline-penalty"])
+@pytest.mark.parametrize(
+    "kind", ["orthogonal", "additive", "orthogonal-penalty", "baseline-penalty"]
+)
 def test_a_row_is_what_the_single_fit_gives(compared, tmp_path, kind):
     spec = (compared / "plant.toml").read_text(encoding="utf-8")
-    (compared / f"{kind}.toml").write_text(spec + f'[structure]\nkind = "{kind}"\n', encoding="utf-8")
+    (compared / f"{kind}.toml").write_text(
+        spec + f'[structure]\nkind = "{kind}"\n', encoding="utf-8"
+    )
     assert run("fit", compared / f"{kind}.toml", "--out", tmp_path / "fit").code == 0
     single = json.loads((tmp_path / "fit" / "result.json").read_text(encoding="utf-8"))
     row = rows_of(compared)[kind]
@@ -126,7 +145,10 @@ def test_every_part_is_scored_in_every_row(compared):
 
 
 def test_the_chosen_row_has_the_lowest_validation_error(compared):
-    errors = {n: row["scores"]["validation"]["prediction"]["nrmse"][0] for n, row in rows_of(compared).items()}
+    errors = {
+        n: row["scores"]["validation"]["prediction"]["nrmse"][0]
+        for n, row in rows_of(compared).items()
+    }
     result = json.loads((compared / "out" / "result.json").read_text(encoding="utf-8"))
     assert result["chosen"] == min(errors, key=errors.__getitem__)
 
@@ -139,7 +161,9 @@ def test_the_models_can_join_the_next_comparison(compared, tmp_path):
     for model, name in zip(models, ("physics alone", "additive"), strict=True):
         row = rows[str(model)]
         assert row["status"] == "saved" and row["scores"] == before[name]["scores"]
-        assert [p["value"] for p in row["parameters"]] == [p["value"] for p in before[name]["parameters"]]
+        assert [p["value"] for p in row["parameters"]] == [
+            p["value"] for p in before[name]["parameters"]
+        ]
         assert all(p["std"] is None for p in row["parameters"])
 
 
@@ -152,13 +176,20 @@ def test_a_row_with_other_parameters_has_its_own_columns(compared):
     head, *rows = _parameter_cells(result)
     assert head[1:5] == ["a", "b", "c", "gain"] and {len(row) for row in rows} == {len(head)}
     told = dict(zip(head, rows[-1], strict=True))
-    assert (told["a"], told["b"], told["gain"], told["weights"]) == ("–", "–", "0.25", str(last["weights"]))
+    assert (told["a"], told["b"], told["gain"], told["weights"]) == (
+        "–",
+        "–",
+        "0.25",
+        str(last["weights"]),
+    )
 
 
 @pytest.mark.parametrize("model", ["nowhere", "run.csv", "empty"])
 def test_what_is_no_saved_model_is_refused(compared, tmp_path, model):
     (compared / "empty").mkdir(exist_ok=True)
-    done = run("compare", compared / "plant.toml", "--out", tmp_path / "out", "--model", compared / model)
+    done = run(
+        "compare", compared / "plant.toml", "--out", tmp_path / "out", "--model", compared / model
+    )
     assert done.code == 2 and model in done.err and done.err.count("\n") == 1
     assert not (tmp_path / "out").exists()
 
@@ -166,7 +197,8 @@ def test_what_is_no_saved_model_is_refused(compared, tmp_path, model):
 def test_a_saved_model_of_other_inputs_is_refused_before_training(compared, tmp_path):
     spec = STARTED.replace('"u"', '"force"').replace("u[k-1]", "force[k-1]")
     other = make_project(
-        tmp_path, spec.replace("[data.channels.y]", '[data.channels.force]\ncolumn = "u"\n[data.channels.y]')
+        tmp_path,
+        spec.replace("[data.channels.y]", '[data.channels.force]\ncolumn = "u"\n[data.channels.y]'),
     )
     model = compared / "out" / "models" / "additive"
     done = run("compare", other, "--out", tmp_path / "out", "--model", model)

@@ -28,7 +28,10 @@ def compared(tmp_path, **changes) -> int:
 UNCHANGED = [
     {},
     {"schema": 2, "status": RESULT["status"] | {"seconds": 9.0, "loss": 0.5 * (1 + 1e-10)}},
-    {"orthogonality_defect": 3e-14, "warnings": [{"code": "poor", "text": "the model of b.csv is poor"}]},
+    {
+        "orthogonality_defect": 3e-14,
+        "warnings": [{"code": "poor", "text": "the model of b.csv is poor"}],
+    },
     {"text": "at experiment 0, run.csv: line 5", "worst": {"row": 3, "where": "run.csv: line 5"}},
 ]
 
@@ -42,8 +45,11 @@ def test_what_may_change(tmp_path, capsys, changes):
 CHANGED = [
     ({"status": RESULT["status"] | {"loss": 0.5 * (1 + 1e-8)}}, "status.loss: 0.5, then"),
     ({"parameters": []}, "parameters: 1 entries, then 0"),
-    ({"parameters": [{"name": "a", "value": 2.0, "std": 0.0}]}, "parameters[0].std: None, then 0.0"),
-    ({"parameters": [{"name": "a", "value": 2.0}]}, "parameters[0].std: None, then absent"),
+    (
+        {"parameters": [{"name": "a", "value": 2.0, "std": 0.0}]},
+        "parameters[0].std: None, then 0.0",
+    ),
+    ({"parameters": [{"name": "a", "value": 2.0}]}, "parameters[0].std: only in one of them"),
     ({"text": "at experiment 0, run.csv: line 6"}, "text: "),
     ({"warnings": [{"code": "poor", "text": "the model is good"}]}, "warnings[0]: "),
     ({"orthogonality_defect": 1e-9}, "orthogonality_defect: "),

@@ -26,7 +26,17 @@ from orthaug.physics.baseline import Baseline, Term
 
 REGRESSORS = {
     1: ("y[k-1]", "u[k]", "u[k-1]", "1", "y[k-1]**3", "sin(2*u[k])", "y[k-1]*u[k-1]", "abs(u[k])"),
-    2: ("y1[k-1]", "y2[k-1]", "u[k]", "u[k-1]", "1", "y1[k-1]**2", "tanh(3*y2[k-1])", "y1[k-1]*u[k]", "abs(u[k-1])"),
+    2: (
+        "y1[k-1]",
+        "y2[k-1]",
+        "u[k]",
+        "u[k-1]",
+        "1",
+        "y1[k-1]**2",
+        "tanh(3*y2[k-1])",
+        "y1[k-1]*u[k]",
+        "abs(u[k-1])",
+    ),
 }
 LAGS = Lags(na=1, nb=2, nk=0)
 
@@ -37,24 +47,35 @@ def quadratic(w, z):
 
 
 QUADRATIC = {
-    ny: Function(quadratic, lambda key, ny=ny: {"gain": jax.random.normal(key, (ny,)), "bias": jnp.ones(ny)})
+    ny: Function(
+        quadratic, lambda key, ny=ny: {"gain": jax.random.normal(key, (ny,)), "bias": jnp.ones(ny)}
+    )
     for ny in (1, 2)
 }
-MODULE = {ny: EquinoxModule(lambda key, ny=ny: eqx.nn.MLP(2 + ny, ny, 3, 1, key=key)) for ny in (1, 2)}
+MODULE = {
+    ny: EquinoxModule(lambda key, ny=ny: eqx.nn.MLP(2 + ny, ny, 3, 1, key=key)) for ny in (1, 2)
+}
 NETWORK = MLP(hidden=(3,))
 
 
 def record_of(rng, ny: int, experiments: int = 1) -> Record:
     """A nonlinear system driven by noise, 57 to 64 usable rows in one or more experiments."""
     names = {"outputs": ["y"] if ny == 1 else ["y1", "y2"], "inputs": ["u"]}
-    lengths = np.full(experiments, 64 // experiments + 1) - np.where(np.arange(experiments) == 0, rng.integers(0, 6), 0)
+    lengths = np.full(experiments, 64 // experiments + 1) - np.where(
+        np.arange(experiments) == 0, rng.integers(0, 6), 0
+    )
     pieces = []
     for length in lengths:
         u, e = rng.normal(size=length), 0.1 * rng.normal(size=(length, ny))
         y = np.zeros((length, ny))
         mix = rng.uniform(-0.4, 0.4, (ny, ny))
         for k in range(1, length):
-            y[k] = mix @ y[k - 1] + np.tanh(u[k] + u[k - 1]) * np.array([1.0, -30.0])[:ny] + 0.2 * np.abs(u[k]) + e[k]
+            y[k] = (
+                mix @ y[k - 1]
+                + np.tanh(u[k] + u[k - 1]) * np.array([1.0, -30.0])[:ny]
+                + 0.2 * np.abs(u[k])
+                + e[k]
+            )
         pieces.append(Record.from_arrays(u, y, **names))
     return Record.join(pieces)
 
@@ -85,7 +106,9 @@ class Stacked:
         self.weight = 1 / rows.y.std(axis=0)
         self.raw_phi = fit.problem.baseline.phi(rows.x, rows.layout, fit.problem.outputs, np)
         z = (fit.problem.feature_rows() - numbers.centre) / numbers.halfwidth
-        padded = np.concatenate([z, np.repeat(z[:1], 64 - len(z), axis=0)])  # one shape, one compiled program
+        padded = np.concatenate(
+            [z, np.repeat(z[:1], 64 - len(z), axis=0)]
+        )  # one shape, one compiled program
         values = np.asarray(learner_of(bound)(jnp.asarray(numbers.weights), padded))[: len(z)]
         self.raw_f = numbers.gain * values
         self.phi = (self.raw_phi * self.weight[:, None]).reshape(rows.y.size, -1)
@@ -139,7 +162,9 @@ def test_f1_it_decouples(case, seed):
     for theta in (fit.theta, fit.theta + np.random.default_rng(seed).normal(size=len(fit.theta))):
         prediction = rows.phi @ (theta - fit.model.theta_aux) + rows.f
         physics_alone = np.sum((q.T @ rows.y - r @ theta) ** 2)
-        assert np.sum((rows.y - prediction) ** 2) == pytest.approx(physics_alone + learner_alone, rel=1e-9)
+        assert np.sum((rows.y - prediction) ** 2) == pytest.approx(
+            physics_alone + learner_alone, rel=1e-9
+        )
     assert fit.status.loss == pytest.approx(learner_alone / len(rows.y), rel=1e-9)
     assert fit.defect <= 1e-12
 
@@ -159,13 +184,20 @@ def test_f2_every_structure_spans_the_same_functions(case):
         np.testing.assert_array_equal(x, additive.problem.rows.x)
         return predicted
 
-    split = orthogonalize(additive.problem.record, additive.problem.baseline, from_elsewhere, lags=LAGS)
+    split = orthogonalize(
+        additive.problem.record, additive.problem.baseline, from_elsewhere, lags=LAGS
+    )
     close(split.theta, orthogonal.theta, 1e-8)
     assert split.defect <= 1e-12
     assert split.status.loss == pytest.approx(orthogonal.status.loss, rel=1e-9)
 
 
-LEARNERS = {"network": lambda ny: NETWORK, "function": QUADRATIC.get, "equinox": MODULE.get, "none": lambda ny: None}
+LEARNERS = {
+    "network": lambda ny: NETWORK,
+    "function": QUADRATIC.get,
+    "equinox": MODULE.get,
+    "none": lambda ny: None,
+}
 
 
 @pytest.mark.parametrize("learner", LEARNERS)
@@ -200,7 +232,10 @@ def test_every_combination(structure, regularization, ny, learner):
 
     np.testing.assert_array_equal(first.theta, second.theta)
     np.testing.assert_array_equal(first.model.numbers.weights, second.model.numbers.weights)
-    assert (first.status.loss, first.status.iterations) == (second.status.loss, second.status.iterations)
+    assert (first.status.loss, first.status.iterations) == (
+        second.status.loss,
+        second.status.iterations,
+    )
 
     components = first.model.components(record)
     np.testing.assert_array_equal(components.model, second.model.predict(record).model)
@@ -214,7 +249,9 @@ def test_every_combination(structure, regularization, ny, learner):
         residual.append(((experiment.outputs - trajectory.model) / record_std(first))[1:])
     assert np.mean(np.concatenate(residual) ** 2) == pytest.approx(first.status.loss, rel=1e-9)
 
-    phi = first.problem.baseline.phi(first.problem.rows.x, first.problem.layout, first.problem.outputs, np)
+    phi = first.problem.baseline.phi(
+        first.problem.rows.x, first.problem.layout, first.problem.outputs, np
+    )
     baseline_part = np.concatenate([t.baseline[1:] for t in components.trajectories])
     np.testing.assert_allclose(baseline_part, phi @ first.theta, rtol=1e-10, atol=1e-12)
     moved = np.concatenate([(t.learner_before - t.learner)[1:] for t in components.trajectories])

@@ -33,13 +33,21 @@ def textbook(phi, y, used=0.0):
 @pytest.fixture(scope="module")
 def single():
     record = Record.from_arrays(U, U @ [1.0, 500.0, -0.1] + E[:, 0])
-    return estimate(record, Baseline.from_terms([Term(f"t{i}", f"u{i + 1}[k]") for i in range(3)]), learner=None)
+    return estimate(
+        record, Baseline.from_terms([Term(f"t{i}", f"u{i + 1}[k]") for i in range(3)]), learner=None
+    )
 
 
 @pytest.fixture(scope="module")
 def network():
     example = static(1, noise=True)
-    return estimate(example.train, example.baseline, learner=MLP(hidden=(8,)), regularization="evidence", solver=SOLVER)
+    return estimate(
+        example.train,
+        example.baseline,
+        learner=MLP(hidden=(8,)),
+        regularization="evidence",
+        solver=SOLVER,
+    )
 
 
 def test_physics_alone_is_the_textbook(single):
@@ -47,18 +55,24 @@ def test_physics_alone_is_the_textbook(single):
     np.testing.assert_allclose(single.std, textbook(U, y), rtol=1e-10)
     np.testing.assert_allclose(single.covariance, single.covariance.T, rtol=1e-12)
     assert single.freedom == pytest.approx(ROWS - 3)
-    np.testing.assert_allclose(single.model.statistics.noise, [[np.sum((y - U @ single.theta) ** 2) / (ROWS - 3)]])
+    np.testing.assert_allclose(
+        single.model.statistics.noise, [[np.sum((y - U @ single.theta) ** 2) / (ROWS - 3)]]
+    )
 
 
 def test_interval_is_student_s(single):
     reach = scipy.stats.t.ppf(0.975, ROWS - 3) * single.std
-    np.testing.assert_allclose(single.interval, np.stack([single.theta - reach, single.theta + reach], axis=1))
+    np.testing.assert_allclose(
+        single.interval, np.stack([single.theta - reach, single.theta + reach], axis=1)
+    )
     few = interval(np.array([1.0]), np.array([0.1]), freedom=2.0, level=0.9)
     np.testing.assert_allclose(few[0], 1.0 + 0.1 * scipy.stats.t.ppf([0.05, 0.95], 2))
 
 
 def test_a_learner_uses_up_freedom(network):
-    u, y = (getattr(network.problem.record.experiments[0], name)[:, 0] for name in ("inputs", "outputs"))
+    u, y = (
+        getattr(network.problem.record.experiments[0], name)[:, 0] for name in ("inputs", "outputs")
+    )
     phi = np.stack([u, u**3], axis=1)
     residual = y - network.model.predict(network.problem.record).model[:, 0]
     freedom = len(y) - 2 - network.effective_weights
@@ -84,7 +98,11 @@ def test_nist_standard_deviations(data_folder, name):
     certified = json.loads((data_folder / "nist_linear" / "certified.json").read_text())[name]
     channels = [column for column in table.columns if column != "y"]
     record = Record.from_arrays(table[channels].to_numpy(), table["y"].to_numpy(), inputs=channels)
-    fit = estimate(record, Baseline.from_terms([Term(f"b{i}", t) for i, t in enumerate(NIST[name])]), learner=None)
+    fit = estimate(
+        record,
+        Baseline.from_terms([Term(f"b{i}", t) for i, t in enumerate(NIST[name])]),
+        learner=None,
+    )
     np.testing.assert_allclose(fit.std, np.array(certified["sd"], dtype=float), rtol=1e-8)
 
 
@@ -122,7 +140,11 @@ def test_two_outputs_that_share_parameters_are_a_sandwich():
     )
     zero = np.zeros(ROWS)
     phi = np.stack(
-        [np.stack([U[:, 0], U[:, 1], zero], axis=1), np.stack([U[:, 2] ** 2, -0.6 * U[:, 1], U[:, 2]], axis=1)], axis=1
+        [
+            np.stack([U[:, 0], U[:, 1], zero], axis=1),
+            np.stack([U[:, 2] ** 2, -0.6 * U[:, 1], U[:, 2]], axis=1),
+        ],
+        axis=1,
     )
     deviation = y.std(axis=0)
     psi, target = phi / deviation[:, None], y / deviation
@@ -135,7 +157,9 @@ def test_two_outputs_that_share_parameters_are_a_sandwich():
     sigma = residual.T @ residual / np.sqrt(np.outer(freedom, freedom))
     meat = sum(row.T @ sigma @ row for row in psi)
     np.testing.assert_allclose(fit.covariance, bread @ meat @ bread, rtol=1e-7)
-    np.testing.assert_allclose(fit.model.statistics.noise, sigma * np.outer(deviation, deviation), rtol=1e-8)
+    np.testing.assert_allclose(
+        fit.model.statistics.noise, sigma * np.outer(deviation, deviation), rtol=1e-8
+    )
 
 
 @pytest.mark.parametrize("freedom", [0.0, -1.0, 0.4])
@@ -146,9 +170,18 @@ def test_no_freedom_no_noise(freedom):
 def test_no_degrees_of_freedom_is_said():
     record = Record.from_arrays(U[:8], E[:8, 0])
     physics = Baseline.from_terms([Term("a", "u1[k]"), Term("b", "u3[k]")])
-    fit = estimate(record, physics, learner=MLP(hidden=(8,)), solver=LevenbergMarquardt(30), regularization="none")
+    fit = estimate(
+        record,
+        physics,
+        learner=MLP(hidden=(8,)),
+        solver=LevenbergMarquardt(30),
+        regularization="none",
+    )
     assert fit.std is None and fit.interval is None and fit.model.statistics.noise is None
-    assert any("8 rows leave no degrees of freedom for 2 parameters and" in str(text) for text in fit.warnings)
+    assert any(
+        "8 rows leave no degrees of freedom for 2 parameters and" in str(text)
+        for text in fit.warnings
+    )
     assert fit.parameters["std"].isna().all() and "–" in fit.summary()
 
 
@@ -169,12 +202,18 @@ def test_coverage_of_the_intervals(network, record_property):
     for _ in range(draws):
         e = rng.normal(scale=NOISE_30_DB, size=(1024, 1))
         record = Record.from_arrays(clean.inputs, clean.outputs + e)
-        fit = estimate(record, example.baseline, initial=network, regularization="evidence", solver=SOLVER)
-        np.testing.assert_allclose(fit.theta - example.theta, np.linalg.pinv(phi) @ e[:, 0], atol=1e-12)
+        fit = estimate(
+            record, example.baseline, initial=network, regularization="evidence", solver=SOLVER
+        )
+        np.testing.assert_allclose(
+            fit.theta - example.theta, np.linalg.pinv(phi) @ e[:, 0], atol=1e-12
+        )
         low, high = fit.interval.T
         inside += (low <= example.theta) & (example.theta <= high)
         covered += 2 * scipy.stats.norm.cdf((high - low) / 2 / true) - 1
-    record_property("covered by 95 % [%]", ", ".join(f"{100 * share:.2f}" for share in covered / draws))
+    record_property(
+        "covered by 95 % [%]", ", ".join(f"{100 * share:.2f}" for share in covered / draws)
+    )
     assert (covered / draws >= 0.945).all() and (covered / draws <= 0.955).all()
     assert (inside / draws >= 0.9).all() and (inside < draws).any()
     np.testing.assert_allclose(network.std, true, rtol=0.1)

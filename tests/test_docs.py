@@ -27,24 +27,46 @@ ROOT = Path(__file__).resolve().parents[1]
 SOURCE = ROOT / "src" / "orthaug"
 PAGES = [
     *sorted((ROOT / "docs").rglob("*.md")),
-    *(ROOT / name for name in ("CONTRIBUTING.md", "README.md", "CHANGELOG.md", "examples/README.md")),
+    *(
+        ROOT / name
+        for name in ("CONTRIBUTING.md", "README.md", "CHANGELOG.md", "examples/README.md")
+    ),
 ]
 TEXTS = {str(page.relative_to(ROOT)): page.read_text(encoding="utf-8") for page in PAGES}
 MADE = {  # by functions: nobody writes their arguments
-    *("Estimate", "MotionEstimate", "Model", "MotionModel", "Response", "Trajectory", "Status", "Explanation"),
+    *(
+        "Estimate",
+        "MotionEstimate",
+        "Model",
+        "MotionModel",
+        "Response",
+        "Trajectory",
+        "Status",
+        "Explanation",
+    ),
     *("LinearView", "Linearization", "Selection", "PhysicsMap"),
 }
-DEVELOPERS = ("CONTRIBUTING.md", "docs/design.md", "docs/notation.md")  # their names are the code's, not a spec's
+DEVELOPERS = (
+    "CONTRIBUTING.md",
+    "docs/design.md",
+    "docs/notation.md",
+)  # their names are the code's, not a spec's
 
 
 def backticked(text: str) -> list[str]:
-    return re.findall(r"`([^`\n]+)`", re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE))
+    return re.findall(
+        r"`([^`\n]+)`", re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
+    )
 
 
 def found(path: str, page: str) -> list[Path]:
     """The files that a path in a document means, from its own folder, the root or the sources."""
     places = (ROOT / page).parent, ROOT, SOURCE
-    return [file for place in places for file in ([place / path] if "*" not in path else place.glob(path))]
+    return [
+        file
+        for place in places
+        for file in ([place / path] if "*" not in path else place.glob(path))
+    ]
 
 
 def statements(files: Iterable[Path]) -> list[ast.stmt]:
@@ -61,18 +83,27 @@ def members(name: str, nodes: list[ast.stmt]) -> set[str]:
                     names.add(child.name)
                 elif isinstance(child, ast.AnnAssign | ast.Assign):
                     targets = [child.target] if isinstance(child, ast.AnnAssign) else child.targets
-                    names |= {t.id if isinstance(t, ast.Name) else getattr(t, "attr", "") for t in targets}
-            names = names.union(*(members(base.id, nodes) for base in node.bases if isinstance(base, ast.Name)))
+                    names |= {
+                        t.id if isinstance(t, ast.Name) else getattr(t, "attr", "") for t in targets
+                    }
+            names = names.union(
+                *(members(base.id, nodes) for base in node.bases if isinstance(base, ast.Name))
+            )
     return names
 
 
 def commands_in(text: str) -> set[str]:
     """What follows `orthaug` in backticks, and at the start of a line of fenced code."""
     fenced = "\n".join(re.findall(r"^```.*?^```", text, flags=re.DOTALL | re.MULTILINE))
-    return {*re.findall(r"`orthaug ([a-z]+)", text), *re.findall(r"^(?:\$ )?orthaug ([a-z]+)", fenced, re.MULTILINE)}
+    return {
+        *re.findall(r"`orthaug ([a-z]+)", text),
+        *re.findall(r"^(?:\$ )?orthaug ([a-z]+)", fenced, re.MULTILINE),
+    }
 
 
-COMMANDS = {command.name or getattr(command.callback, "__name__", "") for command in app.registered_commands}
+COMMANDS = {
+    command.name or getattr(command.callback, "__name__", "") for command in app.registered_commands
+}
 
 
 @cache
@@ -82,7 +113,12 @@ def everything() -> list[ast.stmt]:
 
 @cache
 def words() -> set[str]:
-    return set(re.findall(r"\w+", "".join(f.read_text() for d in (SOURCE, ROOT / "tests") for f in d.rglob("*.py"))))
+    return set(
+        re.findall(
+            r"\w+",
+            "".join(f.read_text() for d in (SOURCE, ROOT / "tests") for f in d.rglob("*.py")),
+        )
+    )
 
 
 @pytest.mark.parametrize("page", TEXTS)
@@ -97,17 +133,27 @@ def test_every_file_that_is_named_exists(page):
 @pytest.mark.parametrize("page", TEXTS)
 def test_every_dotted_name_exists(page):
     missing = set()
-    for name in re.findall(r"\b(?:orthaug|oa)(?:\.[A-Za-z_]\w*)+", "\n".join(backticked(TEXTS[page]))):
+    for name in re.findall(
+        r"\b(?:orthaug|oa)(?:\.[A-Za-z_]\w*)+", "\n".join(backticked(TEXTS[page]))
+    ):
         first, *rest = name.replace("oa.", "orthaug.", 1).split(".")[1:]
-        thing = importlib.import_module(f"orthaug.{first}") if first in ROOMS else getattr(orthaug, first, None)
+        thing = (
+            importlib.import_module(f"orthaug.{first}")
+            if first in ROOMS
+            else getattr(orthaug, first, None)
+        )
         for part in rest:
             if hasattr(thing, "__path__") and not hasattr(thing, part):
                 thing = importlib.import_module(f"{thing.__name__}.{part}")
             else:
                 thing = getattr(thing, part, None)
         missing |= {name} if thing is None else set()
-    for owner, attribute in re.findall(r"\b([A-Z]\w+)\.(?!md|csv)([a-z_]\w*)", "\n".join(backticked(TEXTS[page]))):
-        missing |= {f"{owner}.{attribute}"} - {f"{owner}.{one}" for one in members(owner, everything())}
+    for owner, attribute in re.findall(
+        r"\b([A-Z]\w+)\.(?!md|csv)([a-z_]\w*)", "\n".join(backticked(TEXTS[page]))
+    ):
+        missing |= {f"{owner}.{attribute}"} - {
+            f"{owner}.{one}" for one in members(owner, everything())
+        }
     assert missing == set()
 
 
@@ -118,21 +164,28 @@ def test_every_command_that_is_named_exists(page):
 
 def test_every_command_that_the_program_names_exists():
     texts = [
-        file.read_text(encoding="utf-8") for suffix in ("py", "html", "toml") for file in SOURCE.rglob(f"*.{suffix}")
+        file.read_text(encoding="utf-8")
+        for suffix in ("py", "html", "toml")
+        for file in SOURCE.rglob(f"*.{suffix}")
     ]
     named = set().union(*(commands_in(text) for text in texts))
     assert named <= COMMANDS and len(named) > 5
 
 
 def test_commands_are_found_in_texts():
-    text = "`orthaug validate x.toml`\nso orthaug is\n```sh\northaug fit a.toml\n$ orthaug demo\n```\northaug computes"
+    text = (
+        "`orthaug validate x.toml`\nso orthaug is\n```sh\northaug fit a.toml\n$ orthaug "
+        "demo\n```\northaug computes"
+    )
     assert commands_in(text) == {"validate", "fit", "demo"}
 
 
 @pytest.mark.parametrize("page", DEVELOPERS)
 def test_every_name_of_the_code_is_a_word_of_the_code(page):
     named = [text.partition("(")[0].removeprefix("@") for text in backticked(TEXTS[page])]
-    named = [text for text in named if re.fullmatch(r"[A-Za-z]\w*_\w*|[A-Z]\w*[a-z]\w*|[A-Z]{3,}", text)]
+    named = [
+        text for text in named if re.fullmatch(r"[A-Za-z]\w*_\w*|[A-Z]\w*[a-z]\w*|[A-Z]{3,}", text)
+    ]
     assert {name for name in named if name not in words()} == set()
 
 
@@ -150,17 +203,23 @@ def test_the_rooms_are_told_in_their_order():
 
 
 def test_the_learner_of_the_example_is_one_file_and_one_entry(tmp_path):
-    (text,) = re.findall(r"^```python\n(.*?)^```", TEXTS["CONTRIBUTING.md"], re.DOTALL | re.MULTILINE)
+    (text,) = re.findall(
+        r"^```python\n(.*?)^```", TEXTS["CONTRIBUTING.md"], re.DOTALL | re.MULTILINE
+    )
     names: dict = {"__name__": __name__}
     exec(compile(text, "CONTRIBUTING.md", "exec", dont_inherit=True), names)
     polynomial = names["Polynomial"]
     spec = make_project(tmp_path)
     section = '[learner]\nkind = "polynomial"\nhighest = 2\n'
-    spec.write_text(re.sub(r"^\[learner\]\n(?:\w.*\n)*", section, spec.read_text(), flags=re.MULTILINE))
+    spec.write_text(
+        re.sub(r"^\[learner\]\n(?:\w.*\n)*", section, spec.read_text(), flags=re.MULTILINE)
+    )
     with LEARNERS.added("polynomial", polynomial):
         assert load_spec(spec).declared_learner() == polynomial(highest=2)
     assert Bound(polynomial(), nz=2, ny=1).size == 4
-    with pytest.raises(orthaug.InputError, match="`highest` must be a whole number, 2 or more; got 1"):
+    with pytest.raises(
+        orthaug.InputError, match="`highest` must be a whole number, 2 or more; got 1"
+    ):
         polynomial(highest=1)
 
 
@@ -172,9 +231,15 @@ def told(thing: type | object) -> str:
     fields = [
         f"{before.target.id}: {ast.literal_eval(text.value)}"
         for before, text in zip(body.body, body.body[1:], strict=False)  # type: ignore[attr-defined]
-        if isinstance(before, ast.AnnAssign) and isinstance(before.target, ast.Name) and isinstance(text, ast.Expr)
+        if isinstance(before, ast.AnnAssign)
+        and isinstance(before.target, ast.Name)
+        and isinstance(text, ast.Expr)
     ]
-    makers = [inspect.getdoc(member) or "" for name, member in inspect.getmembers(thing) if name.startswith("from_")]
+    makers = [
+        inspect.getdoc(member) or ""
+        for name, member in inspect.getmembers(thing)
+        if name.startswith("from_")
+    ]
     bases = [inspect.getsource(base) for base in thing.__mro__[1:] if base.__name__.startswith("_")]
     return "\n".join([inspect.getdoc(thing) or "", *fields, *makers, *bases])
 
@@ -188,7 +253,9 @@ def test_every_argument_of_a_function_and_of_a_declaration_is_told():
         if inspect.ismodule(thing) or made:
             continue
         arguments = (
-            [f.name for f in fields(thing) if f.init] if inspect.isclass(thing) else inspect.signature(thing).parameters
+            [f.name for f in fields(thing) if f.init]
+            if inspect.isclass(thing)
+            else inspect.signature(thing).parameters
         )
         text = told(thing)
         untold[name] = {one for one in arguments if not re.search(rf"\b{one}\b", text)} - known
@@ -200,4 +267,8 @@ def test_the_most_used_names_have_examples():
     Samples Simulation Prediction prepare Detrend Lowpass Decimate Outliers Shift save Model estimate Suspect
     MotionSuspect export numpy_step identifiability scores Orthogonal verdict diagnose stability bias_budget
     linearize"""
-    assert {name for name in wanted.split() if ">>> " not in (inspect.getdoc(getattr(orthaug, name)) or "")} == set()
+    assert {
+        name
+        for name in wanted.split()
+        if ">>> " not in (inspect.getdoc(getattr(orthaug, name)) or "")
+    } == set()

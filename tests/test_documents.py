@@ -22,7 +22,9 @@ SOURCE = ROOT / "src" / "orthaug"
 PAGES = {page.relative_to(ROOT).as_posix(): page for page in pages()}
 BLOCKS = {name: list(blocks(page.read_text(encoding="utf-8"))) for name, page in PAGES.items()}
 RUNNING = [name for name, found in BLOCKS.items() if any(block.not_run is None for block in found)]
-REFERENCE = "".join(page.read_text(encoding="utf-8") for page in sorted((ROOT / "docs" / "reference").glob("*.md")))
+REFERENCE = "".join(
+    page.read_text(encoding="utf-8") for page in sorted((ROOT / "docs" / "reference").glob("*.md"))
+)
 RESULTS = ("analysis", "selection", "inference")  # rooms whose classes are results
 NOT_RUN = 11
 OPTIONAL = ("casadi", "control", "dask", "distributed", "pyarrow", "sklearn")
@@ -40,7 +42,9 @@ def fresh(tmp_path, monkeypatch) -> Iterator[None]:
     TARGETS.clear()
     TARGETS.update(targets)
     for name in set(sys.modules) - modules:
-        if str(getattr(sys.modules[name], "__file__", None) or "").startswith((str(tmp_path), "mpc")):
+        if str(getattr(sys.modules[name], "__file__", None) or "").startswith(
+            (str(tmp_path), "mpc")
+        ):
             del sys.modules[name]
     while given.OPEN:
         given.OPEN.pop().close()
@@ -58,7 +62,9 @@ def test_the_page_runs(name):
                 if error.name not in OPTIONAL:
                     raise
                 pytest.skip(f"no {error.name}")
-            assert block.prints is None or differences(block.prints, printed) == [], f"{name}:{block.line}"
+            assert block.prints is None or differences(block.prints, printed) == [], (
+                f"{name}:{block.line}"
+            )
 
 
 def test_few_blocks_are_not_run_and_each_says_why():
@@ -74,7 +80,9 @@ def test_few_blocks_are_not_run_and_each_says_why():
 
 
 def test_every_public_name_is_in_the_reference():
-    public = re.findall(r"^from \.[\w.]+ import (\w+) as \1$", (SOURCE / "__init__.pyi").read_text(), re.MULTILINE)
+    public = re.findall(
+        r"^from \.[\w.]+ import (\w+) as \1$", (SOURCE / "__init__.pyi").read_text(), re.MULTILINE
+    )
     told = re.findall(r"^::: orthaug\.(\w+)$", REFERENCE, re.MULTILINE)
     assert sorted(told) == sorted(public) and len(public) > 80
 
@@ -83,7 +91,9 @@ def test_what_functions_return_is_in_the_reference():
     """Every class of ours that a public function returns, and every class of a result that its fields hold."""
     classes: dict[str, list[tuple[str, ast.ClassDef]]] = {}
     public = set(orthaug.__all__)
-    annotations = [str(getattr(getattr(orthaug, name), "__annotations__", {}).get("return")) for name in public]
+    annotations = [
+        str(getattr(getattr(orthaug, name), "__annotations__", {}).get("return")) for name in public
+    ]
     for file in sorted(SOURCE.rglob("*.py")):
         for node in parsed(file).body:
             if isinstance(node, ast.ClassDef):
@@ -93,18 +103,34 @@ def test_what_functions_return_is_in_the_reference():
         name
         for owner in returned | (public & set(classes))
         for room, node in classes[owner]
-        if room in RESULTS and (owner in returned or f"orthaug.{room}." in getattr(orthaug, owner).__module__)
+        if room in RESULTS
+        and (owner in returned or f"orthaug.{room}." in getattr(orthaug, owner).__module__)
         for child in node.body
         if isinstance(child, ast.AnnAssign)
         for name in re.findall(r"\b[A-Z]\w+", ast.unparse(child.annotation))
         if any(room in RESULTS for room, _ in classes.get(name, ()))
     }
-    assert {"Verdict", "Budget", "Diagnosis", "Job", "Fitted"} <= returned and "SuspectedBias" in held
+    assert {
+        "Verdict",
+        "Budget",
+        "Diagnosis",
+        "Job",
+        "FitReport",
+    } <= returned and "SuspectedBias" in held
     told = re.findall(r"^::: orthaug\.(?:[\w.]+\.)?(\w+)$", REFERENCE, re.MULTILINE)
     assert (returned | held) - set(told) == set()
-    assert {"PhysicalEstimate", "Observations", "Tracking", "Alarm", "FitPlots", "Page"} <= set(told)
+    assert {
+        "PhysicalEstimate",
+        "Observations",
+        "ObserverState",
+        "Alarm",
+        "FitPlots",
+        "Page",
+    } <= set(told)
     for shown in ("Estimate", "MotionEstimate"):
-        assert re.search(rf"^::: orthaug\.{shown}\n    options: .*plot, report", REFERENCE, re.MULTILINE)
+        assert re.search(
+            rf"^::: orthaug\.{shown}\n    options: .*plot, report", REFERENCE, re.MULTILINE
+        )
 
 
 def test_every_page_is_in_the_navigation():
@@ -118,11 +144,14 @@ def test_every_warning_has_a_row_with_a_remedy():
         node
         for file in SOURCE.rglob("*.py")
         for node in ast.walk(parsed(file))
-        if isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("Warning", "WarningResult")
+        if isinstance(node, ast.Call)
+        and getattr(node.func, "id", "") in ("Warning", "WarningResult")
     ]
     first = [call.args[0] if call.args else call.keywords[0].value for call in calls]
     codes = {node.value for node in first if isinstance(node, ast.Constant)}
-    rows = re.findall(r"^\| (`.+`) \| .+ \| .+ \|$", (ROOT / "docs/guide/trouble.md").read_text(), re.MULTILINE)
+    rows = re.findall(
+        r"^\| (`.+`) \| .+ \| .+ \|$", (ROOT / "docs/guide/trouble.md").read_text(), re.MULTILINE
+    )
     assert len(codes) > 50 and codes - set(re.findall(r"`(\w+)`", " ".join(rows))) == set()
 
 
@@ -164,15 +193,26 @@ def test_a_page_of_the_site_that_loads_from_a_network_is_found(monkeypatch):
         '<img src="http://x.y/z.png">',
     ):
         assert hooks.LOADED.search(tag)
-    assert not hooks.LOADED.search('<a href="https://x.y"><img src="figures/a.png"><script src="../assets/a.js">')
+    assert not hooks.LOADED.search(
+        '<a href="https://x.y"><img src="figures/a.png"><script src="../assets/a.js">'
+    )
     linked = hooks.targets(
-        "[a](../examples/mpc.py) [b](https://x.y) [c](spec.md#data) [d](absent.md)", "docs/export.md"
+        "[a](../examples/mpc.py) [b](https://x.y) [c](spec.md#data) [d](absent.md)",
+        "docs/export.md",
     )
     assert linked == {"../examples/mpc.py": "examples/mpc.py", "spec.md": "docs/spec.md"}
     section = '<nav class="md-nav" data-md-level="1" aria-labelledby="l">'
     named = hooks.NAMED.sub(
-        r'\1 aria-label="\3"\2\3', f'{section} <label class="md-nav__title"><span></span> Theory </label>'
+        r'\1 aria-label="\3"\2\3',
+        f'{section} <label class="md-nav__title"><span></span> Theory </label>',
     )
     assert named.startswith('<nav class="md-nav" data-md-level="1" aria-label="Theory">')
-    assert hooks.boost("export.md") > hooks.boost("reference/further.md") > hooks.boost("repository/README.md")
-    assert hooks.place("examples/mpc.py") == "repository/examples/mpc.py" and hooks.place("docs/spec.md") == "spec.md"
+    assert (
+        hooks.boost("export.md")
+        > hooks.boost("reference/further.md")
+        > hooks.boost("repository/README.md")
+    )
+    assert (
+        hooks.place("examples/mpc.py") == "repository/examples/mpc.py"
+        and hooks.place("docs/spec.md") == "spec.md"
+    )

@@ -11,8 +11,8 @@ import pytest
 from orthaug._base.jax import jax, jnp
 from orthaug.data.record import Record
 from orthaug.data.regressors import Lags
-from orthaug.fitting.segments import lay_segments, respond, sensitivity
-from orthaug.models.dynamics import Differentiated, Dynamics, Numbers, Parts
+from orthaug.fitting.segments import build_segments, respond, sensitivity
+from orthaug.models.dynamics import AutodiffDynamics, Dynamics, Numbers, Parts
 from orthaug.models.lagged import Lagged
 from orthaug.models.learners import MLP, Bound
 from orthaug.physics.baseline import Baseline, Term
@@ -22,12 +22,21 @@ from orthaug.physics.problem import pose
 
 
 @dataclass(frozen=True)
-class Generic(Differentiated, Lagged):
+class Generic(AutodiffDynamics, Lagged):
     """The lagged form by automatic differentiation of its step."""
 
 
-ONE = [Term("a", "y1[k-1]"), Term("b", "y1[k-3]"), Term("g", "sin(u1[k-1])"), Term("d", "y1[k-2]", 0.2, fixed=True)]
-TWO = [Term("a", "y1[k-1]", output="y1"), Term("a", "y2[k-2]", output="y2"), Term("b", "y1[k-1]*u1[k]", output="y2")]
+ONE = [
+    Term("a", "y1[k-1]"),
+    Term("b", "y1[k-3]"),
+    Term("g", "sin(u1[k-1])"),
+    Term("d", "y1[k-2]", 0.2, fixed=True),
+]
+TWO = [
+    Term("a", "y1[k-1]", output="y1"),
+    Term("a", "y2[k-2]", output="y2"),
+    Term("b", "y1[k-1]*u1[k]", output="y2"),
+]
 FORMS = {
     "one output": (1, ONE, None, MLP(hidden=(3,))),
     "two outputs": (2, TWO, Lags(2, 2, 0), MLP(hidden=(3,))),
@@ -56,7 +65,10 @@ def form_of(name):
 def runs(dynamics, numbers, inputs, steps=6):
     """(states, slopes as (n0, n0 + n, m), outputs, their slopes) after every step of m runs side by side."""
     rng = np.random.default_rng(3)
-    state, slopes = jnp.asarray(rng.normal(size=(dynamics.states, WIDTH))), dynamics.first_slopes(WIDTH)
+    state, slopes = (
+        jnp.asarray(rng.normal(size=(dynamics.states, WIDTH))),
+        dynamics.first_slopes(WIDTH),
+    )
     found, tangents = [], jax.jit(dynamics.tangents)
     for k in range(steps):
         row = jnp.stack([inputs[k + 7 * m] for m in range(WIDTH)], axis=-1)
@@ -82,7 +94,9 @@ def test_tangents_of_the_lagged_form_are_those_of_its_step(name):
     for own, other in zip(runs(form, numbers, inputs), runs(generic, numbers, inputs), strict=True):
         for one, two in zip(own, other, strict=True):
             assert one.shape == two.shape
-            np.testing.assert_allclose(one, two, rtol=1e-12, atol=1e-12 * np.max(np.abs(two), initial=1.0))
+            np.testing.assert_allclose(
+                one, two, rtol=1e-12, atol=1e-12 * np.max(np.abs(two), initial=1.0)
+            )
     assert own[3].shape == (len(form.outputs), form.states + form.unknowns, WIDTH)
 
 
@@ -99,9 +113,11 @@ def test_sensitivities_are_those_of_the_generic_form(name):
     """The Gram matrices too, which the layout of the slopes must not change."""
     form, numbers, record = form_of(name)
     generic = Generic(form.baseline, form.features, form.layout, form.outputs, form.bound)
-    segments = lay_segments(record, form, 9, 3)
+    segments = build_segments(record, form, 9, 3)
     weight = jnp.asarray(np.random.default_rng(0).normal(size=(len(form.outputs),) * 2))
-    found, other = (sensitivity(d, numbers, segments, segments.start, weight) for d in (form, generic))
+    found, other = (
+        sensitivity(d, numbers, segments, segments.start, weight) for d in (form, generic)
+    )
     for one, two in zip(found, other, strict=True):
         np.testing.assert_allclose(one, two, rtol=0, atol=1e-11 * np.max(np.abs(two)))
 
@@ -110,7 +126,7 @@ def test_sensitivities_are_those_of_the_generic_form(name):
 
 
 @dataclass(frozen=True)
-class StateSpace(Differentiated):
+class StateSpace(AutodiffDynamics):
     """x⁺ = A x + B u, ŷ = C x, with all entries of A, B and C in θ; the state is not known from measured outputs."""
 
     outputs: tuple[str, ...]
@@ -161,10 +177,12 @@ def state_space(ny):
     """(dynamics, numbers, record, segments, states that differ from the start)."""
     rng = np.random.default_rng(ny)
     dynamics = StateSpace(tuple(f"y{i}" for i in range(ny)), 3, 2)
-    pieces = [Record.from_arrays(rng.normal(size=(n, 2)), rng.normal(size=(n, ny))) for n in (19, 11)]
+    pieces = [
+        Record.from_arrays(rng.normal(size=(n, 2)), rng.normal(size=(n, ny))) for n in (19, 11)
+    ]
     record = Record.join(pieces)
     theta = 0.4 * rng.normal(size=dynamics.unknowns)
-    segments = lay_segments(record, dynamics, SEGMENT, WASHOUT)
+    segments = build_segments(record, dynamics, SEGMENT, WASHOUT)
     states = rng.normal(size=segments.start.shape)
     numbers = Numbers(theta, 0 * theta, *NO_LEARNER, np.zeros(ny))
     return dynamics, numbers, record, segments, states
@@ -192,11 +210,15 @@ def test_segments_of_a_state_space(ny):
     """From the first row on; a state that is not measured starts as `start` says."""
     dynamics, _, record, segments, _ = state_space(ny)
     assert segments.start.shape[1] == 3 and not np.asarray(segments.start).any()
-    assert segments.steps == SEGMENT and segments.count == sum(len(e) - WASHOUT for e in record.experiments)
+    assert segments.steps == SEGMENT and segments.count == sum(
+        len(e) - WASHOUT for e in record.experiments
+    )
     first = np.asarray(segments.inputs)[0, :, :, 0]
     np.testing.assert_array_equal(first, record.experiments[0].inputs[:SEGMENT])
-    np.testing.assert_array_equal(np.asarray(segments.target)[0, :, :, 0], record.experiments[0].outputs[:SEGMENT])
-    whole = lay_segments(record, replace(dynamics, first_row=4), 0, 0)
+    np.testing.assert_array_equal(
+        np.asarray(segments.target)[0, :, :, 0], record.experiments[0].outputs[:SEGMENT]
+    )
+    whole = build_segments(record, replace(dynamics, first_row=4), 0, 0)
     assert whole.count == sum(len(e) - 4 for e in record.experiments)
 
 
@@ -222,10 +244,14 @@ def test_sensitivities_of_a_state_space_are_those_of_a_loop(ny):
 
     theta = jnp.asarray(numbers.theta)
     by_state, by_theta = jax.jit(jax.jacfwd(outputs, (0, 1)))(states, theta)
-    error = np.einsum("oi,ktim->ktom", weight, np.where(scored, target, 0.0)) - outputs(states, theta)
+    error = np.einsum("oi,ktim->ktom", weight, np.where(scored, target, 0.0)) - outputs(
+        states, theta
+    )
     columns = np.concatenate([by_theta, error[..., None]], axis=-1)
     rows = columns.reshape(-1, columns.shape[-1])
-    np.testing.assert_allclose(found.shared, rows.T @ rows, rtol=0, atol=1e-10 * np.max(np.abs(rows.T @ rows)))
+    np.testing.assert_allclose(
+        found.shared, rows.T @ rows, rtol=0, atol=1e-10 * np.max(np.abs(rows.T @ rows))
+    )
     for k in range(states.shape[0]):
         for m in range(states.shape[2]):
             start = np.asarray(by_state)[k, :, :, m, k, :, m].reshape(-1, 3)
@@ -242,4 +268,6 @@ def test_a_longer_run_forgets_nothing():
     state, slopes, tangents = np.zeros((3, 1)), dynamics.first_slopes(1), jax.jit(dynamics.tangents)
     for _ in range(12):
         state, slopes, _, slope = tangents(numbers, state, slopes, np.ones((2, 1)))
-    np.testing.assert_allclose(slope[:, :3, 0], c @ np.linalg.matrix_power(a, 11), rtol=1e-10, atol=1e-14)
+    np.testing.assert_allclose(
+        slope[:, :3, 0], c @ np.linalg.matrix_power(a, 11), rtol=1e-10, atol=1e-14
+    )

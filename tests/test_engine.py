@@ -27,7 +27,10 @@ from orthaug.physics.baseline import Baseline, Term
 from orthaug.physics.problem import pose
 from orthaug.physics.streamed import streamed
 
-SIZE, ROWS = 53, 160  # 159 rows after the first: three chunks of one size, which share their compiled programs
+SIZE, ROWS = (
+    53,
+    160,
+)  # 159 rows after the first: three chunks of one size, which share their compiled programs
 
 
 @dataclass(frozen=True)
@@ -48,18 +51,32 @@ def posed(ny, lower=None):
     rng = np.random.default_rng(ny)
     u, y = rng.uniform(-1, 1, ROWS), np.zeros((ROWS, ny))
     for k in range(1, ROWS):
-        y[k, 0] = 0.5 * y[k - 1, 0] + u[k - 1] + 0.3 * np.tanh(2 * u[k - 1] * y[k - 1, 0]) + 0.4 * u[k] ** 2
+        y[k, 0] = (
+            0.5 * y[k - 1, 0]
+            + u[k - 1]
+            + 0.3 * np.tanh(2 * u[k - 1] * y[k - 1, 0])
+            + 0.4 * u[k] ** 2
+        )
         if ny == 2:
             y[k, 1] = 3 * y[k - 1, 0] + 0.5 * y[k - 1, 1] - 2 * u[k - 1] ** 2
     y = y + rng.normal(size=y.shape) * ([0.05, 0.2][:ny])
-    terms = [Term("a", "y1[k-1]", lower or 0.4, output="y1", min=lower), Term("g", "u[k-1]", 0.8, output="y1")]
-    terms += [Term("h", "y1[k-1]", 2.0, output="y2"), Term("a", "y2[k-1]", output="y2")] if ny == 2 else []
+    terms = [
+        Term("a", "y1[k-1]", lower or 0.4, output="y1", min=lower),
+        Term("g", "u[k-1]", 0.8, output="y1"),
+    ]
+    terms += (
+        [Term("h", "y1[k-1]", 2.0, output="y2"), Term("a", "y2[k-1]", output="y2")]
+        if ny == 2
+        else []
+    )
     record = Record.from_arrays(u, y, outputs=["y1", "y2"][:ny])
     return pose(record, Baseline.from_terms(terms), Lags(na=1, nb=2, nk=0))
 
 
 EXACT = LevenbergMarquardt(iterations=400, tolerance=1e-13)
-EARLY = LevenbergMarquardt(iterations=20, tolerance=1e-13)  # without a ridge, before rounding has grown
+EARLY = LevenbergMarquardt(
+    iterations=20, tolerance=1e-13
+)  # without a ridge, before rounding has grown
 STRUCTURES = (Orthogonal(), Additive(), OrthogonalPenalty(1.0), BaselinePenalty(1.0))
 REGULARIZATIONS = ("none", 0.1, "evidence")
 CASES = [  # each structure with one and two outputs, each regularisation with each number of outputs
@@ -78,7 +95,12 @@ def named(value):
 def both(structure, regularization, ny, lower=None):
     """The same fit with rows in memory, and streamed."""
     solver = EARLY if regularization == "none" else EXACT
-    options = {"learner": MLP(hidden=(3,)), "solver": solver, "structure": structure, "regularization": regularization}
+    options = {
+        "learner": MLP(hidden=(3,)),
+        "solver": solver,
+        "structure": structure,
+        "regularization": regularization,
+    }
     return fit(posed(ny, lower), **options), fit(posed(ny, lower), engine=Streaming(), **options)
 
 
@@ -88,7 +110,9 @@ def apart(found, expected):
 
 
 def prediction(found):
-    return np.concatenate([t.model[t.start :] for t in found.model.predict(found.problem.record).trajectories])
+    return np.concatenate(
+        [t.model[t.start :] for t in found.model.predict(found.problem.record).trajectories]
+    )
 
 
 def test_it_is_an_engine():
@@ -118,19 +142,29 @@ def test_streamed_rows_end_in_the_same_conclusions(structure, regularization, ny
         assert max(streamed.defect, memory.defect) <= 1e-12
         np.testing.assert_allclose(streamed.std, memory.std, rtol=1e-5)
     else:
-        assert streamed.defect == pytest.approx(memory.defect, rel=1e-4) and streamed.std is memory.std is None
+        assert (
+            streamed.defect == pytest.approx(memory.defect, rel=1e-4)
+            and streamed.std is memory.std is None
+        )
 
 
-@pytest.mark.parametrize(("structure", "ny"), [*zip(STRUCTURES, (2, 1, 2, 1), strict=True)], ids=named)
+@pytest.mark.parametrize(
+    ("structure", "ny"), [*zip(STRUCTURES, (2, 1, 2, 1), strict=True)], ids=named
+)
 def test_conclusions_of_the_same_weights_are_the_same(structure, ny):
     """Nothing trained: what differs is the order of sums alone."""
     options = {"learner": MLP(hidden=(3,)), "solver": LevenbergMarquardt(0), "structure": structure,
                "regularization": 0.1}  # fmt: skip
-    memory, streamed = (fit(posed(ny), engine=engine, **options) for engine in (InMemory(), Streaming()))
+    memory, streamed = (
+        fit(posed(ny), engine=engine, **options) for engine in (InMemory(), Streaming())
+    )
     np.testing.assert_array_equal(streamed.model.numbers.weights, memory.model.numbers.weights)
     assert apart(streamed.theta, memory.theta) <= 1e-11
     for name in ("gram", "middle", "noise"):
-        assert apart(getattr(streamed.model.statistics, name), getattr(memory.model.statistics, name)) <= 1e-11
+        assert (
+            apart(getattr(streamed.model.statistics, name), getattr(memory.model.statistics, name))
+            <= 1e-11
+        )
     assert streamed.status.loss == pytest.approx(memory.status.loss, rel=1e-12)
     assert streamed.effective_weights == pytest.approx(memory.effective_weights, rel=1e-9)
     assert streamed.model.statistics.ridge == memory.model.statistics.ridge
@@ -144,7 +178,9 @@ def test_the_path_of_the_host_s_loop_is_that_of_the_compiled_one(structure):
     options = {"learner": MLP(hidden=(3,)), "structure": structure, "regularization": 0.1}
     for steps in (1, 9):
         solver = LevenbergMarquardt(steps, tolerance=1e-13)
-        memory, streamed = (fit(posed(1), solver=solver, engine=e, **options) for e in (InMemory(), Streaming()))
+        memory, streamed = (
+            fit(posed(1), solver=solver, engine=e, **options) for e in (InMemory(), Streaming())
+        )
         assert memory.status.iterations == streamed.status.iterations == steps
         assert apart(streamed.model.numbers.weights, memory.model.numbers.weights) <= 1e-10
 
@@ -156,7 +192,9 @@ LINEAR = Function(lambda w, z: w @ (z**2 - z**3), lambda key: 0.1 * jax.random.n
 def test_a_learner_that_is_linear_in_its_weights_ends_at_the_same_place(structure):
     """Without a ridge: the minimum is one point, whatever the way there."""
     options = {"learner": LINEAR, "solver": EXACT, "structure": structure}
-    memory, streamed = (fit(posed(2), engine=engine, **options) for engine in (InMemory(), Streaming()))
+    memory, streamed = (
+        fit(posed(2), engine=engine, **options) for engine in (InMemory(), Streaming())
+    )
     assert memory.status.code == streamed.status.code == "converged"
     assert apart(streamed.theta, memory.theta) <= 1e-10
     assert apart(prediction(streamed), prediction(memory)) <= 1e-10
@@ -167,10 +205,14 @@ def test_a_learner_that_is_linear_in_its_weights_ends_at_the_same_place(structur
 
 
 def test_physics_alone():
-    memory, streamed = (fit(posed(2), learner=None, engine=engine) for engine in (InMemory(), Streaming()))
+    memory, streamed = (
+        fit(posed(2), learner=None, engine=engine) for engine in (InMemory(), Streaming())
+    )
     np.testing.assert_array_equal(streamed.theta, memory.theta)
     np.testing.assert_allclose(streamed.covariance, memory.covariance, rtol=1e-12)
-    np.testing.assert_allclose(streamed.model.statistics.noise, memory.model.statistics.noise, rtol=1e-12)
+    np.testing.assert_allclose(
+        streamed.model.statistics.noise, memory.model.statistics.noise, rtol=1e-12
+    )
 
 
 def test_bounds_that_reach_into_training():
@@ -183,7 +225,9 @@ def test_bounds_that_reach_into_training():
 def test_an_ensemble_and_a_validation():
     options = {"learner": MLP(hidden=(3,)), "solver": LevenbergMarquardt(15), "restarts": 3,
                "regularization": [0.1, 1.0], "validation": posed(1).record, "ensemble": True}  # fmt: skip
-    memory, streamed = (fit(posed(1), engine=engine, **options) for engine in (InMemory(), Streaming()))
+    memory, streamed = (
+        fit(posed(1), engine=engine, **options) for engine in (InMemory(), Streaming())
+    )
     assert [r.chosen for r in streamed.restarts] == [r.chosen for r in memory.restarts]
     np.testing.assert_allclose(streamed.theta, memory.theta, rtol=1e-10)
     assert apart(prediction(streamed), prediction(memory)) <= 1e-6
@@ -202,7 +246,9 @@ def test_a_learner_in_the_span_of_the_physics_has_converged(regularization):
     record = Record.from_arrays(u, u @ [1.0, -2.0] + 0.1 * rng.normal(size=106))
     problem = pose(record, Baseline.from_terms([Term("a", "u1[k]"), Term("b", "u2[k]")]))
     options = {"learner": IN_THE_SPAN, "regularization": regularization}
-    memory, streamed = (fit(problem, engine=engine, **options) for engine in (InMemory(), Streaming()))
+    memory, streamed = (
+        fit(problem, engine=engine, **options) for engine in (InMemory(), Streaming())
+    )
     for found in (memory, streamed):
         assert found.status.ending is Ending.SPANNED and found.status.code == "converged"
         assert found.status.iterations == 0
@@ -220,13 +266,19 @@ def test_a_start_that_is_not_finite():
 
 def test_adam_needs_rows_in_memory():
     options = {"learner": MLP(hidden=(3,)), "solver": AdamLBFGS(2, 2)}
-    with pytest.raises(InputError, match="training on rows that are not in memory needs .*levenberg-marquardt"):
+    with pytest.raises(
+        InputError, match="training on rows that are not in memory needs .*levenberg-marquardt"
+    ):
         fit(posed(1), engine=Streaming(), **options)
 
 
 def test_progress_is_told_as_a_mean_square():
     told = []
-    options = {"learner": MLP(hidden=(3,)), "solver": LevenbergMarquardt(6), "regularization": "none"}
+    options = {
+        "learner": MLP(hidden=(3,)),
+        "solver": LevenbergMarquardt(6),
+        "regularization": "none",
+    }
     found = fit(posed(1), engine=Streaming(), progress=lambda *at: told.append(at), **options)
     assert [(run, n) for run, n, _ in told] == [(0, n + 1) for n in range(found.status.iterations)]
     assert told[-1][2] == pytest.approx(found.status.loss, rel=1e-9)
@@ -262,8 +314,10 @@ def test_sums_over_lists_are_sums_over_chunks():
     w, mix = jnp.asarray(bound.init(jax.random.key(0))), jnp.asarray(rng.normal(size=(ny, ny)))
     found = []
     for engine in (InMemory(limit=16), InMemory(), Streaming()):
-        laid = engine.lay(*rows)
-        found.append((engine.sum(Overlaps(bound), laid, w), engine.sum(MixedGram(bound), laid, w, mix)))
+        laid = engine.build_rows(*rows)
+        found.append(
+            (engine.sum(Overlaps(bound), laid, w), engine.sum(MixedGram(bound), laid, w, mix))
+        )
     for other in found[1:]:
         for one, two in zip(jax.tree.leaves(found[0]), jax.tree.leaves(other), strict=True):
             assert apart(two, one) <= 1e-13
@@ -271,9 +325,15 @@ def test_sums_over_lists_are_sums_over_chunks():
 
 def test_a_free_run_of_two_outputs_with_a_bound():
     """θ's bound makes c follow the learner's share; the outputs' covariance is taken in a second leg."""
-    options = {"learner": MLP(hidden=(2,)), "criterion": Simulation(20, 2, start_iterations=0), "blocks": 0}
+    options = {
+        "learner": MLP(hidden=(2,)),
+        "criterion": Simulation(20, 2, start_iterations=0),
+        "blocks": 0,
+    }
     options |= {"structure": Orthogonal(), "solver": LevenbergMarquardt(12), "fallback": False}
-    memory, streamed = (fit(posed(2, 0.55), engine=engine, **options) for engine in (InMemory(), Streaming()))
+    memory, streamed = (
+        fit(posed(2, 0.55), engine=engine, **options) for engine in (InMemory(), Streaming())
+    )
     np.testing.assert_allclose(streamed.theta, memory.theta, rtol=1e-10)
     assert streamed.status.loss == pytest.approx(memory.status.loss, rel=1e-8)
     assert streamed.at_bound == memory.at_bound
@@ -281,7 +341,9 @@ def test_a_free_run_of_two_outputs_with_a_bound():
 
 def test_chunks_of_another_size():
     options = {"learner": MLP(hidden=(3,)), "solver": LevenbergMarquardt(20), "regularization": 0.1}
-    memory, streamed = (fit(posed(1), engine=engine, **options) for engine in (InMemory(), Streaming(37)))
+    memory, streamed = (
+        fit(posed(1), engine=engine, **options) for engine in (InMemory(), Streaming(37))
+    )
     np.testing.assert_allclose(streamed.theta, memory.theta, rtol=1e-10)
     assert streamed.status.loss == pytest.approx(memory.status.loss, rel=1e-9)
 
@@ -298,9 +360,16 @@ def test_a_problem_of_a_source_is_that_of_its_record(structure, regularization, 
     assert there.count == problem.count
     np.testing.assert_allclose(there.least_squares, problem.least_squares, rtol=1e-13)
     np.testing.assert_allclose(there.freedom_used, problem.freedom_used, rtol=1e-13)
-    assert there.unexplained_moments.square == pytest.approx(problem.unexplained_moments.square, rel=1e-13)
+    assert there.unexplained_moments.square == pytest.approx(
+        problem.unexplained_moments.square, rel=1e-13
+    )
     solver = LevenbergMarquardt(20, tolerance=1e-13)
-    options = {"learner": MLP(hidden=(3,)), "solver": solver, "structure": structure, "regularization": regularization}
+    options = {
+        "learner": MLP(hidden=(3,)),
+        "solver": solver,
+        "structure": structure,
+        "regularization": regularization,
+    }
     memory, streamed_fit = fit(problem, **options), fit(there, engine=engine, **options)
     assert apart(streamed_fit.theta, memory.theta) <= 1e-9
     assert streamed_fit.status.loss == pytest.approx(memory.status.loss, rel=1e-9)
@@ -332,7 +401,10 @@ def test_what_is_wrong_with_a_row_is_found_where_it_is():
     baseline = Baseline.from_terms([Term("a", "u[k]"), Term("b", "log(u[k])")])
     problem = pose(record, baseline)
     problem.record.experiments[0].inputs[137] = -1.0  # behind the problem's back
-    with pytest.raises(InputError, match=r"run.csv: row 137: the regressor of b \(log\(u\[k\]\)\) is not finite there"):
+    with pytest.raises(
+        InputError,
+        match=r"run.csv: row 137: the regressor of b \(log\(u\[k\]\)\) is not finite there",
+    ):
         streamed(problem, source(problem, 50), Stream().passes)
 
 
@@ -359,4 +431,6 @@ def test_reading_ahead_stops_when_nobody_asks():
             break
     count = len(made)
     assert count <= 12
-    assert len(made) == count and not any(t.name == "orthaug-read-ahead" for t in threading.enumerate())
+    assert len(made) == count and not any(
+        t.name == "orthaug-read-ahead" for t in threading.enumerate()
+    )

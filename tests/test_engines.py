@@ -73,7 +73,12 @@ def folder(tmp_path_factory):
     rng = np.random.default_rng(0)
     u, y = rng.uniform(-1, 1, ROWS), np.zeros(ROWS)
     for k in range(2, ROWS):
-        y[k] = 1.5 * y[k - 1] - 0.7 * y[k - 2] + 0.1 * u[k - 1] - 0.05 * math.tanh(8 * (y[k - 1] - y[k - 2]))
+        y[k] = (
+            1.5 * y[k - 1]
+            - 0.7 * y[k - 2]
+            + 0.1 * u[k - 1]
+            - 0.05 * math.tanh(8 * (y[k - 1] - y[k - 2]))
+        )
         y[k] += 1e-3 * rng.normal()
     frame = pd.DataFrame({"u": u, "y": y, "run": np.repeat([1, 2, 3, 4], ROWS // 4)})
     (place / "runs").mkdir()
@@ -98,9 +103,15 @@ def differences(one, other, place=""):
     """Where two results differ by more than rounding."""
     if isinstance(one, dict) and isinstance(other, dict):
         keys = sorted({*one, *other})
-        return [d for key in keys for d in differences(one.get(key), other.get(key), f"{place}/{key}")]
+        return [
+            d for key in keys for d in differences(one.get(key), other.get(key), f"{place}/{key}")
+        ]
     if isinstance(one, list) and isinstance(other, list) and len(one) == len(other):
-        return [d for i, pair in enumerate(zip(one, other, strict=True)) for d in differences(*pair, f"{place}[{i}]")]
+        return [
+            d
+            for i, pair in enumerate(zip(one, other, strict=True))
+            for d in differences(*pair, f"{place}[{i}]")
+        ]
     numbers = isinstance(one, float) and isinstance(other, float)
     same = np.isclose(one, other, rtol=1e-6, atol=1e-11) if numbers else one == other
     return [] if same else [f"{place}: {one} {other}"]
@@ -113,7 +124,9 @@ def check_same(found, expected):
     assert found["status"]["loss"] == pytest.approx(expected["status"]["loss"], rel=1e-8)
     left_out = ["/spec/engine", "/status/seconds", "/physics_alone", "/advice"]
     streamed = found["standard_errors"] == "plain"
-    if streamed and expected.get("standard_errors_by") == "hc3":  # it needs the derivative of every row at once
+    if (
+        streamed and expected.get("standard_errors_by") == "hc3"
+    ):  # it needs the derivative of every row at once
         for parameter, other in zip(found["parameters"], expected["parameters"], strict=True):
             assert parameter["std"] == pytest.approx(other["plain_std"], rel=1e-6)
             for key in ("std", "plain_std", "ci95", "ci95_with_bias"):
@@ -141,8 +154,12 @@ def test_the_residual_of_all_rows_is_tested_where_a_witness_stands_for_them(fold
     (running,), (wanted,) = found["scores"]["train"]["residual"], whole["residuals"]["one_step"]
     assert running["n"] == wanted["n"] > found["residuals"]["one_step"][0]["n"]
     np.testing.assert_allclose(running["acf"], wanted["acf"], atol=1e-6)
-    np.testing.assert_allclose(running["cross"]["u"]["values"], wanted["cross"]["u"]["values"], atol=1e-6)
-    assert running["ljung_box"]["statistic"] == pytest.approx(wanted["ljung_box"]["statistic"], rel=1e-5)
+    np.testing.assert_allclose(
+        running["cross"]["u"]["values"], wanted["cross"]["u"]["values"], atol=1e-6
+    )
+    assert running["ljung_box"]["statistic"] == pytest.approx(
+        wanted["ljung_box"]["statistic"], rel=1e-5
+    )
 
 
 @pytest.fixture(scope="module")
@@ -170,7 +187,9 @@ def test_a_cluster_gives_the_result_of_rows_in_memory(folder, cluster, undisturb
     check_same(on_cluster(folder, cluster, *CASES[1]), fitted(folder, "memory", *CASES[1]))
 
 
-BASELINE = oa.Baseline.from_terms([oa.Term("a", "y[k-1]"), oa.Term("b", "y[k-2]"), oa.Term("c", "u[k-1]")])
+BASELINE = oa.Baseline.from_terms(
+    [oa.Term("a", "y[k-1]"), oa.Term("b", "y[k-2]"), oa.Term("c", "u[k-1]")]
+)
 OPTIONS = {"lags": oa.Lags(na=2, nb=2), "learner": oa.MLP(hidden=(3,)), "solver": oa.LevenbergMarquardt(20),
            "regularization": "none"}  # fmt: skip
 COLUMNS = {"inputs": ["u"], "outputs": ["y"], "sampling_time": 0.1, "experiment": "run"}
@@ -184,13 +203,17 @@ def from_files(folder):
 def test_files_as_a_record(folder):
     """From Python: what is handed in chooses the engine."""
     expected = oa.estimate(from_files(folder), BASELINE, **OPTIONS)
-    source = oa.open_parquet(sorted((folder / "runs").glob("*.parquet")), partition_rows=300, **COLUMNS)
+    source = oa.open_parquet(
+        sorted((folder / "runs").glob("*.parquet")), partition_rows=300, **COLUMNS
+    )
     found = oa.estimate(source, BASELINE, **OPTIONS)
     np.testing.assert_allclose(found.theta, expected.theta, rtol=1e-10)
     assert found.status.loss == pytest.approx(expected.status.loss, rel=1e-8)
-    with pytest.raises(oa.InputError, match="`segment` is 0, whole experiments, which need their rows in memory"):
+    with pytest.raises(
+        oa.InputError, match="`segment` is 0, whole experiments, which need their rows in memory"
+    ):
         oa.estimate(source, BASELINE, criterion=oa.Simulation(0), **OPTIONS)
-    with pytest.raises(oa.InputError, match="a motion takes a Record, whose segments an engine may share out"):
+    with pytest.raises(oa.InputError, match="a motion needs its rows in memory"):
         flown_motion(source)
 
 
@@ -198,7 +221,9 @@ def test_a_frame_on_a_cluster_as_a_record(folder, cluster):
     """Partitions of another length than the experiments; the rows stay on the workers."""
     import dask.dataframe as dd
 
-    frame = pd.concat([pd.read_parquet(file) for file in sorted((folder / "runs").glob("*.parquet"))])
+    frame = pd.concat(
+        [pd.read_parquet(file) for file in sorted((folder / "runs").glob("*.parquet"))]
+    )
     frame = frame.reset_index(drop=True)
     frame.to_parquet(folder / "whole.parquet")
     expected = oa.estimate(oa.read_record(folder / "whole.parquet", **COLUMNS), BASELINE, **OPTIONS)
@@ -213,7 +238,12 @@ def test_a_frame_on_a_cluster_as_a_record(folder, cluster):
         oa.open_frame(emptied, client=cluster, **COLUMNS)
 
 
-FLIGHT = {"regularization": "evidence", "blocks": 0, "fallback": False, "solver": oa.LevenbergMarquardt()}
+FLIGHT = {
+    "regularization": "evidence",
+    "blocks": 0,
+    "fallback": False,
+    "solver": oa.LevenbergMarquardt(),
+}
 
 
 def flown_lagged(record, engine=None):
@@ -225,10 +255,18 @@ def flown_lagged(record, engine=None):
 def flown_motion(record, engine=None):
     """A motion in discrete time, whose segments show that colour themselves."""
     states = [oa.State("x", "a*x + b*z + c*u", start="y", learned=True), oa.State("z", "x")]
-    values = [oa.PhysicalParameter("a", 1.4), oa.PhysicalParameter("b", -0.6), oa.PhysicalParameter("c", 0.1)]
-    motion = oa.Motion.from_equations(states, [oa.Output("y", "x")], values, ["u"], integrator="discrete")
+    values = [
+        oa.PhysicalParameter("a", 1.4),
+        oa.PhysicalParameter("b", -0.6),
+        oa.PhysicalParameter("c", 0.1),
+    ]
+    motion = oa.Motion.from_equations(
+        states, [oa.Output("y", "x")], values, ["u"], integrator="discrete"
+    )
     learner, criterion = oa.MLP((2,)), oa.Simulation(60, 0)
-    return oa.estimate(record, motion, learner=learner, **FLIGHT, criterion=criterion, engine=engine)
+    return oa.estimate(
+        record, motion, learner=learner, **FLIGHT, criterion=criterion, engine=engine
+    )
 
 
 def told_of(fit):
@@ -251,7 +289,9 @@ def check_flown(found, expected):
 
 def opened(folder):
     """Partitions that segments reach across."""
-    return oa.open_parquet(sorted((folder / "runs").glob("*.parquet")), partition_rows=200, **COLUMNS)
+    return oa.open_parquet(
+        sorted((folder / "runs").glob("*.parquet")), partition_rows=200, **COLUMNS
+    )
 
 
 def test_segments_of_files_give_the_free_run_of_rows_in_memory(folder, in_memory):
@@ -302,7 +342,9 @@ def test_workers_that_are_killed_change_nothing(folder, cluster, undisturbed):
     for timer in timers:
         timer.join()
     assert {*cluster.run(os.getpid).values()} & {*workers.values()} == set()
-    assert [p["value"] for p in after["parameters"]] == [p["value"] for p in undisturbed["parameters"]]
+    assert [p["value"] for p in after["parameters"]] == [
+        p["value"] for p in undisturbed["parameters"]
+    ]
     assert after["status"]["loss"] == pytest.approx(undisturbed["status"]["loss"], rel=1e-12)
 
 
@@ -315,13 +357,27 @@ def killed_in(seconds, process):
 def test_memory_for_the_matrices_of_a_learner_is_asked_of_the_workers(cluster, monkeypatch):
     """Told before anything is sent; the limits are those that the scheduler knows."""
     u = np.linspace(-1, 1, 300)
-    record, physics = oa.Record.from_arrays(u=u, y=u + u**3), oa.Baseline.from_terms([oa.Term("a", "u[k]")])
-    wide = {"learner": oa.MLP(hidden=(3000,)), "regularization": "none"}  # 9001 weights, 0.6 GiB a matrix
-    limits = {"workers": {"tcp://a:1": {"memory_limit": 8 << 30}, "tcp://b:1": {"memory_limit": 1 << 30}}}
+    record, physics = (
+        oa.Record.from_arrays(u=u, y=u + u**3),
+        oa.Baseline.from_terms([oa.Term("a", "u[k]")]),
+    )
+    wide = {
+        "learner": oa.MLP(hidden=(3000,)),
+        "regularization": "none",
+    }  # 9001 weights, 0.6 GiB a matrix
+    limits = {
+        "workers": {"tcp://a:1": {"memory_limit": 8 << 30}, "tcp://b:1": {"memory_limit": 1 << 30}}
+    }
     monkeypatch.setattr(cluster, "scheduler_info", lambda **_: limits)
     monkeypatch.setattr("orthaug._base.memory.available", lambda: math.inf)
-    match = "takes {} on each worker or device, for . matrices of its weights; the worker tcp://b:1 has 1 GiB"
-    for restarts, size in ((1, "5.43 GiB"), (2, "1.81 GiB")):  # sums over the workers; whole runs on them
+    match = (
+        "takes {} on each worker or device, for . matrices of its weights; the worker "
+        "tcp://b:1 has 1 GiB"
+    )
+    for restarts, size in (
+        (1, "5.43 GiB"),
+        (2, "1.81 GiB"),
+    ):  # sums over the workers; whole runs on them
         with pytest.raises(oa.InputError, match=match.format(size)):
             oa.estimate(record, physics, engine=oa.Dask(cluster), restarts=restarts, **wide)
     monkeypatch.setattr("orthaug.models.devices.available", lambda: 1 << 30)
@@ -349,7 +405,9 @@ def test_devices_give_the_result_of_rows_in_memory(folder, in_memory):
     script = DEVICES.format(tests=os.path.dirname(__file__), folder=str(folder))
     flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=4"
     environment = os.environ | {"XLA_FLAGS": flags}
-    run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, env=environment, check=False)
+    run = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, env=environment, check=False
+    )
     assert run.returncode == 0, run.stderr
     check_same(json.loads((folder / "devices.json").read_text()), fitted(folder, "memory"))
     for kind, other in in_memory.items():
@@ -360,14 +418,19 @@ def tables(folder, cluster, text, function):
     """What a function gives for a spec in memory, and on a cluster."""
     for kind, more in (("memory", ""), ("dask", f'scheduler = "{cluster.scheduler.address}"\n')):
         path = folder / f"runs-{kind}.toml"
-        path.write_text(text.format(kind=kind, structure="orthogonal", regularization="[0.1, 1.0]") + more, "utf-8")
+        path.write_text(
+            text.format(kind=kind, structure="orthogonal", regularization="[0.1, 1.0]") + more,
+            "utf-8",
+        )
         yield function(path)
 
 
 @pytest.fixture(scope="module")
 def held_here(folder):
     """A spec whose rows are in memory wherever it is fitted."""
-    whole = pd.concat([pd.read_parquet(file) for file in sorted((folder / "runs").glob("*.parquet"))])
+    whole = pd.concat(
+        [pd.read_parquet(file) for file in sorted((folder / "runs").glob("*.parquet"))]
+    )
     whole[whole["run"] < 3].to_csv(folder / "rows.csv", index=False)
     return SPEC.replace("runs/*.parquet", "rows.csv").replace("blocks = 0", "blocks = 2")
 
@@ -428,23 +491,46 @@ def bad(folder, match, frame=None, name="c.parquet", **changes):
 def test_what_is_wrong_with_a_partition_is_named(folder):
     good = pd.read_parquet(folder / "held.parquet")
     bad(folder, r"c.parquet: no column 'y'", good.drop(columns="y"))
-    bad(folder, r"c.parquet: column 'u' holds float values, in .*a.parquet double", good.astype({"u": "float32"}))
-    bad(folder, r"c.parquet: column 'u' holds .*string.* values; expected numbers", good.astype({"u": str}))
+    bad(
+        folder,
+        r"c.parquet: column 'u' holds float values, in .*a.parquet double",
+        good.astype({"u": "float32"}),
+    )
+    bad(
+        folder,
+        r"c.parquet: column 'u' holds .*string.* values; expected numbers",
+        good.astype({"u": str}),
+    )
     bad(folder, r"c.parquet: there are no data rows", good[:0])
     bad(folder, r"c.parquet: row 57, column 'y': the cell is empty; expected a finite number",
         good.assign(y=good["y"].where(np.arange(len(good)) != 57)))  # fmt: skip
-    mixed = good.assign(run=np.where(np.arange(len(good)) < 100, 4, np.where(np.arange(len(good)) < 150, 5, 4)))
-    bad(folder, r"c.parquet: row 150: experiment 4 goes on after another has begun; sort the rows by 'run'", mixed)
+    mixed = good.assign(
+        run=np.where(np.arange(len(good)) < 100, 4, np.where(np.arange(len(good)) < 150, 5, 4))
+    )
+    bad(
+        folder,
+        r"c.parquet: row 150: experiment 4 goes on after another has begun; sort the rows by 'run'",
+        mixed,
+    )
     timed = ("sampling_time = 0.1", 'time = "t"')
     for file in ("runs/a.parquet", "runs/b.parquet"):
         frame = pd.read_parquet(folder / file)
         frame.assign(t=0.1 * np.arange(len(frame))).to_parquet(folder / file, row_group_size=GROUP)
     swapped = good.assign(t=np.where(np.arange(len(good)) == 33, 0.2, 0.1 * np.arange(len(good))))
-    bad(folder, r"c.parquet: row 33, column 't': a step of .* s where 0.1 s is usual", swapped, timed=timed)
+    bad(
+        folder,
+        r"c.parquet: row 33, column 't': a step of .* s where 0.1 s is usual",
+        swapped,
+        timed=timed,
+    )
     bad(folder, r"c.parquet: sampled every 0.2 s, .*a.parquet every 0.1 s", good.assign(t=0.2 * np.arange(len(good))),
         timed=timed)  # fmt: skip
-    bad(folder, "no file fits 'nothing/", pattern=("runs/*", "nothing/*"))
-    bad(folder, "`rows` and `every` need the rows in memory", rows=('*.parquet"]', '*.parquet"], every = 2'))
+    bad(folder, "no file matches 'nothing/", pattern=("runs/*", "nothing/*"))
+    bad(
+        folder,
+        "`rows` and `every` need the rows in memory",
+        rows=('*.parquet"]', '*.parquet"], every = 2'),
+    )
     whole = 'focus = "simulation"\nsegment = 0'
     bad(
         folder,
@@ -455,13 +541,18 @@ def test_what_is_wrong_with_a_partition_is_named(folder):
 
 def test_a_file_that_changes_is_noticed(folder):
     path = folder / "changing.toml"
-    path.write_text(SPEC.format(kind="stream", structure="orthogonal", regularization='"none"'), encoding="utf-8")
+    path.write_text(
+        SPEC.format(kind="stream", structure="orthogonal", regularization='"none"'),
+        encoding="utf-8",
+    )
     job = open_job(path)
     file = folder / "runs" / "b.parquet"
     content = file.read_bytes()
     try:
         file.write_bytes(content)  # the same bytes at another time
-        with pytest.raises(oa.InputError, match=r"b.parquet: the file has changed since it was opened"):
+        with pytest.raises(
+            oa.InputError, match=r"b.parquet: the file has changed since it was opened"
+        ):
             job.run()
     finally:
         file.write_bytes(content)
@@ -489,7 +580,9 @@ def test_files_for_clusters_say_what_the_program_takes(folder, monkeypatch):
     import yaml
 
     place = Path(__file__).parents[1] / "examples" / "cluster"
-    compose, operator = (yaml.safe_load((place / name).read_text()) for name in ("compose.yaml", "kubernetes.yaml"))
+    compose, operator = (
+        yaml.safe_load((place / name).read_text()) for name in ("compose.yaml", "kubernetes.yaml")
+    )
     threads = {"OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "XLA_FLAGS"}
     assert threads == set(compose["services"]["worker"]["environment"])
     (container,) = operator["spec"]["worker"]["spec"]["containers"]
@@ -498,9 +591,16 @@ def test_files_for_clusters_say_what_the_program_takes(folder, monkeypatch):
     import slurm
 
     path = folder / "plain.toml"
-    path.write_text(SPEC.split("[engine]")[0].format(structure="orthogonal", regularization='"none"'), encoding="utf-8")
+    path.write_text(
+        SPEC.split("[engine]")[0].format(structure="orthogonal", regularization='"none"'),
+        encoding="utf-8",
+    )
     engine = load_spec(slurm.with_engine(path, "tcp://there:8786")).engine
-    assert (engine.kind, engine.scheduler, engine.partition_rows) == ("dask", "tcp://there:8786", 5_000_000)
+    assert (engine.kind, engine.scheduler, engine.partition_rows) == (
+        "dask",
+        "tcp://there:8786",
+        5_000_000,
+    )
 
 
 def test_no_cluster_in_reach_is_told(folder, monkeypatch):
@@ -513,12 +613,20 @@ def test_workers_of_another_version_are_refused():
     from orthaug.models.cluster import check_versions, versions
 
     def client(*answers):
-        return SimpleNamespace(run=lambda _, on_error: {f"tcp://there:{i}": found for i, found in enumerate(answers)})
+        return SimpleNamespace(
+            run=lambda _, on_error: {f"tcp://there:{i}": found for i, found in enumerate(answers)}
+        )
 
     same = versions()
-    check_versions(client(same, OSError("killed"), same))  # one that dies while it is asked takes no part
-    with pytest.raises(oa.InputError, match=r"the worker tcp://there:1 has orthaug .*, jax 0.1; here is"):
+    check_versions(
+        client(same, OSError("killed"), same)
+    )  # one that dies while it is asked takes no part
+    with pytest.raises(
+        oa.InputError, match=r"the worker tcp://there:1 has orthaug .*, jax 0.1; here is"
+    ):
         check_versions(client(same, same | {"jax": "0.1"}))
-    with pytest.raises(oa.InputError, match=r"the worker tcp://there:0 has No module named 'orthaug'; here is"):
+    with pytest.raises(
+        oa.InputError, match=r"the worker tcp://there:0 has No module named 'orthaug'; here is"
+    ):
         check_versions(client(ModuleNotFoundError("No module named 'orthaug'")))
     assert set(versions()) == {"orthaug", "jax"}

@@ -17,10 +17,14 @@ from orthaug.data.record import Channel
 ROUGH = "a\nb\r\x1b[31mred\x07\x00\u202e\ud800end"
 
 
-@pytest.mark.parametrize("kind", [InputError, TrainingError, lambda text: KeyedError(text, "key", "words")])
+@pytest.mark.parametrize(
+    "kind", [InputError, TrainingError, lambda text: KeyedError(text, "key", "words")]
+)
 def test_a_message_is_one_visible_line(kind):
     text = str(kind(f"{ROUGH}: wrong."))
-    assert text.isprintable() and text.startswith(r"a\nb\r\x1b[31mred\x07\x00\u202e\ud800end: wrong")
+    assert text.isprintable() and text.startswith(
+        r"a\nb\r\x1b[31mred\x07\x00\u202e\ud800end: wrong"
+    )
 
 
 def test_names_and_values_are_cut_and_the_remedy_stays():
@@ -40,7 +44,9 @@ def test_names_and_values_are_cut_and_the_remedy_stays():
 def test_a_path_is_whole_unless_a_name_in_it_is_too_long():
     path = "/home/someone/" + "folder/" * 30 + "run.csv"
     assert str(InputError(f"{path}: no such file.")) == f"{path}: no such file."
-    assert str(InputError(f"/tmp/{'n' * 200}.csv: no such file.")) == f"/tmp/{'n' * 59}… no such file."
+    assert (
+        str(InputError(f"/tmp/{'n' * 200}.csv: no such file.")) == f"/tmp/{'n' * 59}… no such file."
+    )
 
 
 def test_messages_are_quick_whatever_they_hold():
@@ -61,7 +67,13 @@ class Rude:
         raise RuntimeError("no")
 
 
-VALUES = {"huge": 10**5000, "rude": Rude(), "array": np.zeros((300, 300)), "list": [1] * 10**6, "text": "x" * 10**6}
+VALUES = {
+    "huge": 10**5000,
+    "rude": Rude(),
+    "array": np.zeros((300, 300)),
+    "list": [1] * 10**6,
+    "text": "x" * 10**6,
+}
 
 
 @pytest.mark.parametrize("value", VALUES.values(), ids=VALUES.keys())

@@ -12,7 +12,7 @@ from helpers import unfolded
 import orthaug as oa
 from orthaug._base.errors import InputError, RankError
 from orthaug._base.jax import jax, jnp
-from orthaug._base.progress import Enough
+from orthaug._base.progress import StopTraining
 from orthaug.data.record import Channel, Record
 from orthaug.data.regressors import Lags
 from orthaug.fitting.conclusion import orthogonalize
@@ -25,7 +25,9 @@ from orthaug.physics.baseline import Baseline, Parameter, Term
 
 LINEAR = MLP(hidden=())
 NETWORK = MLP(hidden=(4,))
-PHYSICS = Baseline.from_terms([Term("a", "y[k-1]", initial=0.5), Term("b", "u[k]", initial=1.0, unit="m/N")])
+PHYSICS = Baseline.from_terms(
+    [Term("a", "y[k-1]", initial=0.5), Term("b", "u[k]", initial=1.0, unit="m/N")]
+)
 
 
 def record_of(seed: int = 0, rows: int = 121, noise: float = 0.05) -> Record:
@@ -78,7 +80,13 @@ def fit(record):
 
 @pytest.fixture(scope="module")
 def short(record):
-    return estimate(record, PHYSICS, learner=NETWORK, solver=LevenbergMarquardt(iterations=6), regularization="none")
+    return estimate(
+        record,
+        PHYSICS,
+        learner=NETWORK,
+        solver=LevenbergMarquardt(iterations=6),
+        regularization="none",
+    )
 
 
 # what is refused
@@ -87,7 +95,10 @@ def short(record):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"regularization": "ridge"}, "`regularization` must be one of none, evidence, ard; got 'ridge'"),
+        (
+            {"regularization": "ridge"},
+            "`regularization` must be one of none, evidence, ard; got 'ridge'",
+        ),
         ({"regularization": -0.1}, "`regularization` must be 0 or more; got -0.1"),
         ({"regularization": float("nan")}, "`regularization` must be 0 or more; got nan"),
         ({"regularization": float("inf")}, "`regularization` must be 0 or more; got inf"),
@@ -133,7 +144,9 @@ def test_solver_refused(arguments, message):
 
 def test_initial_refused(record, short):
     alone = estimate(record, PHYSICS, learner=None)
-    with pytest.raises(InputError, match="`initial` is physics alone and has nothing to start from; leave it out"):
+    with pytest.raises(
+        InputError, match="`initial` is physics alone and has nothing to start from; leave it out"
+    ):
         estimate(record, PHYSICS, initial=alone)
     (e,) = record.experiments
     twice = Record.from_arrays(e.inputs, np.hstack([e.outputs, 2 * e.outputs]), outputs=["y", "z"])
@@ -161,7 +174,9 @@ def test_linear_learner_on_expressions_is_least_squares(record, structure):
     a = columns(record, 1, *PHI, *more)
     b = target(record, 1)
     assert found.status.code == "converged"
-    np.testing.assert_allclose(found.model.predict(record).model[1:, 0], a @ least_squares(a, b), atol=1e-9)
+    np.testing.assert_allclose(
+        found.model.predict(record).model[1:, 0], a @ least_squares(a, b), atol=1e-9
+    )
     if structure == "orthogonal":
         np.testing.assert_allclose(found.theta, least_squares(a[:, :2], b), rtol=1e-12)
         beside = estimate(
@@ -179,10 +194,14 @@ def test_learner_with_other_lags_than_the_baseline(record):
         structure=Orthogonal(shared="all"),
         regularization="none",
     )
-    a = columns(record, 3, *PHI, lambda y, u, k: u[k - 2], lambda y, u, k: u[k - 3], lambda y, u, k: 1.0)
+    a = columns(
+        record, 3, *PHI, lambda y, u, k: u[k - 2], lambda y, u, k: u[k - 3], lambda y, u, k: 1.0
+    )
     b = target(record, 3)
     assert (found.model.form.first_row, len(found.problem.rows)) == (3, 118)
-    np.testing.assert_allclose(found.model.predict(record).model[3:, 0], a @ least_squares(a, b), atol=1e-9)
+    np.testing.assert_allclose(
+        found.model.predict(record).model[3:, 0], a @ least_squares(a, b), atol=1e-9
+    )
     np.testing.assert_allclose(found.theta, least_squares(a[:, :2], b), rtol=1e-12)
 
 
@@ -191,13 +210,21 @@ def test_experiments_given_twice_weigh_twice(learner):
     one, other = record_of(1, 61), record_of(2, 61)
     structure = Orthogonal(shared="all")
     found = estimate(
-        Record.join([one, other, one]), PHYSICS, learner=learner, structure=structure, regularization="none"
+        Record.join([one, other, one]),
+        PHYSICS,
+        learner=learner,
+        structure=structure,
+        regularization="none",
     )
-    functions = [*PHI] if learner is None else [*PHI, lambda y, u, k: u[k] ** 2, lambda y, u, k: 1.0]
+    functions = (
+        [*PHI] if learner is None else [*PHI, lambda y, u, k: u[k] ** 2, lambda y, u, k: 1.0]
+    )
     both = Record.join([one, other])
     a, b = columns(both, 1, *functions), target(both, 1)
     weight = np.repeat([np.sqrt(2.0), 1.0], 60)
-    np.testing.assert_allclose(found.theta, least_squares(a[:, :2] * weight[:, None], b * weight), rtol=1e-12)
+    np.testing.assert_allclose(
+        found.theta, least_squares(a[:, :2] * weight[:, None], b * weight), rtol=1e-12
+    )
     expected = a @ least_squares(a * weight[:, None], b * weight)
     predicted = np.concatenate([t.model[1:, 0] for t in found.model.predict(both).trajectories])
     np.testing.assert_allclose(predicted, expected, atol=1e-9)
@@ -205,19 +232,27 @@ def test_experiments_given_twice_weigh_twice(learner):
 
 def test_fixed_terms_are_subtracted_first(record):
     fixed = Baseline.from_terms(
-        [Term("a", "y[k-1]", initial=0.6, fixed=True), Term("b", "u[k]"), Term("c", "u[k-1]", initial=9.0)]
+        [
+            Term("a", "y[k-1]", initial=0.6, fixed=True),
+            Term("b", "u[k]"),
+            Term("c", "u[k-1]", initial=9.0),
+        ]
     )
     found = estimate(record, fixed, learner=None)
     a = columns(record, 1, lambda y, u, k: u[k], lambda y, u, k: u[k - 1])
     rest = target(record, 1) - 0.6 * columns(record, 1, PHI[0])[:, 0]
     np.testing.assert_allclose(found.theta, least_squares(a, rest), rtol=1e-12)
     assert list(found.parameters.index) == ["b", "c"]
-    np.testing.assert_allclose(found.model.predict(record).model, naive.predicted(found.model, record), atol=1e-12)
+    np.testing.assert_allclose(
+        found.model.predict(record).model, naive.predicted(found.model, record), atol=1e-12
+    )
 
 
 def test_nothing_but_fixed_terms(record):
     fixed = Baseline.from_terms([Term("a", "y[k-1]", initial=0.6, fixed=True)])
-    found = estimate(record, fixed, learner=MLP(hidden=(), inputs=("u[k]", "u[k]**2")), regularization="none")
+    found = estimate(
+        record, fixed, learner=MLP(hidden=(), inputs=("u[k]", "u[k]**2")), regularization="none"
+    )
     a = columns(record, 1, lambda y, u, k: u[k], lambda y, u, k: u[k] ** 2, lambda y, u, k: 1.0)
     known = 0.6 * columns(record, 1, PHI[0])[:, 0]
     expected = known + a @ least_squares(a, target(record, 1) - known)
@@ -226,14 +261,18 @@ def test_nothing_but_fixed_terms(record):
 
 
 def test_baseline_function_is_its_terms(record):
-    function = Baseline.from_function(lambda x: jnp.stack([x[:1], x[1:2]], axis=1), [Parameter("a"), "b"])
+    function = Baseline.from_function(
+        lambda x: jnp.stack([x[:1], x[1:2]], axis=1), [Parameter("a"), "b"]
+    )
     lags, solver = Lags(na=1, nb=1, nk=0), LevenbergMarquardt(iterations=6)
     found = estimate(record, function, lags=lags, learner=NETWORK, solver=solver)
     same = estimate(record, PHYSICS, lags=lags, learner=NETWORK, solver=solver)
     np.testing.assert_allclose(found.theta, same.theta, rtol=1e-13)
     for run in ("predict", "simulate"):
         np.testing.assert_allclose(
-            getattr(found.model, run)(record).model, getattr(same.model, run)(record).model, atol=1e-10
+            getattr(found.model, run)(record).model,
+            getattr(same.model, run)(record).model,
+            atol=1e-10,
         )
     with pytest.raises(InputError, match="a baseline function needs `lags`"):
         estimate(record, function, learner=NETWORK)
@@ -261,14 +300,18 @@ def test_ridge_in_normalised_units(record, ridge):
 
 
 def test_ridge_of_nothing_is_none(record, short):
-    again = estimate(record, PHYSICS, learner=NETWORK, solver=LevenbergMarquardt(iterations=6), regularization=0)
+    again = estimate(
+        record, PHYSICS, learner=NETWORK, solver=LevenbergMarquardt(iterations=6), regularization=0
+    )
     np.testing.assert_array_equal(again.model.numbers.weights, short.model.numbers.weights)
 
 
 def test_much_ridge_leaves_physics_alone(record):
     found = estimate(record, PHYSICS, learner=NETWORK, regularization=1e9)
     alone = estimate(record, PHYSICS, learner=None)
-    np.testing.assert_allclose(found.model.predict(record).model, alone.model.predict(record).model, atol=1e-5)
+    np.testing.assert_allclose(
+        found.model.predict(record).model, alone.model.predict(record).model, atol=1e-5
+    )
     assert found.effective_weights < 1e-3
     np.testing.assert_allclose(found.std, alone.std, rtol=1e-4)
 
@@ -304,7 +347,9 @@ def test_warm_start_goes_on(record, short, of):
     same = estimate(record, PHYSICS, initial=initial, solver=LevenbergMarquardt(iterations=0))
     assert same.status.loss == pytest.approx(short.status.loss, rel=1e-12)
     np.testing.assert_array_equal(same.model.numbers.weights, short.model.numbers.weights)
-    np.testing.assert_array_equal(same.model.predict(record).model, short.model.predict(record).model)
+    np.testing.assert_array_equal(
+        same.model.predict(record).model, short.model.predict(record).model
+    )
     further = estimate(record, PHYSICS, initial=initial)
     assert further.status.loss < 0.9 * short.status.loss
     np.testing.assert_allclose(further.theta, short.theta, rtol=1e-12)
@@ -332,7 +377,12 @@ def test_progress_is_told(record):
     told = []
     solver = LevenbergMarquardt(iterations=6)
     found = estimate(
-        record, PHYSICS, learner=NETWORK, solver=solver, restarts=2, progress=lambda *what: told.append(what)
+        record,
+        PHYSICS,
+        learner=NETWORK,
+        solver=solver,
+        restarts=2,
+        progress=lambda *what: told.append(what),
     )
     assert {restart for restart, _, _ in told} == {0, 1, 2, 3}  # none and ard from each start
     for i, run in enumerate(found.restarts):
@@ -351,14 +401,19 @@ def test_iteration_limit(short):
 
 def test_theta_keeps_its_intervals_where_training_does_not_move_it(short):
     """F1: under the training measure θ̂ = Φ⁺Y after every iteration; under another one it follows the weights."""
-    assert short.std is not None and "not_converged" not in {warning.code for warning in short.warnings}
+    assert short.std is not None and "not_converged" not in {
+        warning.code for warning in short.warnings
+    }
     solver = LevenbergMarquardt(iterations=6)
     moved = Orthogonal(measure=oa.Symmetrized())
     record, options = record_of(), {"learner": NETWORK, "solver": solver, "regularization": "none"}
     found = estimate(record, PHYSICS, structure=moved, **options)
     told = {warning.code: warning.text for warning in found.warnings}
     assert found.status.code == "iteration_limit" and found.std is None
-    assert "no intervals: training ended after 6 iterations while the loss still fell" in told["not_converged"]
+    assert (
+        "no intervals: training ended after 6 iterations while the loss still fell"
+        in told["not_converged"]
+    )
     assert "without the key training goes on by itself" in told["not_converged"]
     flown = estimate(record, PHYSICS, criterion=oa.Simulation(30, 0), **options | {"blocks": 0})
     assert flown.std is None and "not_converged" in {warning.code for warning in flown.warnings}
@@ -369,15 +424,19 @@ def test_a_learner_that_was_regularised_to_nothing_says_so():
     silent = estimate(record_of(), PHYSICS, regularization=1e9, **options)
     told = {warning.code: warning.text for warning in silent.warnings}
     assert silent.effective_weights < 0.5
-    assert re.search(r"the learner is silent: the fit is that of physics alone .*compare", told["learner_silent"])
+    assert re.search(
+        r"the learner is silent: the fit is that of physics alone .*Compare", told["learner_silent"]
+    )
     heard = estimate(record_of(), PHYSICS, regularization="none", **options)
     assert "learner_silent" not in {warning.code for warning in heard.warnings}
 
 
-@pytest.mark.parametrize("solver", [LevenbergMarquardt(iterations=60), AdamLBFGS(40, 40)], ids=["lm", "paper"])
+@pytest.mark.parametrize(
+    "solver", [LevenbergMarquardt(iterations=60), AdamLBFGS(40, 40)], ids=["lm", "paper"]
+)
 def test_who_is_told_can_say_that_it_is_enough(record, solver):
     def enough(run, iteration, loss):
-        raise Enough
+        raise StopTraining
 
     found = estimate(record, PHYSICS, learner=NETWORK, solver=solver, restarts=2, progress=enough)
     assert found.status.code == "stopped" and found.status.ok and found.status.iterations == 1
@@ -407,7 +466,9 @@ def test_non_finite(record, learner, structure):
     arguments = {"structure": Additive()} if structure == "additive" else {}
     found = estimate(record, PHYSICS, learner=learner, restarts=2, **arguments)
     assert found.status.code == "non_finite" and not found.status.ok
-    assert "the learner returns NaN" in found.status.message and found.status.message in unfolded(found.summary())
+    assert "the learner returns NaN" in found.status.message and found.status.message in unfolded(
+        found.summary()
+    )
     assert [run.loss for run in found.restarts] == [None, None]
     assert found.std is None and np.isfinite(found.theta).all()
     assert "nan" not in repr(found.theta)
@@ -454,7 +515,10 @@ def test_rank_deficient_physics_is_refused(record):
 def test_ill_conditioned_physics_is_a_warning(record):
     close = Baseline.from_terms([Term("a", "u[k]"), Term("b", "u[k] + 1e-9*y[k-1]")])
     found = estimate(record, close, learner=None)
-    assert any("the physics is ill-conditioned on the data (condition" in str(text) for text in found.warnings)
+    assert any(
+        "the physics is ill-conditioned on the data (condition" in str(text)
+        for text in found.warnings
+    )
     assert estimate(record, PHYSICS, learner=None).warnings == ()
 
 
@@ -462,7 +526,9 @@ def test_no_degree_of_freedom_is_a_warning():
     found = estimate(record_of(rows=3), PHYSICS, learner=None)
     assert found.std is None and found.interval is None
     (warning,) = found.warnings
-    assert str(warning).startswith("no standard errors: 2 rows leave no degrees of freedom for 2 parameters")
+    assert str(warning).startswith(
+        "no standard errors: 2 rows leave no degrees of freedom for 2 parameters"
+    )
 
 
 # models from elsewhere
@@ -482,7 +548,9 @@ def test_orthogonalize(record, name):
     values = np.reshape(g(phi), -1)
     np.testing.assert_allclose(found.theta, least_squares(phi, values), rtol=1e-12)
     assert found.defect <= 1e-12 and found.std is None
-    assert [str(w) for w in found.warnings] == ["no standard errors: the function was trained elsewhere."]
+    assert [str(w) for w in found.warnings] == [
+        "no standard errors: the function was trained elsewhere."
+    ]
     prediction = found.model.predict(record)
     np.testing.assert_allclose(prediction.model[1:, 0], values, atol=1e-12)
     learner = prediction.trajectories[0].learner[1:, 0]
@@ -494,7 +562,9 @@ def test_orthogonalize(record, name):
         own[k] = np.reshape(g(np.array([[own[k - 1], e.inputs[k, 0]]])), ())
     np.testing.assert_allclose(found.model.simulate(record).model[1:, 0], own[1:], atol=1e-10)
     ahead = found.model.predict(record, horizon=2).model
-    two = np.reshape(g(np.column_stack([np.r_[0.0, prediction.model[1:, 0]][1:-1], e.inputs[2:, 0]])), -1)
+    two = np.reshape(
+        g(np.column_stack([np.r_[0.0, prediction.model[1:, 0]][1:-1], e.inputs[2:, 0]])), -1
+    )
     np.testing.assert_allclose(ahead[2:, 0], two, atol=1e-10)
 
 
@@ -502,7 +572,9 @@ def test_orthogonalize_two_outputs():
     rng = np.random.default_rng(0)
     u, y = rng.normal(size=60), rng.normal(size=(60, 2)) * [1.0, 50.0]
     record = Record.from_arrays(u, y)
-    physics = Baseline.from_terms([Term("a", "u[k]", output="y1"), Term("b", "y1[k-1]", output="y2")])
+    physics = Baseline.from_terms(
+        [Term("a", "u[k]", output="y1"), Term("b", "y1[k-1]", output="y2")]
+    )
 
     def g(x):
         return np.column_stack([x[:, 1] + np.cos(x[:, 0]), 30 * x[:, 0]])
@@ -568,11 +640,15 @@ def test_parameters(fit):
     assert list(table["unit"]) == ["", "m/N"] and list(table["initial"]) == [0.5, 1.0]
     np.testing.assert_array_equal(table["value"], fit.theta)
     np.testing.assert_array_equal(table["std"], fit.std)
-    assert (table["ci95_low"] < table["value"]).all() and (table["value"] < table["ci95_high"]).all()
+    assert (table["ci95_low"] < table["value"]).all() and (
+        table["value"] < table["ci95_high"]
+    ).all()
 
 
 def test_units_of_channels_stay_with_the_model():
     (e,) = record_of().experiments
-    named = Record.from_arrays(e.inputs, e.outputs, inputs=[Channel("u", "N")], outputs=[Channel("y", "m")])
+    named = Record.from_arrays(
+        e.inputs, e.outputs, inputs=[Channel("u", "N")], outputs=[Channel("y", "m")]
+    )
     found = estimate(named, PHYSICS, learner=None)
     assert [c.label for c in (*found.model.outputs, *found.model.inputs)] == ["y [m]", "u [N]"]

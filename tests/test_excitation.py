@@ -51,7 +51,9 @@ def test_groups_are_kept_apart():
     found = of(A, B, 3 * A, C, -B, 5 * A)
     assert found.rank == 3
     assert found.collinear == (("a", "c", "f"), ("b", "e"))
-    with pytest.raises(RankError, match="the columns of a, c, f are linearly dependent; the columns of b, e are"):
+    with pytest.raises(
+        RankError, match="the columns of a, c, f are linearly dependent; the columns of b, e are"
+    ):
         require_rank(found, 30)
 
 
@@ -83,7 +85,9 @@ def test_more_columns_than_rows():
     found = of(A[:2], B[:2], C[:2])
     assert (found.rank, found.columns, found.condition) == (2, 3, None)
     assert found.collinear == (("a", "b", "c"),)
-    with pytest.raises(RankError, match="2 usable rows for 3 parameters; give at least as many rows as parameters"):
+    with pytest.raises(
+        RankError, match="2 usable rows for 3 parameters; give at least as many rows as parameters"
+    ):
         require_rank(found, 2)
 
 
@@ -94,11 +98,15 @@ def test_identifiable_but_not_excited():
     baseline = Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "u[k]")])
     x = np.stack([A, 2 * A], axis=1)
     assert identifiability(baseline, LAYOUT, ("y",), x).full_rank
-    assert not excitation(Projection.factor(baseline.phi(x, LAYOUT, ("y",), np)).r, baseline.names).full_rank
+    assert not excitation(
+        Projection.factor(baseline.phi(x, LAYOUT, ("y",), np)).r, baseline.names
+    ).full_rank
 
 
 def test_not_identifiable():
-    baseline = Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "u[k]"), Term("c", "y[k-1] - 2*u[k]")])
+    baseline = Baseline.from_terms(
+        [Term("a", "y[k-1]"), Term("b", "u[k]"), Term("c", "y[k-1] - 2*u[k]")]
+    )
     found = identifiability(baseline, LAYOUT, ("y",), np.stack([A, B], axis=1))
     assert (found.rank, found.collinear) == (2, (("a", "b", "c"),))
 
@@ -114,7 +122,9 @@ def both(record, *texts):
     """(identifiability, excitation) of terms a, b, c, … on a record."""
     baseline = Baseline.from_terms([Term("abc"[i], text) for i, text in enumerate(texts)])
     problem = pose(record, baseline, require_full_rank=False)
-    return identifiability(baseline, problem.layout, problem.outputs, problem.rows.x), problem.excitation
+    return identifiability(
+        baseline, problem.layout, problem.outputs, problem.rows.x
+    ), problem.excitation
 
 
 DECAY = 0.5 ** np.arange(20.0)  # a free decay: y[k-2] is twice y[k-1]

@@ -35,7 +35,7 @@ from orthaug.models.lagged import Lagged
 from orthaug.models.learners import ACTIVATIONS, Bound
 from orthaug.models.model import Model
 from orthaug.models.motion_model import MotionModel
-from orthaug.models.moving import Moving
+from orthaug.models.moving import MotionDynamics
 from orthaug.models.terms import Terms
 from orthaug.physics.baseline import Baseline
 
@@ -100,10 +100,17 @@ def moving(motion: oa.Motion, features=(), learner=None, substeps=2) -> MotionMo
     bound = Bound(learner, len(entries), values) if learner is not None else None
     weights = np.zeros(0) if bound is None else np.asarray(bound.init(jax.random.key(4)))
     q, nz = motion.coordinates.initial, len(entries)
-    numbers = Numbers(q, 0.02 * np.ones_like(q), weights, 0.1 * np.ones(nz), 1.5 * np.ones(nz), 0.3 * np.ones(values))
+    numbers = Numbers(
+        q,
+        0.02 * np.ones_like(q),
+        weights,
+        0.1 * np.ones(nz),
+        1.5 * np.ones(nz),
+        0.3 * np.ones(values),
+    )
     ny = len(motion.outputs)
     return MotionModel(
-        form=Moving(motion, entries, bound, 0.1, substeps),
+        form=MotionDynamics(motion, entries, bound, 0.1, substeps),
         numbers=numbers,
         outputs=tuple(oa.Channel(output.name, "m") for output in motion.outputs),
         inputs=tuple(oa.Channel(name, "N") for name in motion.inputs),
@@ -124,7 +131,11 @@ TWO_OUTPUTS = [
     oa.Term("b", "max(min(3*u1[k-4], limit, 1), -limit)*atan2(u2[k], 2)", output="y2"),
     oa.Term("c", "sqrt(abs(u2[k-2]))*sign(u1[k]) - (-u2[k])**3/(1 + u1[k]**2)**2", output="y1"),
     oa.Term("d", "exp(-abs(y1[k-1]))**1.5 - (u1[k] - (u2[k] - 1)) + 2**-2", output="y2"),
-    oa.Term("e", "log(2 + atan(u2[k-1]))/(tan(0.3) + y2[k-1]**gain) + (1 + abs(u1[k]))**-0.5", output="y2"),
+    oa.Term(
+        "e",
+        "log(2 + atan(u2[k-1]))/(tan(0.3) + y2[k-1]**gain) + (1 + abs(u1[k]))**-0.5",
+        output="y2",
+    ),
     oa.Term("f", "-(2 + abs(u1[k-1]))**-2 + u2[k]/(gain*limit)", output="y1"),
 ]
 POSITIVE = [oa.PhysicalParameter(n, v, min=0) for n, v in (("m", 1.3), ("c", 2.7), ("k", 9.0))]
@@ -132,12 +143,18 @@ POSITIVE = [oa.PhysicalParameter(n, v, min=0) for n, v in (("m", 1.3), ("c", 2.7
 
 def spring(**options) -> oa.Motion:
     return oa.Motion.from_equations(
-        states=[oa.State("x", "v", unit="m"), oa.State("v", "(total - drag*v)/m", learned=True, unit="m/s")],
+        states=[
+            oa.State("x", "v", unit="m"),
+            oa.State("v", "(total - drag*v)/m", learned=True, unit="m/s"),
+        ],
         outputs=[oa.Output("y", "x + 0.1*v**2", learned=True), oa.Output("rate", "v + 0.01*u")],
         inputs=["u", "w"],
         parameters=[*POSITIVE, oa.PhysicalParameter("offset", -0.2)],
         constants={"limit": 0.8},
-        define={"drag": "c + abs(v)", "total": "max(min(u, limit), -limit) + w - k*x - k*offset*x**3"},
+        define={
+            "drag": "c + abs(v)",
+            "total": "max(min(u, limit), -limit) + w - k*x - k*offset*x**3",
+        },
         **options,
     )
 
@@ -168,10 +185,15 @@ MODELS: dict[str, Callable[[], Model | MotionModel]] = {
     "network of one input, fading": lambda: limited(
         lagged(LINEAR, ("y[k-1]",), oa.MLP((16, 1, 4), beyond="fade"), ("y",), ("u",))
     ),
-    "physics alone, no feedback": lambda: lagged([oa.Term("a", "double[k]")], (), None, ("flag",), ("double",)),
+    "physics alone, no feedback": lambda: lagged(
+        [oa.Term("a", "double[k]")], (), None, ("flag",), ("double",)
+    ),
     "motion without inputs": lambda: moving(
         oa.Motion.from_equations(
-            states=[oa.State("x", "v", start=0), oa.State("v", "9 - k*sin(x) - 0.3*v", start=0, learned=True)],
+            states=[
+                oa.State("x", "v", start=0),
+                oa.State("v", "9 - k*sin(x) - 0.3*v", start=0, learned=True),
+            ],
             outputs=[oa.Output("y", "x")],
             parameters=[oa.PhysicalParameter("k", 12.0)],
         ),
@@ -181,7 +203,9 @@ MODELS: dict[str, Callable[[], Model | MotionModel]] = {
     "motion, first-order hold": lambda: moving(
         spring(hold="first-order"), ("v", "x*u"), oa.MLP((5, 4), "silu"), substeps=2
     ),
-    "motion that fades": lambda: limited(moving(spring(), ("v", "x - w"), oa.MLP((5,)), substeps=2)),
+    "motion that fades": lambda: limited(
+        moving(spring(), ("v", "x - w"), oa.MLP((5,)), substeps=2)
+    ),
     "motion, exact, held": lambda: limited(
         moving(spring(integrator="exact"), ("v", "w"), oa.MLP((5,), beyond="hold"), substeps=1)
     ),
@@ -202,7 +226,9 @@ def limited(model):
 
     points = np.random.default_rng(3).uniform(-1, 1, (50, n))
     limits = np.stack([np.full(nz, -0.4), np.full(nz, 0.6)])
-    return replace(model, numbers=model.numbers._replace(limits=limits, pull=pull_of(features, points)))
+    return replace(
+        model, numbers=model.numbers._replace(limits=limits, pull=pull_of(features, points))
+    )
 
 
 @dataclass(frozen=True)
@@ -245,12 +271,17 @@ def imported(path: Path):
 def run_numpy(folder: Path, given: Case):
     module = imported(folder / "plant.py")
     steps = [module.step(s, u) for s, u in zip(given.state, given.inputs, strict=False)]
-    yield "float64", (*map(np.array, zip(*steps, strict=True)), module.run(module.start(), given.inputs))
+    yield (
+        "float64",
+        (*map(np.array, zip(*steps, strict=True)), module.run(module.start(), given.inputs)),
+    )
 
 
 def run_casadi(folder: Path, given: Case):
     step = imported(folder / "plant.py").step()
-    following, y = (np.array(part).T for part in step.map(POINTS)(given.state.T, given.inputs[:POINTS].T))
+    following, y = (
+        np.array(part).T for part in step.map(POINTS)(given.state.T, given.inputs[:POINTS].T)
+    )
     free = step.mapaccum(STEPS)(np.zeros(given.state.shape[1]), given.inputs.T)[1]
     yield "float64", (following, y, np.array(free).T)
 
@@ -262,7 +293,9 @@ def run_control(folder: Path, given: Case):
     rows = list(zip(given.state, given.inputs, strict=False))
     single = [np.array([ask(0.0, s, u) for s, u in rows]) for ask in (plant.dynamics, plant.output)]
     time = 0.1 * np.arange(STEPS)
-    free = control.input_output_response(plant, time, given.inputs.T, np.zeros(given.state.shape[1]), squeeze=False)
+    free = control.input_output_response(
+        plant, time, given.inputs.T, np.zeros(given.state.shape[1]), squeeze=False
+    )
     yield "float64", (*single, free.outputs.T)
 
 
@@ -276,7 +309,9 @@ def run_fmu(folder: Path, given: Case):
     place = fmpy.extract(str(folder / "plant.fmu"), folder.parent / "unpacked")
     by = {kind: [v.valueReference for v in described.modelVariables if v.causality == kind] for kind in
           ("input", "output", "local")}  # fmt: skip
-    fmu = FMU2Slave(guid=described.guid, unzipDirectory=place, modelIdentifier="plant", instanceName="one")
+    fmu = FMU2Slave(
+        guid=described.guid, unzipDirectory=place, modelIdentifier="plant", instanceName="one"
+    )
     fmu.instantiate()
     fmu.setupExperiment(startTime=0.0)
     fmu.enterInitializationMode()
@@ -302,7 +337,9 @@ def run_fmu(folder: Path, given: Case):
 def run_onnx(folder: Path, given: Case):
     import onnxruntime
 
-    session = onnxruntime.InferenceSession(str(folder / "plant.onnx"), providers=["CPUExecutionProvider"])
+    session = onnxruntime.InferenceSession(
+        str(folder / "plant.onnx"), providers=["CPUExecutionProvider"]
+    )
     wanted = {value.name for value in session.get_inputs()}
     n = given.state.shape[1]
 
@@ -326,10 +363,27 @@ def run_c(folder: Path, given: Case):
         pytest.skip("no C compiler")
     for precision, options in (("float64", ()), ("float32", ("-DPLANT_FLOAT",))):
         shared = folder.parent / f"{folder.name}_{precision}.so"
-        made = [compiler, *STRICT, *options, "-shared", "-fPIC", "plant.c", "-lm", "-o", str(shared)]
+        made = [
+            compiler,
+            *STRICT,
+            *options,
+            "-shared",
+            "-fPIC",
+            "plant.c",
+            "-lm",
+            "-o",
+            str(shared),
+        ]
         subprocess.run(made, cwd=folder, check=True)
         yield precision, run_library(ctypes.CDLL(str(shared)), given, np.dtype(precision))
-    checking = [compiler, *STRICT, "-fsanitize=address,undefined", "-fno-sanitize-recover=all", "plant.c", "check.c"]
+    checking = [
+        compiler,
+        *STRICT,
+        "-fsanitize=address,undefined",
+        "-fno-sanitize-recover=all",
+        "plant.c",
+        "check.c",
+    ]
     subprocess.run([*checking, "-lm", "-o", "../check"], cwd=folder, check=True)
     done = subprocess.run(["../check"], cwd=folder, check=True, capture_output=True, text=True)
     assert done.stdout.startswith("64 steps: ") and done.stderr == ""
@@ -380,8 +434,20 @@ def flagged_steps(step, state, row, y, at) -> None:
     assert state["flag"][0] == 0
 
 
-NEEDED = {"casadi": ["casadi"], "control": ["control"], "fmu": ["fmpy"], "onnx": ["onnx", "onnxruntime"]}
-RUNS = {"numpy": run_numpy, "c": run_c, "casadi": run_casadi, "control": run_control, "fmu": run_fmu, "onnx": run_onnx}
+NEEDED = {
+    "casadi": ["casadi"],
+    "control": ["control"],
+    "fmu": ["fmpy"],
+    "onnx": ["onnx", "onnxruntime"],
+}
+RUNS = {
+    "numpy": run_numpy,
+    "c": run_c,
+    "casadi": run_casadi,
+    "control": run_control,
+    "fmu": run_fmu,
+    "onnx": run_onnx,
+}
 
 
 @pytest.mark.parametrize("target", RUNS)
@@ -401,9 +467,13 @@ def test_an_export_computes_what_the_model_computes(tmp_path, name, target):
 @pytest.mark.parametrize("name", MODELS)
 def test_a_step_in_numpy_alone(name):
     given, step = case(name), numpy_step(case(name).model)
-    assert (step.state_names, step.step_inputs) == (given.model.state_names, given.model.step_inputs)
+    assert (step.state_names, step.step_inputs) == (
+        given.model.state_names,
+        given.model.step_inputs,
+    )
     following, y = map(
-        np.array, zip(*(step(s, u) for s, u in zip(given.state, given.inputs, strict=False)), strict=True)
+        np.array,
+        zip(*(step(s, u) for s, u in zip(given.state, given.inputs, strict=False)), strict=True),
     )
     near(following, given.stepped[0], 1e-12)
     near(y, given.stepped[1], 1e-12)
@@ -414,7 +484,9 @@ def test_a_step_in_numpy_alone(name):
 def record_for(model: Model | MotionModel, rows: int = 40) -> oa.Record:
     rng = np.random.default_rng(1)
     u, y = (rng.normal(size=(rows, len(channels))) for channels in (model.inputs, model.outputs))
-    return oa.Record.from_arrays(u, y, inputs=model.inputs, outputs=model.outputs, sampling_time=0.1)
+    return oa.Record.from_arrays(
+        u, y, inputs=model.inputs, outputs=model.outputs, sampling_time=0.1
+    )
 
 
 @pytest.mark.parametrize("name", ["several outputs, every activation", "motion, first-order hold"])
@@ -422,25 +494,41 @@ def test_steps_from_a_start_are_the_free_run(name):
     model = case(name).model
     record = record_for(model)
     first, u = model.form.first_row, record.experiments[0].inputs
-    rows = u if len(model.step_inputs) == u.shape[1] else np.concatenate([u, np.vstack([u[1:], u[-1:]])], axis=1)
+    rows = (
+        u
+        if len(model.step_inputs) == u.shape[1]
+        else np.concatenate([u, np.vstack([u[1:], u[-1:]])], axis=1)
+    )
     start = model.start(record)
     last, y = jax.jit(lambda s, u: jax.lax.scan(model.step, s, u))(start, rows[first:-1])
     np.testing.assert_allclose(y, model.simulate(record).model[first:-1], rtol=1e-9, atol=1e-12)
     if first:  # the state says what it holds
         named = dict(zip(model.state_names, start, strict=True))
-        assert named["u1[k-4]"] == u[first - 4, 0] and named["y1[k-3]"] == record.experiments[0].outputs[first - 3, 0]
+        assert (
+            named["u1[k-4]"] == u[first - 4, 0]
+            and named["y1[k-3]"] == record.experiments[0].outputs[first - 3, 0]
+        )
         assert model.start(record, row=40)[0] == record.experiments[0].outputs[39, 0]
     else:
         np.testing.assert_allclose(model.start(record, row=39), last, rtol=1e-9)
-    assert jax.jacobian(lambda s: model.step(s, rows[0])[1])(start).shape == (len(model.outputs), len(start))
+    assert jax.jacobian(lambda s: model.step(s, rows[0])[1])(start).shape == (
+        len(model.outputs),
+        len(start),
+    )
 
 
 @pytest.mark.parametrize("name", ["network", "motion, first-order hold"])
 def test_arguments_of_a_step_are_checked(name):
     model = case(name).model
     n, nu = len(model.state_names), len(model.step_inputs)
-    for state, inputs in ((np.zeros(n + 1), np.zeros(nu)), (np.zeros(n), 0.0), (np.zeros((1, n)), np.zeros(nu))):
-        with pytest.raises(oa.InputError, match=f"a step takes a state of {n} and inputs of {nu} numbers"):
+    for state, inputs in (
+        (np.zeros(n + 1), np.zeros(nu)),
+        (np.zeros(n), 0.0),
+        (np.zeros((1, n)), np.zeros(nu)),
+    ):
+        with pytest.raises(
+            oa.InputError, match=f"a step takes a state of {n} and inputs of {nu} numbers"
+        ):
             model.step(state, inputs)
     with pytest.raises(oa.InputError, match="a step takes two vectors of numbers"):
         model.step("x", np.zeros(nu))
@@ -464,7 +552,9 @@ def test_starts_that_are_refused_in_words():
 def test_activations_are_those_of_the_learners(name):
     a = np.array([-800.0, -30.0, -2.5, -1e-9, 0.0, 1e-9, 0.7, 3.0, 40.0, 800.0])
     with np.errstate(all="ignore"):
-        found = NumpyStep(program_of(case("terms").model))._evaluation(nodes.ACTIVATIONS[name])({"a": a})
+        found = NumpyStep(program_of(case("terms").model))._evaluation(nodes.ACTIVATIONS[name])(
+            {"a": a}
+        )
     np.testing.assert_allclose(found, ACTIVATIONS[name](jnp.asarray(a)), rtol=1e-14, atol=1e-15)
 
 
@@ -482,8 +572,12 @@ def test_what_is_written_beside_the_code(tmp_path):
         text = (tmp_path / target / "README.md").read_text()
         assert f'"checksum": "{program.digest}"' in (tmp_path / "model" / "model.json").read_text()
         assert program.digest in text and "`u` [N]" in text and "0.1 s" in text
-        assert any(program.digest in path.read_text() for path in (tmp_path / target).glob("plant.*"))
-        assert (tmp_path / target / "vectors.csv").read_text() == (tmp_path / "c" / "vectors.csv").read_text()
+        assert any(
+            program.digest in path.read_text() for path in (tmp_path / target).glob("plant.*")
+        )
+        assert (tmp_path / target / "vectors.csv").read_text() == (
+            tmp_path / "c" / "vectors.csv"
+        ).read_text()
     with open(tmp_path / "c" / "vectors.csv", newline="") as file:
         head, *rows = csv.reader(file)
     assert head == ["input:u", "state:y[k-1]", "state:u[k-1]", "state:u[k-2]", "output:y"]
@@ -497,10 +591,14 @@ def test_what_is_written_beside_the_code(tmp_path):
 def test_what_an_export_needs_is_named_where_it_is_missing(tmp_path, monkeypatch):
     model = case("network").model
     monkeypatch.setitem(sys.modules, "onnx", None)
-    with pytest.raises(oa.InputError, match="the package onnx, which is not installed; pip install onnx"):
+    with pytest.raises(
+        oa.InputError, match="the package onnx, which is not installed; pip install onnx"
+    ):
         oa.export(model, tmp_path / "out", "onnx")
     monkeypatch.setattr(fmu, "_target", lambda: ("linux64", ".so"))
-    failing = [(str(tmp_path / "bin"), "cc failed: no licence")] if os.name == "posix" else []  # a script is no program
+    failing = (
+        [(str(tmp_path / "bin"), "cc failed: no licence")] if os.name == "posix" else []
+    )  # a script is no program
     for path, words in [("", "no C compiler was found"), *failing]:
         monkeypatch.setenv("PATH", path)
         (tmp_path / "bin").mkdir(exist_ok=True)
@@ -523,8 +621,14 @@ def test_vectors_of_a_model_without_values_at_zero(tmp_path, term, rows):
     lines = (tmp_path / "c" / "vectors.csv").read_text().splitlines()
     assert (len(lines) > 1) == bool(rows)
     compiler = shutil.which("gcc") or pytest.skip("no C compiler")
-    subprocess.run([compiler, *STRICT, "model.c", "check.c", "-lm", "-o", "check"], cwd=tmp_path / "c", check=True)
-    done = subprocess.run(["./check"], cwd=tmp_path / "c", check=True, capture_output=True, text=True)
+    subprocess.run(
+        [compiler, *STRICT, "model.c", "check.c", "-lm", "-o", "check"],
+        cwd=tmp_path / "c",
+        check=True,
+    )
+    done = subprocess.run(
+        ["./check"], cwd=tmp_path / "c", check=True, capture_output=True, text=True
+    )
     assert done.stdout.startswith(f"{len(lines) - 1} steps")
 
 
@@ -540,7 +644,10 @@ def test_equations_in_latex(tmp_path):
     for name in MODELS:
         oa.export(case(name).model, tmp_path, "latex")
         text = (tmp_path / "model.tex").read_text(encoding="utf-8")
-        assert all(text.count(f"\\begin{{{what}}}") == text.count(f"\\end{{{what}}}") for what in ("align*", "pmatrix"))
+        assert all(
+            text.count(f"\\begin{{{what}}}") == text.count(f"\\end{{{what}}}")
+            for what in ("align*", "pmatrix")
+        )
         assert text.count("{") == text.count("}") and text.count(r"\left") == text.count(r"\right")
     assert r"a_{k+1} &= 0.6 \, a + 0.3 \, \sin\left(θ \, b\right)" in text
     assert r"\DeclareUnicodeCharacter{03B8}{\ensuremath{\theta}}" in text
@@ -551,7 +658,20 @@ def test_equations_in_latex(tmp_path):
 
 
 HOSTILE = (
-    *(r"\input{/etc/passwd}", r"\write18{id}", "}{", "a~b", "a^b", "^^5cinput", "100 %", "m_2", "$x$", "&", "#1", "{"),
+    *(
+        r"\input{/etc/passwd}",
+        r"\write18{id}",
+        "}{",
+        "a~b",
+        "a^b",
+        "^^5cinput",
+        "100 %",
+        "m_2",
+        "$x$",
+        "&",
+        "#1",
+        "{",
+    ),
     *("\\\\", r"\end{document}", r"\catcode`\@=0", "a|b", "<m>", '"', "`", r"\\[1em]\hline"),
 )
 
@@ -559,15 +679,29 @@ HOSTILE = (
 @pytest.mark.parametrize("name", HOSTILE)
 def test_a_hostile_unit_is_text_in_latex(tmp_path, name):
     """Read as TeX does: what is left after the commands of the escape is the unit, letter for letter."""
-    letters = {"textbackslash": "\\", "textasciicircum": "^", "textasciitilde": "~", "textless": "<"}
+    letters = {
+        "textbackslash": "\\",
+        "textasciicircum": "^",
+        "textasciitilde": "~",
+        "textless": "<",
+    }
     letters |= {"textgreater": ">", "textbar": "|", "textquotedbl": '"', "textasciigrave": "`"}
     model = case("terms").model
     first = model.form.baseline.terms[0]
     terms = (replace(first, unit=name), *model.form.baseline.terms[1:])
-    parameters = (replace(model.form.baseline.parameters[0], unit=name), *model.form.baseline.parameters[1:])
-    form = replace(model.form, baseline=replace(model.form.baseline, terms=terms, parameters=parameters))
+    parameters = (
+        replace(model.form.baseline.parameters[0], unit=name),
+        *model.form.baseline.parameters[1:],
+    )
+    form = replace(
+        model.form, baseline=replace(model.form.baseline, terms=terms, parameters=parameters)
+    )
     oa.export(replace(model, form=form), tmp_path, "latex")
-    row = next(r for r in (tmp_path / "model.tex").read_text(encoding="utf-8").splitlines() if r.startswith("$a$ &"))
+    row = next(
+        r
+        for r in (tmp_path / "model.tex").read_text(encoding="utf-8").splitlines()
+        if r.startswith("$a$ &")
+    )
     cell = row.rsplit(" & ", 1)[1].removesuffix(r" \\")
     read = re.sub(r"\\(?:([a-z]+)\{\}|([_%&#${}]))|([\\{}_%&#$^~])", _plainly(letters), cell)
     assert f"[{name}]" in read or name in read
@@ -599,7 +733,10 @@ def refusals():
     broken = network.numbers._replace(gain=np.array([np.nan]))
     yield replace(network, numbers=broken), "the model holds numbers that are not finite"
     yield 5, "`model` must be a fitted model"
-    yield moving(spring(hold="spline"), ("v", "w"), oa.MLP((2,))), "a step knows no spline through the whole record"
+    yield (
+        moving(spring(hold="spline"), ("v", "w"), oa.MLP((2,))),
+        "a step cannot interpolate by a spline over the whole record",
+    )
     made = oa.Motion.from_functions(
         lambda x, u, p: x, lambda x, u, p: x, ["x"], ["y"], [oa.PhysicalParameter("a", 1.0)]
     )
@@ -637,13 +774,22 @@ def command(monkeypatch, *arguments: str) -> int:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("out", "--to", "cassadi", "--out", "new"), "no export to 'cassadi', did you mean 'casadi'?; known are c, "),
+        (
+            ("out", "--to", "cassadi", "--out", "new"),
+            "no export to 'cassadi', did you mean 'casadi'?; known are c, ",
+        ),
         (("out", "--to", "c", "--out", "theirs"), "theirs: holds notes.txt"),
         (("out", "--to", "c", "--out", "file/new"), "file/new: cannot be written"),
         (("out", "--to", "c", "--out", "out"), "out: holds"),
         (("absent", "--to", "c", "--out", "new"), "absent: no saved model there"),
-        (("out", "--to", "c", "--out", "new", "--name", "2nd"), "'2nd' cannot name the exported code"),
-        (("out", "--to", "c", "--out", "new", "--name", "while"), "'while' cannot name the exported code"),
+        (
+            ("out", "--to", "c", "--out", "new", "--name", "2nd"),
+            "'2nd' cannot name the exported code",
+        ),
+        (
+            ("out", "--to", "c", "--out", "new", "--name", "while"),
+            "'while' cannot name the exported code",
+        ),
         (("out", "--out", "new"), "Missing option '--to'"),
     ],
 )
@@ -658,8 +804,14 @@ def test_the_command_writes_a_folder_and_replaces_its_own(saved, monkeypatch, ca
     for _ in range(2):
         assert command(monkeypatch, "out", "--to", "numpy", "--out", "new", "--name", "plant") == 0
         assert capsys.readouterr().out == "written to new\n"
-    assert {path.name for path in (saved / "new").iterdir()} >= {"plant.py", "README.md", "vectors.csv"}
-    newer = (saved / "out" / "model" / "model.json").read_text().replace('"format": 2', '"format": 99')
+    assert {path.name for path in (saved / "new").iterdir()} >= {
+        "plant.py",
+        "README.md",
+        "vectors.csv",
+    }
+    newer = (
+        (saved / "out" / "model" / "model.json").read_text().replace('"format": 2', '"format": 99')
+    )
     (saved / "out" / "model" / "model.json").write_text(newer)
     assert command(monkeypatch, "out", "--to", "c", "--out", "other") == 2
     assert "in format 99" in capsys.readouterr().err and not (saved / "other").exists()

@@ -32,21 +32,30 @@ def suspect(name: str, shares: dict[str, float | None]) -> SuspectResult:
     """A suspect with biases in per cent."""
     unknown = dict.fromkeys(("relative_physical_bias", "expected_physical_bias"))
     relative = {key: None if share is None else share / 100 for key, share in shares.items()}
-    return SuspectResult.model_construct(name=name, relative_bias=relative, coefficient=1.0, size=1.0, **unknown)
+    return SuspectResult.model_construct(
+        name=name, relative_bias=relative, coefficient=1.0, size=1.0, **unknown
+    )
 
 
-@pytest.mark.parametrize(("rows", "columns", "kept"), [(5, 3, (5, 3)), (40, 8, (25, 8)), (1, 300, (1, 12))])
+@pytest.mark.parametrize(
+    ("rows", "columns", "kept"), [(5, 3, (5, 3)), (40, 8, (25, 8)), (1, 300, (1, 12))]
+)
 def test_of_many_biases_the_largest_have_numbers(tmp_path, rows, columns, kept):
     rng = np.random.default_rng(0)
     shares = rng.permutation(np.arange(1.0, rows * columns + 1)).reshape(rows, columns)
-    many = [suspect(f"term {i}", {f"c{j}": v for j, v in enumerate(row)}) for i, row in enumerate(shares)]
+    many = [
+        suspect(f"term {i}", {f"c{j}": v for j, v in enumerate(row)})
+        for i, row in enumerate(shares)
+    ]
     shown = bias_map(many)
     assert shown.shares.shape == kept and shares.max() in shown.shares
     left = shares.max(axis=1)[[f"term {i}" not in shown.suspects for i in range(rows)]]
     assert len(left) == rows - kept[0] and left.max(initial=0.0) <= shown.shares.max(axis=1).min()
     assert ("result.json has all" in shown.left_out) == (kept != (rows, columns))
     assert (f"{kept[0]} of {rows} suspects" in shown.left_out) == (kept[0] < rows)
-    assert list(shown.suspects) == [one.name for one in many if one.name in shown.suspects], "in their order"
+    assert list(shown.suspects) == [one.name for one in many if one.name in shown.suspects], (
+        "in their order"
+    )
     figure, page = bias_figure(many), bias_plot(many)
     assert len(figure.axes[0].texts) == shown.shares.size and "logarithmic" in figure.get_suptitle()
     assert page.traces[0]["text"] == shown.cells and "logarithmic" in page.caption
@@ -105,20 +114,32 @@ def test_a_residual_figure_has_its_units_and_keeps_within_its_edges(tmp_path):
     found = analysed(1e-3 * e, x)
     figure = residual_analysis_figure([found, found], "one-step residual", UNITS)
     own, crossed, over = figure.axes[:3]
-    assert own.get_ylabel() == "autocorrelation" and own.get_title(loc="left") == "residual of speed"
-    assert crossed.get_ylabel() == "correlation with the inputs" and over.get_ylabel() == "mean residual [rad/s]"
+    assert (
+        own.get_ylabel() == "autocorrelation" and own.get_title(loc="left") == "residual of speed"
+    )
+    assert (
+        crossed.get_ylabel() == "correlation with the inputs"
+        and over.get_ylabel() == "mean residual [rad/s]"
+    )
     (name,) = found.most_telling
     assert over.get_xlabel() == f"{name} [{UNITS[name.partition('[')[0]]}]"
     assert drawn(figure, tmp_path / "figure.png")
     edge = figure.bbox
     boxes = [axis.get_tightbbox() for axis in figure.axes]
     assert all(box.x0 >= edge.x0 and box.x1 <= edge.x1 for box in boxes)
-    assert all(left.x1 <= right.x0 for row in (boxes[:3], boxes[3:]) for left, right in zip(row, row[1:], strict=False))
+    assert all(
+        left.x1 <= right.x0
+        for row in (boxes[:3], boxes[3:])
+        for left, right in zip(row, row[1:], strict=False)
+    )
 
 
 def test_the_largest_autocorrelation_keeps_its_sign():
     e = lfilter([1.0], [1.0, 0.6], np.random.default_rng(7).normal(size=2000))
     found = analysed(e, {"voltage[k-1]": e})
     assert found.strongest_acf == pytest.approx(-found.largest_acf) and found.strongest_acf < -0.5
-    assert f"The largest in size is −{found.largest_acf:.2g}." in residual_plots(found, "residual", UNITS)[0].caption
+    assert (
+        f"The largest in size is −{found.largest_acf:.2g}."
+        in residual_plots(found, "residual", UNITS)[0].caption
+    )
     json.loads(found.model_dump_json())

@@ -31,7 +31,9 @@ def test_a_tie_on_held_out_rows_does_not_outdo_the_lag_that_is_significant(seed)
 def test_lag_0_is_taken_where_it_is_clearly_better():
     rng = np.random.default_rng(0)
     u = rng.normal(size=400)
-    model = first_model(Record.from_arrays(u, u + 0.5 * np.roll(u, 1) + 0.01 * rng.normal(size=400)))
+    model = first_model(
+        Record.from_arrays(u, u + 0.5 * np.roll(u, 1) + 0.01 * rng.normal(size=400))
+    )
     assert model is not None and model.delays == (0,) and model.orders.nk == (0,)
 
 
@@ -41,12 +43,18 @@ def test_the_level_of_an_output_is_no_delay(seed):
     u = rng.normal(size=600)
     y = 5 + lfilter([0, 0, 0, 1.0], [1, -0.8], u) + 0.05 * rng.normal(size=600)
     model = first_model(Record.from_arrays(u, y))
-    assert model is not None and model.offset and (model.orders.na, model.orders.nb, model.orders.nk) == (1, (1,), (3,))
+    assert (
+        model is not None
+        and model.offset
+        and (model.orders.na, model.orders.nb, model.orders.nk) == (1, (1,), (3,))
+    )
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_the_delay_of_an_input_that_acts_by_its_square_is_found(seed):
     rng = np.random.default_rng(seed)
     u = rng.normal(size=600)
-    model = first_model(Record.from_arrays(u, lfilter([0, 0, 1.0], [1, -0.8], u**2) + 0.05 * rng.normal(size=600)))
+    model = first_model(
+        Record.from_arrays(u, lfilter([0, 0, 1.0], [1, -0.8], u**2) + 0.05 * rng.normal(size=600))
+    )
     assert model is not None and model.delays == (2,) and model.orders.nk == (2,)

@@ -9,7 +9,9 @@ from test_cli import run
 
 import orthaug as oa
 
-PHYSICS = oa.Baseline.from_terms([oa.Term("a1", "y[k-1]"), oa.Term("a2", "y[k-2]"), oa.Term("b", "u[k-1]")])
+PHYSICS = oa.Baseline.from_terms(
+    [oa.Term("a1", "y[k-1]"), oa.Term("a2", "y[k-2]"), oa.Term("b", "u[k-1]")]
+)
 LEARNER = oa.MLP(hidden=(4,))
 
 
@@ -35,8 +37,15 @@ def free_run_error(model, data) -> float:
 
 def test_noise_of_the_equation_changes_nothing():
     data = record(equation=0.003)
-    found, one_step = (oa.estimate(data, PHYSICS, learner=LEARNER, criterion=c) for c in (oa.Auto(), oa.Prediction()))
-    assert found.focus is not None and found.focus.chosen == "prediction" and not found.focus.candidates
+    found, one_step = (
+        oa.estimate(data, PHYSICS, learner=LEARNER, criterion=c)
+        for c in (oa.Auto(), oa.Prediction())
+    )
+    assert (
+        found.focus is not None
+        and found.focus.chosen == "prediction"
+        and not found.focus.candidates
+    )
     np.testing.assert_array_equal(found.theta, one_step.theta)
     np.testing.assert_allclose(found.theta, found.problem.least_squares, rtol=1e-12)
     np.testing.assert_array_equal(found.model.numbers.weights, one_step.model.numbers.weights)
@@ -44,7 +53,10 @@ def test_noise_of_the_equation_changes_nothing():
 
 def test_noise_on_the_sensor_asks_for_the_free_run():
     data, test = record(sensor=0.02), record(seed=7)
-    found, one_step = (oa.estimate(data, PHYSICS, learner=LEARNER, criterion=c) for c in (oa.Auto(), oa.Prediction()))
+    found, one_step = (
+        oa.estimate(data, PHYSICS, learner=LEARNER, criterion=c)
+        for c in (oa.Auto(), oa.Prediction())
+    )
     assert found.focus.chosen == "simulation" and len(found.focus.candidates) == 4
     assert (
         "trained one step ahead and, because its residual" in found.focus.text
@@ -58,7 +70,9 @@ def test_noise_on_the_sensor_asks_for_the_free_run():
 def test_physics_alone_is_trained_on_the_free_run_too():
     """Linear physics without a learner: output error instead of least squares where the sensor is noisy."""
     data, test = record(sensor=0.05, friction=0.0), record(seed=7, friction=0.0)
-    found, one_step = (oa.estimate(data, PHYSICS, learner=None, criterion=c) for c in (oa.Auto(), oa.Prediction()))
+    found, one_step = (
+        oa.estimate(data, PHYSICS, learner=None, criterion=c) for c in (oa.Auto(), oa.Prediction())
+    )
     assert found.focus.chosen == "simulation" and found.physics_alone is None
     assert free_run_error(found.model, test) < 0.5 * free_run_error(one_step.model, test)
 
@@ -66,7 +80,9 @@ def test_physics_alone_is_trained_on_the_free_run_too():
 def test_a_learner_that_finds_noise_is_left_out():
     """Nothing is missing, and few rows: what a network learns is noise."""
     data = record(rows=120, sensor=0.1, friction=0.0)
-    found = oa.estimate(data, PHYSICS, learner=oa.MLP(hidden=(24,)), criterion=oa.Auto(), regularization="none")
+    found = oa.estimate(
+        data, PHYSICS, learner=oa.MLP(hidden=(24,)), criterion=oa.Auto(), regularization="none"
+    )
     assert found.model.form.bound is None
     assert "physics_alone" in [warning.code for warning in found.warnings]
     errors = {(c.focus, c.learner): c.error for c in found.focus.candidates}
@@ -80,7 +96,9 @@ def test_a_learner_that_is_wanted_is_kept():
     found = oa.estimate(data, PHYSICS, learner=oa.MLP(hidden=(24,)), **options)
     errors = {(c.focus, c.learner): c.error for c in found.focus.candidates}
     assert min(errors, key=errors.get)[1] is False
-    assert found.model.form.bound is not None and "one_step_only" not in [w.code for w in found.warnings]
+    assert found.model.form.bound is not None and "one_step_only" not in [
+        w.code for w in found.warnings
+    ]
 
 
 def test_a_validation_part_chooses():
@@ -88,7 +106,10 @@ def test_a_validation_part_chooses():
     found = oa.estimate(data, PHYSICS, learner=LEARNER, criterion=oa.Auto(), validation=validation)
     errors = {(c.focus, c.learner): c.error for c in found.focus.candidates}
     unit = found.problem.deviation
-    own = validation.experiments[0].outputs[2:] - found.model.simulate(validation).trajectories[0].model[2:]
+    own = (
+        validation.experiments[0].outputs[2:]
+        - found.model.simulate(validation).trajectories[0].model[2:]
+    )
     key = (found.focus.chosen, found.model.form.bound is not None)
     assert errors[key] == pytest.approx(float(np.sqrt(np.mean((own / unit) ** 2))), rel=1e-9)
 
@@ -97,7 +118,9 @@ def test_a_static_model_has_no_free_run():
     rng = np.random.default_rng(0)
     u = rng.uniform(-1, 1, 200)
     data = oa.Record.from_arrays(u=u, y=2 * u + u**2)
-    found = oa.estimate(data, oa.Baseline.from_terms([oa.Term("g", "u[k]")]), learner=LEARNER, criterion=oa.Auto())
+    found = oa.estimate(
+        data, oa.Baseline.from_terms([oa.Term("g", "u[k]")]), learner=LEARNER, criterion=oa.Auto()
+    )
     assert found.focus.chosen == "prediction"
 
 
@@ -145,7 +168,13 @@ hidden = [4]
 def write(folder, spec=SPEC, **options):
     for name, seed in (("run", 0), ("last", 1)):
         u, y = signals(seed=seed, **options)
-        np.savetxt(folder / f"{name}.csv", np.column_stack([u, y]), delimiter=",", header="u,y", comments="")
+        np.savetxt(
+            folder / f"{name}.csv",
+            np.column_stack([u, y]),
+            delimiter=",",
+            header="u,y",
+            comments="",
+        )
     (folder / "spec.toml").write_text(spec)
 
 
@@ -158,13 +187,17 @@ def test_both_models_are_kept_and_run(tmp_path, monkeypatch):
     assert result["focus"]["chosen"] == "simulation" and len(result["focus"]["candidates"]) == 4
     scores = {}
     for which in ("fitted", "physics"):
-        assert run("simulate", "out", "last.csv", "--model", which, "--out", f"{which}.csv").code == 0
+        assert (
+            run("simulate", "out", "last.csv", "--model", which, "--out", f"{which}.csv").code == 0
+        )
         table = np.genfromtxt(f"{which}.csv", delimiter=",", names=True)
         errors = (table["y"] - table["y_model"])[2:]
         scores[which] = float(np.sqrt(np.mean(errors**2)))
     alone = result["physics_alone"]["scores"]["tests.last"]["simulation"]["rmse"][0]
     assert scores["physics"] == pytest.approx(alone, rel=1e-6)
-    assert scores["fitted"] == pytest.approx(result["scores"]["tests.last"]["simulation"]["rmse"][0], rel=1e-6)
+    assert scores["fitted"] == pytest.approx(
+        result["scores"]["tests.last"]["simulation"]["rmse"][0], rel=1e-6
+    )
     assert run("export", "out", "--to", "numpy", "--out", "code", "--model", "physics").code == 0
     assert run("predict", "out/model", "last.csv", "--model", "physics", "--out", "p.csv").code == 0
     refused = run("simulate", "out", "last.csv", "--model", "other")
@@ -185,7 +218,13 @@ def test_physics_is_there_where_the_learner_was_left_out(tmp_path, monkeypatch):
 def test_one_step_by_hand_is_kept_and_named(tmp_path, monkeypatch):
     """A learner that is fitted to noise one step ahead runs worse than physics alone: the first line says so."""
     monkeypatch.chdir(tmp_path)
-    write(tmp_path, SPEC.replace("hidden = [4]", "hidden = [30]") + NOISY, rows=150, sensor=0.3, friction=0.0)
+    write(
+        tmp_path,
+        SPEC.replace("hidden = [4]", "hidden = [30]") + NOISY,
+        rows=150,
+        sensor=0.3,
+        friction=0.0,
+    )
     done = run("fit", "spec.toml", "--out", "out")
     assert done.code == 0
     result = json.loads((tmp_path / "out/result.json").read_text())
@@ -214,4 +253,4 @@ def test_auto_needs_what_can_be_trained_on_the_free_run():
 
 def test_a_motion_is_trained_on_its_free_run():
     found = replace(oa.Auto(), segment=100)
-    assert found.simulation == oa.Simulation(100) and found.flown is None
+    assert found.simulation == oa.Simulation(100) and found.free_run is None

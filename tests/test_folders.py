@@ -102,7 +102,8 @@ def test_something_else_is_refused_and_kept(tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "thesis.txt").write_text("mine")
     message = (
-        "out: holds thesis.txt and no manifest.json that says orthaug wrote it; give another folder, or .* with --force"
+        "out: holds thesis.txt and no manifest.json that says orthaug wrote it; give another "
+        "folder, or .* with --force"
     )
     with pytest.raises(InputError, match=message):
         check_replaceable(tmp_path / "out")
@@ -205,7 +206,10 @@ def test_without_a_manifest_every_file_is_the_users(tmp_path):
     """A name says nothing about who wrote a file: what older versions wrote is kept, too."""
     write(tmp_path / "out", "old")
     (tmp_path / "out" / "manifest.json").unlink()
-    with pytest.raises(InputError, match="out: holds ours and no manifest.json that says orthaug wrote it; .*--force"):
+    with pytest.raises(
+        InputError,
+        match="out: holds ours and no manifest.json that says orthaug wrote it; .*--force",
+    ):
         check_replaceable(tmp_path / "out")
     assert (tmp_path / "out" / "ours").read_text() == "old"
 
@@ -249,7 +253,9 @@ def put(path: Path, text: str = "new", **options: bool) -> None:
 
 def test_a_file_is_replaced_only_by_force(tmp_path):
     put(tmp_path / "a.csv", "old")
-    with pytest.raises(InputError, match=r"a.csv: exists; give another name, or replace it with --force"):
+    with pytest.raises(
+        InputError, match=r"a.csv: exists; give another name, or replace it with --force"
+    ):
         check_new_file(tmp_path / "a.csv")
     with pytest.raises(InputError, match=r"a.csv: exists and holds something else"):
         put(tmp_path / "a.csv")
@@ -273,7 +279,10 @@ def test_a_disk_without_space(tmp_path):
         raise OSError(28, "No space left on device")
 
     for whole in (lambda: whole_folder(tmp_path / "out"), lambda: whole_file(tmp_path / "out")):
-        with pytest.raises(InputError, match=r"out: cannot be written \(No space left on device\)"), whole() as partial:
+        with (
+            pytest.raises(InputError, match=r"out: cannot be written \(No space left on device\)"),
+            whole() as partial,
+        ):
             fail(partial)
     assert listing(tmp_path) == []
 

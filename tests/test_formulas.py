@@ -36,14 +36,24 @@ def test_symbols(text, made):
     assert formulas.rows(text) == made
 
 
-@pytest.mark.parametrize("text", ["θ̂ = R⁻¹QᵀY", "ΦᵀΦ", "S_k = G_k + Σ A_{k,i} S_{k−i}", "‖Y − Φθ − P⊥F‖²", "s²(ΦᵀΦ)⁻¹"])
+@pytest.mark.parametrize(
+    "text", ["θ̂ = R⁻¹QᵀY", "ΦᵀΦ", "S_k = G_k + Σ A_{k,i} S_{k−i}", "‖Y − Φθ − P⊥F‖²", "s²(ΦᵀΦ)⁻¹"]
+)
 def test_code_that_is_a_formula(text):
     assert formulas.typeset(f"<article><p><code>{text}</code></p></article>").count("<math>") == 1
 
 
 @pytest.mark.parametrize(
     "text",
-    ["y[k-1]", "theta_aux", "estimate(λ=1)", "BaselinePenalty(λ)", "θ is split off along them", '"θ"', "model.θ_aux"],
+    [
+        "y[k-1]",
+        "theta_aux",
+        "estimate(λ=1)",
+        "BaselinePenalty(λ)",
+        "θ is split off along them",
+        '"θ"',
+        "model.θ_aux",
+    ],
 )
 def test_code_that_is_typed_stays(text):
     page = f"<article><p><code>{text}</code></p></article>"
@@ -61,12 +71,18 @@ def test_prose():
         "10 %, then",
         "y_k outside",
     ):
-        page = f"<article>{text}</article>" if text != "y_k outside" else f"<nav>{text}</nav><article></article>"
+        page = (
+            f"<article>{text}</article>"
+            if text != "y_k outside"
+            else f"<nav>{text}</nav><article></article>"
+        )
         assert formulas.typeset(page) == page
 
 
 def test_lines_of_formulas_and_printed_lines():
-    block = '<article><div class="highlight"><pre><span></span><code>{}\n</code></pre></div></article>'
+    block = (
+        '<article><div class="highlight"><pre><span></span><code>{}\n</code></pre></div></article>'
+    )
     assert 'display="block"' in formulas.typeset(block.format("‖Y − Ŷ‖² = ‖QᵀY − Rθ‖²"))
     printed = block.format("100 % of what the learner found = θ̂ of it")
     assert formulas.typeset(printed) == printed
@@ -75,7 +91,9 @@ def test_lines_of_formulas_and_printed_lines():
 def test_every_formula_of_the_documents_is_well_formed():
     found = 0
     for page in pages():
-        prose = re.sub(r"^ *```.*?^ *```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+        prose = re.sub(
+            r"^ *```.*?^ *```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE
+        )
         for text in re.findall(r"`([^`\n]+)`", prose):
             if formulas.is_formula(text):
                 made = ElementTree.fromstring(formulas.mathml(text))

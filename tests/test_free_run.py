@@ -11,12 +11,12 @@ import scipy.signal
 
 from orthaug._base.errors import InputError
 from orthaug._base.jax import jax, jnp
-from orthaug._base.progress import Enough
+from orthaug._base.progress import StopTraining
 from orthaug.data.record import Record
 from orthaug.fitting.criteria import Prediction, Simulation
 from orthaug.fitting.estimation import estimate as choosing
-from orthaug.fitting.flight_plan import FlightPlan
 from orthaug.fitting.one_step import OneStepTask
+from orthaug.fitting.segmented_lagged import SegmentedLagged
 from orthaug.fitting.segments import respond
 from orthaug.fitting.solvers.adam_lbfgs import AdamLBFGS
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
@@ -54,7 +54,13 @@ def record(seed=1, lengths=(300,)):
 
 @cache
 def fit(structure=Orthogonal(), criterion=FREE, lengths=(300,), seed=0):  # noqa: B008  (frozen)
-    options = {"learner": NETWORK, "solver": LM, "structure": structure, "criterion": criterion, "seed": seed}
+    options = {
+        "learner": NETWORK,
+        "solver": LM,
+        "structure": structure,
+        "criterion": criterion,
+        "seed": seed,
+    }
     return estimate(record(1, lengths), PHYSICS, **options)
 
 
@@ -63,7 +69,9 @@ def free_run_loss(found, given, washout):
     squares = []
     for trajectory in found.model.simulate(given).trajectories:
         first = found.model.form.first_row + washout
-        squares.append(((trajectory.measured - trajectory.model)[first:] / found.problem.deviation) ** 2)
+        squares.append(
+            ((trajectory.measured - trajectory.model)[first:] / found.problem.deviation) ** 2
+        )
     return np.mean(np.concatenate(squares))
 
 
@@ -79,14 +87,18 @@ def test_the_free_run_is_better_than_that_of_the_one_step_solution():
 def test_every_structure_trains_on_the_free_run_and_predicts(structure):
     found = fit(structure)
     assert found.status.ok and found.status.iterations > 10 and np.isfinite(found.theta).all()
-    assert free_run_loss(found, record(), 8) < 0.9 * free_run_loss(fit(structure, Prediction()), record(), 8)
+    assert free_run_loss(found, record(), 8) < 0.9 * free_run_loss(
+        fit(structure, Prediction()), record(), 8
+    )
     assert found.model.predict(record()).scores().fit[0] > 85
     assert (found.std is None) == (structure.name != "orthogonal")
 
 
 @pytest.mark.parametrize("lengths", [(300,), (150, 60, 94)], ids=str)
 def test_loss_is_the_mean_square_of_simulate(lengths):
-    assert fit(lengths=lengths).status.loss == pytest.approx(free_run_loss(fit(lengths=lengths), record(1, lengths), 8))
+    assert fit(lengths=lengths).status.loss == pytest.approx(
+        free_run_loss(fit(lengths=lengths), record(1, lengths), 8)
+    )
 
 
 @pytest.mark.parametrize("lengths", [(300,), (150, 60, 94)], ids=str)
@@ -97,7 +109,9 @@ def test_theta_is_the_share_of_the_model_in_the_physics(lengths):
     values = np.concatenate([t.model[start:] for t in found.model.predict(given).trajectories])
     rows = found.problem.rows
     phi = found.problem.baseline.phi(rows.x, rows.layout, ("y",), np)[:, 0]
-    np.testing.assert_allclose(found.theta, np.linalg.lstsq(phi, values[:, 0], rcond=None)[0], rtol=1e-10)
+    np.testing.assert_allclose(
+        found.theta, np.linalg.lstsq(phi, values[:, 0], rcond=None)[0], rtol=1e-10
+    )
     assert found.defect <= 1e-12 and np.abs(found.model.theta_aux).max() > 1e-3
 
 
@@ -105,14 +119,22 @@ def test_orthogonal_and_additive_train_the_same_function():
     """Without penalty or bounds every structure trains the same (c, w) (F2)."""
     orthogonal, additive = fit(Orthogonal()), fit(Additive())
     np.testing.assert_allclose(
-        orthogonal.model.simulate(record()).model[2:], additive.model.simulate(record()).model[2:], rtol=1e-6, atol=1e-8
+        orthogonal.model.simulate(record()).model[2:],
+        additive.model.simulate(record()).model[2:],
+        rtol=1e-6,
+        atol=1e-8,
     )
     assert not np.allclose(orthogonal.theta, additive.theta, rtol=1e-2)
 
 
 def test_a_large_orthogonal_penalty_gives_the_orthogonal_theta():
     np.testing.assert_allclose(fit(OrthogonalPenalty(1e3)).theta, fit().theta, rtol=2e-2)
-    assert fit(OrthogonalPenalty(1e3)).defect < fit(OrthogonalPenalty(1.0)).defect < 0.1 < fit(Additive()).defect
+    assert (
+        fit(OrthogonalPenalty(1e3)).defect
+        < fit(OrthogonalPenalty(1.0)).defect
+        < 0.1
+        < fit(Additive()).defect
+    )
 
 
 def test_a_large_baseline_penalty_gives_the_initial_values():
@@ -127,9 +149,17 @@ def test_whole_experiments():
 
 
 def test_a_warm_start_goes_on():
-    again = estimate(record(), PHYSICS, initial=fit(), criterion=FREE, solver=LevenbergMarquardt(10))
+    again = estimate(
+        record(), PHYSICS, initial=fit(), criterion=FREE, solver=LevenbergMarquardt(10)
+    )
     assert again.status.loss < 1.02 * fit().status.loss
-    stopped = estimate(record(), PHYSICS, initial=fit(), criterion=Simulation(64, 8, 0), solver=LevenbergMarquardt(0))
+    stopped = estimate(
+        record(),
+        PHYSICS,
+        initial=fit(),
+        criterion=Simulation(64, 8, 0),
+        solver=LevenbergMarquardt(0),
+    )
     np.testing.assert_array_equal(stopped.model.numbers.weights, fit().model.numbers.weights)
 
 
@@ -150,8 +180,12 @@ def by_scipy(given, extra=0.0):
             found.append((y - experiment.outputs[:, 0]) / size)
         return np.concatenate(found)
 
-    start = np.concatenate([[0.8, -0.2 - extra, 0.4], *(e.outputs[:2, 0] for e in given.experiments)])
-    return scipy.optimize.least_squares(residual, start, x_scale="jac", xtol=1e-13, ftol=1e-13, gtol=1e-13).x[:3]
+    start = np.concatenate(
+        [[0.8, -0.2 - extra, 0.4], *(e.outputs[:2, 0] for e in given.experiments)]
+    )
+    return scipy.optimize.least_squares(
+        residual, start, x_scale="jac", xtol=1e-13, ftol=1e-13, gtol=1e-13
+    ).x[:3]
 
 
 @pytest.mark.parametrize("extra", [0.0, 0.15])
@@ -167,13 +201,17 @@ def test_physics_alone_is_output_error_as_scipy_has_it(extra):
 def test_a_fixed_term_stays_beside_a_learner():
     """Moving a known share of b into a fixed term changes b by it and nothing else."""
     terms = [*TERMS, Term("d", "y[k-2]", 0.15, fixed=True)]
-    shifted = estimate(record(), Baseline.from_terms(terms), learner=NETWORK, solver=LM, criterion=FREE)
+    shifted = estimate(
+        record(), Baseline.from_terms(terms), learner=NETWORK, solver=LM, criterion=FREE
+    )
     rows = shifted.problem.rows
     start = shifted.model.form.first_row
     known = 0.15 * record().experiments[0].outputs[start - 2 : -2, 0]
     values = shifted.model.predict(record()).model[start:, 0] - known
     phi = shifted.problem.baseline.phi(rows.x, rows.layout, ("y",), np)[:, 0]
-    np.testing.assert_allclose(shifted.theta, np.linalg.lstsq(phi, values, rcond=None)[0], rtol=1e-10)
+    np.testing.assert_allclose(
+        shifted.theta, np.linalg.lstsq(phi, values, rcond=None)[0], rtol=1e-10
+    )
     np.testing.assert_allclose(shifted.theta[1], fit().theta[1] - 0.15, atol=3 * fit().std[1])
 
 
@@ -196,23 +234,34 @@ def bounded_physics(box=BOX):
 @cache
 def bounded(structure):
     return estimate(
-        record(3, (150,)), bounded_physics(), learner=MLP((2,)), criterion=SMALL, solver=EXACT, structure=structure
+        record(3, (150,)),
+        bounded_physics(),
+        learner=MLP((2,)),
+        criterion=SMALL,
+        solver=EXACT,
+        structure=structure,
     )
 
 
 def reparametrised(found, orthogonal):
     """(residual, Jacobian) of the segments' errors over (θ, w), with `c = θ − Φ⁺F(w)` where θ is orthogonal."""
     problem = found.problem
-    flown = FlightPlan.of(OneStepTask.of(problem, MLP((2,))), SMALL)
+    flown = SegmentedLagged.of(OneStepTask.of(problem, MLP((2,))), SMALL)
     phi = problem.baseline.phi(problem.rows.x, problem.layout, ("y",), np)[:, 0]
     pseudo, z = np.linalg.pinv(phi), jnp.asarray(flown.task.scaling(problem.feature_rows()))
 
     def residual(p):
         theta, w = p[:3], p[3:]
-        share = pseudo @ (flown.task.unit * jax.vmap(lambda row: flown.bound.values(w, row))(z))[:, 0]
-        numbers = flown.numbers(0.0 * phi[0], 0.0)._replace(theta=theta - orthogonal * share, weights=w)
+        share = (
+            pseudo @ (flown.task.unit * jax.vmap(lambda row: flown.bound.values(w, row))(z))[:, 0]
+        )
+        numbers = flown.numbers(0.0 * phi[0], 0.0)._replace(
+            theta=theta - orthogonal * share, weights=w
+        )
         run = respond(flown.dynamics, numbers, flown.segments, flown.segments.start)
-        return jnp.where(flown.segments.scored[:, :, None], flown.segments.target - run, 0.0).ravel()
+        return jnp.where(
+            flown.segments.scored[:, :, None], flown.segments.target - run, 0.0
+        ).ravel()
 
     jacobian = jax.jit(jax.jacfwd(residual))
     compiled = jax.jit(residual)
@@ -240,7 +289,12 @@ def test_bounds_on_the_free_run(structure):
     mine = np.sum(residual(at) ** 2)
     for begin in (at, start):
         other = scipy.optimize.least_squares(
-            residual, np.clip(begin, low + 1e-9, high - 1e-9), jacobian, (low, high), x_scale="jac", max_nfev=300
+            residual,
+            np.clip(begin, low + 1e-9, high - 1e-9),
+            jacobian,
+            (low, high),
+            x_scale="jac",
+            max_nfev=300,
         )
         assert mine <= 1.01 * 2 * other.cost
     assert np.all((low[:3] <= found.theta) & (found.theta <= high[:3]))
@@ -250,7 +304,9 @@ def test_bounds_on_the_free_run(structure):
 
 
 def test_physics_alone_at_a_bound():
-    found = estimate(record(3, (150,)), bounded_physics({"g": (0.6, 1.0)}), learner=None, criterion=SMALL)
+    found = estimate(
+        record(3, (150,)), bounded_physics({"g": (0.6, 1.0)}), learner=None, criterion=SMALL
+    )
     assert found.at_bound["g"] == found.theta[2] == 0.6 and found.status.code == "converged"
 
 
@@ -291,7 +347,9 @@ def unweighted(given):
     def residual(p):
         inputs = experiment.inputs * p[1:3]
         inputs[0] = p[3:]
-        return (weight * (scipy.signal.lfilter([1], [1, -p[0]], inputs, axis=0) - experiment.outputs)).ravel()
+        return (
+            weight * (scipy.signal.lfilter([1], [1, -p[0]], inputs, axis=0) - experiment.outputs)
+        ).ravel()
 
     return scipy.optimize.least_squares(residual, [0.5, 1, 1, *experiment.outputs[0]]).x[:3]
 
@@ -326,11 +384,16 @@ def test_two_outputs_with_a_learner(baseline):
     given = two_outputs(1, (0.05, 0.05), 0.2)
     found = estimate(given, baseline, learner=NETWORK, criterion=FREE, solver=LM)
     rows, weight = found.problem.rows, 1 / found.problem.deviation[:, None]
-    phi = (found.problem.baseline.phi(rows.x, rows.layout, found.problem.outputs, np) * weight).reshape(rows.y.size, -1)
+    phi = (
+        found.problem.baseline.phi(rows.x, rows.layout, found.problem.outputs, np) * weight
+    ).reshape(rows.y.size, -1)
     values = (found.model.predict(given).model[1:] / found.problem.deviation).ravel()
     np.testing.assert_allclose(found.theta, np.linalg.lstsq(phi, values, rcond=None)[0], rtol=1e-10)
     assert found.defect <= 1e-12
-    assert found.status.loss == pytest.approx(free_run_loss(found, given, 8)) and found.status.loss < 0.01
+    assert (
+        found.status.loss == pytest.approx(free_run_loss(found, given, 8))
+        and found.status.loss < 0.01
+    )
 
 
 # --- choice between restarts
@@ -347,12 +410,18 @@ def test_restarts_are_chosen_by_the_loss_of_the_free_run():
 
 
 def test_validation_chooses_by_the_free_run():
-    options = {"learner": NETWORK, "solver": LevenbergMarquardt(3), "criterion": Simulation(64, 8, 3)}
+    options = {
+        "learner": NETWORK,
+        "solver": LevenbergMarquardt(3),
+        "criterion": Simulation(64, 8, 3),
+    }
     options["regularization"] = "none"
     other = record(9)
     several = estimate(record(), PHYSICS, restarts=3, seed=4, validation=other, **options)
     alone = [estimate(record(), PHYSICS, seed=s, **options) for s in (4, 5, 6)]
-    expected = [np.mean((f.model.simulate(other).scores().rmse / f.problem.deviation) ** 2) for f in alone]
+    expected = [
+        np.mean((f.model.simulate(other).scores().rmse / f.problem.deviation) ** 2) for f in alone
+    ]
     np.testing.assert_allclose([r.validation for r in several.restarts], expected, rtol=1e-12)
     assert int(np.argmin(expected)) == [r.chosen for r in several.restarts].index(True)
 
@@ -374,7 +443,13 @@ def test_progress_ends_at_the_loss_of_the_segments(ny):
     """In deviations of the outputs, like the loss: over whole experiments both are the same sum."""
     told = []
     given, baseline = (record(), PHYSICS) if ny == 1 else (two_outputs(1, (0.05, 0.2)), SEPARATE)
-    found = estimate(given, baseline, learner=None, criterion=Simulation(0, 8), progress=lambda *a: told.append(a))
+    found = estimate(
+        given,
+        baseline,
+        learner=None,
+        criterion=Simulation(0, 8),
+        progress=lambda *a: told.append(a),
+    )
     assert [(i, n) for i, n, _ in told] == [(0, n + 1) for n in range(found.status.iterations)]
     assert told[-1][2] == pytest.approx(found.status.loss, rel=0.1)
 
@@ -396,14 +471,19 @@ FIRST = Baseline.from_terms([Term("a", "y[k-1]", 0.8), Term("g", "u[k]", 0.4)])
 def test_a_horizon_lowers_the_error_that_many_steps_ahead(horizon):
     given = first_order(0)
     errors = [
-        estimate(given, FIRST, learner=None, criterion=Prediction(h)).model.predict(given, horizon).scores().rmse[0]
+        estimate(given, FIRST, learner=None, criterion=Prediction(h))
+        .model.predict(given, horizon)
+        .scores()
+        .rmse[0]
         for h in (1, horizon)
     ]
     assert errors[1] < errors[0]
 
 
 def test_a_horizon_with_a_learner():
-    errors = [fit(criterion=Prediction(h)).model.predict(record(), 5).scores().rmse[0] for h in (1, 5)]
+    errors = [
+        fit(criterion=Prediction(h)).model.predict(record(), 5).scores().rmse[0] for h in (1, 5)
+    ]
     assert errors[1] < 0.95 * errors[0]
     assert fit(criterion=Prediction(5)).defect <= 1e-12
 
@@ -433,7 +513,9 @@ def test_a_horizon_ends_at_the_least_error_that_many_steps_ahead(horizon):
 
 @pytest.mark.parametrize(("segment", "washout"), [(40, 40), (5, 40), (1, 1)])
 def test_a_washout_that_leaves_nothing_is_refused(segment, washout):
-    with pytest.raises(InputError, match=rf"`washout` must be shorter than `segment`; got {washout} and {segment}"):
+    with pytest.raises(
+        InputError, match=rf"`washout` must be shorter than `segment`; got {washout} and {segment}"
+    ):
         Simulation(segment, washout)
 
 
@@ -456,7 +538,9 @@ def test_adam_is_refused(criterion, learner):
 M, C, K, TS = 1.0, 100.0, 1000.0, 0.002
 GAMMA = M + C * TS + K * TS**2
 SPRING = np.array([2 * M + C * TS, -M, TS**2]) / GAMMA
-SPRING_PHYSICS = Baseline.from_terms([Term("t1", "y[k-1]"), Term("t2", "y[k-2]"), Term("t3", "u[k]")])
+SPRING_PHYSICS = Baseline.from_terms(
+    [Term("t1", "y[k-1]"), Term("t2", "y[k-2]"), Term("t3", "u[k]")]
+)
 
 
 @cache
@@ -467,8 +551,15 @@ def springs():
         rng = np.random.default_rng(seed)
         u = 100 * rng.normal(size=10_000)
         y = scipy.signal.lfilter([SPRING[2]], [1, -SPRING[0], -SPRING[1]], u)
-        noisy = Record.from_arrays(u, y + 10**-1.5 * y.std() * rng.normal(size=len(y)), sampling_time=TS)
-        found.append([estimate(noisy, SPRING_PHYSICS, learner=None, criterion=c) for c in (Simulation(), Prediction())])
+        noisy = Record.from_arrays(
+            u, y + 10**-1.5 * y.std() * rng.normal(size=len(y)), sampling_time=TS
+        )
+        found.append(
+            [
+                estimate(noisy, SPRING_PHYSICS, learner=None, criterion=c)
+                for c in (Simulation(), Prediction())
+            ]
+        )
     return found
 
 
@@ -482,7 +573,9 @@ def physical(found):
         return np.array([m, c, (gamma - m - c * TS) / TS**2])
 
     steps = np.diag(1e-6 * np.abs(found.theta))
-    slope = np.stack([(solve(found.theta + d) - solve(found.theta - d)) / (2 * d.sum()) for d in steps], axis=1)
+    slope = np.stack(
+        [(solve(found.theta + d) - solve(found.theta - d)) / (2 * d.sum()) for d in steps], axis=1
+    )
     return solve(found.theta), np.sqrt(np.diag(slope @ found.covariance @ slope.T))
 
 
@@ -509,7 +602,9 @@ def test_a_free_run_that_diverges_over_whole_experiments_is_no_error():
     unstable = Baseline.from_terms([Term("d", "y[k-1]", 1.3, fixed=True), Term("g", "u[k]", 1.0)])
     found = estimate(first_order(0), unstable, learner=None, criterion=Simulation(8, 0))
     assert found.status.ok and np.isfinite(found.parameters["value"]).all()
-    assert found.status.loss == found.status.start_loss == found.restarts[0].loss and np.isfinite(found.status.loss)
+    assert found.status.loss == found.status.start_loss == found.restarts[0].loss and np.isfinite(
+        found.status.loss
+    )
     assert [w.code for w in found.warnings] == ["free_run_diverges"]
 
 
@@ -521,8 +616,12 @@ def test_a_slowly_growing_free_run_has_a_loss():
 
 @pytest.mark.parametrize("learner", [None, NETWORK], ids=["no learner", "learner"])
 def test_a_free_run_that_nothing_can_save(learner):
-    hopeless = Baseline.from_terms([Term("d", "y[k-1]**3", 1e3, fixed=True), Term("g", "u[k]", 1.0)])
-    found = estimate(first_order(0), hopeless, learner=learner, criterion=Simulation(64, 8, 3), solver=LM)
+    hopeless = Baseline.from_terms(
+        [Term("d", "y[k-1]**3", 1e3, fixed=True), Term("g", "u[k]", 1.0)]
+    )
+    found = estimate(
+        first_order(0), hopeless, learner=learner, criterion=Simulation(64, 8, 3), solver=LM
+    )
     assert found.status.code == "non_finite" and not found.status.ok and found.status.message
     assert np.isfinite(found.parameters["value"]).all() and found.std is None
     assert "non_finite" in found.summary()
@@ -554,16 +653,21 @@ def unstable(rows=300):
 
 
 def test_physics_alone_that_runs_away_trains_over_segments_that_lengthen(monkeypatch):
-    steps, over = [], FlightPlan.over
+    steps, over = [], SegmentedLagged.over
 
     def counted(self, segment):
         steps.append(segment)
         return over(self, segment)
 
-    monkeypatch.setattr(FlightPlan, "over", counted)
+    monkeypatch.setattr(SegmentedLagged, "over", counted)
     physics = Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "u[k-1]")])
     found = estimate(unstable(), physics, learner=None, criterion=Simulation(256, 8), solver=LM)
-    assert found.status.ok and found.status.loss == found.status.start_loss < 1 and steps[0] == 4 and len(steps) > 2
+    assert (
+        found.status.ok
+        and found.status.loss == found.status.start_loss < 1
+        and steps[0] == 4
+        and len(steps) > 2
+    )
 
 
 @pytest.mark.parametrize("seed", range(2, 6))
@@ -583,23 +687,33 @@ def monte_carlo(draws, **options):
     u = rng.normal(size=300)
     y = scipy.signal.lfilter([0.5], [1, -0.9], u)
     fits = [
-        estimate(Record.from_arrays(u, y + 0.3 * np.random.default_rng(100 + s).normal(size=300)), FIRST, **options)
+        estimate(
+            Record.from_arrays(u, y + 0.3 * np.random.default_rng(100 + s).normal(size=300)),
+            FIRST,
+            **options,
+        )
         for s in range(draws)
     ]
     return np.array([f.theta for f in fits]), np.array([f.std for f in fits])
 
 
-@pytest.mark.parametrize("criterion", [Simulation(64, 8), Simulation(0, 0)], ids=["segments", "whole"])
+@pytest.mark.parametrize(
+    "criterion", [Simulation(64, 8), Simulation(0, 0)], ids=["segments", "whole"]
+)
 def test_standard_deviations_of_the_physics(criterion):
     theta, std = monte_carlo(60, learner=None, criterion=criterion)
     np.testing.assert_allclose(std.mean(axis=0), theta.std(axis=0, ddof=1), rtol=0.25)
-    assert np.all(np.abs(theta.mean(axis=0) - [0.9, 0.5]) < 4 * theta.std(axis=0, ddof=1) / np.sqrt(60))
+    assert np.all(
+        np.abs(theta.mean(axis=0) - [0.9, 0.5]) < 4 * theta.std(axis=0, ddof=1) / np.sqrt(60)
+    )
 
 
 @pytest.mark.proof
 def test_standard_deviations_beside_a_regularised_learner(record_property):
     criterion, solver = Simulation(64, 8, 10), LevenbergMarquardt()
-    theta, std = monte_carlo(60, learner=MLP((2,)), criterion=criterion, regularization="evidence", solver=solver)
+    theta, std = monte_carlo(
+        60, learner=MLP((2,)), criterion=criterion, regularization="evidence", solver=solver
+    )
     ratio = theta.std(axis=0, ddof=1) / std.mean(axis=0)
     record_property("scatter over std", ", ".join(f"{one:.2f}" for one in ratio))
     np.testing.assert_allclose(std.mean(axis=0), theta.std(axis=0, ddof=1), rtol=0.25)
@@ -620,17 +734,21 @@ def test_evidence_keeps_a_learner_that_the_data_need():
 def test_a_run_that_is_stopped_is_kept_and_tried_on_no_block():
     def enough_after_physics(run, iteration, loss):
         if iteration > 12:
-            raise Enough
+            raise StopTraining
 
-    found = choosing(record(), PHYSICS, learner=NETWORK, solver=LM, criterion=FREE, progress=enough_after_physics)
+    found = choosing(
+        record(), PHYSICS, learner=NETWORK, solver=LM, criterion=FREE, progress=enough_after_physics
+    )
     assert found.status.code == "stopped" and found.held_out is None
     assert found.status.loss < found.status.start_loss and found.model.form.bound is not None
-    assert any("none was tried on held-out blocks" in w.text for w in found.warnings if w.code == "stopped")
+    assert any(
+        "none was tried on held-out blocks" in w.text for w in found.warnings if w.code == "stopped"
+    )
 
 
 def test_a_theta_that_the_data_do_not_determine_beside_the_learner_has_a_sentence(monkeypatch):
     nothing = np.full((3, 3), np.nan)
-    monkeypatch.setattr("orthaug.fitting.flights.theta_block", lambda *_: nothing)
+    monkeypatch.setattr("orthaug.fitting.simulation_task.theta_block", lambda *_: nothing)
     fit = choosing(nonlinear(), PHYSICS, learner=NETWORK, criterion=FREE, blocks=0)
     assert np.isnan(fit.std).all()
     assert [w.text[:60] for w in fit.warnings if w.code == "no_standard_errors"] == [

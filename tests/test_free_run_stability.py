@@ -24,7 +24,7 @@ from orthaug.data.regressors import Lags, stack_rows
 from orthaug.fitting.conclusion import orthogonalize
 from orthaug.fitting.estimation import estimate
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
-from orthaug.models.dynamics import Differentiated, Dynamics, Parts
+from orthaug.models.dynamics import AutodiffDynamics, Dynamics, Parts
 from orthaug.models.learners import MLP, Function
 from orthaug.models.model import Model
 from orthaug.models.storage import load, save
@@ -34,11 +34,15 @@ from orthaug.reports.findings import StabilityResult
 FEW = LevenbergMarquardt(iterations=5)
 
 
-def model_of(terms: list[Term], theta, outputs=("y",), largest: float = 10.0, inputs=("u",)) -> Model:
+def model_of(
+    terms: list[Term], theta, outputs=("y",), largest: float = 10.0, inputs=("u",)
+) -> Model:
     """Physics alone with a given θ; `largest` is its largest training output."""
     rng = np.random.default_rng(0)
     y = 20 * rng.normal(size=(500, len(outputs)))
-    record = Record.from_arrays(rng.normal(size=(500, len(inputs))), y, inputs=list(inputs), outputs=list(outputs))
+    record = Record.from_arrays(
+        rng.normal(size=(500, len(inputs))), y, inputs=list(inputs), outputs=list(outputs)
+    )
     model = estimate(record, Baseline.from_terms(terms), learner=None).model
     numbers = model.numbers._replace(theta=np.asarray(theta, dtype=float))
     return replace(model, numbers=numbers, largest_output=np.full(len(outputs), largest))
@@ -96,7 +100,14 @@ def network():
     record = Record.from_arrays(u, y, outputs=["p", "q"])
     terms = [Term("a", "p[k-1]", output="p"), Term("b", "q[k-1]*p[k-2]", output="q")]
     lags = Lags(na=[3, 1], nb=2)
-    fit = estimate(record, Baseline.from_terms(terms), lags=lags, learner=MLP((4,)), solver=FEW, regularization=1.0)
+    fit = estimate(
+        record,
+        Baseline.from_terms(terms),
+        lags=lags,
+        learner=MLP((4,)),
+        solver=FEW,
+        regularization=1.0,
+    )
     return fit.model, record
 
 
@@ -138,7 +149,9 @@ def test_companion_moves_the_state(network):
     past = np.random.default_rng(0).normal(size=(3, 2))
     expected = [sum(a[i] @ past[i] for i in range(3)), past[0], past[1]]
     np.testing.assert_allclose(whole @ past.ravel(), np.ravel(expected), atol=1e-12)
-    ends = [model.form.step(model.numbers, state + h * past.ravel(), inputs)[0] for h in (1e-6, -1e-6)]
+    ends = [
+        model.form.step(model.numbers, state + h * past.ravel(), inputs)[0] for h in (1e-6, -1e-6)
+    ]
     np.testing.assert_allclose(whole @ past.ravel(), (ends[0] - ends[1]) / 2e-6, atol=1e-7)
 
 
@@ -150,7 +163,16 @@ def test_companion_moves_the_state(network):
         [0.99 * np.exp(0.3j), 0.99 * np.exp(-0.3j)],
         [0.9, 0.9],
         [0.9999 * np.exp(0.01j), 0.9999 * np.exp(-0.01j)],
-        [0.98 * np.exp(0.5j), 0.98 * np.exp(-0.5j), 0.9 * np.exp(1j), 0.9 * np.exp(-1j), 0.9, 0.8, 0.5, -0.6],
+        [
+            0.98 * np.exp(0.5j),
+            0.98 * np.exp(-0.5j),
+            0.9 * np.exp(1j),
+            0.9 * np.exp(-1j),
+            0.9,
+            0.8,
+            0.5,
+            -0.6,
+        ],
         [0.9 * np.exp(0.4j * k) for k in range(-7, 8)],
     ],
 )
@@ -160,7 +182,9 @@ def test_poles_of_linear_models(poles):
     record = driven(model, noise(400))
     found, contracts = feedback(model, record), contraction(model, record)
     radius = max(np.abs(poles))
-    assert found.largest == pytest.approx(radius, abs=1e-6) and found.median == pytest.approx(radius, abs=1e-6)
+    assert found.largest == pytest.approx(radius, abs=1e-6) and found.median == pytest.approx(
+        radius, abs=1e-6
+    )
     assert found.share_above_one == 0
     assert radius - 1e-6 <= contracts.rate <= radius**0.93 < 1
     assert contracts.share == 1 and contracts.bound == pytest.approx(radius, abs=1e-6)
@@ -173,7 +197,9 @@ def test_poles_of_linear_models(poles):
 
 def test_a_normal_matrix_needs_no_other_norm():
     """A rotation, shrunk by 0.9: its norm is its spectral radius."""
-    model = model_of(BOTH, [0.9 * np.cos(1), -0.9 * np.sin(1), 0.9 * np.sin(1), 0.9 * np.cos(1), 1.0], ("p", "q"))
+    model = model_of(
+        BOTH, [0.9 * np.cos(1), -0.9 * np.sin(1), 0.9 * np.sin(1), 0.9 * np.cos(1), 1.0], ("p", "q")
+    )
     record = driven(model, noise(300))
     contracts = contraction(model, record)
     assert contracts.bound == pytest.approx(0.9) and 0.9 - 1e-9 <= contracts.rate < 0.905
@@ -186,7 +212,10 @@ def test_an_unstable_linear_model():
     assert found.feedback.largest == pytest.approx(1.02) and found.feedback.share_above_one == 1
     assert found.contraction.rate >= 1.02 - 1e-6 and found.contraction.share == 0
     assert len(found.warnings) == 1
-    assert "radius is above 1 at 100 %" in found.warnings[0].text and "At 100 % of the 58" in found.text
+    assert (
+        "radius is above 1 at 100 %" in found.warnings[0].text
+        and "At 100 % of the 58" in found.text
+    )
 
 
 def test_a_pole_at_one_is_not_above():
@@ -284,7 +313,10 @@ def test_duffing_diverges_at_a_known_factor(duffing):
 
 def test_a_threshold_that_is_known():
     """y = 0.5 y + 10 max(y − 10, 0) + u settles at 2 u up to 10; u = 3 ± 1 may be scaled to 3 ± 2, and no farther."""
-    model = model_of([Term("c", "y[k-1]"), Term("a", "max(y[k-1] - 10, 0)"), Term("b", "u[k-1]")], [0.5, 10.0, 1.0])
+    model = model_of(
+        [Term("c", "y[k-1]"), Term("a", "max(y[k-1] - 10, 0)"), Term("b", "u[k-1]")],
+        [0.5, 10.0, 1.0],
+    )
     u = 3 + np.tile(np.repeat([1.0, -1.0], 50), 4)
     assert 2 < divergence_scaling(model, driven(model, u)) <= 2.1
 
@@ -341,7 +373,9 @@ def test_without_feedback():
     found = stability(model, record)
     assert found.feedback is None and found.contraction is None and found.diverges_at is None
     assert feedback(model, record) is None and contraction(model, record) is None
-    assert "uses no past outputs: its free run cannot diverge" in found.text and found.warnings == ()
+    assert (
+        "uses no past outputs: its free run cannot diverge" in found.text and found.warnings == ()
+    )
     assert found.lipschitz.gradient == pytest.approx(np.hypot(1, 2), rel=1e-2)
     json.dumps(content(found), allow_nan=False)
 
@@ -378,7 +412,9 @@ def test_a_long_past_is_not_looked_at():
     with pytest.raises(InputError, match="too few"):
         stability(model, Record.from_arrays(noise(100), noise(100)))
     found = stability(model, record)
-    assert found.contraction is None and found.feedback.largest is None and found.feedback.skipped == 0
+    assert (
+        found.contraction is None and found.feedback.largest is None and found.feedback.skipped == 0
+    )
     assert "more than 200 past outputs" in dict(found.warnings)["contraction_not_checked"]
     json.dumps(content(found), allow_nan=False)
 
@@ -401,33 +437,56 @@ def test_lipschitz_of_known_gradients():
     y1, y2, u1 = y[1:-1], y[:-2], u[1:-1]
     size = np.sqrt(0.25 * (y1**2 + y2**2) + 9)
     assert found.gradient == pytest.approx(size.max()) and found.rows == 198
-    scaled = np.sqrt(0.25 * ((y2 * y1.std()) ** 2 + (y1 * y2.std()) ** 2) + (3 * u1.std()) ** 2) / y.std()
-    assert found.gradient_scaled == pytest.approx(scaled.max()) and found.worst.row == scaled.argmax() + 2
+    scaled = (
+        np.sqrt(0.25 * ((y2 * y1.std()) ** 2 + (y1 * y2.std()) ** 2) + (3 * u1.std()) ** 2)
+        / y.std()
+    )
+    assert (
+        found.gradient_scaled == pytest.approx(scaled.max())
+        and found.worst.row == scaled.argmax() + 2
+    )
     assert found.phi == pytest.approx(np.sqrt(y1**2 + y2**2 + 1).max())
     rms = [np.sqrt(np.mean((y1 * y2) ** 2)), np.sqrt(np.mean(u1**2))]
-    phi = np.sqrt(((y2 * y1.std()) ** 2 + (y1 * y2.std()) ** 2) / rms[0] ** 2 + (u1.std() / rms[1]) ** 2)
+    phi = np.sqrt(
+        ((y2 * y1.std()) ** 2 + (y1 * y2.std()) ** 2) / rms[0] ** 2 + (u1.std() / rms[1]) ** 2
+    )
     assert found.phi_scaled == pytest.approx(phi.max()) and found.phi_worst.row == phi.argmax() + 2
 
 
 def test_lipschitz_of_the_weights_of_a_known_learner(monkeypatch):
     """f = w₁ z₁ z₂ + w₂ z₁²: ∂²f/∂w∂z = [[z₂, z₁], [2 z₁, 0]], z scaled and f in its unit."""
     learner = Function(
-        lambda w, z: w[:1] * z[0] * z[1] + w[1:] * z[0] ** 2, lambda key: jnp.zeros(2), ("u[k]", "u[k-1]")
+        lambda w, z: w[:1] * z[0] * z[1] + w[1:] * z[0] ** 2,
+        lambda key: jnp.zeros(2),
+        ("u[k]", "u[k-1]"),
     )
     u, y = 1 + 0.5 * noise(200), 3 * noise(200, 2)
     record = Record.from_arrays(u, y)
-    model = estimate(record, Baseline.from_terms([Term("a", "u[k]")]), learner=learner, solver=FEW).model
+    model = estimate(
+        record, Baseline.from_terms([Term("a", "u[k]")]), learner=learner, solver=FEW
+    ).model
     numbers, x = model.numbers, np.stack([u[1:], u[:-1]], axis=1)
     z = (x - numbers.centre) / numbers.halfwidth
-    columns = [z[:, 1] ** 2 + 4 * z[:, 0] ** 2, z[:, 0] ** 2]  # Σ over the weights, for each entry of x
+    columns = [
+        z[:, 1] ** 2 + 4 * z[:, 0] ** 2,
+        z[:, 0] ** 2,
+    ]  # Σ over the weights, for each entry of x
     squares = np.stack(columns, axis=1) * (numbers.gain / numbers.halfwidth) ** 2
     found = lipschitz(model, record)
-    assert found.weights == pytest.approx(np.sqrt(squares.sum(axis=1)).max()) and found.weights_rows == 199
+    assert (
+        found.weights == pytest.approx(np.sqrt(squares.sum(axis=1)).max())
+        and found.weights_rows == 199
+    )
     scaled = np.sqrt((squares * x.std(axis=0) ** 2).sum(axis=1)) / y.std()
-    assert found.weights_scaled == pytest.approx(scaled.max()) and found.weights_worst.row == scaled.argmax() + 1
+    assert (
+        found.weights_scaled == pytest.approx(scaled.max())
+        and found.weights_worst.row == scaled.argmax() + 1
+    )
     monkeypatch.setattr(gradients, "_MOST_CELLS", 4 * 50)
     few, some = lipschitz(model, record), np.linspace(0, 198, 50).round().astype(int)
-    assert few.weights_rows == 50 and few.weights == pytest.approx(np.sqrt(squares[some].sum(axis=1)).max())
+    assert few.weights_rows == 50 and few.weights == pytest.approx(
+        np.sqrt(squares[some].sum(axis=1)).max()
+    )
     assert few.weights_worst.row == some[scaled[some].argmax()] + 1 and few.rows == 199
 
 
@@ -440,16 +499,25 @@ def test_lipschitz_of_the_weights_of_a_network(network):
         slope = jax.jacfwd(lambda w, x: form.at(numbers._replace(weights=w), x).total)
         return jnp.linalg.norm(jax.jacfwd(slope, 1)(numbers.weights, row).ravel())
 
-    assert lipschitz(model, record).weights == pytest.approx(float(jax.jit(jax.vmap(size))(x).max()))
+    assert lipschitz(model, record).weights == pytest.approx(
+        float(jax.jit(jax.vmap(size))(x).max())
+    )
 
 
 def test_lipschitz_of_no_weights(duffing):
     """Physics alone, and a learner from elsewhere, have none."""
     model, record = duffing
-    split = orthogonalize(record, Baseline.from_terms([DUFFING[0]]), lambda x: x[:, 0], lags=Lags(na=2, nb=1)).model
+    split = orthogonalize(
+        record, Baseline.from_terms([DUFFING[0]]), lambda x: x[:, 0], lags=Lags(na=2, nb=1)
+    ).model
     for one in (model, split):
         found = lipschitz(one, record.rows(None, 300))
-        assert (found.weights, found.weights_scaled, found.weights_worst, found.weights_rows) == (None, None, None, 0)
+        assert (found.weights, found.weights_scaled, found.weights_worst, found.weights_rows) == (
+            None,
+            None,
+            None,
+            0,
+        )
         assert found.gradient > 0 and found.rows == 298
 
 
@@ -483,7 +551,9 @@ def test_a_model_from_elsewhere_by_differences(duffing):
     def outside(x):
         return 1.6 * x[:, 0] - 0.8 * x[:, 1] - 0.05 * x[:, 0] ** 3 + 0.2 * x[:, 2]
 
-    split = orthogonalize(record, Baseline.from_terms([DUFFING[0]]), outside, lags=Lags(na=2, nb=1)).model
+    split = orthogonalize(
+        record, Baseline.from_terms([DUFFING[0]]), outside, lags=Lags(na=2, nb=1)
+    ).model
     short = record.rows(None, 300)
     found, expected = feedback(split, short), feedback(model, short)
     np.testing.assert_allclose(found.transition, expected.transition, atol=1e-5)
@@ -501,7 +571,10 @@ def test_the_result_is_plain(network):
     found = stability(model, record)
     plain = json.loads(json.dumps(content(found), allow_nan=False))
     assert plain == content(found)
-    assert plain["feedback"]["largest"] == found.feedback.largest and "transition" not in plain["feedback"]
+    assert (
+        plain["feedback"]["largest"] == found.feedback.largest
+        and "transition" not in plain["feedback"]
+    )
     assert np.shape(plain["contraction"]["metric"]) == (6, 6)
     assert set(plain["lipschitz"]["worst"]["regressor"]) == {str(lag) for lag in model.form.layout}
 
@@ -520,12 +593,17 @@ def test_the_search_tries_the_factors_of_a_plain_one(duffing, scale):
     """Doubling and bisecting one free run at a time, as the docstring says it, comes to the same number."""
     model, record = duffing
     (e,) = record.experiments
-    record = Record.join([Record.from_arrays(scale * e.inputs[k:], e.outputs[k:]) for k in (0, 2500)])
+    record = Record.join(
+        [Record.from_arrays(scale * e.inputs[k:], e.outputs[k:]) for k in (0, 2500)]
+    )
     mean = np.concatenate([e.inputs for e in record.experiments]).mean(axis=0)
 
     def diverges(factor):
         scaled = [replace(e, inputs=mean + factor * (e.inputs - mean)) for e in record.experiments]
-        return any(t.diverged for t in model.simulate(replace(record, experiments=tuple(scaled))).trajectories)
+        return any(
+            t.diverged
+            for t in model.simulate(replace(record, experiments=tuple(scaled))).trajectories
+        )
 
     low = high = 1.0
     while diverges(low):
@@ -546,7 +624,7 @@ def test_channels_by_name(network):
 
 
 @dataclass(frozen=True)
-class Oscillator(Differentiated):
+class Oscillator(AutodiffDynamics):
     """x⁺ = A x + (0, u), y = x₁ + x₂³ of a state that nobody measures: no past outputs anywhere."""
 
     a: tuple[tuple[float, ...], ...]
@@ -571,7 +649,9 @@ class Oscillator(Differentiated):
 
     def step(self, numbers, state, inputs):
         y = state[:1] + state[1:] ** 3
-        return jnp.asarray(self.a) @ state + jnp.append(jnp.zeros(1), inputs), Parts(y, 0 * y, 0 * y)
+        return jnp.asarray(self.a) @ state + jnp.append(jnp.zeros(1), inputs), Parts(
+            y, 0 * y, 0 * y
+        )
 
 
 def oscillating(radius: float) -> tuple[Model, np.ndarray]:
@@ -632,7 +712,10 @@ def test_a_state_that_is_no_past_output_diverges():
     record = Record.from_arrays(0.1 * noise(400), noise(400, 2))
     found = stability(model, record)
     row = model.simulate(record).trajectories[0].diverged[0]
-    assert found.feedback.diverged == (f"y at experiment 0, row {row}",) and found.feedback.steps == row + 1 < 100
+    assert (
+        found.feedback.diverged == (f"y at experiment 0, row {row}",)
+        and found.feedback.steps == row + 1 < 100
+    )
     assert found.feedback.largest == pytest.approx(1.3) and found.contraction.rate >= 1.3 - 1e-9
     assert found.diverges_at == 0.0
 
@@ -674,7 +757,8 @@ def test_records_refused(duffing):
     with pytest.raises(InputError, match="lacks the output y"):
         stability(model, Record.from_arrays(noise(50)))
     with pytest.raises(
-        InputError, match=r"`x` has shape \(2998, 2\); the usable regressors of the record have \(2998, 3"
+        InputError,
+        match=r"`x` has shape \(2998, 2\); the usable regressors of the record have \(2998, 3",
     ):
         stability(model, record, x=stack_rows(record, model.form.layout).x[:, :2])
     with pytest.raises(InputError, match="no measured outputs to start from"):

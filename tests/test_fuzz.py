@@ -46,12 +46,16 @@ def test_specs(tmp_path):
 
 def test_saved_models(tmp_path):
     content = model_files(tmp_path / "model")
-    assert judged(lambda seed: try_model(seed, content, tmp_path / "model"), range(60))["refused"] > 40
+    assert (
+        judged(lambda seed: try_model(seed, content, tmp_path / "model"), range(60))["refused"] > 40
+    )
 
 
 def test_forged_models(tmp_path):
     content, _ = model_of(tmp_path / "model")
-    assert judged(lambda seed: try_forged(seed, content, tmp_path / "model"), range(15))["refused"] > 5
+    assert (
+        judged(lambda seed: try_forged(seed, content, tmp_path / "model"), range(15))["refused"] > 5
+    )
 
 
 def test_commands(tmp_path):
@@ -74,7 +78,9 @@ def test_exports(tmp_path):
     assert judged(lambda seed: try_export(seed, model, tmp_path), range(12))["equal"] > 2
 
 
-@pytest.mark.parametrize("data", [b"", b"x", b"\xff\xfe", b"(" * 4000, b"{}", b'{"kind": "motion"}', b"\x02PK\x03\x04"])
+@pytest.mark.parametrize(
+    "data", [b"", b"x", b"\xff\xfe", b"(" * 4000, b"{}", b'{"kind": "motion"}', b"\x02PK\x03\x04"]
+)
 @pytest.mark.parametrize("target", TARGETS)
 def test_entry_points_of_a_guided_fuzzer_raise_nothing(target, data):
     TARGETS[target](data)

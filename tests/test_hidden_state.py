@@ -32,7 +32,9 @@ LAGGED = "".join(
 )
 
 
-def spring(rows: int = 700, hidden: float = 1.0, seed: int = 0, equation: float = 0.2) -> dict[str, np.ndarray]:
+def spring(
+    rows: int = 700, hidden: float = 1.0, seed: int = 0, equation: float = 0.2
+) -> dict[str, np.ndarray]:
     """x'' = u − 0.6 x' − 4 x − z with a hidden z' = (x − z)/0.5, noise in the equation."""
     random = np.random.default_rng(seed)
     u = np.repeat(random.uniform(-3, 3, rows // 12 + 1), 12)[:rows]
@@ -49,7 +51,9 @@ def spring(rows: int = 700, hidden: float = 1.0, seed: int = 0, equation: float 
     return {"u": u, "y": np.array(y) + 1e-4 * random.normal(size=rows)}
 
 
-def lags(rows: int = 700, hidden: float = 0.1, seed: int = 0, sensor: float = 0.0) -> dict[str, np.ndarray]:
+def lags(
+    rows: int = 700, hidden: float = 0.1, seed: int = 0, sensor: float = 0.0
+) -> dict[str, np.ndarray]:
     """y = 1.35 y₁ − 0.48 y₂ + 0.5 u₁ − 0.1 z + e with a hidden first-order lag z of y."""
     random = np.random.default_rng(seed)
     u, y, z = np.repeat(random.uniform(-3, 3, rows // 10 + 1), 10)[:rows], np.zeros(rows), 0.0
@@ -61,11 +65,15 @@ def lags(rows: int = 700, hidden: float = 0.1, seed: int = 0, sensor: float = 0.
 
 
 def codes(result: oa.FitResult | dict) -> set[str]:
-    warnings = result["warnings"] if isinstance(result, dict) else [vars(one) for one in result.warnings]
+    warnings = (
+        result["warnings"] if isinstance(result, dict) else [vars(one) for one in result.warnings]
+    )
     return {warning["code"] for warning in warnings}
 
 
-def fitted(folder: Path, physics: str, data: dict[str, np.ndarray], learner: str = "") -> tuple[dict, str, str]:
+def fitted(
+    folder: Path, physics: str, data: dict[str, np.ndarray], learner: str = ""
+) -> tuple[dict, str, str]:
     """result.json, the text, and the page of `orthaug fit`."""
     write_csv(folder / "run.csv", **data)
     physics = physics.replace("LEARNED", "true" if learner else "false")
@@ -81,16 +89,23 @@ def test_a_fall_back_says_that_a_state_is_missing(tmp_path):
     learner = '[learner]\nhidden = [3]\ninputs = ["v"]\n'
     result, text, page = fitted(tmp_path, MOTION, spring(), learner)
     k = next(row for row in result["parameters"] if row["name"] == "k")
-    said = k["ci95"] is not None  # what a missing state leaves may remember itself for too long to have an interval
+    said = (
+        k["ci95"] is not None
+    )  # what a missing state leaves may remember itself for too long to have an interval
     assert (k["ci95_counts"] == "noise only") if said else ("too_long_memory" in codes(result))
     assert {"unexplained", "hidden_state"} <= codes(result)
     assert result["unexplained"]["hidden_state"]
     best = result["unexplained"]["memory"][0]
     assert best["kind"] == "lag" and abs(best["parameters"]["k"] - 4) < 0.7 * abs(k["value"] - 4)
-    assert not said or ("95 %, noise only" in text and "95 % interval  " not in text.split("part ")[0])
+    assert not said or (
+        "95 %, noise only" in text and "95 % interval  " not in text.split("part ")[0]
+    )
     assert not said or ("95 %, noise only" in page and "count noise only" in page)
     assert "write the state out as a state of the motion" in " ".join(text.split())
-    assert result["shared"] is None or result["shared"]["withdrawn"] == ["m", "k"]  # nothing counts as determined
+    assert result["shared"] is None or result["shared"]["withdrawn"] == [
+        "m",
+        "k",
+    ]  # nothing counts as determined
     assert not re.search(r"[Tt]he fit determines", text)
 
 
@@ -115,5 +130,8 @@ def test_noise_alone_is_no_hidden_state(tmp_path, physics, data):
     """Noise on the sensor colours the one-step residual: that has a warning of its own."""
     result, text, _ = fitted(tmp_path, physics, data)
     assert not {"unexplained", "hidden_state"} & codes(result)
-    assert all("ci95_counts" not in row for row in result["parameters"]) and "unexplained" not in result
+    assert (
+        all("ci95_counts" not in row for row in result["parameters"])
+        and "unexplained" not in result
+    )
     assert "noise only" not in text

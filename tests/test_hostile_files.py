@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import struct
+import time
 import warnings
 import zipfile
 import zlib
@@ -15,6 +16,7 @@ import pytest
 from orthaug._base import memory
 from orthaug._base.errors import InputError
 from orthaug.data.readers import read_record
+from orthaug.data.survey import survey
 from orthaug.data.tables import read_table
 
 NS = 'xmlns="http://schemas.openxmlformats.org/spreadsheetml/2006/main"'
@@ -33,7 +35,10 @@ def refusal(path: Path, *columns: str) -> str:
 
 def npy(shape: str, kind: str = "<f8", body: bytes = b"") -> bytes:
     """An array file that declares what it does not hold."""
-    header = f"{{'descr': '{kind}', 'fortran_order': False, 'shape': {shape}, }}".encode().ljust(117) + b"\n"
+    header = (
+        f"{{'descr': '{kind}', 'fortran_order': False, 'shape': {shape}, }}".encode().ljust(117)
+        + b"\n"
+    )
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header + body
 
 
@@ -45,7 +50,9 @@ def put_npz(folder: Path, members: dict[str, bytes], **options) -> Path:
     return path
 
 
-@pytest.mark.parametrize("shape", ["(1000000000000,)", f"({10**30},)", "(1000000, 1000000)", "(-1,)"])
+@pytest.mark.parametrize(
+    "shape", ["(1000000000000,)", f"({10**30},)", "(1000000, 1000000)", "(-1,)"]
+)
 def test_npz_that_declares_more_than_it_holds(tmp_path, shape):
     assert "'u' is " in refusal(put_npz(tmp_path, {"u": npy(shape)}), "u")
 
@@ -54,7 +61,10 @@ def test_an_array_larger_than_the_memory(tmp_path, monkeypatch):
     path = tmp_path / "run.npz"
     np.savez_compressed(path, u=np.zeros(100_000))
     monkeypatch.setattr(memory, "available", lambda: 1e5)
-    assert "an array of 100000 numbers would take 1.53 MiB of memory; 97.7 KiB are available" in refusal(path, "u")
+    assert (
+        "an array of 100000 numbers would take 1.53 MiB of memory; 97.7 KiB are available"
+        in refusal(path, "u")
+    )
 
 
 def marked(path: Path, local: int, central: int, value: int) -> Path:
@@ -75,7 +85,10 @@ def test_an_encrypted_npz_and_one_of_unknown_compression(tmp_path):
 
 def test_long_doubles_beyond_double_precision_are_not_finite_and_warn_of_nothing(tmp_path):
     np.savez(tmp_path / "run.npz", u=np.array([1.0, np.finfo(np.longdouble).max], np.longdouble))
-    with warnings.catch_warnings(), pytest.raises(InputError, match="row 1, column 'u': found 'inf'"):
+    with (
+        warnings.catch_warnings(),
+        pytest.raises(InputError, match="row 1, column 'u': found 'inf'"),
+    ):
         warnings.simplefilter("error")
         read_record(tmp_path / "run.npz", inputs=["u"])
 
@@ -121,7 +134,10 @@ PARTS = {
         f'Type="{RELATIONS}/sharedStrings" Target="sharedStrings.xml"/></Relationships>',
     ),
     "strings": ("xl/sharedStrings.xml", f"<sst {NS}><si><t>u</t></si><si><t>y</t></si></sst>"),
-    "sheet": ("xl/worksheets/sheet1.xml", f"<worksheet {NS}><sheetData>{ROWS}</sheetData></worksheet>"),
+    "sheet": (
+        "xl/worksheets/sheet1.xml",
+        f"<worksheet {NS}><sheetData>{ROWS}</sheetData></worksheet>",
+    ),
     "styles": ("xl/styles.xml", None),
 }
 
@@ -141,9 +157,7 @@ def sheet(rows: str) -> str:
 
 
 HEADER = '<row r="1"><c r="A1" t="s"><v>0</v></c><c r="B1" t="s"><v>1</v></c></row>'
-FAR = (
-    '<row r="2"><c r="A2"><v>1</v></c><c r="B2"><v>2</v></c></row><row r="1048576"><c r="XFD1048576"><v>9</v></c></row>'
-)
+FAR = '<row r="2"><c r="A2"><v>1</v></c><c r="B2"><v>2</v></c></row><row r="1048576"><c r="XFD1048576"><v>9</v></c></row>'
 BOMB = (
     "<!DOCTYPE a [<!ENTITY a '"
     + "x" * 100
@@ -230,37 +244,55 @@ def test_hdf5_that_declares_more_than_there_is_memory(tmp_path, ending):
     assert "an array of 1000000000000 numbers would take 14.6 TiB of memory" in refusal(path, "u")
 
 
-@pytest.mark.parametrize("content", ["u,y\n1,2\n3\0,4\n", "u,y\n1,2\n3,4\n\0", "u,y,n\n1,2,a\0b\n", "u,\0y\n1,2\n"])
+@pytest.mark.parametrize(
+    "content", ["u,y\n1,2\n3\0,4\n", "u,y\n1,2\n3,4\n\0", "u,y,n\n1,2,a\0b\n", "u,\0y\n1,2\n"]
+)
 def test_nul_bytes_in_a_csv(tmp_path, content):
     (tmp_path / "run.csv").write_text(content)
     assert "not a text table" in refusal(tmp_path / "run.csv", "u")
 
 
-@pytest.mark.parametrize("content", ["u;y\n12,5;1.234\n", "u;y\n1.234;1\n2;12,5\n", "u;y;n\n1.234;2;0\n3;4.5;0,5\n"])
+@pytest.mark.parametrize(
+    "content", ["u;y\n12,5;1.234\n", "u;y\n1.234;1\n2;12,5\n", "u;y;n\n1.234;2;0\n3;4.5;0,5\n"]
+)
 def test_a_point_beside_decimal_commas_may_be_one_of_thousands(tmp_path, content):
     (tmp_path / "run.csv").write_text(content)
-    with pytest.raises(InputError, match=r"found '(1\.234|4\.5)'; expected decimals with commas, as in other cells"):
+    with pytest.raises(
+        InputError, match=r"found '(1\.234|4\.5)'; expected decimals with commas, as in other cells"
+    ):
         read_record(tmp_path / "run.csv", inputs=["u"], outputs=["y"])
 
 
 def test_numbers_of_a_text_are_those_that_python_reads(tmp_path):
     """To the last bit, with points and with commas."""
     rng = np.random.default_rng(1)
-    numbers = [f"{x:.{d}e}" for x, d in zip(rng.normal(size=4000), rng.integers(1, 22, 4000), strict=True)]
+    numbers = [
+        f"{x:.{d}e}" for x, d in zip(rng.normal(size=4000), rng.integers(1, 22, 4000), strict=True)
+    ]
     for name, texts in (("a.csv", numbers), ("b.csv", [n.replace(".", ",") for n in numbers])):
         (tmp_path / name).write_text("y;z\n" + "".join(f"{text};1\n" for text in texts))
-        assert read_table(tmp_path / name, ("y",)).columns["y"].tolist() == [float(n) for n in numbers]
+        assert read_table(tmp_path / name, ("y",)).columns["y"].tolist() == [
+            float(n) for n in numbers
+        ]
 
 
 TIMES = [
-    (np.delete(np.arange(60) * 0.1, np.arange(2, 60, 3)), "a step of 0.2 s where 0.1 s is usual|0.1 s where 0.2 s"),
-    (np.cumsum(np.linspace(0.1, 0.14, 200)), "the step drifts between 0.107 s and 0.133 s|drifts between"),
+    (
+        np.delete(np.arange(60) * 0.1, np.arange(2, 60, 3)),
+        "a step of 0.2 s where 0.1 s is usual|0.1 s where 0.2 s",
+    ),
+    (
+        np.cumsum(np.linspace(0.1, 0.14, 200)),
+        "the step drifts between 0.107 s and 0.133 s|drifts between",
+    ),
     (np.r_[np.arange(30) * 0.1, 3.0 + np.arange(30) * 0.13], "drifts between"),
     (1.7e18 + 1e7 * np.arange(20), "subtract the first instant"),
 ]
 
 
-@pytest.mark.parametrize(("instants", "message"), TIMES, ids=["a third missing", "drift", "two rates", "nanoseconds"])
+@pytest.mark.parametrize(
+    ("instants", "message"), TIMES, ids=["a third missing", "drift", "two rates", "nanoseconds"]
+)
 def test_time_columns_that_are_not_even(tmp_path, instants, message):
     np.savez(tmp_path / "run.npz", t=instants, y=np.arange(len(instants)) % 5.0)
     with pytest.raises(InputError) as refused:
@@ -273,7 +305,9 @@ def test_time_columns_that_are_even_enough(tmp_path):
     for count in (2, 5, 20, 1000):
         jitter = rng.uniform(-0.15, 0.15, count)
         for start in (0.0, 1.7e9):
-            np.savez(tmp_path / "run.npz", t=start + 0.01 * (np.arange(count) + jitter), y=np.ones(count))
+            np.savez(
+                tmp_path / "run.npz", t=start + 0.01 * (np.arange(count) + jitter), y=np.ones(count)
+            )
             if start == 0.0 or count == 1000:
                 step = read_record(tmp_path / "run.npz", outputs=["y"], time="t").sampling_time
                 assert step == pytest.approx(0.01, rel=0.35 / max(count - 1, 1))
@@ -281,7 +315,9 @@ def test_time_columns_that_are_even_enough(tmp_path):
 
 def test_one_column_is_not_time_and_output(tmp_path):
     (tmp_path / "run.csv").write_text("t,u\n0,1\n1,2\n2,0\n")
-    with pytest.raises(InputError, match="the column 't' is `time` and the output 'y'; one of them is wrong"):
+    with pytest.raises(
+        InputError, match="the column 't' is both `time` and the output 'y'; correct one of them"
+    ):
         read_record(tmp_path / "run.csv", inputs=["u"], outputs=["y"], columns={"y": "t"}, time="t")
 
 
@@ -304,7 +340,12 @@ def structured(folder: Path, format_: str) -> Path:
 def test_fields_of_structs_and_rows_of_matrices(tmp_path, format_):
     path = structured(tmp_path, format_)
     columns = read_table(path, ("data.u", "data.deep.Y[1,:]", "Y[0,:]", "Y[:,0]")).columns
-    assert [c.tolist() for c in columns.values()] == [[0, 1, 2, 3, 4], [5, 6, 7, 8, 9], [0, 1, 2, 3, 4], [0, 5]]
+    assert [c.tolist() for c in columns.values()] == [
+        [0, 1, 2, 3, 4],
+        [5, 6, 7, 8, 9],
+        [0, 1, 2, 3, 4],
+        [0, 5],
+    ]
     assert 'Name a field of it, such as "data.u"' in refusal(path, "data")
     assert "no variable 'data.v'" in refusal(path, "data.v")
     assert 'a row as "Y[0,:]"' in refusal(path, "Y")
@@ -326,5 +367,52 @@ def test_an_npz_that_is_made_to_fill_the_memory(tmp_path, monkeypatch):
     monkeypatch.setattr(variables, "_LARGE", 1e5)
     path = tmp_path / "run.npz"
     np.savez_compressed(path, u=np.zeros(100_000), y=np.random.default_rng(0).normal(size=20_000))
-    assert "'u' is 781 KiB in" in refusal(path, "u") and "store it uncompressed" in refusal(path, "u")
+    assert "'u' is 781 KiB in" in refusal(path, "u") and "Store it uncompressed" in refusal(
+        path, "u"
+    )
     assert len(read_table(path, ("y",)).columns["y"]) == 20_000
+
+
+def put_zeros(path: Path, names: tuple[str, ...], head: bytes, size: int) -> None:
+    """An npz whose members go on with gigabytes of zeros, which are packed once a MiB and never held."""
+    block = zlib.compressobj(9, zlib.DEFLATED, -15)
+    packed = block.compress(bytes(2**20)) + block.flush(zlib.Z_FULL_FLUSH)
+    begin = zlib.compressobj(9, zlib.DEFLATED, -15)
+    first = begin.compress(head + bytes(size % 2**20)) + begin.flush(zlib.Z_FULL_FLUSH)
+    body = first + size // 2**20 * packed + b"\x03\x00"  # an empty last block
+    whole, central = io.BytesIO(), b""
+    for name in names:
+        told = struct.pack(
+            "<HHHHHIIIHH", 20, 0, 8, 0, 33, 0, len(body), len(head) + size, len(name) + 4, 0
+        )
+        member = f"{name}.npy".encode()
+        central += (
+            b"PK\x01\x02\x14\x00" + told + bytes(10) + struct.pack("<I", whole.tell()) + member
+        )
+        whole.write(b"PK\x03\x04" + told + member + body)
+    end = struct.pack("<HHHHIIH", 0, 0, len(names), len(names), len(central), whole.tell(), 0)
+    path.write_bytes(whole.getvalue() + central + b"PK\x05\x06" + end)
+
+
+def test_an_npz_of_some_megabytes_that_holds_two_arrays_of_3_gigabytes(tmp_path):
+    path = tmp_path / "run.npz"
+    put_zeros(path, ("u", "y"), npy("(400000000,)"), 3_200_000_000)
+    with (
+        zipfile.ZipFile(path) as archive,
+        archive.open("y.npy") as member,
+    ):  # a sound archive of true zeros
+        assert member.read(128) == npy("(400000000,)") and not any(member.read(2**22))
+    assert 5e6 < path.stat().st_size < 8e6
+    began = time.process_time()
+    assert "'u' is 2.98 GiB in" in refusal(path, "u", "y")
+    with pytest.raises(InputError, match="'u' is 2.98 GiB in"):
+        survey(path)
+    assert time.process_time() - began < 2
+
+
+def test_an_npz_whose_header_is_of_gigabytes(tmp_path):
+    path = tmp_path / "run.npz"
+    put_zeros(path, ("u",), b"\x93NUMPY\x02\x00" + struct.pack("<I", 3_200_000_000), 3_200_000_000)
+    began = time.process_time()
+    assert "'u' is unreadable" in refusal(path, "u")
+    assert time.process_time() - began < 2

@@ -18,7 +18,10 @@ def test_alone_there_is_nothing_to_join():
     [
         ({"ORTHAUG_PROCESSES": "two"}, r"ORTHAUG_PROCESSES: found 'two'; expected a whole number"),
         ({"ORTHAUG_PROCESS": "-1"}, r"ORTHAUG_PROCESS: found '-1'; expected a whole number"),
-        ({"ORTHAUG_PROCESS": "1"}, r"ORTHAUG_COORDINATOR=127.0.0.1:9: no first process answers there"),
+        (
+            {"ORTHAUG_PROCESS": "1"},
+            r"ORTHAUG_COORDINATOR=127.0.0.1:9: no first process answers there",
+        ),
     ],
 )
 def test_what_is_wrong_with_the_environment_is_told(monkeypatch, environment, told):
@@ -36,5 +39,7 @@ def test_programs_that_share_devices_run_one_after_another():
         assert len(running) == 1
         return running.pop()
 
-    assert list(oa.Devices().map(one, "shared", [3, 1, 2], lambda i, what: heard.append((i, what)))) == [3, 1, 2]
+    assert list(
+        oa.Devices().map(one, "shared", [3, 1, 2], lambda i, what: heard.append((i, what)))
+    ) == [3, 1, 2]
     assert heard == [(0, "shared"), (1, "shared"), (2, "shared")]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import sys
 import tomllib
 
@@ -11,6 +12,7 @@ import pandas as pd
 import pytest
 import scipy.io
 import scipy.signal
+from helpers import unfolded
 from test_cli import run
 
 from orthaug.commands import cli, kinds
@@ -31,7 +33,9 @@ def plant(rows: int = 600) -> tuple[np.ndarray, np.ndarray]:
 @pytest.fixture
 def csv(tmp_path):
     u, y = plant()
-    frame = pd.DataFrame({"time [ms]": 10.0 * np.arange(len(u)), "force [N]": np.clip(u, -1.5, 1.5)})
+    frame = pd.DataFrame(
+        {"time [ms]": 10.0 * np.arange(len(u)), "force [N]": np.clip(u, -1.5, 1.5)}
+    )
     frame["force [N]"] = u.clip(-1.5, None)
     frame["position_mm"], frame["gain"], frame["note"] = y, 2.0, "ok"
     frame.loc[40:43, "position_mm"] = np.nan
@@ -62,7 +66,17 @@ def test_names_of_channels_are_identifiers():
     names: list[str] = []
     for text in texts:
         names.append(channel_name(text, names))
-    assert names == ["Kraft_1", "x2nd", "sin_", "lambda_", "time_", "Ts_", "U_2", "channel", "Kraft_1_2"]
+    assert names == [
+        "Kraft_1",
+        "x2nd",
+        "sin_",
+        "lambda_",
+        "time_",
+        "Ts_",
+        "U_2",
+        "channel",
+        "Kraft_1_2",
+    ]
 
 
 def test_columns_of_every_kind_of_file(tmp_path):
@@ -70,8 +84,16 @@ def test_columns_of_every_kind_of_file(tmp_path):
     frame.to_parquet(tmp_path / "a.parquet")
     frame.to_excel(tmp_path / "a.xlsx", index=False)
     (tmp_path / "a.csv").write_text("u;y;\n1,5;2;\n")
-    assert [column_names(tmp_path / f"a.{end}") for end in ("parquet", "xlsx", "csv")] == [["u", "y"]] * 3
-    wide = {"U": np.ones((9, 2)), "W": np.ones((2, 9)), "v": np.ones(9), "one": 3.0, "cube": np.ones((2, 2, 2))}
+    assert [column_names(tmp_path / f"a.{end}") for end in ("parquet", "xlsx", "csv")] == [
+        ["u", "y"]
+    ] * 3
+    wide = {
+        "U": np.ones((9, 2)),
+        "W": np.ones((2, 9)),
+        "v": np.ones(9),
+        "one": 3.0,
+        "cube": np.ones((2, 2, 2)),
+    }
     np.savez(tmp_path / "a.npz", **wide)
     assert column_names(tmp_path / "a.npz") == ["U[0]", "U[1]", "W[0,:]", "W[1,:]", "v"]
     scipy.io.savemat(tmp_path / "a.mat", {"data": {"u": np.ones(5)}, "v": np.ones(9), "name": "x"})
@@ -98,23 +120,46 @@ def test_a_file_is_seen_and_its_spec_runs(csv, tmp_path):
     spec = tomllib.loads(out.read_text())
     assert spec["data"]["missing"] == "skip" and spec["data"]["time"] == "time [ms]"
     assert spec["data"]["channels"]["position"] == {"column": "position_mm", "unit": "mm"}
-    assert [t["regressor"] for t in spec["baseline"]["terms"]] == ["position[k-1]", "position[k-2]", "force[k-3]"]
+    assert [t["regressor"] for t in spec["baseline"]["terms"]] == [
+        "position[k-1]",
+        "position[k-2]",
+        "force[k-3]",
+    ]
     assert run("check", out).code == 0
     assert run("init", csv, "--inputs", "force", "--outputs", "position", "--out", out).code == 2
-    assert run("init", csv, "--inputs", "force", "--outputs", "position", "--out", out, "--force").code == 0
+    assert (
+        run("init", csv, "--inputs", "force", "--outputs", "position", "--out", out, "--force").code
+        == 0
+    )
 
 
 REFUSED = [
-    ((), "the names of the columns do not tell inputs from outputs: force [N], position_mm. Say both"),
+    (
+        (),
+        "the names of the columns do not show which are inputs and which outputs: force [N], position_mm. Say "
+        "both",
+    ),
     (("--inputs", "force"), "Say both"),
-    (("--inputs", "force", "--outputs", "speed"), "no column 'speed'; the file has time [ms], force [N]"),
-    (("--inputs", "gain", "--outputs", "position"), "column 'gain' is 2 in every row; leave it out"),
-    (("--inputs", "note", "--outputs", "position"), "column 'note' cannot be a channel: no numbers"),
+    (
+        ("--inputs", "force", "--outputs", "speed"),
+        "no column 'speed'; the file has time [ms], force [N]",
+    ),
+    (
+        ("--inputs", "gain", "--outputs", "position"),
+        "column 'gain' is 2 in every row; leave it out",
+    ),
+    (
+        ("--inputs", "note", "--outputs", "position"),
+        "column 'note' cannot be a channel: no numbers",
+    ),
     (("--inputs", "force", "--outputs", "force_,force"), "no column 'force_'"),
     (("--inputs", "force", "--outputs", "force [N]"), "'force [N]' is named twice"),
     (("--inputs", "time [ms]", "--outputs", "position"), "is the time; it is no channel"),
     (("--inputs", "force", "--outputs", ","), "no output is named"),
-    (("--inputs", "force", "--outputs", "position", "--sampling-time", "0"), "the sampling time must be a positive"),
+    (
+        ("--inputs", "force", "--outputs", "position", "--sampling-time", "0"),
+        "the sampling time must be a positive",
+    ),
 ]
 
 
@@ -139,13 +184,19 @@ def test_on_a_terminal_it_asks(tmp_path, monkeypatch):
 
 def test_names_that_say_it_are_enough_and_few_rows_are_refused(tmp_path):
     u, y = plant(300)
-    pd.DataFrame({"t": 0.5 * np.arange(300), "u": u, "y": y}).to_csv(tmp_path / "a.csv", index=False)
+    pd.DataFrame({"t": 0.5 * np.arange(300), "u": u, "y": y}).to_csv(
+        tmp_path / "a.csv", index=False
+    )
     assert run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml").code == 0
     data = tomllib.loads((tmp_path / "spec.toml").read_text())["data"]
     assert (data["time"], data["inputs"], data["outputs"]) == ("t", ["u"], ["y"])
     pd.DataFrame({"u": u[:3], "y": y[:3]}).to_csv(tmp_path / "b.csv", index=False)
     done = run("init", tmp_path / "b.csv", "--out", tmp_path / "b.toml")
-    assert done.code == 2 and "3 usable rows are too few" in done.err and not (tmp_path / "b.toml").exists()
+    assert (
+        done.code == 2
+        and "3 usable rows are too few" in done.err
+        and not (tmp_path / "b.toml").exists()
+    )
 
 
 def test_one_wrong_sample_of_a_signal_that_moves_fast_is_seen_and_replaced(tmp_path):
@@ -154,8 +205,12 @@ def test_one_wrong_sample_of_a_signal_that_moves_fast_is_seen_and_replaced(tmp_p
     assert survey(tmp_path / "a.csv").find("y").spikes == 0
     y[350] += 2.5 * np.ptp(y)
     pd.DataFrame({"u": u, "y": y}).to_csv(tmp_path / "a.csv", index=False)
-    done = run("init", tmp_path / "a.csv", "--sampling-time", "0.1", "--out", tmp_path / "spec.toml")
-    assert done.code == 0 and "; 1 sample far from all neighbours, which the spec replaces" in done.out
+    done = run(
+        "init", tmp_path / "a.csv", "--sampling-time", "0.1", "--out", tmp_path / "spec.toml"
+    )
+    assert (
+        done.code == 0 and "; 1 sample far from all neighbours, which the spec replaces" in done.out
+    )
     job = kinds.open_job(tmp_path / "spec.toml")
     assert job.train.record.prepared[0].samples == 1
 
@@ -165,25 +220,37 @@ def test_a_delay_is_seen_where_the_response_sets_in_slowly(tmp_path, held):
     """An inertia, sampled often: the response grows from nothing at lag 4; the cross-correlation sees it far later."""
     rng = np.random.default_rng(3)
     u = np.repeat(rng.normal(size=2000 // held), held)
-    y = scipy.signal.lfilter([0, 0, 0, 0, 0.002], [1, -1.98, 0.985], u) + 1e-4 * rng.normal(size=2000)
+    y = scipy.signal.lfilter([0, 0, 0, 0, 0.002], [1, -1.98, 0.985], u) + 1e-4 * rng.normal(
+        size=2000
+    )
     pd.DataFrame({"u": u, "y": y}).to_csv(tmp_path / "a.csv", index=False)
-    done = run("init", tmp_path / "a.csv", "--sampling-time", "0.01", "--out", tmp_path / "spec.toml")
+    done = run(
+        "init", tmp_path / "a.csv", "--sampling-time", "0.01", "--out", tmp_path / "spec.toml"
+    )
     assert "it is first significant at lag 4" in done.out and ", nk 4;" in done.out
 
 
 def test_what_is_seen_of_a_column(tmp_path):
     rng = np.random.default_rng(0)
     square, coarse = np.sign(rng.normal(size=400)), np.round(rng.normal(size=400), 1)
-    frame = pd.DataFrame({"t": np.arange(400.0) + (np.arange(400) > 200), "square": square, "coarse": coarse})
+    frame = pd.DataFrame(
+        {"t": np.arange(400.0) + (np.arange(400) > 200), "square": square, "coarse": coarse}
+    )
     frame.to_csv(tmp_path / "a.csv", index=False)
     found = survey(tmp_path / "a.csv")
     assert not found.clock.even and found.clock.step == 1.0 and "uneven" in str(found.clock)
     held = np.repeat(rng.normal(size=40), 10)
-    pd.DataFrame({"held": np.convolve(held, [0.5, 0.5], "same")}).to_csv(tmp_path / "b.csv", index=False)
-    assert survey(tmp_path / "b.csv").find("held").limits == ()  # an input between its steps is at no limit
+    pd.DataFrame({"held": np.convolve(held, [0.5, 0.5], "same")}).to_csv(
+        tmp_path / "b.csv", index=False
+    )
+    assert (
+        survey(tmp_path / "b.csv").find("held").limits == ()
+    )  # an input between its steps is at no limit
     assert found.find("square").limits == () and found.find("square").quantum is None
     assert found.find("coarse").quantum == pytest.approx(0.1)
-    slow = 100 * np.sin(np.arange(4000) / 400)  # an encoder: fine beside the range, coarse beside a sample
+    slow = 100 * np.sin(
+        np.arange(4000) / 400
+    )  # an encoder: fine beside the range, coarse beside a sample
     noisy = np.round(slow + 2 * rng.normal(size=4000))
     frame = pd.DataFrame({"encoder": np.round(slow), "fine": np.round(slow, 2), "noisy": noisy})
     frame.to_csv(tmp_path / "c.csv", index=False)
@@ -202,15 +269,31 @@ def test_uneven_instants_are_resampled(tmp_path):
     done = run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml")
     assert done.code == 0 and "but the steps are uneven" in done.out, done.err
     data = tomllib.loads((tmp_path / "spec.toml").read_text())["data"]
-    assert [step["step"] for step in data["prepare"]] == ["outliers", "fill", "resample"] and data["time"] == "t"
-    assert data["prepare"][-1]["sampling_time"] == 0.1 and "1 sample far from all neighbours" in done.out
+    assert [step["step"] for step in data["prepare"]] == ["outliers", "fill", "resample"] and data[
+        "time"
+    ] == "t"
+    assert (
+        data["prepare"][-1]["sampling_time"] == 0.1
+        and "1 sample far from all neighbours" in done.out
+    )
 
 
 def test_an_output_without_inputs_and_level_gets_its_own_past(tmp_path):
     y = scipy.signal.lfilter([1.0], [1, -1.5, 0.8], np.random.default_rng(0).normal(size=400))
     pd.DataFrame({"y": y - y.mean()}).to_csv(tmp_path / "a.csv", index=False)
-    done = run("init", tmp_path / "a.csv", "--inputs", "", "--outputs", "y", "--out", tmp_path / "spec.toml")
-    assert done.code == 0 and 'regressor = "y[k-2]"' in (tmp_path / "spec.toml").read_text(), done.err
+    done = run(
+        "init",
+        tmp_path / "a.csv",
+        "--inputs",
+        "",
+        "--outputs",
+        "y",
+        "--out",
+        tmp_path / "spec.toml",
+    )
+    assert done.code == 0 and 'regressor = "y[k-2]"' in (tmp_path / "spec.toml").read_text(), (
+        done.err
+    )
 
 
 def test_columns_of_one_name_are_told_apart(tmp_path, monkeypatch):
@@ -220,28 +303,38 @@ def test_columns_of_one_name_are_told_apart(tmp_path, monkeypatch):
     (tmp_path / "a.csv").write_text("y,T [K],T [K]\n" + rows)
     out = tmp_path / "spec.toml"
     done = run("init", tmp_path / "a.csv", "--inputs", "y", "--outputs", "T [K]", "--out", out)
-    assert done.code == 2 and "the name 'T [K]' stands twice; from the left: T [K].0, T [K].1" in done.err
-    assert run("init", tmp_path / "a.csv", "--inputs", "y", "--outputs", "T [K].0", "--out", out).code == 0
-    assert tomllib.loads(out.read_text())["data"]["channels"] == {"T_0": {"column": "T [K].0", "unit": "K"}}
+    assert (
+        done.code == 2
+        and "several columns are called 'T [K]'; from the left: T [K].0, T [K].1" in done.err
+    )
+    assert (
+        run("init", tmp_path / "a.csv", "--inputs", "y", "--outputs", "T [K].0", "--out", out).code
+        == 0
+    )
+    assert tomllib.loads(out.read_text())["data"]["channels"] == {
+        "T_0": {"column": "T [K].0", "unit": "K"}
+    }
 
 
 NOTHING = [
-    ("u,y\n1,2\n", (), "no column could be a channel, 1 row: u (constant), y (constant). A first model needs"),
+    ("u,y\n1,2\n", (), "no column can be a channel, 1 row: u (constant), y (constant). A first model needs"),
     ("u,y\n1,\n2,\n3,\n", (), '--inputs "" --outputs "u"; columns that are not named are left out. No channels: '
      "y (no numbers)."),
-    ("u,y\n1,\n2,\n3,\n", ("--inputs", "u"), "an input already (u), and none is left for an output; left out: y (no"),
+    ("u,y\n1,\n2,\n3,\n", ("--inputs", "u"), "already an input (u), so no column is left for an output; left out: y (no"),
     ("a,b,c\n1,2,4\n2,1,7\n", ("--outputs", "b"), 'only outputs are named: a, b, c. Say both, separated by commas, '
      'such as --inputs "a,c" --outputs "b" (--inputs "" for none)'),
     ("a,b,c\n1,2,4\n2,1,7\n", ("--inputs", "c"), '--inputs "c" --outputs "b"; columns'),
     ("a,b,c\n1,2,4\n2,1,7\n", ("--inputs", "A"), "no column 'A', did you mean 'a'?"),
-    ("-1.5,2\n1,2\n2,3\n", (), 'from outputs: x1, x2. Say both, separated by commas, such as --inputs "x1"'),
+    ("-1.5,2\n1,2\n2,3\n", (), 'which outputs: x1, x2. Say both, separated by commas, such as --inputs "x1"'),
     ("bench 3, May\nu\nnone\n", (), "expected one for each signal, under a header. The names that were found are "
      "'bench 3, May'; a line above the header must begin with #"),
 ]  # fmt: skip
 
 
 @pytest.mark.parametrize(("content", "options", "message"), NOTHING, ids=range(len(NOTHING)))
-def test_a_proposal_respects_what_was_given_and_is_never_empty(tmp_path, monkeypatch, content, options, message):
+def test_a_proposal_respects_what_was_given_and_is_never_empty(
+    tmp_path, monkeypatch, content, options, message
+):
     monkeypatch.setattr(sys, "stdin", io.StringIO())
     (tmp_path / "a.csv").write_text(content)
     done = run("init", tmp_path / "a.csv", *options, "--out", tmp_path / "spec.toml")
@@ -253,8 +346,28 @@ def test_an_encoding_that_was_guessed_is_told(tmp_path):
     rows = "".join(f"{a},{b}\n" for a, b in zip(u, y, strict=True))
     (tmp_path / "a.csv").write_bytes(("u,y [µm]\n" + rows).encode("cp1252"))
     done = run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml")
-    assert done.code == 0 and "a.csv: 300 rows, 2 columns; no UTF-8, so read as Windows-1252" in done.out
-    assert run("check", tmp_path / "spec.toml").code == 0
+    assert (
+        done.code == 0
+        and "a.csv: 300 rows, 2 columns; not UTF-8, so read as Windows-1252" in done.out
+    )
+    warning = "line 1 of a.csv is no UTF-8, so the file is read as Windows-1252; save it as UTF-8."
+    assert warning in unfolded(run("check", tmp_path / "spec.toml").out)
+    done = run("fit", tmp_path / "spec.toml", "--out", tmp_path / "out", "--json")
+    told = [w["text"] for w in json.loads(done.out)["warnings"] if w["code"] == "encoding_guessed"]
+    assert told[0] == f"train: {warning}"
+
+
+def test_a_damaged_byte_in_a_column_that_is_not_used_is_told_with_its_line(tmp_path):
+    """Found by the fuzzer (.tsv, seed 110): the file was read as Windows-1252 without a word."""
+    u, y = plant(300)
+    rows = "".join(f"{a},{b},n{i}\n" for i, (a, b) in enumerate(zip(u, y, strict=True))).encode()
+    (tmp_path / "a.csv").write_bytes(b"u,y,note\n" + rows.replace(b"n7\n", b"n7\x7f\xff\n"))
+    spec = '[data]\nsampling_time = 0.1\ninputs = ["u"]\noutputs = ["y"]\ntrain = { files = ["a.csv"] }\n'
+    (tmp_path / "spec.toml").write_text(
+        spec + '[baseline]\nterms = [{ parameter = "b", regressor = "u[k-1]" }]\n'
+    )
+    done = run("check", tmp_path / "spec.toml")
+    assert done.code == 0 and "line 9 of a.csv is no UTF-8" in unfolded(done.out)
 
 
 def test_on_a_terminal_it_asks_again(tmp_path, monkeypatch):
@@ -265,18 +378,29 @@ def test_on_a_terminal_it_asks_again(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "stdin", terminal)
     done = run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml")
     assert done.code == 0, done.err
-    assert "no column 'Forze', did you mean 'force'?" in done.err and "'force' is named twice" in done.err
+    assert (
+        "no column 'Forze', did you mean 'force'?" in done.err
+        and "'force' is named twice" in done.err
+    )
 
 
 def test_dates_are_the_clock(tmp_path):
     u, y = plant(300)
-    frame = pd.DataFrame({"logged": pd.date_range("2024-02-28", periods=300, freq="20ms"), "u": u, "y": y})
-    for ending, write in (("csv", frame.to_csv), ("parquet", frame.to_parquet), ("xlsx", frame.to_excel)):
+    frame = pd.DataFrame(
+        {"logged": pd.date_range("2024-02-28", periods=300, freq="20ms"), "u": u, "y": y}
+    )
+    for ending, write in (
+        ("csv", frame.to_csv),
+        ("parquet", frame.to_parquet),
+        ("xlsx", frame.to_excel),
+    ):
         write(tmp_path / f"a.{ending}", index=False)
         done = run("init", tmp_path / f"a.{ending}", "--out", tmp_path / "spec.toml", "--force")
         assert "sampling time: 0.02 s, from column 'logged'" in done.out, done.err
         assert "left out" not in done.out
-        assert kinds.open_job(tmp_path / "spec.toml").train.record.sampling_time == pytest.approx(0.02)
+        assert kinds.open_job(tmp_path / "spec.toml").train.record.sampling_time == pytest.approx(
+            0.02
+        )
 
 
 def test_uneven_milliseconds_are_resampled_and_their_steps_told(tmp_path):
@@ -284,12 +408,18 @@ def test_uneven_milliseconds_are_resampled_and_their_steps_told(tmp_path):
     t = 20.0 * np.arange(300.0)
     t[1::2] += 3.0
     pd.DataFrame({"t [ms]": t, "u": u, "y": y}).to_csv(tmp_path / "a.csv", index=False)
-    assert "from column 't [ms]'; single steps are 0.017 to 0.023 s" in str(survey(tmp_path / "a.csv").clock)
+    assert "from column 't [ms]'; single steps are 0.017 to 0.023 s" in str(
+        survey(tmp_path / "a.csv").clock
+    )
     t[200:] += 8.0  # the parts of the spec differ by 0.3 % in their mean step
     pd.DataFrame({"t [ms]": t, "u": u, "y": y}).to_csv(tmp_path / "a.csv", index=False)
     assert run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml").code == 0
     assert "sampling_time" in tomllib.loads((tmp_path / "spec.toml").read_text())["data"]
-    assert not [w for w in kinds.open_job(tmp_path / "spec.toml").warnings if w.code == "other_sampling_time"]
+    assert not [
+        w
+        for w in kinds.open_job(tmp_path / "spec.toml").warnings
+        if w.code == "other_sampling_time"
+    ]
     t[200:] += 20.0
     pd.DataFrame({"t [ms]": t, "u": u, "y": y}).to_csv(tmp_path / "a.csv", index=False)
     done = run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml", "--force")
@@ -300,8 +430,18 @@ def test_uneven_milliseconds_are_resampled_and_their_steps_told(tmp_path):
 
 
 STEPS = [
-    ("t [ms]", 20.0, "sampling_time = 1.0", "`sampling_time` is 1 s, but column 't [ms]' of a.csv tells 0.02 s"),
-    ("time", 0.1, "", "so 1 s is taken, but column 'time' of a.csv tells 0.1 s; perhaps time = \"time\" is meant"),
+    (
+        "t [ms]",
+        20.0,
+        "sampling_time = 1.0",
+        "`sampling_time` is 1 s, but column 't [ms]' of a.csv gives 0.02 s",
+    ),
+    (
+        "time",
+        0.1,
+        "",
+        "so 1 s is used, but column 'time' of a.csv gives 0.1 s; perhaps time = \"time\" is meant",
+    ),
     ("time", 0.1, "sampling_time = 0.1", ""),
     ("other", 0.1, "sampling_time = 1.0", ""),
 ]
@@ -310,21 +450,32 @@ STEPS = [
 @pytest.mark.parametrize(("header", "every", "given", "told"), STEPS)
 def test_a_column_that_tells_another_step_is_a_warning(tmp_path, header, every, given, told):
     u, y = plant(100)
-    pd.DataFrame({header: every * np.arange(100), "u": u, "y": y}).to_csv(tmp_path / "a.csv", index=False)
+    pd.DataFrame({header: every * np.arange(100), "u": u, "y": y}).to_csv(
+        tmp_path / "a.csv", index=False
+    )
     spec = f'[data]\n{given}\ninputs = ["u"]\noutputs = ["y"]\ntrain = {{files = ["a.csv"]}}\n'
     spec += '[[baseline.terms]]\nparameter = "a"\nregressor = "y[k-1]"\n'
     (tmp_path / "spec.toml").write_text(spec)
-    warnings = [w for w in kinds.open_job(tmp_path / "spec.toml").warnings if w.code == "other_sampling_time"]
+    warnings = [
+        w
+        for w in kinds.open_job(tmp_path / "spec.toml").warnings
+        if w.code == "other_sampling_time"
+    ]
     assert len(warnings) == bool(told) and all(told in w.text for w in warnings)
 
 
 THINNED = [
-    ("time", 0.05, 5, 'Give sampling_time = 0.01, that of the file\'s rows, or time = "time" instead.'),
+    (
+        "time",
+        0.05,
+        5,
+        'Give sampling_time = 0.01, that of the file\'s rows, or time = "time" instead.',
+    ),
     (
         "aika",
         0.05,
         5,
-        "column 'aika' of a.csv tells 0.01 s from row to row, so rows of which one in 5 is kept are 0.05 s",
+        "the rows of a.csv are 0.01 s apart by column 'aika', and the rows that are kept 0.05 s",
     ),
     ("Ts", 0.05, 5, "Give sampling_time = 0.01, that of the file's rows.\n"),
     ("time", 0.01, 5, ""),
@@ -338,7 +489,9 @@ THINNED = [
 def test_a_sampling_time_that_is_thinned_already_is_refused(tmp_path, header, given, every, told):
     u, y = plant(300)
     clock = {"Ts": np.full(300, 0.01), "row": np.arange(300)}.get(header, 0.01 * np.arange(300))
-    pd.DataFrame({"u": u, "y": y, "note": "warm", header: clock}).to_csv(tmp_path / "a.csv", index=False)
+    pd.DataFrame({"u": u, "y": y, "note": "warm", header: clock}).to_csv(
+        tmp_path / "a.csv", index=False
+    )
     spec = f'[data]\nsampling_time = {given}\ninputs = ["u"]\noutputs = ["y"]\n'
     spec += f'train = {{files = ["a.csv"], every = {every}}}\n'
     spec += '[[baseline.terms]]\nparameter = "a"\nregressor = "y[k-1]"\n'
@@ -346,12 +499,17 @@ def test_a_sampling_time_that_is_thinned_already_is_refused(tmp_path, header, gi
     done = run("check", tmp_path / "spec.toml")
     assert done.code == (2 if told else 0) and told in done.err, done.err
     multiplied = (
-        f"data.train: every = {every} multiplies the sampling time {given:g} s to {every * given:g} s, but column"
+        f"data.train: every = {every} multiplies the sampling time {given:g} s to "
+        f"{every * given:g} s. But the rows of"
     )
     assert (multiplied in done.err) == bool(told)
     if not told and every > 1:
-        apart = f"without a filter, so that rows are {every * given:g} s apart instead of {given:g} s"
-        assert any(apart in warning.text for warning in kinds.open_job(tmp_path / "spec.toml").warnings)
+        apart = (
+            f"without a filter, so that rows are {every * given:g} s apart instead of {given:g} s"
+        )
+        assert any(
+            apart in warning.text for warning in kinds.open_job(tmp_path / "spec.toml").warnings
+        )
 
 
 SINGLE = [
@@ -370,21 +528,31 @@ def test_a_single_number_in_a_file_of_matlab_is_the_sampling_time(tmp_path, besi
     u, y = plant(300)
     data = {"u": u, "y": y} | beside.pop("data", {})
     scipy.io.savemat(tmp_path / "a.mat", {"data": data} | beside)
-    done = run("init", tmp_path / "a.mat", "--out", tmp_path / "spec.toml")  # data.u and data.y are known as u and y
+    done = run(
+        "init", tmp_path / "a.mat", "--out", tmp_path / "spec.toml"
+    )  # data.u and data.y are known as u and y
     assert done.code == 0, done.err
     data = tomllib.loads((tmp_path / "spec.toml").read_text())["data"]
-    assert (data["inputs"], data["outputs"], data["sampling_time"]) == (["data_u"], ["data_y"], step or 1.0)
-    assert ("no column tells it" in done.out) == (step is None)
+    assert (data["inputs"], data["outputs"], data["sampling_time"]) == (
+        ["data_u"],
+        ["data_y"],
+        step or 1.0,
+    )
+    assert ("no column states it" in done.out) == (step is None)
     np.savez(tmp_path / "a.npz", u=u, y=y, **beside)
     assert survey(tmp_path / "a.npz").clock.step == (step if beside else None)
 
 
 def test_a_lag_that_is_a_guess_is_told_in_the_spec(tmp_path):
     rng = np.random.default_rng(0)
-    pd.DataFrame({"u": rng.normal(size=30), "y": rng.normal(size=30)}).to_csv(tmp_path / "a.csv", index=False)
+    pd.DataFrame({"u": rng.normal(size=30), "y": rng.normal(size=30)}).to_csv(
+        tmp_path / "a.csv", index=False
+    )
     done = run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml")
     assert done.code == 0 and "no lag of it is significant" in done.out
-    assert "# no lag of it is significant, so this is a guess" in (tmp_path / "spec.toml").read_text()
+    assert (
+        "# no lag of it is significant, so this is a guess" in (tmp_path / "spec.toml").read_text()
+    )
 
 
 def test_the_focus_is_left_to_the_data(tmp_path):
@@ -404,7 +572,9 @@ def test_a_long_file_is_looked_at_in_windows_and_says_so(tmp_path, monkeypatch):
     pd.DataFrame({"u": u, "y": y}).to_csv(tmp_path / "a.csv", index=False)
     done = run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml")
     assert done.code == 0 and "reading a.csv" in done.err and "looking at signals" in done.err
-    assert "delays and orders are found on 500 of these rows" in done.out and "nk 3;" in done.out
+    assert (
+        "delays and orders are estimated from 500 of these rows" in done.out and "nk 3;" in done.out
+    )
 
 
 def frame_with(**columns) -> pd.DataFrame:
@@ -435,8 +605,20 @@ def test_the_time_is_known_by_rising_evenly_and_is_no_channel(tmp_path, header, 
     data = tomllib.loads((tmp_path / "spec.toml").read_text())["data"]
     assert (data["inputs"], data["outputs"]) == (["u"], ["y"])
     assert f"from column '{header or 'aika'}', which rises as time does" in done.out
-    assert kinds.open_job(tmp_path / "spec.toml").train.record.sampling_time == pytest.approx(step, rel=1e-3)
-    done = run("init", tmp_path / "a.csv", "--inputs", "u", "--outputs", "y", header or "aika", "--out", tmp_path / "b")
+    assert kinds.open_job(tmp_path / "spec.toml").train.record.sampling_time == pytest.approx(
+        step, rel=1e-3
+    )
+    done = run(
+        "init",
+        tmp_path / "a.csv",
+        "--inputs",
+        "u",
+        "--outputs",
+        "y",
+        header or "aika",
+        "--out",
+        tmp_path / "b",
+    )
     assert done.code == 2 and "in each row, as time does; it is no output" in done.err
 
 
@@ -446,9 +628,21 @@ NO_TIMES = {
         np.arange(300.0) ** 1.5,
         "rises, but in steps of 1 to 25.9, so it is taken for a signal",
     ),
-    "another unit": ("pos [mm]", EVEN, "rises evenly, but its unit mm is none of time, so it is taken for a signal"),
-    "a time that begins anew": ("time", EVEN % 4.0, "falls from 3.98 to 0 in row 200, so it is not the time"),
-    "instants that repeat": ("time", np.floor(EVEN * 10), "stands still at 0 in row 1, so it is not the time"),
+    "another unit": (
+        "pos [mm]",
+        EVEN,
+        "rises evenly, but its unit mm is no unit of time, so it is taken for a signal",
+    ),
+    "a time that begins anew": (
+        "time",
+        EVEN % 4.0,
+        "falls from 3.98 to 0 in row 200, so it is not the time",
+    ),
+    "instants that repeat": (
+        "time",
+        np.floor(EVEN * 10),
+        "stays at 0 in row 1, so it is not the time",
+    ),
     "a temperature": ("t", np.cos(EVEN), "falls in many rows, so it is taken for a signal"),
     "a counter": ("row", np.arange(300), "counts the rows"),
 }
@@ -457,8 +651,17 @@ NO_TIMES = {
 @pytest.mark.parametrize(("header", "values", "reason"), NO_TIMES.values(), ids=NO_TIMES.keys())
 def test_why_a_column_is_not_the_time_is_said(tmp_path, header, values, reason):
     frame_with(**{header: values}).to_csv(tmp_path / "a.csv", index=False)
-    done = run("init", tmp_path / "a.csv", "--inputs", "u", "--outputs", "y", "--out", tmp_path / "spec.toml")
-    assert done.code == 0 and "sampling time: no column tells it" in done.out, done.err
+    done = run(
+        "init",
+        tmp_path / "a.csv",
+        "--inputs",
+        "u",
+        "--outputs",
+        "y",
+        "--out",
+        tmp_path / "spec.toml",
+    )
+    assert done.code == 0 and "sampling time: no column states it" in done.out, done.err
     assert any(header in line and reason in line for line in done.out.splitlines()), done.out
     signals = [column.header for column in survey(tmp_path / "a.csv").signals]
     assert signals == (["u", "y"] if "signal" not in reason else [header, "u", "y"])
@@ -467,7 +670,9 @@ def test_why_a_column_is_not_the_time_is_said(tmp_path, header, values, reason):
 def test_a_second_time_is_no_signal_either(tmp_path):
     frame_with(n=np.arange(300), time=EVEN, aika=EVEN + 3.0).to_csv(tmp_path / "a.csv", index=False)
     done = run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml")
-    assert "0.02 s, from column 'time'" in done.out and "left out: n (counts the rows)" in done.out, done.err
+    assert (
+        "0.02 s, from column 'time'" in done.out and "left out: n (counts the rows)" in done.out
+    ), done.err
     assert "left out: aika (rises by 0.02 in each row, as a time does)" in done.out
 
 
@@ -478,10 +683,28 @@ def test_a_ramp_may_be_an_input_where_the_time_is_known(tmp_path, monkeypatch):
     frame.to_csv(tmp_path / "a.csv", index=False)
     out = tmp_path / "spec.toml"
     done = run("init", tmp_path / "a.csv", "--out", out)  # its name says input, its values time
-    assert done.code == 2 and "the names of the columns do not tell inputs from outputs: y" in done.err
+    assert (
+        done.code == 2
+        and "the names of the columns do not show which are inputs and which outputs: y" in done.err
+    )
     done = run("init", tmp_path / "a.csv", "--inputs", "u", "--outputs", "y", "--out", out)
-    assert done.code == 2 and "column 'u' rises by 0.5 s in each row, as time does; if it is an input, give" in done.err
-    done = run("init", tmp_path / "a.csv", "--inputs", "u", "--outputs", "y", "--sampling-time", "0.1", "--out", out)
+    assert (
+        done.code == 2
+        and "column 'u' rises by 0.5 s in each row, as time does; if it is an input, give"
+        in done.err
+    )
+    done = run(
+        "init",
+        tmp_path / "a.csv",
+        "--inputs",
+        "u",
+        "--outputs",
+        "y",
+        "--sampling-time",
+        "0.1",
+        "--out",
+        out,
+    )
     assert done.code == 0 and "sampling time: 0.1 s, as given" in done.out, done.err
     assert tomllib.loads(out.read_text())["data"]["sampling_time"] == 0.1
 
@@ -508,16 +731,29 @@ def test_columns_are_listed_by_spaces_commas_or_repetition(tmp_path, monkeypatch
 
 def test_a_column_may_have_a_comma_in_its_name(tmp_path):
     frame_with().rename(columns={"u": "Kraft, N"}).to_csv(tmp_path / "a.csv", index=False)
-    done = run("init", tmp_path / "a.csv", "--inputs", "Kraft, N", "--outputs", "y", "--out", tmp_path / "spec.toml")
+    done = run(
+        "init",
+        tmp_path / "a.csv",
+        "--inputs",
+        "Kraft, N",
+        "--outputs",
+        "y",
+        "--out",
+        tmp_path / "spec.toml",
+    )
     assert done.code == 0, done.err
     assert tomllib.loads((tmp_path / "spec.toml").read_text())["data"]["channels"] == {
         "Kraft_N": {"column": "Kraft, N"}
     }
 
 
-@pytest.mark.parametrize(("ending", "separator", "comma"), [("txt", " ", "."), ("dat", ";", ","), ("csv", "\t", ",")])
+@pytest.mark.parametrize(
+    ("ending", "separator", "comma"), [("txt", " ", "."), ("dat", ";", ","), ("csv", "\t", ",")]
+)
 def test_a_file_without_a_header_is_begun_with_and_runs(tmp_path, ending, separator, comma):
-    frame_with(t=EVEN).to_csv(tmp_path / f"a.{ending}", index=False, header=False, sep=separator, decimal=comma)
+    frame_with(t=EVEN).to_csv(
+        tmp_path / f"a.{ending}", index=False, header=False, sep=separator, decimal=comma
+    )
     out = tmp_path / "spec.toml"
     done = run("init", tmp_path / f"a.{ending}", "--inputs", "x2", "--outputs", "x3", "--out", out)
     assert done.code == 0 and "no header, so the columns are called x1 to x3" in done.out, done.err
@@ -542,11 +778,17 @@ def put_dspace(path, *, names=("Force", "Position"), rows=300):
             held = []
             for i, value in enumerate(values):
                 text = isinstance(value, str)
-                data = np.array([[ord(c)] for c in value], "u2") if text else np.asarray(value)[:, None]
+                data = (
+                    np.array([[ord(c)] for c in value], "u2")
+                    if text
+                    else np.asarray(value)[:, None]
+                )
                 made = refs.create_dataset(f"{field}{i}", data=data)
                 made.attrs["MATLAB_class"] = np.bytes_("char" if text else "double")
                 held.append([made.ref])
-            run_["Y"].create_dataset(field, data=np.array(held, dtype=h5py.ref_dtype), dtype=h5py.ref_dtype)
+            run_["Y"].create_dataset(
+                field, data=np.array(held, dtype=h5py.ref_dtype), dtype=h5py.ref_dtype
+            )
     return path
 
 
@@ -554,7 +796,9 @@ def test_signals_of_dspace_are_known_by_their_names(tmp_path):
     path, out = put_dspace(tmp_path / "run.mat"), tmp_path / "spec.toml"
     assert column_names(path) == ["run.X.Data", "Force", "Position"]
     done = run("init", path, "--inputs", "Force", "--outputs", "Position", "--out", out)
-    assert done.code == 0 and "0.02 s, from column 'run.X.Data', which rises as time does" in done.out, done.err
+    assert (
+        done.code == 0 and "0.02 s, from column 'run.X.Data', which rises as time does" in done.out
+    ), done.err
     assert tomllib.loads(out.read_text())["data"]["time"] == "run.X.Data" and "nk 3;" in done.out
     assert run("check", out).code == 0
     assert column_names(put_dspace(tmp_path / "b.mat", names=("In", "In"))) == [
@@ -574,10 +818,19 @@ MEASURED = [
 def test_measured_files_are_begun_with(data_folder, tmp_path, file, inputs, outputs, step):
     if not (data_folder / file).is_file():
         pytest.skip(f"no {file}; set ORTHAUG_DATA to the folder of the data sets")
-    options = ["--inputs", *inputs.split(), "--outputs", *outputs.split(), "--out", tmp_path / "spec.toml"]
+    options = [
+        "--inputs",
+        *inputs.split(),
+        "--outputs",
+        *outputs.split(),
+        "--out",
+        tmp_path / "spec.toml",
+    ]
     done = run("init", data_folder / file, *options)
     assert done.code == 0, done.err
-    assert kinds.open_job(tmp_path / "spec.toml").train.record.sampling_time == pytest.approx(step, rel=1e-4)
+    assert kinds.open_job(tmp_path / "spec.toml").train.record.sampling_time == pytest.approx(
+        step, rel=1e-4
+    )
 
 
 def test_runs_of_unequal_length_have_their_own_time(tmp_path, monkeypatch):
@@ -588,7 +841,9 @@ def test_runs_of_unequal_length_have_their_own_time(tmp_path, monkeypatch):
     out = tmp_path / "spec.toml"
     assert run("init", tmp_path / "a.mat", "--out", out).code == 2  # u and y of two runs
     done = run("init", tmp_path / "a.mat", "--inputs", "a.u", "--outputs", "b.y", "--out", out)
-    assert done.code == 2 and "the columns have unequal lengths: 'a.u' 300, 'b.y' 200 rows" in done.err
+    assert (
+        done.code == 2 and "the columns have unequal lengths: 'a.u' 300, 'b.y' 200 rows" in done.err
+    )
     done = run("init", tmp_path / "a.mat", "--inputs", "b.u", "--outputs", "b.y", "--out", out)
     assert done.code == 0 and "0.05 s, from column 'b.tid'" in done.out, done.err
 
@@ -597,7 +852,11 @@ def test_wild_samples_in_long_runs_are_left_out(tmp_path):
     u, y = plant(1200)
     y[100:104] = [60.0, -70.0, 80.0, -90.0]  # more than the step `fill` reconstructs
     pd.DataFrame({"u": u, "y": y}).to_csv(tmp_path / "a.csv", index=False)
-    done = run("init", tmp_path / "a.csv", "--sampling-time", "0.1", "--out", tmp_path / "spec.toml")
-    assert done.code == 0 and "4 training rows in longer runs of wild samples are left out" in done.out, done.err
+    done = run(
+        "init", tmp_path / "a.csv", "--sampling-time", "0.1", "--out", tmp_path / "spec.toml"
+    )
+    assert (
+        done.code == 0 and "4 training rows in longer runs of wild samples are left out" in done.out
+    ), done.err
     assert tomllib.loads((tmp_path / "spec.toml").read_text())["data"]["missing"] == "skip"
     assert run("check", tmp_path / "spec.toml").code == 0

@@ -66,7 +66,9 @@ def test_after_a_step_the_states_are_those_of_dense_least_squares(name):
     n0 = case(name).states.size
     step = 0.1 * np.random.default_rng(0).normal(size=matrix.shape[1] - n0)
     best = np.linalg.lstsq(matrix[:, :n0], right - matrix[:, n0:] @ step, rcond=None)[0]
-    assert_close(followed(name, step) - case(name).states, best.reshape(case(name).states.shape), 1e-9)
+    assert_close(
+        followed(name, step) - case(name).states, best.reshape(case(name).states.shape), 1e-9
+    )
 
 
 @pytest.mark.parametrize("name", ["no learner", "two outputs, no learner"])
@@ -76,7 +78,11 @@ def test_the_step_of_the_eliminated_equations_is_the_dense_one(name):
     n0 = case(name).states.size
     step = np.linalg.solve(*eliminated(name)[:2])
     np.testing.assert_allclose(step, expected[n0:], rtol=1e-8)
-    assert_close(followed(name, step) - case(name).states, expected[:n0].reshape(case(name).states.shape), 1e-8)
+    assert_close(
+        followed(name, step) - case(name).states,
+        expected[:n0].reshape(case(name).states.shape),
+        1e-8,
+    )
 
 
 def test_loss_of_the_states_by_a_loop():
@@ -84,7 +90,9 @@ def test_loss_of_the_states_by_a_loop():
     states, weight, values = states_of(name), case(name).weight, case(name).states
     shape = (len(values), case(name).form.memory, 2, values.shape[-1])
     miss = np.moveaxis((states.measured - values).reshape(shape), 2, -1).reshape(-1, 2)
-    assert states.loss(values, start_rows(name)) == pytest.approx(sum(np.sum((weight @ row) ** 2) for row in miss))
+    assert states.loss(values, start_rows(name)) == pytest.approx(
+        sum(np.sum((weight @ row) ** 2) for row in miss)
+    )
     assert states.loss(states.measured, start_rows(name)) == 0
 
 

@@ -41,11 +41,14 @@ class Wave(eqx.Module):
 def rows(learner_nz: int, ny: int, count: int = 11):
     """Features (nz, m) and gains (ny, ny, m) with the batch last."""
     rng = np.random.default_rng(2)
-    return jnp.asarray(rng.uniform(-1, 1, (learner_nz, count))), jnp.asarray(rng.uniform(0.5, 2, (ny, ny, count)))
+    return jnp.asarray(rng.uniform(-1, 1, (learner_nz, count))), jnp.asarray(
+        rng.uniform(0.5, 2, (ny, ny, count))
+    )
 
 
 @pytest.mark.parametrize(
-    ("hidden", "nz", "ny", "size"), [((), 3, 2, 8), ((5,), 2, 1, 21), ((4, 3), 2, 2, 12 + 15 + 8), ((16,), 1, 1, 49)]
+    ("hidden", "nz", "ny", "size"),
+    [((), 3, 2, 8), ((5,), 2, 1, 21), ((4, 3), 2, 2, 12 + 15 + 8), ((16,), 1, 1, 49)],
 )
 def test_mlp_shapes(hidden, nz, ny, size):
     bound = Bound(MLP(hidden=hidden), nz, ny)
@@ -53,14 +56,20 @@ def test_mlp_shapes(hidden, nz, ny, size):
     assert bound.size == size and w.shape == (size,) and w.dtype == float
     assert bound.values(w, jnp.ones(nz)).shape == (ny,)
     sizes = (nz, *hidden, ny)
-    expected = [s for i in range(len(sizes) - 1) for s in ((sizes[i + 1], sizes[i]), (sizes[i + 1],))]
+    expected = [
+        s for i in range(len(sizes) - 1) for s in ((sizes[i + 1], sizes[i]), (sizes[i + 1],))
+    ]
     assert [leaf.shape for leaf in bound.leaves(w)] == expected
     np.testing.assert_array_equal(bound.ravel(bound.leaves(w)), w)
 
 
-@pytest.mark.parametrize(("activation", "gain"), [("tanh", 5 / 3), ("relu", math.sqrt(2)), ("gelu", 1.0)])
+@pytest.mark.parametrize(
+    ("activation", "gain"), [("tanh", 5 / 3), ("relu", math.sqrt(2)), ("gelu", 1.0)]
+)
 def test_xavier(activation, gain):
-    weight1, bias1, weight2, bias2 = jax.tree.leaves(MLP(hidden=(200,), activation=activation).init(KEY, 10, 3))
+    weight1, bias1, weight2, bias2 = jax.tree.leaves(
+        MLP(hidden=(200,), activation=activation).init(KEY, 10, 3)
+    )
     for weight, fan, factor in ((weight1, 210, gain), (weight2, 203, 1.0)):
         a = factor * math.sqrt(6 / fan)
         assert 0.98 * a < np.abs(weight).max() <= a
@@ -89,7 +98,9 @@ FORMULAS = {
 @pytest.mark.parametrize("activation", ACTIVATIONS)
 def test_mlp_is_its_formula(activation):
     bound = Bound(MLP(hidden=(4, 3), activation=activation), 2, 2)
-    w1, b1, w2, b2, w3, b3 = leaves = [np.asarray(leaf) + 0.1 for leaf in bound.leaves(bound.init(KEY))]
+    w1, b1, w2, b2, w3, b3 = leaves = [
+        np.asarray(leaf) + 0.1 for leaf in bound.leaves(bound.init(KEY))
+    ]
     z, f = np.array([0.3, -0.8]), FORMULAS[activation]
     expected = w3 @ f(w2 @ f(w1 @ z + b1) + b2) + b3
     np.testing.assert_allclose(bound.from_leaves(leaves, jnp.asarray(z)), expected, rtol=1e-13)
@@ -104,7 +115,9 @@ LEARNERS = [
 ]
 
 
-@pytest.mark.parametrize(("learner", "nz", "ny"), LEARNERS, ids=["mlp", "deep", "linear", "function", "equinox"])
+@pytest.mark.parametrize(
+    ("learner", "nz", "ny"), LEARNERS, ids=["mlp", "deep", "linear", "function", "equinox"]
+)
 def test_jacobian_is_the_derivative_of_the_values(learner, nz, ny):
     bound = Bound(learner, nz, ny)
     w = bound.init(KEY) + 0.1
@@ -167,7 +180,9 @@ def test_external_values():
 
 def test_external_of_one_output_may_return_a_vector():
     bound = Bound(External(lambda x: x[:, 0] ** 2), 2, 1)
-    found = jax.vmap(lambda row: bound.values(jnp.zeros(0), row))(jnp.array([[2.0, 0.0], [3.0, 0.0]]))
+    found = jax.vmap(lambda row: bound.values(jnp.zeros(0), row))(
+        jnp.array([[2.0, 0.0], [3.0, 0.0]])
+    )
     np.testing.assert_array_equal(found, [[4.0], [9.0]])
 
 
@@ -175,7 +190,9 @@ def test_external_has_an_empty_jacobian():
     bound = Bound(External(product, ny=2), 2, 2)
     z, gain = rows(2, 2)
     values, jacobian = bound.jacobian(jnp.zeros(0), z, gain)
-    np.testing.assert_allclose(values, np.einsum("oim,im->om", gain, product(np.asarray(z).T).T), rtol=1e-13)
+    np.testing.assert_allclose(
+        values, np.einsum("oim,im->om", gain, product(np.asarray(z).T).T), rtol=1e-13
+    )
     assert jacobian.shape == (0, 2, 11)
 
 
@@ -189,11 +206,26 @@ def test_external_of_the_wrong_shape():
 @pytest.mark.parametrize(
     ("learner", "message"),
     [
-        (Function(lambda w, z: w @ z, lambda key: jnp.ones(2)), r"shape \(\) for one row; expected \(ny,\) = \(1,\)"),
-        (Function(lambda w, z: w * z, lambda key: jnp.ones(2)), r"shape \(2,\) for one row; expected"),
-        (Function(lambda w, z: [w[0]], lambda key: jnp.ones(2)), "shape list for one row; expected"),
-        (Function(lambda w, z: w[:1] * 1.0, lambda key: jnp.arange(2)), "must be float arrays; found int64"),
-        (Function(lambda w, z: w[:1], lambda key: jnp.ones(2) + 1j), "must be float arrays; found complex128"),
+        (
+            Function(lambda w, z: w @ z, lambda key: jnp.ones(2)),
+            r"shape \(\) for one row; expected \(ny,\) = \(1,\)",
+        ),
+        (
+            Function(lambda w, z: w * z, lambda key: jnp.ones(2)),
+            r"shape \(2,\) for one row; expected",
+        ),
+        (
+            Function(lambda w, z: [w[0]], lambda key: jnp.ones(2)),
+            "shape list for one row; expected",
+        ),
+        (
+            Function(lambda w, z: w[:1] * 1.0, lambda key: jnp.arange(2)),
+            "must be float arrays; found int64",
+        ),
+        (
+            Function(lambda w, z: w[:1], lambda key: jnp.ones(2) + 1j),
+            "must be float arrays; found complex128",
+        ),
     ],
 )
 def test_learner_refused(learner, message):
@@ -219,18 +251,24 @@ def test_mlp_refused(arguments, message):
 
 def test_bound_is_hashable_so_that_programs_are_reused():
     assert Bound(MLP(hidden=[4]), 2, 1) == Bound(MLP(hidden=(4,), inputs=None), 2, 1)
-    assert hash(Bound(MLP(hidden=[4], inputs=["y[k-1]"]), 2, 1)) == hash(Bound(MLP((4,), inputs=("y[k-1]",)), 2, 1))
+    assert hash(Bound(MLP(hidden=[4], inputs=["y[k-1]"]), 2, 1)) == hash(
+        Bound(MLP((4,), inputs=("y[k-1]",)), 2, 1)
+    )
     assert Bound(MLP(), 2, 1) != Bound(MLP(), 3, 1)
 
 
-@pytest.mark.parametrize(("hidden", "nz", "ny"), [((16,), 3, 1), ((40, 30), 50, 2), ((2000,), 3, 1)])
+@pytest.mark.parametrize(
+    ("hidden", "nz", "ny"), [((16,), 3, 1), ((40, 30), 50, 2), ((2000,), 3, 1)]
+)
 def test_weights_are_those_of_a_draw_at_their_own_size(hidden, nz, ny):
     sizes = (nz, *hidden, ny)
     keys = jax.random.split(KEY, len(sizes) - 1)
     for i, (weight, _) in enumerate(MLP(hidden, activation="relu").init(KEY, nz, ny)):
         a = math.sqrt(6 / (sizes[i] + sizes[i + 1])) * (math.sqrt(2) if i < len(hidden) else 1.0)
         shape = (sizes[i + 1], sizes[i])
-        np.testing.assert_array_equal(weight, jax.random.uniform(keys[i], shape, minval=-a, maxval=a, dtype=float))
+        np.testing.assert_array_equal(
+            weight, jax.random.uniform(keys[i], shape, minval=-a, maxval=a, dtype=float)
+        )
 
 
 GROUPS = [  # weights in the tree's order: into the neurons, their biases, out of the last layer, the output's bias

@@ -24,13 +24,19 @@ def regression(learner=MLP(hidden=()), ny=1, noise=0.1):  # noqa: B008
     """Two physics columns, four features, outputs that are a curve in the features."""
     rng = np.random.default_rng(0)
     z, phi = rng.uniform(-1, 1, (ROWS, 4)), rng.normal(size=(ROWS, ny, 2))
-    y = np.sin(z @ rng.normal(size=(4, ny))) + phi @ [1.0, -2.0] + noise * rng.normal(size=(ROWS, ny))
+    y = (
+        np.sin(z @ rng.normal(size=(4, ny)))
+        + phi @ [1.0, -2.0]
+        + noise * rng.normal(size=(ROWS, ny))
+    )
     return problem(learner, z, y, phi)
 
 
 def minimise(given, w=None, solver=LevenbergMarquardt(), **options):  # noqa: B008
     w = given.bound.init(jax.random.key(3)) if w is None else w
-    return solver.minimise(given.criterion, w, given.arguments, given.nothing, samples=SAMPLES, **options)
+    return solver.minimise(
+        given.criterion, w, given.arguments, given.nothing, samples=SAMPLES, **options
+    )
 
 
 @pytest.mark.parametrize("ny", [1, 2])
@@ -52,7 +58,9 @@ def test_linear_learner_ends_at_ridge_regression(ridge):
     expected = np.linalg.solve(hessian + ridge * np.eye(len(hessian)), columns.T @ given.e.ravel())
     assert run.ending is Ending.CONVERGED and run.ridge == ridge
     np.testing.assert_allclose(run.w, expected, atol=1e-8)
-    np.testing.assert_allclose(run.effective, np.trace(np.linalg.solve(hessian + ridge * np.eye(5), hessian)))
+    np.testing.assert_allclose(
+        run.effective, np.trace(np.linalg.solve(hessian + ridge * np.eye(5), hessian))
+    )
 
 
 @pytest.mark.parametrize("ridge", [0.0, 1.0])
@@ -88,14 +96,18 @@ def test_evidence_of_a_linear_learner():
 
 def test_evidence_reaches_its_fixed_point_equations():
     given = regression(MLP(hidden=(5,)), noise=0.3)
-    run = minimise(given, solver=LevenbergMarquardt(iterations=3000, tolerance=1e-13), ridge=1.0, evidence=True)
+    run = minimise(
+        given, solver=LevenbergMarquardt(iterations=3000, tolerance=1e-13), ridge=1.0, evidence=True
+    )
     w, values = np.asarray(run.w), np.linalg.eigvalsh(run.normal.hessian)
     gamma = np.sum(values / (values + run.ridge))
     variance = float(run.normal.loss) / (SAMPLES - gamma)
     assert run.ending is Ending.CONVERGED
     np.testing.assert_allclose(run.effective, gamma, rtol=1e-4)
     np.testing.assert_allclose(run.ridge, gamma * variance / (w @ w), rtol=1e-4)
-    assert np.linalg.norm(run.normal.gradient - run.ridge * w) < 1e-4 * np.linalg.norm(run.ridge * w)
+    assert np.linalg.norm(run.normal.gradient - run.ridge * w) < 1e-4 * np.linalg.norm(
+        run.ridge * w
+    )
 
 
 def relevance(columns, target, samples, groups):
@@ -130,7 +142,9 @@ def test_a_weight_that_nothing_needs_falls_silent():
     columns = linear_columns(given)
     least_squares = np.linalg.lstsq(columns, given.e.ravel(), rcond=None)[0]
     for i in (1, 2):  # Mackay's condition: an estimate within its standard error is pruned
-        deviation = np.sqrt(np.linalg.inv(columns.T @ columns)[i, i] * float(run.normal.loss) / SAMPLES)
+        deviation = np.sqrt(
+            np.linalg.inv(columns.T @ columns)[i, i] * float(run.normal.loss) / SAMPLES
+        )
         assert (run.ridge[i] > 1e6) == (abs(least_squares[i]) < deviation)
     assert run.ridge[0] < 1 and run.w[0] == pytest.approx(least_squares[0], rel=0.01)
 
@@ -148,7 +162,9 @@ def in_the_span(noise):
     """A learner that is linear in the physics' own regressors, the paper's Example 1."""
     rng = np.random.default_rng(0)
     z = rng.normal(size=(ROWS, 2))
-    return problem(IN_THE_SPAN, z, (z @ [1.0, -2.0] + noise * rng.normal(size=ROWS))[:, None], z[:, None])
+    return problem(
+        IN_THE_SPAN, z, (z @ [1.0, -2.0] + noise * rng.normal(size=ROWS))[:, None], z[:, None]
+    )
 
 
 @pytest.mark.parametrize("options", [{}, {"ridge": 1.0}, {"ridge": 1.0, "evidence": True}])
@@ -186,7 +202,9 @@ def uphill(w, overlap):
 
 
 def test_no_step_descends():
-    run = LevenbergMarquardt().minimise(uphill, jnp.ones(2), (), Overlap(jnp.zeros((0, 2)), jnp.zeros(0)), samples=1)
+    run = LevenbergMarquardt().minimise(
+        uphill, jnp.ones(2), (), Overlap(jnp.zeros((0, 2)), jnp.zeros(0)), samples=1
+    )
     assert run.ending is Ending.NO_DESCENT
     np.testing.assert_array_equal(run.w, 1.0)
 
@@ -198,7 +216,9 @@ def wall(w, overlap):
 
 
 def test_trial_without_a_value_is_taken_back():
-    run = LevenbergMarquardt().minimise(wall, jnp.zeros(1), (), Overlap(jnp.zeros((0, 1)), jnp.zeros(0)), samples=1)
+    run = LevenbergMarquardt().minimise(
+        wall, jnp.zeros(1), (), Overlap(jnp.zeros((0, 1)), jnp.zeros(0)), samples=1
+    )
     assert 0.0 < run.w[0] <= 1.0 and np.isfinite(run.normal.loss)
 
 
@@ -214,7 +234,11 @@ def test_a_run_goes_on_past_its_limit_while_the_loss_falls():
         minimise(given, solver=LevenbergMarquardt(*limits, longest=last))
         for limits, last in (((8, 0.0), 8), ((8, 0.0), 40), ((40, 0.0), 40))
     )
-    assert (short.iterations, long.iterations) == (8, 40) and long.tail.prolonged and not short.tail.prolonged
+    assert (
+        (short.iterations, long.iterations) == (8, 40)
+        and long.tail.prolonged
+        and not short.tail.prolonged
+    )
     np.testing.assert_array_equal(long.w, longest.w)
     assert short.tail.noticeable and short.tail.fall > 0 and short.tail.window == 5
     once = minimise(given, solver=LevenbergMarquardt(8, 0.0, longest=40), noticeable=1e6)
@@ -223,7 +247,11 @@ def test_a_run_goes_on_past_its_limit_while_the_loss_falls():
 
 def test_only_the_default_limit_is_passed():
     assert LevenbergMarquardt().limit()[:2] == (300, 3000)
-    assert LevenbergMarquardt(200).limit()[:2] == LevenbergMarquardt().at_most(200).limit()[:2] == (200, 200)
+    assert (
+        LevenbergMarquardt(200).limit()[:2]
+        == LevenbergMarquardt().at_most(200).limit()[:2]
+        == (200, 200)
+    )
     assert LevenbergMarquardt().within_limit.limit()[:2] == (300, 300)
     assert LevenbergMarquardt().after(120).limit()[:2] == (180, 2880)
 
@@ -248,12 +276,20 @@ def test_pauses_change_nothing(monkeypatch, seconds):
     given, told = regression(MLP(hidden=(5,))), []
     solver = LevenbergMarquardt(iterations=40)
     w = given.bound.init(jax.random.key(3))
-    options = compiled.Options(jnp.asarray(solver.tolerance), jnp.asarray(True), jnp.asarray(float(SAMPLES)))
-    start = compiled._begun(w, linearise(given.criterion, w, given.arguments, given.nothing), jnp.asarray(0.1))
-    whole = compiled._advance(given.criterion, start, given.arguments, options, jnp.asarray(solver.iterations))
+    options = compiled.Options(
+        jnp.asarray(solver.tolerance), jnp.asarray(True), jnp.asarray(float(SAMPLES))
+    )
+    start = compiled._begun(
+        w, linearise(given.criterion, w, given.arguments, given.nothing), jnp.asarray(0.1)
+    )
+    whole = compiled._advance(
+        given.criterion, start, given.arguments, options, jnp.asarray(solver.iterations)
+    )
 
     monkeypatch.setattr(compiled, "_SECONDS_PER_BURST", seconds)
-    run = minimise(given, w, solver, ridge=0.1, evidence=True, progress=lambda i, loss: told.append((i, loss)))
+    run = minimise(
+        given, w, solver, ridge=0.1, evidence=True, progress=lambda i, loss: told.append((i, loss))
+    )
     np.testing.assert_array_equal(run.w, whole.w)
     assert (run.ridge, run.iterations, run.ending) == (
         float(whole.ridge),

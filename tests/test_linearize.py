@@ -32,7 +32,13 @@ def two_by_two(rows: int = 400) -> oa.Record:
     rng = np.random.default_rng(3)
     u, y = rng.normal(size=(rows, 2)), np.zeros((rows, 2))
     for k in range(4, rows):
-        y[k, 0] = 1.4 * y[k - 1, 0] - 0.6 * y[k - 2, 0] + 0.1 * y[k - 1, 1] + 0.5 * u[k, 0] + 0.2 * u[k - 4, 1]
+        y[k, 0] = (
+            1.4 * y[k - 1, 0]
+            - 0.6 * y[k - 2, 0]
+            + 0.1 * y[k - 1, 1]
+            + 0.5 * u[k, 0]
+            + 0.2 * u[k - 4, 1]
+        )
         y[k, 1] = 0.7 * y[k - 1, 1] - 0.2 * y[k - 1, 0] + 0.3 * u[k - 3, 1]
     y += 0.01 * rng.normal(size=y.shape)
     channels = {
@@ -44,8 +50,15 @@ def two_by_two(rows: int = 400) -> oa.Record:
 
 @pytest.fixture(scope="module")
 def linear() -> oa.Estimate:
-    rows = [("y", ("y[k-1]", "y[k-2]", "q[k-1]", "u[k]", "w[k-4]")), ("q", ("q[k-1]", "y[k-1]", "w[k-3]"))]
-    terms = [oa.Term(f"{out}{i}", r, output=out) for out, regressors in rows for i, r in enumerate(regressors)]
+    rows = [
+        ("y", ("y[k-1]", "y[k-2]", "q[k-1]", "u[k]", "w[k-4]")),
+        ("q", ("q[k-1]", "y[k-1]", "w[k-3]")),
+    ]
+    terms = [
+        oa.Term(f"{out}{i}", r, output=out)
+        for out, regressors in rows
+        for i, r in enumerate(regressors)
+    ]
     return oa.estimate(two_by_two(), oa.Baseline.from_terms(terms), learner=None)
 
 
@@ -65,10 +78,15 @@ def cubic() -> oa.Estimate:
 def pendulum() -> oa.MotionEstimate:
     """A pendulum under a torque, fitted without a learner."""
     motion = oa.Motion.from_equations(
-        states=[oa.State("angle", "rate", start="q", unit="rad"), oa.State("rate", PENDULUM, start=0.0, unit="rad/s")],
+        states=[
+            oa.State("angle", "rate", start="q", unit="rad"),
+            oa.State("rate", PENDULUM, start=0.0, unit="rad/s"),
+        ],
         outputs=[oa.Output("q", "angle")],
         inputs=["torque"],
-        parameters=[oa.PhysicalParameter(n, v, min=0) for n, v in (("J", 1.0), ("d", 0.5), ("g", 9.0))],
+        parameters=[
+            oa.PhysicalParameter(n, v, min=0) for n, v in (("J", 1.0), ("d", 0.5), ("g", 9.0))
+        ],
         integrator="rk4",
         substeps=1,
     )
@@ -77,9 +95,15 @@ def pendulum() -> oa.MotionEstimate:
     x, q = np.array([0.1, 0.0]), np.zeros(400)
     for k, u in enumerate(torque):
         q[k] = x[0]
-        x = _runge_kutta(lambda x, u=u: np.array([x[1], u - 0.5 * x[1] - 9 * np.sin(x[0])]), x, STEP)
+        x = _runge_kutta(
+            lambda x, u=u: np.array([x[1], u - 0.5 * x[1] - 9 * np.sin(x[0])]), x, STEP
+        )
     record = oa.Record.from_arrays(
-        torque, q + 0.01 * rng.normal(size=400), sampling_time=STEP, inputs=["torque"], outputs=["q"]
+        torque,
+        q + 0.01 * rng.normal(size=400),
+        sampling_time=STEP,
+        inputs=["torque"],
+        outputs=["q"],
     )
     return oa.estimate(record, motion, learner=None)
 
@@ -146,13 +170,21 @@ def test_derivatives_are_those_of_finite_differences(cubic):
         sides = []
         for sign in (-1, 1):
             p = np.concatenate([model.theta, model.numbers.weights]) + sign * 1e-3 * root[:, j]
-            numbers = model.numbers._replace(theta=p[: len(model.theta)], weights=p[len(model.theta) :])
-            sides.append(oa.linearize(replace(model, numbers=numbers), at, frequencies=frequency)[0])
+            numbers = model.numbers._replace(
+                theta=p[: len(model.theta)], weights=p[len(model.theta) :]
+            )
+            sides.append(
+                oa.linearize(replace(model, numbers=numbers), at, frequencies=frequency)[0]
+            )
         low, high = sides
         moved = (high.system.matrix - low.system.matrix) / 2e-3
         np.testing.assert_allclose(view.system.moved[j], moved, rtol=1e-4, atol=1e-9)
-        np.testing.assert_allclose(found.moved[:, j], (high.bode.value - low.bode.value) / 2e-3, rtol=1e-4, atol=1e-9)
-        np.testing.assert_allclose(gain.moved[0, j], (high.gain - low.gain) / 2e-3, rtol=1e-4, atol=1e-9)
+        np.testing.assert_allclose(
+            found.moved[:, j], (high.bode.value - low.bode.value) / 2e-3, rtol=1e-4, atol=1e-9
+        )
+        np.testing.assert_allclose(
+            gain.moved[0, j], (high.gain - low.gain) / 2e-3, rtol=1e-4, atol=1e-9
+        )
         pole = (high.poles[0].z - low.poles[0].z) / 2e-3
         assert view.system.modes.moved[0][j] == pytest.approx(pole, rel=1e-4, abs=1e-9)
 
@@ -160,7 +192,10 @@ def test_derivatives_are_those_of_finite_differences(cubic):
 def test_all_equilibria_are_found_and_told(cubic):
     found = oa.linearize(cubic.model)
     rests = sorted(view.point.values["y"] for view in found)
-    a, c = 1 - oa.linearize(cubic.model, "y = 0, u = 0")[0].a[0, 0], float(cubic.terms["coefficient"].iloc[0])
+    a, c = (
+        1 - oa.linearize(cubic.model, "y = 0, u = 0")[0].a[0, 0],
+        float(cubic.terms["coefficient"].iloc[0]),
+    )
     np.testing.assert_allclose(rests, [-np.sqrt(a / c), 0.0, np.sqrt(a / c)], rtol=1e-6, atol=1e-9)
     assert [view.stable for view in found] == [False, True, True]
     assert found[0].poles[0].damping == -1 and found[0].poles[0].time_constant is None
@@ -195,7 +230,9 @@ def test_a_motion_has_the_matrices_of_its_equations(pendulum):
     series = sum(np.linalg.matrix_power(a * h, i) / np.prod(range(1, i + 1)) for i in range(5))
     np.testing.assert_allclose(view.a, series, **EXACT)
     low, high = view.gain_ci95[0, 0]
-    assert low < view.gain[0, 0] < high and view.gain[0, 0] == pytest.approx(1 / values["g"], rel=1e-9)
+    assert low < view.gain[0, 0] < high and view.gain[0, 0] == pytest.approx(
+        1 / values["g"], rel=1e-9
+    )
     upright = oa.linearize(pendulum.model, {"angle": np.pi})
     assert not upright[0].stable and abs(upright[0].point.inputs[0]) < 1e-9
 
@@ -215,13 +252,18 @@ def test_holds_and_discrete_motions_give_the_same_response(pendulum):
     whole = scipy.linalg.expm(block)
     now, ramp = whole[:n, 2], whole[:n, 3]
     x = np.linalg.solve(z * np.eye(n) - whole[:n, :n], now + ramp * (z - 1))
-    assert view.bode.value[0, 0, 0] == pytest.approx(x[0], rel=1e-4)  # Runge-Kutta against the exponential
+    assert view.bode.value[0, 0, 0] == pytest.approx(
+        x[0], rel=1e-4
+    )  # Runge-Kutta against the exponential
     spline = replace(model, form=replace(form, motion=replace(form.motion, hold="spline")))
     told = oa.linearize(spline, "angle = 0", frequencies=[1.0])
     assert [warning.code for warning in told.warnings] == ["hold_replaced"]
     np.testing.assert_array_equal(told[0].a, view.a)
     exact = view.to_control("continuous")(1j * w)
-    assert told[0].bode.value[0, 0, 0] == pytest.approx(exact, rel=1e-10) and view.bode.value[0, 0, 0] != exact
+    assert (
+        told[0].bode.value[0, 0, 0] == pytest.approx(exact, rel=1e-10)
+        and view.bode.value[0, 0, 0] != exact
+    )
 
 
 def test_continuous_time_gives_the_sampled_system_back(linear):
@@ -231,7 +273,9 @@ def test_continuous_time_gives_the_sampled_system_back(linear):
     assert small.states < view.system.states and list(dead) == [0, 2]
     z = np.exp(2j * np.pi * view.bode.frequency[::50] * STEP)
     late = np.stack([z**-count for count in dead], axis=-1)[:, None]
-    np.testing.assert_allclose(small.response(z).value * late, view.system.response(z).value, **EXACT)
+    np.testing.assert_allclose(
+        small.response(z).value * late, view.system.response(z).value, **EXACT
+    )
     back = control.c2d(view.to_control("continuous"), STEP, "zoh")
     np.testing.assert_allclose(np.hstack([back.A, back.B]), small.matrix[: small.states], atol=1e-9)
     tustin = oa.linearize(linear.model, continuous="tustin")[0].continuous
@@ -299,7 +343,10 @@ def test_what_has_no_linear_view_is_said(linear, cubic):
     view = oa.linearize(model)
     assert view[0].gain is None and view.warnings[0].code == "continuum_of_equilibria"
     assert "a pole at 1 integrates" in linear_text(view)
-    with pytest.raises(InputError, match="no equilibrium was found at u = 1, from 33 starts: either the model integra"):
+    with pytest.raises(
+        InputError,
+        match="no equilibrium was found at u = 1, from 33 starts: either the model integra",
+    ):
         oa.linearize(model, "u = 1")
     for at, message in (
         ("fource = 1", "the model has no 'fource'; known are u, w, y, q"),
@@ -313,7 +360,10 @@ def test_what_has_no_linear_view_is_said(linear, cubic):
         with pytest.raises(InputError, match=message):
             oa.linearize(linear.model, at)
     for options, message in (
-        ({"frequencies": [0.0]}, r"`frequencies` must be numbers above 0 up to half the sampling rate, 10 Hz"),
+        (
+            {"frequencies": [0.0]},
+            r"`frequencies` must be numbers above 0 up to half the sampling rate, 10 Hz",
+        ),
         ({"continuous": "foh"}, "`continuous` must be one of zoh, tustin; got 'foh'"),
         ({"record": two_by_two().rows}, "`record` must be a Record"),
     ):
@@ -341,7 +391,9 @@ def test_dry_friction_at_rest_is_no_line():
 def test_without_a_joint_covariance_the_learner_is_frozen_or_nothing_is_told(linear, cubic):
     ensemble = replace(cubic, model=replace(cubic.model, statistics=type(cubic.model.statistics)()))
     frozen = oa.linearize(ensemble, "y = 0")
-    assert [warning.code for warning in frozen.warnings] == ["learner_frozen"] and frozen[0].gain_ci95 is not None
+    assert [warning.code for warning in frozen.warnings] == ["learner_frozen"] and frozen[
+        0
+    ].gain_ci95 is not None
     bare = oa.linearize(ensemble.model, "y = 0")
     assert [warning.code for warning in bare.warnings] == ["no_intervals"]
     assert bare[0].gain_ci95 is None and bare[0].bode.magnitude_ci95 is None
@@ -360,7 +412,11 @@ def test_the_command_writes_numbers_a_page_and_figures(cubic, tmp_path, monkeypa
     rows = np.hstack([experiment.inputs, experiment.outputs])
     np.savetxt("run.csv", rows, delimiter=",", header="u,y", comments="")
     done = run("linearize", "model", "--at", "y = 0.5", "--data", "run.csv", "--out", "linear")
-    assert done.code == 0 and "against data alone (Welch's spectra" in done.out and "written to linear" in done.out
+    assert (
+        done.code == 0
+        and "against data alone (Welch's spectra" in done.out
+        and "written to linear" in done.out
+    )
     told = json.loads((tmp_path / "linear/result.json").read_text())
     assert LinearizeResult.model_validate(told).points[0].outputs["y"] == pytest.approx(0.5)
     assert told["held"] == "found" and len(told["points"][0]["frequency"]) == 400
@@ -376,7 +432,10 @@ def test_the_command_writes_numbers_a_page_and_figures(cubic, tmp_path, monkeypa
 def test_bad_arguments_end_in_words_and_nothing_is_written(cubic, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     oa.save(cubic.model, "model")
-    changed = json.loads((tmp_path / "model/model.json").read_text()) | {"format": 99, "orthaug": "9.0"}
+    changed = json.loads((tmp_path / "model/model.json").read_text()) | {
+        "format": 99,
+        "orthaug": "9.0",
+    }
     oa.save(cubic.model, "newer")
     (tmp_path / "newer/model.json").write_text(json.dumps(changed))
     (tmp_path / "theirs").mkdir()
@@ -418,7 +477,10 @@ def test_the_example_of_silverbox_gives_its_resonance(data_folder, tmp_path, mon
 def test_whatever_is_given_ends_in_words(cubic):
     model = cubic.model
     for name, least in (("at", 20), ("record", 20), ("frequencies", 14), ("continuous", 20)):
-        assert tried(lambda value, name=name: oa.linearize(model, **{"at": {"y": 0.5}, name: value})) >= least, name
+        assert (
+            tried(lambda value, name=name: oa.linearize(model, **{"at": {"y": 0.5}, name: value}))
+            >= least
+        ), name
     assert tried(oa.linearize) == len(WRONG)
     view = oa.linearize(model, "y = 0.5", frequencies=[1.0])
     assert tried(view.to_control) == len(WRONG)

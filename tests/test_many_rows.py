@@ -11,7 +11,7 @@ import pytest
 from test_free_run import PHYSICS, nonlinear
 
 import orthaug as oa
-from orthaug._base.progress import Enough
+from orthaug._base.progress import StopTraining
 from orthaug.fitting import one_step
 from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.structures import Orthogonal
@@ -66,16 +66,23 @@ def test_it_begins_at_the_weights_where_the_run_over_some_rows_ended(many, regul
 
 def test_progress_counts_passes_over_all_rows_and_asks_for_an_end_in_both(many):
     told, few = [], []
-    fitted(progress=lambda run, iteration, loss: told.append(iteration), solver=oa.LevenbergMarquardt(40))
+    fitted(
+        progress=lambda run, iteration, loss: told.append(iteration),
+        solver=oa.LevenbergMarquardt(40),
+    )
     assert told[0] == 0 and told == sorted(told)
 
     def enough(run, iteration, loss):
         few.append(iteration)
-        raise Enough
+        raise StopTraining
 
     found = fitted(progress=enough)
-    assert few[0] == 0 < few[-1] and len(few) <= 4  # a run that is stopped above physics alone starts anew, silent
-    assert found.status.code == "stopped" and "stopped" in [warning.code for warning in found.warnings]
+    assert (
+        few[0] == 0 < few[-1] and len(few) <= 4
+    )  # a run that is stopped above physics alone starts anew, silent
+    assert found.status.code == "stopped" and "stopped" in [
+        warning.code for warning in found.warnings
+    ]
 
 
 def test_fewer_rows_are_run_over_as_they_are():
@@ -87,7 +94,13 @@ def test_rows_that_lack_what_the_physics_needs_are_not_begun_with(many):
     rng = np.random.default_rng(0)
     u[100:300] = rng.normal(size=200)  # between the windows that stand for all rows
     for k in range(2, ROWS):
-        y[k] = 0.9 * y[k - 1] - 0.3 * y[k - 2] + 0.5 * u[k - 1] + 0.3 * np.tanh(2 * y[k - 1]) + 0.01 * rng.normal()
+        y[k] = (
+            0.9 * y[k - 1]
+            - 0.3 * y[k - 2]
+            + 0.5 * u[k - 1]
+            + 0.3 * np.tanh(2 * y[k - 1])
+            + 0.01 * rng.normal()
+        )
     record = oa.Record.from_arrays(u, y)
     assert OneStepTask.of(pose(record, PHYSICS), NETWORK).prepared(LM, Orthogonal()).few is None
     assert fitted(record).status.ok
@@ -100,7 +113,9 @@ def test_streamed_rows_begin_where_those_in_memory_do(many, tmp_path):
     frame.to_parquet(tmp_path / "run.parquet", row_group_size=900)
     names = {"inputs": ["u"], "outputs": ["y"], "sampling_time": 1.0}
     source = oa.open_parquet([tmp_path / "run.parquet"], **names)
-    frame = oa.Record.from_arrays(one.inputs, one.outputs, sampling_time=1.0, inputs=["u"], outputs=["y"])
+    frame = oa.Record.from_arrays(
+        one.inputs, one.outputs, sampling_time=1.0, inputs=["u"], outputs=["y"]
+    )
     short = {"solver": oa.LevenbergMarquardt(20)}
     here, there = fitted(frame, **short), fitted(source, engine=Stream(), **short)
     assert here.status.iterations == there.status.iterations

@@ -20,12 +20,25 @@ KINDS = ["f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "?"]
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_of_number(tmp_path, kind, compressed):
     rng = np.random.default_rng(0)
-    values = (100 * rng.normal(size=(40, 3))).astype(kind) if kind != "?" else rng.normal(size=(40, 3)) > 0
-    empty = {"text": "warm", "cell": np.array([1, "a"], object), "z": values * 1j, "e": np.zeros((0, 0))}
-    scipy.io.savemat(tmp_path / "run.mat", {"a": values, "s": {"b": values}, **empty}, do_compression=compressed)
+    values = (
+        (100 * rng.normal(size=(40, 3))).astype(kind)
+        if kind != "?"
+        else rng.normal(size=(40, 3)) > 0
+    )
+    empty = {
+        "text": "warm",
+        "cell": np.array([1, "a"], object),
+        "z": values * 1j,
+        "e": np.zeros((0, 0)),
+    }
+    scipy.io.savemat(
+        tmp_path / "run.mat", {"a": values, "s": {"b": values}, **empty}, do_compression=compressed
+    )
     read = read_variables(tmp_path / "run.mat", ("a[1]", "a[7,:]", "s.b[2]"))
     expected = scipy.io.loadmat(tmp_path / "run.mat")["a"]
-    for found, wanted in zip(read.values(), (expected[:, 1], expected[7], expected[:, 2]), strict=True):
+    for found, wanted in zip(
+        read.values(), (expected[:, 1], expected[7], expected[:, 2]), strict=True
+    ):
         np.testing.assert_array_equal(found, wanted.astype(float))
     for name, words in (("text", "text"), ("cell", "a cell"), ("z", "complex"), ("s", "a struct")):
         with pytest.raises(InputError, match=words):
@@ -37,9 +50,18 @@ def test_paths_into_structs_and_cells(tmp_path):
     u, path = np.arange(6.0), tmp_path / "run.mat"
     one, two = np.empty((1, 1), object), np.empty((1, 2), object)
     one[0, 0], two[0, 0], two[0, 1] = np.stack([u, 2 * u], 1), u[None], 3 * u
-    runs = np.array([(u, {"y": 4 * u}), (5 * u, {"y": 6 * u})], dtype=[("u", object), ("deep", object)])
+    runs = np.array(
+        [(u, {"y": 4 * u}), (5 * u, {"y": 6 * u})], dtype=[("u", object), ("deep", object)]
+    )
     scipy.io.savemat(path, {"z": {"InputData": one}, "c": two, "runs": runs})
-    wanted = {"z.InputData[1]": 2, "z/InputData[0]": 1, "c[0]": 1, "c[1]": 3, "runs[1].u": 5, "runs[1].deep.y": 6}
+    wanted = {
+        "z.InputData[1]": 2,
+        "z/InputData[0]": 1,
+        "c[0]": 1,
+        "c[1]": 3,
+        "runs[1].u": 5,
+        "runs[1].deep.y": 6,
+    }
     for name, values in read_variables(path, tuple(wanted)).items():
         np.testing.assert_array_equal(values, wanted[name] * u, err_msg=name)
     for name, words in (
@@ -86,9 +108,13 @@ def test_a_compressed_variable_that_swells_is_not_inflated(monkeypatch):
     monkeypatch.setattr("orthaug._base.memory.available", lambda: 1e6)
     data = struct.pack("<II", 14, 2**31 - 16) + struct.pack("<IIII", 6, 8, 6, 0)
     data += (
-        struct.pack("<IIii", 5, 8, 1, 2**28 - 10) + struct.pack("<HH4s", 1, 1, b"u") + struct.pack("<II", 9, 2**31 - 80)
+        struct.pack("<IIii", 5, 8, 1, 2**28 - 10)
+        + struct.pack("<HH4s", 1, 1, b"u")
+        + struct.pack("<II", 9, 2**31 - 80)
     )
     packed = zlib.compress(data + bytes(10**6))
-    content = b"MATLAB 5.0".ljust(124) + b"\x00\x01IM" + struct.pack("<II", 15, len(packed)) + packed
+    content = (
+        b"MATLAB 5.0".ljust(124) + b"\x00\x01IM" + struct.pack("<II", 15, len(packed)) + packed
+    )
     with pytest.raises(InputError, match="a compressed variable would take 6 GiB of memory"):
         read_mat5(content, "run.mat")["u"].numbers()

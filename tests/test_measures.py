@@ -9,7 +9,15 @@ import scipy.integrate
 from orthaug._base.errors import InputError
 from orthaug.data.record import Record
 from orthaug.data.regressors import Lags, largest_lag
-from orthaug.inference.measures import Measure, Samples, Support, Symmetrized, Training, Uniform, Weighted
+from orthaug.inference.measures import (
+    Measure,
+    Samples,
+    Support,
+    Symmetrized,
+    Training,
+    Uniform,
+    Weighted,
+)
 
 RNG = np.random.default_rng(0)
 U = 0.3 * RNG.normal(size=400)
@@ -20,7 +28,9 @@ def support(na=0, nb=1, nk=0, used=None, u=U) -> Support:
     """A record of one input and one output; the model reads the lags numbered `used` of the layout, all by default."""
     layout = Lags(na, nb, nk).layout(["y"], ["u"])
     return Support(
-        Record.from_arrays(u, Y[: len(u)]), layout, layout if used is None else tuple(layout[i] for i in used)
+        Record.from_arrays(u, Y[: len(u)]),
+        layout,
+        layout if used is None else tuple(layout[i] for i in used),
     )
 
 
@@ -45,7 +55,9 @@ def test_a_measure_has_a_name_and_weights_that_add_up_to_one(kind):
 
 
 def two_experiments() -> Support:
-    record = Record.join([Record.from_arrays(U[:10], Y[:10]), Record.from_arrays(U[10:17], Y[10:17])])
+    record = Record.join(
+        [Record.from_arrays(U[:10], Y[:10]), Record.from_arrays(U[10:17], Y[10:17])]
+    )
     layout = Lags(na=2, nb=1, nk=0).layout(["y"], ["u"])
     return Support(record, layout, layout)
 
@@ -119,12 +131,28 @@ def test_lag_zero_may_be_written_out():
     ("columns", "weights", "message"),
     [
         ({"u[k-1]": [1.0]}, None, r"the samples lack y\[k-1\]; give a column for every raw lag"),
-        ({"u[k-1]": [1.0], "y[k-3]": [1.0]}, None, r"'y\[k-3\]' is no raw lag .* did you mean 'y\[k-1\]'"),
-        ({"u[k-1]": [1.0, 2.0], "y[k-1]": [1.0]}, None, "columns differ in shape: .*; give one vector of a length"),
+        (
+            {"u[k-1]": [1.0], "y[k-3]": [1.0]},
+            None,
+            r"'y\[k-3\]' is no raw lag .* did you mean 'y\[k-1\]'",
+        ),
+        (
+            {"u[k-1]": [1.0, 2.0], "y[k-1]": [1.0]},
+            None,
+            "columns differ in shape: .*; give one vector of a length",
+        ),
         ({"u[k-1]": np.ones((2, 2)), "y[k-1]": np.ones((2, 2))}, None, "columns differ in shape"),
         ({"u[k-1]": [], "y[k-1]": []}, None, "the samples have no rows"),
-        ({"u[k-1]": [np.inf], "y[k-1]": [1.0]}, None, r"column u\[k-1\] holds a value that is not finite"),
-        ({"u[k-1]": [np.nan], "y[k-1]": [1.0]}, None, r"column u\[k-1\] holds a value that is not finite"),
+        (
+            {"u[k-1]": [np.inf], "y[k-1]": [1.0]},
+            None,
+            r"column u\[k-1\] holds a value that is not finite",
+        ),
+        (
+            {"u[k-1]": [np.nan], "y[k-1]": [1.0]},
+            None,
+            r"column u\[k-1\] holds a value that is not finite",
+        ),
         ({"u[k-1]": [1.0], "y[k-1]": [1.0]}, [1.0, 2.0], r"there are \(2,\) weights for 1 samples"),
         ({"u[k-1]": [1.0, 2.0], "y[k-1]": [1.0, 2.0]}, [2.0, -1.0], "none negative"),
         ({"u[k-1]": ["a"], "y[k-1]": [1.0]}, None, r"column u\[k-1\]"),
@@ -139,7 +167,11 @@ def test_bad_samples(columns, weights, message):
 # --- uniform
 
 BOX = {"u[k]": (-0.5, 1.5)}
-SMOOTH = {"exp": lambda x: np.exp(3 * x), "rational": lambda x: 1 / (1 + 25 * x**2), "one": lambda x: 0 * x + 1}
+SMOOTH = {
+    "exp": lambda x: np.exp(3 * x),
+    "rational": lambda x: 1 / (1 + 25 * x**2),
+    "one": lambda x: 0 * x + 1,
+}
 KINKED = {"kink": (lambda x: np.abs(x - 0.3), 0.3), "root": (lambda x: np.sqrt(np.abs(x)), 0.0)}
 JUMPS = {"of the centre": 0.5, "elsewhere": 0.3}
 
@@ -160,7 +192,9 @@ def test_one_coordinate_is_exact_to_1e_6_for_kinks(name):
 @pytest.mark.parametrize("name", JUMPS)
 def test_one_coordinate_is_exact_to_1e_6_for_jumps(name):
     at = JUMPS[name]
-    assert mean(lambda x: np.sign(x - at), Uniform(BOX).points(ONE)) == pytest.approx(0.5 - at, abs=1e-6)
+    assert mean(lambda x: np.sign(x - at), Uniform(BOX).points(ONE)) == pytest.approx(
+        0.5 - at, abs=1e-6
+    )
 
 
 @pytest.mark.parametrize("coordinates", [2, 3])
@@ -189,7 +223,9 @@ def test_four_coordinates_are_quasi_random_and_always_the_same():
     box = {f"u[k-{i}]": (-1.0, 1.0) for i in range(4)}
     points, again = Uniform(box).points(given), Uniform(box).points(given)
     np.testing.assert_array_equal(points.x, again.x)
-    assert mean(lambda *x: x[0] ** 2 * x[1] ** 2 + x[2] * x[3], points) == pytest.approx(1 / 9, abs=2e-5)
+    assert mean(lambda *x: x[0] ** 2 * x[1] ** 2 + x[2] * x[3], points) == pytest.approx(
+        1 / 9, abs=2e-5
+    )
 
 
 def test_the_box_is_the_range_of_the_data_where_none_is_given():
@@ -219,7 +255,10 @@ def test_a_model_that_reads_no_lag_has_one_point():
         ({"u[k]": (1.0, 2.0, 3.0)}, r"must be two numbers, lower and upper; got \(1.0, 2.0, 3.0\)"),
         ({"u[k]": 1.0}, "must be two numbers, lower and upper; got 1.0"),
         ({"u[k]": ("a", "b")}, "must be two numbers, lower and upper"),
-        ({"u[k-1]": (-1.0, 1.0)}, r"'u\[k-1\]' is no raw lag that this model reads.* It reads u\[k\]"),
+        (
+            {"u[k-1]": (-1.0, 1.0)},
+            r"'u\[k-1\]' is no raw lag that this model reads.* It reads u\[k\]",
+        ),
         ({"v[k]": (-1.0, 1.0)}, r"'v\[k\]' is no raw lag that this model reads"),
         ({"u": (-1.0, 1.0)}, "'u' is no raw lag that this model reads"),
     ],
@@ -244,7 +283,9 @@ def test_the_data_support_their_own_rows_wholly():
 def test_the_data_support_a_box_beyond_them_in_part():
     """Evenly spaced data on ±0.9 reach twice their spacing beyond it."""
     even = support(u=np.linspace(-0.9, 0.9, 361))
-    assert even.share(Uniform({"u[k]": (-3, 3)}).points(even)) == pytest.approx((1.8 + 4 * 0.005) / 6, abs=1e-4)
+    assert even.share(Uniform({"u[k]": (-3, 3)}).points(even)) == pytest.approx(
+        (1.8 + 4 * 0.005) / 6, abs=1e-4
+    )
     assert even.share(Uniform({"u[k]": (-0.9, 0.9)}).points(even)) == pytest.approx(1, abs=1e-12)
 
 
@@ -257,7 +298,12 @@ def test_support_counts_correlation_not_only_ranges():
     """Along a line in two coordinates the data reach a small part of their own box."""
     walk = support(nb=2, u=np.sin(2 * np.pi * 0.003 * np.arange(400)))
     assert walk.share(Uniform().points(walk)) < 0.2
-    assert support(nb=2).share(Uniform({"u[k]": (-0.3, 0.3), "u[k-1]": (-0.3, 0.3)}).points(support(nb=2))) > 0.95
+    assert (
+        support(nb=2).share(
+            Uniform({"u[k]": (-0.3, 0.3), "u[k-1]": (-0.3, 0.3)}).points(support(nb=2))
+        )
+        > 0.95
+    )
 
 
 def test_lags_that_are_not_read_do_not_count_for_support():

@@ -22,7 +22,9 @@ def test_what_does_not_fit_is_refused(monkeypatch):
         memory.check_memory(4 * 2**30, "this")
 
 
-@pytest.mark.parametrize(("size", "words"), [(0, "0 bytes"), (1536, "1.5 KiB"), (8e30, "7.11e+15 PiB")])
+@pytest.mark.parametrize(
+    ("size", "words"), [(0, "0 bytes"), (1536, "1.5 KiB"), (8e30, "7.11e+15 PiB")]
+)
 def test_sizes_in_words(size, words):
     assert memory.in_words(size) == words
 
@@ -32,5 +34,7 @@ def test_a_limit_on_the_process_counts():
         "import resource; from orthaug._base.memory import available; before = available()\n"
         "resource.setrlimit(resource.RLIMIT_AS, (2**31, 2**31)); print(available() < 2**31)"
     )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True
+    )
     assert done.stdout.strip() == "True"

@@ -32,7 +32,11 @@ def test_fit_is_not_clipped(model, fit):
 def test_an_output_that_does_not_move_has_no_fit():
     found = scores(np.ones((4, 1)), np.zeros((4, 1)))
     assert found.rmse[0] == 1.0 and np.isnan(found.nrmse[0]) and np.isnan(found.fit[0])
-    assert ScoreResult.model_validate(found).content() == {"rmse": [1.0], "nrmse": None, "fit": None}
+    assert ScoreResult.model_validate(found).content() == {
+        "rmse": [1.0],
+        "nrmse": None,
+        "fit": None,
+    }
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e200])
@@ -40,11 +44,17 @@ def test_a_run_that_left_all_bounds_has_no_score(value):
     y, model = np.arange(8.0).reshape(4, 2), np.zeros((4, 2))
     model[2, 1] = value
     found = scores(y, model)
-    assert np.isfinite(found.rmse[0]) and np.isnan([found.rmse[1], found.nrmse[1], found.fit[1]]).all()
+    assert (
+        np.isfinite(found.rmse[0]) and np.isnan([found.rmse[1], found.nrmse[1], found.fit[1]]).all()
+    )
     content = ScoreResult.model_validate(found).content()
     assert content["rmse"] == [pytest.approx(np.sqrt(14.0)), None]
     model[:, 0] = value
-    assert ScoreResult.model_validate(scores(y, model)).content() == {"rmse": None, "nrmse": None, "fit": None}
+    assert ScoreResult.model_validate(scores(y, model)).content() == {
+        "rmse": None,
+        "nrmse": None,
+        "fit": None,
+    }
 
 
 def test_a_result_holds_plain_numbers():

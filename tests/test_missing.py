@@ -19,7 +19,16 @@ from orthaug.physics.baseline import Baseline, Term
 from orthaug.physics.problem import pose
 
 PHYSICS = Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "y[k-2]"), Term("g", "u[k-1]")])
-GAPS = {8: "", 20: "NaN", 21: "NA", 23: "", 50: "null", 60: "", 61: "", 62: ""}  # of y; 22 and 24…49 stay
+GAPS = {
+    8: "",
+    20: "NaN",
+    21: "NA",
+    23: "",
+    50: "null",
+    60: "",
+    61: "",
+    62: "",
+}  # of y; 22 and 24…49 stay
 U_GAPS = {35: "", 70: "n/a"}
 SPEC = """
 [data]
@@ -56,7 +65,9 @@ def write(path, y_cells=GAPS, u_cells=U_GAPS, rows=100, seed=0, time=None) -> Pa
     lines = ["t,u,y" if time is not None else "u,y"]
     for k in range(rows):
         cells = [u_cells.get(k, u[k]), y_cells.get(k, y[k])]
-        lines.append(",".join(str(cell) for cell in ([time[k]] if time is not None else []) + cells))
+        lines.append(
+            ",".join(str(cell) for cell in ([time[k]] if time is not None else []) + cells)
+        )
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
     return path
 
@@ -84,13 +95,17 @@ def long_enough(record):
 def rows_of(record):
     """φ and y of the usable rows, without stretches that are too short."""
     problem = pose(long_enough(record), PHYSICS)
-    return np.asarray(problem.baseline.phi(problem.rows.x, problem.layout, ("y",), np))[:, 0], problem.rows.y[:, 0]
+    return np.asarray(problem.baseline.phi(problem.rows.x, problem.layout, ("y",), np))[
+        :, 0
+    ], problem.rows.y[:, 0]
 
 
 # --- reading
 
 
-@pytest.mark.parametrize("options", [{}, {"rows": [5, 64]}, {"every": 2}, {"rows": [1, 90], "every": 3}], ids=str)
+@pytest.mark.parametrize(
+    "options", [{}, {"rows": [5, 64]}, {"every": 2}, {"rows": [1, 90], "every": 3}], ids=str
+)
 def test_windows_that_touch_a_gap_are_left_out(tmp_path, options):
     phi, y = rows_of(read(write(tmp_path / "run.csv"), **options))
     begin, end = options.get("rows", (0, 100))
@@ -116,7 +131,12 @@ def test_theta_is_that_of_the_naive_rows(tmp_path):
 def test_rows_that_are_left_out_are_counted_and_stretches_know_their_place(tmp_path):
     record = read(write(tmp_path / "run.csv"))
     assert record.missing == 10 and len(record) == 90
-    assert [(e.first_row, len(e)) for e in record.experiments][:4] == [(0, 8), (9, 11), (22, 1), (24, 11)]
+    assert [(e.first_row, len(e)) for e in record.experiments][:4] == [
+        (0, 8),
+        (9, 11),
+        (22, 1),
+        (24, 11),
+    ]
     assert [e.offset for e in record.experiments][:3] == [0, 9, 22]
     assert record.experiments[1].where(0).endswith("run.csv: line 11 (row 9)")
 
@@ -139,14 +159,17 @@ def test_how_a_missing_sample_is_written(tmp_path, word):
 def test_other_text_is_refused_with_line_and_column(tmp_path, word, missing):
     path = write(tmp_path / "run.csv", {40: f'"{word}"'}, {})
     with pytest.raises(
-        InputError, match=rf"run\.csv: line 42 \(row 40\), column 'y': found '{word}'".replace("?", ".")
+        InputError,
+        match=rf"run\.csv: line 42 \(row 40\), column 'y': found '{word}'".replace("?", "."),
     ):
         read(path, missing=missing)
 
 
 def test_missing_cells_are_errors_by_default(tmp_path):
     path = write(tmp_path / "run.csv", u_cells={})
-    with pytest.raises(InputError, match=r"line 10 \(row 8\), column 'y': the cell is empty; expected a finite"):
+    with pytest.raises(
+        InputError, match=r"line 10 \(row 8\), column 'y': the cell is empty; expected a finite"
+    ):
         read_record(path, inputs=["u"], outputs=["y"])
 
 
@@ -162,7 +185,9 @@ def test_cells_that_are_not_read_do_not_matter(tmp_path):
     assert read(path, rows=[8, 30]).missing == 0
 
 
-@pytest.mark.parametrize("cells", [{0: "", 1: ""}, {98: "NaN", 99: "NaN"}, {98: "", 99: ""}], ids=str)
+@pytest.mark.parametrize(
+    "cells", [{0: "", 1: ""}, {98: "NaN", 99: "NaN"}, {98: "", 99: ""}], ids=str
+)
 def test_gaps_at_the_ends(tmp_path, cells):
     record = read(write(tmp_path / "run.csv", cells, {}))
     assert (record.missing, len(record), len(record.experiments)) == (2, 98, 1)
@@ -170,14 +195,18 @@ def test_gaps_at_the_ends(tmp_path, cells):
 
 
 def test_a_range_of_missing_rows_only(tmp_path):
-    with pytest.raises(InputError, match="every row from 60 to 62 has a missing cell; nothing is left"):
+    with pytest.raises(
+        InputError, match="every row from 60 to 62 has a missing cell; nothing is left"
+    ):
         read(write(tmp_path / "run.csv"), rows=[60, 63])
 
 
 @pytest.mark.parametrize("word", ["NaN", ""])
 def test_a_column_without_a_sample_is_refused(tmp_path, word):
     path = write(tmp_path / "run.csv", dict.fromkeys(range(100), word), {})
-    with pytest.raises(InputError, match=r"run\.csv: (every row|there are no data rows|column 'y'|.*missing)"):
+    with pytest.raises(
+        InputError, match=r"run\.csv: (every row|there are no data rows|column 'y'|.*missing)"
+    ):
         read(path)
 
 
@@ -205,7 +234,9 @@ def test_single_rows_tell_no_sampling_time(tmp_path):
 
 def test_stretches_of_another_step_are_refused(tmp_path):
     time = [k if k < 50 else 50 + 2 * (k - 50) for k in range(100)]
-    with pytest.raises(InputError, match="column 't' steps by 1 s in one row range and by 2 s in another"):
+    with pytest.raises(
+        InputError, match="column 't' steps by 1 s in one row range and by 2 s in another"
+    ):
         read(write(tmp_path / "run.csv", {50: ""}, {}, time=time), time="t")
 
 
@@ -241,13 +272,16 @@ def test_the_fit_is_that_of_the_naive_rows(project):
     theta = np.linalg.lstsq(phi, y, rcond=None)[0]
     result = fit(project)
     np.testing.assert_allclose([p["value"] for p in result["parameters"]], theta, rtol=1e-10)
-    assert result["scores"]["train"]["prediction"]["rmse"][0] == pytest.approx(np.sqrt(np.mean((y - phi @ theta) ** 2)))
+    assert result["scores"]["train"]["prediction"]["rmse"][0] == pytest.approx(
+        np.sqrt(np.mean((y - phi @ theta) ** 2))
+    )
     assert result["scores"]["train"]["simulation"]["rmse"][0] > 0
 
 
 def test_the_warning_counts_what_is_left_out(project):
     expected = (
-        f"train: 10 rows have missing cells and are left out with all windows that touch them; {len(windows()[0])} "
+        "train: 10 rows have missing cells and are left out with all windows that touch them; "
+        f"{len(windows()[0])} "
     )
     (warning,) = [w["text"] for w in fit(project)["warnings"] if w["code"] == "missing_rows"]
     assert warning.startswith(expected + "usable rows remain, in 7 stretches")
@@ -279,7 +313,9 @@ def test_text_is_an_error(project):
 def test_an_unknown_way_is_an_error(project):
     project.write_text(SPEC.replace('"skip"', '"drop"'), encoding="utf-8")
     done = run("fit", project)
-    assert done.code == 2 and one_line(done.err, "error: ", "'data.missing': found \"drop\"", "'error' or 'skip'")
+    assert done.code == 2 and one_line(
+        done.err, "error: ", "'data.missing': found \"drop\"", "'error' or 'skip'"
+    )
 
 
 def test_no_stretch_is_long_enough(project):
@@ -305,8 +341,12 @@ def test_a_test_part_is_scored_on_its_naive_rows(project, skip):
     theta = np.array([p["value"] for p in result["parameters"]])
     phi, y, k = windows(seed=1)
     e = (y - phi @ theta)[k >= skip]
-    assert result["scores"]["tests.other"]["prediction"]["rmse"][0] == pytest.approx(np.sqrt(np.mean(e**2)))
-    assert any(w["text"].startswith("tests.other: 10 rows have missing cells") for w in result["warnings"])
+    assert result["scores"]["tests.other"]["prediction"]["rmse"][0] == pytest.approx(
+        np.sqrt(np.mean(e**2))
+    )
+    assert any(
+        w["text"].startswith("tests.other: 10 rows have missing cells") for w in result["warnings"]
+    )
 
 
 def test_the_free_run_of_a_test_part_starts_anew_after_a_gap(project):
@@ -330,11 +370,15 @@ def test_the_free_run_of_a_test_part_starts_anew_after_a_gap(project):
 def test_rows_and_every_of_a_part(project):
     with_test_part(project, "rows = [10, 90]\n")
     text = project.read_text(encoding="utf-8")
-    project.write_text(text.replace('["run.csv"] }', '["run.csv"], rows = [0, 64] }'), encoding="utf-8")
+    project.write_text(
+        text.replace('["run.csv"] }', '["run.csv"], rows = [0, 64] }'), encoding="utf-8"
+    )
     result = fit(project)
     counts = [len(windows(range(64))[0]), len(windows(range(10, 90))[0])]
     warnings = [w["text"] for w in result["warnings"] if w["code"] == "missing_rows"]
-    assert [f"{count} usable rows remain" in text for count, text in zip(counts, warnings, strict=True)] == [True, True]
+    assert [
+        f"{count} usable rows remain" in text for count, text in zip(counts, warnings, strict=True)
+    ] == [True, True]
 
 
 def test_a_learner_on_the_free_run(project):
@@ -342,7 +386,10 @@ def test_a_learner_on_the_free_run(project):
     learner = '[learner]\nhidden = [3]\n[training]\nfocus = "simulation"\nsegment = 16\nwashout = 2\niterations = 5\n'
     project.write_text(SPEC.replace('[learner]\nkind = "none"\n', learner), encoding="utf-8")
     result = fit(project)
-    assert result["status"]["code"] in ("converged", "iteration_limit") and result["orthogonality_defect"] < 1e-12
+    assert (
+        result["status"]["code"] in ("converged", "iteration_limit")
+        and result["orthogonality_defect"] < 1e-12
+    )
     assert result["scores"]["train"]["simulation"]["nrmse"][0] < 1
     assert np.isfinite(load("out").theta).all()
 

@@ -19,7 +19,11 @@ from orthaug.reports.result import ScoreResult
 
 FEW = LevenbergMarquardt(iterations=5)
 NETWORK = MLP(hidden=(3,))
-ONE = [Term("a", "y[k-1]"), Term("b", "gain*sin(u[k-1])"), Term("c", "u[k-1]", initial=0.2, fixed=True)]
+ONE = [
+    Term("a", "y[k-1]"),
+    Term("b", "gain*sin(u[k-1])"),
+    Term("c", "u[k-1]", initial=0.2, fixed=True),
+]
 TWO = [
     Term("a", "y1[k-1]", output="y1"),
     Term("b", "v[k]", output="y1"),
@@ -35,7 +39,10 @@ def two_signals(rng, rows: int, sampling_time: float = 0.5) -> Record:
     for k in range(3, rows):
         y[k, 0] = 0.5 * y[k - 1, 0] + u[k, 0] + 0.1 * np.sin(y[k - 2, 0])
         y[k, 1] = 0.3 * np.tanh(y[k - 1, 1]) + 20 * u[k - 3, 1] * u[k, 0] + 0.1 * rng.normal()
-    channels = {"inputs": [Channel("v"), Channel("w", "V")], "outputs": [Channel("y1", "m"), Channel("y2")]}
+    channels = {
+        "inputs": [Channel("v"), Channel("w", "V")],
+        "outputs": [Channel("y1", "m"), Channel("y2")],
+    }
     return Record.from_arrays(u, y, sampling_time=sampling_time, **channels)
 
 
@@ -43,7 +50,9 @@ def one_signal(rng, rows: int) -> Record:
     u = rng.normal(size=rows)
     y = np.zeros(rows)
     for k in range(2, rows):
-        y[k] = 0.6 * y[k - 1] + 0.5 * np.sin(u[k - 1]) + 0.2 * np.cos(u[k - 2]) + 0.05 * rng.normal()
+        y[k] = (
+            0.6 * y[k - 1] + 0.5 * np.sin(u[k - 1]) + 0.2 * np.cos(u[k - 2]) + 0.05 * rng.normal()
+        )
     return Record.from_arrays(u, y)
 
 
@@ -56,13 +65,43 @@ def alone(rng, rows: int) -> Record:
 
 
 CASES = {
-    "fixed term": (one_signal, Baseline.from_terms(ONE, {"gain": 2.0}), Lags(na=2, nb=1, nk=1), NETWORK),
-    "no feedback": (one_signal, Baseline.from_terms([Term("b", "sin(u[k])")]), Lags(na=0, nb=2, nk=0), NETWORK),
-    "input lags longer": (one_signal, Baseline.from_terms(ONE[:1]), Lags(na=1, nb=3, nk=2), NETWORK),
+    "fixed term": (
+        one_signal,
+        Baseline.from_terms(ONE, {"gain": 2.0}),
+        Lags(na=2, nb=1, nk=1),
+        NETWORK,
+    ),
+    "no feedback": (
+        one_signal,
+        Baseline.from_terms([Term("b", "sin(u[k])")]),
+        Lags(na=0, nb=2, nk=0),
+        NETWORK,
+    ),
+    "input lags longer": (
+        one_signal,
+        Baseline.from_terms(ONE[:1]),
+        Lags(na=1, nb=3, nk=2),
+        NETWORK,
+    ),
     "physics alone": (one_signal, Baseline.from_terms([*ONE[:1], Term("b", "u[k-4]")]), None, None),
-    "two outputs": (two_signals, Baseline.from_terms(TWO), Lags(na=[2, 1], nb=[1, 2], nk=[0, 3]), NETWORK),
-    "no inputs": (alone, Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "y[k-2]")]), Lags(na=3), NETWORK),
-    "learner inputs": (one_signal, Baseline.from_terms(ONE[:1]), None, MLP((3,), inputs=("y[k-2]*u[k-1]", "u[k]"))),
+    "two outputs": (
+        two_signals,
+        Baseline.from_terms(TWO),
+        Lags(na=[2, 1], nb=[1, 2], nk=[0, 3]),
+        NETWORK,
+    ),
+    "no inputs": (
+        alone,
+        Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "y[k-2]")]),
+        Lags(na=3),
+        NETWORK,
+    ),
+    "learner inputs": (
+        one_signal,
+        Baseline.from_terms(ONE[:1]),
+        None,
+        MLP((3,), inputs=("y[k-2]*u[k-1]", "u[k]")),
+    ),
 }
 
 
@@ -71,7 +110,9 @@ def case(request):
     """A model that was fitted shortly, and a new record of 40 rows."""
     make, baseline, lags, learner = CASES[request.param]
     rng = np.random.default_rng(1)
-    fit = estimate(make(rng, 80), baseline, lags=lags, learner=learner, solver=FEW, regularization=1.0)
+    fit = estimate(
+        make(rng, 80), baseline, lags=lags, learner=learner, solver=FEW, regularization=1.0
+    )
     return fit.model, make(rng, 40)
 
 
@@ -87,7 +128,9 @@ def first_order():
 def pair():
     make, baseline, lags, learner = CASES["two outputs"]
     rng = np.random.default_rng(3)
-    return estimate(make(rng, 80), baseline, lags=lags, learner=learner, solver=FEW).model, make(rng, 30)
+    return estimate(make(rng, 80), baseline, lags=lags, learner=learner, solver=FEW).model, make(
+        rng, 30
+    )
 
 
 def close(found, expected):
@@ -138,7 +181,10 @@ def test_simulated_parts_add_up(case):
 def test_lengths_around_the_padding(first_order, usable):
     record = one_signal(np.random.default_rng(4), usable + 1)
     close(first_order.predict(record).model, naive.predicted(first_order, record))
-    close(first_order.simulate(record, "zero").model, naive.simulated(first_order, record, np.zeros((1, 1))))
+    close(
+        first_order.simulate(record, "zero").model,
+        naive.simulated(first_order, record, np.zeros((1, 1))),
+    )
     if usable > 1:
         close(first_order.predict(record, horizon=2).model, naive.predicted(first_order, record, 2))
 
@@ -153,7 +199,9 @@ def test_experiments_do_not_meet(first_order):
         lambda record: first_order.predict(record, horizon=2),
     ):
         whole = run(both)
-        np.testing.assert_array_equal(whole.model, np.concatenate([run(piece).model for piece in pieces]))
+        np.testing.assert_array_equal(
+            whole.model, np.concatenate([run(piece).model for piece in pieces])
+        )
         assert [len(t.model) for t in whole.trajectories] == [30, 20]
 
 
@@ -169,7 +217,9 @@ def test_channels_are_matched_by_name(pair):
     )
     for run in (model.predict, model.simulate, lambda r: model.predict(r, horizon=2)):
         np.testing.assert_array_equal(run(turned).model, run(record).model)
-    np.testing.assert_array_equal(model.predict(turned).scores().rmse, model.predict(record).scores().rmse)
+    np.testing.assert_array_equal(
+        model.predict(turned).scores().rmse, model.predict(record).scores().rmse
+    )
 
 
 def test_simulate_without_measured_outputs(pair):
@@ -182,7 +232,9 @@ def test_simulate_without_measured_outputs(pair):
     assert "y1" not in response.to_frame()
     with pytest.raises(InputError, match="no measured outputs to compare with"):
         response.scores()
-    with pytest.raises(InputError, match="no measured outputs to start from; use initial='zero' or give the values"):
+    with pytest.raises(
+        InputError, match="no measured outputs to start from; use initial='zero' or give the values"
+    ):
         model.simulate(only_inputs)
 
 
@@ -210,7 +262,9 @@ def test_scores_skip(first_order):
 def growing(factors, names):
     """Models y_i[k] = factor_i y_i[k-1], exactly."""
     y = np.array(factors) ** np.arange(10)[:, None]
-    baseline = Baseline.from_terms([Term(f"a{i}", f"{n}[k-1]", output=n) for i, n in enumerate(names)])
+    baseline = Baseline.from_terms(
+        [Term(f"a{i}", f"{n}[k-1]", output=n) for i, n in enumerate(names)]
+    )
     return estimate(Record.from_arrays(y=y, outputs=names), baseline, learner=None).model
 
 
@@ -220,23 +274,40 @@ def test_skip_refused(first_order):
         response.scores(skip=(1, 2))
 
 
-@pytest.mark.parametrize(("factors", "diverging"), [((2.0, 0.5), "p"), ((0.5, 2.0), "q"), ((1.5, 2.0), "q")])
+@pytest.mark.parametrize(
+    ("factors", "diverging"), [((2.0, 0.5), "p"), ((0.5, 2.0), "q"), ((1.5, 2.0), "q")]
+)
 def test_divergence_is_named(factors, diverging):
     """Beyond 10⁶ times the largest training output, 2⁹, there is no value: step 29."""
     model = growing(factors, ["p", "q"])
-    (trajectory,) = model.simulate(Record.from_arrays(y=np.ones((60, 2)), outputs=["p", "q"])).trajectories
+    (trajectory,) = model.simulate(
+        Record.from_arrays(y=np.ones((60, 2)), outputs=["p", "q"])
+    ).trajectories
     assert trajectory.diverged == (29, diverging)
-    np.testing.assert_allclose(trajectory.model[1:29], np.array(factors) ** np.arange(1, 29)[:, None], rtol=1e-12)
-    for part in (trajectory.model, trajectory.baseline, trajectory.learner, trajectory.learner_before):
+    np.testing.assert_allclose(
+        trajectory.model[1:29], np.array(factors) ** np.arange(1, 29)[:, None], rtol=1e-12
+    )
+    for part in (
+        trajectory.model,
+        trajectory.baseline,
+        trajectory.learner,
+        trajectory.learner_before,
+    ):
         assert np.isnan(part[29:]).all()
     scores = model.simulate(Record.from_arrays(y=np.ones((60, 2)), outputs=["p", "q"])).scores()
-    assert ScoreResult.model_validate(scores).content() == {"rmse": None, "nrmse": None, "fit": None}
+    assert ScoreResult.model_validate(scores).content() == {
+        "rmse": None,
+        "nrmse": None,
+        "fit": None,
+    }
 
 
 def test_a_run_that_overflows():
     """Squares grow beyond double precision within a few steps: NaN from there on, no warning."""
     y = np.array([0.5, 0.25, 0.0625, 0.00390625])
-    model = estimate(Record.from_arrays(y=y), Baseline.from_terms([Term("a", "y[k-1]**2")]), learner=None).model
+    model = estimate(
+        Record.from_arrays(y=y), Baseline.from_terms([Term("a", "y[k-1]**2")]), learner=None
+    ).model
     (trajectory,) = model.simulate(Record.from_arrays(y=np.full(40, 10.0))).trajectories
     assert trajectory.diverged == (3, "y")
     np.testing.assert_allclose(trajectory.model[1:3, 0], [1e2, 1e4], rtol=1e-9)
@@ -245,7 +316,9 @@ def test_a_run_that_overflows():
 
 def test_initial_of_a_diverging_run_is_not_scored():
     model = growing((0.5,), ["p"])
-    (trajectory,) = model.simulate(Record.from_arrays(y=np.full(20, 3.0), outputs=["p"])).trajectories
+    (trajectory,) = model.simulate(
+        Record.from_arrays(y=np.full(20, 3.0), outputs=["p"])
+    ).trajectories
     assert trajectory.diverged is None and np.isnan(trajectory.model[0, 0])
     np.testing.assert_allclose(trajectory.model[1:, 0], 3.0 * 0.5 ** np.arange(1, 20))
 
@@ -263,7 +336,9 @@ def test_a_free_run_says_where_it_leaves_the_training_data(case):
     x = model.form.regressors(replace(experiment, outputs=own), record)
     z = np.asarray(model.form.features.evaluate(x, model.form.layout, np))
     z = np.abs((z - model.numbers.centre) / model.numbers.halfwidth)
-    np.testing.assert_array_equal(run.outside, np.concatenate([np.zeros(start), ~np.all(z <= 1 + 1e-9, axis=1)]))
+    np.testing.assert_array_equal(
+        run.outside, np.concatenate([np.zeros(start), ~np.all(z <= 1 + 1e-9, axis=1)])
+    )
     assert model.components(record).trajectories[0].outside is None
 
 
@@ -272,7 +347,9 @@ def test_to_frame(pair):
     run = model.simulate(record)
     frame = run.to_frame()
     flags, start = frame.pop("extrapolates"), model.form.first_row
-    assert flags[:start].isna().all() and (flags[start:] == run.trajectories[0].outside[start:]).all()
+    assert (
+        flags[:start].isna().all() and (flags[start:] == run.trajectories[0].outside[start:]).all()
+    )
     names = [f"{y}{kind}" for y in ("y1", "y2") for kind in ("", "_model", "_baseline", "_learner")]
     assert list(frame.columns) == ["time", *names]
     np.testing.assert_allclose(frame["time"], 0.5 * np.arange(30))
@@ -284,10 +361,15 @@ def test_to_frame(pair):
 def test_repr(pair):
     model, record = pair
     assert repr(model).startswith("Model(orthogonal, θ: a, b, c, learner: MLP(hidden=(3,)")
-    assert repr(model.simulate(record)) == "Response(simulation of y1, y2, 1 experiment, 30 samples)"
+    assert (
+        repr(model.simulate(record)) == "Response(simulation of y1, y2, 1 experiment, 30 samples)"
+    )
     assert repr(model.simulate(record).trajectories[0]) == "Trajectory(30 samples of 2 outputs)"
     assert repr(model.simulate(record).scores()).startswith("Scores(rmse = ")
-    assert repr(model.predict(record, 3)) == "Response(3-step prediction of y1, y2, 1 experiment, 30 samples)"
+    assert (
+        repr(model.predict(record, 3))
+        == "Response(3-step prediction of y1, y2, 1 experiment, 30 samples)"
+    )
     none = CASES["physics alone"]
     fit = estimate(none[0](np.random.default_rng(0), 30), none[1], learner=None)
     assert repr(fit.model) == "Model(orthogonal, θ: a, b, learner: none)"
@@ -295,7 +377,9 @@ def test_repr(pair):
 
 @pytest.mark.parametrize("horizon", [0, -1, 1.5, True, "1", None])
 def test_horizon_refused(first_order, horizon):
-    with pytest.raises(InputError, match=rf"`horizon` must be a whole number of steps, 1 or more; got {horizon!r}"):
+    with pytest.raises(
+        InputError, match=rf"`horizon` must be a whole number of steps, 1 or more; got {horizon!r}"
+    ):
         first_order.predict(Record.from_arrays(np.ones(9), np.ones(9)), horizon=horizon)
 
 

@@ -14,7 +14,10 @@ K = oa.PhysicalParameter("k", 8.0)
 
 def motion(**changed) -> oa.Motion:
     given = {
-        "states": [oa.State("x", "v", start="y"), oa.State("v", "(u - k*x)/m", start="derivative of y")],
+        "states": [
+            oa.State("x", "v", start="y"),
+            oa.State("v", "(u - k*x)/m", start="derivative of y"),
+        ],
         "outputs": [oa.Output("y", "x")],
         "parameters": [M, K],
         "inputs": ["u"],
@@ -61,19 +64,43 @@ def test_positive_parameters_are_estimated_as_logarithms() -> None:
         ({"states": [oa.State("x")]}, "the state 'x' has no `derivative`"),
         ({"states": []}, "the motion has no states"),
         ({"outputs": []}, "the motion has no outputs"),
-        ({"outputs": [oa.Output("y", "u*k*m")]}, "the output 'y' = u*k*m is no expression of a state"),
+        (
+            {"outputs": [oa.Output("y", "u*k*m")]},
+            "the output 'y' = u*k*m is no expression of a state",
+        ),
         ({"outputs": [oa.Output("y")]}, "the output 'y' has no expression"),
         ({"define": {"a": "b + 1", "b": "2*a"}}, "motion.define: an algebraic loop, a → b → a"),
-        ({"parameters": [M, K, oa.PhysicalParameter("c", 1.0)]}, "the parameter 'c' is in no equation and no output"),
-        ({"parameters": [oa.PhysicalParameter("m", -1.0, min=0), K]}, "the initial value of 'm' is -1; its bounds are"),
+        (
+            {"parameters": [M, K, oa.PhysicalParameter("c", 1.0)]},
+            "the parameter 'c' is in no equation and no output",
+        ),
+        (
+            {"parameters": [oa.PhysicalParameter("m", -1.0, min=0), K]},
+            "the initial value of 'm' is -1; its bounds are",
+        ),
         ({"states": [oa.State("x", "k*m*u", start="z")]}, "the state 'x' starts from 'z'"),
-        ({"states": [oa.State("x", "k*m*u", start="derivative of z")]}, "the state 'x' starts from 'derivative of z'"),
-        ({"states": [oa.State("x", "k*m*u", start=np.inf)]}, "the start of 'x' must be a finite number"),
+        (
+            {"states": [oa.State("x", "k*m*u", start="derivative of z")]},
+            "the state 'x' starts from 'derivative of z'",
+        ),
+        (
+            {"states": [oa.State("x", "k*m*u", start=np.inf)]},
+            "the start of 'x' must be a finite number",
+        ),
         ({"inputs": ["x"]}, "'x' is a state and an input"),
         ({"inputs": ["a b"]}, "'a b' cannot name an input"),
-        ({"inputs": ["Ts"]}, "'Ts' cannot name an input: expressions read it as the sampling time of the data"),
-        ({"states": [oa.State("Ts", "k*m*u")]}, "'Ts' cannot name a state: expressions read it as the sampling time"),
-        ({"define": {"Ts": "k*m"}}, "'Ts' cannot name a definition: expressions read it as the sampling time"),
+        (
+            {"inputs": ["Ts"]},
+            "'Ts' cannot name an input: expressions read it as the sampling time of the data",
+        ),
+        (
+            {"states": [oa.State("Ts", "k*m*u")]},
+            "'Ts' cannot name a state: expressions read it as the sampling time",
+        ),
+        (
+            {"define": {"Ts": "k*m"}},
+            "'Ts' cannot name a definition: expressions read it as the sampling time",
+        ),
         (
             {"parameters": [M, K, oa.PhysicalParameter("Ts", 1.0)]},
             "'Ts' cannot name a parameter: expressions read it as the sampling time of the data",
@@ -81,7 +108,10 @@ def test_positive_parameters_are_estimated_as_logarithms() -> None:
         ({"integrator": "euler"}, "`integrator`"),
         ({"hold": "cubic"}, "`hold`"),
         ({"substeps": 0}, "`substeps` must be a whole number from 1"),
-        ({"integrator": "discrete", "hold": "spline"}, "a discrete motion has no input between samples"),
+        (
+            {"integrator": "discrete", "hold": "spline"},
+            "a discrete motion has no input between samples",
+        ),
         (
             {"states": [oa.State("x", "y[k-1]")]},
             "the equation of 'x' = y[k-1]: a signal such as",
@@ -99,19 +129,36 @@ def test_what_is_no_motion_is_refused_in_words(changed: dict, message: str) -> N
     [
         (motion(), record(outputs=["z"]), None, "the output 'z' has no expression in the motion"),
         (motion(), record(y=np.ones(50)), None, "channel 'y' is constant"),
-        (motion(constants={"Ts": 0.5}), record(), None, "the constant 'Ts' is 0.5, but the data are sampled every"),
+        (
+            motion(constants={"Ts": 0.5}),
+            record(),
+            None,
+            "the constant 'Ts' is 0.5, but the data are sampled every",
+        ),
         (motion(), record(), ["m*v"], "learner input = m*v: unknown name 'm'"),
-        (motion(define={"a": "k*x"}), record(), ["a"], "learner input = a: 'a' contains parameters"),
+        (
+            motion(define={"a": "k*x"}),
+            record(),
+            ["a"],
+            "learner input = a: 'a' contains parameters",
+        ),
         (
             motion(states=[oa.State("x", "k*m*log(x - 100)", start="y")]),
             record(),
             None,
             "the equation of 'x' is not finite at the start (x = ",
         ),
-        (motion(), record(sampling_time=1e3), None, "the sampling time of 1000 s is too long for the fastest mode"),
+        (
+            motion(),
+            record(sampling_time=1e3),
+            None,
+            "the sampling time of 1000 s is too long for the fastest mode",
+        ),
     ],
 )
-def test_data_and_motion_that_do_not_fit_are_refused_in_words(made, data, inputs, message: str) -> None:
+def test_data_and_motion_that_do_not_fit_are_refused_in_words(
+    made, data, inputs, message: str
+) -> None:
     with pytest.raises(oa.InputError) as error:
         pose_motion(data, made, inputs)
     assert str(error.value).startswith(message)
@@ -119,9 +166,16 @@ def test_data_and_motion_that_do_not_fit_are_refused_in_words(made, data, inputs
 
 def test_a_motion_of_functions() -> None:
     made = oa.Motion.from_functions(
-        lambda x, u, p: -p[0] * x + u, lambda x, u, p: x, ["x"], ["y"], [oa.PhysicalParameter("a", 1.0)], ["u"]
+        lambda x, u, p: -p[0] * x + u,
+        lambda x, u, p: x,
+        ["x"],
+        ["y"],
+        [oa.PhysicalParameter("a", 1.0)],
+        ["u"],
     )
-    np.testing.assert_allclose(made.rates(np.array([2.0]), np.array([3.0]), made.initial, np), [1.0])
+    np.testing.assert_allclose(
+        made.rates(np.array([2.0]), np.array([3.0]), made.initial, np), [1.0]
+    )
     with pytest.raises(oa.InputError, match="must be a function"):
         oa.Motion.from_functions(None, None, ["x"], ["y"], [oa.PhysicalParameter("a", 1.0)])
 
@@ -129,14 +183,34 @@ def test_a_motion_of_functions() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"learner": oa.MLP((2,))}, "there is a learner, but no state and no output of the motion is learned"),
+        (
+            {"learner": oa.MLP((2,))},
+            "there is a learner, but no state and no output of the motion is learned",
+        ),
         ({"learner": None, "criterion": oa.Prediction()}, "a motion is trained on its free run"),
         ({"learner": None, "structure": oa.Additive()}, "a motion has the orthogonal structure"),
         ({"learner": None, "lags": oa.Lags(1, 1, 1)}, "a motion has no `lags`"),
-        ({"learner": None, "solver": oa.AdamLBFGS()}, "a motion is trained by `LevenbergMarquardt`"),
+        (
+            {"learner": None, "solver": oa.AdamLBFGS()},
+            "a motion is trained by `LevenbergMarquardt`",
+        ),
     ],
 )
-def test_options_that_a_motion_does_not_have_are_refused_in_words(options: dict, message: str) -> None:
+def test_options_that_a_motion_does_not_have_are_refused_in_words(
+    options: dict, message: str
+) -> None:
     with pytest.raises(oa.InputError) as error:
         oa.estimate(record(), motion(), **options)
     assert str(error.value).startswith(message)
+
+
+def test_definitions_may_need_each_other_in_a_long_chain():
+    chain = {"d0": "x"} | {f"d{i}": f"d{i - 1} + 1" for i in reversed(range(1, 3000))}
+    states, outputs, k = (
+        [oa.State("x", "-k*d2999")],
+        [oa.Output("y", "x")],
+        oa.PhysicalParameter("k", 2.0),
+    )
+    long = oa.Motion.from_equations(states, outputs, [k], define=chain)
+    assert long.rates(np.array([1.0]), np.zeros(0), long.initial, np) == pytest.approx(-2 * 3000.0)
+    assert long.observed(np.array([1.0]), np.zeros(0), long.initial, np) == 1.0

@@ -63,7 +63,9 @@ def small(tmp_path, monkeypatch) -> Path:
     pd.DataFrame(friction(60, 1), columns=["force", "position"]).to_csv("run.csv", index=False)
     text = SPEC.replace('tests.steps = { files = ["steps.csv"] }\n', "")
     text = text.replace('hidden = [3]\ninputs = ["v"]', 'kind = "none"')
-    Path("plant.toml").write_text(text.replace("learned = true, ", "").replace("segment = 150\n", ""))
+    Path("plant.toml").write_text(
+        text.replace("learned = true, ", "").replace("segment = 150\n", "")
+    )
     return Path("plant.toml")
 
 
@@ -87,6 +89,53 @@ def test_a_channel_of_an_unlikely_size_is_named_where_the_free_run_fails(small, 
         assert words in err and "check `scale`, `offset` and `unit`" in err
     else:
         assert "training failed" not in err
+
+
+@pytest.mark.parametrize(
+    ("equation", "words"),
+    [
+        (
+            "(force - c*v - 1e7*k*x)/m",
+            "oscillates with 3.16e+04 rad/s, 50.3 periods in a sample of 0.01 s",
+        ),
+        (
+            "(force - 1e6*c*v - k*x)/m",
+            '1e+06 1/s, also of `integrator = "exact"`: 1e+04 in a substep, at most 4096',
+        ),
+    ],
+    ids=["turns", "decays"],
+)
+def test_modes_beyond_what_samples_show_are_refused_of_an_exact_integrator(small, equation, words):
+    text = small.read_text().replace("(force - c*v - k*x)/m", equation)
+    small.write_text(
+        text.replace("[motion.states]", '[motion]\nintegrator = "exact"\n[motion.states]')
+    )
+    code, _, err = orthaug("fit", small, "--out", "out")
+    assert code == 2 and words in err and "leave the fast mode out" in err
+    small.write_text(small.read_text().replace('"exact"', '"exact"\nsubsteps = 8'))
+    assert orthaug("check", small)[0] == (2 if "1e7" in equation else 0)
+
+
+@pytest.mark.parametrize("substeps", [1, 3])
+def test_a_long_chain_of_definitions_is_what_it_stands_for(small, substeps):
+    """200 operations: such a motion has its stages in a loop; the short one has them one by one."""
+    text = small.read_text().replace(
+        "[motion.states]", f"[motion]\nsubsteps = {substeps}\n[motion.states]"
+    )
+    small.write_text(text)
+    assert orthaug("fit", small, "--out", "short")[0] == 0
+    chain = 'd1 = "x + 1"\n' + "".join(f'd{i} = "d{i - 1} + 1"\n' for i in range(2, 201))
+    text = text.replace("k*x)/m", "k*(d200 - 200))/m").replace(
+        "[motion.parameters]", f"[motion.define]\n{chain}[motion.parameters]"
+    )
+    small.write_text(text)
+    assert orthaug("fit", small, "--out", "long")[0] == 0
+    short, long = (
+        strict(Path(out, "result.json").read_text())["parameters"] for out in ("short", "long")
+    )
+    for one, other in zip(short, long, strict=True):
+        assert other["value"] == pytest.approx(one["value"], rel=1e-6)
+        assert other["std"] == pytest.approx(one["std"], rel=1e-4)
 
 
 def friction(rows: int, seed: int) -> np.ndarray:
@@ -125,14 +174,20 @@ def put(folder: Path, text: str = SPEC) -> Path:
     for name, rows, seed in (("run", 300, 1), ("steps", 120, 2)):
         if not (folder / f"{name}.csv").exists():
             table = friction(rows, seed)
-            np.savetxt(folder / f"{name}.csv", table, delimiter=",", header="force,position", comments="")
+            np.savetxt(
+                folder / f"{name}.csv", table, delimiter=",", header="force,position", comments=""
+            )
     return spec
 
 
 def orthaug(*arguments: object) -> tuple[int, str, str]:
     """Exit code, standard output and standard error of a command, run in this process."""
     out, err = io.StringIO(), io.StringIO()
-    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+    ):
         patch.setattr(sys, "argv", ["orthaug", *map(str, arguments)])
         try:
             cli.main()
@@ -183,17 +238,29 @@ def test_a_fit_finds_mass_and_stiffness_beside_the_friction(result):
     for name, truth in (("m", M), ("k", K)):
         assert abs(rows[name]["value"] - truth) < 4 * rows[name]["std"]
         assert rows[name]["ci95"][0] < rows[name]["value"] < rows[name]["ci95"][1]
-    assert rows["c"]["value"] > C + 5 * rows["c"]["std"]  # the nearest viscous friction has a share of Coulomb's
+    assert (
+        rows["c"]["value"] > C + 5 * rows["c"]["std"]
+    )  # the nearest viscous friction has a share of Coulomb's
 
 
-def test_what_a_learner_that_helps_may_hold_of_a_parameter_is_told_where_no_suspect_is_declared(printed, result):
+def test_what_a_learner_that_helps_may_hold_of_a_parameter_is_told_where_no_suspect_is_declared(
+    printed, result
+):
     rows = {row["name"]: row for row in result["parameters"]}
-    assert result["validation"]["verdict"] == "helps" and [name for name in rows if rows[name]["shared"]] == ["c"]
+    assert result["validation"]["verdict"] == "helps" and [
+        name for name in rows if rows[name]["shared"]
+    ] == ["c"]
     (cause,) = result["bias"]  # a usual one that nobody declared
     assert rows["c"]["bias"]["cause"] == cause["name"] and cause["equation"] == "v"
-    assert cause["name"].startswith(("coulomb of v", "tanh(v", "saturation(v"))  # friction that ends at a force
-    assert cause["coefficient_found"] * cause["bias"]["c"] == pytest.approx(rows["c"]["bias"]["value"])
-    limits = rows["c"]["ci95_with_bias"]  # of so short a training the causes that noise cannot tell apart may disagree
+    assert cause["name"].startswith(
+        ("coulomb of v", "tanh(v", "saturation(v")
+    )  # friction that ends at a force
+    assert cause["coefficient_found"] * cause["bias"]["c"] == pytest.approx(
+        rows["c"]["bias"]["value"]
+    )
+    limits = rows["c"][
+        "ci95_with_bias"
+    ]  # of so short a training the causes that noise cannot tell apart may disagree
     assert limits[0] < C < limits[1] if rows["c"]["bias"]["determined"] else limits is None
     assert ("not_determined" in {w["code"] for w in result["warnings"]}) == (limits is None)
     assert cause["name"] in " ".join(printed.split())
@@ -210,7 +277,10 @@ def test_a_result_has_what_a_motion_has_and_null_for_the_rest(result):
     assert result["orthogonality_defect"] < 1e-10
     assert status["code"] == "iteration_limit"  # so that nothing counts as determined by the fit
     assert result["shared"]["inputs"] == ["v"] and result["shared"]["determined"] == []
-    assert result["shared"]["withdrawn"] == ["m", "k"] and result["shared"]["doubt"] == "training had not converged"
+    assert (
+        result["shared"]["withdrawn"] == ["m", "k"]
+        and result["shared"]["doubt"] == "training had not converged"
+    )
     own = {"states": ["x", "v"], "integrator": "rk4", "substeps": 1, "hold": "zero-order"}
     assert {key: result["motion"][key] for key in own} == own
     assert set(result["motion"]) == {*own, "window", "parts", "substep_bias"}
@@ -223,7 +293,15 @@ def test_a_result_has_what_a_motion_has_and_null_for_the_rest(result):
 
 def test_the_folder_has_figures_and_a_page(folder, printed, result):
     figures = {path.stem for path in (folder / "out" / "figures").iterdir()}
-    assert figures == {"simulation", "prediction", "residual", "states", "components", "learner", "bias"}
+    assert figures == {
+        "simulation",
+        "prediction",
+        "residual",
+        "states",
+        "components",
+        "learner",
+        "bias",
+    }
     page = (folder / "out" / "report.html").read_text()
     assert ">(force - c*v - k*x)/m</td>" in page and ">dv/dt</th>" in page
     (part,) = result["motion"]["parts"]
@@ -272,12 +350,16 @@ def test_functions_are_asked_for_again(folder, model):
 
 def test_an_input_is_designed_for_the_motion(folder):
     spec = put(folder).with_name("design.toml")
-    spec.write_text(SPEC.replace("[training]", "[design]\nsamples = 300\namplitude = 20\nseed = 3\n[training]"))
+    spec.write_text(
+        SPEC.replace("[training]", "[design]\nsamples = 300\namplitude = 20\nseed = 3\n[training]")
+    )
     code, out, err = orthaug("design", spec, "--out", folder / "u.csv", "--json")
     assert code == 0, err
     told, table = strict(out), pd.read_csv(folder / "u.csv")
     assert list(table) == ["time", "force"] and len(table) == 300 and table.force.abs().max() <= 20
-    assert set(told["std"]) == {"m", "c", "k"} and told["relative_error"] ** 2 == pytest.approx(told["cost"])
+    assert set(told["std"]) == {"m", "c", "k"} and told["relative_error"] ** 2 == pytest.approx(
+        told["cost"]
+    )
     errors = {row["name"]: row["std"] for row in told["candidates"]}
     assert told["relative_error"] < 0.5 * errors["white binary, hold 1"]
     spec.write_text(spec.read_text().replace("samples = 300", "samples = 9"))
@@ -294,21 +376,39 @@ def test_a_split_is_the_fits_own_under_its_measure(folder, result):
 
 def test_a_split_under_a_box_moves_what_is_shared(folder, result):
     code, out, _ = orthaug(
-        *("split", folder / "out", folder / "run.csv", "--measure", "uniform", "--box", "v=-1:1", "--json")
+        *(
+            "split",
+            folder / "out",
+            folder / "run.csv",
+            "--measure",
+            "uniform",
+            "--box",
+            "v=-1:1",
+            "--json",
+        )
     )
     assert code == 0
     before, after = (
-        {r["name"]: r["value"] for r in rows} for rows in (result["parameters"], strict(out)["parameters"])
+        {r["name"]: r["value"] for r in rows}
+        for rows in (result["parameters"], strict(out)["parameters"])
     )
-    assert after["m"] == pytest.approx(before["m"], rel=1e-9) and after["k"] == pytest.approx(before["k"], rel=1e-9)
-    assert after["c"] > before["c"] + 0.5  # Coulomb friction counts for more where velocities are small
+    assert after["m"] == pytest.approx(before["m"], rel=1e-9) and after["k"] == pytest.approx(
+        before["k"], rel=1e-9
+    )
+    assert (
+        after["c"] > before["c"] + 0.5
+    )  # Coulomb friction counts for more where velocities are small
 
 
 def test_a_split_refuses_what_it_was_not_trained_on(folder, printed):
     code, _, err = orthaug("split", folder / "out", folder / "steps.csv")
     assert code == 2 and "the model was trained on other rows" in err
-    code, _, err = orthaug(*("split", folder / "out", folder / "run.csv", "--measure", "uniform", "--box", "w=0:1"))
-    assert code == 2 and "'w' is no state or input that this model reads. It reads x, v, force" in err
+    code, _, err = orthaug(
+        *("split", folder / "out", folder / "run.csv", "--measure", "uniform", "--box", "w=0:1")
+    )
+    assert (
+        code == 2 and "'w' is no state or input that this model reads. It reads x, v, force" in err
+    )
 
 
 def test_the_learner_is_orthogonal_to_what_it_could_imitate(folder, model):
@@ -318,21 +418,38 @@ def test_the_learner_is_orthogonal_to_what_it_could_imitate(folder, model):
     m, c, k = model.parameters.values()
     assert physics[:, 0] == pytest.approx((u[:, 0] - c * x[:, 1] - k * x[:, 0]) / m, abs=1e-9)
     cosine = learner[:, 0] @ x[:, 1] / np.linalg.norm(learner) / np.linalg.norm(x[:, 1])
-    assert abs(cosine) < 0.02  # zero over the runs of the training segments, which start a little elsewhere
+    assert (
+        abs(cosine) < 0.02
+    )  # zero over the runs of the training segments, which start a little elsewhere
     assert states["v_learner"].to_numpy() == pytest.approx(learner[:, 0])
 
 
 def test_simulate_and_predict_write_what_physics_alone_gives(folder, model):
-    assert orthaug("simulate", folder / "out", folder / "steps.csv", "--out", folder / "sim.csv")[0] == 0
+    assert (
+        orthaug("simulate", folder / "out", folder / "steps.csv", "--out", folder / "sim.csv")[0]
+        == 0
+    )
     run = pd.read_csv(folder / "sim.csv")
     assert list(run) == [
         *("time", "position", "position_model", "position_baseline", "position_learner"),
         "extrapolates",
     ]
     assert np.abs(run.position_learner).max() > 1e-3
-    assert run.position_model.to_numpy() == pytest.approx((run.position_baseline + run.position_learner).to_numpy())
+    assert run.position_model.to_numpy() == pytest.approx(
+        (run.position_baseline + run.position_learner).to_numpy()
+    )
     assert (
-        orthaug(*("predict", folder / "out", folder / "steps.csv", "--horizon", 5, "--out", folder / "ahead.csv"))[0]
+        orthaug(
+            *(
+                "predict",
+                folder / "out",
+                folder / "steps.csv",
+                "--horizon",
+                5,
+                "--out",
+                folder / "ahead.csv",
+            )
+        )[0]
         == 0
     )
     ahead = pd.read_csv(folder / "ahead.csv")
@@ -350,15 +467,26 @@ def test_a_run_survives_physics_that_run_away(folder, model):
     numbers = model.numbers
     moved = numbers._replace(theta=numbers.theta + shift, theta_aux=numbers.theta_aux + shift)
     record = read(folder / "steps.csv")
-    run, usual = (one.simulate(record, "zero") for one in (replace(model, numbers=moved), model))  # no start to search
-    assert run.model == pytest.approx(usual.model, abs=1e-12) and run.trajectories[0].diverged is None
-    assert np.isnan(run.trajectories[0].baseline[-1]).all() and np.isfinite(usual.trajectories[0].baseline).all()
-    assert (usual.trajectories[0].baseline + usual.trajectories[0].learner) == pytest.approx(usual.model)
+    run, usual = (
+        one.simulate(record, "zero") for one in (replace(model, numbers=moved), model)
+    )  # no start to search
+    assert (
+        run.model == pytest.approx(usual.model, abs=1e-12) and run.trajectories[0].diverged is None
+    )
+    assert (
+        np.isnan(run.trajectories[0].baseline[-1]).all()
+        and np.isfinite(usual.trajectories[0].baseline).all()
+    )
+    assert (usual.trajectories[0].baseline + usual.trajectories[0].learner) == pytest.approx(
+        usual.model
+    )
 
 
 def test_a_short_recording_has_a_prediction(folder, model):
     record = read(folder / "steps.csv")
-    short = oa.Record(record.inputs, record.outputs, record.sampling_time, (record.experiments[0].rows(0, 6),))
+    short = oa.Record(
+        record.inputs, record.outputs, record.sampling_time, (record.experiments[0].rows(0, 6),)
+    )
     response = model.predict(short)
     assert np.isfinite(response.model[-1]).all() and np.isnan(response.model[:5]).all()
 
@@ -374,36 +502,58 @@ def test_modes_are_the_roots_of_the_characteristic_polynomial(model):
 def test_an_angle_integrates_and_does_not_decay():
     def told(*states):
         given = [oa.PhysicalParameter("c", 2.0)]
-        model = moving(oa.Motion.from_equations(list(states), [oa.Output("y", "x")], given, inputs=["u"]))
+        model = moving(
+            oa.Motion.from_equations(list(states), [oa.Output("y", "x")], given, inputs=["u"])
+        )
         model = replace(model, numbers=model.numbers._replace(theta_aux=np.zeros(1)))
-        return motion_stability(model, np.random.default_rng(0).normal(size=(5, len(states))), np.zeros((5, 1)))
+        return motion_stability(
+            model, np.random.default_rng(0).normal(size=(5, len(states))), np.zeros((5, 1))
+        )
 
     shaft = told(oa.State("x", "v"), oa.State("v", "u - c*v - 12*i"), oa.State("i", "u - 3*i"))
     assert shaft.text == (
-        "The linearised motion has an integrator and modes of 2 to 3 1/s along the free run. All others decay "
-        "everywhere: the largest real part is -2 1/s. What integrates neither decays nor grows: it keeps its errors."
+        "The linearised motion has an integrator and modes of 2 to 3 1/s along the free run. "
+        "All others decay everywhere: the largest real part is -2 1/s. The integrating mode "
+        "neither decays nor grows: errors in it stay."
     )
-    assert (shaft.modes.integrators, shaft.modes.rightmost, shaft.modes.slowest) == pytest.approx((1, -2, 2))
+    assert (shaft.modes.integrators, shaft.modes.rightmost, shaft.modes.slowest) == pytest.approx(
+        (1, -2, 2)
+    )
     mass = told(oa.State("x", "v"), oa.State("v", "c*u"))
-    assert "has 2 integrators and no other mode along" in mass.text and "decay everywhere" not in mass.text
+    assert (
+        "has 2 integrators and no other mode along" in mass.text
+        and "decay everywhere" not in mass.text
+    )
     swing = told(oa.State("x", "v"), oa.State("v", "c*u - 9*x"))
-    assert "has modes of 3 1/s" in swing.text and "None grows, and not all decay" in swing.text
+    assert "has modes of 3 1/s" in swing.text and "No mode grows, but not all decay" in swing.text
     runaway = told(oa.State("x", "v"), oa.State("v", "u + c*v"))
-    assert "has an integrator and modes of 2 1/s" in runaway.text and "grows, by up to 2 1/s" in runaway.text
+    assert (
+        "has an integrator and modes of 2 1/s" in runaway.text
+        and "grows, by up to 2 1/s" in runaway.text
+    )
     assert not any("-0 " in found.text for found in (shaft, mass, swing, runaway))
 
 
 def test_compare_puts_physics_alone_and_saved_models_beside(folder, printed, result):
     saved = folder / "out"
-    code, out, err = orthaug("compare", folder / "msd.toml", "--out", folder / "both", "--model", saved, "--json")
+    code, out, err = orthaug(
+        "compare", folder / "msd.toml", "--out", folder / "both", "--model", saved, "--json"
+    )
     assert code == 0, err
     alone, learned, kept = strict(out)["comparison"]
-    assert (alone["name"], learned["name"], kept["status"]) == ("physics alone", "orthogonal", "saved")
+    assert (alone["name"], learned["name"], kept["status"]) == (
+        "physics alone",
+        "orthogonal",
+        "saved",
+    )
     assert kept["scores"] == learned["scores"]
     values = [row["value"] for row in learned["parameters"]]
     assert values == pytest.approx([row["value"] for row in result["parameters"]], rel=1e-9)
     assert alone["weights"] == 0 and learned["validation"]["verdict"] == "helps"
-    assert learned["scores"]["train"]["simulation"]["nrmse"] < alone["scores"]["train"]["simulation"]["nrmse"]
+    assert (
+        learned["scores"]["train"]["simulation"]["nrmse"]
+        < alone["scores"]["train"]["simulation"]["nrmse"]
+    )
 
 
 def test_check_tells_what_cannot_be_told_apart_and_which_hold_is_right(tmp_path):
@@ -412,10 +562,14 @@ def test_check_tells_what_cannot_be_told_apart_and_which_hold_is_right(tmp_path)
         "[learner]", "g = { initial = 1.1, min = 0 }\n[motion]\nsubsteps = 1\n[learner]"
     )
     spec = put(tmp_path, text.replace("tests.steps", "# tests.steps"))
-    np.savetxt(tmp_path / "run.csv", ramps(300), delimiter=",", header="force,position", comments="")
+    np.savetxt(
+        tmp_path / "run.csv", ramps(300), delimiter=",", header="force,position", comments=""
+    )
     code, out, err = orthaug("check", spec, "--json")
     assert code == 2
-    assert "rank 3 of 4): m, c, k, g cannot be told apart; give one of them as a constant." in err
+    assert (
+        "rank 3 of 4): m, c, k, g cannot be distinguished; give one of them as a constant." in err
+    )
     told = strict(out)
     assert told["excitation"]["rank"] == told["identifiability"]["rank"] == 3
     assert told["identifiability"]["inseparable"] == [["m", "c", "k", "g"]]
@@ -461,17 +615,25 @@ def test_suspects_are_weighed_before_a_fit_and_after_it(folder, result):
             "N",
             True,
         )
-        assert friction["removed_by"] == "learner in part" and zone["removed_by"] == "nothing" and not zone["seen"]
+        assert (
+            friction["removed_by"] == "learner in part"
+            and zone["removed_by"] == "nothing"
+            and not zone["seen"]
+        )
         assert friction["expected_bias"]["c"] == pytest.approx(0.73, rel=0.1)
         assert [friction["bias"][name] for name in "mk"] == pytest.approx([0, 0], abs=1e-9)
     found = told["bias"][0]
     assert found["coefficient_found"] == pytest.approx(1.5, rel=0.1) and found["explained"] > 0.9
     rows = {row["name"]: row for row in told["parameters"]}
-    assert rows["c"]["ci95_with_bias"][0] < C < rows["c"]["ci95_with_bias"][1] < rows["c"]["ci95"][0]
+    assert (
+        rows["c"]["ci95_with_bias"][0] < C < rows["c"]["ci95_with_bias"][1] < rows["c"]["ci95"][0]
+    )
     assert rows["c"]["bias"]["cause"] == "friction"
     assert rows["m"]["ci95_with_bias"] == pytest.approx(rows["m"]["ci95"], rel=1e-3)
     assert "no suspect explains" not in out
-    assert "of what the learner found is friction" in out and "biased" in [w["code"] for w in told["warnings"]]
+    assert "of what the learner found is friction" in out and "biased" in [
+        w["code"] for w in told["warnings"]
+    ]
     assert (folder / "suspects" / "figures" / "bias.png").exists()
 
 
@@ -555,8 +717,9 @@ def test_an_analysis_that_fails_numerically_loses_no_training(folder, result, mo
     told = strict((folder / "fails" / "result.json").read_text())
     texts = [w["text"] for w in told["warnings"] if w["code"] == "analysis_failed"]
     assert texts == [
-        "the analysis of the modes failed numerically (Singular matrix): the result stands without it.",
-        "the bias by suspects failed numerically (Singular matrix): the result stands without it.",
+        "the analysis of the modes failed numerically (Singular matrix): the result is given "
+        "without it.",
+        "the bias by suspects failed numerically (Singular matrix): the result is given without it.",
     ]
     assert told["stability"] is None and told["bias"] is None and told["residuals"] is not None
     assert all(unfolded(text) in unfolded(out + err) for text in texts)
@@ -572,9 +735,15 @@ def test_a_defect_of_an_analysis_loses_no_training_either(monkeypatch):
     def fails(error):
         raise error
 
-    assert attempt.attempt("the analysis", lambda: fails(IndexError("out of bounds")), warnings, 3) == 3
+    assert (
+        attempt.attempt("the analysis", lambda: fails(IndexError("out of bounds")), warnings, 3)
+        == 3
+    )
     (warning,) = warnings
-    assert warning.code == "analysis_failed" and "a defect of orthaug (IndexError: out of bounds)" in warning.text
+    assert (
+        warning.code == "analysis_failed"
+        and "a defect of orthaug (IndexError: out of bounds)" in warning.text
+    )
     with pytest.raises(InputError, match="bad"):
         attempt.attempt("the analysis", lambda: fails(InputError("bad")), warnings, 3)
 
@@ -590,10 +759,22 @@ BAD = {
         "[motion.parameters]\nTs = { initial = 1.0 }",
         "'Ts' cannot name a parameter",
     ),
-    "undefined": ("c*v", "cc*v", "the equation of 'v' = (force - cc*v - k*x)/m: unknown name 'cc', did you mean 'c'?"),
-    "lag": ("(force -", "(force[k] -", "a signal such as y[k-1] is no part of it"),
-    "no derivative": ('derivative = "v", ', "", "`states.x` has no `derivative`; expected its equation"),
-    "no state": ('position = "x"\n', 'position = "3*k"\n', "'position' = 3*k is no expression of a state"),
+    "undefined": (
+        "c*v",
+        "cc*v",
+        "the equation of 'v' = (force - cc*v - k*x)/m: unknown name 'cc', did you mean 'c'?",
+    ),
+    "lag": ("(force -", "(force[k] -", "a signal such as y[k-1] is not allowed here"),
+    "no derivative": (
+        'derivative = "v", ',
+        "",
+        "`states.x` has no `derivative`; expected its equation",
+    ),
+    "no state": (
+        'position = "x"\n',
+        'position = "3*k"\n',
+        "'position' = 3*k is no expression of a state",
+    ),
     "loop": (
         "[motion.parameters]",
         '[motion.define]\na = "b + x"\nb = "a*2"\n[motion.parameters]',
@@ -601,15 +782,43 @@ BAD = {
     ),
     "not finite": ("k*x)/m", "k*x)/m + log(-1 - x**2)", "'v' is not finite at the start"),
     "term": ("k*x)/m", "k*x)/m + log(-1 - x**2)", "log(-1 - x ** 2) at x = "),
-    "unused": ("[motion.parameters]", "[motion.parameters]\nq = { initial = 1.0 }", "'q' is in no equation"),
-    "bounds": ('initial = 1.2, unit = "kg"', "initial = -1.2", "the initial value of 'm' is -1.2; its bounds are 0"),
-    "learned": ("[motion.outputs]", "w = { learned = true }\n[motion.outputs]", "`states.w` has no `derivative`"),
+    "unused": (
+        "[motion.parameters]",
+        "[motion.parameters]\nq = { initial = 1.0 }",
+        "'q' is in no equation",
+    ),
+    "bounds": (
+        'initial = 1.2, unit = "kg"',
+        "initial = -1.2",
+        "the initial value of 'm' is -1.2; its bounds are 0",
+    ),
+    "learned": (
+        "[motion.outputs]",
+        "w = { learned = true }\n[motion.outputs]",
+        "`states.w` has no `derivative`",
+    ),
     "start": ('start = "position"', 'start = "positon"', "did you mean 'position'?"),
-    "too long": ("sampling_time = 0.01", "sampling_time = 100.0", "is too long for the fastest mode of the motion"),
-    "focus": ("[training]", '[training]\nfocus = "prediction"', "'training.focus' = prediction; expected simulation"),
+    "too long": (
+        "sampling_time = 0.01",
+        "sampling_time = 100.0",
+        "is too long for the fastest mode of the motion",
+    ),
+    "focus": (
+        "[training]",
+        '[training]\nfocus = "prediction"',
+        "'training.focus' = prediction; expected simulation",
+    ),
     "solver": ("[training]", '[training]\nsolver = "adam-lbfgs"', "'training.solver' = adam-lbfgs"),
-    "ensemble": ("restarts = 1", "ensemble = true\nrestarts = 2", "`training.ensemble`: a motion has none"),
-    "structure": ("[training]", '[structure]\nkind = "additive"\n[training]', "'structure.kind' = additive; expected"),
+    "ensemble": (
+        "restarts = 1",
+        "ensemble = true\nrestarts = 2",
+        "`training.ensemble`: a motion has none",
+    ),
+    "structure": (
+        "[training]",
+        '[structure]\nkind = "additive"\n[training]',
+        "'structure.kind' = additive; expected",
+    ),
     "lags": ("[training]", "[lags]\nna = 2\n[training]", "`lags`: found beside [motion]"),
     "suspect": (
         "[training]",
@@ -626,15 +835,27 @@ BAD = {
         '[[baseline.terms]]\nparameter = "a"\nregressor = "position[k-1]"\n[training]',
         "`baseline`: found beside [motion]",
     ),
-    "nothing learned": (", learned = true", "", "'learner': no state and no output has `learned = true`"),
+    "nothing learned": (
+        ", learned = true",
+        "",
+        "'learner': no state and no output has `learned = true`",
+    ),
     "learner input": ('inputs = ["v"]', 'inputs = ["w"]', "learner input = w: unknown name 'w'"),
     "box": (
         "[training]",
         '[structure.measure]\nkind = "uniform"\nbox = { "v[k]" = [0, 1] }\n[training]',
         "'v[k]' is no state or input that this model reads",
     ),
-    "discrete": ("[motion.states]", '[motion]\nintegrator = "discrete"\n[motion.states]', "reads `next`"),
-    "output": ('position = "x"\n', 'place = "x"\n', "'position'; expected a number, an output (place)"),
+    "discrete": (
+        "[motion.states]",
+        '[motion]\nintegrator = "discrete"\n[motion.states]',
+        "reads `next`",
+    ),
+    "output": (
+        'position = "x"\n',
+        'place = "x"\n',
+        "'position'; expected a number, an output (place)",
+    ),
 }
 
 
@@ -654,14 +875,23 @@ def test_bad_input_ends_with_code_2(folder):
     spec = folder / "neither.toml"
     spec.write_text(SPEC[: SPEC.index("[motion.states]")])
     code, _, err = orthaug("fit", spec)
-    assert code == 2 and "the key 'baseline' is missing; expected [[baseline.terms]], or a [motion] instead" in err
+    assert (
+        code == 2
+        and "the key 'baseline' is missing; expected [[baseline.terms]], or a [motion] instead"
+        in err
+    )
 
 
 def test_what_a_motion_is_trained_with_unless_asked(folder):
     spec = put(folder).with_name("plain.toml")
-    spec.write_text(SPEC.replace("segment = 150\n", "").replace('[learner]\nhidden = [3]\ninputs = ["v"]\n', ""))
+    spec.write_text(
+        SPEC.replace("segment = 150\n", "").replace('[learner]\nhidden = [3]\ninputs = ["v"]\n', "")
+    )
     criterion = open_job(spec).spec.declared_criterion()
-    assert (criterion, open_job(spec).spec.declared_learner()) == (oa.Simulation("auto", 0), oa.MLP())
+    assert (criterion, open_job(spec).spec.declared_learner()) == (
+        oa.Simulation("auto", 0),
+        oa.MLP(),
+    )
     spec.write_text(spec.read_text().replace(", learned = true", ""))
     job = open_job(spec)
     assert job.spec.declared_learner() is None and job.compared == ("physics alone",)
@@ -669,16 +899,30 @@ def test_what_a_motion_is_trained_with_unless_asked(folder):
 
 def test_rows_of_a_motion_are_all_usable(folder):
     lines = put(folder).with_name("run.csv").read_text().splitlines()
-    gaps = [line.split(",")[0] + "," if k in (50, 52, 120) else line for k, line in enumerate(lines)]
+    gaps = [
+        line.split(",")[0] + "," if k in (50, 52, 120) else line for k, line in enumerate(lines)
+    ]
     (folder / "gaps.csv").write_text("\n".join(gaps))
     spec = folder / "gaps.toml"
-    spec.write_text(SPEC.replace("run.csv", "gaps.csv").replace("[data]\n", '[data]\nmissing = "skip"\n'))
+    spec.write_text(
+        SPEC.replace("run.csv", "gaps.csv").replace("[data]\n", '[data]\nmissing = "skip"\n')
+    )
     job = open_job(spec)
-    assert [len(e) for e in job.train.record.experiments] == [49, 67, 180]  # one row alone tells no start
-    assert "3 rows have missing cells" in job.warnings[0].text and "296 usable rows remain" in job.warnings[0].text
+    assert [len(e) for e in job.train.record.experiments] == [
+        49,
+        67,
+        180,
+    ]  # one row alone tells no start
+    assert (
+        "3 rows have missing cells" in job.warnings[0].text
+        and "296 usable rows remain" in job.warnings[0].text
+    )
     (folder / "short.csv").write_text("\n".join(lines[:3]))
     spec.write_text(SPEC.replace("steps.csv", "short.csv"))
-    with pytest.raises(InputError, match=r"short.csv: data.tests.steps has 2 rows, too few; at least 3 tell where"):
+    with pytest.raises(
+        InputError,
+        match=r"short.csv: data.tests.steps has 2 rows, too few; at least 3 determine where",
+    ):
         open_job(spec)
 
 
@@ -687,5 +931,7 @@ def test_opening_a_motion_loads_no_jax(folder):
         "import sys\nfrom pathlib import Path\nfrom orthaug.commands.kinds import open_job\n"
         f"open_job(Path({str(put(folder))!r}))\nassert 'jax' not in sys.modules\n"
     )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=False
+    )
     assert done.returncode == 0, done.stderr

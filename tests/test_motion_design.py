@@ -13,11 +13,19 @@ from orthaug.analysis.design import Design
 TRUTH = np.array([1.0, 0.8, 25.0])
 NOISE, SAMPLES, AMPLITUDE = 0.02, 119, 8.0  # so short a record is flown in one piece
 SPRING = spring(substeps=2)
-FRICTION = oa.MotionSuspect.of("expression", "tanh(v/0.1)", factor="-1/m", coefficient=0.05, name="friction")
+FRICTION = oa.MotionSuspect.of(
+    "expression", "tanh(v/0.1)", factor="-1/m", coefficient=0.05, name="friction"
+)
 
 
 def designed(**changes) -> Design:
-    given = {"sampling_time": TS, "samples": SAMPLES, "amplitude": AMPLITUDE, "noise": NOISE, "parameters": TRUTH}
+    given = {
+        "sampling_time": TS,
+        "samples": SAMPLES,
+        "amplitude": AMPLITUDE,
+        "noise": NOISE,
+        "parameters": TRUTH,
+    }
     return oa.design_motion_input(SPRING, **(given | changes))
 
 
@@ -54,14 +62,18 @@ def best() -> Design:
 
 
 @pytest.mark.proof
-def test_the_prediction_is_the_scatter_of_fits_and_beats_a_random_input(best: Design, record_property) -> None:
+def test_the_prediction_is_the_scatter_of_fits_and_beats_a_random_input(
+    best: Design, record_property
+) -> None:
     assert np.abs(best.signal).max() <= AMPLITUDE and best.names == ("m", "c", "k")
     own = errors(best.signal)
     ratio = np.sqrt(np.mean(own**2, axis=0)) / best.std
     assert np.all((ratio > 0.65) & (ratio < 1.35))  # 24 draws tell a deviation to 15 %
     power = np.sqrt(np.mean(best.signal**2))
     random = power * np.sign(np.random.default_rng(7).normal(size=SAMPLES))  # of equal power
-    relative = [np.sqrt(np.mean(np.sum((found / TRUTH) ** 2, axis=1))) for found in (own, errors(random))]
+    relative = [
+        np.sqrt(np.mean(np.sum((found / TRUTH) ** 2, axis=1))) for found in (own, errors(random))
+    ]
     record_property("scatter over predicted", f"{ratio.min():.2f} to {ratio.max():.2f}")
     record_property("error over that of a random input", f"{relative[0] / relative[1]:.2f}")
     assert relative[0] == pytest.approx(best.relative_error, rel=0.3)
@@ -96,7 +108,14 @@ def test_an_input_that_is_known_tells_its_own_gain() -> None:
     states = [oa.State("x", "(b*u + g*w - x)/T")]
     values = [oa.PhysicalParameter(name, 1.0) for name in ("T", "b", "g")]
     motion = oa.Motion.from_equations(states, [oa.Output("y", "x")], values, ["u", "w"], substeps=1)
-    given = {"sampling_time": 0.2, "samples": 80, "amplitude": 1.0, "noise": 0.01, "channel": "u", "iterations": 1}
+    given = {
+        "sampling_time": 0.2,
+        "samples": 80,
+        "amplitude": 1.0,
+        "noise": 0.01,
+        "channel": "u",
+        "iterations": 1,
+    }
     with pytest.raises(InputError, match="no candidate has a condition number"):
         oa.design_motion_input(motion, **given)
     known = np.sin(np.arange(80) / 5)

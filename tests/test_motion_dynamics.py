@@ -14,11 +14,11 @@ import orthaug as oa
 import orthaug.fitting.segments as laid
 from orthaug._base.jax import jax
 from orthaug.data.expressions import parse_named
-from orthaug.fitting.segments import lay_segments, respond, sensitivity
-from orthaug.models.dynamics import Differentiated, Numbers
+from orthaug.fitting.segments import build_segments, respond, sensitivity
+from orthaug.models.dynamics import AutodiffDynamics, Numbers
 from orthaug.models.integrators import held
 from orthaug.models.learners import Bound
-from orthaug.models.moving import Moving
+from orthaug.models.moving import MotionDynamics
 from orthaug.models.settling import Windows, settle
 from orthaug.physics.motion_problem import guess
 
@@ -42,22 +42,26 @@ def spring(**options) -> oa.Motion:
 
 def numbers(motion: oa.Motion, weights=()) -> Numbers:
     q = motion.coordinates.initial
-    return Numbers(q, np.zeros_like(q), np.asarray(weights), np.zeros(2), np.ones(2), np.array([0.5, 0.1]))
+    return Numbers(
+        q, np.zeros_like(q), np.asarray(weights), np.zeros(2), np.ones(2), np.array([0.5, 0.1])
+    )
 
 
-def with_learner(motion: oa.Motion, substeps: int) -> tuple[Moving, Numbers]:
+def with_learner(motion: oa.Motion, substeps: int) -> tuple[MotionDynamics, Numbers]:
     features = tuple(parse_named(text, motion.known, "feature") for text in ("v", "x*u"))
     bound = Bound(oa.MLP((3,)), 2, 2)
     weights = 0.3 * np.random.default_rng(0).normal(size=bound.size)
-    return Moving(motion, features, bound, TS, substeps), numbers(motion, weights)
+    return MotionDynamics(motion, features, bound, TS, substeps), numbers(motion, weights)
 
 
 def record(rows: int = 60) -> oa.Record:
     rng = np.random.default_rng(1)
-    return oa.Record.from_arrays(u=rng.normal(size=rows), y=0.1 * rng.normal(size=rows), sampling_time=TS)
+    return oa.Record.from_arrays(
+        u=rng.normal(size=rows), y=0.1 * rng.normal(size=rows), sampling_time=TS
+    )
 
 
-def run(form: Moving, made: Numbers, data: oa.Record, start) -> np.ndarray:
+def run(form: MotionDynamics, made: Numbers, data: oa.Record, start) -> np.ndarray:
     inputs = form.inputs(data.experiments[0], data)
 
     @jax.jit
@@ -70,12 +74,15 @@ def run(form: Moving, made: Numbers, data: oa.Record, start) -> np.ndarray:
 
 @pytest.mark.parametrize("hold", ["zero-order", "first-order"])
 def test_an_exact_step_is_that_of_the_matrix_exponential(hold: str) -> None:
-    motion, method = spring(integrator="exact", hold=hold), {"zero-order": "zoh", "first-order": "foh"}[hold]
+    motion, method = (
+        spring(integrator="exact", hold=hold),
+        {"zero-order": "zoh", "first-order": "foh"}[hold],
+    )
     m, c, k = motion.initial
     a, b = np.array([[0, 1], [-k / m, -c / m]]), np.array([[0], [1 / m]])
     data = record()
     u = data.experiments[0].inputs[:, 0]
-    ours = run(Moving(motion, (), None, TS, 1), numbers(motion), data, [0.3, -0.2])
+    ours = run(MotionDynamics(motion, (), None, TS, 1), numbers(motion), data, [0.3, -0.2])
     if method == "zoh":
         ad, bd, *_ = scipy.signal.cont2discrete((a, b, np.eye(2), np.zeros((2, 1))), TS, "zoh")
         x = np.array([0.3, -0.2])
@@ -83,12 +90,16 @@ def test_an_exact_step_is_that_of_the_matrix_exponential(hold: str) -> None:
             np.testing.assert_allclose(ours[i], x, rtol=0, atol=1e-12)
             x = ad @ x + bd[:, 0] * u[i]
         return
-    _, _, x = scipy.signal.lsim((a, b, np.eye(2), np.zeros((2, 1))), u, TS * np.arange(len(u)), [0.3, -0.2])
+    _, _, x = scipy.signal.lsim(
+        (a, b, np.eye(2), np.zeros((2, 1))), u, TS * np.arange(len(u)), [0.3, -0.2]
+    )
     np.testing.assert_allclose(ours, x, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize(("integrator", "substeps"), [("rk4", 6), ("exact", 3)])
-def test_a_nonlinear_motion_under_a_spline_is_that_of_an_adaptive_integrator(integrator: str, substeps: int) -> None:
+def test_a_nonlinear_motion_under_a_spline_is_that_of_an_adaptive_integrator(
+    integrator: str, substeps: int
+) -> None:
     motion = oa.Motion.from_equations(
         states=[oa.State("x", "v"), oa.State("v", "u - 0.4*v - k*x - 3*x**3")],
         outputs=[oa.Output("y", "x")],
@@ -99,12 +110,14 @@ def test_a_nonlinear_motion_under_a_spline_is_that_of_an_adaptive_integrator(int
     )
     time = TS * np.arange(80)
     data = oa.Record.from_arrays(u=np.sin(3 * time), y=np.zeros(80), sampling_time=TS)
-    ours = run(Moving(motion, (), None, TS, substeps), numbers(motion), data, [0.5, 0.0])
+    ours = run(MotionDynamics(motion, (), None, TS, substeps), numbers(motion), data, [0.5, 0.0])
 
     def rates(t, x):
         return [x[1], np.sin(3 * t) - 0.4 * x[1] - 4 * x[0] - 3 * x[0] ** 3]
 
-    exact = scipy.integrate.solve_ivp(rates, (0, time[-1]), [0.5, 0.0], t_eval=time, rtol=1e-11, atol=1e-12).y.T
+    exact = scipy.integrate.solve_ivp(
+        rates, (0, time[-1]), [0.5, 0.0], t_eval=time, rtol=1e-11, atol=1e-12
+    ).y.T
     np.testing.assert_allclose(ours, exact, rtol=0, atol=1e-5)
 
 
@@ -117,14 +130,21 @@ def test_inputs_between_samples() -> None:
     np.testing.assert_allclose(spline[:-1, -1], u[1:], atol=1e-12)
 
 
-@pytest.mark.parametrize(("integrator", "substeps", "hold"), [("rk4", 1, "zero-order"), ("rk4", 2, "spline")])
-def test_the_adjoint_of_the_stages_gives_the_derivatives(integrator: str, substeps: int, hold: str) -> None:
+@pytest.mark.parametrize(
+    ("integrator", "substeps", "hold"), [("rk4", 1, "zero-order"), ("rk4", 2, "spline")]
+)
+def test_the_adjoint_of_the_stages_gives_the_derivatives(
+    integrator: str, substeps: int, hold: str
+) -> None:
     form, made = with_learner(spring(integrator=integrator, hold=hold, learned=True), substeps)
     rng = np.random.default_rng(3)
     points = {"zero-order": 1, "spline": 2 * substeps + 1}[hold]
     state, inputs = rng.normal(size=(2, 5)), rng.normal(size=(points, 5))
     given = (made, state, inputs)
-    ours, plain = jax.jit(form.local)(*given), jax.jit(partial(Differentiated.local, form))(*given)
+    ours, plain = (
+        jax.jit(form.local)(*given),
+        jax.jit(partial(AutodiffDynamics.local, form))(*given),
+    )
     for one, other in zip(ours, plain, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-13)
 
@@ -138,7 +158,7 @@ def test_sensitivities_over_segments_are_those_of_forward_differentiation(integr
         motion = replace(motion, states=tuple(states))
     form, made = with_learner(motion, 1)
     data = record(40)
-    segments = lay_segments(data, form, 20, 0)
+    segments = build_segments(data, form, 20, 0)
     states = np.asarray(segments.start) + 0.1
     gram = np.asarray(sensitivity(form, made, segments, states, np.eye(1)).shared)
 
@@ -152,13 +172,21 @@ def test_sensitivities_over_segments_are_those_of_forward_differentiation(integr
     np.testing.assert_allclose(gram, columns.T @ columns, rtol=1e-8, atol=1e-10)
 
 
-def test_sensitivities_of_steps_at_once_are_those_step_by_step(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sensitivities_of_steps_at_once_are_those_step_by_step(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     form, made = with_learner(spring(learned=True), 1)
-    segments = lay_segments(record(40), form, 19, 3)
+    segments = build_segments(record(40), form, 19, 3)
     given = (form, made, segments, segments.start, np.array([[2.0]]))
     told = []
-    for block, fewest in ((1 << 15, 1), (8 * 3 * (2 + form.unknowns) * segments.scored.shape[2], 8), (1, 8)):
-        monkeypatch.setattr(laid, "_BLOCK", block)  # one block; three, the last of which is not full; no blocks
+    for block, fewest in (
+        (1 << 15, 1),
+        (8 * 3 * (2 + form.unknowns) * segments.scored.shape[2], 8),
+        (1, 8),
+    ):
+        monkeypatch.setattr(
+            laid, "_BLOCK", block
+        )  # one block; three, the last of which is not full; no blocks
         monkeypatch.setattr(laid, "_FEWEST", fewest)
         told.append(sensitivity.__wrapped__(*given))
     for other in told[1:]:
@@ -168,7 +196,7 @@ def test_sensitivities_of_steps_at_once_are_those_step_by_step(monkeypatch: pyte
 
 def test_a_start_is_guessed_and_then_settled() -> None:
     motion = spring()
-    form, made = Moving(motion, (), None, TS, 1), numbers(motion)
+    form, made = MotionDynamics(motion, (), None, TS, 1), numbers(motion)
     data = record(64)
     truth = run(form, made, data, [0.4, -1.0])
     guessed = guess(motion, truth[:, :1], [0, 30], TS)
@@ -187,7 +215,7 @@ def test_a_start_that_no_row_shows_stays_where_it_was_guessed() -> None:
         inputs=["u"],
         parameters=[oa.PhysicalParameter("a", 1.0)],
     )
-    form, data = Moving(motion, (), None, TS, 1), record(20)
+    form, data = MotionDynamics(motion, (), None, TS, 1), record(20)
     made = numbers(motion)
     inputs, outputs = form.inputs(data.experiments[0], data), data.experiments[0].outputs
     windows = Windows(inputs[..., None], outputs[..., None], np.ones((20, 1), dtype=bool))

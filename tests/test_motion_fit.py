@@ -11,8 +11,8 @@ import orthaug as oa
 from orthaug.data.expressions import parse_named
 from orthaug.inference.motion_split import shared_of_motion
 from orthaug.models.learners import Bound
-from orthaug.models.moving import Moving
-from orthaug.selection.explained_ground import ground_of
+from orthaug.models.moving import MotionDynamics
+from orthaug.selection.learned_linearization import linearization_of
 
 TS = 0.05
 WHOLE = oa.Simulation(0, 0)
@@ -36,7 +36,11 @@ def spring(learned: bool = False, extra: str = "", more=(), substeps: int = 1) -
 
 
 def data(
-    rows: int = 300, friction: float = 0.6, noise: float = 0.002, seed: int = 0, hardening: float = 0.0
+    rows: int = 300,
+    friction: float = 0.6,
+    noise: float = 0.002,
+    seed: int = 0,
+    hardening: float = 0.0,
 ) -> oa.Record:
     """m = 1, c = 0.8, k = 25 with friction tanh(v / 0.1) and a spring x³ under steps; finely integrated."""
     rng = np.random.default_rng(seed)
@@ -44,7 +48,12 @@ def data(
     state, y = np.zeros(2), []
 
     def rates(x, u):
-        return np.array([x[1], u - 0.8 * x[1] - 25 * x[0] - friction * np.tanh(x[1] / 0.1) - hardening * x[0] ** 3])
+        return np.array(
+            [
+                x[1],
+                u - 0.8 * x[1] - 25 * x[0] - friction * np.tanh(x[1] / 0.1) - hardening * x[0] ** 3,
+            ]
+        )
 
     for value in u:
         y.append(state[0])
@@ -54,7 +63,9 @@ def data(
             k2 = rates(state + h / 2 * k1, value)
             k3 = rates(state + h / 2 * k2, value)
             state = state + h / 6 * (k1 + 2 * k2 + 2 * k3 + rates(state + h * k3, value))
-    return oa.Record.from_arrays(u=u, y=np.array(y) + noise * rng.normal(size=rows), sampling_time=TS)
+    return oa.Record.from_arrays(
+        u=u, y=np.array(y) + noise * rng.normal(size=rows), sampling_time=TS
+    )
 
 
 @pytest.fixture(scope="module")
@@ -70,19 +81,33 @@ def test_a_linear_motion_is_the_output_error_fit_of_the_lagged_form(record_prope
     u, x, y = rng.normal(size=120), np.zeros(2), []
     for value in u:  # any stable system will do, with sensor noise
         y.append(x[0])
-        x = np.array([0.9 * x[0] + 0.05 * x[1] + 0.02 * value, -0.4 * x[0] + 0.85 * x[1] + 0.1 * value])
-    record = oa.Record.from_arrays(u=u, y=np.array(y) + 0.01 * rng.normal(size=120), sampling_time=TS)
+        x = np.array(
+            [0.9 * x[0] + 0.05 * x[1] + 0.02 * value, -0.4 * x[0] + 0.85 * x[1] + 0.1 * value]
+        )
+    record = oa.Record.from_arrays(
+        u=u, y=np.array(y) + 0.01 * rng.normal(size=120), sampling_time=TS
+    )
     states = [oa.State("x", "z + b1*u", start="y"), oa.State("z", "-k*x - c*z + b2*u")]
-    parameters = [oa.PhysicalParameter(n, v) for n, v in (("k", 10.0), ("c", 2.0), ("b1", 0.5), ("b2", 0.5))]
+    parameters = [
+        oa.PhysicalParameter(n, v) for n, v in (("k", 10.0), ("c", 2.0), ("b1", 0.5), ("b2", 0.5))
+    ]
     motion = oa.Motion.from_equations(
         states, [oa.Output("y", "x")], parameters, ["u"], integrator="exact", hold="zero-order"
     )
     solver = oa.LevenbergMarquardt(200, tolerance=1e-14)
     ours = oa.estimate(record, motion, learner=None, criterion=WHOLE, solver=solver)
-    terms = [oa.Term(f"{n}{i}", f"{signal}[k-{i}]") for n, signal in (("a", "y"), ("b", "u")) for i in (1, 2)]
-    theirs = oa.estimate(record, oa.Baseline.from_terms(terms), learner=None, criterion=WHOLE, solver=solver)
+    terms = [
+        oa.Term(f"{n}{i}", f"{signal}[k-{i}]")
+        for n, signal in (("a", "y"), ("b", "u"))
+        for i in (1, 2)
+    ]
+    theirs = oa.estimate(
+        record, oa.Baseline.from_terms(terms), learner=None, criterion=WHOLE, solver=solver
+    )
     # the motion's loss counts the first rows, which the lagged form takes as its starts
-    a = ours.course.objective().errors(ours.theta, np.zeros(0), ours.states, ours.course.segments)[0, 2:, 0, 0]
+    a = ours.segmented.objective().errors(
+        ours.theta, np.zeros(0), ours.states, ours.segmented.segments
+    )[0, 2:, 0, 0]
     root = np.sqrt(np.mean(a**2))
     noise = float(np.sqrt(theirs.model.statistics.noise[0, 0] * theirs.freedom / len(a)))
     assert root == pytest.approx(noise, rel=1e-6)
@@ -92,26 +117,35 @@ def test_a_linear_motion_is_the_output_error_fit_of_the_lagged_form(record_prope
     assert np.poly(poles) == pytest.approx([1, *-theirs.theta[:2]], rel=1e-6)
 
 
-def test_mass_and_stiffness_are_told_from_a_learner_of_the_velocity(fitted: oa.MotionEstimate) -> None:
+def test_mass_and_stiffness_are_told_from_a_learner_of_the_velocity(
+    fitted: oa.MotionEstimate,
+) -> None:
     table = fitted.parameters
     assert table["shared"].to_dict() == {"m": False, "c": True, "k": False}
     for name, truth in (("m", 1.0), ("k", 25.0)):
         assert abs(table["value"][name] - truth) < 3 * table["std"][name]
         assert table["std"][name] < 0.02 * truth
     alone = oa.estimate(data(), spring(), learner=None, criterion=WHOLE)
-    assert fitted.status.loss < 0.1 * alone.status.loss and fitted.status.start_loss == alone.status.loss
+    assert (
+        fitted.status.loss < 0.1 * alone.status.loss
+        and fitted.status.start_loss == alone.status.loss
+    )
     assert fitted.defect is not None and fitted.defect < 1e-8
 
 
-def test_on_its_training_data_a_motion_does_not_extrapolate(fitted: oa.MotionEstimate, tmp_path) -> None:
+def test_on_its_training_data_a_motion_does_not_extrapolate(
+    fitted: oa.MotionEstimate, tmp_path
+) -> None:
     """What training reached is that of the fitted run; the learner is scaled over that of physics alone."""
     oa.save(fitted.model, tmp_path / "model")
     for model in (fitted.model, oa.load(tmp_path / "model")):
         assert isinstance(model, oa.MotionModel)
         (run,) = model.simulate(data()).trajectories
         assert run.outside is not None and not run.outside.any()
-        assert ground_of(model, data()).outside == 0
-        (wider,) = model.simulate(oa.Record.from_arrays(u=100 * np.ones(40), sampling_time=TS), "zero").trajectories
+        assert linearization_of(model, data()).outside == 0
+        (wider,) = model.simulate(
+            oa.Record.from_arrays(u=100 * np.ones(40), sampling_time=TS), "zero"
+        ).trajectories
         assert wider.outside is not None and wider.outside.any()
     before = replace(fitted.model, seen=None)  # as a file of an earlier version gives it
     oa.save(before, tmp_path / "before")
@@ -122,8 +156,12 @@ def test_on_its_training_data_a_motion_does_not_extrapolate(fitted: oa.MotionEst
 def test_the_damping_is_that_of_the_nearest_physics(fitted: oa.MotionEstimate) -> None:
     """Linear along the shared direction: c − c_fit is the least-squares slope of −m g on v over the runs."""
     model = fitted.model
-    x, u = fitted.course.trajectory(model.theta - model.numbers.theta_aux, model.numbers.weights, fitted.states)
-    learned = np.array([model.form.learned(model.numbers, a, b)[0] for a, b in zip(x, u, strict=True)])
+    x, u = fitted.segmented.trajectory(
+        model.theta - model.numbers.theta_aux, model.numbers.weights, fitted.states
+    )
+    learned = np.array(
+        [model.form.learned(model.numbers, a, b)[0] for a, b in zip(x, u, strict=True)]
+    )
     c = model.form.motion.coordinates.physical(model.theta - model.numbers.theta_aux)
     v = x[:, 1]
     assert fitted.values[1] == pytest.approx(c[1] - c[0] * (v @ learned) / (v @ v), rel=1e-8)
@@ -139,7 +177,9 @@ def test_a_split_under_another_measure_moves_only_what_is_shared(fitted: oa.Moti
     np.testing.assert_allclose(again.std, fitted.std, rtol=1e-6)
     record = data()
     for one, other in zip(
-        wide.model.simulate(record).trajectories, fitted.model.simulate(record).trajectories, strict=True
+        wide.model.simulate(record).trajectories,
+        fitted.model.simulate(record).trajectories,
+        strict=True,
     ):
         np.testing.assert_allclose(one.model, other.model, rtol=0, atol=1e-12)
 
@@ -150,7 +190,7 @@ def test_standard_errors_of_a_split_are_those_of_its_slope(fitted: oa.MotionEsti
     from orthaug.fitting.motion_measures import field_under
     from orthaug.inference.motion_split import nearest
 
-    course, numbers = fitted.course, fitted_numbers(fitted.model.numbers)
+    segmented, numbers = fitted.segmented, fitted_numbers(fitted.model.numbers)
     unknowns = np.concatenate([numbers.theta, numbers.weights])
     bounds = fitted.problem.motion.coordinates.bounds
     size = fitted.split_by.field.size
@@ -158,8 +198,8 @@ def test_standard_errors_of_a_split_are_those_of_its_slope(fitted: oa.MotionEsti
     def q_at(unknowns: np.ndarray, moved: np.ndarray) -> np.ndarray:
         own = numbers._replace(theta=unknowns[:3], weights=unknowns[3:])
         states = fitted.states - np.moveaxis(fitted.slope @ moved, 1, -1)
-        field = field_under(oa.Training(), course, own, states)[0]._replace(size=size)
-        return nearest(course.dynamics, own, fitted.alone, field, bounds)[0]
+        field = field_under(oa.Training(), segmented, own, states)[0]._replace(size=size)
+        return nearest(segmented.dynamics, own, fitted.alone, field, bounds)[0]
 
     rng = np.random.default_rng(0)
     for _ in range(3):
@@ -175,9 +215,11 @@ def test_standard_errors_of_a_split_are_those_of_its_slope(fitted: oa.MotionEsti
 def test_shared_directions_of_the_spring(seen: tuple[str, ...], shared: int) -> None:
     motion = spring(learned=True)
     features = tuple(parse_named(text, motion.known, "feature") for text in seen)
-    form = Moving(motion, features, Bound(oa.MLP((2,)), len(seen), 1), TS, 1)
+    form = MotionDynamics(motion, features, Bound(oa.MLP((2,)), len(seen), 1), TS, 1)
     rng = np.random.default_rng(0)
-    found = shared_of_motion(form, motion.coordinates.initial, rng.normal(size=(200, 2)), rng.normal(size=(200, 1)))
+    found = shared_of_motion(
+        form, motion.coordinates.initial, rng.normal(size=(200, 2)), rng.normal(size=(200, 1))
+    )
     assert found.basis.shape[1] == shared
 
 
@@ -185,9 +227,11 @@ def test_shared_directions_of_the_spring(seen: tuple[str, ...], shared: int) -> 
 def test_shared_directions_of_a_duffing_equation(seen: tuple[str, ...], shared: int) -> None:
     motion = spring(learned=True, extra=" - k3*x**3", more=[oa.PhysicalParameter("k3", 2.0)])
     features = tuple(parse_named(text, motion.known, "feature") for text in seen)
-    form = Moving(motion, features, Bound(oa.MLP((2,)), len(seen), 1), TS, 1)
+    form = MotionDynamics(motion, features, Bound(oa.MLP((2,)), len(seen), 1), TS, 1)
     rng = np.random.default_rng(0)
-    found = shared_of_motion(form, motion.coordinates.initial, rng.normal(size=(200, 2)), rng.normal(size=(200, 1)))
+    found = shared_of_motion(
+        form, motion.coordinates.initial, rng.normal(size=(200, 2)), rng.normal(size=(200, 1))
+    )
     assert found.basis.shape[1] == shared
 
 
@@ -195,7 +239,9 @@ def test_shared_directions_of_a_duffing_equation(seen: tuple[str, ...], shared: 
 def test_no_learner_ends_above_physics_alone(seed: int) -> None:
     """Random springs, frictions, noise, regularizations and learners; one shape, so one compilation."""
     rng = np.random.default_rng(seed)
-    record = data(160, friction=float(rng.uniform(0, 1)), noise=float(10 ** rng.uniform(-4, -1)), seed=seed)
+    record = data(
+        160, friction=float(rng.uniform(0, 1)), noise=float(10 ** rng.uniform(-4, -1)), seed=seed
+    )
     regularization = ["none", "evidence", 1e-3][seed % 3]
     fit = oa.estimate(
         record,
@@ -232,14 +278,20 @@ def test_what_no_output_tells_has_no_interval() -> None:
     for value in u:
         y.append(x)
         x += TS * (-2 * x + 3 * value)
-    record = oa.Record.from_arrays(u=u, y=np.array(y) + 0.01 * rng.normal(size=150), sampling_time=TS)
+    record = oa.Record.from_arrays(
+        u=u, y=np.array(y) + 0.01 * rng.normal(size=150), sampling_time=TS
+    )
     motion = oa.Motion.from_equations(
         [oa.State("z", "-a*z + b*u")], [oa.Output("y", "g*z")], positive(a=1.0, b=1.0, g=1.0), ["u"]
     )
     fit = oa.estimate(record, motion, learner=None, criterion=WHOLE)
-    assert fit.unidentified == ("b", "g") and np.isnan(fit.std[1:]).all() and np.isfinite(fit.std[0])
+    assert (
+        fit.unidentified == ("b", "g") and np.isnan(fit.std[1:]).all() and np.isfinite(fit.std[0])
+    )
     decay = 1 - 2 * TS  # of the record's own step; the motion runs between samples
-    assert fit.values[1] * fit.values[2] == pytest.approx(3 * -np.log(decay) / (1 - decay), rel=0.02)
+    assert fit.values[1] * fit.values[2] == pytest.approx(
+        3 * -np.log(decay) / (1 - decay), rel=0.02
+    )
     assert "not identified: b, g" in fit.summary()
 
 
@@ -250,10 +302,16 @@ def test_what_the_prior_of_the_weights_holds_has_no_interval() -> None:
     for value in u:
         y.append(x + 0.3 * np.tanh(x / 0.1))
         x += TS * (-2 * x + 3 * value)
-    record = oa.Record.from_arrays(u=u, y=np.array(y) + 0.01 * rng.normal(size=150), sampling_time=TS)
+    record = oa.Record.from_arrays(
+        u=u, y=np.array(y) + 0.01 * rng.normal(size=150), sampling_time=TS
+    )
     outputs = [oa.Output("y", "z", learned=True)]
-    motion = oa.Motion.from_equations([oa.State("z", "-a*z + b*u")], outputs, positive(a=1.0, b=1.0), ["u"])
-    fit = oa.estimate(record, motion, learner=oa.MLP((4,), inputs=("z",)), criterion=WHOLE, blocks=0)
+    motion = oa.Motion.from_equations(
+        [oa.State("z", "-a*z + b*u")], outputs, positive(a=1.0, b=1.0), ["u"]
+    )
+    fit = oa.estimate(
+        record, motion, learner=oa.MLP((4,), inputs=("z",)), criterion=WHOLE, blocks=0
+    )
     assert fit.unidentified == ("b",) and np.isnan(fit.std[1])
     decay = 1 - 2 * TS  # of the record's own step; the motion runs between samples
     assert fit.values[0] == pytest.approx(-np.log(decay) / TS, abs=3 * fit.std[0])
@@ -261,7 +319,9 @@ def test_what_the_prior_of_the_weights_holds_has_no_interval() -> None:
     assert told.startswith("not identified: b. ") and "the prior of the weights" in told
 
 
-def test_the_band_of_what_is_learned_follows_all_that_was_estimated(fitted: oa.MotionEstimate) -> None:
+def test_the_band_of_what_is_learned_follows_all_that_was_estimated(
+    fitted: oa.MotionEstimate,
+) -> None:
     """Its variance is that of the learner's part when (c, w), and p̂ with them, move by columns of a root of Cov."""
     from orthaug.analysis.learned_part import learned_reach
     from orthaug.models.motion_field import parts_at
@@ -275,7 +335,11 @@ def test_the_band_of_what_is_learned_follows_all_that_was_estimated(fitted: oa.M
         sides = []
         for step in (column, -column):
             at = q + slope @ step
-            changed = {"theta": at, "theta_aux": at - c - step[:3], "weights": numbers.weights + step[3:]}
+            changed = {
+                "theta": at,
+                "theta_aux": at - c - step[:3],
+                "weights": numbers.weights + step[3:],
+            }
             sides.append(parts_at(fitted.model.form, numbers._replace(**changed), x, u)[1])
         moved.append((sides[0] - sides[1]) / (2 * tiny))
     half = learned_reach(fitted, x, u)
@@ -306,7 +370,9 @@ def test_a_model_runs_on_other_records(fitted: oa.MotionEstimate) -> None:
     np.testing.assert_allclose(trajectory.baseline + trajectory.learner, trajectory.model)
     alone = model.alone.simulate(record, initial=record.experiments[0].outputs).trajectories[0]
     assert np.abs(trajectory.learner).max() > 0.01 and alone.learner.any() == False  # noqa: E712  (an array)
-    zero = model.simulate(oa.Record.from_arrays(u=record.experiments[0].inputs[:, 0], sampling_time=TS), "zero")
+    zero = model.simulate(
+        oa.Record.from_arrays(u=record.experiments[0].inputs[:, 0], sampling_time=TS), "zero"
+    )
     assert zero.trajectories[0].model[0, 0] == 0.0
     with pytest.raises(oa.InputError, match="no measured outputs to start from"):
         model.simulate(oa.Record.from_arrays(u=np.ones(5), sampling_time=TS))
@@ -314,7 +380,9 @@ def test_a_model_runs_on_other_records(fitted: oa.MotionEstimate) -> None:
     assert list(frame) == ["time", "x", "v", "v_physics", "v_learner"] and len(frame) == len(record)
 
 
-def test_white_errors_are_told_from_coloured_ones_and_make_robust_errors(fitted: oa.MotionEstimate) -> None:
+def test_white_errors_are_told_from_coloured_ones_and_make_robust_errors(
+    fitted: oa.MotionEstimate,
+) -> None:
     from orthaug.analysis.motion_diagnosis import diagnose_motion
     from orthaug.analysis.robustness import robust_free_run
 
@@ -326,13 +394,18 @@ def test_white_errors_are_told_from_coloured_ones_and_make_robust_errors(fitted:
     assert found.missing is not None and not found.missing.found(0.01, 0.05)
     alone = oa.estimate(data(), spring(), learner=None, criterion=WHOLE)
     found = diagnose_motion(alone, alone.model.simulate(data()))
-    assert found is not None and found.verdict == "unmodelled" and found.predictable[0].own_past > 0.5
-    assert "Intervals count noise alone" in dict(found.warnings)["coloured_residual"]
+    assert (
+        found is not None and found.verdict == "unmodelled" and found.predictable[0].own_past > 0.5
+    )
+    assert "Intervals cover noise only" in dict(found.warnings)["coloured_residual"]
     assert found.missing is not None and found.missing.p < 1e-4
     term = found.missing.terms[0]
     assert (term.equation, term.variable, term.shape) == ("v", "v", "jump") and term.share > 0.5
     assert term.coefficient == pytest.approx(-0.6, rel=0.15)
-    assert "the equation of v lacks something odd in v" in found.text and "*sign(v) would explain" in found.text
+    assert (
+        "the equation of v lacks something odd in v" in found.text
+        and "*sign(v) would explain" in found.text
+    )
     helps = oa.verdict(fitted, alone, {"other": data(seed=9)})
     assert helps.code == "helps" and helps.trials[0].model < 0.5 * helps.trials[0].alone
     assert {e.lag for e in helps.extrapolation} <= {"x", "v", "u"}
@@ -341,7 +414,9 @@ def test_white_errors_are_told_from_coloured_ones_and_make_robust_errors(fitted:
     np.testing.assert_array_equal(robust.values, alone.values)
     np.testing.assert_array_equal(robust.plain_std, alone.std)
     assert (robust.std > 1.2 * alone.std).all() and robust.freedom < 31
-    assert "batch means" in "\n".join(robust.lines()) and "batch means" not in "\n".join(alone.lines())
+    assert "batch means" in "\n".join(robust.lines()) and "batch means" not in "\n".join(
+        alone.lines()
+    )
 
 
 @pytest.mark.parametrize("samples", [0, 5])
@@ -354,7 +429,9 @@ def test_an_input_that_acts_late_is_named_with_its_delay(samples: int) -> None:
     found = oa.diagnose(oa.estimate(record, spring(), learner=None, criterion=WHOLE))
     assert found is not None and found.verdict == "unmodelled"
     texts = [warning.text for warning in found.warnings if warning.code == "dead_time"]
-    assert len(texts) == (samples > 0) and ("Most likely u acts later" in found.text) == bool(samples)
+    assert len(texts) == (samples > 0) and ("Most likely u acts later" in found.text) == bool(
+        samples
+    )
     assert all('channel = "u", samples = 5;' in text for text in texts)
 
 
@@ -371,7 +448,11 @@ def test_what_is_called_coloured_is_told_with_its_correlation(own: float, words:
     e[1:, 0] += 0.2 * e[:-1, 0]
     tests = analyse([e], [np.zeros((4000, 0))], [np.zeros((4000, 0))], ["y", "z"], [], [])
     told = _colour(tests, tuple(Predictable(name, 1.0, own, 0.0, 0.0) for name in "yz"))
-    assert told.startswith("y has autocorrelations of up to 0.2") and words in told and "z has" not in told
+    assert (
+        told.startswith("y has autocorrelations of up to 0.2")
+        and words in told
+        and "z has" not in told
+    )
 
 
 def test_several_experiments_are_diagnosed_as_one_is() -> None:
@@ -393,20 +474,26 @@ def test_traces_that_tests_see_beside_the_noise_are_told() -> None:
     from orthaug.analysis.residuals import analyse
 
     random = np.random.default_rng(3)
-    e, u, x = random.normal(size=(4000, 2)), random.normal(size=(4000, 1)), random.normal(size=(4000, 1))
+    e, u, x = (
+        random.normal(size=(4000, 2)),
+        random.normal(size=(4000, 1)),
+        random.normal(size=(4000, 1)),
+    )
     shares = tuple(Predictable(name, 1.0, 0.5, 0.0, 0.02) for name in "yz")
     names = (["y", "z"], ["u"], ["v"])
     assert _traces(analyse([e], [u], [x], *names), shares) == ""
     e[:, 0] += 0.1 * u[:, 0]
     e[:, 1] += 0.1 * (x[:, 0] ** 2 - 1)
     told = _traces(analyse([e], [u], [x], *names), shares)
-    assert told == " Tests still see traces (y follows u; z is not flat over v): 2 % of its square at most."
+    assert (
+        told
+        == " Tests still detect small effects (y follows u; z is not flat over v): 2 % of its square at most."
+    )
 
 
 def test_a_term_that_is_there_already_moves_the_run_as_its_parameter_does() -> None:
     """Linear in x, added to the equation of v: the spring's own column, −k/m of it by the logarithm of k."""
-    from orthaug.analysis.missing_terms import doubted
-    from orthaug.analysis.motion_sensitivities import sensitivities
+    from orthaug.analysis.missing_terms import doubted, sensitivities
 
     fit = oa.estimate(data(), spring(), learner=None, criterion=WHOLE)
     assert doubted(fit) == (1,)  # ẋ = v only says what v is
@@ -415,18 +502,27 @@ def test_a_term_that_is_there_already_moves_the_run_as_its_parameter_does() -> N
     own, added = found.columns[..., 4], found.columns[..., 5]
     m, _, k = fit.values
     np.testing.assert_allclose(-k / m * added, own, rtol=0, atol=0.02 * np.abs(own).max())
-    errors = fit.course.objective().errors(fit.theta, np.zeros(0), fit.states, fit.course.segments)
+    errors = fit.segmented.objective().errors(
+        fit.theta, np.zeros(0), fit.states, fit.segmented.segments
+    )
     np.testing.assert_allclose(np.ravel(errors), np.ravel(found.errors), rtol=1e-9)
 
 
 def test_what_stands_at_a_bound_is_a_constant_to_the_others() -> None:
     """The spring's own stiffness held down by a bound: mass and damping have the intervals of a fit with it fixed."""
     low = [oa.PhysicalParameter("m", 1.2, min=0), oa.PhysicalParameter("c", 1.2, min=0)]
-    states = [oa.State("x", "v", start="y"), oa.State("v", "(u - c*v - k*x)/m", start="derivative of y")]
+    states = [
+        oa.State("x", "v", start="y"),
+        oa.State("v", "(u - c*v - k*x)/m", start="derivative of y"),
+    ]
     given = {"states": states, "outputs": [oa.Output("y", "x")], "inputs": ["u"], "substeps": 1}
-    bounded = oa.Motion.from_equations(**given, parameters=[*low, oa.PhysicalParameter("k", 20.0, max=20.0)])
+    bounded = oa.Motion.from_equations(
+        **given, parameters=[*low, oa.PhysicalParameter("k", 20.0, max=20.0)]
+    )
     fixed = oa.Motion.from_equations(**given, parameters=low, constants={"k": 20.0})
-    one, other = (oa.estimate(data(), made, learner=None, criterion=WHOLE) for made in (bounded, fixed))
+    one, other = (
+        oa.estimate(data(), made, learner=None, criterion=WHOLE) for made in (bounded, fixed)
+    )
     assert one.at_bound == ("k",) and one.unidentified == () and np.isnan(one.std[2])
     np.testing.assert_allclose(one.values[:2], other.values, rtol=1e-4)
     np.testing.assert_allclose(one.std[:2], other.std, rtol=1e-2)
@@ -445,13 +541,17 @@ def axis(rows: int = 300, friction: float = 20.4) -> oa.Record:
         drive.append(float(np.clip(160 * (goal - state[0]) + 24 * (speed - state[1]), -10, 10)))
 
         def rates(x, force=35.15 * drive[-1]):
-            return np.array([x[1], (force - 203.5 * x[1] - friction * np.tanh(x[1] / 1e-3) + 3.2) / 95.1])
+            return np.array(
+                [x[1], (force - 203.5 * x[1] - friction * np.tanh(x[1] / 1e-3) + 3.2) / 95.1]
+            )
 
         for _ in range(steps):
             half = state + 0.01 / steps * rates(state)
             state = state + 0.02 / steps * rates(half)
     names = {"inputs": ["drive"], "outputs": ["q"]}
-    return oa.Record.from_arrays(u=np.array(drive), y=np.array(position), sampling_time=0.02, **names)
+    return oa.Record.from_arrays(
+        u=np.array(drive), y=np.array(position), sampling_time=0.02, **names
+    )
 
 
 AXIS = oa.Motion.from_equations(
@@ -470,12 +570,18 @@ def test_evidence_that_silences_dry_friction_is_tried_again():
     record = axis()
     by_hand = oa.estimate(record, AXIS, learner=SPEED, regularization="evidence", blocks=0)
     told = {warning.code: warning.text for warning in by_hand.warnings}
-    assert by_hand.effective_weights < 1.5 and "has learned nothing but a constant" in told["learner_silent"]
+    assert (
+        by_hand.effective_weights < 1.5
+        and "has learned nothing but a constant" in told["learner_silent"]
+    )
     assert abs(by_hand.values[0] - 95.1) > 3 * by_hand.std[0]
     found = oa.estimate(record, AXIS, learner=SPEED)
     told = {warning.code: warning.text for warning in found.warnings}
     assert found.effective_weights > 4 and "learner_silent" not in told
-    assert "so training was tried again with no regularization and a ridge of" in told["evidence_retried"]
+    assert (
+        "so training was tried again with no regularization and a ridge of"
+        in told["evidence_retried"]
+    )
     assert [r.regularization for r in found.restarts][:2] == ["evidence", "none"]
     (low, high), _ = found.interval
     assert low < 95.1 < high
@@ -484,11 +590,15 @@ def test_evidence_that_silences_dry_friction_is_tried_again():
 def tanks(rows: int = 300) -> oa.Record:
     """Two tanks of which the upper one runs over; K = 0.05, a1 = 0.05, a2 = 0.04, and both levels are measured."""
     rng, state, levels = np.random.default_rng(5), np.array([3.0, 3.0]), []
-    pump = np.interp(np.arange(rows), np.arange(0, rows + 1, 15), rng.uniform(0.3, 6.5, rows // 15 + 1))
+    pump = np.interp(
+        np.arange(rows), np.arange(0, rows + 1, 15), rng.uniform(0.3, 6.5, rows // 15 + 1)
+    )
 
     def rates(x, u):
         down, over = 0.05 * np.sqrt(max(x[0], 0.0)), 3 * max(x[0] - 10, 0.0)
-        return np.array([0.05 * u - down - over, down - 0.04 * np.sqrt(max(x[1], 0.0)) + 0.6 * over])
+        return np.array(
+            [0.05 * u - down - over, down - 0.04 * np.sqrt(max(x[1], 0.0)) + 0.6 * over]
+        )
 
     for u in pump:
         levels.append(state)
@@ -496,14 +606,18 @@ def tanks(rows: int = 300) -> oa.Record:
             half = state + 0.1 * rates(state, u)
             state = state + 0.2 * rates(half, u)
     y = np.array(levels) + 0.01 * rng.normal(size=(rows, 2))
-    return oa.Record.from_arrays(u=pump, y=y, sampling_time=4.0, inputs=["pump"], outputs=["upper", "lower"])
+    return oa.Record.from_arrays(
+        u=pump, y=y, sampling_time=4.0, inputs=["pump"], outputs=["upper", "lower"]
+    )
 
 
 def test_a_motion_whose_training_has_not_ended_has_no_intervals():
     motion = oa.Motion.from_equations(
         states=[
             oa.State("x1", "K*pump - a1*sqrt(max(x1, 0.01))", start="upper", learned=True),
-            oa.State("x2", "a1*sqrt(max(x1, 0.01)) - a2*sqrt(max(x2, 0.01))", start="lower", learned=True),
+            oa.State(
+                "x2", "a1*sqrt(max(x1, 0.01)) - a2*sqrt(max(x2, 0.01))", start="lower", learned=True
+            ),
         ],
         outputs=[oa.Output("upper", "x1"), oa.Output("lower", "x2")],
         inputs=["pump"],
@@ -514,8 +628,14 @@ def test_a_motion_whose_training_has_not_ended_has_no_intervals():
     told = {warning.code: warning.text for warning in short.warnings}
     assert short.status.code == "iteration_limit" and short.std is None and short.interval is None
     assert short.parameters["std"].isna().all() and short.split(oa.Uniform()).std is None
-    assert "while the loss still fell" in told["not_converged"] and "`iterations`" in told["not_converged"]
+    assert (
+        "while the loss still fell" in told["not_converged"]
+        and "`iterations`" in told["not_converged"]
+    )
     whole = oa.estimate(tanks(), motion, **options)
-    assert whole.status.iterations > 300 and "went on past its limit of 300 iterations" in whole.status.message
+    assert (
+        whole.status.iterations > 300
+        and "went on past its limit of 300 iterations" in whole.status.message
+    )
     assert (whole.std is None) == ("not_converged" in {warning.code for warning in whole.warnings})
     assert whole.status.loss < short.status.loss

@@ -12,13 +12,17 @@ import orthaug as oa
 from orthaug._base.errors import InputError
 from orthaug._base.jax import jnp
 from orthaug.analysis.budget import AS_MUCH
-from orthaug.analysis.motion_bias import ground_after, softened_bias, usual_biases
-from orthaug.analysis.motion_budget import motion_budget, one_of_each, rivals_of, told_budget
+from orthaug.analysis.motion_bias import linearize_fit, softened_bias, usual_biases
+from orthaug.analysis.motion_budget import declared_budget, motion_budget, one_of_each, rivals_of
 from orthaug.analysis.motion_suspects import check_motion_suspects, usual_motion_suspects
 from orthaug.physics.motion_problem import MotionProblem, pose_motion
 
-FRICTION = oa.MotionSuspect.of("expression", "tanh(v/0.1)", factor="-1/m", unit="N", name="friction")
-HARDENING = oa.MotionSuspect.of("cubic", "x", factor="-1/m", equation="v", coefficient=0.2, name="hardening")
+FRICTION = oa.MotionSuspect.of(
+    "expression", "tanh(v/0.1)", factor="-1/m", unit="N", name="friction"
+)
+HARDENING = oa.MotionSuspect.of(
+    "cubic", "x", factor="-1/m", equation="v", coefficient=0.2, name="hardening"
+)
 SUSPECTS = (FRICTION, HARDENING)
 TRUTH = np.array([1.0, 0.8, 25.0])
 
@@ -39,15 +43,21 @@ def learned() -> oa.MotionEstimate:
     return oa.estimate(data(), spring(learned=True), learner=learner, criterion=WHOLE, blocks=0)
 
 
-def test_physics_alone_is_biased_as_the_term_says_and_the_residual_tells_its_size(alone: oa.MotionEstimate) -> None:
+def test_physics_alone_is_biased_as_the_term_says_and_the_residual_tells_its_size(
+    alone: oa.MotionEstimate,
+) -> None:
     friction, hardening = oa.suspected_bias(alone, SUSPECTS)
     moved = friction.per_unit * 0.1
     assert moved[1] == pytest.approx(alone.values[1] - TRUTH[1], rel=0.03)
     assert moved[1] > 50 * 0.0004  # of many standard errors of a fit without friction
-    assert (np.abs(alone.values - moved - TRUTH) < [9e-4, 1.2e-3, 0.025]).all()  # three such standard errors
+    assert (
+        np.abs(alone.values - moved - TRUTH) < [9e-4, 1.2e-3, 0.025]
+    ).all()  # three such standard errors
     assert friction.removed_by == "nothing" and friction.seen is None and friction.explained is None
     told = friction.residual
-    assert told.coefficient == pytest.approx(0.1, abs=3 * told.std) and told.coefficient == pytest.approx(0.1, rel=0.05)
+    assert told.coefficient == pytest.approx(
+        0.1, abs=3 * told.std
+    ) and told.coefficient == pytest.approx(0.1, rel=0.05)
     assert told.t > 5 and told.share > 5 * hardening.residual.share
     assert 0.9 < friction.cosine < 1.0
 
@@ -63,7 +73,10 @@ def refitted(fit: oa.MotionEstimate, friction: float, size: float) -> np.ndarray
     learner = oa.MLP((4,), inputs=("v",)) if fit.model.form.bound is not None else None
     options = {"learner": learner, "criterion": WHOLE, "blocks": 0}
     records = [data(friction=friction, hardening=sign * size) for sign in (1, -1)]
-    ends = [oa.estimate(record, spring(learned=learner is not None), **options).values for record in records]
+    ends = [
+        oa.estimate(record, spring(learned=learner is not None), **options).values
+        for record in records
+    ]
     return (ends[0] - ends[1]) / (2 * size)
 
 
@@ -81,18 +94,24 @@ def test_a_fit_of_difference_equations_is_refused() -> None:
         oa.suspected_bias(fit, SUSPECTS)  # type: ignore[arg-type]
 
 
-def test_a_term_that_the_learner_sees_moves_what_it_could_imitate_alone(learned: oa.MotionEstimate) -> None:
+def test_a_term_that_the_learner_sees_moves_what_it_could_imitate_alone(
+    learned: oa.MotionEstimate,
+) -> None:
     friction, hardening = oa.suspected_bias(learned, SUSPECTS)
     assert friction.seen and friction.moved[[0, 2]] == pytest.approx([0, 0], abs=1e-12)
     assert friction.coefficient_found == pytest.approx(0.6, rel=0.03) and friction.explained > 0.98
     assert learned.values[1] - 0.6 * friction.per_unit[1] == pytest.approx(TRUTH[1], rel=0.02)
-    assert friction.removed_by == "learner in part" and friction.residual is None  # v tanh(v) is never negative
+    assert (
+        friction.removed_by == "learner in part" and friction.residual is None
+    )  # v tanh(v) is never negative
     assert hardening.seen is False and hardening.removed_by == "nothing"
     assert abs(hardening.residual.t) < 3  # nothing of it is there
     assert hardening.explained < 0.1
 
 
-def test_explain_tells_the_parameters_with_the_term_in_the_physics(learned: oa.MotionEstimate) -> None:
+def test_explain_tells_the_parameters_with_the_term_in_the_physics(
+    learned: oa.MotionEstimate,
+) -> None:
     """c is fitted as a logarithm: a step of that as long as the bias would end at 0.83."""
     told = oa.explain(learned, suspects=[FRICTION])
     assert [term.expression for term in told.terms] == [FRICTION.expression]
@@ -115,11 +134,19 @@ def test_the_budget_covers_the_truth_where_the_interval_does_not(
         assert fit.interval[1, 0] > TRUTH[1] and c.ci95[0] < TRUTH[1] < c.ci95[1]
         assert c.ci95[1] - c.ci95[0] < 0.35 * c.value  # the bias is told, not only admitted
         (warning,) = budget.warnings
-        assert warning.code == "biased" and "friction of size" in warning.text and "c by +" in warning.text
+        assert (
+            warning.code == "biased"
+            and "friction of size" in warning.text
+            and "c by +" in warning.text
+        )
     assert motion_budget(clean, oa.suspected_bias(clean, SUSPECTS)) is None
     friction = oa.suspected_bias(alone, SUSPECTS)[0]
-    among_more = replace(friction, residual=replace(friction.residual, left=1.5 * friction.residual.share))
-    assert motion_budget(alone, [among_more]) is None  # something else is missing: no one knows what
+    among_more = replace(
+        friction, residual=replace(friction.residual, left=1.5 * friction.residual.share)
+    )
+    assert (
+        motion_budget(alone, [among_more]) is None
+    )  # something else is missing: no one knows what
 
 
 def test_a_function_has_suspects_too(alone: oa.MotionEstimate) -> None:
@@ -140,7 +167,9 @@ def test_a_sensor_may_lack_a_term() -> None:
     """An offset of the sensor moves nothing that the start does not; it is found, within its standard error."""
     record = data(friction=0.0)
     shifted = oa.Record.from_arrays(
-        u=record.experiments[0].inputs[:, 0], y=record.experiments[0].outputs[:, 0] + 0.05, sampling_time=0.05
+        u=record.experiments[0].inputs[:, 0],
+        y=record.experiments[0].outputs[:, 0] + 0.05,
+        sampling_time=0.05,
     )
     fit = oa.estimate(shifted, spring(), learner=None, criterion=WHOLE)
     (offset,) = oa.suspected_bias(fit, [oa.MotionSuspect.of("offset", equation="y")])
@@ -162,7 +191,9 @@ def test_suspects_that_the_motion_cannot_have_are_refused() -> None:
     refused("is not finite at", "expression", "1/(x - x)")
     refused("a signal such as y", "cubic", "y[k-1]")
     two = oa.Motion.from_equations(
-        [oa.State("a", "-k*a"), oa.State("b", "k*a - b*c")], [oa.Output("y", "b")], positive(k=1.0, c=1.0)
+        [oa.State("a", "-k*a"), oa.State("b", "k*a - b*c")],
+        [oa.Output("y", "b")],
+        positive(k=1.0, c=1.0),
     )
     with pytest.raises(InputError, match="`equation` is missing; one of a, b, y"):
         oa.MotionSuspect.of("offset").place(two)
@@ -183,7 +214,10 @@ def test_what_keeps_its_sign_has_no_jump_at_zero() -> None:
     u, y = np.array(rows).T
     record = oa.Record.from_arrays(u=u, y=y + 0.002 * rng.normal(size=300), sampling_time=0.1)
     tank = oa.Motion.from_equations(
-        [oa.State("h", "g*u - k*h", start="y")], [oa.Output("y", "h")], positive(g=1.0, k=1.0), inputs=["u"]
+        [oa.State("h", "g*u - k*h", start="y")],
+        [oa.Output("y", "h")],
+        positive(g=1.0, k=1.0),
+        inputs=["u"],
     )
     fit = oa.estimate(record, tank, learner=None, criterion=WHOLE)
     found = oa.diagnose(fit)
@@ -208,14 +242,22 @@ def test_friction_that_turns_round_smoothly_is_no_drag() -> None:
     suspects = [oa.MotionSuspect.of(kind, "v", factor="-1/m", name=kind) for kind in kinds]
     table, smooth = oa.suspected_bias(fit, suspects), softened_bias(fit, suspects)
     alone, beside = motion_budget(fit, table), motion_budget(fit, table, smooth)
-    assert alone.cause.suspect.name == "quadratic_drag" and alone.coefficient < 0 and alone.of("c").value < 0
+    assert (
+        alone.cause.suspect.name == "quadratic_drag"
+        and alone.coefficient < 0
+        and alone.of("c").value < 0
+    )
     assert beside.cause.suspect.name.startswith("coulomb as tanh(v/0.") and beside.share > 0.97
     assert beside.coefficient == pytest.approx(6.0, rel=0.3)
     low, high = beside.of("c").ci95
     assert low < TRUTH[1] < high
     rivals = rivals_of(beside.cause, (*table, *smooth))
-    assert [rival.suspect.name[:15] for rival in rivals] == ["coulomb as tanh"] and rivals[0] is not beside.cause
-    twice = motion_budget(fit, [beside.cause, replace(table[1], explained=beside.share)])  # a rival that is elsewhere
+    assert [rival.suspect.name[:15] for rival in rivals] == ["coulomb as tanh"] and rivals[
+        0
+    ] is not beside.cause
+    twice = motion_budget(
+        fit, [beside.cause, replace(table[1], explained=beside.share)]
+    )  # a rival that is elsewhere
     assert not twice.of("c").determined or twice.of("c").ci95[1] > alone.of("c").ci95[0]
     assert "(near it: quadratic_drag, " in twice.warnings[0].text
 
@@ -226,7 +268,10 @@ def test_usual_terms_that_the_learner_sees_are_weighed_too(
     """With widths by the states that the fit has found: guessed ones may stand still."""
     table, smooth = usual_biases(learned)
     kinds = ("coulomb", "quadratic_drag", "cubic")
-    assert [entry.suspect.name for entry in table] == [*(f"{kind} of v" for kind in kinds), "offset"]
+    assert [entry.suspect.name for entry in table] == [
+        *(f"{kind} of v" for kind in kinds),
+        "offset",
+    ]
     assert len(smooth) == 6
     found = motion_budget(learned, table, smooth)
     assert found.cause.suspect.name.startswith(("coulomb of v", "tanh(v")) and found.share > 0.9
@@ -240,7 +285,7 @@ def test_a_learner_that_found_nothing_is_no_term() -> None:
     fit = oa.estimate(data(friction=0.0), spring(learned=True), **options)
     table, smooth = usual_biases(fit)
     assert max(entry.explained or 0.0 for entry in table) > 0.5  # of next to nothing
-    assert motion_budget(fit, table, smooth) is None and told_budget(fit, (), []) is None
+    assert motion_budget(fit, table, smooth) is None and declared_budget(fit, (), []) is None
 
 
 def test_a_declared_term_that_explains_half_hides_no_usual_one(learned: oa.MotionEstimate) -> None:
@@ -249,19 +294,23 @@ def test_a_declared_term_that_explains_half_hides_no_usual_one(learned: oa.Motio
     half = motion_budget(learned, table)
     assert half.cause.suspect is drag and half.share < 0.9 and half.of("c").value < 0
     assert "what the learner found looks most like drag of size" in half.warnings[0].text
-    found = told_budget(learned, [drag], table)
+    found = declared_budget(learned, [drag], table)
     assert (
         found.cause.suspect.name.startswith(("coulomb of v", "tanh(v"))
         and found.share > 0.9
         and found.of("c").value > 0
     )
     sure = [replace(table[0], explained=0.99)]
-    assert told_budget(learned, [drag], sure).cause is sure[0]
+    assert declared_budget(learned, [drag], sure).cause is sure[0]
 
 
-def test_the_interval_counts_what_the_next_term_makes_of_the_rest(learned: oa.MotionEstimate) -> None:
+def test_the_interval_counts_what_the_next_term_makes_of_the_rest(
+    learned: oa.MotionEstimate,
+) -> None:
     kinds = ("coulomb", "quadratic_drag")
-    both = oa.suspected_bias(learned, [oa.MotionSuspect.of(kind, "v", factor="-1/m", name=kind) for kind in kinds])
+    both = oa.suspected_bias(
+        learned, [oa.MotionSuspect.of(kind, "v", factor="-1/m", name=kind) for kind in kinds]
+    )
     assert rivals_of(both[0], both) == []
     one, two = (motion_budget(learned, table).of("c").ci95 for table in (both[:1], both))
     assert two[0] < one[0] and two[1] > one[1]
@@ -274,11 +323,13 @@ def test_states_that_nobody_guessed_have_suspects_where_the_run_goes() -> None:
     )  # fmt: skip
     fit = oa.estimate(data(), still, learner=None, criterion=WHOLE)
     assert "coulomb of v" not in usual_of(fit.problem)
-    assert "coulomb of v" in [suspect.name for suspect in ground_after(fit).usual()]
+    assert "coulomb of v" in [suspect.name for suspect in linearize_fit(fit).usual()]
 
 
 def test_a_rival_leaves_about_as_little_of_the_learner(learned: oa.MotionEstimate) -> None:
-    (cause,) = oa.suspected_bias(learned, [oa.MotionSuspect.of("quadratic_drag", "v", factor="-1/m", name="drag")])
+    (cause,) = oa.suspected_bias(
+        learned, [oa.MotionSuspect.of("quadratic_drag", "v", factor="-1/m", name="drag")]
+    )
     for share, least in ((0.9999, 0.995), (0.95, 0.9), (0.6, 0.5)):
         table = [replace(cause, explained=least + step) for step in (0.001, -0.001)]
         assert rivals_of(replace(cause, explained=share), table) == table[:1]
@@ -286,10 +337,13 @@ def test_a_rival_leaves_about_as_little_of_the_learner(learned: oa.MotionEstimat
 
 def test_what_a_cause_leaves_of_the_learner_may_be_another_s(learned: oa.MotionEstimate) -> None:
     """A cause that explains all but a drag of half its size: the interval counts what that would do."""
-    ground = ground_after(learned)
+    ground = linearize_fit(learned)
     kinds = ("coulomb", "quadratic_drag")
     dry, drag = (oa.MotionSuspect.of(kind, "v", factor="-1/m", name=kind) for kind in kinds)
-    rows = [suspect.values(ground.motion, learned.values, ground.field.x, ground.field.u) for suspect in (dry, drag)]
+    rows = [
+        suspect.values(ground.motion, learned.values, ground.field.x, ground.field.u)
+        for suspect in (dry, drag)
+    ]
     both = replace(ground, learned=(rows[0] + 0.5 * rows[1])[:, None])
     first, second = both.table([dry, drag])
     (after,) = both.after([replace(first, coefficient_found=1.0)], [first, second])
@@ -302,7 +356,9 @@ def test_a_jump_that_is_there_stays_one(learned: oa.MotionEstimate) -> None:
     assert softened_bias(learned, SUSPECTS) == []  # none of the kind coulomb
     jump = oa.MotionSuspect.of("coulomb", "v - 0.1", factor="-1/m", name="dry", coefficient=0.5)
     smooth = [entry.suspect for entry in softened_bias(learned, [jump])]
-    assert len(smooth) == 6 and all(s.expression.startswith("(-1/m)*(tanh((v - 0.1)/") for s in smooth)
+    assert len(smooth) == 6 and all(
+        s.expression.startswith("(-1/m)*(tanh((v - 0.1)/") for s in smooth
+    )
     assert {(s.equation, s.coefficient, s.jump) for s in smooth} == {(None, 0.5, None)}
     drag = oa.MotionSuspect.of("quadratic_drag", "v", factor="-1/m", name="drag")
     (entry,) = oa.suspected_bias(learned, [drag])
@@ -326,7 +382,9 @@ def masses() -> oa.MotionEstimate:
             middle = x[k + 1] + step / 2 * slope(x[k + 1], u)
             x[k + 1] = x[k + 1] + step * slope(middle, u)
     y = x[:, ::2] + 1e-3 * rng.normal(size=(600, 2))
-    record = oa.Record.from_arrays(force, y, sampling_time=10 * step, inputs=["u"], outputs=["a", "b"])
+    record = oa.Record.from_arrays(
+        force, y, sampling_time=10 * step, inputs=["u"], outputs=["a", "b"]
+    )
     motion = oa.Motion.from_equations(
         states=[
             oa.State("x1", "v1", start="a"),
@@ -345,41 +403,67 @@ def masses() -> oa.MotionEstimate:
 
 
 @pytest.mark.proof
-def test_a_force_between_two_masses_is_named_in_both_equations(masses: oa.MotionEstimate, record_property) -> None:
-    found = told_budget(masses, (), [])
-    assert [str(cause.suspect.name) for cause in found.causes] == ["cubic of x1-x2 in v1", "cubic of x1-x2 in v2"]
+def test_a_force_between_two_masses_is_named_in_both_equations(
+    masses: oa.MotionEstimate, record_property
+) -> None:
+    found = declared_budget(masses, (), [])
+    assert [str(cause.suspect.name) for cause in found.causes] == [
+        "cubic of x1-x2 in v1",
+        "cubic of x1-x2 in v2",
+    ]
     one, two = (cause.coefficient_found for cause in found.causes)
     record_property("coefficients, -60 and 120 in truth", f"{one:.1f}, {two:.1f}")
-    assert one == pytest.approx(-60, rel=0.2) and two == pytest.approx(120, rel=0.2) and found.share > 0.9
+    assert (
+        one == pytest.approx(-60, rel=0.2)
+        and two == pytest.approx(120, rel=0.2)
+        and found.share > 0.9
+    )
     (low, high), stiffness = found.of("k").ci95, masses.values[1]
     assert low < 20 < high and stiffness - 20 > high - low
     (warning,) = found.warnings
     assert "and cubic of x1-x2 in v2 of size" in warning.text and "explain 100 % of" in warning.text
-    assert "in the equation of v1 and" in warning.text and "in the equation of v2 explain" in warning.text
+    assert (
+        "in the equation of v1 and" in warning.text
+        and "in the equation of v2 explain" in warning.text
+    )
 
 
 @pytest.mark.proof
 @pytest.mark.parametrize("points", [50, 20_000])
-def test_terms_of_each_equation_are_chosen_beside_those_of_the_others(masses, points, monkeypatch) -> None:
+def test_terms_of_each_equation_are_chosen_beside_those_of_the_others(
+    masses, points, monkeypatch
+) -> None:
     """What two terms make together is found though another one explains more alone; their order tells nothing."""
     monkeypatch.setattr("orthaug.analysis.motion_budget.CERTIFIED_POINTS", points)
-    ground, table = ground_after(masses), usual_biases(masses)[0]
+    ground, table = linearize_fit(masses), usual_biases(masses)[0]
     names = [entry.suspect.name for entry in table]
-    one, two = (table[names.index(f"{kind} of x1-x2 in {v}")] for kind, v in (("dead_zone", "v1"), ("cubic", "v2")))
+    one, two = (
+        table[names.index(f"{kind} of x1-x2 in {v}")]
+        for kind, v in (("dead_zone", "v1"), ("cubic", "v2"))
+    )
     values = 3.0 * ground._rows(one.suspect, 1) - 40.0 * ground._rows(two.suspect, 3)
     for entries in (table, table[::-1]):
-        each = {found[0].equation: found[0] for found in one_of_each(replace(ground, learned=values), entries)}
+        each = {
+            found[0].equation: found[0]
+            for found in one_of_each(replace(ground, learned=values), entries)
+        }
         assert each["v1"].suspect == one.suspect and each["v2"].suspect == two.suspect
-        assert each["v1"].coefficient_found == pytest.approx(3.0) and each["v1"].explained == pytest.approx(1.0)
+        assert each["v1"].coefficient_found == pytest.approx(3.0) and each[
+            "v1"
+        ].explained == pytest.approx(1.0)
         assert each["v2"].coefficient_found == pytest.approx(-40.0)
     alone = [entry for entry in table if entry.equation == "v1"]
     assert one_of_each(ground, alone) == []
 
 
-def test_the_size_of_a_cause_is_that_of_what_tells_of_it(alone: oa.MotionEstimate, learned: oa.MotionEstimate) -> None:
+def test_the_size_of_a_cause_is_that_of_what_tells_of_it(
+    alone: oa.MotionEstimate, learned: oa.MotionEstimate
+) -> None:
     """Of a learner by what it found, also where the residual tells of the term; without a learner by the residual."""
     told = oa.suspected_bias(alone, SUSPECTS)[0].residual
     (entry,) = oa.suspected_bias(learned, [FRICTION])
     budget = motion_budget(learned, [replace(entry, residual=told)])
     assert budget.coefficient == entry.coefficient_found != told.coefficient
-    assert motion_budget(alone, oa.suspected_bias(alone, [FRICTION])).coefficient == told.coefficient
+    assert (
+        motion_budget(alone, oa.suspected_bias(alone, [FRICTION])).coefficient == told.coefficient
+    )

@@ -65,9 +65,14 @@ def fitted(tmp_path_factory, request):
 
 def test_theta_is_found(fitted):
     folder, _, learns = fitted
-    rows = {row["name"]: row for row in json.loads((folder / "fit" / "result.json").read_text())["parameters"]}
+    rows = {
+        row["name"]: row
+        for row in json.loads((folder / "fit" / "result.json").read_text())["parameters"]
+    }
     for name, truth in (("w2", STIFFNESS), ("c", DAMPING)):
-        if not (learns and name == "c"):  # the learner could imitate it, so that it is the nearest damping
+        if not (
+            learns and name == "c"
+        ):  # the learner could imitate it, so that it is the nearest damping
             std = rows[name].get("plain_std", rows[name]["std"])  # robust ones are from few batches
             assert abs(rows[name]["value"] - truth) < 3 * std < 0.02 * truth
 
@@ -87,7 +92,12 @@ def test_theta_is_found(fitted):
 )
 def test_a_command(fitted, words):
     folder, spec, learns = fitted
-    given = {"SPEC": spec, "FIT": folder / "fit", "DATA": folder / "one.csv", "NEW": folder / "compared"}
+    given = {
+        "SPEC": spec,
+        "FIT": folder / "fit",
+        "DATA": folder / "one.csv",
+        "NEW": folder / "compared",
+    }
     code, out, err = orthaug(*(given.get(word, word) for word in words))
     if words[0] == "check":
         assert "from other starts" in out and "rich inputs" not in out
@@ -100,15 +110,26 @@ def test_a_command(fitted, words):
 
 @pytest.mark.parametrize(
     "words",
-    [("design", "SPEC", "--out", "NEW"), ("select", "SPEC", "--out", "NEW"), ("track", "FIT", "--data", "DATA")],
+    [
+        ("design", "SPEC", "--out", "NEW"),
+        ("select", "SPEC", "--out", "NEW"),
+        ("track", "FIT", "--data", "DATA"),
+    ],
     ids=lambda words: words[0],
 )
 def test_a_command_that_refuses_in_words(fitted, words):
     folder, spec, _ = fitted
     if words[0] == "design":
         spec = folder / "design.toml"
-        spec.write_text((folder / "pendulum.toml").read_text() + "\n[design]\nsamples = 100\namplitude = 1.0\n")
-    given = {"SPEC": spec, "FIT": folder / "fit", "DATA": folder / "one.csv", "NEW": folder / "new.csv"}
+        spec.write_text(
+            (folder / "pendulum.toml").read_text() + "\n[design]\nsamples = 100\namplitude = 1.0\n"
+        )
+    given = {
+        "SPEC": spec,
+        "FIT": folder / "fit",
+        "DATA": folder / "one.csv",
+        "NEW": folder / "new.csv",
+    }
     code, _, err = orthaug(*(given.get(word, word) for word in words))
     assert code == 2 and err.startswith("error: ") and len(err.splitlines()) == 1
 
@@ -141,7 +162,9 @@ def test_an_equation_without_a_value_is_named(fitted):
     assert code == 1, err
     assert "the equation of 'v' is not finite" in err and "sqrt(v) at v = -" in err
     assert "learner" not in err
-    assert "sqrt(v)" in json.loads((folder / "bad" / "result.json").read_text())["status"]["message"]
+    assert (
+        "sqrt(v)" in json.loads((folder / "bad" / "result.json").read_text())["status"]["message"]
+    )
 
 
 def predators() -> np.ndarray:
@@ -151,14 +174,23 @@ def predators() -> np.ndarray:
     def rate(_, x):
         return [1.1 * x[0] - 0.4 * x[0] * x[1] / (1 + 0.03 * x[0]), 0.1 * x[0] * x[1] - 0.4 * x[1]]
 
-    return scipy.integrate.solve_ivp(rate, (0, t[-1]), (10, 5), t_eval=t, rtol=1e-10, atol=1e-10).y.T
+    return scipy.integrate.solve_ivp(
+        rate, (0, t[-1]), (10, 5), t_eval=t, rtol=1e-10, atol=1e-10
+    ).y.T
 
 
 def test_a_lagged_model_alone_without_descent_speaks_of_the_physics():
     noise = 0.05 * np.random.default_rng(14).normal(size=(400, 2))
-    record = oa.Record.from_arrays(None, predators() + noise, outputs=["prey", "pred"], sampling_time=0.1)
+    record = oa.Record.from_arrays(
+        None, predators() + noise, outputs=["prey", "pred"], sampling_time=0.1
+    )
     both = "prey[k-1]*pred[k-1]"
-    table = [("p1", "prey[k-1]", "prey"), ("p2", both, "prey"), ("q1", "pred[k-1]", "pred"), ("q2", both, "pred")]
+    table = [
+        ("p1", "prey[k-1]", "prey"),
+        ("p2", both, "prey"),
+        ("q1", "pred[k-1]", "pred"),
+        ("q2", both, "pred"),
+    ]
     baseline = oa.Baseline.from_terms([oa.Term(*row[:2], output=row[2]) for row in table])
     status = oa.estimate(record, baseline, learner=None, criterion=oa.Simulation()).status
     assert status.code == "no_descent"
@@ -170,14 +202,19 @@ def test_starts_that_settle_slowly_are_no_poor_minimum():
     """No orbit of Lotka-Volterra follows a run that grows: 0.457 was the least of 14 random starts by SciPy."""
     run = predators()
     motion = oa.Motion.from_equations(
-        states=[oa.State("x", "a*x - b*x*y", start="prey"), oa.State("y", "c*x*y - d*y", start="pred")],
+        states=[
+            oa.State("x", "a*x - b*x*y", start="prey"),
+            oa.State("y", "c*x*y - d*y", start="pred"),
+        ],
         outputs=[oa.Output("prey", "x"), oa.Output("pred", "y")],
-        parameters=[oa.PhysicalParameter(n, v, min=0) for n, v in dict(a=1.0, b=0.3, c=0.1, d=0.3).items()],
+        parameters=[
+            oa.PhysicalParameter(n, v, min=0) for n, v in dict(a=1.0, b=0.3, c=0.1, d=0.3).items()
+        ],
         substeps=1,
     )
     record = oa.Record.from_arrays(None, run, outputs=["prey", "pred"], sampling_time=0.1)
     fit = oa.estimate(record, motion, learner=None)
     assert fit.status.code == "converged"
-    errors = fit.course.objective().errors(fit.alone, (), fit.states, fit.course.segments)
+    errors = fit.segmented.objective().errors(fit.alone, (), fit.states, fit.segmented.segments)
     left = np.sqrt(np.mean((errors / run.std(axis=0)[:, None]) ** 2))
     assert left < 0.46

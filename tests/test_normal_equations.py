@@ -25,7 +25,12 @@ def case(ny, nt, rows=37):
     rng = np.random.default_rng(10 * ny + nt)
     z, y = rng.uniform(-1, 1, (rows, 2)), rng.normal(size=(rows, ny))
     given = problem(
-        MLP(hidden=(3,)), z, y, rng.normal(size=(rows, ny, nt)), gain=rng.uniform(0.5, 2.0, (rows, ny)), limit=16
+        MLP(hidden=(3,)),
+        z,
+        y,
+        rng.normal(size=(rows, ny, nt)),
+        gain=rng.uniform(0.5, 2.0, (rows, ny)),
+        limit=16,
     )
     hold = Hold(jnp.asarray(rng.normal(size=(nt, nt))), jnp.asarray(rng.normal(size=nt)))
     return given._replace(hold=hold), given.bound.init(jax.random.key(ny)) + 0.1
@@ -45,7 +50,9 @@ def written_out(given, w):
         return jnp.concatenate([rest, given.hold.target - given.hold.matrix @ (q.T @ values(w))])
 
     r, jacobian = jax.jit(lambda w: (residual(w), jax.jacrev(residual)(w)))(w)
-    overlap = Overlap(*jax.jit(lambda w: (jax.jacrev(lambda w: q.T @ values(w))(w), q.T @ values(w)))(w))
+    overlap = Overlap(
+        *jax.jit(lambda w: (jax.jacrev(lambda w: q.T @ values(w))(w), q.T @ values(w)))(w)
+    )
     return jacobian.T @ jacobian, -jacobian.T @ r, r @ r, overlap
 
 
@@ -67,7 +74,9 @@ def test_prediction_is_the_projected_residual(ny, nt):
 def test_any_earlier_overlap_gives_the_same(ny, nt):
     given, w = case(ny, nt)
     rng = np.random.default_rng(1)
-    before = Overlap(jnp.asarray(rng.normal(size=(nt, given.bound.size))), jnp.asarray(rng.normal(size=nt)))
+    before = Overlap(
+        jnp.asarray(rng.normal(size=(nt, given.bound.size))), jnp.asarray(rng.normal(size=nt))
+    )
     found = jax.jit(given.criterion)(w, *given.arguments, before)
     assert_close(tuple(found), written_out(given, w), 1e-10)
 
@@ -95,7 +104,9 @@ def test_learner_almost_in_the_span_of_the_physics():
     criterion = jax.jit(given.criterion)
     first = criterion(w, *given.arguments, given.nothing)
     second = criterion(w, *given.arguments, first.overlap)
-    unguarded, guarded = (np.abs(n.hessian - exact).max() / np.abs(exact).max() for n in (first, second))
+    unguarded, guarded = (
+        np.abs(n.hessian - exact).max() / np.abs(exact).max() for n in (first, second)
+    )
     assert guarded < 1e-6 < unguarded
     gradient = 1e-6 * outside.T @ given.e[:, 0] - exact @ w
     np.testing.assert_allclose(second.gradient, gradient, rtol=1e-6)
@@ -104,7 +115,11 @@ def test_learner_almost_in_the_span_of_the_physics():
 def test_padding_adds_nothing():
     given, w = case(2, 3)
     padded = [jax.tree.map(lambda a: jnp.concatenate([a, jnp.zeros_like(a[:2])]), given.rows)]
-    padded += [jax.tree.map(lambda a: jnp.concatenate([a, jnp.zeros((*a.shape[:-1], 8))], axis=-1), given.rows)]
+    padded += [
+        jax.tree.map(
+            lambda a: jnp.concatenate([a, jnp.zeros((*a.shape[:-1], 8))], axis=-1), given.rows
+        )
+    ]
     expected = jax.jit(given.criterion)(w, *given.arguments, given.nothing)
     for chunks in padded:
         found = jax.jit(given.criterion)(w, chunks, given.hold, given.nothing)
@@ -114,7 +129,9 @@ def test_padding_adds_nothing():
 def test_padding_adds_nothing_of_a_learner_without_a_value_at_zero():
     logarithm = Function(lambda w, z: w * jnp.log(jnp.abs(z)), lambda key: jnp.ones(1))
     u, y = np.random.default_rng(0).normal(size=(2, 37))
-    task = OneStepTask.of(pose(Record.from_arrays(u, y), Baseline.from_terms([Term("a", "u[k]")])), logarithm)
+    task = OneStepTask.of(
+        pose(Record.from_arrays(u, y), Baseline.from_terms([Term("a", "u[k]")])), logarithm
+    )
     assert task.rows.z.size > 37
     run = task.run(LevenbergMarquardt(), jnp.ones(1))
     assert run.ending is Ending.CONVERGED and np.isfinite(run.normal.hessian).all()

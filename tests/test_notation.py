@@ -76,7 +76,11 @@ def missing(row: Row) -> list[str]:
     for name in backticked(row["in the code"]):
         owner, _, attribute = name.partition(".")
         if re.fullmatch(r"[A-Za-z_]\w*(?:\.\w+)?", name):
-            found += [name] if owner not in known or (attribute and attribute not in members(owner, nodes)) else []
+            found += (
+                [name]
+                if owner not in known or (attribute and attribute not in members(owner, nodes))
+                else []
+            )
     return found
 
 
@@ -88,12 +92,16 @@ def test_what_a_row_names_exists(row):
         {"symbol", "meaning", "in the code", "shape, unit", "paper", "file", "test"},
     )
     if row["file"] == "–":
-        assert row["in the code"].startswith("none") and len(row["in the code"].split()) > 3, "without a reason"
+        assert row["in the code"].startswith("none") and len(row["in the code"].split()) > 3, (
+            "without a reason"
+        )
     else:
         assert backticked(row["in the code"]) and missing(row) == []
         files = [CODE / name for name in backticked(row["file"])]
         named = {part for name in backticked(row["in the code"]) for part in name.split(".")}
-        assert all(named & defined(statements([file])) for file in files), "a file of the row defines none of its names"
+        assert all(named & defined(statements([file])) for file in files), (
+            "a file of the row defines none of its names"
+        )
         assert row["test"] != "–", "code without a test"
     for test in backticked(row["test"]):
         file, _, name = test.partition(".")
@@ -102,7 +110,10 @@ def test_what_a_row_names_exists(row):
 
 
 def test_what_is_not_there_is_seen():
-    row = {"in the code": "`Projection.solve`, `Projection.solved`, `Projektion`", "file": "`physics/projection.py`"}
+    row = {
+        "in the code": "`Projection.solve`, `Projection.solved`, `Projektion`",
+        "file": "`physics/projection.py`",
+    }
     assert missing(row) == ["Projection.solved", "Projektion"]
     assert missing(row | {"file": "`physics/projektion.py`"}) == ["physics/projektion.py"]
 
@@ -110,8 +121,12 @@ def test_what_is_not_there_is_seen():
 def test_every_label_and_every_symbol_has_a_row():
     labels, symbols = ([one for row in ROWS for one in of(row)] for of in (labels_of, symbols_of))
     assert len(PAPER["labels"]) > 30 and len(PAPER["symbols"]) > 100
-    assert {label: labels.count(label) for label in PAPER["labels"] if labels.count(label) != 1} == {}
-    assert {symbol: symbols.count(symbol) for symbol in PAPER["symbols"] if symbols.count(symbol) != 1} == {}
+    assert {
+        label: labels.count(label) for label in PAPER["labels"] if labels.count(label) != 1
+    } == {}
+    assert {
+        symbol: symbols.count(symbol) for symbol in PAPER["symbols"] if symbols.count(symbol) != 1
+    } == {}
 
 
 def latex() -> str:
@@ -138,4 +153,7 @@ def test_the_stored_symbols_are_those_of_the_paper():
     ]
     used = {letter for kind in kinds for letter in re.findall(kind, source)}
     assert len(used) > 40
-    assert sorted(letter for letter in used - {r"\mathbb{R}", r"\mathbb{Z}"} if letter not in stored) == []
+    assert (
+        sorted(letter for letter in used - {r"\mathbb{R}", r"\mathbb{Z}"} if letter not in stored)
+        == []
+    )

@@ -66,13 +66,17 @@ def record() -> oa.Record:
 
 @pytest.fixture(scope="module")
 def baseline() -> oa.Baseline:
-    return oa.Baseline.from_terms([oa.Term("a", "x[k-1]"), oa.Term("b", "u[k-1]", unit="m/N", min=0)])
+    return oa.Baseline.from_terms(
+        [oa.Term("a", "x[k-1]"), oa.Term("b", "u[k-1]", unit="m/N", min=0)]
+    )
 
 
 @pytest.fixture(scope="module")
 def fit(record):
     terms = [oa.Term("a", "x[k-1]"), oa.Term("b", "u[k-1]", unit="m/N")]
-    return oa.estimate(record, oa.Baseline.from_terms(terms), learner=MLP((3,), inputs=("x[k-1]",)), progress=False)
+    return oa.estimate(
+        record, oa.Baseline.from_terms(terms), learner=MLP((3,), inputs=("x[k-1]",)), progress=False
+    )
 
 
 @pytest.fixture
@@ -81,14 +85,19 @@ def motion() -> oa.Motion:
         states=[oa.State("v", "(u - c*v)/m", start=0.0, unit="m/s")],
         outputs=[oa.Output("x", "v")],
         inputs=["u"],
-        parameters=[oa.PhysicalParameter("m", 2.0, "kg", min=0), oa.PhysicalParameter("c", 1.0, "N s/m")],
+        parameters=[
+            oa.PhysicalParameter("m", 2.0, "kg", min=0),
+            oa.PhysicalParameter("c", 1.0, "N s/m"),
+        ],
     )
 
 
 def test_records_are_shown_and_escaped(record):
     assert {"u", "N", "input", "x", "m", "output"} <= set(Checked(record._repr_html_()).cells)
     assert "300 in 1 experiment" in record._repr_html_()
-    odd = oa.Record.from_arrays(y=[0.0, np.nan, 1.0], outputs=[oa.Channel("y", "<b>&")], missing="keep")
+    odd = oa.Record.from_arrays(
+        y=[0.0, np.nan, 1.0], outputs=[oa.Channel("y", "<b>&")], missing="keep"
+    )
     shown = Checked(odd._repr_html_())
     assert {"<b>&", "1"} <= set(shown.cells) and "b" not in shown.seen
 
@@ -121,7 +130,9 @@ def test_the_fit_of_a_spec_shows_what_its_result_tells(fit):
         ci95_with_bias=[1.9, 2.9],
     )
     result = FitResult.model_construct(
-        parameters=[row], physical_parameters=None, warnings=[WarningResult(code="biased", text="friction moves m")]
+        parameters=[row],
+        physical_parameters=None,
+        warnings=[WarningResult(code="biased", text="friction moves m")],
     )
     shown = html_of(card_of_result(fit, result))
     assert {"m", "2.5", "(kg)", "[2, 3]", "0.125", "[1.9, 2.9]"} <= set(Checked(shown).cells)
@@ -144,9 +155,17 @@ def test_figures_show_what_their_names_say(fit):
     trajectory = fit.model.simulate(fit.problem.record).trajectories[0]
     np.testing.assert_allclose(residual, trajectory.measured[:, 0] - trajectory.model[:, 0])
     gain, phase = (fit.plot.bode(phase=p, ax=Figure().subplots()) for p in (False, True))
-    assert (gain.get_yscale(), gain.get_ylabel(), phase.get_ylabel()) == ("log", "gain [m/N]", "phase [°]")
+    assert (gain.get_yscale(), gain.get_ylabel(), phase.get_ylabel()) == (
+        "log",
+        "gain [m/N]",
+        "phase [°]",
+    )
     free = fit.plot.free_run(ax=Figure().subplots())
-    assert [line.get_label() for line in free.lines] == ["measured", "model", "model without its learner"]
+    assert [line.get_label() for line in free.lines] == [
+        "measured",
+        "model",
+        "model without its learner",
+    ]
 
 
 @pytest.mark.parametrize(
@@ -174,7 +193,9 @@ def test_new_axes_are_pyplots_where_it_is_in_use():
         "import matplotlib; matplotlib.use('agg'); from matplotlib import pyplot\n"
         "axis = axes_for(None); print(alone, pyplot.get_fignums(), pyplot.gca() is axis)"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
+    )
     assert done.stdout.split("\n")[0] == "False [1] True"
 
 
@@ -210,7 +231,7 @@ def test_the_page_of_a_fit(fit, tmp_path):
 def test_pages_that_cannot_be_made(fit, options, message, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("orthaug.commands.library.judged", lambda fitted: fitted)
-    monkeypatch.setattr("orthaug.commands.library.told_of", lambda job, fit: fit)
+    monkeypatch.setattr("orthaug.commands.library.report_of", lambda job, fit: fit)
     monkeypatch.setattr("orthaug.commands.library.fit_report", lambda fitted, origin: "")
     with pytest.raises(oa.InputError, match=message):
         fit.report(**options)
@@ -219,7 +240,14 @@ def test_pages_that_cannot_be_made(fit, options, message, tmp_path, monkeypatch)
 
 def test_parameters_are_a_table(fit):
     assert list(fit.parameters.index) == ["a", "b"]
-    assert set(fit.parameters.columns) >= {"unit", "initial", "value", "std", "ci95_low", "ci95_high"}
+    assert set(fit.parameters.columns) >= {
+        "unit",
+        "initial",
+        "value",
+        "std",
+        "ci95_low",
+        "ci95_high",
+    }
 
 
 class _Notebook:
@@ -246,7 +274,10 @@ def test_progress_in_a_notebook(monkeypatch):
         tell(0, 20, 0.5)
         tell(1, 30, 0.25)
     assert ["<progress" in line for line in notebook.shown] == [True, True, True, False]
-    assert "run 2, iteration 30, loss 0.25" in notebook.shown[2] and "2 runs, 50 iterations" in notebook.shown[3]
+    assert (
+        "run 2, iteration 30, loss 0.25" in notebook.shown[2]
+        and "2 runs, 50 iterations" in notebook.shown[3]
+    )
 
 
 def test_progress_is_shown_to_people_only(monkeypatch, capsys):
@@ -271,8 +302,12 @@ def test_the_page_of_the_documents(tmp_path, monkeypatch):
     for k in range(2, 300):
         y[k] = 1.5 * y[k - 1] - 0.7 * y[k - 2] + 0.1 * u[k - 1] - 0.1 * y[k - 1] ** 3
     monkeypatch.chdir(tmp_path)
-    np.savetxt("run1.csv", np.column_stack([u, y]), delimiter=",", header="force,position", comments="")
-    text = (Path(__file__).resolve().parents[1] / "docs" / "notebook.md").read_text(encoding="utf-8")
+    np.savetxt(
+        "run1.csv", np.column_stack([u, y]), delimiter=",", header="force,position", comments=""
+    )
+    text = (Path(__file__).resolve().parents[1] / "docs" / "notebook.md").read_text(
+        encoding="utf-8"
+    )
     blocks = re.findall(r"^```python\n(.*?)^```", text, flags=re.DOTALL | re.MULTILINE)
     names: dict[str, object] = {}
     matplotlib.use("agg")

@@ -11,9 +11,9 @@ import pytest
 from orthaug._base.jax import jax
 from orthaug.data.record import Record
 from orthaug.fitting.criteria import Simulation
-from orthaug.fitting.flight_plan import FlightPlan, StructuredObjective
 from orthaug.fitting.initial_states import Start
 from orthaug.fitting.one_step import OneStepTask
+from orthaug.fitting.segmented_lagged import SegmentedLagged, StructuredObjective
 from orthaug.fitting.solvers.descent import MARQUARDT, SquaredResiduals, descend
 from orthaug.fitting.solvers.limit import Limit
 from orthaug.fitting.status import Ending
@@ -38,7 +38,9 @@ def objective(kind="orthogonal") -> StructuredObjective:
     """On the noisy mass-spring-damper; segments have a washout, so their states are free."""
     example = mass_spring_damper()
     (experiment,) = example.train.experiments
-    y = experiment.outputs + 0.02 * experiment.outputs.std() * np.random.default_rng(0).normal(size=(10_000, 1))
+    y = experiment.outputs + 0.02 * experiment.outputs.std() * np.random.default_rng(0).normal(
+        size=(10_000, 1)
+    )
     names = {"inputs": ["force"], "outputs": ["position"], "sampling_time": 0.01}
     record = Record.from_arrays(experiment.inputs, y, **names).rows(0, ROWS)
     baseline = example.baseline
@@ -46,7 +48,7 @@ def objective(kind="orthogonal") -> StructuredObjective:
         terms = [Term(t.parameter, t.regressor, t.initial, min=-5, max=5) for t in baseline.terms]
         baseline = Baseline.from_terms(terms)
     task = OneStepTask.of(pose(record, baseline), MLP(hidden=(3,)))
-    found = FlightPlan.of(task, CRITERION).objective(KINDS[kind])
+    found = SegmentedLagged.of(task, CRITERION).objective(KINDS[kind])
     assert found.initial.free and found.follows == (kind == "bounds")
     return found
 
@@ -81,15 +83,15 @@ def test_the_same_p_has_the_same_loss_in_any_order_of_calls(kind):
     given = objective(kind)
     p, q = points(given)
     start = nowhere(given)
-    first = given.fly(p, start)
+    first = given.evaluate(p, start)
     kept = copied(first)
-    there = given.fly(q, start)
+    there = given.evaluate(q, start)
     assert there.loss != first.loss and np.isfinite([first.loss, there.loss]).all()
     linear = given.linearise(there)
-    assert_same(given.fly(p, start), kept)
-    given.fly(p, linear.start), given.linearise(given.fly(p, linear.start))
-    assert_same(given.fly(p, start), kept)
-    assert_same(given.fly(q, start), copied(there))
+    assert_same(given.evaluate(p, start), kept)
+    given.evaluate(p, linear.start), given.linearise(given.evaluate(p, linear.start))
+    assert_same(given.evaluate(p, start), kept)
+    assert_same(given.evaluate(q, start), copied(there))
     assert_same(first, kept)  # nothing is written to what was handed out
 
 
@@ -98,36 +100,36 @@ def test_a_linearisation_is_that_of_its_trial(kind):
     """Whatever was flown or linearised in between."""
     given = objective(kind)
     p, q = points(given)
-    flown = given.fly(p, nowhere(given))
-    first = copied(given.linearise(flown))
-    other = given.linearise(given.fly(q, nowhere(given)))
-    given.samples(given.fly(q, other.start))
-    assert_same(given.linearise(flown), first)
-    assert_same(given.linearise(given.fly(p, nowhere(given))), first)
+    point = given.evaluate(p, nowhere(given))
+    first = copied(given.linearise(point))
+    other = given.linearise(given.evaluate(q, nowhere(given)))
+    given.samples(given.evaluate(q, other.start))
+    assert_same(given.linearise(point), first)
+    assert_same(given.linearise(given.evaluate(p, nowhere(given))), first)
 
 
 @pytest.mark.parametrize("kind", ["orthogonal", "bounds"])
 def test_a_trial_with_followed_states_can_be_repeated(kind):
     given = objective(kind)
     p, q = points(given)
-    linear = given.linearise(given.fly(p, nowhere(given)))
-    first = copied(given.fly(q, linear.start))
-    rejected = given.fly(p + 0.5 * (q - p), linear.start)
-    given.fly(2 * q, linear.start), given.linearise(rejected)
-    assert_same(given.fly(q, linear.start), first)
+    linear = given.linearise(given.evaluate(p, nowhere(given)))
+    first = copied(given.evaluate(q, linear.start))
+    rejected = given.evaluate(p + 0.5 * (q - p), linear.start)
+    given.evaluate(2 * q, linear.start), given.linearise(rejected)
+    assert_same(given.evaluate(q, linear.start), first)
 
 
 def test_states_follow_only_where_that_lowers_the_misfit():
     """They start as measured; after one linearisation a trial at the same p has better ones."""
     given = objective()
     p, _ = points(given)
-    flown = given.fly(p, nowhere(given))
-    np.testing.assert_array_equal(flown.states, given.initial.measured)
-    linear = given.linearise(flown)
-    again = given.fly(p, linear.start)
-    assert again.misfit < flown.misfit and not np.array_equal(again.states, flown.states)
+    point = given.evaluate(p, nowhere(given))
+    np.testing.assert_array_equal(point.states, given.initial.measured)
+    linear = given.linearise(point)
+    again = given.evaluate(p, linear.start)
+    assert again.misfit < point.misfit and not np.array_equal(again.states, point.states)
     worse = linear.start._replace(offset=1e3 * linear.start.offset)
-    np.testing.assert_array_equal(given.fly(p, worse).states, flown.states)
+    np.testing.assert_array_equal(given.evaluate(p, worse).states, point.states)
 
 
 class Rejecting:
@@ -137,32 +139,40 @@ class Rejecting:
         self.given, self.far, self.physics = given, far, given.physics
 
     def disturb(self, start):
-        rejected = self.given.fly(self.far, start)
+        rejected = self.given.evaluate(self.far, start)
         if np.isfinite(rejected.loss):
             self.given.samples(rejected), self.given.linearise(rejected)
 
-    def fly(self, p, start):
+    def evaluate(self, p, start):
         self.disturb(start)
-        return self.given.fly(p, start)
+        return self.given.evaluate(p, start)
 
-    def linearise(self, flown):
+    def linearise(self, point):
         self.disturb(nowhere(self.given))
-        return self.given.linearise(flown)
+        return self.given.linearise(point)
 
-    def samples(self, flown):
+    def samples(self, point):
         self.disturb(nowhere(self.given))
-        return self.given.samples(flown)
+        return self.given.samples(point)
 
 
 @pytest.mark.parametrize("evidence", [False, True], ids=["plain", "evidence"])
 def test_a_rejected_trial_leaves_nothing_behind(evidence):
     given = objective()
     p, q = points(given)
-    options = {"limit": Limit(6, 6), "tolerance": 1e-9, "damping": MARQUARDT, "ridge": 1.0, "evidence": evidence}
+    options = {
+        "limit": Limit(6, 6),
+        "tolerance": 1e-9,
+        "damping": MARQUARDT,
+        "ridge": 1.0,
+        "evidence": evidence,
+    }
     plain = descend(given, p, nowhere(given), **options)
     disturbed = descend(Rejecting(given, q), p, nowhere(given), **options)
-    assert plain.ending is Ending.RUNNING and plain.flown.loss < given.fly(p, nowhere(given)).loss
-    assert_same(plain.flown, disturbed.flown)
+    assert (
+        plain.ending is Ending.RUNNING and plain.point.loss < given.evaluate(p, nowhere(given)).loss
+    )
+    assert_same(plain.point, disturbed.point)
     assert_same(plain.linear, disturbed.linear)
     assert (plain.ridge, plain.effective, plain.iterations) == (
         disturbed.ridge,
@@ -175,7 +185,7 @@ def test_two_objectives_share_nothing():
     given = objective()
     p, q = points(given)
     other = replace(given, weight=2 * given.weight)
-    first = given.fly(p, nowhere(given)).loss
-    other.linearise(other.fly(q, nowhere(other)))
-    assert given.fly(p, nowhere(given)).loss == first
-    assert other.fly(p, nowhere(other)).loss == pytest.approx(4 * first, rel=1e-12)
+    first = given.evaluate(p, nowhere(given)).loss
+    other.linearise(other.evaluate(q, nowhere(other)))
+    assert given.evaluate(p, nowhere(given)).loss == first
+    assert other.evaluate(p, nowhere(other)).loss == pytest.approx(4 * first, rel=1e-12)

@@ -19,7 +19,9 @@ from orthaug.analysis.observer_noise import by_verdict, to_keep
 
 pytestmark = pytest.mark.usefixtures("without_figures")
 
-PHYSICS = oa.Baseline.from_terms([oa.Term("a", "y[k-1]"), oa.Term("b", "y[k-2]"), oa.Term("g", "u[k-1]")])
+PHYSICS = oa.Baseline.from_terms(
+    [oa.Term("a", "y[k-1]"), oa.Term("b", "y[k-2]"), oa.Term("g", "u[k-1]")]
+)
 TWO = [
     oa.Term("a", "y[k-1]", output="y"),
     oa.Term("b", "z[k-2]", output="y"),
@@ -35,13 +37,20 @@ def of(covariance) -> np.ndarray:
 
 def linear_lagged():
     model = lagged(TWO, (), None, ("y", "z"), ("u",))
-    numbers = model.numbers._replace(theta=np.array([0.7, 0.1, 1.0, 0.3, 0.5]), theta_aux=np.zeros(5))
-    return replace(model, numbers=numbers), oa.Noise(of([[0.02, 0.01], [0.01, 0.05]]), of([[0.1, 0.02], [0.02, 0.3]]))
+    numbers = model.numbers._replace(
+        theta=np.array([0.7, 0.1, 1.0, 0.3, 0.5]), theta_aux=np.zeros(5)
+    )
+    return replace(model, numbers=numbers), oa.Noise(
+        of([[0.02, 0.01], [0.01, 0.05]]), of([[0.1, 0.02], [0.02, 0.3]])
+    )
 
 
 def linear_motion(hold="zero-order", features=(), learner=None, integrator="exact"):
     motion = oa.Motion.from_equations(
-        states=[oa.State("x", "v", start="y"), oa.State("v", "(u - 0.4*v - k*x)/m", learned=learner is not None)],
+        states=[
+            oa.State("x", "v", start="y"),
+            oa.State("v", "(u - 0.4*v - k*x)/m", learned=learner is not None),
+        ],
         outputs=[oa.Output("y", "x")],
         inputs=["u"],
         parameters=[oa.PhysicalParameter("m", 1.3), oa.PhysicalParameter("k", 9.0)],
@@ -58,11 +67,17 @@ def matrices(model):
     """A, C, where the disturbance enters the state, and the output, by differences of `step`."""
     n, nu = len(model.state_names), len(model.step_inputs)
     base = model.step(np.zeros(n), np.zeros(nu))
-    columns = [[np.asarray(b - a) for a, b in zip(base, model.step(e, np.zeros(nu)), strict=True)] for e in np.eye(n)]
+    columns = [
+        [np.asarray(b - a) for a, b in zip(base, model.step(e, np.zeros(nu)), strict=True)]
+        for e in np.eye(n)
+    ]
     a, c = (np.stack([column[i] for column in columns], axis=1) for i in (0, 1))
     if model.form.memory == 0:
         return a, c, np.eye(n), np.zeros((len(c), n))
-    newest = [[float(name == f"{output.name}[k-1]") for output in model.outputs] for name in model.state_names]
+    newest = [
+        [float(name == f"{output.name}[k-1]") for output in model.outputs]
+        for name in model.state_names
+    ]
     return a, c, np.array(newest), np.eye(len(c))
 
 
@@ -82,7 +97,7 @@ def test_the_steady_gain_is_that_of_riccatis_equation(make):
         now = now.update(zeros, np.zeros(ny))
     np.testing.assert_allclose(now.belief.covariance, p, rtol=0, atol=1e-8 * np.abs(p).max())
     told = now.update(zeros, np.zeros(ny))
-    np.testing.assert_allclose(told.told.spread, c @ p @ c.T + r, rtol=1e-8)
+    np.testing.assert_allclose(told.latest.spread, c @ p @ c.T + r, rtol=1e-8)
     for i, unit in enumerate(np.eye(ny)):
         moved = np.asarray(now.update(zeros, unit).belief.state) - np.asarray(told.belief.state)
         np.testing.assert_allclose(moved, gain[:, i], rtol=0, atol=1e-8 * np.abs(gain).max())
@@ -121,7 +136,11 @@ def record_of(model, u, y):
 
 
 def nonlinear_lagged():
-    terms = [oa.Term("a", "y[k-1]"), oa.Term("b", "y[k-2]"), oa.Term("g", "tanh(u[k-1]) - 0.1*y[k-1]**3")]
+    terms = [
+        oa.Term("a", "y[k-1]"),
+        oa.Term("b", "y[k-2]"),
+        oa.Term("g", "tanh(u[k-1]) - 0.1*y[k-1]**3"),
+    ]
     model = lagged(terms, ("y[k-1]",), oa.MLP((3,)), ("y",), ("u",))
     numbers = model.numbers._replace(theta=np.array([1.4, -0.6, 0.4]), theta_aux=np.zeros(3))
     return replace(model, numbers=numbers), oa.Noise(of([[0.01]]), of([[0.04]]))
@@ -150,7 +169,10 @@ def test_bands_hold_95_percent(make):
     run, truth, states = tracked(make)
     (one,) = run.experiments
     rows = slice(one.start + 50, None)
-    pairs = [(one.outputs, one.outputs_std, truth), (one.predicted, one.predicted_std, one.measured)]
+    pairs = [
+        (one.outputs, one.outputs_std, truth),
+        (one.predicted, one.predicted_std, one.measured),
+    ]
     pairs += [(one.states, one.states_std, states)] if run.state_names else []
     for found, std, true in pairs:
         covered = np.mean(np.abs(found - true)[rows] <= 1.96 * std[rows], axis=0)
@@ -162,14 +184,18 @@ def test_the_table_has_bands(make=nonlinear_motion):
     table = run.to_frame()
     assert list(table)[:5] == ["time", "y", "y_model", "y_model_low", "y_model_high"]
     for name in ("y_model", "state:x", "state:v"):
-        assert (table[f"{name}_low"] < table[name]).all() and (table[name] < table[f"{name}_high"]).all()
+        assert (table[f"{name}_low"] < table[name]).all() and (
+            table[name] < table[f"{name}_high"]
+        ).all()
     assert table["time"][3] == pytest.approx(0.3)
 
 
 def test_wrong_noises_are_told():
     model, noise = nonlinear_lagged()
     measured, _, _, u = simulated(model, noise, 1000, seed=2)
-    told = oa.Observer(model, oa.Noise(0.3 * noise.state, 0.3 * noise.output)).run(record_of(model, u, measured))
+    told = oa.Observer(model, oa.Noise(0.3 * noise.state, 0.3 * noise.output)).run(
+        record_of(model, u, measured)
+    )
     assert not told.consistency().consistent and told.consistency().nis > 2
 
 
@@ -191,7 +217,10 @@ def test_without_sensor_noise_it_is_the_prediction_from_measured_lags(horizon):
     measured, _, _, u = simulated(model, noise, 300, seed=4)
     record = record_of(model, u, measured)
     observer = oa.Observer(model, oa.Noise(noise.state, 0 * noise.output))
-    (ours,), (plain,) = observer.predict(record, horizon).trajectories, model.predict(record, horizon).trajectories
+    (ours,), (plain,) = (
+        observer.predict(record, horizon).trajectories,
+        model.predict(record, horizon).trajectories,
+    )
     np.testing.assert_allclose(ours.model, plain.model, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(ours.learner, plain.learner, rtol=1e-9, atol=1e-12)
     assert ours.start == plain.start and np.isfinite(ours.std[ours.start :]).all()
@@ -251,8 +280,12 @@ def test_update_is_a_row_of_run(make):
         now = now.update(u[k], measured[k])
         np.testing.assert_allclose(now.outputs, one.outputs[k], rtol=1e-9)
         np.testing.assert_allclose(now.state, one.states[k], rtol=1e-9)
-        np.testing.assert_allclose((now.outputs_band[1] - now.outputs) / 1.959963984540054, one.outputs_std[k])
-        np.testing.assert_allclose((now.state_band[1] - now.state) / 1.959963984540054, one.states_std[k], atol=1e-12)
+        np.testing.assert_allclose(
+            (now.outputs_band[1] - now.outputs) / 1.959963984540054, one.outputs_std[k]
+        )
+        np.testing.assert_allclose(
+            (now.state_band[1] - now.state) / 1.959963984540054, one.states_std[k], atol=1e-12
+        )
         assert now.square == pytest.approx(one.square[k])
         assert (now.predicted_band[0] < now.predicted).all()
 
@@ -296,10 +329,12 @@ def test_a_model_by_itself_goes_by_how_it_was_trained():
     """And by the verdict that a saved one carries."""
     model = oa.estimate(system(0.1, 0.3), PHYSICS, learner=None, criterion=oa.Simulation()).model
     sensor = by_verdict(model)
-    both = by_verdict(replace(model, statistics=replace(model.statistics, verdict="equation_noise")))
+    both = by_verdict(
+        replace(model, statistics=replace(model.statistics, verdict="equation_noise"))
+    )
     assert both.state[0, 0] == pytest.approx(30 * sensor.state[0, 0])
     assert both.output[0, 0] == pytest.approx(sensor.output[0, 0] * 0.1 / 0.97)
-    free = replace(model.statistics, flown=False)
+    free = replace(model.statistics, simulated=False)
     assert by_verdict(replace(model, statistics=free)).output == 0
 
 
@@ -307,14 +342,22 @@ def test_a_fit_keeps_noises_by_the_likelihood_of_its_data(tmp_path):
     """Disturbances of a motion make its errors coloured; what share of them they make no rule knows."""
     model, _ = linear_motion(integrator="rk4")
     noise = oa.Noise(of([[0, 0], [0, 0.001]]), of([[0.01]]))
-    records = [record_of(model, u, y) for y, _, _, u in (simulated(model, noise, 2000, seed) for seed in (11, 12))]
-    fit = oa.estimate(records[0], model.form.motion, learner=None, criterion=oa.Simulation(segment=0, washout=0))
+    records = [
+        record_of(model, u, y)
+        for y, _, _, u in (simulated(model, noise, 2000, seed) for seed in (11, 12))
+    ]
+    fit = oa.estimate(
+        records[0], model.form.motion, learner=None, criterion=oa.Simulation(segment=0, washout=0)
+    )
     kept = to_keep(fit, "equation_noise")
     assert kept is not None and to_keep(fit, "white") is None
     statistics = replace(fit.model.statistics, verdict="equation_noise")
     known = replace(statistics, disturbance=kept.state, sensor=kept.output)
     oa.save(replace(fit.model, statistics=known), tmp_path / "model")
-    observers = [oa.Observer(oa.load(tmp_path / "model")), oa.Observer(replace(fit.model, statistics=statistics))]
+    observers = [
+        oa.Observer(oa.load(tmp_path / "model")),
+        oa.Observer(replace(fit.model, statistics=statistics)),
+    ]
     held = []
     for observer in observers:
         (one,) = observer.predict(records[1]).trajectories
@@ -330,16 +373,24 @@ def test_a_fit_keeps_noises_by_the_likelihood_of_its_data(tmp_path):
 
 def test_what_it_cannot_observe_is_told():
     model, noise = nonlinear_lagged()
-    with pytest.raises(oa.InputError, match="no estimate of its noise .*; give the observer `noise=`"):
+    with pytest.raises(
+        oa.InputError, match="no estimate of its noise .*; give the observer `noise=`"
+    ):
         oa.Observer(model)
     with pytest.raises(oa.InputError, match="`model` must be a fitted model or a fit"):
         oa.Observer("model")
     wrong = [
-        (oa.Noise(np.eye(2), noise.output), r"`noise.state` has the shape \(2, 2\); expected \(1, 1\)"),
+        (
+            oa.Noise(np.eye(2), noise.output),
+            r"`noise.state` has the shape \(2, 2\); expected \(1, 1\)",
+        ),
         (oa.Noise(noise.state, -noise.output), "`noise.output` is no covariance"),
         (oa.Noise(noise.state, of([[np.nan]])), "`noise.output` is no covariance"),
         (oa.Noise(noise.state, "x"), "`noise.output` is not a matrix of numbers"),
-        (oa.Noise(0 * noise.state, 0 * noise.output), "the sensors' covariance must be positive definite"),
+        (
+            oa.Noise(0 * noise.state, 0 * noise.output),
+            "the sensors' covariance must be positive definite",
+        ),
         ((noise.state, noise.output), r"`noise` must be an oa.Noise\(state, output\)"),
     ]
     for given, message in wrong:
@@ -373,7 +424,9 @@ def test_what_is_no_sample_is_told():
 def test_an_estimate_without_bounds_is_told():
     terms = [oa.Term("a", "y[k-1]**3"), oa.Term("g", "u[k-1]")]
     model = lagged(terms, (), None, ("y",), ("u",))
-    model = replace(model, numbers=model.numbers._replace(theta=np.array([2.0, 1.0]), theta_aux=np.zeros(2)))
+    model = replace(
+        model, numbers=model.numbers._replace(theta=np.array([2.0, 1.0]), theta_aux=np.zeros(2))
+    )
     y = np.full(40, np.nan)
     y[0] = 3.0
     record = record_of(model, np.ones(40), y)
@@ -386,7 +439,9 @@ def test_others_refuse_missing_outputs(verb):
     model, _ = nonlinear_lagged()
     y = np.zeros(20)
     y[7] = np.nan
-    with pytest.raises(oa.InputError, match="row 7: an output is missing there, which only an Observer takes"):
+    with pytest.raises(
+        oa.InputError, match="row 7: an output is missing, which only an Observer accepts"
+    ):
         getattr(model, verb)(record_of(model, np.zeros(20), y))
 
 
@@ -395,10 +450,15 @@ def test_a_fit_refuses_missing_outputs():
     y[7] = np.nan
     record = oa.Record.from_arrays(np.arange(60.0), y, missing="keep")
     motion = oa.Motion.from_equations(
-        [oa.State("x", "u - a*x", start="y")], [oa.Output("y", "x")], [oa.PhysicalParameter("a", 1.0)], ["u"]
+        [oa.State("x", "u - a*x", start="y")],
+        [oa.Output("y", "x")],
+        [oa.PhysicalParameter("a", 1.0)],
+        ["u"],
     )
     for physics in (PHYSICS, motion):
-        with pytest.raises(oa.InputError, match='row 7: an output is missing there, .*`missing = "skip"`'):
+        with pytest.raises(
+            oa.InputError, match='row 7: an output is missing, .*`missing = "skip"`'
+        ):
             oa.estimate(record, physics, learner=None)
     with pytest.raises(oa.InputError, match="not finite at row 7"):
         oa.Record.from_arrays(np.arange(60.0), y)
@@ -424,7 +484,15 @@ def table(done) -> np.ndarray:
 def test_simulate_and_predict_score_what_fit_scored(fitted):
     scores = finite_json((fitted / "out" / "result.json").read_text())["scores"]["train"]
     for verb, kind in (("simulate", "simulation"), ("predict", "prediction")):
-        done = run(verb, fitted / "out", fitted / "run.csv", "--missing", "skip", "--out", fitted / f"{verb}.csv")
+        done = run(
+            verb,
+            fitted / "out",
+            fitted / "run.csv",
+            "--missing",
+            "skip",
+            "--out",
+            fitted / f"{verb}.csv",
+        )
         assert done.code == 0 and "10 rows have missing cells" in done.err and "note: " in done.err
         rows = np.genfromtxt(fitted / f"{verb}.csv", delimiter=",", names=True)
         assert len(rows) == 200 and np.isnan(rows["y_model"][[0, 8, 9, 10]]).all()
@@ -436,12 +504,24 @@ def test_simulate_and_predict_score_what_fit_scored(fitted):
 def test_missing_samples_name_the_remedy(fitted):
     done = run("simulate", fitted / "out", fitted / "run.csv")
     assert (done.code, done.out) == (2, "")
-    assert one_line(done.err, "error: ", "line 37 (row 35)", "the cell is empty", "--missing skip leaves such rows out")
+    assert one_line(
+        done.err,
+        "error: ",
+        "line 37 (row 35)",
+        "the cell is empty",
+        "--missing skip leaves such rows out",
+    )
 
 
 def test_an_observer_goes_on_where_outputs_are_missing(fitted):
     found = table(run("predict", fitted / "out", fitted / "run.csv", "--observer"))
-    assert len(found) == 200 and found.dtype.names[:5] == ("time", "y", "y_model", "y_model_low", "y_model_high")
+    assert len(found) == 200 and found.dtype.names[:5] == (
+        "time",
+        "y",
+        "y_model",
+        "y_model_low",
+        "y_model_high",
+    )
     assert np.isnan(found["y"][8]) and np.isfinite(found["y_model"][[8, 9, 10, 61, 63]]).all()
     assert np.isnan(found["y_model"][[35, 36, 37]]).all()  # no input there, and two lags behind
     inside = (found["y_model_low"] < found["y"]) & (found["y"] < found["y_model_high"])
@@ -456,7 +536,18 @@ def test_rows_and_columns_are_chosen_as_in_a_spec(fitted):
     whole = table(run("simulate", fitted / "out", fitted / "run.csv", "--missing", "skip"))
     part = table(run("simulate", fitted / "out", fitted / "named.csv", *names, "--rows", "80:150"))
     np.testing.assert_allclose(part["y"], whole["y"][80:150])
-    thinned = table(run("predict", fitted / "out", fitted / "named.csv", *names, "--rows", "80:150", "--every", "2"))
+    thinned = table(
+        run(
+            "predict",
+            fitted / "out",
+            fitted / "named.csv",
+            *names,
+            "--rows",
+            "80:150",
+            "--every",
+            "2",
+        )
+    )
     np.testing.assert_allclose(thinned["y"], whole["y"][80:150:2])
     assert thinned["time"][1] == 0.5  # the model's own
 
@@ -474,42 +565,72 @@ def test_rows_and_columns_are_chosen_as_in_a_spec(fitted):
             ["--missing", "skip", "--initial", "zero"],
             ["each stretch starts from its own outputs", "leave --initial out"],
         ),
-        (["--missing", "skip", "--horizon", "190"], ["the longest stretch between missing samples has 129 rows"]),
+        (
+            ["--missing", "skip", "--horizon", "190"],
+            ["the longest stretch between missing samples has 129 rows"],
+        ),
         (["--observer", "--initial", "zero"], ["--initial", "--observer"]),
-        (["--observer", "--horizon", "0"], ["`horizon` must be a whole number of steps, 1 or more; got 0"]),
+        (
+            ["--observer", "--horizon", "0"],
+            ["`horizon` must be a whole number of steps, 1 or more; got 0"],
+        ),
     ],
     ids=str,
 )
 def test_wrong_options_are_told(fitted, options, words, tmp_path):
-    done = run("predict", fitted / "out", fitted / "run.csv", *options, "--out", tmp_path / "out.csv")
+    done = run(
+        "predict", fitted / "out", fitted / "run.csv", *options, "--out", tmp_path / "out.csv"
+    )
     assert (done.code, done.out) == (2, "") and not (tmp_path / "out.csv").exists()
     assert one_line(done.err.splitlines()[-1] + "\n", "error: ", *words)
 
 
 def test_a_saved_model_carries_the_verdict(fitted, tmp_path):
     model = oa.load(fitted / "out")
-    assert model.statistics.verdict == finite_json((fitted / "out" / "result.json").read_text())["residuals"]["verdict"]
-    assert model.statistics.flown is False
+    assert (
+        model.statistics.verdict
+        == finite_json((fitted / "out" / "result.json").read_text())["residuals"]["verdict"]
+    )
+    assert model.statistics.simulated is False
     oa.save(model, tmp_path / "model")
     assert oa.load(tmp_path / "model").statistics.verdict == model.statistics.verdict != ""
 
 
 def test_a_prediction_tells_whether_its_band_is_one_of_95_percent(fitted, tmp_path):
     done = run(
-        "predict", fitted / "out", fitted / "run.csv", "--observer", "--horizon", "2", "--out", tmp_path / "a.csv"
+        "predict",
+        fitted / "out",
+        fitted / "run.csv",
+        "--observer",
+        "--horizon",
+        "2",
+        "--out",
+        tmp_path / "a.csv",
     )
     assert one_line(
-        done.err.splitlines()[-1] + "\n", "note: the innovations' squares are", "(NIS, ", "its 95 % band holds 9"
+        done.err.splitlines()[-1] + "\n",
+        "note: the squared innovations are",
+        "(NIS; ",
+        "Its 95 % band contains 9",
     )
     model = oa.load(fitted / "out")
-    small = replace(model.statistics, disturbance=0.2 * model.statistics.noise, sensor=0 * model.statistics.noise)
+    small = replace(
+        model.statistics,
+        disturbance=0.2 * model.statistics.noise,
+        sensor=0 * model.statistics.noise,
+    )
     oa.save(replace(model, statistics=small), tmp_path / "model")
-    done = run("predict", tmp_path / "model", fitted / "run.csv", "--observer", "--out", tmp_path / "b.csv")
-    words = ("Do not take the band for one of 95 %: its noises are too small", ".tuned(record)")
+    done = run(
+        "predict", tmp_path / "model", fitted / "run.csv", "--observer", "--out", tmp_path / "b.csv"
+    )
+    words = ("Do not use the band as one of 95 %: its noises are too small", ".tuned(record)")
     assert done.code == 0 and one_line(
-        done.err.splitlines()[-1] + "\n", "warning: the innovations' squares are", *words
+        done.err.splitlines()[-1] + "\n", "warning: the squared innovations are", *words
     )
     rows = np.genfromtxt(tmp_path / "b.csv", delimiter=",", names=True)
     there = np.isfinite(rows["y"]) & np.isfinite(rows["y_model"])
     inside = (rows["y_model_low"] <= rows["y"]) & (rows["y"] <= rows["y_model_high"])
-    assert f"its 95 % band holds {percent(inside[there].mean(), 3)} of what was measured" in done.err
+    assert (
+        f"Its 95 % band contains {percent(inside[there].mean(), 3)} of the measured values"
+        in done.err
+    )

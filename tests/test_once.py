@@ -27,7 +27,14 @@ def spec(tmp_path: Path) -> Path:
     for name, record in (("train", example.train), ("test", example.test)):
         run = record.experiments[0].rows(0, 1500)
         table = np.column_stack([run.inputs, run.outputs])
-        np.savetxt(tmp_path / f"{name}.csv", table, fmt="%.17g", delimiter=",", header="force,position", comments="")
+        np.savetxt(
+            tmp_path / f"{name}.csv",
+            table,
+            fmt="%.17g",
+            delimiter=",",
+            header="force,position",
+            comments="",
+        )
     text = demo.SPEC.replace("[training]", '[training]\nfocus = "prediction"\niterations = 3')
     (tmp_path / "spec.toml").write_text(text, encoding="utf-8")
     return tmp_path / "spec.toml"
@@ -50,7 +57,9 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
     for name, home in (("pose", problem), ("stack_rows", regressors)):
         original = getattr(home, name)
         users = [
-            m for key, m in sys.modules.items() if key.startswith("orthaug") and getattr(m, name, None) is original
+            m
+            for key, m in sys.modules.items()
+            if key.startswith("orthaug") and getattr(m, name, None) is original
         ]
         count(home, name)
         for module in users:
@@ -77,8 +86,12 @@ def test_the_counts_of_a_fit(
     spec: Path, tmp_path: Path, counted: Counter[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Both parts are scored, of the model and of physics alone, which the verdict takes; the page drops the learner."""
-    monkeypatch.setattr("orthaug.commands.fit.advised", lambda fitted: fitted)  # which fits other specs
+    monkeypatch.setattr(
+        "orthaug.commands.fit.with_advice", lambda fitted: fitted
+    )  # which fits other specs
     run("fit", spec, "--out", tmp_path / "result")
     assert counted["pose"] == counted["factor"] == counted["stack_rows"] == 1
     assert counted["simulate"] == 2
-    assert counted["simulate physics alone"] <= 4  # the fit of physics alone on both parts; the page's on both
+    assert (
+        counted["simulate physics alone"] <= 4
+    )  # the fit of physics alone on both parts; the page's on both

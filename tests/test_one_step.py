@@ -17,7 +17,11 @@ from orthaug.physics.baseline import Baseline, Term
 from orthaug.physics.problem import pose
 from orthaug.studies.synthetic import mass_spring_damper
 
-TERMS = [Term("a", "y1[k-1]", output="y1"), Term("b", "u[k]", output="y2"), Term("a", "u[k-1]", output="y2")]
+TERMS = [
+    Term("a", "y1[k-1]", output="y1"),
+    Term("b", "u[k]", output="y2"),
+    Term("a", "u[k-1]", output="y2"),
+]
 
 
 @pytest.fixture(scope="module", params=[1, 2])
@@ -52,7 +56,9 @@ def test_output_unit_is_a_multiple_of_the_baseline_s_residual(task):
     phi = problem.projection.phi.reshape(problem.target.size, -1)
     y = problem.whitened_target.ravel()
     e = (y - phi @ np.linalg.lstsq(phi, y, rcond=None)[0]).reshape(problem.target.shape)
-    np.testing.assert_allclose(task.unit, OUTPUT_UNIT * e.std(axis=0) * problem.deviation, rtol=1e-9)
+    np.testing.assert_allclose(
+        task.unit, OUTPUT_UNIT * e.std(axis=0) * problem.deviation, rtol=1e-9
+    )
     assert task.rms == pytest.approx(np.sqrt(np.mean(e.var(axis=0))), rel=1e-9)
     rows = from_chunks(task.rows.e, len(problem.rows))
     np.testing.assert_allclose(rows, e / task.rms, atol=1e-10)
@@ -68,10 +74,15 @@ def test_padding_has_no_weight(task):
 
 
 def test_a_given_scaling_is_kept(task):
-    scaling, unit = Scaling(np.zeros(task.bound.nz), np.full(task.bound.nz, 2.0)), np.full(task.bound.ny, 3.0)
+    scaling, unit = (
+        Scaling(np.zeros(task.bound.nz), np.full(task.bound.nz, 2.0)),
+        np.full(task.bound.ny, 3.0),
+    )
     again = OneStepTask.of(task.problem, task.bound.learner, scaling, unit)
     np.testing.assert_array_equal(again.unit, unit)
-    np.testing.assert_allclose(from_chunks(again.rows.z, len(task.problem.rows)), task.problem.feature_rows() / 2)
+    np.testing.assert_allclose(
+        from_chunks(again.rows.z, len(task.problem.rows)), task.problem.feature_rows() / 2
+    )
 
 
 def whitened(task, w):
@@ -91,7 +102,9 @@ def test_gram_is_that_of_physics_and_jacobian(task, run):
     both = np.hstack([phi, jax.jit(jax.jacrev(lambda w: whitened(task, w)))(run.w)])
     found, expected = task.gram(run), both.T @ both
     size = np.sqrt(np.diag(expected))
-    np.testing.assert_allclose(found / np.outer(size, size), expected / np.outer(size, size), atol=1e-11)
+    np.testing.assert_allclose(
+        found / np.outer(size, size), expected / np.outer(size, size), atol=1e-11
+    )
     np.testing.assert_array_equal(found.shape, (len(size),) * 2)
 
 
@@ -107,6 +120,8 @@ def test_gram_has_no_rows_of_a_penalty():
     example = mass_spring_damper()
     task = OneStepTask.of(pose(example.train.rows(0, 400), example.baseline), MLP(hidden=(3,)))
     w = task.bound.init(jax.random.key(0))
-    free, held = (task.run(LevenbergMarquardt(0), w, s) for s in (Orthogonal(), OrthogonalPenalty(100.0)))
+    free, held = (
+        task.run(LevenbergMarquardt(0), w, s) for s in (Orthogonal(), OrthogonalPenalty(100.0))
+    )
     assert held.held and not free.held
     np.testing.assert_allclose(task.gram(held), task.gram(free), rtol=1e-9, atol=1e-9)

@@ -31,22 +31,22 @@ class LeastSquares:
     def loss(self, p):
         return float(np.sum(self.residual(p) ** 2))
 
-    def fly(self, p, start):
+    def evaluate(self, p, start):
         self.trials.append(p.copy())
-        return Flown(p, self.loss(p))
+        return TrialPoint(p, self.loss(p))
 
     def normal(self, p):
         j = self.jacobian(p)
         return j.T @ j, self.sign * j.T @ self.residual(p)
 
-    def linearise(self, flown):
-        return Linear(*self.normal(flown.p), None)
+    def linearise(self, point):
+        return Linear(*self.normal(point.p), None)
 
-    def samples(self, flown):
+    def samples(self, point):
         return self.independent
 
 
-class Flown(NamedTuple):
+class TrialPoint(NamedTuple):
     p: np.ndarray
     loss: float
 
@@ -70,11 +70,17 @@ class Outcome(NamedTuple):
 
 
 def run(objective, p, *, physics=None, iterations=200, **options):
-    options = {"limit": Limit(iterations, iterations), "tolerance": 1e-14, "damping": MARQUARDT} | options
+    options = {
+        "limit": Limit(iterations, iterations),
+        "tolerance": 1e-14,
+        "damping": MARQUARDT,
+    } | options
     objective.physics = len(p) if physics is None else physics
     end = descend(objective, np.array(p, dtype=float), None, **options)
     hessian = None if end.linear is None else end.linear.hessian
-    return Outcome(end.flown.p, hessian, end.flown.loss, end.ridge, end.effective, end.iterations, end.ending)
+    return Outcome(
+        end.point.p, hessian, end.point.loss, end.ridge, end.effective, end.iterations, end.ending
+    )
 
 
 def linear(rows=30, columns=4, seed=0, **options):
@@ -128,12 +134,19 @@ def test_the_limit_of_iterations_is_told():
     assert found.loss < rosenbrock().loss(np.array([-1.2, 1.0]))
 
 
-BOXES = [((0, 0, 0), (1.5, 5, 5)), ((0, 1.6, 0.6), (9, 9, 9)), ((0, 0, 0), (1.5, 1.0, 9)), ((-9, -9, -9), (9, 9, 9))]
+BOXES = [
+    ((0, 0, 0), (1.5, 5, 5)),
+    ((0, 1.6, 0.6), (9, 9, 9)),
+    ((0, 0, 0), (1.5, 1.0, 9)),
+    ((-9, -9, -9), (9, 9, 9)),
+]
 
 
 def by_scipy(objective, box):
     start, exact = np.clip(np.ones(3), *box), {"ftol": 1e-15, "xtol": 1e-15, "gtol": 1e-15}
-    return scipy.optimize.least_squares(objective.residual, start, objective.jacobian, box, **exact).x
+    return scipy.optimize.least_squares(
+        objective.residual, start, objective.jacobian, box, **exact
+    ).x
 
 
 @pytest.mark.parametrize("box", BOXES, ids=str)
@@ -165,7 +178,9 @@ def test_a_start_at_a_bounded_minimum_has_converged():
     at = run(decay(), [1.0, 1.0, 1.0], bounds=np.array(BOXES[0], dtype=float))
     again = run(decay(), at.p, bounds=np.array(BOXES[0], dtype=float))
     np.testing.assert_allclose(again.loss, at.loss, rtol=2e-14)  # the run's tolerance
-    np.testing.assert_allclose(again.p, at.p, rtol=1e-7)  # its root: what a loss that is flat there tells of p
+    np.testing.assert_allclose(
+        again.p, at.p, rtol=1e-7
+    )  # its root: what a loss that is flat there tells of p
     assert at.p[0] == 1.5 and again.ending is Ending.CONVERGED
 
 
@@ -181,7 +196,8 @@ def test_everything_at_a_bound_from_the_start_has_converged():
 def test_trials_that_are_not_finite_are_rejected(wild):
     """arctan p from p = 1.3: the Gauss-Newton step leads far to the other side, where there is no value."""
     objective = LeastSquares(
-        lambda p: np.where(p > -0.5, np.arctan(p), wild), lambda p: np.array([[1 / (1 + p[0] ** 2)]])
+        lambda p: np.where(p > -0.5, np.arctan(p), wild),
+        lambda p: np.array([[1 / (1 + p[0] ** 2)]]),
     )
     found = run(objective, [1.3])
     assert min(p[0] for p in objective.trials) < -0.5
@@ -204,7 +220,9 @@ def test_a_start_whose_jacobian_is_not_finite():
 
 def test_a_trial_whose_jacobian_is_not_finite_is_rejected():
     """The minimum itself is refused; the run ends beside it."""
-    objective = LeastSquares(lambda p: p - 1, lambda p: np.array([[1.0 if p[0] < 0.99 else np.nan]]))
+    objective = LeastSquares(
+        lambda p: p - 1, lambda p: np.array([[1.0 if p[0] < 0.99 else np.nan]])
+    )
     found = run(objective, [0.0])
     assert 0.5 < found.p[0] < 0.99 and np.isfinite(found.hessian).all()
 
@@ -259,17 +277,25 @@ def test_the_ridge_acts_on_the_weights_alone(physics):
     matrix, right, objective = linear()
     found = run(objective, np.ones(4), physics=physics, ridge=30.0)
     penalty = 30.0 * np.diag(np.arange(4) >= physics)
-    np.testing.assert_allclose(found.p, np.linalg.solve(matrix.T @ matrix + penalty, matrix.T @ right), rtol=1e-8)
-    assert found.loss == pytest.approx(np.sum((matrix @ found.p - right) ** 2)) and found.ridge == 30.0
+    np.testing.assert_allclose(
+        found.p, np.linalg.solve(matrix.T @ matrix + penalty, matrix.T @ right), rtol=1e-8
+    )
+    assert (
+        found.loss == pytest.approx(np.sum((matrix @ found.p - right) ** 2)) and found.ridge == 30.0
+    )
 
 
 def test_effective_weights_are_the_trace():
     """tr(H (H + αI)⁻¹) with H of the weights after projection on what the physics cannot express."""
     matrix, _, objective = linear()
     found = run(objective, np.ones(4), physics=2, ridge=30.0)
-    rest = matrix[:, 2:] - matrix[:, :2] @ np.linalg.lstsq(matrix[:, :2], matrix[:, 2:], rcond=None)[0]
+    rest = (
+        matrix[:, 2:] - matrix[:, :2] @ np.linalg.lstsq(matrix[:, :2], matrix[:, 2:], rcond=None)[0]
+    )
     h = rest.T @ rest
-    assert found.effective == pytest.approx(np.trace(h @ np.linalg.inv(h + 30 * np.eye(2))), rel=1e-10)
+    assert found.effective == pytest.approx(
+        np.trace(h @ np.linalg.inv(h + 30 * np.eye(2))), rel=1e-10
+    )
 
 
 def mackay(matrix, right, physics, samples, share, steps=5000):
@@ -318,7 +344,9 @@ def test_progress_is_called_at_every_iteration():
     found = run(rosenbrock(), [-1.2, 1.0], progress=lambda i, loss: told.append((i, loss)))
     assert [i for i, _ in told] == list(range(1, found.iterations + 1))
     losses = [loss for _, loss in told]
-    assert all(b <= a for a, b in zip(losses, losses[1:], strict=False)) and losses[-1] == found.loss
+    assert (
+        all(b <= a for a, b in zip(losses, losses[1:], strict=False)) and losses[-1] == found.loss
+    )
 
 
 # --- how many of the residuals are independent

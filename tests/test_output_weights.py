@@ -11,8 +11,7 @@ from test_cli import finite_json, run
 from orthaug._base.errors import InputError
 from orthaug.data.record import Record
 from orthaug.fitting.criteria import Simulation
-from orthaug.fitting.estimation import estimate
-from orthaug.fitting.reweighting import reweighted
+from orthaug.fitting.estimation import estimate, reweighted
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.structures import Additive, OrthogonalPenalty
 from orthaug.inference.covariance import joint_covariance
@@ -25,7 +24,11 @@ from orthaug.physics.problem import pose
 ROWS = 300
 LEARNER, SOLVER = MLP((3,)), LevenbergMarquardt(200)
 BASELINE = Baseline.from_terms(
-    [Term("a", "u[k]", output="y1"), Term("a", "40*u[k]", output="y2"), Term("b", "20*u[k]**3", output="y2")]
+    [
+        Term("a", "u[k]", output="y1"),
+        Term("a", "40*u[k]", output="y2"),
+        Term("b", "20*u[k]**3", output="y2"),
+    ]
 )
 CHOICES = ("none", "std", "covariance", (1.0, 0.01))
 
@@ -68,7 +71,9 @@ def learner_values(fit) -> np.ndarray:
 @pytest.mark.parametrize("choice", CHOICES, ids=str)
 def test_theta_is_weighted_least_squares_whatever_the_learner_does(choice):
     fit = fitted(choice)
-    np.testing.assert_allclose(fit.theta, weighted_least_squares(fit.problem.weight.matrix), rtol=1e-10)
+    np.testing.assert_allclose(
+        fit.theta, weighted_least_squares(fit.problem.weight.matrix), rtol=1e-10
+    )
     assert fit.defect is not None and fit.defect <= 1e-12
 
 
@@ -83,7 +88,9 @@ def test_theta_is_weighted_least_squares_whatever_the_learner_does(choice):
 )
 def test_what_is_chosen(choice, matrix):
     weight = pose(two_outputs(), BASELINE, output_weights=choice).weight
-    np.testing.assert_allclose(weight.matrix / weight.matrix[0, 0], matrix / matrix[0, 0], atol=1e-15)
+    np.testing.assert_allclose(
+        weight.matrix / weight.matrix[0, 0], matrix / matrix[0, 0], atol=1e-15
+    )
     whitened = two_outputs().experiments[0].outputs @ weight.matrix.T
     assert np.mean(whitened.var(axis=0)) == pytest.approx(1.0)
 
@@ -94,7 +101,11 @@ def test_none_is_the_papers_inner_product():
 
     def defect(fit) -> float:
         values = learner_values(fit)
-        return float(np.linalg.norm(np.einsum("kot,ko->t", phi, values)) / np.linalg.norm(phi) / np.linalg.norm(values))
+        return float(
+            np.linalg.norm(np.einsum("kot,ko->t", phi, values))
+            / np.linalg.norm(phi)
+            / np.linalg.norm(values)
+        )
 
     assert defect(fitted("none")) <= 1e-14
     assert defect(fitted("std")) > 1e-3
@@ -116,8 +127,12 @@ def test_covariance_of_physics_alone_is_iterated_generalised_least_squares():
         residual = y - phi @ theta
         matrix = np.linalg.inv(np.linalg.cholesky(residual.T @ residual / ROWS))
     fit = estimate(two_outputs(), BASELINE, learner=None, output_weights="covariance")
-    np.testing.assert_allclose(fit.theta, theta, rtol=1e-3)  # degrees of freedom differ between the outputs
-    rows = np.einsum("oi,kit->kot", np.linalg.inv(np.linalg.cholesky(fit.model.statistics.noise)), phi).reshape(-1, 2)
+    np.testing.assert_allclose(
+        fit.theta, theta, rtol=1e-3
+    )  # degrees of freedom differ between the outputs
+    rows = np.einsum(
+        "oi,kit->kot", np.linalg.inv(np.linalg.cholesky(fit.model.statistics.noise)), phi
+    ).reshape(-1, 2)
     np.testing.assert_allclose(fit.std, np.sqrt(np.diag(np.linalg.inv(rows.T @ rows))), rtol=1e-5)
     plain = estimate(two_outputs(), BASELINE, learner=None)
     assert np.all(fit.std < plain.std)
@@ -134,11 +149,14 @@ def test_covariance_does_not_depend_on_the_outputs_units():
 def test_numbers_weigh_squared_errors():
     """Equal numbers are "none"; a hundred times the first one's leaves θ to the first output."""
     np.testing.assert_allclose(
-        *(pose(two_outputs(), BASELINE, output_weights=c).weight.matrix for c in ("none", [3, 3])), rtol=1e-14
+        *(pose(two_outputs(), BASELINE, output_weights=c).weight.matrix for c in ("none", [3, 3])),
+        rtol=1e-14,
     )
     many = estimate(two_outputs(), BASELINE, learner=None, output_weights=[1e6, 1e-3])
     phi, y = physics()
-    assert many.theta[0] == pytest.approx(float(phi[:, 0, 0] @ y[:, 0] / (phi[:, 0, 0] @ phi[:, 0, 0])), rel=1e-4)
+    assert many.theta[0] == pytest.approx(
+        float(phi[:, 0, 0] @ y[:, 0] / (phi[:, 0, 0] @ phi[:, 0, 0])), rel=1e-4
+    )
 
 
 def test_penalties_count_in_the_units_of_the_sum_that_is_asked_for():
@@ -146,13 +164,22 @@ def test_penalties_count_in_the_units_of_the_sum_that_is_asked_for():
     weight = pose(two_outputs(), BASELINE, output_weights="none").weight
     np.testing.assert_allclose(weight.matrix, weight.unit * np.eye(2))
     structure = OrthogonalPenalty(weight=3.0)
-    fit = estimate(two_outputs(), BASELINE, learner=LEARNER, structure=structure, solver=SOLVER, output_weights="none")
+    fit = estimate(
+        two_outputs(),
+        BASELINE,
+        learner=LEARNER,
+        structure=structure,
+        solver=SOLVER,
+        output_weights="none",
+    )
     phi, y = physics()
     q = np.linalg.qr(phi.reshape(-1, 2))[0]
     values = learner_values(fit)
     residual = y - phi @ fit.theta - values
     penalised = np.sum(residual**2) + 3.0 * np.sum((q.T @ values.ravel()) ** 2)
-    moved = values + 1e-4 * (q @ (q.T @ values.ravel())).reshape(values.shape)  # along the physics, θ moved against it
+    moved = values + 1e-4 * (q @ (q.T @ values.ravel())).reshape(
+        values.shape
+    )  # along the physics, θ moved against it
     theta = np.linalg.lstsq(phi.reshape(-1, 2), (y - moved).ravel(), rcond=None)[0]
     other = np.sum((y - phi @ theta - moved) ** 2) + 3.0 * np.sum((q.T @ moved.ravel()) ** 2)
     assert penalised <= other * (1 + 1e-9)
@@ -190,7 +217,9 @@ def test_theta_and_weights_are_uncorrelated_where_errors_are_white():
     for choice in ("std", "covariance"):
         covariance = joint_covariance(fitted(choice).problem, fitted(choice).model)
         deviation = np.sqrt(np.diag(covariance))
-        across = covariance[:2, 2:] / np.outer(deviation[:2], np.where(deviation[2:] > 0, deviation[2:], np.inf))
+        across = covariance[:2, 2:] / np.outer(
+            deviation[:2], np.where(deviation[2:] > 0, deviation[2:], np.inf)
+        )
         largest[choice] = np.abs(across).max()
     assert largest["covariance"] < 1e-4 < 1e-3 < largest["std"]
 
@@ -198,7 +227,8 @@ def test_theta_and_weights_are_uncorrelated_where_errors_are_white():
 def test_the_free_run_takes_them_too():
     options = {"learner": None, "criterion": Simulation(0, 0), "structure": Additive()}
     thetas = [
-        estimate(two_outputs(), BASELINE, output_weights=choice, **options).theta for choice in ("none", "std", "auto")
+        estimate(two_outputs(), BASELINE, output_weights=choice, **options).theta
+        for choice in ("none", "std", "auto")
     ]
     for choice, theta in zip(("none", "std"), thetas, strict=False):
         matrix = pose(two_outputs(), BASELINE, output_weights=choice).weight.matrix
@@ -257,7 +287,8 @@ output_weights = WEIGHTS
 
 @pytest.mark.usefixtures("without_figures")
 @pytest.mark.parametrize(
-    ("weights", "kind"), [('"none"', "none"), ('"covariance"', "covariance"), ("[1, 0.01]", "given")]
+    ("weights", "kind"),
+    [('"none"', "none"), ('"covariance"', "covariance"), ("[1, 0.01]", "given")],
 )
 def test_from_the_spec(tmp_path, monkeypatch, weights, kind):
     monkeypatch.chdir(tmp_path)
@@ -276,4 +307,8 @@ def test_a_wrong_spec_is_one_line(tmp_path, monkeypatch):
     np.savetxt("run.csv", rows, delimiter=",", header="u,y1,y2", comments="")
     (tmp_path / "spec.toml").write_text(SPEC.replace("WEIGHTS", "[1, -1]"), encoding="utf-8")
     refused = run("check", "spec.toml")
-    assert refused.code == 2 and "2 positive weights" in refused.err and len(refused.err.splitlines()) == 1
+    assert (
+        refused.code == 2
+        and "2 positive weights" in refused.err
+        and len(refused.err.splitlines()) == 1
+    )

@@ -47,7 +47,10 @@ def test_the_version_stands_in_one_place():
 
 
 def test_the_recipe_asks_for_what_the_package_asks_for():
-    wanted = {CONDA_NAMES.get(name, name): what for name, what in bounds(PROJECT["project"]["dependencies"]).items()}
+    wanted = {
+        CONDA_NAMES.get(name, name): what
+        for name, what in bounds(PROJECT["project"]["dependencies"]).items()
+    }
     given = bounds(recipe()["requirements"]["run"])
     assert given.pop("python") == ">=${{ python_min }}"
     assert given == wanted
@@ -73,10 +76,18 @@ def test_the_oldest_dependencies_are_the_lower_bounds():
 
 
 def test_constraints_name_every_dependency():
-    pinned = {line.partition("==")[0].lower().replace("_", "-") for line in text("constraints.txt").splitlines()}
+    pinned = {
+        line.partition("==")[0].lower().replace("_", "-")
+        for line in text("constraints.txt").splitlines()
+    }
     extras = PROJECT["project"]["optional-dependencies"]
-    asked = [*PROJECT["project"]["dependencies"], *(entry for group in extras.values() for entry in group)]
-    names = {re.match(r"[A-Za-z0-9_.-]+", entry)[0].lower().replace("_", "-") for entry in asked} - {"orthaug"}
+    asked = [
+        *PROJECT["project"]["dependencies"],
+        *(entry for group in extras.values() for entry in group),
+    ]
+    names = {
+        re.match(r"[A-Za-z0-9_.-]+", entry)[0].lower().replace("_", "-") for entry in asked
+    } - {"orthaug"}
     assert names <= pinned
 
 
@@ -84,7 +95,9 @@ def test_the_workflow_tries_every_python_on_every_system():
     workflow = yaml.safe_load(text(".github/workflows/test.yml"))
     matrix = workflow["jobs"]["wheel"]["strategy"]["matrix"]
     assert {name.partition("-")[0] for name in matrix["os"]} == {"ubuntu", "macos", "windows"}
-    named = {c.rpartition(" ")[2] for c in PROJECT["project"]["classifiers"] if re.search(r"3\.\d+$", c)}
+    named = {
+        c.rpartition(" ")[2] for c in PROJECT["project"]["classifiers"] if re.search(r"3\.\d+$", c)
+    }
     assert set(matrix["python"]) == named
     steps = [step.get("run", "") for job in workflow["jobs"].values() for step in job["steps"]]
     files = re.findall(r"(?:packaging|tests)/[\w./]+|\.ci/run", " ".join(steps))
@@ -100,33 +113,48 @@ def test_the_container_copies_what_is_there():
 def test_the_wheel_carries_what_tells_of_every_key():
     wheel = PROJECT["tool"]["hatch"]["build"]["targets"]["wheel"]
     assert wheel["force-include"] == {"docs/spec.md": "orthaug/commands/spec.md"}
-    told = [line for line in text("docs/spec.md").rstrip().split("\n") if not line.startswith("<!--")]
+    told = [
+        line for line in text("docs/spec.md").rstrip().split("\n") if not line.startswith("<!--")
+    ]
     assert keys_of_a_spec().split("\n") == told  # which init's specs and the app point at
     properties = schema_of_a_spec()["properties"]
     assert {"data", "baseline", "motion", "learner", "structure", "training"} <= set(properties)
-    assert {name for name in properties if f"## [{name}]" not in keys_of_a_spec().replace("[[", "[")} == set()
+    assert {
+        name for name in properties if f"## [{name}]" not in keys_of_a_spec().replace("[[", "[")
+    } == set()
 
 
 @pytest.mark.parametrize("page", ["README.md", "docs/start.md", "docs/install.md"])
 def test_every_extra_is_told(page):
     extras = set(PROJECT["project"]["optional-dependencies"]) - {"dev"}
     told = set(
-        re.findall(r"`(\w+)`", text(page).partition("xtra")[2].partition("\n\n[")[0].partition("\nWhere an extra")[0])
+        re.findall(
+            r"`(\w+)`",
+            text(page).partition("xtra")[2].partition("\n\n[")[0].partition("\nWhere an extra")[0],
+        )
     )
     assert extras <= told
 
 
 def test_the_image_sees_what_it_copies():
     kept = [line[1:] for line in text(".dockerignore").splitlines() if line.startswith("!")]
-    (line,) = [line for line in text("packaging/Containerfile").splitlines() if line.startswith("COPY pyproject")]
+    (line,) = [
+        line
+        for line in text("packaging/Containerfile").splitlines()
+        if line.startswith("COPY pyproject")
+    ]
     assert {*line.split()[1:-1], "packaging/about.md", "docs/spec.md", "src"} == set(kept)
 
 
 def test_the_suite_runs_on_the_python_that_is_set_up():
     suite = yaml.safe_load(text(".github/workflows/test.yml"))["jobs"]["suite"]["steps"]
-    (python,) = [step["with"]["python-version"] for step in suite if "python-version" in step.get("with", {})]
+    (python,) = [
+        step["with"]["python-version"] for step in suite if "python-version" in step.get("with", {})
+    ]
     (pythons,) = [step["env"]["PYTHONS"] for step in suite if step.get("run") == ".ci/run"]
-    assert pythons == f"python{python}" and re.search(r"^PYTHONS \?= ", text("Makefile"), re.MULTILINE)
+    assert pythons == f"python{python}" and re.search(
+        r"^PYTHONS \?= ", text("Makefile"), re.MULTILINE
+    )
 
 
 def test_lines_end_alike_on_every_system():
@@ -135,11 +163,22 @@ def test_lines_end_alike_on_every_system():
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
 def test_completion(shell, tmp_path):
-    words = {"COMP_WORDS": "orthaug fit --r", "COMP_CWORD": "2", "_TYPER_COMPLETE_ARGS": "orthaug fit --r"}
+    words = {
+        "COMP_WORDS": "orthaug fit --r",
+        "COMP_CWORD": "2",
+        "_TYPER_COMPLETE_ARGS": "orthaug fit --r",
+    }
     homes = dict.fromkeys(("HOME", "USERPROFILE"), str(tmp_path))
-    system = {name: os.environ[name] for name in ("SYSTEMROOT",) if name in os.environ}  # Windows starts none without
+    system = {
+        name: os.environ[name] for name in ("SYSTEMROOT",) if name in os.environ
+    }  # Windows starts none without
     settings = {"PATH": "", "PYTHONPATH": str(ROOT / "src"), **homes, **system, **words}
-    settings |= {"_ORTHAUG_COMPLETE": f"complete_{shell}", "_TYPER_COMPLETE_FISH_ACTION": "get-args"}
+    settings |= {
+        "_ORTHAUG_COMPLETE": f"complete_{shell}",
+        "_TYPER_COMPLETE_FISH_ACTION": "get-args",
+    }
     command = [sys.executable, "-m", "orthaug"]
-    done = subprocess.run(command, env=settings, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(
+        command, env=settings, capture_output=True, text=True, timeout=60, check=False
+    )
     assert "--resume" in done.stdout and done.stderr == ""

@@ -43,7 +43,11 @@ def rmse(fit, record: Record) -> float:
 def noiseless(request):
     example = static(request.param)
     options = {"regularization": "none"}
-    return request.param, example, [estimate(example.train, example.baseline, seed=s, **options) for s in SEEDS]
+    return (
+        request.param,
+        example,
+        [estimate(example.train, example.baseline, seed=s, **options) for s in SEEDS],
+    )
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +61,10 @@ def noisy():
 def additive():
     example = static(1)
     return example, [
-        estimate(example.train, example.baseline, structure=Additive(), regularization="none", seed=s) for s in range(4)
+        estimate(
+            example.train, example.baseline, structure=Additive(), regularization="none", seed=s
+        )
+        for s in range(4)
     ]
 
 
@@ -65,7 +72,9 @@ def additive():
 def spring():
     example = mass_spring_damper()
     solver = LevenbergMarquardt(iterations=100)
-    return example, [estimate(example.train, example.baseline, solver=solver, seed=seed) for seed in range(2)]
+    return example, [
+        estimate(example.train, example.baseline, solver=solver, seed=seed) for seed in range(2)
+    ]
 
 
 ERROR = {1: (0.0, 1e-12), 2: (0.0795547, 5e-8), 3: (0.1433322, 5e-8)}  # ‖θ* − θ̂‖ without noise
@@ -84,7 +93,11 @@ def test_theta_on_the_static_sets(noiseless):
 def test_theta_is_the_same_for_every_learner(noiseless, learner):
     _, example, fits = noiseless
     fit = estimate(
-        example.train, example.baseline, learner=learner, solver=LevenbergMarquardt(20), regularization="none"
+        example.train,
+        example.baseline,
+        learner=learner,
+        solver=LevenbergMarquardt(20),
+        regularization="none",
     )
     np.testing.assert_allclose(fit.theta, fits[0].theta, rtol=0, atol=1e-10)
     assert fit.defect is None if learner is None else fit.defect <= 1e-12
@@ -92,7 +105,9 @@ def test_theta_is_the_same_for_every_learner(noiseless, learner):
 
 def test_static_sets_are_learned_without_noise(noiseless):
     _, example, fits = noiseless
-    assert np.median([rmse(fit, example.test) for fit in fits]) <= 5e-6  # the published scripts: 6e-5 to 6e-4
+    assert (
+        np.median([rmse(fit, example.test) for fit in fits]) <= 5e-6
+    )  # the published scripts: 6e-5 to 6e-4
 
 
 def test_static_set_with_noise(noisy):
@@ -101,7 +116,9 @@ def test_static_set_with_noise(noisy):
         assert np.linalg.norm(fit.theta - example.theta) == pytest.approx(0.0089013, abs=5e-8)
         assert fit.defect <= 1e-12
     errors = [rmse(fit, example.test) for fit in fits]
-    assert np.median(errors) <= 7.1e-4 and max(errors) <= 8e-4  # the published scripts: 6.9e-4 to 7.2e-4
+    assert (
+        np.median(errors) <= 7.1e-4 and max(errors) <= 8e-4
+    )  # the published scripts: 6.9e-4 to 7.2e-4
 
 
 def test_the_default_leaves_few_weights(noisy):
@@ -112,7 +129,11 @@ def test_the_default_leaves_few_weights(noisy):
 def test_theta_with_noise_is_the_same_for_every_learner(noisy, learner):
     example, fits = noisy
     fit = estimate(
-        example.train, example.baseline, learner=learner, solver=LevenbergMarquardt(20), regularization="none"
+        example.train,
+        example.baseline,
+        learner=learner,
+        solver=LevenbergMarquardt(20),
+        regularization="none",
     )
     np.testing.assert_allclose(fit.theta, fits[0].theta, rtol=0, atol=1e-10)
 
@@ -159,7 +180,11 @@ def test_theorem_1(data_set, learner):
     """‖θ* − θ̂‖ = ‖Φ⁺Δ‖ (eq:error_val): without noise it holds however good the fit is."""
     example = static(data_set)
     fit = estimate(
-        example.train, example.baseline, learner=learner, solver=LevenbergMarquardt(20), regularization="none"
+        example.train,
+        example.baseline,
+        learner=learner,
+        solver=LevenbergMarquardt(20),
+        regularization="none",
     )
     u = example.train.experiments[0].inputs[:, 0]
     delta = 0.01 - 0.5 * u**2
@@ -175,7 +200,9 @@ def test_error_of_the_additive_structure(additive):
         phi, learner = matrix(fit)
         expected = np.linalg.lstsq(phi, learner - (0.01 - 0.5 * u**2), rcond=None)[0]
         np.testing.assert_allclose(example.theta - fit.theta, expected, atol=1e-10)
-        assert np.linalg.norm(example.theta - fit.theta) == pytest.approx(np.linalg.norm(expected), abs=1e-10)
+        assert np.linalg.norm(example.theta - fit.theta) == pytest.approx(
+            np.linalg.norm(expected), abs=1e-10
+        )
 
 
 THETA = np.array([1.0, 1.0])
@@ -201,7 +228,9 @@ def test_a_dominant_physics_orders_the_errors_in_the_norm_of_phi_alone():
     record, phi, delta = twins()
     error = estimate(record, TWINS, learner=None).theta - THETA
     np.testing.assert_allclose(error, np.linalg.lstsq(phi, delta, rcond=None)[0], rtol=1e-9)
-    assert np.linalg.norm(phi @ THETA) > 1.3 * np.linalg.norm(delta)  # the assumption, with room to spare
+    assert np.linalg.norm(phi @ THETA) > 1.3 * np.linalg.norm(
+        delta
+    )  # the assumption, with room to spare
     assert np.linalg.norm(error) > 500 * np.linalg.norm(THETA)
     assert np.linalg.norm(phi @ THETA) > np.linalg.norm(delta) > np.linalg.norm(phi @ error)
 
@@ -210,10 +239,14 @@ def test_a_dominant_physics_orders_the_errors_in_the_norm_of_phi_alone():
 def test_a_dominant_physics_errs_least_in_the_norm_of_phi(seed):
     """‖Φθ*‖ > ‖Δ‖ ≥ ‖ΦΦ⁺Δ‖ of any physics, however its columns depend on each other; by a thousandth here."""
     rng = np.random.default_rng(seed)
-    phi = rng.normal(size=(30, 4)) @ np.diag(10.0 ** rng.uniform(-4, 4, 4)) @ rng.normal(size=(4, 4))
+    phi = (
+        rng.normal(size=(30, 4)) @ np.diag(10.0 ** rng.uniform(-4, 4, 4)) @ rng.normal(size=(4, 4))
+    )
     theta, delta = rng.normal(size=4), phi @ rng.normal(size=4) + 0.1 * rng.normal(size=30)
     delta *= 0.999 * np.linalg.norm(phi @ theta) / np.linalg.norm(delta)
-    assert np.linalg.norm(phi @ theta) > np.linalg.norm(Projection.factor(phi[:, None]).solve(delta[:, None]) @ phi.T)
+    assert np.linalg.norm(phi @ theta) > np.linalg.norm(
+        Projection.factor(phi[:, None]).solve(delta[:, None]) @ phi.T
+    )
 
 
 @pytest.mark.parametrize("further", [0.0, 0.01, -0.5])
@@ -232,7 +265,9 @@ def test_the_orthogonal_solution_is_in_the_equivalence_set(further):
     theta = exact.theta + further * error
     values = orthogonal.learner[:, 0] - further * (phi @ error)
     np.testing.assert_allclose(phi @ theta + values, phi @ THETA + delta, atol=1e-9)
-    shown = np.linalg.norm(np.linalg.lstsq(phi, values - delta, rcond=None)[0])  # eq:baseline_error_simple_augm
+    shown = np.linalg.norm(
+        np.linalg.lstsq(phi, values - delta, rcond=None)[0]
+    )  # eq:baseline_error_simple_augm
     assert shown == pytest.approx((1 + further) * np.linalg.norm(error), rel=1e-9)
     assert (shown > (1 + 1e-9) * np.linalg.norm(error)) == (further > 0)
 
@@ -257,7 +292,10 @@ def test_example_1(noise, regularization):
     record = first_order(noise)
     fit = estimate(record, LINEAR, learner=MLP(hidden=()), regularization=regularization)
     alone = estimate(record, LINEAR, learner=None)
-    assert sum("the learner lies in the span of the physics" in str(text) for text in fit.warnings) == 1
+    assert (
+        sum("the learner lies in the span of the physics" in str(text) for text in fit.warnings)
+        == 1
+    )
     assert fit.status.code == "converged" and np.isfinite(fit.status.loss)
     np.testing.assert_allclose(fit.theta, alone.theta, rtol=1e-12)
     np.testing.assert_allclose(fit.std, alone.std, rtol=1e-6, atol=1e-14)
@@ -271,5 +309,8 @@ def test_example_1(noise, regularization):
 def test_example_1_without_orthogonality():
     """Any (θ, W) with θ + W = θ* is a minimum of the additive structure: the sum is found, the parts are not."""
     record = first_order(0.1)
-    thetas = [estimate(record, LINEAR, learner=MLP(hidden=()), structure=Additive(), seed=s).theta for s in range(3)]
+    thetas = [
+        estimate(record, LINEAR, learner=MLP(hidden=()), structure=Additive(), seed=s).theta
+        for s in range(3)
+    ]
     assert np.ptp(thetas, axis=0).max() > 0.02

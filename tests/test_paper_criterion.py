@@ -26,14 +26,22 @@ INITIAL = np.array([0.8, 0.03])
 
 def example(**limits) -> tuple[Record, Baseline]:
     u = np.random.default_rng(5).normal(0.0, 0.3, 200)
-    terms = [Term("a", "u[k]", initial=INITIAL[0], **limits), Term("b", "u[k]**3", initial=INITIAL[1])]
+    terms = [
+        Term("a", "u[k]", initial=INITIAL[0], **limits),
+        Term("b", "u[k]**3", initial=INITIAL[1]),
+    ]
     return Record.from_arrays(u, 0.01 + u - 0.5 * u**2 + 0.1 * u**3), Baseline.from_terms(terms)
 
 
 def fitted(iterations: int, structure=STRUCTURE, **options):
     record, baseline = example()
     return estimate(
-        record, baseline, learner=LEARNER, structure=structure, solver=LevenbergMarquardt(iterations), **options
+        record,
+        baseline,
+        learner=LEARNER,
+        structure=structure,
+        solver=LevenbergMarquardt(iterations),
+        **options,
     )
 
 
@@ -54,7 +62,9 @@ def test_normal_equations_are_those_of_all_columns(known):
     scale = np.sqrt(len(phi)) / np.linalg.norm(phi * problem.weight.matrix[0, 0] / task.rms, axis=0)
 
     def residual(p):
-        values = jax.vmap(task.bound.values, in_axes=(None, 0))(p[2:], task.scaling(problem.feature_rows()))
+        values = jax.vmap(task.bound.values, in_axes=(None, 0))(
+            p[2:], task.scaling(problem.feature_rows())
+        )
         model = phi @ (INITIAL + scale * p[:2]) + task.unit * values[:, 0]
         return (problem.target[:, 0] - model) * problem.weight.matrix[0, 0] / task.rms
 
@@ -79,13 +89,17 @@ def test_it_ends_near_its_start_and_predicts_like_the_solved_one():
 
 def test_a_bound_holds():
     record, baseline = example(max=0.8)
-    fit = estimate(record, baseline, learner=LEARNER, structure=STRUCTURE, solver=LevenbergMarquardt(30))
+    fit = estimate(
+        record, baseline, learner=LEARNER, structure=STRUCTURE, solver=LevenbergMarquardt(30)
+    )
     assert fit.theta[0] <= 0.8 and "a" in fit.at_bound
 
 
 @pytest.mark.parametrize("regularization", ["evidence", 0.1])
 def test_regularization_is_refused_in_words(regularization):
-    with pytest.raises(InputError, match="regularization needs a solved θ; leave out `from_initial`"):
+    with pytest.raises(
+        InputError, match="regularization needs a solved θ; leave out `from_initial`"
+    ):
         fitted(2, regularization=regularization)
 
 

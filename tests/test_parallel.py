@@ -14,7 +14,7 @@ import scipy.linalg  # noqa: F401  (brings a BLAS of its own)
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from orthaug._base import parallel
-from orthaug._base.parallel import Stopped, one_blas_thread, spread
+from orthaug._base.parallel import RunCancelled, one_blas_thread, spread
 from orthaug.data.record import Record
 from orthaug.fitting.estimation import estimate
 from orthaug.fitting.solvers.adam_lbfgs import AdamLBFGS
@@ -31,7 +31,9 @@ def cores(monkeypatch):
 
 def test_blas_has_one_thread_inside_and_what_it_had_after():
     def threads():
-        return {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
+        return {
+            library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"
+        }
 
     with threadpool_limits(limits=2, user_api="blas"):
         before = threads()
@@ -60,7 +62,9 @@ def test_results_keep_the_order_of_the_items(cores):
 def test_one_item_or_one_core_runs_inline(cores, items, count):
     cores(count)
     here = threading.get_ident()
-    assert spread(lambda item, check: (check(), item, threading.get_ident())[1:], items) == [(i, here) for i in items]
+    assert spread(lambda item, check: (check(), item, threading.get_ident())[1:], items) == [
+        (i, here) for i in items
+    ]
 
 
 class Odd(Exception):
@@ -72,7 +76,7 @@ def until_stopped(ended: Counter, check) -> None:
     for _ in range(200):
         try:
             check()
-        except Stopped:
+        except RunCancelled:
             ended["stopped"] += 1
             raise
         time.sleep(0.01)
@@ -189,5 +193,12 @@ def test_what_progress_raises_in_any_run_ends_the_estimate(cores):
 
     solver = LevenbergMarquardt(iterations=100_000, tolerance=0.0)
     with pytest.raises(KeyboardInterrupt):
-        estimate(record_of(), PHYSICS, learner=MLP(hidden=(4,)), solver=solver, restarts=3, progress=progress)
+        estimate(
+            record_of(),
+            PHYSICS,
+            learner=MLP(hidden=(4,)),
+            solver=solver,
+            restarts=3,
+            progress=progress,
+        )
     assert 1 in heard

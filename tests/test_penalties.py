@@ -16,8 +16,12 @@ from orthaug.fitting.structures import Additive, BaselinePenalty, Orthogonal, Or
 from orthaug.models.learners import MLP
 from orthaug.studies.synthetic import mass_spring_damper
 
-PIPELINE = AdamLBFGS(adam_iterations=100, lbfgs_iterations=60)  # of the scripts' 2500 and 500: θ stands by then
-LONGER = AdamLBFGS(adam_iterations=300, lbfgs_iterations=150)  # where the weight is neither small nor large
+PIPELINE = AdamLBFGS(
+    adam_iterations=100, lbfgs_iterations=60
+)  # of the scripts' 2500 and 500: θ stands by then
+LONGER = AdamLBFGS(
+    adam_iterations=300, lbfgs_iterations=150
+)  # where the weight is neither small nor large
 SHORT = LevenbergMarquardt(iterations=30)
 PENALTIES = (OrthogonalPenalty, BaselinePenalty)
 
@@ -55,7 +59,9 @@ def published(structure):
 
 
 def test_a_large_orthogonal_penalty_gives_the_orthogonal_structure():
-    np.testing.assert_allclose(fit(OrthogonalPenalty(1e5), SHORT).theta, fit(Orthogonal(), SHORT).theta, rtol=1e-4)
+    np.testing.assert_allclose(
+        fit(OrthogonalPenalty(1e5), SHORT).theta, fit(Orthogonal(), SHORT).theta, rtol=1e-4
+    )
 
 
 def test_a_large_orthogonal_penalty_drives_the_learner_out_of_the_physics():
@@ -64,7 +70,9 @@ def test_a_large_orthogonal_penalty_drives_the_learner_out_of_the_physics():
 
 
 def test_a_large_baseline_penalty_gives_the_initial_values():
-    np.testing.assert_allclose(fit(BaselinePenalty(1e5), SHORT).theta, (0.61, -0.52, 4.7e-5), rtol=1e-4)
+    np.testing.assert_allclose(
+        fit(BaselinePenalty(1e5), SHORT).theta, (0.61, -0.52, 4.7e-5), rtol=1e-4
+    )
 
 
 @pytest.mark.parametrize("penalty", PENALTIES)
@@ -76,14 +84,18 @@ def test_a_small_penalty_gives_the_additive_structure(penalty):
 
 @pytest.mark.parametrize("penalty", PENALTIES)
 def test_no_penalty_is_the_additive_structure(penalty):
-    np.testing.assert_allclose(fit(penalty(0.0), SHORT).theta, fit(Additive(), SHORT).theta, rtol=1e-6)
+    np.testing.assert_allclose(
+        fit(penalty(0.0), SHORT).theta, fit(Additive(), SHORT).theta, rtol=1e-6
+    )
 
 
 @pytest.mark.proof
 def test_theta_error_falls_with_the_orthogonal_penalty(record_property):
     """Published: 0.104, 0.078, 0.0141, 0.0130 at 1e-4, 1e-2, 0.1, 10, and 0.01325 of the orthogonal structure."""
     weights, pipelines = (1e-4, 1e-1, 10.0), (PIPELINE, LONGER, PIPELINE)
-    small, large, largest = (error(OrthogonalPenalty(w), p) for w, p in zip(weights, pipelines, strict=True))
+    small, large, largest = (
+        error(OrthogonalPenalty(w), p) for w, p in zip(weights, pipelines, strict=True)
+    )
     record_property("relative error of θ", f"{small:.4f}, {large:.4f}, {largest:.4f}")
     assert small > large > 0.012
     assert large == pytest.approx(0.0133, abs=0.002)

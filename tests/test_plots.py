@@ -18,7 +18,9 @@ from orthaug.reports.result import ParameterResult, RowResult
 CHANNELS = (Channel("position", "m"), Channel("angle"))
 
 
-def response(ny: int = 1, rows: int = 900, measured: bool = True, diverged: bool = False) -> Response:
+def response(
+    ny: int = 1, rows: int = 900, measured: bool = True, diverged: bool = False
+) -> Response:
     rng = np.random.default_rng(0)
     baseline, learner, noise = rng.normal(size=(3, rows, ny))
     baseline[:2] = learner[:2] = np.nan
@@ -46,7 +48,9 @@ def test_every_figure(tmp_path, name, ny):
     assert len(figure.axes) == panels * ny
     labels = " | ".join(axis.get_ylabel() for axis in figure.axes)
     if name == "components":
-        assert labels == " | ".join(["baseline [m]", "learner [m]", "baseline", "learner"][: 2 * ny])
+        assert labels == " | ".join(
+            ["baseline [m]", "learner [m]", "baseline", "learner"][: 2 * ny]
+        )
     else:
         assert "position [m]" in labels and ("angle" in labels) == (ny == 2)
     assert figure.axes[-1].get_xlabel() == "time [s]"
@@ -74,8 +78,12 @@ def test_legends():
 def test_text_that_looks_like_a_formula_is_drawn_as_it_is(tmp_path, text):
     """In units, titles, names of parameters, suspects and rows."""
     odd = Response(response().trajectories, 1, (Channel("position", text),), 0.1)
-    parameter = ParameterResult(name="a", unit=text, initial=0.0, value=1.0, std=0.1, ci95=[0.8, 1.2])
-    unknown = dict.fromkeys(("structure", "residuals", "learner_to_physics", "validation", "seconds"))
+    parameter = ParameterResult(
+        name="a", unit=text, initial=0.0, value=1.0, std=0.1, ci95=[0.8, 1.2]
+    )
+    unknown = dict.fromkeys(
+        ("structure", "residuals", "learner_to_physics", "validation", "seconds")
+    )
     row = RowResult.model_construct(name=text, parameters=[parameter], scores={}, **unknown)
     suspect = SuspectResult.model_construct(
         name=text,
@@ -103,7 +111,9 @@ def test_output_shows_a_window_from_the_first_value_on():
     rows = slice(2, 2 + len(time))
     assert 100 <= len(time) <= 500
     np.testing.assert_allclose(time, 0.1 * np.arange(rows.start, rows.stop))
-    np.testing.assert_array_equal(axis.lines[0].get_ydata(), shown.trajectories[0].measured[rows, 0])
+    np.testing.assert_array_equal(
+        axis.lines[0].get_ydata(), shown.trajectories[0].measured[rows, 0]
+    )
     np.testing.assert_array_equal(axis.lines[1].get_ydata(), shown.model[rows, 0])
     difference = shown.trajectories[0].measured[rows, 0] - shown.model[rows, 0]
     np.testing.assert_array_equal(lower.lines[0].get_ydata(), difference)
@@ -147,6 +157,11 @@ def test_a_run_that_diverged_is_drawn_as_far_as_it_goes(tmp_path, name):
 @pytest.mark.parametrize("name", FIGURES)
 def test_a_short_record(tmp_path, name):
     figure = FIGURES[name][0](response(rows=3), "one sample")
-    values = [line.get_ydata() for axis in figure.axes for line in axis.lines if len(line.get_ydata()) != 2]
+    values = [
+        line.get_ydata()
+        for axis in figure.axes
+        for line in axis.lines
+        if len(line.get_ydata()) != 2
+    ]
     assert all(np.isfinite(shown).sum() == 1 for shown in values) and values
     assert drawn(figure, tmp_path / "figure.png")

@@ -11,10 +11,34 @@ from test_architecture import FILES, in_files
 
 ONLY_POSIX = {
     **dict.fromkeys(("fcntl", "grp", "pwd", "pty", "termios", "tty", "syslog", "resource"), ()),
-    "os": ("fork", "forkpty", "killpg", "setsid", "getuid", "geteuid", "mkfifo", "getpgid", "wait3", "uname", "nice"),
-    "signal": ("SIGKILL", "SIGPIPE", "SIGHUP", "SIGUSR1", "SIGUSR2", "SIGALRM", "alarm", "setitimer", "pause"),
+    "os": (
+        "fork",
+        "forkpty",
+        "killpg",
+        "setsid",
+        "getuid",
+        "geteuid",
+        "mkfifo",
+        "getpgid",
+        "wait3",
+        "uname",
+        "nice",
+    ),
+    "signal": (
+        "SIGKILL",
+        "SIGPIPE",
+        "SIGHUP",
+        "SIGUSR1",
+        "SIGUSR2",
+        "SIGALRM",
+        "alarm",
+        "setitimer",
+        "pause",
+    ),
 }
-ASKED_FIRST = dict.fromkeys(("_base.memory", "commands.app.worker"), {"resource"})  # in a `try`, and done without
+ASKED_FIRST = dict.fromkeys(
+    ("_base.memory", "commands.app.worker"), {"resource"}
+)  # in a `try`, and done without
 TEXT = {"read_text": 0, "write_text": 1}  # and how many arguments stand before the encoding
 
 
@@ -25,8 +49,14 @@ def foreign(tree: ast.AST) -> Iterator[str]:
             yield from (alias.name for alias in node.names if ONLY_POSIX.get(alias.name) == ())
         elif isinstance(node, ast.ImportFrom) and node.module in ONLY_POSIX:
             names = [alias.name for alias in node.names]
-            yield from (name for name in names if not ONLY_POSIX[node.module] or name in ONLY_POSIX[node.module])
-        elif isinstance(node, ast.Attribute) and node.attr in ONLY_POSIX.get(name_of(node.value), ()):
+            yield from (
+                name
+                for name in names
+                if not ONLY_POSIX[node.module] or name in ONLY_POSIX[node.module]
+            )
+        elif isinstance(node, ast.Attribute) and node.attr in ONLY_POSIX.get(
+            name_of(node.value), ()
+        ):
             yield f"{name_of(node.value)}.{node.attr}"
 
 
@@ -39,7 +69,9 @@ def without_encoding(tree: ast.AST) -> Iterator[str]:
     for node in ast.walk(tree):
         if not isinstance(node, ast.Call):
             continue
-        verb = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
+        verb = (
+            node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
+        )
         said = any(keyword.arg == "encoding" for keyword in node.keywords)
         if verb in TEXT and not said and len(node.args) <= TEXT[verb]:
             if not any(keyword.arg is None for keyword in node.keywords):
@@ -53,12 +85,20 @@ def is_text(node: ast.Call) -> bool:
     if isinstance(node.func, ast.Attribute) and name_of(node.func.value) in ("os", "archive"):
         return False
     place = 1 if isinstance(node.func, ast.Name) else 0
-    modes = [*node.args[place : place + 1], *(keyword.value for keyword in node.keywords if keyword.arg == "mode")]
+    modes = [
+        *node.args[place : place + 1],
+        *(keyword.value for keyword in node.keywords if keyword.arg == "mode"),
+    ]
     return not any(isinstance(mode, ast.Constant) and "b" in str(mode.value) for mode in modes)
 
 
 def test_every_system_has_what_is_used():
-    assert in_files(lambda name: sorted(set(foreign(parsed(FILES[name]))) - ASKED_FIRST.get(name, set()))) == {}
+    assert (
+        in_files(
+            lambda name: sorted(set(foreign(parsed(FILES[name]))) - ASKED_FIRST.get(name, set()))
+        )
+        == {}
+    )
     assert in_files(lambda name: list(without_encoding(parsed(FILES[name])))) == {}
 
 

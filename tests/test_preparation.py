@@ -45,7 +45,9 @@ def test_trends_are_taken_out_of_each_experiment():
     assert np.allclose(means, 0, atol=1e-12)
 
 
-@pytest.mark.parametrize(("step", "kept", "gone"), [(oa.Lowpass, SLOW, FAST), (oa.Highpass, FAST, SLOW)])
+@pytest.mark.parametrize(
+    ("step", "kept", "gone"), [(oa.Lowpass, SLOW, FAST), (oa.Highpass, FAST, SLOW)]
+)
 def test_filters_of_zero_phase(step, kept, gone):
     done = prepared(SLOW + FAST, step(cutoff=12.0))
     assert np.abs(done - kept)[MIDDLE].max() < 2e-3 and np.abs(done - gone)[MIDDLE].max() > 0.5
@@ -78,7 +80,10 @@ def test_inputs_and_outputs_of_a_linear_plant_keep_their_relation_through_a_filt
 
 def test_filters_act_within_experiments():
     rng = np.random.default_rng(2)
-    one, other = record(rng.normal(size=200), np.ones(200)), record(9 + rng.normal(size=300), np.ones(300))
+    one, other = (
+        record(rng.normal(size=200), np.ones(200)),
+        record(9 + rng.normal(size=300), np.ones(300)),
+    )
     steps = oa.Lowpass(cutoff=10.0), oa.Decimate(factor=4)
     joined = oa.prepare(oa.Record.join([one, other]), *steps)
     alone = [oa.prepare(part, *steps).experiments[0] for part in (one, other)]
@@ -103,7 +108,10 @@ def test_outliers_are_marked_and_short_gaps_reconstructed():
     for method in ("linear", "pchip"):
         filled = oa.prepare(record(y), oa.Outliers(), oa.Fill(most=2, method=method))
         assert len(filled) == 1000 and filled.prepared[1].samples == 3
-        assert np.abs(filled.experiments[0].outputs[[100, 400, 401], 0] - SLOW[[100, 400, 401]]).max() < 0.1
+        assert (
+            np.abs(filled.experiments[0].outputs[[100, 400, 401], 0] - SLOW[[100, 400, 401]]).max()
+            < 0.1
+        )
     assert len(oa.prepare(record(y), oa.Outliers(), oa.Fill(most=1)).experiments) == 2
     square = np.where(SLOW >= 0, 1.0, -1.0)
     assert np.array_equal(prepared(square, oa.Outliers()), square)
@@ -127,7 +135,9 @@ def test_uneven_time_stamps_get_an_even_grid(tmp_path):
         oa.read_record(tmp_path / "a.csv", **options)
     steps = [oa.Resample(sampling_time=0.01, method="pchip"), oa.Lowpass(cutoff=20.0)]
     done = oa.read_record(tmp_path / "a.csv", **options, missing="skip", prepare=steps)
-    assert done.sampling_time == 0.01 and len(done.experiments) == 2  # nothing is invented for a second
+    assert (
+        done.sampling_time == 0.01 and len(done.experiments) == 2
+    )  # nothing is invented for a second
     for e in done.experiments:
         truth = np.sin(4 * (e.start_time + 0.01 * np.arange(len(e))))
         assert np.abs(e.outputs[:, 0] - truth)[40:-40].max() < 1e-3
@@ -167,25 +177,43 @@ def test_empty_cells_are_filled_when_they_are_read(tmp_path):
 
 
 REFUSED = [
-    (lambda: oa.prepare(record(SLOW), oa.Lowpass(cutoff=50.0)), "`cutoff`: 50 Hz is not below 50 Hz"),
-    (lambda: oa.prepare(record(SLOW), oa.Lowpass(cutoff=1.0, channels=("x",))), "`channels`: no channel 'x'"),
-    (lambda: oa.prepare(record(SLOW), oa.Lowpass(cutoff=1.0, channels=3)), "`channels` must be a list"),
+    (
+        lambda: oa.prepare(record(SLOW), oa.Lowpass(cutoff=50.0)),
+        "`cutoff`: 50 Hz is not below 50 Hz",
+    ),
+    (
+        lambda: oa.prepare(record(SLOW), oa.Lowpass(cutoff=1.0, channels=("x",))),
+        "`channels`: no channel 'x'",
+    ),
+    (
+        lambda: oa.prepare(record(SLOW), oa.Lowpass(cutoff=1.0, channels=3)),
+        "`channels` must be a list",
+    ),
     (lambda: oa.prepare(record(SLOW), oa.Shift("y", 1)), "'y' is no input; the inputs are u"),
-    (lambda: oa.prepare(record(SLOW), oa.Shift("u", 1000)), "has 1000 rows, too few to be shifted by 1000"),
+    (
+        lambda: oa.prepare(record(SLOW), oa.Shift("u", 1000)),
+        "has 1000 rows, too few to be shifted by 1000",
+    ),
     (lambda: oa.prepare(record(SLOW), oa.Shift("u", 1.5)), "`samples` must be a whole number"),
     (lambda: oa.prepare(record(SLOW), oa.Resample(sampling_time=1e-9)), "take a longer one"),
     (
         lambda: oa.prepare(record(SLOW).rows(0, 9), oa.Lowpass(cutoff=1.0)),
-        "has 9 rows, a filter of zero phase",
+        "has 9 rows, but a filter of zero phase",
     ),
-    (lambda: oa.prepare(record(SLOW), "lowpass"), "preparation takes steps, which are Detrend"),
+    (
+        lambda: oa.prepare(record(SLOW), "lowpass"),
+        "preparation takes a list of steps with their arguments: Detrend",
+    ),
     (lambda: oa.prepare(SLOW, oa.Detrend()), "`record` must be a Record"),
     (lambda: oa.Lowpass(cutoff=0.0), "cutoff"),
     (lambda: oa.Lowpass(cutoff=1.0, order=11), "`order` must be at most 10"),
     (lambda: oa.Lowpass(cutoff=1.0, phase="linear"), "`phase`"),
     (lambda: oa.Detrend(degree=2), "`degree` must be 0"),
     (lambda: oa.Decimate(factor=1), "factor"),
-    (lambda: oa.Record.join([record(SLOW), oa.prepare(record(SLOW), oa.Detrend())]), "prepare all alike"),
+    (
+        lambda: oa.Record.join([record(SLOW), oa.prepare(record(SLOW), oa.Detrend())]),
+        "prepare all alike",
+    ),
 ]
 
 
@@ -219,9 +247,16 @@ def test_a_spec_prepares_every_part_and_the_result_tells(tmp_path, monkeypatch):
     assert result["data"]["prepare"][1]["options"]["cutoff"] == 0.4
     assert [w["code"] for w in result["warnings"]].count("filtered_noise") == 1
     told = run("simulate", "result", "run.csv", "--out", "free.csv")
-    assert told.code == 0 and "fitted to prepared data: detrend (degree 0), lowpass (cutoff 0.4" in told.err
+    assert (
+        told.code == 0
+        and "fitted to prepared data: detrend (degree 0), lowpass (cutoff 0.4" in told.err
+    )
     told = run("export", "result", "--to", "numpy", "--out", "code")
-    assert told.code == 0 and "The code stands for data after these steps" in told.err and "detrend" in told.err
+    assert (
+        told.code == 0
+        and "The code expects data after these steps" in told.err
+        and "detrend" in told.err
+    )
     for wrong, message in (
         ('step = "lowpas"\n', "'lowpass'"),
         ('step = "lowpass"\n', "cutoff"),
@@ -269,12 +304,24 @@ def test_a_saved_model_knows_how_its_data_were_prepared(decimated, monkeypatch):
     raw = {"inputs": ["u"], "outputs": ["y"], "sampling_time": model.sampling_time / 2}
     record = oa.read_record("run.csv", **raw, prepare=model.preparation)
     done = run("simulate", "again", "run.csv", "--prepare", "--out", "free.csv", "--force")
-    assert done.code == 0 and "The same was done to these data, here with outliers" in unfolded(done.err), done.err
+    assert done.code == 0 and "The same was done to these data, here with outliers" in unfolded(
+        done.err
+    ), done.err
     free = pd.read_csv("free.csv")
     (expected,) = model.simulate(record).trajectories
     np.testing.assert_allclose(free["y_model"], expected.model[:, 0], rtol=1e-12)
     np.testing.assert_allclose(np.diff(free["time"]), model.sampling_time)
-    done = run("predict", "result", "run.csv", "--horizon", "3", "--prepare", "--out", "ahead.csv", "--force")
+    done = run(
+        "predict",
+        "result",
+        "run.csv",
+        "--horizon",
+        "3",
+        "--prepare",
+        "--out",
+        "ahead.csv",
+        "--force",
+    )
     assert done.code == 0 and len(pd.read_csv("ahead.csv")) == len(free)
 
 
@@ -282,9 +329,14 @@ def test_a_file_of_other_instants_needs_a_word(decimated, monkeypatch):
     """Rows of 1 s taken as rows of 2 s would run at half the speed, and nothing would tell."""
     monkeypatch.chdir(decimated)
     done = run("simulate", "result", "run.csv")
-    assert done.code == 2 and "give --prepare for a file as it was measured, or --no-prepare" in done.err, done.err
+    assert (
+        done.code == 2
+        and "give --prepare for a file as it was measured, or --no-prepare" in done.err
+    ), done.err
     done = run("simulate", "result", "inputs.csv", "--no-prepare", "--out", "plain.csv")
-    assert done.code == 0 and "are taken as they are; --prepare does" in unfolded(done.err), done.err
+    assert done.code == 0 and "are taken as they are; --prepare does" in unfolded(done.err), (
+        done.err
+    )
     assert len(pd.read_csv("plain.csv")) == len(pd.read_csv("inputs.csv"))
 
 
@@ -293,7 +345,10 @@ def test_code_tells_what_its_signals_stand_for(decimated, monkeypatch):
     assert run("export", "result", "--to", "c", "--out", "code").code == 0
     for file in ("README.md", "model.h"):
         text = (decimated / "code" / file).read_text(encoding="utf-8")
-        assert "detrend (degree 0), decimate (factor 2, phase zero), shift (channel u, samples 1)" in text
+        assert (
+            "detrend (degree 0), decimate (factor 2, phase zero), shift (channel u, samples 1)"
+            in text
+        )
         assert "outliers" not in text
 
 
@@ -308,7 +363,9 @@ def test_outputs_that_a_file_lacks_are_not_prepared(decimated, monkeypatch):
         prepare=[STEPS[0][1], STEPS[3][1], STEPS[4][1]],
     )
     (expected,) = oa.load("result").simulate(record, initial="zero").trajectories
-    np.testing.assert_allclose(pd.read_csv("driven.csv")["y_model"], expected.model[:, 0], rtol=1e-12)
+    np.testing.assert_allclose(
+        pd.read_csv("driven.csv")["y_model"], expected.model[:, 0], rtol=1e-12
+    )
 
 
 def test_training_files_are_prepared_again_for_a_split_and_for_tracking(decimated, monkeypatch):
@@ -323,14 +380,20 @@ def test_training_files_are_prepared_again_for_a_split_and_for_tracking(decimate
     assert done.code == 0, done.err
     assert "the model was fitted to prepared data" in done.err
     done = run("explain", "result", "run.csv")
-    assert "prepared data: detrend" in done.err and "1 sample marked as missing" in unfolded(done.err), done.err
+    assert "prepared data: detrend" in done.err and "1 sample marked as missing" in unfolded(
+        done.err
+    ), done.err
     done = run("linearize", "result")
-    assert done.code == 0 and "Operating points are those of data after these steps" in unfolded(done.err), done.err
+    assert done.code == 0 and "Operating points are those of data after these steps" in unfolded(
+        done.err
+    ), done.err
 
 
 def test_instants_are_resampled_as_those_of_the_training_data():
     resampled = Prepared("resample", {"method": "linear"})
-    steps, step = steps_again([resampled, Prepared("decimate", {"factor": 5, "phase": "zero"})], ["u"], 0.1)
+    steps, step = steps_again(
+        [resampled, Prepared("decimate", {"factor": 5, "phase": "zero"})], ["u"], 0.1
+    )
     assert steps == (oa.Resample(sampling_time=0.02), oa.Decimate(factor=5)) and step == 0.02
 
 

@@ -39,7 +39,9 @@ def test_rows_and_weight():
 
 
 def test_each_output_has_its_weight():
-    baseline = Baseline.from_terms([Term("a", "u1[k]", output="y1"), Term("a", "u2[k]", output="y2")])
+    baseline = Baseline.from_terms(
+        [Term("a", "u1[k]", output="y1"), Term("a", "u2[k]", output="y2")]
+    )
     problem = pose(PAIR, baseline)
     np.testing.assert_allclose(problem.whitened_target.std(axis=0), 1.0)
     expected = np.stack([U, -(U**2)], axis=1) / problem.deviation
@@ -47,15 +49,23 @@ def test_each_output_has_its_weight():
 
 
 def test_fixed_terms_leave_the_target():
-    problem = pose(RECORD, Baseline.from_terms([Term("a", "y[k-1]", initial=0.5, fixed=True), Term("b", "u[k]")]))
+    problem = pose(
+        RECORD,
+        Baseline.from_terms([Term("a", "y[k-1]", initial=0.5, fixed=True), Term("b", "u[k]")]),
+    )
     np.testing.assert_allclose(problem.target[:, 0], Y[1:] - 0.5 * Y[:-1])
     assert problem.projection.phi.shape == (19, 1, 1)
 
 
 def test_a_target_that_fixed_terms_explain_whole():
     record = Record.from_arrays(U, 2 * U)
-    problem = pose(record, Baseline.from_terms([Term("a", "u[k]", initial=2.0, fixed=True), Term("b", "1")]))
-    assert not problem.target.any() and problem.weight.matrix == 1 / record.experiments[0].outputs.std()
+    problem = pose(
+        record, Baseline.from_terms([Term("a", "u[k]", initial=2.0, fixed=True), Term("b", "1")])
+    )
+    assert (
+        not problem.target.any()
+        and problem.weight.matrix == 1 / record.experiments[0].outputs.std()
+    )
 
 
 @pytest.mark.parametrize(
@@ -76,13 +86,17 @@ def test_layout_holds_what_physics_and_learner_use(lags, inputs, layout, feature
 
 def test_learner_inputs_may_use_the_baseline_s_constants():
     baseline = Baseline.from_terms([Term("a", "u[k]")], {"gain": 2.0})
-    np.testing.assert_array_equal(pose(RECORD, baseline, None, ("gain*u[k]",)).feature_rows()[:, 0], 2 * U)
+    np.testing.assert_array_equal(
+        pose(RECORD, baseline, None, ("gain*u[k]",)).feature_rows()[:, 0], 2 * U
+    )
 
 
 def test_rank_is_reported_where_asked():
     problem = pose(RECORD, physics("u[k]", "2*u[k]", "y[k-1]"), require_full_rank=False)
     assert (problem.excitation.rank, problem.excitation.collinear) == (2, (("t0", "t1"),))
-    with pytest.raises(RankError, match="rank 2 of 3.: the columns of t0, t1 are linearly dependent"):
+    with pytest.raises(
+        RankError, match="rank 2 of 3.: the columns of t0, t1 are linearly dependent"
+    ):
         pose(RECORD, physics("u[k]", "2*u[k]", "y[k-1]"))
 
 
@@ -113,7 +127,9 @@ REFUSED = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("record", "baseline", "options", "message"), REFUSED, ids=range(len(REFUSED)))
+@pytest.mark.parametrize(
+    ("record", "baseline", "options", "message"), REFUSED, ids=range(len(REFUSED))
+)
 def test_refused(record, baseline, options, message):
     with pytest.raises(InputError, match=message):
         pose(record, baseline, **options)
@@ -128,7 +144,10 @@ def test_the_sampling_time_is_a_name():
     np.testing.assert_array_equal(found.projection.phi, wanted.projection.phi)
     np.testing.assert_array_equal(found.feature_rows(), wanted.feature_rows())
     assert dict(found.baseline.constants) == constants  # as a saved model needs it
-    with pytest.raises(InputError, match="the constant 'Ts' is 0.5, but the data are sampled every 0.25 s. Ts is the"):
+    with pytest.raises(
+        InputError,
+        match="the constant 'Ts' is 0.5, but the data are sampled every 0.25 s. Ts is the",
+    ):
         pose(Record.from_arrays(U, Y, sampling_time=0.25), declared)
     with pytest.raises(InputError, match="'Ts' is a constant and a channel"):
         pose(Record.from_arrays(U, Y, inputs=["Ts"]), physics("Ts[k]", "Ts*y[k-1]"))
@@ -137,16 +156,20 @@ def test_the_sampling_time_is_a_name():
 @pytest.mark.parametrize("initial", [None, 0.5])
 def test_initial_values_are_within_their_bounds(initial):
     with pytest.raises(
-        InputError, match="the initial value of 't0' is .*; its bounds are 1 and inf. Give an `initial`"
+        InputError,
+        match="the initial value of 't0' is .*; its bounds are 1 and inf. Give an `initial`",
     ):
         pose(RECORD, physics("u[k]", min=1.0, initial=initial))
 
 
 @pytest.mark.parametrize(
-    ("u", "y", "name"), [(np.full(20, 3.0), Y, "'u' is constant .3."), (U, np.zeros(20), "'y' is constant .0.")]
+    ("u", "y", "name"),
+    [(np.full(20, 3.0), Y, "'u' is constant .3."), (U, np.zeros(20), "'y' is constant .0.")],
 )
 def test_constant_channels(u, y, name):
-    with pytest.raises(InputError, match=f"channel {name} over all training data; nothing can be learned from it"):
+    with pytest.raises(
+        InputError, match=f"channel {name} over all training data; nothing can be learned from it"
+    ):
         pose(Record.from_arrays(u, y), physics("u[k]"))
 
 
@@ -163,10 +186,22 @@ ZERO_AT_7 = np.where(np.arange(20) == 7, 0.0, U)
 @pytest.mark.parametrize(
     ("baseline", "options", "message"),
     [
-        (physics("log(u[k])"), {}, r"row 7: the regressor of t0 \(log\(u\[k\]\)\) is not finite there"),
+        (
+            physics("log(u[k])"),
+            {},
+            r"row 7: the regressor of t0 \(log\(u\[k\]\)\) is not finite there",
+        ),
         (physics("1/u[k-2]"), {}, r"row 9: the regressor of t0 \(1/u\[k-2\]\) is not finite there"),
-        (physics("1/u[k]", initial=1.0, fixed=True), {}, "row 7: the sum of the fixed terms is not finite there"),
-        (physics("u[k]"), {"learner_inputs": ("log(u[k])",)}, r"row 7: the learner input log\(u\[k\]\) is not finite"),
+        (
+            physics("1/u[k]", initial=1.0, fixed=True),
+            {},
+            "row 7: the sum of the fixed terms is not finite there",
+        ),
+        (
+            physics("u[k]"),
+            {"learner_inputs": ("log(u[k])",)},
+            r"row 7: the learner input log\(u\[k\]\) is not finite",
+        ),
     ],
 )
 def test_expressions_without_a_value_name_the_row(baseline, options, message):
@@ -179,5 +214,7 @@ def test_expressions_without_a_value_name_the_row(baseline, options, message):
 
 def test_a_baseline_function_without_a_value_names_the_row():
     function = Baseline.from_function(lambda x: jnp.log(x)[None], ["a"])
-    with pytest.raises(InputError, match=r"row 7: the regressor of a \(the baseline function\) is not finite there"):
+    with pytest.raises(
+        InputError, match=r"row 7: the regressor of a \(the baseline function\) is not finite there"
+    ):
         pose(Record.from_arrays(ZERO_AT_7, Y), function, Lags(nb=1, nk=0))

@@ -35,7 +35,9 @@ def nist(folder, name):
     """φ (N, 1, nθ) and y (N, 1) by the path that estimates θ, and what was computed in exact fractions."""
     table = pd.read_csv(folder / "nist_linear" / f"{name}.csv", encoding="utf-8-sig")
     channels = [c for c in table.columns if c != "y"]
-    record = Record.from_arrays(table[channels].to_numpy(), table["y"].to_numpy(), inputs=channels, outputs=["y"])
+    record = Record.from_arrays(
+        table[channels].to_numpy(), table["y"].to_numpy(), inputs=channels, outputs=["y"]
+    )
     baseline = Baseline.from_terms([Term(f"b{i}", text) for i, text in enumerate(NIST[name])])
     rows = stack_rows(record, in_order(baseline.lags, ["y"], channels))
     phi = baseline.phi(rows.x, rows.layout, ("y",), np)
@@ -45,7 +47,10 @@ def nist(folder, name):
 def digits(theta, certified) -> float:
     """Correct digits of the worst coefficient, at most 15."""
     with mpmath.workdps(40):
-        errors = [abs(mpmath.mpf(float(t)) / mpmath.mpf(b) - 1) for t, b in zip(theta, certified, strict=True)]
+        errors = [
+            abs(mpmath.mpf(float(t)) / mpmath.mpf(b) - 1)
+            for t, b in zip(theta, certified, strict=True)
+        ]
         return min(15.0, *(float(-mpmath.log10(e)) if e else 15.0 for e in errors))
 
 
@@ -70,7 +75,9 @@ def test_nist_digits(data_folder, name):
 def test_nist_standard_deviations(data_folder, name):
     phi, y, certified = nist(data_folder, name)
     factor = Projection.factor(phi).covariance_factor()
-    found = math.sqrt(float(certified["rss"]) / (len(y) - len(factor))) * np.linalg.norm(factor, axis=1)
+    found = math.sqrt(float(certified["rss"]) / (len(y) - len(factor))) * np.linalg.norm(
+        factor, axis=1
+    )
     assert digits(found, certified["sd"]) > 9
 
 
@@ -81,14 +88,18 @@ def test_normal_equations_lose_longley(data_folder):
     assert digits(Projection.factor(phi).solve(y), certified["beta"]) > 10.0
 
 
-SHAPES = st.tuples(st.integers(8, 30), st.integers(1, 3), st.integers(0, 5), st.integers(0, 2**32 - 1))
+SHAPES = st.tuples(
+    st.integers(8, 30), st.integers(1, 3), st.integers(0, 5), st.integers(0, 2**32 - 1)
+)
 
 
 def draw(shape):
     """φ with columns of very different size, and values to project."""
     rows, ny, nt, seed = shape
     rng = np.random.default_rng(seed)
-    return rng.normal(size=(rows, ny, nt)) * 10.0 ** rng.integers(-6, 7, nt), rng.normal(size=(rows, ny))
+    return rng.normal(size=(rows, ny, nt)) * 10.0 ** rng.integers(-6, 7, nt), rng.normal(
+        size=(rows, ny)
+    )
 
 
 @given(SHAPES)
@@ -191,7 +202,9 @@ def test_factor_of_blocks_is_that_of_the_whole(shape, sizes):
 def test_factor_of_blocks_of_any_size(size):
     """Of fewer rows than columns too, as the first ones of one row are."""
     phi = np.random.default_rng(0).normal(size=(200, 1, 5)) * [1e-6, 1e-3, 1.0, 1e3, 1e6]
-    assert_same_columns(upper(Factor.of_blocks(blocks_of(phi, [size]))), upper(Projection.factor(phi)))
+    assert_same_columns(
+        upper(Factor.of_blocks(blocks_of(phi, [size]))), upper(Projection.factor(phi))
+    )
 
 
 def test_blocks_without_rows_add_nothing():
@@ -242,7 +255,10 @@ def ill_conditioned(name, rng):
     if name == "powers":
         phi, beta = (np.arange(21.0) + rng.uniform(size=21))[:, None] ** np.arange(6), np.ones(6)
     elif name == "a large mean":
-        phi, beta = np.stack([np.ones(40), 1e7 + rng.normal(size=40)], axis=1), np.array([-3e7, 3.0])
+        phi, beta = (
+            np.stack([np.ones(40), 1e7 + rng.normal(size=40)], axis=1),
+            np.array([-3e7, 3.0]),
+        )
     else:
         phi = rng.normal(size=(50, 1)) + 1e-6 * rng.normal(size=(50, 4))
         beta = np.array([1.0, -2.0, 3.0, -4.0])
@@ -286,7 +302,9 @@ def test_along_directions_that_the_rows_tell_phi_may_have_columns_of_zeros():
     expected = basis @ np.linalg.lstsq(stacked @ basis, v.reshape(-1), rcond=None)[0]
     assert projection.solve_along(v, basis) == pytest.approx(expected, rel=1e-12)
     everything = projection.solve_along(v, np.eye(5))  # the shortest of all that are as near
-    assert everything == pytest.approx(np.linalg.lstsq(stacked, v.reshape(-1), rcond=None)[0], rel=1e-12)
+    assert everything == pytest.approx(
+        np.linalg.lstsq(stacked, v.reshape(-1), rcond=None)[0], rel=1e-12
+    )
     assert not projection.solve_along(v, np.eye(5)[:, 3:]).any()
 
 
@@ -294,6 +312,6 @@ def test_directions_that_differ_in_what_no_row_tells_are_one():
     phi = np.zeros((20, 1, 3))
     phi[:, 0, :2] = np.random.default_rng(1).normal(size=(20, 2))
     projection, basis = Projection.factor(phi), np.array([[1.0, 1.0], [0.5, 0.5], [0.0, 7.0]])
-    told = projection.told_of(basis)
+    told = projection.without_null(basis)
     assert told.shape == (3, 1) and np.linalg.matrix_rank(phi[:, 0] @ told) == 1
-    assert np.array_equal(projection.told_of(basis[:, :1]), basis[:, :1])
+    assert np.array_equal(projection.without_null(basis[:, :1]), basis[:, :1])

@@ -25,7 +25,10 @@ def test_names_and_units():
     record = Record.from_arrays(STEPS, STEPS, inputs=[Channel("force", "N")], outputs=["position"])
     assert record.inputs[0].label == "force [N]"
     assert record.outputs[0].label == "position"
-    assert repr(record) == "Record(1 experiment, 6 samples, Ts = 1 s, inputs: force; outputs: position)"
+    assert (
+        repr(record)
+        == "Record(1 experiment, 6 samples, Ts = 1 s, inputs: force; outputs: position)"
+    )
 
 
 def test_without_inputs_or_without_outputs():
@@ -76,13 +79,24 @@ def test_slices():
 
 def test_a_slice_of_several_experiments_keeps_them_apart():
     joined = Record.join(Record.from_arrays(y=np.arange(n), source=str(n)) for n in (10, 20, 5))
-    for part, lengths in ((joined[5:32], [5, 20, 2]), (joined[10:30], [20]), (joined[-7:], [2, 5]), (joined[:3], [3])):
+    for part, lengths in (
+        (joined[5:32], [5, 20, 2]),
+        (joined[10:30], [20]),
+        (joined[-7:], [2, 5]),
+        (joined[:3], [3]),
+    ):
         assert [len(e) for e in part.experiments] == lengths
-    assert joined[5:32].experiments[0].first_row == 5 and joined[-7:].experiments[0].where(0) == "20: row 18"
+    assert (
+        joined[5:32].experiments[0].first_row == 5
+        and joined[-7:].experiments[0].where(0) == "20: row 18"
+    )
 
 
 NO_SLICES = [
-    (slice(None, None, 5), r"record\[start:stop:5\]: a step would leave out rows .* with `every`, or take `prepare"),
+    (
+        slice(None, None, 5),
+        r"record\[start:stop:5\]: a step would leave out rows .* with `every`, or take `prepare",
+    ),
     (slice(None, None, -1), "a step would leave out rows"),
     (slice(4, 2), r"record\[4:2\] holds no row; the record has 6"),
     (slice(6, None), r"record\[6:\] holds no row; the record has 6"),
@@ -106,11 +120,17 @@ def test_a_record_is_not_iterated_by_rows():
 def test_several_experiments_are_split_each_or_as_a_whole():
     joined = Record.join(Record.from_arrays(y=np.arange(n), source=str(n)) for n in (10, 20, 5))
     first, rest = joined.split(0.8)
-    assert [len(e) for e in first.experiments] == [8, 16, 4] and [len(e) for e in rest.experiments] == [2, 4, 1]
+    assert [len(e) for e in first.experiments] == [8, 16, 4] and [
+        len(e) for e in rest.experiments
+    ] == [2, 4, 1]
     np.testing.assert_array_equal(rest.experiments[1].outputs[:, 0], [16, 17, 18, 19])
     first, rest = joined.split(2 / 3, by="experiments")
-    assert [e.source for e in first.experiments] == ["10", "20"] and [e.source for e in rest.experiments] == ["5"]
-    with pytest.raises(InputError, match="the split at 0.09 would be empty: an experiment has 5 rows"):
+    assert [e.source for e in first.experiments] == ["10", "20"] and [
+        e.source for e in rest.experiments
+    ] == ["5"]
+    with pytest.raises(
+        InputError, match="the split at 0.09 would be empty: an experiment has 5 rows"
+    ):
         joined.split(0.09)
     with pytest.raises(InputError, match="would be empty: there are 3 experiments"):
         joined.split(0.1, by="experiments")
@@ -119,7 +139,9 @@ def test_several_experiments_are_split_each_or_as_a_whole():
 
 
 def test_join_keeps_experiments_apart():
-    record = Record.join(Record.from_arrays(y=STEPS, sampling_time=0.1, source=str(i)) for i in range(3))
+    record = Record.join(
+        Record.from_arrays(y=STEPS, sampling_time=0.1, source=str(i)) for i in range(3)
+    )
     assert [e.source for e in record.experiments] == ["0", "1", "2"]
     assert len(record) == 18
     assert repr(record).startswith("Record(3 experiments, 18 samples, Ts = 0.1 s")
@@ -129,9 +151,13 @@ def test_join_keeps_experiments_apart():
 
 def test_join_refuses_what_does_not_fit():
     record = Record.from_arrays(y=STEPS)
-    with pytest.raises(InputError, match=r"other channels cannot be joined: .*outputs: y\).*outputs: z\)"):
+    with pytest.raises(
+        InputError, match=r"other channels cannot be joined: .*outputs: y\).*outputs: z\)"
+    ):
         Record.join([record, Record.from_arrays(y=STEPS, outputs=["z"])])
-    with pytest.raises(InputError, match="a record: sampled every 2 s, another every 1 s; resample one of them"):
+    with pytest.raises(
+        InputError, match="a record: sampled every 2 s, another every 1 s; resample one of them"
+    ):
         Record.join([record, Record.from_arrays(y=STEPS, sampling_time=2.0)])
     with pytest.raises(InputError, match="at least one"):
         Record.join([])
@@ -145,8 +171,14 @@ def test_split_fraction(fraction):
 
 REFUSED = [
     ({}, "needs `u`, `y` or both; got neither"),
-    ({"u": STEPS[1:], "y": STEPS}, "`y` has 6 rows but `u` has 5. Give both the same length, or drop the last rows"),
-    ({"y": [1.0, float("nan")]}, "`y` is not finite at row 1, channel 0: found nan. Remove the row or split"),
+    (
+        {"u": STEPS[1:], "y": STEPS},
+        "`y` has 6 rows but `u` has 5. Give both the same length, or drop the last rows",
+    ),
+    (
+        {"y": [1.0, float("nan")]},
+        "`y` is not finite at row 1, channel 0: found nan. Remove the row or split",
+    ),
     ({"u": [[1.0, 2.0], [3.0, float("inf")]]}, "`u` is not finite at row 1, channel 1: found inf"),
     ({"y": ["a", "b"]}, "`y` is not an array of numbers: could not convert"),
     ({"y": [[1.0], [2.0, 3.0]]}, "`y` is not an array of numbers"),
@@ -165,11 +197,26 @@ REFUSED = [
         {"y": np.stack([STEPS, STEPS], 1), "outputs": ["X", "X_model"]},
         "an output cannot be called 'X_model': results have a column of that name",
     ),
-    ({"y": np.stack([STEPS, STEPS], 1), "outputs": ["X_learner", "X"]}, "an output cannot be called 'X_learner'"),
-    ({"y": np.stack([STEPS, STEPS], 1), "outputs": ["X_baseline", "X"]}, "an output cannot be called 'X_baseline'"),
-    ({"y": STEPS, "outputs": ["a", "b"]}, "2 names for 1 channels of `y`; give one name for each column"),
-    ({"u": STEPS, "y": STEPS, "inputs": ["a"], "outputs": ["a"]}, "channel 'a' is given twice; names must differ"),
-    ({"y": STEPS, "outputs": ["position (mm)"]}, r"'position \(mm\)' cannot name a channel; use letters"),
+    (
+        {"y": np.stack([STEPS, STEPS], 1), "outputs": ["X_learner", "X"]},
+        "an output cannot be called 'X_learner'",
+    ),
+    (
+        {"y": np.stack([STEPS, STEPS], 1), "outputs": ["X_baseline", "X"]},
+        "an output cannot be called 'X_baseline'",
+    ),
+    (
+        {"y": STEPS, "outputs": ["a", "b"]},
+        "2 names for 1 channels of `y`; give one name for each column",
+    ),
+    (
+        {"u": STEPS, "y": STEPS, "inputs": ["a"], "outputs": ["a"]},
+        "channel 'a' is given twice; names must differ",
+    ),
+    (
+        {"y": STEPS, "outputs": ["position (mm)"]},
+        r"'position \(mm\)' cannot name a channel; use letters",
+    ),
     ({"y": STEPS, "outputs": ["2nd"]}, "'2nd' cannot name a channel"),
     ({"y": STEPS, "outputs": [""]}, "'' cannot name a channel"),
     ({"y": STEPS, "outputs": ["k"]}, "'k' cannot name a channel"),
@@ -200,9 +247,12 @@ def test_sampling_times_are_compared_to_a_thousandth():
     assert not same_step(0.1, 0.1002) and not same_step(1e-9, 1.1e-9)
     joined = Record.join([Record.from_arrays(y=STEPS, sampling_time=t) for t in (0.1, 0.10005)])
     assert (joined.sampling_time, len(joined.experiments)) == (0.1, 2)
-    with pytest.raises(InputError, match="b.csv: sampled every 0.1002 s, a.csv every 0.1 s; resample one of them"):
+    with pytest.raises(
+        InputError, match="b.csv: sampled every 0.1002 s, a.csv every 0.1 s; resample one of them"
+    ):
         Record.join(
-            Record.from_arrays(y=STEPS, sampling_time=t, source=s) for t, s in ((0.1, "a.csv"), (0.1002, "b.csv"))
+            Record.from_arrays(y=STEPS, sampling_time=t, source=s)
+            for t, s in ((0.1, "a.csv"), (0.1002, "b.csv"))
         )
 
 

@@ -25,7 +25,9 @@ def test_it_is_least_squares_on_all_rows(ny):
     for row, y in zip(*new, strict=True):
         recursion.update(row, y)
     whole = [np.concatenate(pair) for pair in zip(old, new, strict=True)]
-    np.testing.assert_allclose(recursion.theta, Projection.factor(whole[0]).solve(whole[1]), rtol=1e-10)
+    np.testing.assert_allclose(
+        recursion.theta, Projection.factor(whole[0]).solve(whole[1]), rtol=1e-10
+    )
     assert recursion.rows == 3050 and recursion.effective_rows == pytest.approx(3050)
 
 
@@ -37,7 +39,9 @@ def test_the_noise_level_is_the_residual_sum_of_squares():
     for row, y in zip(*new, strict=True):
         recursion.update(row, y)
     phi, y = (np.concatenate(pair) for pair in zip(old, new, strict=True))
-    assert recursion.level == pytest.approx(np.sum((y - phi @ recursion.theta) ** 2) / 147, rel=1e-9)
+    assert recursion.level == pytest.approx(
+        np.sum((y - phi @ recursion.theta) ** 2) / 147, rel=1e-9
+    )
 
 
 def test_an_empty_start_moves_no_further_than_the_rows_ask():

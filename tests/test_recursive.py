@@ -23,7 +23,13 @@ def system(seed: int, rows: int = 400, gain: float = 1.0, noise: float = 0.02) -
     rng = np.random.default_rng(seed)
     u, y = rng.uniform(-1, 1, rows), np.zeros(rows)
     for k in range(2, rows):
-        y[k] = 0.6 * y[k - 1] - 0.2 * y[k - 2] + gain * u[k - 1] - 0.2 * y[k - 1] ** 3 + noise * rng.normal()
+        y[k] = (
+            0.6 * y[k - 1]
+            - 0.2 * y[k - 2]
+            + gain * u[k - 1]
+            - 0.2 * y[k - 1] ** 3
+            + noise * rng.normal()
+        )
     return oa.Record.from_arrays(u, y, sampling_time=0.1)
 
 
@@ -35,7 +41,9 @@ def two_outputs(seed: int) -> oa.Record:
 
 def fitted(record: oa.Record | None = None, **options) -> oa.Estimate:
     given = {"learner": oa.MLP((4,)), **QUICK, **options}
-    return oa.estimate(system(0) if record is None else record, oa.Baseline.from_terms(TERMS), **given)
+    return oa.estimate(
+        system(0) if record is None else record, oa.Baseline.from_terms(TERMS), **given
+    )
 
 
 @pytest.fixture(scope="module")
@@ -120,9 +128,12 @@ def test_gaps_and_missing_samples_leave_rows_out(fit):
     apart.update(first)
     apart.update(second, gap=True)
     np.testing.assert_allclose(apart.theta, joined.theta, rtol=1e-13)
-    np.testing.assert_allclose(apart.theta, batch(fit, fit.problem.record, first, second), rtol=1e-10)
+    np.testing.assert_allclose(
+        apart.theta, batch(fit, fit.problem.record, first, second), rtol=1e-10
+    )
     u, y = (
-        np.concatenate([getattr(r.experiments[0], kind) for r in (first, second)]) for kind in ("inputs", "outputs")
+        np.concatenate([getattr(r.experiments[0], kind) for r in (first, second)])
+        for kind in ("inputs", "outputs")
     )
     lost = np.concatenate([y[:100], [[np.nan]], y[100:]])
     missing.update(u=np.insert(u, 100, np.nan, axis=0), y=lost)
@@ -141,7 +152,9 @@ def test_forgetting_is_weighted_least_squares(fit):
     age = np.arange(len(rows))[::-1]
     share = min(1.0, 1 / (1 - factor) / len(fit.problem.rows)) * factor ** len(rows)
     root = np.sqrt(np.concatenate([np.full(len(fit.problem.rows), share), factor**age]))
-    phi, target = (np.concatenate([one, other]) for one, other in zip(old[:2], new[:2], strict=True))
+    phi, target = (
+        np.concatenate([one, other]) for one, other in zip(old[:2], new[:2], strict=True)
+    )
     weighted = Projection.factor(phi * root[:, None, None]).solve(target * root[:, None])
     np.testing.assert_allclose(online.theta, weighted, rtol=1e-10)
     assert online.effective_rows == pytest.approx((1 + factor) / (1 - factor), rel=1e-3)
@@ -176,7 +189,11 @@ def test_a_change_is_followed_and_what_no_parameter_explains_raises_the_alarm(tm
 
 def test_physical_parameters_over_time(fit):
     physics = oa.PhysicsMap.of(
-        [oa.PhysicalParameter("p", 1.0), oa.PhysicalParameter("q", 1.0), oa.PhysicalParameter("r", 1.0)],
+        [
+            oa.PhysicalParameter("p", 1.0),
+            oa.PhysicalParameter("q", 1.0),
+            oa.PhysicalParameter("r", 1.0),
+        ],
         {"a": "p", "b": "q - p", "g": "2*r"},
     )
     online = oa.Recursive(fit, memory=5.0)
@@ -205,39 +222,53 @@ def test_intervals_count_the_colour_of_the_errors():
 
 
 def test_a_saved_model_needs_its_training_data(fit):
-    with pytest.raises(oa.InputError, match="a saved model does not hold its training data; give them"):
+    with pytest.raises(
+        oa.InputError, match="a saved model does not contain its training data; give them"
+    ):
         oa.Recursive(fit.model)
     with pytest.raises(oa.InputError, match="is not the least-squares estimate of these 398 rows"):
         oa.Recursive(fit.model, training=system(8))
     online = oa.Recursive(fit.model, training=system(0))
     np.testing.assert_allclose(online.std, fit.std, rtol=1e-6)
     some = FITS["some features"]()
-    np.testing.assert_allclose(oa.Recursive(some.model, training=system(0)).std, some.std, rtol=1e-6)
+    np.testing.assert_allclose(
+        oa.Recursive(some.model, training=system(0)).std, some.std, rtol=1e-6
+    )
 
 
 def test_what_cannot_be_followed_is_refused(fit):
     flown = fitted(learner=None, criterion=oa.Simulation(), structure=oa.Orthogonal())
-    with pytest.raises(oa.InputError, match="one of the free run, and recursive least squares looks one step ahead"):
+    with pytest.raises(
+        oa.InputError, match="the fit minimises the free run's error, but recursive least squares"
+    ):
         oa.Recursive(flown)
     bounded = oa.estimate(
-        system(0), oa.Baseline.from_terms([*TERMS[:2], oa.Term("g", "u[k-1]", max=0.5)]), learner=None
+        system(0),
+        oa.Baseline.from_terms([*TERMS[:2], oa.Term("g", "u[k-1]", max=0.5)]),
+        learner=None,
     )
-    with pytest.raises(oa.InputError, match="g stand at a bound, which new rows would leave"):
+    with pytest.raises(oa.InputError, match="g at a bound: new rows would move them across it"):
         oa.Recursive(bounded)
     with pytest.raises(oa.InputError, match=r"`fit` must be what `estimate` returned"):
         oa.Recursive(oa.Motion)  # type: ignore[arg-type]
     with pytest.raises(oa.InputError, match="give `forgetting` or `memory`, not both"):
         oa.Recursive(fit, forgetting=0.9, memory=2.0)
-    with pytest.raises(oa.InputError, match="`memory` must be at least one sampling time, 0.1 s; got 0.01"):
+    with pytest.raises(
+        oa.InputError, match="`memory` must be at least one sampling time, 0.1 s; got 0.01"
+    ):
         oa.Recursive(fit, memory=0.01)
     online = oa.Recursive(fit)
     with pytest.raises(oa.InputError, match=r"`y` has 3 rows but `u` has 2"):
         online.update(u=[1.0, 2.0], y=[1.0, 2.0, 3.0])
-    with pytest.raises(oa.InputError, match="`u` is missing; give the measured outputs `y` and inputs `u`"):
+    with pytest.raises(
+        oa.InputError, match="`u` is missing; give the measured outputs `y` and inputs `u`"
+    ):
         online.update(y=1.0)
     with pytest.raises(oa.InputError, match="`y` is not finite at row 0"):
         online.update(u=1.0, y=np.inf)
-    with pytest.raises(oa.InputError, match="the record is sampled every 1 s, the model every 0.1 s"):
+    with pytest.raises(
+        oa.InputError, match="the record is sampled every 1 s, the model every 0.1 s"
+    ):
         online.update(oa.Record.from_arrays(np.ones(9), np.ones(9)))
     assert online.rows == 0 and not len(online.history)
 
@@ -256,7 +287,9 @@ def test_arguments_of_every_kind(fit, tmp_path):
 def test_a_damaged_state_is_refused(fit, tmp_path):
     place = tmp_path / "state"
     oa.Recursive(fit).save(place)
-    with pytest.raises(oa.InputError, match="no saved recursive estimate there; expected recursive.json"):
+    with pytest.raises(
+        oa.InputError, match="no saved recursive estimate there; expected recursive.json"
+    ):
         oa.Recursive.load(tmp_path)
     arrays = place / "recursive.safetensors"
     arrays.write_bytes(arrays.read_bytes()[:-8])
@@ -266,5 +299,5 @@ def test_a_damaged_state_is_refused(fit, tmp_path):
         oa.Recursive(fit).save(place)
     oa.Recursive(fit).save(place, force=True)
     oa.save(fitted(learner=None).model, place / "model", force=True)
-    with pytest.raises(oa.InputError, match="its model is not the one that was followed"):
+    with pytest.raises(oa.InputError, match="its model is not that of the recursive estimate"):
         oa.Recursive.load(place)

@@ -28,7 +28,10 @@ from orthaug.studies.references import Spread
 
 SHIPPED = files("orthaug.studies").joinpath("references.json")
 MEASURED = Path(__file__).resolve().parents[2] / "shared" / "reference"
-AXES = {"static": ("data_set", "noise_30dB", "structure"), "mass_spring_damper": ("structure", "weight")}
+AXES = {
+    "static": ("data_set", "noise_30dB", "structure"),
+    "mass_spring_damper": ("structure", "weight"),
+}
 TEST_SAMPLES = 1024  # of the static example
 MADE = "by the authors' published scripts; tests/test_references.py says how"
 
@@ -41,7 +44,9 @@ def summary(runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[str, Any]:
         for run in runs[name]:
             groups.setdefault(tuple(run[axis] for axis in axes), []).append(quantities(name, run))
         content[name] = [
-            dict(zip(axes, values, strict=True)) | {"runs": len(rows)} | {q: parts(rows, q) for q in rows[0]}
+            dict(zip(axes, values, strict=True))
+            | {"runs": len(rows)}
+            | {q: parts(rows, q) for q in rows[0]}
             for values, rows in groups.items()
         ]
     return content
@@ -50,7 +55,10 @@ def summary(runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[str, Any]:
 def quantities(name: str, run: Mapping[str, Any]) -> dict[str, float]:
     values = {"test_rmse": run["test_rmse"], "seconds": run["seconds"]}
     if name == "static":
-        return values | {"test_sse": TEST_SAMPLES * run["test_rmse"] ** 2, "theta_error": run["theta_error"]}
+        return values | {
+            "test_sse": TEST_SAMPLES * run["test_rmse"] ** 2,
+            "theta_error": run["theta_error"],
+        }
     return values | {"theta_error": run["theta_relative_error"]}
 
 
@@ -63,7 +71,10 @@ def parts(rows: Sequence[Mapping[str, float]], quantity: str) -> dict[str, float
 def measured(folder: Path) -> dict[str, Any]:
     """One entry per run, by example."""
     names = {"static": "static_example", "mass_spring_damper": "mass_spring_damper"}
-    return {name: json.loads((folder / f"{file}.json").read_text(encoding="utf-8")) for name, file in names.items()}
+    return {
+        name: json.loads((folder / f"{file}.json").read_text(encoding="utf-8"))
+        for name, file in names.items()
+    }
 
 
 def test_the_shipped_file_is_the_summary_of_the_measurements():
@@ -78,7 +89,13 @@ def test_a_summary_of_known_runs():
         static | {"test_rmse": rmse, "theta_error": error, "seconds": seconds}
         for rmse, error, seconds in ((0.5, 1.0, 2.0), (1.5, 4.0, 3.0))
     ]
-    damper = {"structure": "orthogonal", "weight": 0.0, "test_rmse": 3.0, "theta_relative_error": 0.1, "seconds": 1.0}
+    damper = {
+        "structure": "orthogonal",
+        "weight": 0.0,
+        "test_rmse": 3.0,
+        "theta_relative_error": 0.1,
+        "seconds": 1.0,
+    }
     content = summary({"static": runs, "mass_spring_damper": [damper]})
     (row,) = content["static"]
     assert row["runs"] == 2 and row["theta_error"] == {"mean": 2.5, "min": 1.0, "max": 4.0}
@@ -90,12 +107,18 @@ def test_every_configuration_of_the_shipped_file_can_be_read():
     content = json.loads(SHIPPED.read_text(encoding="utf-8"))
     assert "scripts" in content["made"]
     for row in content["static"]:
-        spread = references.static(row["data_set"], row["structure"], "test_sse", noise=row["noise_30dB"])
+        spread = references.static(
+            row["data_set"], row["structure"], "test_sse", noise=row["noise_30dB"]
+        )
         assert spread.low <= spread.mean <= spread.high and spread.runs == row["runs"] == 10
         # the mean of squares is no less than the square of the mean
-        rmse = references.static(row["data_set"], row["structure"], "test_rmse", noise=row["noise_30dB"])
+        rmse = references.static(
+            row["data_set"], row["structure"], "test_rmse", noise=row["noise_30dB"]
+        )
         assert spread.mean >= TEST_SAMPLES * rmse.mean**2
-        np.testing.assert_allclose([spread.low, spread.high], TEST_SAMPLES * np.array([rmse.low, rmse.high]) ** 2)
+        np.testing.assert_allclose(
+            [spread.low, spread.high], TEST_SAMPLES * np.array([rmse.low, rmse.high]) ** 2
+        )
     for row in content["mass_spring_damper"]:
         spread = references.mass_spring_damper(row["structure"], row["weight"], "theta_error")
         assert spread is not None and spread.low <= spread.mean <= spread.high
@@ -131,4 +154,6 @@ def test_a_spread_in_words_and_in_other_units():
 
 if __name__ == "__main__":
     target = Path(__file__).resolve().parents[1] / "src" / "orthaug" / "studies" / "references.json"
-    target.write_text(json.dumps(summary(measured(Path(sys.argv[1]))), indent=1) + "\n", encoding="utf-8")
+    target.write_text(
+        json.dumps(summary(measured(Path(sys.argv[1]))), indent=1) + "\n", encoding="utf-8"
+    )

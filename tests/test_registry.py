@@ -15,7 +15,7 @@ from test_cli import SPEC, finite_json, make_project, one_line, run
 
 from orthaug._base.errors import InputError, KeyedError
 from orthaug._base.jax import jnp
-from orthaug._base.registry import LIBRARY_ONLY, InSpec, OneOf, Registry, check_fields, keys_of
+from orthaug._base.registry import LIBRARY_ONLY, OneOf, Registry, SpecLimit, check_fields, keys_of
 from orthaug.commands.spec import load_spec
 from orthaug.data.readers import read_record
 from orthaug.fitting.criteria import Prediction, Simulation
@@ -104,14 +104,22 @@ def test_a_learner_from_outside(project, tmp_path):
         done = run("fit", spec, "--out", tmp_path / "out", "--json")
         assert done.code == 0, done.err
         model = load(tmp_path / "out")
-        assert model.form.bound is not None and model.form.bound.learner == Powers(2, (1.0, 2.5), ("u[k-1]", "y[k-1]"))
+        assert model.form.bound is not None and model.form.bound.learner == Powers(
+            2, (1.0, 2.5), ("u[k-1]", "y[k-1]")
+        )
         assert model.form.bound.size == 2
-    with pytest.raises(InputError, match="learner is of the kind 'powers', which is not registered here"):
+    with pytest.raises(
+        InputError, match="learner is of the kind 'powers', which is not registered here"
+    ):
         load(tmp_path / "out")
     given = Powers(2, inputs=("u[k-1]", "y[k-1]"))
-    record = read_record(project.with_name("run.csv"), inputs=["u"], outputs=["y"], sampling_time=model.sampling_time)
+    record = read_record(
+        project.with_name("run.csv"), inputs=["u"], outputs=["y"], sampling_time=model.sampling_time
+    )
     again = load(tmp_path / "out", learner=given).predict(record)
-    np.testing.assert_array_equal(again.trajectories[0].model, model.predict(record).trajectories[0].model)
+    np.testing.assert_array_equal(
+        again.trajectories[0].model, model.predict(record).trajectories[0].model
+    )
 
 
 def test_the_keys_of_a_learner_from_outside_are_checked(project):
@@ -126,13 +134,17 @@ def test_the_keys_of_a_learner_from_outside_are_checked(project):
             done = run("fit", with_sections(project, "bad", f'[learner]\nkind = "powers"\n{key}\n'))
             assert done.code == 2 and one_line(done.err, words)
         done = run("fit", with_sections(project, "bad", '[learner]\nkind = "power"\n'))
-        assert one_line(done.err, "'learner.kind': found \"power\"; expected 'mlp', 'terms', 'none' or 'powers'")
+        assert one_line(
+            done.err, "'learner.kind': found \"power\"; expected 'mlp', 'terms', 'none' or 'powers'"
+        )
     done = run("fit", with_sections(project, "bad", "[learner]\nhighest = 3\n"))
     assert done.code == 2 and one_line(done.err, "unknown key 'learner.highest'")
 
 
 def test_a_structure_from_outside(project, tmp_path):
-    spec = with_sections(project, "nearness", '[structure]\nkind = "nearness"\nstiffness = 1e9\n' + TRAINED)
+    spec = with_sections(
+        project, "nearness", '[structure]\nkind = "nearness"\nstiffness = 1e9\n' + TRAINED
+    )
     with STRUCTURES.added("nearness", Nearness):
         assert load_spec(spec).declared_structure() == Nearness(1e9)
         done = run("fit", spec, "--out", tmp_path / "out", "--json")
@@ -145,7 +157,13 @@ def test_a_structure_from_outside(project, tmp_path):
         done = run("compare", spec, "--out", tmp_path / "compared", "--json")
         assert done.code == 0, done.err
         names = [row["name"] for row in finite_json(done.out)["comparison"]]
-        assert names == ["physics alone", "additive", "orthogonal", "orthogonal-penalty", "nearness"]
+        assert names == [
+            "physics alone",
+            "additive",
+            "orthogonal",
+            "orthogonal-penalty",
+            "nearness",
+        ]
     assert one_line(run("fit", spec).err, "'structure.kind': found \"nearness\"")
     spec = with_sections(project, "stiff", "[structure]\nstiffness = 1e9\n")
     assert one_line(run("fit", spec).err, "unknown key 'structure.stiffness'")
@@ -166,7 +184,9 @@ def test_a_measure_from_outside(project, tmp_path):
         done = run("split", tmp_path / "out", data, "--measure", "enlarged", "--box", "u[k-1]=-1:1")
         assert one_line(done.err, "--box: belongs to --measure uniform; found --measure enlarged")
     done = run("split", tmp_path / "out", data, "--measure", "enlarged")
-    assert done.code == 2 and one_line(done.err, "--measure must be one of training,", "got 'enlarged'")
+    assert done.code == 2 and one_line(
+        done.err, "--measure must be one of training,", "got 'enlarged'"
+    )
 
 
 def test_the_kinds_of_a_file_are_the_classes_of_the_library():
@@ -189,7 +209,9 @@ def test_reading_a_spec_loads_no_jax():
         "spec.spec_model()\n"
         "print([name for name in ('jax', 'optax') if name in sys.modules])"
     )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
     assert done.stdout.strip() == "[]"
 
 
@@ -222,7 +244,12 @@ class Soft:
 
 
 REFUSED = [
-    (LEARNERS, "deep", Deep, "the learner 'deep' and the learner 'mlp' declare the key 'hidden' differently"),
+    (
+        LEARNERS,
+        "deep",
+        Deep,
+        "the learner 'deep' and the learner 'mlp' declare the key 'hidden' differently",
+    ),
     (LEARNERS, "sized", Sized, "the learner 'sized' has a key 'nz', which its section has already"),
     (
         SOLVERS,
@@ -230,14 +257,21 @@ REFUSED = [
         Segmented,
         "the solver 'segmented' and the criterion 'auto' declare the key 'segment'",
     ),
-    (CRITERIA, "seeded", Seeded, "the criterion 'seeded' has a key 'seed', which its section has already"),
+    (
+        CRITERIA,
+        "seeded",
+        Seeded,
+        "the criterion 'seeded' has a key 'seed', which its section has already",
+    ),
     (MEASURES, "uniform", Enlarged, "the measure 'uniform' is registered already"),
     (STRUCTURES, "soft", Soft, "the structure 'soft' must be a frozen dataclass"),
     (STRUCTURES, "number", int, "the structure 'number' must be a frozen dataclass"),
 ]
 
 
-@pytest.mark.parametrize(("registry", "kind", "declaration", "message"), REFUSED, ids=[r[1] for r in REFUSED])
+@pytest.mark.parametrize(
+    ("registry", "kind", "declaration", "message"), REFUSED, ids=[r[1] for r in REFUSED]
+)
 def test_entries_that_are_refused(registry, kind, declaration, message):
     before = dict(registry)
     with pytest.raises(InputError, match=message), registry.added(kind, declaration):
@@ -248,7 +282,7 @@ def test_entries_that_are_refused(registry, kind, declaration, message):
 @dataclass(frozen=True)
 class Whole:
     path: str
-    count: Annotated[int, Ge(0), InSpec(Ge(1))] = 3
+    count: Annotated[int, Ge(0), SpecLimit(Ge(1))] = 3
     size: Annotated[float, Gt(0)] = 1.0
     shape: Annotated[str, OneOf(("round", "square"))] = "round"
     hidden: int = field(default=0, metadata=LIBRARY_ONLY)

@@ -43,7 +43,11 @@ def test_orders_per_channel():
 
 
 def test_orders_may_be_numpy_integers():
-    assert names(Lags(na=np.int64(1), nb=np.array([2]), nk=0).layout(["y"], ["u"])) == ["y[k-1]", "u[k]", "u[k-1]"]
+    assert names(Lags(na=np.int64(1), nb=np.array([2]), nk=0).layout(["y"], ["u"])) == [
+        "y[k-1]",
+        "u[k]",
+        "u[k-1]",
+    ]
 
 
 @pytest.mark.parametrize(
@@ -54,8 +58,14 @@ def test_orders_may_be_numpy_integers():
         (Lags(na=True), "`na` must be whole numbers"),
         (Lags(nk=[0.5, 1]), "`nk` must be whole numbers"),
         (Lags(na=2.0), "`na` must be whole numbers"),
-        (Lags(na=[1, 2]), "`na` has 2 numbers but there are 1 outputs; give one number, or one per output"),
-        (Lags(nk=[1]), "`nk` has 1 numbers but there are 2 inputs; give one number, or one per input"),
+        (
+            Lags(na=[1, 2]),
+            "`na` has 2 numbers but there are 1 outputs; give one number, or one per output",
+        ),
+        (
+            Lags(nk=[1]),
+            "`nk` has 1 numbers but there are 2 inputs; give one number, or one per input",
+        ),
     ],
 )
 def test_orders_refused(lags, message):
@@ -71,9 +81,13 @@ def test_in_order():
 
 
 def test_in_order_refuses():
-    with pytest.raises(InputError, match=r"'w\[k-1\]' uses the unknown channel 'w'; known are y, u"):
+    with pytest.raises(
+        InputError, match=r"'w\[k-1\]' uses the unknown channel 'w'; known are y, u"
+    ):
         in_order([Lag("w", 1)], ["y"], ["u"])
-    with pytest.raises(InputError, match=r"'y\[k\]' is the output .* outputs are used from lag 1, y\[k-1\]"):
+    with pytest.raises(
+        InputError, match=r"'y\[k\]' is the output .* outputs are used from lag 1, y\[k-1\]"
+    ):
         in_order([Lag("y", 0)], ["y"], ["u"])
 
 
@@ -90,7 +104,10 @@ def test_lag_matrix_is_a_double_loop(lengths, lags, seed):
     pieces = [{name: draw.normal(size=n) for name in CHANNELS} for n in lengths]
     record = Record.join(
         Record.from_arrays(
-            u=np.stack([p["u"], p["v"]], 1), y=np.stack([p["a"], p["b"]], 1), inputs=["u", "v"], outputs=["a", "b"]
+            u=np.stack([p["u"], p["v"]], 1),
+            y=np.stack([p["a"], p["b"]], 1),
+            inputs=["u", "v"],
+            outputs=["a", "b"],
         )
         for p in pieces
     )
@@ -98,16 +115,22 @@ def test_lag_matrix_is_a_double_loop(lengths, lags, seed):
     rows = stack_rows(record, layout)
     start = max([lag.lag for lag in lags], default=0)
     expected = [
-        [piece[lag.channel][k - lag.lag] for lag in layout] for piece in pieces for k in range(start, len(piece["a"]))
+        [piece[lag.channel][k - lag.lag] for lag in layout]
+        for piece in pieces
+        for k in range(start, len(piece["a"]))
     ]
-    outputs = [[piece["a"][k], piece["b"][k]] for piece in pieces for k in range(start, len(piece["a"]))]
+    outputs = [
+        [piece["a"][k], piece["b"][k]] for piece in pieces for k in range(start, len(piece["a"]))
+    ]
     assert rows.start == start and len(rows) == len(expected)
     np.testing.assert_array_equal(rows.x, np.array(expected).reshape(len(expected), len(layout)))
     np.testing.assert_array_equal(rows.y, outputs)
 
 
 def test_never_across_experiments():
-    record = Record.join([Record.from_arrays(y=[1.0, 2.0, 3.0]), Record.from_arrays(y=[10.0, 20.0, 30.0])])
+    record = Record.join(
+        [Record.from_arrays(y=[1.0, 2.0, 3.0]), Record.from_arrays(y=[10.0, 20.0, 30.0])]
+    )
     rows = stack_rows(record, (Lag("y", 2),))
     np.testing.assert_array_equal(rows.x[:, 0], [1.0, 10.0])
     np.testing.assert_array_equal(rows.y[:, 0], [3.0, 30.0])
@@ -120,7 +143,10 @@ def test_later_start():
 
 
 def test_too_few_rows():
-    with pytest.raises(InputError, match="run.csv has 2 rows, too few: the largest lag is 2, so at least 3 are needed"):
+    with pytest.raises(
+        InputError,
+        match="run.csv has 2 rows, too few: the largest lag is 2, so at least 3 are needed",
+    ):
         stack_rows(Record.from_arrays(y=[1.0, 2.0], source="run.csv"), (Lag("y", 2),))
     record = Record.join([Record.from_arrays(y=np.arange(9.0)), Record.from_arrays(y=[1.0])])
     with pytest.raises(InputError, match="experiment 1 has 1 rows, too few"):
@@ -153,4 +179,6 @@ def test_scaling_maps_the_training_data_onto_the_unit_box(seed, rows):
 
 def test_scaling_leaves_a_feature_that_never_moves_in_its_unit():
     scaling = Scaling.fit(np.array([[7.0, 0.0], [7.0, 4.0]]))
-    np.testing.assert_array_equal(scaling(np.array([[7.0, 2.0], [8.0, 6.0]])), [[0.0, 0.0], [1.0, 2.0]])
+    np.testing.assert_array_equal(
+        scaling(np.array([[7.0, 2.0], [8.0, 6.0]])), [[0.0, 0.0], [1.0, 2.0]]
+    )

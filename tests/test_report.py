@@ -36,7 +36,15 @@ from orthaug.reports.page_verdict import compare_verdict, fit_verdict
 SUSPECT = '[[suspects]]\nname = "square"\non = "u[k-1]**2"\n'
 FIT = ["Verdict", "Parameters", "Free run", "Physics and learner", "What was learned", "Residual tests", "Stability",
        "Excitation and suspects", "Training and restarts", "Scores", "How to reproduce it"]  # fmt: skip
-COMPARED = ["Verdict", "Models", "Scores", "Parameters", "Free run", "Residual tests", "How to reproduce it"]
+COMPARED = [
+    "Verdict",
+    "Models",
+    "Scores",
+    "Parameters",
+    "Free run",
+    "Residual tests",
+    "How to reproduce it",
+]
 LARGEST = 6_000_000  # letters of a page
 
 
@@ -73,7 +81,9 @@ class Read(HTMLParser):
 @pytest.fixture(scope="module")
 def lagged(tmp_path_factory):
     folder = tmp_path_factory.mktemp("lagged")
-    return oa.fit_spec(str(make_project(folder, SPEC.replace('kind = "none"\n', MLP + "restarts = 3\n" + SUSPECT))))
+    return oa.fit_spec(
+        str(make_project(folder, SPEC.replace('kind = "none"\n', MLP + "restarts = 3\n" + SUSPECT)))
+    )
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +98,11 @@ def compared(lagged):
 
 @pytest.fixture(scope="module")
 def pages(lagged, motion, compared):
-    return {"lagged": fit_report(lagged), "motion": fit_report(motion), "compared": compare_report(compared)}
+    return {
+        "lagged": fit_report(lagged),
+        "motion": fit_report(motion),
+        "compared": compare_report(compared),
+    }
 
 
 def figures(page: str) -> list[dict]:
@@ -120,11 +134,13 @@ def test_the_sections_stand_in_their_order_and_the_contents_lead_to_them(pages, 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_page_is_one_file_that_asks_nothing_of_a_network(pages, kind):
     page = Read(pages[kind])
-    assert not page.attributes("src") and all(link.startswith("#") for link in page.attributes("href"))
-    assert "default-src 'none'" in " ".join(page.attributes("content"))
-    assert "http" not in re.sub(r'<script type="text/plain" id="plotly">.*?</script>', "", pages[kind]).replace(
-        "http-equiv", ""
+    assert not page.attributes("src") and all(
+        link.startswith("#") for link in page.attributes("href")
     )
+    assert "default-src 'none'" in " ".join(page.attributes("content"))
+    assert "http" not in re.sub(
+        r'<script type="text/plain" id="plotly">.*?</script>', "", pages[kind]
+    ).replace("http-equiv", "")
     assert len(pages[kind].encode()) < LARGEST
 
 
@@ -132,10 +148,14 @@ def test_a_page_is_one_file_that_asks_nothing_of_a_network(pages, kind):
 def test_every_plot_is_told_in_words_and_every_caption_is_a_sentence(pages, kind):
     page = Read(pages[kind])
     plots = [attrs for _, attrs, _ in page.found if "data-figure" in attrs]
-    assert [int(plot["data-figure"]) for plot in plots] == list(range(len(figures(pages[kind])))) and len(plots) >= 5
+    assert [int(plot["data-figure"]) for plot in plots] == list(
+        range(len(figures(pages[kind])))
+    ) and len(plots) >= 5
     assert all(len(plot["aria-label"]) > 20 and plot["tabindex"] == "0" for plot in plots)
     captions = page.text("figcaption") + page.text("caption")
-    assert [caption for caption in captions if len(caption.split()) < 4 or not caption.endswith(".")] == []
+    assert [
+        caption for caption in captions if len(caption.split()) < 4 or not caption.endswith(".")
+    ] == []
     assert len(page.text("figcaption")) == len(plots)
 
 
@@ -150,12 +170,17 @@ def test_curves_hold_the_whole_record_in_finite_numbers(pages, lagged, motion, c
         assert measured == pytest.approx(experiment.outputs[:, 0], rel=1e-5, abs=1e-7)
         for trace in figure["data"]:
             for key in [trace["series"]] if "series" in trace else trace["minus"]:
-                assert np.isfinite(values(figure["series"][key])[2:]).all() and len(values(figure["series"][key])) > 50
+                assert (
+                    np.isfinite(values(figure["series"][key])[2:]).all()
+                    and len(values(figure["series"][key])) > 50
+                )
 
 
 def test_physics_alone_is_the_model_without_its_learner(lagged, motion, pages):
     part = lagged.job.parts[-1].record
-    own = lagged.fit.model.alone.simulate(part).trajectories[0].model  # of a motion from the same start
+    own = (
+        lagged.fit.model.alone.simulate(part).trajectories[0].model
+    )  # of a motion from the same start
     for kind, fitted, alone in (("lagged", lagged, own), ("motion", motion, None)):
         (run,) = fitted.responses[fitted.job.parts[-1].name][1].trajectories
         alone = run.baseline[:, 0] if alone is None else alone[:, 0]
@@ -178,7 +203,9 @@ def test_a_page_tells_how_its_result_was_made(lagged, pages, monkeypatch):
     assert origin_of(lagged.job, "fit").date == "1970-01-02 00:00 UTC"
     for text in ("253402300800", "9" * 30, "-1", "²", "today"):
         monkeypatch.setenv("SOURCE_DATE_EPOCH", text)
-        with pytest.raises(oa.InputError, match="SOURCE_DATE_EPOCH: found .* expected whole seconds since 1970"):
+        with pytest.raises(
+            oa.InputError, match="SOURCE_DATE_EPOCH: found .* expected whole seconds since 1970"
+        ):
             check_folder(lagged.job.path.parent / "not yet there")
 
 
@@ -188,17 +215,25 @@ def test_a_spec_that_was_changed_meanwhile_is_told_as_it_was_read(lagged):
     for changed in (written.replace("restarts = 3", "restarts = 4"), "not TOML"):
         path.write_text(changed)
         told = tomllib.loads(origin_of(lagged.job, "fit").toml)
-        assert told["training"]["restarts"] == 3 and told["baseline"]["terms"][0]["parameter"] == "a"
+        assert (
+            told["training"]["restarts"] == 3 and told["baseline"]["terms"][0]["parameter"] == "a"
+        )
     path.write_text(written)
     assert origin_of(lagged.job, "fit").toml == written
 
 
 def test_what_a_motion_learned_is_a_curve_with_its_band_and_the_reach_of_the_data(motion, pages):
-    over = [f for f in figures(pages["motion"]) if f["layout"].get("xaxis", {}).get("title") == {"text": "v [m/s]"}]
+    over = [
+        f
+        for f in figures(pages["motion"])
+        if f["layout"].get("xaxis", {}).get("title") == {"text": "v [m/s]"}
+    ]
     (curve,) = [f for f in over if not f["layout"]["yaxis"]["title"]["text"].startswith("residual")]
     traces = {trace["name"]: trace for trace in curve["data"]}
     assert curve["layout"]["yaxis"]["title"] == {"text": "dv/dt [m/s²]"}
-    assert {"training data", "learner", "beyond the data", "95 % interval", "lower limit"} == set(traces)
+    assert {"training data", "learner", "beyond the data", "95 % interval", "lower limit"} == set(
+        traces
+    )
     inside, beyond = traces["learner"]["x"], traces["beyond the data"]["x"]
     assert beyond[0] < inside[0] < inside[-1] < beyond[-1]
     (stripe,) = curve["layout"]["shapes"]
@@ -219,27 +254,43 @@ def test_what_is_drawn_over_an_input_is_told_as_it_is(lagged, motion, pages):
     assert "Its means over u[k-1] have" in " ".join(Read(pages["lagged"]).text("figcaption"))
     for kind in ("lagged", "motion"):
         stripes = [
-            s for f in figures(pages[kind]) for s in f["layout"].get("shapes", []) if s.get("fillcolor") == "@reach"
+            s
+            for f in figures(pages[kind])
+            for s in f["layout"].get("shapes", [])
+            if s.get("fillcolor") == "@reach"
         ]
-        assert stripes and all(stripe["name"] for stripe in stripes) and any(s["showlegend"] for s in stripes)
+        assert (
+            stripes
+            and all(stripe["name"] for stripe in stripes)
+            and any(s["showlegend"] for s in stripes)
+        )
     (runs,) = [f for f in figures(pages["lagged"]) if f["data"][0].get("name") == "loss"]
-    assert runs["layout"]["xaxis"]["ticktext"] == ["0", "1", "2"] and runs["layout"]["xaxis"]["title"] == {
-        "text": "seed"
-    }
+    assert runs["layout"]["xaxis"]["ticktext"] == ["0", "1", "2"] and runs["layout"]["xaxis"][
+        "title"
+    ] == {"text": "seed"}
 
 
 def test_units_that_the_spec_does_not_give_are_those_that_the_channels_ask_for(lagged):
     units = {row.name: (row.unit, row.derived_unit) for row in lagged.result.parameters}
     assert units == {"a": ("1", None), "b": ("", "1"), "c": ("", None)}  # the input has no unit
-    rows = [row.model_copy(update={"unit": "", "derived_unit": "mm/N"}) for row in lagged.result.parameters]
-    told = Read(fit_report(replace(lagged, result=lagged.result.model_copy(update={"parameters": rows}))))
-    assert "(mm/N)" in told.text("td") and any("the channels' units ask for it" in c for c in told.text("caption"))
+    rows = [
+        row.model_copy(update={"unit": "", "derived_unit": "mm/N"})
+        for row in lagged.result.parameters
+    ]
+    told = Read(
+        fit_report(replace(lagged, result=lagged.result.model_copy(update={"parameters": rows})))
+    )
+    assert "(mm/N)" in told.text("td") and any(
+        "it follows from the units of the channels" in c for c in told.text("caption")
+    )
 
 
 def test_the_parameters_have_their_intervals_and_the_suspect_its_bias(pages):
     page, drawn = Read(pages["lagged"]), figures(pages["lagged"])
     assert {"a [1]", "b", "c"} == {
-        re.sub("<br>.*|<.?b>", "", tick["ticktext"][0]) for k, tick in drawn[0]["layout"].items() if k[:5] == "yaxis"
+        re.sub("<br>.*|<.?b>", "", tick["ticktext"][0])
+        for k, tick in drawn[0]["layout"].items()
+        if k[:5] == "yaxis"
     }
     assert [trace["name"] for trace in drawn[0]["data"]].count("95 % interval") == 3
     assert "square" in page.text("th") and any(f["data"][0].get("y") == ["square"] for f in drawn)
@@ -257,7 +308,11 @@ def test_intervals_and_shares_in_cells():
     assert interval([-1e-17, 2.0]) == "0 … 2" and interval(None) == "–"
     assert interval([1.459492, 1.459527]) == "1.459492 … 1.459527"  # not one number twice
     assert percent(-1e-17, signed=True) == "0 %" and percent(0.0123, signed=True) == "+1.2 %"
-    assert percent(22.6) == "2260 %" and percent(-4.2, signed=True) == "−420 %" and percent(1e7) == "1·10⁹ %"
+    assert (
+        percent(22.6) == "2260 %"
+        and percent(-4.2, signed=True) == "−420 %"
+        and percent(1e7) == "1·10⁹ %"
+    )
 
 
 def wave(rows: int, *, wild: int | None = None, experiments: int = 1) -> Response:
@@ -269,9 +324,15 @@ def wave(rows: int, *, wild: int | None = None, experiments: int = 1) -> Respons
         measured = model + 0.01 * random.normal(size=model.shape)
         away = wild is not None and i == experiments - 1
         if away:
-            model = np.where(np.arange(rows)[:, None] < wild, model * np.exp(np.arange(rows) / 9)[:, None], np.nan)
+            model = np.where(
+                np.arange(rows)[:, None] < wild,
+                model * np.exp(np.arange(rows) / 9)[:, None],
+                np.nan,
+            )
         nothing = np.zeros_like(model)
-        found.append(Trajectory(model, nothing, nothing, measured, 0, diverged=(wild, "y") if away else None))
+        found.append(
+            Trajectory(model, nothing, nothing, measured, 0, diverged=(wild, "y") if away else None)
+        )
     return Response(tuple(found), None, (Channel("y", "m"),), 0.01)
 
 
@@ -279,20 +340,34 @@ def test_a_divergence_is_seen_and_does_not_flatten_the_rest():
     (plot,) = run_plots([Run("tests.fast", wave(300, wild=200, experiments=2))], {})
     (told,) = plot.layout["annotations"]
     (left,) = [trace for trace in plot.traces if trace.get("mode") == "markers"]
-    assert f"At {left['x'][0]:.4g} s y of the model leaves the panel" in plot.caption and plot.caption.endswith(" m.")
+    assert (
+        f"At {left['x'][0]:.4g} s y of the model leaves the panel" in plot.caption
+        and plot.caption.endswith(" m.")
+    )
     run = values(plot.series["model 0"])[round(left["x"][0] / 0.01) - 1 :]
     low, high = plot.layout["yaxis"]["range"]
-    assert low < run[0] < high and not low < run[1] < high and left["y"] == [high if run[1] > high else low]
-    assert told["text"] == "free run diverges in y" and told["x"] == pytest.approx(0.01 * (301 + 200))
-    assert "leaves all bounds in y at row 200" in plot.caption and "2 experiments" in plot.caption
+    assert (
+        low < run[0] < high
+        and not low < run[1] < high
+        and left["y"] == [high if run[1] > high else low]
+    )
+    assert told["text"] == "free run diverges in y" and told["x"] == pytest.approx(
+        0.01 * (301 + 200)
+    )
+    assert "diverges in y at row 200" in plot.caption and "2 experiments" in plot.caption
     low, high = plot.layout["yaxis"]["range"]
     assert -4 < low < -1 and 1 < high < 4
-    assert np.isnan(values(plot.series["model 0"])[300]) and np.isnan(values(plot.series["model 0"])[-50:]).all()
+    assert (
+        np.isnan(values(plot.series["model 0"])[300])
+        and np.isnan(values(plot.series["model 0"])[-50:]).all()
+    )
 
 
 def test_a_curve_that_stays_has_no_mark_and_the_model_without_its_learner_has_its_name():
     (plot,) = run_plots([Run("tests.slow", wave(300), wave(300))], {})
-    assert "leaves the panel" not in plot.caption and all("mode" not in trace for trace in plot.traces)
+    assert "leaves the panel" not in plot.caption and all(
+        "mode" not in trace for trace in plot.traces
+    )
     assert [trace["name"] for trace in plot.traces] == [
         "measured",
         "model without its learner",
@@ -309,14 +384,19 @@ def test_long_records_are_thinned_by_their_envelope_and_said_to_be():
     peak = np.asarray(long.trajectories[0].measured)
     peak[123_456] = 9.0
     plots = run_plots(
-        [Run(name, long, long) for name in ("train", "validation", "tests.a", "tests.b")], error_band(long)
+        [Run(name, long, long) for name in ("train", "validation", "tests.a", "tests.b")],
+        error_band(long),
     )
     kept = values(plots[0].series["measured 0"])
-    assert kept.max() == pytest.approx(9.0, rel=1e-6) and kept.min() == pytest.approx(peak.min(), rel=1e-6)
-    assert "points are kept, the least and the largest value of every stretch" in plots[0].caption
-    assert sum(len(json.dumps([p.traces, p.series])) for p in plots) < LARGEST - 2_200_000  # the rest is Plotly's
+    assert kept.max() == pytest.approx(9.0, rel=1e-6) and kept.min() == pytest.approx(
+        peak.min(), rel=1e-6
+    )
+    assert "points, the minimum and maximum of every stretch" in plots[0].caption
+    assert (
+        sum(len(json.dumps([p.traces, p.series])) for p in plots) < LARGEST - 2_200_000
+    )  # the rest is Plotly's
     short = run_plots([Run("train", wave(5000))], {})[0]
-    assert len(values(short.series["measured 0"])) == 5000 and "points are kept" not in short.caption
+    assert len(values(short.series["measured 0"])) == 5000 and "is drawn by" not in short.caption
     both = compared_plots({name: {"train": long} for name in "abc"})[0]
     assert len(json.dumps([both.traces, both.series])) < LARGEST - 2_200_000
 
@@ -342,54 +422,79 @@ def with_warning(fitted, code: str, text: str):
 def test_the_verdict_is_built_from_the_findings(lagged, motion):
     good = fit_verdict(motion.result)
     assert good.level in ("good", "care") and "on tests.steps its free run leaves" in good.trust
-    assert "m and k as physics" in good.use and "c is what the physics nearest" in good.use
-    ran = fit_verdict(with_warning(lagged, "free_run_diverged", "tests.steps: the free run diverged."))
+    assert "m and k as physics" in good.use and "c is taken from the physics nearest" in good.use
+    ran = fit_verdict(
+        with_warning(lagged, "free_run_diverged", "tests.steps: the free run diverged.")
+    )
     assert ran.level == "bad" and "its free run diverges on tests.steps" in ran.trust
     untold = lagged.result.model_copy(update={"data": lagged.result.data.model_copy(update={"tests": None}),
                                               "validation": None})  # fmt: skip
-    assert "never tried on data" in fit_verdict(untold).trust
+    assert "not tested on data" in fit_verdict(untold).trust
     row = lagged.result.parameters[0]
     bias = {"value": 10 * (row.std or 1.0), "cause": "square", "share": 0.9}
     biased = row.model_copy(update={"bias": type("B", (), bias)()})
     one = lagged.result.model_copy(update={"parameters": [biased]})
     assert "the estimate of a carries a bias of 10 standard errors" in fit_verdict(one).trust
     for name in ("unmodelled", "sensor_noise"):
-        residuals = motion.result.residuals.model_copy(update={"verdict": name, "changes": [], "missing": None})
+        residuals = motion.result.residuals.model_copy(
+            update={"verdict": name, "changes": [], "missing": None}
+        )
         doubted = fit_verdict(motion.result.model_copy(update={"residuals": residuals}))
         assert doubted.level != "good" and "do not read m and k as physics yet" in doubted.use
         assert not doubted.then.startswith("Nothing further")
     residuals = residuals.model_copy(update={"verdict": "unmodelled", "steps": {"x": 0.1}})
     ended = motion.result.status.model_copy(update={"code": "converged"})
     unbiased = [row.model_copy(update={"bias": None}) for row in motion.result.parameters]
-    changed = {"residuals": residuals, "status": ended, "validation": None, "parameters": unbiased, "advice": []}
+    changed = {
+        "residuals": residuals,
+        "status": ended,
+        "validation": None,
+        "parameters": unbiased,
+        "advice": [],
+    }
     coarse = fit_verdict(motion.result.model_copy(update=changed))
     assert (
         "its one-step residual has the size of the steps of x" in coarse.trust
         and "the steps of x are as large" in coarse.then
     )
     train, test = (motion.result.scores[part] for part in ("train", "tests.steps"))
-    far = test.simulation.model_copy(update={"rmse": [2 * value for value in train.simulation.rmse]})
+    far = test.simulation.model_copy(
+        update={"rmse": [2 * value for value in train.simulation.rmse]}
+    )
     scores = {**motion.result.scores, "tests.steps": test.model_copy(update={"simulation": far})}
     beyond = fit_verdict(motion.result.model_copy(update={"scores": scores}))
-    assert "its error on tests.steps is 2 times that on the training data" in beyond.trust and beyond.level == "care"
+    assert (
+        "its error on tests.steps is 2 times that on the training data" in beyond.trust
+        and beyond.level == "care"
+    )
     hurts = lagged.result.validation.model_copy(update={"verdict": "hurts"})
     told = fit_verdict(lagged.result.model_copy(update={"validation": hurts, "advice": []}))
     assert told.level == "bad" and "physics alone (`learner.kind" in told.then
-    assert all(sentence.endswith(".") for verdict in (good, ran, told) for sentence in verdict.sentences)
+    assert all(
+        sentence.endswith(".") for verdict in (good, ran, told) for sentence in verdict.sentences
+    )
 
 
 def test_the_verdict_of_a_comparison_names_a_model(compared):
     verdict = compare_verdict(compared.result)
     names = [row.name for row in compared.result.comparison]
-    assert any(f"Take “{name}”" in verdict.trust for name in names) and "validation part" in verdict.then
+    assert (
+        any(f"Take “{name}”" in verdict.trust for name in names)
+        and "validation part" in verdict.then
+    )
     first = next(row for row in compared.result.comparison if row.validation)
-    twin = compared.result.model_copy(update={"comparison": [first, first.model_copy(update={"name": "twin"})]})
+    twin = compared.result.model_copy(
+        update={"comparison": [first, first.model_copy(update={"name": "twin"})]}
+    )
     trust = compare_verdict(twin.model_copy(update={"chosen": None})).trust
-    assert "as does “twin”, and no other leaves less" in trust and "less than of any other" not in trust
+    assert (
+        "as does “twin”, and no other leaves less" in trust
+        and "less than of any other" not in trust
+    )
 
 
 def test_a_witness_is_told_where_runs_are_shown(lagged):
-    told = "train: findings and figures look at 10 of 99 rows, in windows spread over them."
+    told = "train: findings and figures use 10 of 99 rows, in windows spread over them."
     page = Read(fit_report(replace(lagged, result=with_warning(lagged, "witness", told))))
     (section,) = page.text("section", id="free-run")
     assert told in section
@@ -399,7 +504,11 @@ def test_minus_signs_of_texts_are_those_of_tables_and_short_cells_stay_whole(lag
     told = "moves a by -0.015, see `a-1`: y[k-1] goes from -2 to 3"
     page = fit_report(replace(lagged, result=with_warning(lagged, "small_margin", told)))
     assert "moves a by −0.015, see <code>a-1</code>: y[k-1] goes from −2 to 3" in page
-    whole = ["".join(text) for _, given, text in Read(page).found if "whole" in (given.get("class") or "").split()]
+    whole = [
+        "".join(text)
+        for _, given, text in Read(page).found
+        if "whole" in (given.get("class") or "").split()
+    ]
     assert any(" … " in cell for cell in whole) and "(1)" in whole
 
 
@@ -413,13 +522,27 @@ def test_what_looks_like_markup_is_text(lagged):
 
 
 def test_the_page_does_not_import_plotly_nor_does_help():
-    program = "import sys; from orthaug.commands import cli; import orthaug.reports.page as page; page._plotly(); "
-    program += "print([name for name in sys.modules if name.split('.')[0] in ('plotly', 'narwhals')])"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    program = (
+        "import sys; from orthaug.commands import cli; import orthaug.reports.page as page; "
+        "page._plotly(); "
+    )
+    program += (
+        "print([name for name in sys.modules if name.split('.')[0] in ('plotly', 'narwhals')])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
     assert done.stdout.strip() == "[]"
-    program = "import sys; sys.argv = ['orthaug', '--help']\nfrom orthaug.commands.cli import main\n"
-    program += "try: main()\nexcept SystemExit: print('reports.page' in str(sorted(sys.modules)), file=sys.stderr)"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    program = (
+        "import sys; sys.argv = ['orthaug', '--help']\nfrom orthaug.commands.cli import main\n"
+    )
+    program += (
+        "try: main()\nexcept SystemExit: print('reports.page' in str(sorted(sys.modules)), "
+        "file=sys.stderr)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
     assert done.stderr.strip().endswith("False")
 
 
@@ -449,7 +572,9 @@ def test_a_comparison_tells_the_biases(compared):
     def with_bias(bias):
         first = compared.result.comparison[0]
         parameters = [row.model_copy(update={"bias": bias}) for row in first.parameters]
-        return compared.result.model_copy(update={"comparison": [first.model_copy(update={"parameters": parameters})]})
+        return compared.result.model_copy(
+            update={"comparison": [first.model_copy(update={"parameters": parameters})]}
+        )
 
     assert "bias" not in heads(with_bias(None))[0]
     head, cell = heads(with_bias(BiasResult(value=-0.25, cause="drag", share=0.9)))

@@ -23,7 +23,9 @@ from orthaug.reports.page_fit import FitPage
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 CHROMIUM = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, BROWSERS)), None)
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed; set CHROMIUM to its file")
+pytestmark = pytest.mark.skipif(
+    CHROMIUM is None, reason="no Chromium is installed; set CHROMIUM to its file"
+)
 
 ROWS = 100_000
 
@@ -44,9 +46,17 @@ def long_run(part: str) -> tuple[Response, Response]:
 def folder(tmp_path_factory) -> Path:
     """Pages of a fit, of a comparison, and of a long record."""
     folder = tmp_path_factory.mktemp("pages")
-    fitted = oa.fit_spec(str(make_project(folder, SPEC.replace('kind = "none"\n', MLP + "restarts = 3\n"))))
-    long = FitPage(origin_of(fitted.job, "fit"), fitted.result, {p: long_run(p) for p in fitted.responses})
-    pages = {"fit": fit_report(fitted), "compared": compare_report(oa.compare(fitted.job)), "long": fit_page(long)}
+    fitted = oa.fit_spec(
+        str(make_project(folder, SPEC.replace('kind = "none"\n', MLP + "restarts = 3\n")))
+    )
+    long = FitPage(
+        origin_of(fitted.job, "fit"), fitted.result, {p: long_run(p) for p in fitted.responses}
+    )
+    pages = {
+        "fit": fit_report(fitted),
+        "compared": compare_report(oa.compare(fitted.job)),
+        "long": fit_page(long),
+    }
     for name, page in pages.items():
         (folder / f"{name}.html").write_text(page, encoding="utf-8")
     return folder
@@ -55,7 +65,9 @@ def folder(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def browser():
     with playwright.sync_playwright() as started:
-        browser = started.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--disable-gpu"])
+        browser = started.chromium.launch(
+            executable_path=CHROMIUM, args=["--no-sandbox", "--disable-gpu"]
+        )
         yield browser
         browser.close()
 
@@ -64,9 +76,14 @@ class Shown:
     """A page that was opened and drawn, with what the browser complained of and asked for."""
 
     def __init__(self, browser, file: Path, width: int = 1280, scheme: str = "light"):
-        self.context = browser.new_context(viewport={"width": width, "height": 844}, color_scheme=scheme)
+        self.context = browser.new_context(
+            viewport={"width": width, "height": 844}, color_scheme=scheme
+        )
         self.page, self.told, self.asked = self.context.new_page(), [], []
-        self.page.on("console", lambda m: self.told.append(m.text) if m.type in ("error", "warning") else None)
+        self.page.on(
+            "console",
+            lambda m: self.told.append(m.text) if m.type in ("error", "warning") else None,
+        )
         self.page.on("pageerror", lambda error: self.told.append(str(error)))
         self.page.on("request", lambda request: self.asked.append(request.url))
         self.page.goto(file.as_uri())
@@ -94,12 +111,16 @@ def run_plot(page) -> str:
 
 
 def shown_range(page, plot: str) -> list[float]:
-    return [float(end) for end in page.evaluate(f"document.querySelector('{plot}').layout.xaxis.range")]
+    return [
+        float(end) for end in page.evaluate(f"document.querySelector('{plot}').layout.xaxis.range")
+    ]
 
 
 @pytest.mark.parametrize("name", ["fit", "compared", "long"])
 @pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (390, "dark")])
-def test_a_page_is_drawn_without_error_and_network_and_fits_its_width(browser, folder, name, width, scheme):
+def test_a_page_is_drawn_without_error_and_network_and_fits_its_width(
+    browser, folder, name, width, scheme
+):
     shown = Shown(browser, folder / f"{name}.html", width, scheme)
     with shown as page:
         plots = page.locator(".plot").count()
@@ -108,14 +129,21 @@ def test_a_page_is_drawn_without_error_and_network_and_fits_its_width(browser, f
         assert shown.told == [] and shown.asked == [(folder / f"{name}.html").as_uri()]
         assert page.evaluate("document.documentElement.scrollWidth") == width
         wide = "[...document.querySelectorAll('main td, main th, main p, .plot, svg')].filter(e => "
-        wide += "e.getBoundingClientRect().right > innerWidth + 1 && getComputedStyle(e).position !== 'absolute')"
+        wide += (
+            "e.getBoundingClientRect().right > innerWidth + 1 && getComputedStyle(e).position "
+            "!== 'absolute')"
+        )
         hidden = ".filter(e => !e.closest('thead') && !e.closest('pre')).length"
         assert width > 500 or page.evaluate(wide + hidden) == 0
 
 
-@pytest.mark.parametrize(("name", "scheme"), [("fit", "light"), ("fit", "dark"), ("compared", "light")])
+@pytest.mark.parametrize(
+    ("name", "scheme"), [("fit", "light"), ("fit", "dark"), ("compared", "light")]
+)
 def test_axe_finds_nothing(browser, folder, name, scheme):
-    axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="axe is not installed")
+    axe = pytest.importorskip(
+        "axe_playwright_python.sync_playwright", reason="axe is not installed"
+    )
     with Shown(browser, folder / f"{name}.html", scheme=scheme) as page:
         found = axe.Axe().run(page)
         assert found.violations_count == 0, found.generate_report()
@@ -138,7 +166,9 @@ def test_a_zoom_moves_every_panel_and_shows_more_of_a_long_record(browser, folde
         assert 49 < low < high < 53
         until(page, f"{curves}[0].x.length < 7000 && {curves}[0].x[1] - {curves}[0].x[0] < 0.0011")
         ranges = page.evaluate(f"{curves}.map(t => [t.xaxis ?? 'x', t.x[0], t.x.at(-1)])")
-        assert len({tuple(entry) for entry in ranges}) == 1, "all curves live on the same stretch of the same axis"
+        assert len({tuple(entry) for entry in ranges}) == 1, (
+            "all curves live on the same stretch of the same axis"
+        )
 
 
 def test_keys_move_zoom_and_reset_a_run(browser, folder):
@@ -169,13 +199,18 @@ def test_the_contents_are_reached_and_followed_by_keys(browser, folder):
         last = page.locator("nav a").last
         last.focus()
         page.keyboard.press("Enter")
-        until(page, "document.querySelector('#reproduce').getBoundingClientRect().top < innerHeight")
+        until(
+            page, "document.querySelector('#reproduce').getBoundingClientRect().top < innerHeight"
+        )
         assert page.url.endswith("#reproduce")
 
 
 def test_a_change_of_theme_colours_the_curves_anew(browser, folder):
     with Shown(browser, folder / "fit.html") as page:
-        color = f"document.querySelector('{run_plot(page)}').data.find(t => t.name == 'model').line.color"
+        color = (
+            f"document.querySelector('{run_plot(page)}').data.find(t => t.name == "
+            "'model').line.color"
+        )
         light = page.evaluate(color)
         page.emulate_media(color_scheme="dark")
         until(page, f"{color} != '{light}'")
@@ -193,6 +228,11 @@ def test_on_paper_every_plot_is_whole(browser, folder):
                       "getComputedStyle(document.documentElement).getPropertyValue('--paper').trim()]; })")  # fmt: skip
         paper = page.pdf(format="A4", prefer_css_page_size=True)
         seen, colour = page.evaluate("window.seen")
-        assert colour in ("#ffffff", "#fff") and max(seen) <= 182 / 25.4 * 96, "the width of A4 less its margins"
-        assert paper.startswith(b"%PDF") and 3 <= len(re.findall(rb"/Type\s*/Page\b(?!s)", paper)) <= 20
+        assert colour in ("#ffffff", "#fff") and max(seen) <= 182 / 25.4 * 96, (
+            "the width of A4 less its margins"
+        )
+        assert (
+            paper.startswith(b"%PDF")
+            and 3 <= len(re.findall(rb"/Type\s*/Page\b(?!s)", paper)) <= 20
+        )
         assert min(page.evaluate(widths)) > 0 and max(page.evaluate(widths)) > max(seen)

@@ -16,6 +16,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from html import unescape
 from html.parser import HTMLParser
 from pathlib import Path
@@ -31,7 +32,7 @@ from orthaug.studies.references import Spread
 from orthaug.studies.reproduction import (
     HYPHEN,
     WIDTH,
-    Reproduced,
+    StudyOutcome,
     as_rows,
     catalogue,
     chosen,
@@ -75,7 +76,7 @@ EXACT: dict[str, str] = {  # rows of which θ is solved, whatever the learner do
 }
 
 
-def reduced(store: Path) -> list[Reproduced]:
+def reduced(store: Path) -> list[StudyOutcome]:
     """Every study at its reduced size; where training takes longest it ends before it has converged.
 
     The uniform measure's rule has 2¹² of its 2²⁰ nodes, which integrate these smooth functions to rounding as well.
@@ -86,7 +87,7 @@ def reduced(store: Path) -> list[Reproduced]:
         return reproduce(chosen(None), small=True, store=store)
 
 
-def stored_columns(one: Reproduced) -> dict[str, list]:
+def stored_columns(one: StudyOutcome) -> dict[str, list]:
     """What is kept of a study: its axes, and the columns that are compared."""
     name = one.entry.name
     axes = list(one.entry.study("ours", True).grid)
@@ -100,7 +101,7 @@ def store(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def found(store) -> list[Reproduced]:
+def found(store) -> list[StudyOutcome]:
     return reduced(store)
 
 
@@ -128,7 +129,9 @@ def test_values_are_the_stored_ones(found, references, name):
     for axis in one.entry.study("ours", True).grid:
         assert now[axis] == then[axis]
     for column, (relative, absolute) in TOLERANCES[name].items():
-        np.testing.assert_allclose(now[column], then[column], relative, absolute, err_msg=f"{name}, {column}")
+        np.testing.assert_allclose(
+            now[column], then[column], relative, absolute, err_msg=f"{name}, {column}"
+        )
     if name in EXACT:
         rows = one.table.reset_index(drop=True).query(EXACT[name]).index
         assert len(rows)
@@ -162,7 +165,9 @@ def test_a_quantity_is_counted_once(found):
     quantities = [finding.quantity for one in found for finding in one.findings]
     assert len(set(quantities)) == len(quantities)
     # Φ⁺Y of the paper's noisy record is the answer of every regularization and of the shortest consistency run
-    shown = [finding for one in found for finding in one.findings if finding.ours.startswith("0.0089013")]
+    shown = [
+        finding for one in found for finding in one.findings if finding.ours.startswith("0.0089013")
+    ]
     assert len(shown) == 1
 
 
@@ -170,8 +175,14 @@ def test_a_quantity_is_counted_once(found):
 def test_figures_say_in_sentences_what_they_show(found, name):
     one = next(o for o in found if o.entry.name == name)
     for drawing in one.figures.values():
-        assert drawing.shows[0].isupper() and drawing.shows.endswith(".") and len(drawing.shows.split()) > 8
-        assert drawing.reading == "" or (drawing.reading[0].isupper() and drawing.reading.endswith("."))
+        assert (
+            drawing.shows[0].isupper()
+            and drawing.shows.endswith(".")
+            and len(drawing.shows.split()) > 8
+        )
+        assert drawing.reading == "" or (
+            drawing.reading[0].isupper() and drawing.reading.endswith(".")
+        )
         assert ".png" not in drawing.shows
 
 
@@ -192,7 +203,9 @@ def test_whiskers_end_at_the_smallest_and_the_largest_value():
     (drawn,) = axis.containers
     middle, (low, high) = drawn[0].get_ydata(), (cap.get_ydata() for cap in drawn[1])
     assert list(middle) == [1.0, 3.0]
-    np.testing.assert_allclose(np.array([low, high], dtype=float), [[1e-6, 2.0], [10.0, 4.0]], rtol=1e-9)
+    np.testing.assert_allclose(
+        np.array([low, high], dtype=float), [[1e-6, 2.0], [10.0, 4.0]], rtol=1e-9
+    )
 
 
 def test_what_the_scripts_gave_is_drawn_from_their_smallest_to_their_largest_run():
@@ -202,7 +215,7 @@ def test_what_the_scripts_gave_is_drawn_from_their_smallest_to_their_largest_run
     assert [float(line.get_ydata()[0]) for line in (drawn[0], *drawn[1])] == [2.0, 0.5, 9.0]
 
 
-def by_quantity(found: list[Reproduced], name: str, start: str) -> Finding:
+def by_quantity(found: list[StudyOutcome], name: str, start: str) -> Finding:
     one = next(o for o in found if o.entry.name == name)
     (finding,) = (f for f in one.findings if f.quantity.startswith(start))
     return finding
@@ -219,7 +232,18 @@ def by_quantity(found: list[Reproduced], name: str, start: str) -> Finding:
         ("static_errors", "set 1, no noise, additive, θ eliminated: ‖", None, None),
         ("static_errors", "set 1, no noise, additive, θ eliminated: test", None, None),
         ("static_noise", "set 1, 30 dB, orthogonal: ‖", True, True),
-        ("covariance", "P̂ between θ and the weights: share of entries below 10⁻⁶ of the geometric", True, None),
+        (
+            "covariance",
+            "P̂ between θ and the weights: share of entries below 10⁻⁶ of the geometric",
+            True,
+            None,
+        ),
+        (
+            "covariance",
+            "P̂ between θ and the weights: share of entries below 10⁻⁶ in absolute value",
+            True,
+            None,
+        ),
         ("regularization_weight", "orthogonal: relative error", None, True),
         ("regularization_weight", "orthogonal-penalty, λ = 100", True, None),
         ("regularization_weight", "baseline-penalty, λ = 100", True, None),
@@ -252,20 +276,31 @@ def test_the_uniform_measure_leaves_a_hundredth_of_the_error(found):
 def test_the_papers_record_has_the_scripts_error_at_every_place_where_it_is_solved(found):
     """It is shown once, and solved in three studies."""
     tables = {one.entry.name: one.table for one in found}
-    noise, lengths, errors = (tables[name] for name in ("consistency", "data_length", "static_errors"))
-    own = noise[(noise.data_set == 1) & (noise.curve == "orthogonal") & (noise.run == 0) & (noise.samples == 1024)]
+    noise, lengths, errors = (
+        tables[name] for name in ("consistency", "data_length", "static_errors")
+    )
+    own = noise[
+        (noise.data_set == 1)
+        & (noise.curve == "orthogonal")
+        & (noise.run == 0)
+        & (noise.samples == 1024)
+    ]
     solved = tables["static_noise"].query("structure == 'orthogonal'").theta_error
     np.testing.assert_allclose(solved, own.theta_error.iloc[0], rtol=1e-9)
     for data_set in (2, 3):
         of = errors[(errors.data_set == data_set) & (errors.structure == "orthogonal")].theta_error
-        paper = lengths.query(f"data_set == {data_set} and measure == 'training' and draw == 0 and samples == 1024")
+        paper = lengths.query(
+            f"data_set == {data_set} and measure == 'training' and draw == 0 and samples == 1024"
+        )
         np.testing.assert_allclose(of, paper.theta_error.iloc[0], rtol=1e-9)
 
 
 def test_the_papers_sums_of_squares_are_compared_with_sums_of_squares(found):
     one = next(o for o in found if o.entry.name == "static_noise")
     rows = one.table.query("regularization == 'none' and structure == 'orthogonal'")
-    finding = by_quantity(found, "static_noise", "set 1, 30 dB, orthogonal: sum of squared test errors")
+    finding = by_quantity(
+        found, "static_noise", "set 1, 30 dB, orthogonal: sum of squared test errors"
+    )
     squares = 1024 * rows.test_rmse**2
     assert finding.published == "0.000535" and finding.ours.startswith(f"{squares.mean():.3g}")
     assert finding.as_published is bool(squares.min() <= 5.35e-4 <= squares.max())
@@ -278,7 +313,9 @@ def test_the_papers_sums_of_squares_are_compared_with_sums_of_squares(found):
 @pytest.mark.parametrize(("slowest", "noisy"), [(1.2, False), (1.3, True)])
 def test_a_time_that_differs_from_start_to_start_is_no_result(found, slowest, noisy):
     one = next(o for o in found if o.entry.name == "solver_times")
-    rows = [dict(one.table.iloc[i]) | {"seed": seed} for i in range(len(one.table)) for seed in range(2)]
+    rows = [
+        dict(one.table.iloc[i]) | {"seed": seed} for i in range(len(one.table)) for seed in range(2)
+    ]
     seconds = [row["iterations"] * (slowest if row["seed"] else 1.0) for row in rows]
     findings = one.entry.findings(pd.DataFrame(rows).assign(seconds=seconds))
     assert all(("noisy" in finding.ours) is noisy for finding in findings)
@@ -293,13 +330,23 @@ def test_counts_keep_the_three_kinds_apart():
         Finding("d", "1", "x", scripts="shown, but not comparable"),
         Finding("e", "1", "x"),
     ]
-    assert Counts.of(rows) == Counts(published_met=1, published=2, scripts_met=1, scripts=2, beyond=2)
+    assert Counts.of(rows) == Counts(
+        published_met=1, published=2, scripts_met=1, scripts=2, beyond=2
+    )
     assert [row.beyond for row in rows] == [False, False, False, True, True]
 
 
 def test_the_text_fits_a_terminal_and_counts(found):
-    lines, counts = text(found).splitlines(), Counts.of(finding for one in found for finding in one.findings)
+    lines, counts = (
+        text(found).splitlines(),
+        Counts.of(finding for one in found for finding in one.findings),
+    )
     assert max(map(len, lines)) <= WIDTH == 100
+    made, whole_size = sum(len(one.runs) for one in found), sum(one.whole for one in found)
+    assert any(
+        line.startswith(f"small: {made} of {whole_size} runs. At this size differences")
+        for line in lines
+    )
     assert lines[-3:] == [
         f"met against the printed paper: {counts.published_met} of {counts.published}",
         f"met against its scripts, as measured: {counts.scripts_met} of {counts.scripts}",
@@ -308,6 +355,9 @@ def test_the_text_fits_a_terminal_and_counts(found):
     whole = " ".join(lines)
     assert all(one.entry.title in whole for one in found)
     assert whole.count("(met)") <= counts.published_met + counts.scripts_met
+    assert "(differs)" not in whole and all(
+        f"small: {len(o.runs)} of {o.whole} runs" in lines for o in found
+    )
     # a quantity is wrapped in its column, so that its first words are together
     assert all(finding.quantity[:12] in whole for one in found for finding in one.findings)
 
@@ -362,10 +412,21 @@ def test_the_page_holds_every_figure_and_finding(found, page):
         assert finding.quantity in plain and finding.verdict in plain and finding.ours in plain
     for statement in THEORY:
         assert all(part in plain for part in statement)
-    assert "reduced size" in html and "http" not in html.replace("charset", "")
+    assert (
+        "At this size differences from the paper and its scripts are expected" in plain
+        and "http" not in html.replace("charset", "")
+    )
     rows = [finding for one in found for finding in one.findings]
-    marks = [mark for row in rows for mark in (row.as_published, row.as_scripts) if mark is not None]
-    assert html.count("✓ met") == sum(marks) and html.count("≠ differs") == len(marks) - sum(marks)
+    marks = [
+        mark for row in rows for mark in (row.as_published, row.as_scripts) if mark is not None
+    ]
+    assert html.count("✓ met") == sum(marks) and html.count("≠ differs at small size") == len(
+        marks
+    ) - sum(marks)
+    assert html.count("≠ differs") == len(marks) - sum(marks)
+    assert all(
+        f"small: {len(one.runs)} of {one.whole} runs of the full size." in plain for one in found
+    )
     counts = Counts.of(rows)
     assert f"<td>{counts.published_met} of {counts.published}</td>" in html
     assert f"<td>{counts.scripts_met} of {counts.scripts}</td><td>{counts.beyond}</td>" in html
@@ -384,7 +445,18 @@ def test_the_folder_holds_figures_runs_and_findings(found, page):
             assert content.startswith(b"\x89PNG") and len(content) > 10_000
     content = json.loads((page / "reproduction.json").read_text(encoding="utf-8"))
     assert content["findings"] == as_rows(found) and content["pipeline"] == "ours"
-    assert content["counts"]["beyond"] == sum(finding.beyond for one in found for finding in one.findings)
+    size = content["size"]
+    assert (
+        size["small"] is True
+        and "differences from the paper and its scripts are expected" in size["text"]
+    )
+    assert size["studies"] == {
+        one.entry.name: {"runs": len(one.runs), "of": one.whole} for one in found
+    }
+    assert all(part["runs"] < part["of"] for part in size["studies"].values())
+    assert content["counts"]["beyond"] == sum(
+        finding.beyond for one in found for finding in one.findings
+    )
     assert content["runs"] == {one.entry.name: when(one.runs) for one in found}
 
 
@@ -401,13 +473,16 @@ def test_runs_of_a_store_are_the_same_file_and_said_to_be_stored(found, page, st
 def test_a_second_run_reads_the_store(found, store, monkeypatch):
     (first,) = (one for one in found if one.entry.name == "static_errors")
     study = first.entry.study("ours", True)
-    monkeypatch.setattr("orthaug.studies.static_errors.trained", lambda *a, **k: pytest.fail("it ran again"))
+    monkeypatch.setattr(
+        "orthaug.studies.static_errors.trained", lambda *a, **k: pytest.fail("it ran again")
+    )
     again = run(study, store=store)
     assert again.test_rmse.tolist() == first.table.test_rmse.tolist()
 
 
 @pytest.mark.parametrize(
-    ("name", "hint"), [("static_error", "static_errors"), ("consistancy", "consistency"), ("cover", "coverage")]
+    ("name", "hint"),
+    [("static_error", "static_errors"), ("consistancy", "consistency"), ("cover", "coverage")],
 )
 def test_an_unknown_study_has_a_nearest_one(name, hint):
     with pytest.raises(InputError, match=f"no study '{name}', did you mean '{hint}'"):
@@ -415,18 +490,49 @@ def test_an_unknown_study_has_a_nearest_one(name, hint):
 
 
 def test_an_unknown_pipeline_is_refused():
-    with pytest.raises(InputError, match="--pipeline must be one of ours, paper, scripts; got 'nonsense'"):
+    with pytest.raises(
+        InputError, match="--pipeline must be one of ours, paper, scripts; got 'nonsense'"
+    ):
         reproduce([], pipeline="nonsense")
 
 
-def command(*arguments: str) -> list[str]:
-    return [
-        sys.executable,
-        "-c",
-        "import sys; from orthaug.commands.cli import main; sys.exit(main())",
-        "reproduce",
-        *arguments,
+def test_the_full_size_makes_no_excuse(found, tmp_path):
+    """The same runs as if they were all: nothing is called small."""
+    (one,) = (o for o in found if o.entry.name == "static_noise")
+    full = [replace(one, small=False)]
+    shown = " ".join(text(full).split())
+    assert "small:" not in shown and "at small size" not in shown and "differs)" in shown
+    write(full, tmp_path / "out", "ours")
+    content = json.loads((tmp_path / "out" / "reproduction.json").read_text(encoding="utf-8"))[
+        "size"
     ]
+    assert content["small"] is False and content["text"] is None
+    html = (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
+    assert "small:" not in html and "at small size" not in html and "≠ differs" in html
+
+
+def test_longer_training_is_named_where_the_papers_sum_is_missed(found):
+    """The row says what ours is when training stops early, and with how many effective weights."""
+    (one,) = (o for o in found if o.entry.name == "static_noise")
+    rows = one.table.query("regularization == 'stopping' and structure == 'orthogonal'")
+    finding = by_quantity(
+        found, "static_noise", "set 1, 30 dB, orthogonal: sum of squared test errors"
+    )
+    assert (
+        f"after 50 iterations ours is {1024 * (rows.test_rmse**2).mean():.3g} (" in finding.verdict
+    )
+    assert f"with {rows.effective_weights.mean():.3g} instead of " in finding.verdict
+    plain = one.table[one.table.regularization == "none"]  # as the other pipelines have it
+    assert not any("after 50" in finding.verdict for finding in one.entry.findings(plain))
+
+
+def command(*arguments: str) -> list[str]:
+    """The program as it is started; children of a background job would ignore Ctrl-C."""
+    program = (
+        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
+        "from orthaug.commands.entry import main; main()"
+    )
+    return [sys.executable, "-c", program, "reproduce", *arguments]
 
 
 @pytest.mark.parametrize(
@@ -442,27 +548,39 @@ def test_refusals_of_the_command(tmp_path, arguments, message):
     assert not (tmp_path / "out").exists()
 
 
-def test_ctrl_c_and_again(tmp_path, page, monkeypatch):
-    """Stopped by Ctrl-C, the next command goes on from what is kept."""
+@pytest.mark.parametrize(
+    ("number", "words"), [(signal.SIGINT, "interrupted"), (signal.SIGTERM, "terminated")]
+)
+def test_stopped_and_again(tmp_path, page, monkeypatch, number, words):
+    """Stopped by a signal it names no file of the cache; the next command goes on from what is kept."""
     if sys.platform != "linux":
         pytest.skip("the cache folder is elsewhere")
     whole = command("consistency", "--small", "--out", str(tmp_path / "out"))
     environment = dict(os.environ, XDG_CACHE_HOME=str(tmp_path / "cache"))
-    process = subprocess.Popen(whole, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
+    process = subprocess.Popen(
+        whole, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
+    )
     store = tmp_path / "cache" / "orthaug" / "studies"
     end = time.monotonic() + 60
     while not list(store.rglob("*.json")) and process.poll() is None and time.monotonic() < end:
         time.sleep(0.02)
-    process.send_signal(signal.SIGINT)
+    process.send_signal(number)
     _, errors = process.communicate(timeout=60)
     kept = {path: path.stat().st_mtime_ns for path in store.rglob("*.json")}
-    assert process.returncode != 0, "it was done before the signal came"
-    assert kept and "Traceback" not in errors and not (tmp_path / "out").exists()
+    assert process.returncode == 128 + number, "it was done before the signal came"
+    title, done = catalogue()["consistency"].title, r"\d+ of \d+ runs done"
+    then = "The runs that are done are kept: the same command goes on from there"
+    assert re.fullmatch(
+        f"{words} during '{title}', {done}; nothing is written. {then}\n", errors
+    ), errors
+    assert kept and not (tmp_path / "out").exists()
     monkeypatch.setenv("XDG_CACHE_HOME", environment["XDG_CACHE_HOME"])
     done = run_command(*whole[3:])
     assert done.code == 0, done.err
     assert {path: path.stat().st_mtime_ns for path in kept} == kept
-    assert len(list(store.rglob("*.json"))) == len(catalogue()["consistency"].study("ours", True).cases())
+    assert len(list(store.rglob("*.json"))) == len(
+        catalogue()["consistency"].study("ours", True).cases()
+    )
     html = (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
     assert "read from the store" in html and "made now" in html
     # as it would be without the interruption
@@ -483,6 +601,8 @@ def plain(value):
 if __name__ == "__main__":
     with tempfile.TemporaryDirectory() as folder:
         results = reduced(Path(folder))
-    kept = {one.entry.name: {k: plain(v) for k, v in stored_columns(one).items()} for one in results}
+    kept = {
+        one.entry.name: {k: plain(v) for k, v in stored_columns(one).items()} for one in results
+    }
     REFERENCES.parent.mkdir(exist_ok=True)
     REFERENCES.write_text(json.dumps(kept, ensure_ascii=False) + "\n", encoding="utf-8")

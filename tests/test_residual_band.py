@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from orthaug.fitting.residual_band import SCALES, Reference, Watch
+from orthaug.fitting.residual_band import SCALES, Reference, ResidualMonitor
 
 ROWS = 2000
 QUIET = 1e5
@@ -27,10 +27,10 @@ def watched(kind: str, seed: int = 0, used: float = 0.0) -> tuple[Reference, np.
 
 
 def loudest(reference: Reference, rows: np.ndarray) -> float:
-    return max(levels(Watch(reference), rows))
+    return max(levels(ResidualMonitor(reference), rows))
 
 
-def levels(watch: Watch, rows: np.ndarray) -> list[float]:
+def levels(watch: ResidualMonitor, rows: np.ndarray) -> list[float]:
     return [watch.level for row in rows if watch.step(row, 1.0) in (True, False)]
 
 
@@ -69,7 +69,7 @@ def test_one_outlier_is_no_alarm_and_a_gap_begins_anew():
     reference, _ = watched("coloured")
     rows = residuals("coloured", 3, 300)
     rows[150] += 1e6
-    watch = Watch(reference)
+    watch = ResidualMonitor(reference)
     assert max(levels(watch, rows)) < 1
     watch.gap()
     assert np.isnan(watch.past).all() and not any(watch.counts)
@@ -78,7 +78,7 @@ def test_one_outlier_is_no_alarm_and_a_gap_begins_anew():
 
 def test_an_alarm_is_raised_once_stands_and_ends():
     reference, _ = watched("white")
-    watch, rows = Watch(reference), residuals("white", 60, 6000)
+    watch, rows = ResidualMonitor(reference), residuals("white", 60, 6000)
     rows[500:900] *= 2.0
     raised = [k for k, row in enumerate(rows) if watch.step(row, 1.0)]
     assert len(raised) == 1 and 500 < raised[0] < 560

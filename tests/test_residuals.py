@@ -13,11 +13,20 @@ from orthaug._base.errors import InputError
 from orthaug._base.parallel import one_blas_thread
 from orthaug.analysis.independence import against_input, against_regressor
 from orthaug.analysis.residuals import analyse
-from orthaug.analysis.whiteness import autocorrelation, cross_correlation, ljung_box, normality, whitening
+from orthaug.analysis.whiteness import (
+    autocorrelation,
+    cross_correlation,
+    ljung_box,
+    normality,
+    whitening,
+)
 from orthaug.reports.residual_tests import ResidualTestResult
 
 RECORDS, ROWS, WARM_UP = 2000, 1000, 300
-BETWEEN = (0.005, 0.016)  # of 2000 records that a test at 1 % may reject; ± 0.0022 is one standard deviation
+BETWEEN = (
+    0.005,
+    0.016,
+)  # of 2000 records that a test at 1 % may reject; ± 0.0022 is one standard deviation
 
 
 @pytest.fixture(autouse=True)
@@ -35,7 +44,9 @@ def report(e, u=None, x=None, **settings):
     """The test of one output, from signals of one experiment."""
     u, x = ({} if signals is None else signals for signals in (u, x))
     columns = [np.stack(list(s.values()), axis=1) if s else np.zeros((len(e), 0)) for s in (u, x)]
-    (found,) = analyse([e[:, None]], [columns[0]], [columns[1]], ["y"], list(u), list(x), **settings)
+    (found,) = analyse(
+        [e[:, None]], [columns[0]], [columns[1]], ["y"], list(u), list(x), **settings
+    )
     return found
 
 
@@ -48,7 +59,9 @@ def naive_correlation(e, u, lags):
             for lag in range(-lags, lags + 1):
                 if 0 <= k - lag < len(one):
                     sums[lag + lags] += (one[k] - e_mean) * (other[k - lag] - u_mean)
-    norms = [sum(np.sum((part - mean) ** 2) for part in s) for s, mean in ((e, e_mean), (u, u_mean))]
+    norms = [
+        sum(np.sum((part - mean) ** 2) for part in s) for s, mean in ((e, e_mean), (u, u_mean))
+    ]
     return sums / np.sqrt(norms[0] * norms[1])
 
 
@@ -62,8 +75,12 @@ def test_correlations_are_those_of_two_loops():
 def test_many_lags_are_those_of_two_loops():
     rng = np.random.default_rng(3)
     e, u = ([rng.normal(3.0, 1e3, n) for n in (300, 7, 1, 260)] for _ in range(2))
-    np.testing.assert_allclose(cross_correlation(e, u, 280), naive_correlation(e, u, 280), atol=1e-14)
-    np.testing.assert_allclose(autocorrelation([*e, np.zeros(0)], 280), naive_correlation(e, e, 280)[280:], atol=1e-14)
+    np.testing.assert_allclose(
+        cross_correlation(e, u, 280), naive_correlation(e, u, 280), atol=1e-14
+    )
+    np.testing.assert_allclose(
+        autocorrelation([*e, np.zeros(0)], 280), naive_correlation(e, e, 280)[280:], atol=1e-14
+    )
 
 
 def test_no_product_crosses_a_boundary():
@@ -117,13 +134,19 @@ def test_ljung_box_is_its_formula():
 def test_normality_is_that_of_scipy():
     e = np.random.default_rng(5).gamma(30.0, size=700)
     found, other = normality([e[:100], e[100:]]), scipy.stats.jarque_bera(e)
-    np.testing.assert_allclose([found.statistic, found.p], [other.statistic, other.pvalue], rtol=1e-9)
-    np.testing.assert_allclose([found.skewness, found.kurtosis], [scipy.stats.skew(e), scipy.stats.kurtosis(e)])
+    np.testing.assert_allclose(
+        [found.statistic, found.p], [other.statistic, other.pvalue], rtol=1e-9
+    )
+    np.testing.assert_allclose(
+        [found.skewness, found.kurtosis], [scipy.stats.skew(e), scipy.stats.kurtosis(e)]
+    )
 
 
 def test_normality_is_asked_of_what_is_left_when_the_colour_is_gone():
     rng = np.random.default_rng(6)
-    rejected = sum(report(coloured(rng.normal(size=ROWS), -0.95)).normality.p < 0.01 for _ in range(200))
+    rejected = sum(
+        report(coloured(rng.normal(size=ROWS), -0.95)).normality.p < 0.01 for _ in range(200)
+    )
     assert rejected <= 8  # 54 % on the residual itself
 
 
@@ -146,18 +169,25 @@ def test_against_a_white_residual_bins_are_an_analysis_of_variance():
     assert found.p == pytest.approx(scipy.stats.f_oneway(*groups).pvalue, rel=1e-8)
     np.testing.assert_allclose(found.means + e.mean(), [group.mean() for group in groups])
     within = sum(np.sum((group - group.mean()) ** 2) for group in groups)
-    np.testing.assert_allclose(found.errors, np.sqrt(within / 980 * (1 / 50 - 1 / 1000)))  # of the distance to the mean
+    np.testing.assert_allclose(
+        found.errors, np.sqrt(within / 980 * (1 / 50 - 1 / 1000))
+    )  # of the distance to the mean
     assert found.share == pytest.approx(1 - within / np.sum((e - e.mean()) ** 2))
     mean_square = 50 * sum(group.mean() ** 2 for group in groups) / 20
     against_zero = against_regressor(e, x, a=np.ones(1))
-    assert against_zero.p == pytest.approx(scipy.stats.f.sf(mean_square / (within / 980), 20, 980), rel=1e-8)
+    assert against_zero.p == pytest.approx(
+        scipy.stats.f.sf(mean_square / (within / 980), 20, 980), rel=1e-8
+    )
 
 
 def test_many_experiments_shorter_than_the_lags_are_tested_from_rest():
     rng = np.random.default_rng(28)
     e, u = ([rng.normal(size=20) for _ in range(50)] for _ in range(2))
     assert against_input(e, u).p > 0.01
-    driven = [one + 0.5 * np.concatenate([[0.0, 0.0], other[:-2]]) for one, other in zip(e, u, strict=True)]
+    driven = [
+        one + 0.5 * np.concatenate([[0.0, 0.0], other[:-2]])
+        for one, other in zip(e, u, strict=True)
+    ]
     found = against_input(driven, u)
     assert found.p < 1e-10 and found.lag == 2 and len(found.values) == 39
 
@@ -258,8 +288,13 @@ def test_an_input_is_followed_beyond_the_widest_band_only():
     rng = np.random.default_rng(18)
     e, u, slow = rng.normal(size=(3, 20000))
     found = report(e + 0.04 * u, {"u": u})
-    assert found.correlated_inputs == ("u",) and found.follows() == [] and found.follows(0.01) == ["u"]
-    found = report(coloured(e[:2000], -0.98) + 0.5 * u[:2000], {"u": u[:2000], "slow": coloured(slow[:2000], -0.98)})
+    assert (
+        found.correlated_inputs == ("u",) and found.follows() == [] and found.follows(0.01) == ["u"]
+    )
+    found = report(
+        coloured(e[:2000], -0.98) + 0.5 * u[:2000],
+        {"u": u[:2000], "slow": coloured(slow[:2000], -0.98)},
+    )
     assert found.correlated_inputs == ("u",) and found.cross["u"].largest > found.cross["u"].band
     assert found.follows() == []
 
@@ -293,7 +328,10 @@ def test_flags_count_the_tests_of_their_family():
     e, *signals = rng.normal(size=(41, 500))
     names = {f"s{i}": signal for i, signal in enumerate(signals)}
     found = report(e, names, names, level=0.3)
-    for tests, flags in ((found.cross, found.correlated_inputs), (found.regressors, found.curved_regressors)):
+    for tests, flags in (
+        (found.cross, found.correlated_inputs),
+        (found.regressors, found.curved_regressors),
+    ):
         assert min(test.p for test in tests.values()) < 0.3
         assert flags == tuple(name for name, test in tests.items() if test.p < 0.3 / 40)
 
@@ -305,7 +343,9 @@ def test_an_input_with_few_frequencies_is_tested_where_it_has_any():
     assert scipy.stats.kstest(p, "uniform").pvalue > 0.01
     driven = rng.normal(size=(20, 1000)) + 0.3 * u
     assert max(against_input(e, u, a=np.ones(1)).p for e in driven) < 1e-4
-    assert np.median([against_input(e, u).p for e in driven]) < 0.01  # the sine is taken for colour in part
+    assert (
+        np.median([against_input(e, u).p for e in driven]) < 0.01
+    )  # the sine is taken for colour in part
 
 
 @pytest.mark.parametrize("value", [0.0, 0.1, 1e-300, -7e8, np.nan, np.inf, 1e200])
@@ -315,7 +355,15 @@ def test_a_residual_that_is_constant_or_without_bounds_has_no_tests(value):
     if not np.isfinite(value) or value == 1e200:
         e = np.where(np.arange(1000) < 900, rng.normal(size=1000), value)
     found = report(e, {"u": rng.normal(size=1000)}, {"x": rng.normal(size=1000)})
-    assert found.white is found.acf is found.ljung_box is found.normality is found.order is found.largest_acf is None
+    assert (
+        found.white
+        is found.acf
+        is found.ljung_box
+        is found.normality
+        is found.order
+        is found.largest_acf
+        is None
+    )
     assert found.cross == {"u": None} and found.regressors == {"x": None}
     assert found.correlated_inputs == found.curved_regressors == ()
     assert (found.rms is None) == (not abs(value) < 1e100)
@@ -334,20 +382,26 @@ def test_a_signal_that_does_not_move_or_exist_has_no_test(value):
 @pytest.mark.parametrize("rows", [0, 1, 2, 3, 9, 10, 19, 20, 27, 41])
 def test_short_records_have_what_they_can(rows):
     rng = np.random.default_rng(23)
-    found = report(rng.normal(size=rows), {"u": rng.normal(size=rows)}, {"x": rng.normal(size=rows)})
+    found = report(
+        rng.normal(size=rows), {"u": rng.normal(size=rows)}, {"x": rng.normal(size=rows)}
+    )
     ResidualTestResult.model_validate(found).to_json()
     assert found.n == rows and (found.white is None) == (rows < 20)
     assert (found.regressors["x"] is None) == (rows < 10)
 
 
-@pytest.mark.parametrize("e", [np.arange(400.0), np.sin(np.arange(400) / 9), np.tile([1.0, -1.0], 200), np.eye(400)[7]])
+@pytest.mark.parametrize(
+    "e", [np.arange(400.0), np.sin(np.arange(400) / 9), np.tile([1.0, -1.0], 200), np.eye(400)[7]]
+)
 def test_residuals_without_noise_do_not_break_anything(e):
     rng = np.random.default_rng(24)
     tests = report(e, {"e": e, "u": rng.normal(size=400)}, {"e": e, "x": np.roll(e, 1)})
     ResidualTestResult.model_validate(tests).to_json()
     assert tests.n == 400 and tests.rms == pytest.approx(np.sqrt(np.mean(e**2)))
     assert tests.cross["e"].lag == 0 and tests.cross["e"].largest == pytest.approx(1)
-    np.testing.assert_allclose(tests.cross["e"].values, np.concatenate([tests.acf[:0:-1], tests.acf]), atol=1e-12)
+    np.testing.assert_allclose(
+        tests.cross["e"].values, np.concatenate([tests.acf[:0:-1], tests.acf]), atol=1e-12
+    )
     assert 0 <= tests.ljung_box.p <= 1 and 0 < tests.regressors["e"].share <= 1
 
 
@@ -355,12 +409,17 @@ def test_results_do_not_depend_on_units():
     rng = np.random.default_rng(25)
     e, u, x = rng.normal(size=(3, 600))
     e = coloured(e, -0.7) + 0.1 * x**2
-    plain, scaled = report(e, {"u": u}, {"x": x}), report(1e-9 * e, {"u": 1e7 * u + 3e7}, {"x": 1e-5 * x})
+    plain, scaled = (
+        report(e, {"u": u}, {"x": x}),
+        report(1e-9 * e, {"u": 1e7 * u + 3e7}, {"x": 1e-5 * x}),
+    )
     assert scaled.ljung_box.p == pytest.approx(plain.ljung_box.p)
     assert scaled.cross["u"].p == pytest.approx(plain.cross["u"].p, rel=1e-6)
     assert scaled.cross["u"].band == pytest.approx(plain.cross["u"].band)
     assert scaled.regressors["x"].p == pytest.approx(plain.regressors["x"].p)
-    np.testing.assert_allclose(scaled.regressors["x"].means, 1e-9 * plain.regressors["x"].means, atol=1e-20)
+    np.testing.assert_allclose(
+        scaled.regressors["x"].means, 1e-9 * plain.regressors["x"].means, atol=1e-20
+    )
     assert scaled.rms == pytest.approx(1e-9 * plain.rms)
 
 
@@ -374,7 +433,12 @@ def test_every_output_has_its_tests_as_plain_content():
         assert test.ljung_box == ljung_box([one[:, i] for one in e])
         assert test.acf_band == pytest.approx(2.5758 / np.sqrt(500), rel=1e-4)
         content = json.loads(ResidualTestResult.model_validate(test).to_json())
-        assert list(content["cross"]) == ["a", "b"] and list(content["regressors"]) == ["s", "t", "v", "w"]
+        assert list(content["cross"]) == ["a", "b"] and list(content["regressors"]) == [
+            "s",
+            "t",
+            "v",
+            "w",
+        ]
         assert len(content["acf"]) == 26 and len(content["cross"]["b"]["values"]) == 51
         assert content["white"] is test.white and content["ljung_box"]["freedom"] == 25
         assert content["n"] == 500 and sum(content["regressors"]["w"]["counts"]) == 500
@@ -386,8 +450,14 @@ def test_every_output_has_its_tests_as_plain_content():
     [
         ({"inputs": []}, "`inputs` has 0 experiments but `residuals` has 1"),
         ({"residuals": [], "inputs": [], "regressors": []}, "`residuals` has 0 experiments"),
-        ({"inputs": [np.zeros((49, 1))]}, r"`inputs` of experiment 0 has the shape \(49, 1\); .* make \(50, 1\)"),
-        ({"regressors": [np.zeros((50, 2))]}, r"`regressors` of experiment 0 has the shape \(50, 2\)"),
+        (
+            {"inputs": [np.zeros((49, 1))]},
+            r"`inputs` of experiment 0 has the shape \(49, 1\); .* make \(50, 1\)",
+        ),
+        (
+            {"regressors": [np.zeros((50, 2))]},
+            r"`regressors` of experiment 0 has the shape \(50, 2\)",
+        ),
         ({"residuals": [np.zeros(50)]}, r"`residuals` of experiment 0 has the shape \(50,\)"),
         ({"output_names": ["y", "y"]}, "'y' is given twice"),
         ({"lags": 0}, "`lags` must be a whole number, 1 or more"),

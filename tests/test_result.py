@@ -32,7 +32,9 @@ def documented() -> dict[str, set[str]]:
         where, keys = line.strip("| ").split(" | ", maxsplit=1)
         command, _, rest = where.rpartition(": ")
         for place in re.findall(r"`([^`]+)`", rest) or ["top"]:
-            places[f"{command.strip('`') or 'fit'}: {place}"] = set(re.findall(r"`([a-z_0-9]+)`", keys))
+            places[f"{command.strip('`') or 'fit'}: {place}"] = set(
+                re.findall(r"`([a-z_0-9]+)`", keys)
+            )
     return places
 
 
@@ -57,7 +59,9 @@ def tables(annotation: Any, place: str) -> Iterator[tuple[str, type[Content]]]:
         yield from tables(get_args(annotation)[1], f"{place}{{}}")
 
 
-TABLES = [(command, place, model) for command, top in RESULTS.items() for place, model in tables(top, "")]
+TABLES = [
+    (command, place, model) for command, top in RESULTS.items() for place, model in tables(top, "")
+]
 
 
 def test_every_key_is_documented():
@@ -65,8 +69,12 @@ def test_every_key_is_documented():
     for command, place, model in TABLES:
         place = place.removeprefix("comparison[].") if command == "compare" else place
         keys = {key_of(model, name) for name in model.model_fields}
-        lacking[command, place] = keys - known.get(f"{command}: {place}", known.get(f"fit: {place}", set()))
-    assert {place: keys for place, keys in lacking.items() if keys} == {}, "docs/result.md does not tell of these"
+        lacking[command, place] = keys - known.get(
+            f"{command}: {place}", known.get(f"fit: {place}", set())
+        )
+    assert {place: keys for place, keys in lacking.items() if keys} == {}, (
+        "docs/result.md does not tell of these"
+    )
 
 
 def test_no_key_is_documented_that_is_not_there():
@@ -138,7 +146,9 @@ def test_places_are_told_as_the_spec_names_files(written):
 def test_the_schema_names_every_key(command):
     printed = json.loads(run("schema", command).out)
     assert printed == schema_of(command)
-    assert list(printed["properties"]) == [key_of(RESULTS[command], name) for name in RESULTS[command].model_fields]
+    assert list(printed["properties"]) == [
+        key_of(RESULTS[command], name) for name in RESULTS[command].model_fields
+    ]
 
 
 def test_the_schema_of_another_command_is_refused():
@@ -149,5 +159,8 @@ def test_the_schema_of_another_command_is_refused():
 
 def test_the_schema_knows_what_may_be_absent_and_null():
     parameter = schema_of("fit")["$defs"]["ParameterResult"]
-    assert parameter["required"][:4] == ["name", "unit", "initial", "value"] and "one_step" not in parameter["required"]
+    assert (
+        parameter["required"][:4] == ["name", "unit", "initial", "value"]
+        and "one_step" not in parameter["required"]
+    )
     assert parameter["properties"]["std"]["anyOf"] == [{"type": "number"}, {"type": "null"}]

@@ -42,7 +42,9 @@ def test_round_trip(rows, trailing):
 def test_row_sum_is_the_plain_sum(rows):
     values = np.random.default_rng(rows).normal(size=(rows, 4))
     chunks = jnp.asarray(in_chunks(values, chunk_shape(rows, 64)))
-    np.testing.assert_allclose(jax.jit(lambda c: row_sum(gram, c))(chunks), values.T @ values, rtol=1e-13, atol=1e-13)
+    np.testing.assert_allclose(
+        jax.jit(lambda c: row_sum(gram, c))(chunks), values.T @ values, rtol=1e-13, atol=1e-13
+    )
 
 
 def test_row_sum_takes_and_gives_trees():
@@ -56,6 +58,9 @@ def test_row_sum_takes_and_gives_trees():
 
 def test_chunking_does_not_change_the_sum():
     values = np.random.default_rng(0).normal(size=(1000, 3))
-    sums = [row_sum(gram, jnp.asarray(in_chunks(values, chunk_shape(1000, limit)))) for limit in (8, 100, 999, 5000)]
+    sums = [
+        row_sum(gram, jnp.asarray(in_chunks(values, chunk_shape(1000, limit))))
+        for limit in (8, 100, 999, 5000)
+    ]
     for other in sums[1:]:
         np.testing.assert_allclose(other, sums[0], rtol=1e-12, atol=1e-12)

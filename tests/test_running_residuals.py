@@ -43,7 +43,10 @@ def test_the_band_of_a_cross_correlation_holds_its_level():
     inside = 0
     for seed in range(300):
         rng = np.random.default_rng(seed)
-        e, u = (np.convolve(rng.normal(size=1010), 0.6 ** np.arange(11), "valid")[:, None] for _ in range(2))
+        e, u = (
+            np.convolve(rng.normal(size=1010), 0.6 ** np.arange(11), "valid")[:, None]
+            for _ in range(2)
+        )
         running = RunningResidual(["y"], ["u"], lags=15)
         running.add(e, u, begins=True)
         cross = running.tests()[0].cross["u"]

@@ -38,7 +38,10 @@ NARX_CANNOT = {  # by what it is: predict(X, y) looks back from each row at meas
 def statuses(estimator, **options):
     with np.errstate(all="ignore"):
         found = check_estimator(estimator, on_skip=None, **options)
-    return {kind: {one["check_name"] for one in found if one["status"] == kind} for kind in ("passed", "skipped")}
+    return {
+        kind: {one["check_name"] for one in found if one["status"] == kind}
+        for kind in ("passed", "skipped")
+    }
 
 
 def static(rows=80):
@@ -78,19 +81,26 @@ def test_the_checks_of_scikit_learn_pass_and_none_is_skipped_but_its_own():
 
 def test_the_checks_that_a_narx_can_pass():
     expected = dict.fromkeys(NARX_CANNOT, "predict needs y")
-    found = statuses(oa.AugmentedNARX(learner=None), on_fail="raise", expected_failed_checks=expected)
+    found = statuses(
+        oa.AugmentedNARX(learner=None), on_fail="raise", expected_failed_checks=expected
+    )
     assert len(found["passed"]) > 20 and not found["passed"] & NARX_CANNOT
 
 
 def test_static_numbers_are_those_of_estimate():
     X, y = static()
     model = oa.AugmentedRegressor(
-        {"drag": "speed**2"}, learner=oa.MLP(hidden=(3,), inputs=("angle",)), restarts=2, random_state=3
+        {"drag": "speed**2"},
+        learner=oa.MLP(hidden=(3,), inputs=("angle",)),
+        restarts=2,
+        random_state=3,
     ).fit(X, y)
     record = oa.Record.from_arrays(X, y, inputs=["speed", "angle"])
     baseline = oa.Baseline.from_terms([oa.Term("drag", "speed[k]**2")])
     learner = oa.MLP(hidden=(3,), inputs=("angle[k]",))
-    fit = oa.estimate(record, baseline, lags=oa.Lags(nb=1, nk=0), learner=learner, restarts=2, seed=3)
+    fit = oa.estimate(
+        record, baseline, lags=oa.Lags(nb=1, nk=0), learner=learner, restarts=2, seed=3
+    )
     np.testing.assert_array_equal(model.theta_, fit.theta)
     np.testing.assert_array_equal(model.theta_interval_, fit.interval)
     pd.testing.assert_frame_equal(model.coef_table_, fit.parameters)
@@ -119,7 +129,10 @@ def test_the_default_physics_is_least_squares():
     [
         (["x0**2", "x1"], ["theta1", "theta2"]),
         ([oa.Term("a", "x0**2", unit="N"), oa.Term("b", "x1[k]")], ["a", "b"]),
-        (oa.Baseline.from_terms([oa.Term("a", "c*x0[k]**2"), oa.Term("b", "x1[k]")], {"c": 1.0}), ["a", "b"]),
+        (
+            oa.Baseline.from_terms([oa.Term("a", "c*x0[k]**2"), oa.Term("b", "x1[k]")], {"c": 1.0}),
+            ["a", "b"],
+        ),
         (lambda x: oa._base.jax.jnp.stack([x[0] ** 2, x[1]])[None], ["theta1", "theta2"]),
     ],
     ids=["expressions", "terms", "baseline", "function"],
@@ -148,7 +161,8 @@ def test_a_column_called_intercept_keeps_the_other_one():
     model = oa.AugmentedRegressor(learner=None).fit(X.rename(columns={"angle": "intercept"}), y)
     assert list(model.coef_table_.index) == ["intercept_", "speed", "intercept"]
     np.testing.assert_allclose(
-        model.predict(X.rename(columns={"angle": "intercept"})), LinearRegression().fit(X, y).predict(X)
+        model.predict(X.rename(columns={"angle": "intercept"})),
+        LinearRegression().fit(X, y).predict(X),
     )
 
 
@@ -160,11 +174,15 @@ def test_several_outputs():
     values, std = model.predict(X, return_std=True)
     assert values.shape == std.shape == both.shape
     for j in range(2):
-        alone = oa.AugmentedRegressor({"drag": "speed**2", "turn": "angle"}, learner=None).fit(X, both[:, j])
+        alone = oa.AugmentedRegressor({"drag": "speed**2", "turn": "angle"}, learner=None).fit(
+            X, both[:, j]
+        )
         np.testing.assert_allclose(values[:, j], alone.predict(X), rtol=1e-9)
         np.testing.assert_allclose(model.noise_std_[j], alone.noise_std_[0], rtol=0.05)
     shared = [oa.Term("drag", "speed**2", output="a"), oa.Term("drag", "2*speed**2", output="b")]
-    fitted = oa.AugmentedRegressor(shared, learner=None).fit(X, pd.DataFrame(both, columns=["a", "b"]))
+    fitted = oa.AugmentedRegressor(shared, learner=None).fit(
+        X, pd.DataFrame(both, columns=["a", "b"])
+    )
     assert fitted.theta_.shape == (1,)
 
 
@@ -182,17 +200,33 @@ def test_tools_of_scikit_learn():
 def test_what_is_refused_and_how():
     X, y = static()
     wrong = [
-        (oa.AugmentedRegressor("speed"), X, "`physics` must be 'linear', a list of expressions or Terms"),
+        (
+            oa.AugmentedRegressor("speed"),
+            X,
+            "`physics` must be 'linear', a list of expressions or Terms",
+        ),
         (oa.AugmentedRegressor(3), X, "`physics` must be 'linear'.*got 3"),
         (oa.AugmentedRegressor(["speed[k-1]"], learner=None), X, "the rows of X have no order"),
-        (oa.AugmentedRegressor(["mass*speed"]), X, "unknown column 'mass'; the columns are speed, angle"),
-        (oa.AugmentedRegressor({"drag": "sped**2 + 1e3"}), X, "unknown column 'sped', did you mean"),
+        (
+            oa.AugmentedRegressor(["mass*speed"]),
+            X,
+            "unknown column 'mass'; the columns are speed, angle",
+        ),
+        (
+            oa.AugmentedRegressor({"drag": "sped**2 + 1e3"}),
+            X,
+            "unknown column 'sped', did you mean",
+        ),
         (
             oa.AugmentedRegressor(learner=None),
             X.assign(angle=1.0),
             r"constant \(1\).* PolynomialFeatures .*include_bias",
         ),
-        (oa.AugmentedRegressor(lambda x: x), X, r"returned shape \(2,\) for one row; expected \(n_outputs, n_param"),
+        (
+            oa.AugmentedRegressor(lambda x: x),
+            X,
+            r"returned shape \(2,\) for one row; expected \(n_outputs, n_param",
+        ),
         (oa.AugmentedRegressor(), X.assign(angle=1.0), "channel 'angle' is constant"),
         (oa.AugmentedRegressor(["speed", "2*speed"]), X, "rank-deficient"),
         (oa.AugmentedRegressor(learner="mlp"), X, "`learner` must be"),
@@ -216,9 +250,12 @@ def test_without_scikit_learn_the_names_are_there_and_say_what_to_install():
         "    try: getattr(oa, name)()\n"
         "    except oa.InputError as error: print(error)"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True
+    )
     assert done.stdout.splitlines() == [
-        f"{name} needs scikit-learn; install orthaug[sklearn]." for name in ("AugmentedRegressor", "AugmentedNARX")
+        f"{name} needs scikit-learn; install orthaug[sklearn]."
+        for name in ("AugmentedRegressor", "AugmentedNARX")
     ]
 
 
@@ -240,7 +277,9 @@ def test_narx_numbers_are_those_of_estimate(narx, records):
 
 def test_rows_of_a_group_need_not_stand_together(narx, records):
     X, y, groups, _ = records
-    order = np.argsort(np.tile(np.arange(60), 4), kind="stable")  # row 0 of every experiment, row 1 of every one, …
+    order = np.argsort(
+        np.tile(np.arange(60), 4), kind="stable"
+    )  # row 0 of every experiment, row 1 of every one, …
     mixed = clone(narx).fit(X[order], y[order], groups[order])
     np.testing.assert_array_equal(mixed.theta_, narx.theta_)
     back = np.empty(len(y))
@@ -259,7 +298,9 @@ def test_where_a_free_run_starts(narx, records):
 def test_a_free_run_that_runs_away_scores_less_than_any():
     u, y = experiment(60, 0)
     grown = 1.6 ** np.arange(60.0) + np.random.default_rng(1).normal(size=60)
-    narx = oa.AugmentedNARX({"pole": "y[k-1]", "gain": "x0[k-1]"}, learner=None).fit(u[:, None], grown)
+    narx = oa.AugmentedNARX({"pole": "y[k-1]", "gain": "x0[k-1]"}, learner=None).fit(
+        u[:, None], grown
+    )
     longer = np.tile(u, 3)[:, None]
     assert narx.score(longer, np.tile(y, 3) + 1) == -np.inf
 
@@ -267,13 +308,21 @@ def test_a_free_run_that_runs_away_scores_less_than_any():
 def test_experiments_are_left_out_by_their_groups(narx, records):
     X, y, groups, record = records
     with sklearn.config_context(enable_metadata_routing=True):
-        routed = clone(narx).set_params(learner=None).set_fit_request(groups=True).set_score_request(groups=True)
-        found = cross_val_score(routed, X, y, cv=GroupKFold(4), params={"groups": groups}, error_score="raise")
+        routed = (
+            clone(narx)
+            .set_params(learner=None)
+            .set_fit_request(groups=True)
+            .set_score_request(groups=True)
+        )
+        found = cross_val_score(
+            routed, X, y, cv=GroupKFold(4), params={"groups": groups}, error_score="raise"
+        )
     baseline = oa.Baseline.from_terms([oa.Term("pole", "y[k-1]"), oa.Term("gain", "x0[k-1]")])
     expected = []
     for left in range(4):
         parts = [
-            oa.Record.join([oa.Record.from_arrays(e.inputs, e.outputs, inputs=["x0"])]) for e in record.experiments
+            oa.Record.join([oa.Record.from_arrays(e.inputs, e.outputs, inputs=["x0"])])
+            for e in record.experiments
         ]
         held = parts.pop(left)
         free = oa.estimate(oa.Record.join(parts), baseline, learner=None).model.simulate(held).model
@@ -285,7 +334,12 @@ def test_narx_of_several_outputs_and_lags():
     u, y = experiment(80, 0)
     both = np.column_stack([y, np.tanh(2 * y) + 0.1 * np.roll(u, 3)])
     narx = oa.AugmentedNARX(lags=oa.Lags(na=1, nb=2), learner=None).fit(u[:, None], both)
-    assert [str(i) for i in narx.coef_table_.index[:4]] == ["intercept_y0", "intercept_y1", "y0_1_y0", "y0_1_y1"]
+    assert [str(i) for i in narx.coef_table_.index[:4]] == [
+        "intercept_y0",
+        "intercept_y1",
+        "y0_1_y0",
+        "y0_1_y1",
+    ]
     assert narx.first_row_ == 2 and narx.predict(u[:, None], both).shape == both.shape
 
 
@@ -300,7 +354,8 @@ def test_of_the_outputs_only_the_first_rows_start_a_free_run(narx, records):
 
 
 @pytest.mark.parametrize(
-    ("label", "words"), [(None, "no label at row 3"), (np.nan, "no label at row 3"), (2, "int, str")]
+    ("label", "words"),
+    [(None, "no label at row 3"), (np.nan, "no label at row 3"), (2, "int, str")],
 )
 def test_labels_of_experiments(narx, records, label, words):
     X, y, _, _ = records
@@ -313,7 +368,8 @@ def test_labels_of_experiments(narx, records, label, words):
 def test_what_sets_a_field_of_a_declaration_names_the_remedy():
     model = oa.AugmentedRegressor(learner=SMALL)
     with pytest.raises(
-        oa.InputError, match=r'give `learner` itself, in a grid \{"learner": \[oa.MLP\(hidden=…\), …\]\}'
+        oa.InputError,
+        match=r'set `learner` itself, in a grid \{"learner": \[oa.MLP\(hidden=…\), …\]\}',
     ):
         model.set_params(learner__hidden=(3,))
     with pytest.raises(ValueError, match="Invalid parameter"):
@@ -324,9 +380,15 @@ def test_what_a_narx_refuses_and_how(narx, records):
     X, y, groups, _ = records
     pole = {"pole": "y[k-1]"}
     wrong = [
-        (lambda: clone(narx).fit(X, y, groups[:5]), r"`groups` has the shape \(5,\); expected one label"),
+        (
+            lambda: clone(narx).fit(X, y, groups[:5]),
+            r"`groups` has the shape \(5,\); expected one label",
+        ),
         (lambda: clone(narx).fit(X, y, np.arange(240)), "group 0 has 1 rows, too few"),
-        (lambda: oa.AugmentedNARX(pole, score_on="both").fit(X, y), "`score_on` must be one of simulation, prediction"),
+        (
+            lambda: oa.AugmentedNARX(pole, score_on="both").fit(X, y),
+            "`score_on` must be one of simulation, prediction",
+        ),
         (lambda: oa.AugmentedNARX(["y[k]"]).fit(X, y), "output that is to be predicted"),
         (lambda: narx.predict(X, y[:5]), r"`y` has the shape \(5, 1\); expected \(240, 1\)"),
         (lambda: narx.simulate(X, np.ones((1, 2))), "`initial` has 2 columns"),

@@ -16,7 +16,7 @@ from orthaug._base.jax import jax, jnp
 from orthaug.data.record import Record
 from orthaug.data.regressors import Lags
 from orthaug.fitting.estimation import estimate
-from orthaug.fitting.segments import Segments, lay_segments, respond, sensitivity
+from orthaug.fitting.segments import Segments, build_segments, respond, sensitivity
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.models.dynamics import Numbers
 from orthaug.models.lagged import Lagged
@@ -37,10 +37,18 @@ SHARED = [
 ]
 CASES = {
     "one output": (ONE, Lags(2, 2, 0), NETWORK),
-    "gaps between lags": ([Term("a", "y1[k-1]"), Term("b", "y1[k-3]"), Term("g", "u[k]")], None, NETWORK),
+    "gaps between lags": (
+        [Term("a", "y1[k-1]"), Term("b", "y1[k-3]"), Term("g", "u[k]")],
+        None,
+        NETWORK,
+    ),
     "expressions": (ONE, None, MLP(hidden=(2,), inputs=("sin(y1[k-1])", "y1[k-3]*u[k]"))),
     "nonlinear physics and a fixed term": (
-        [Term("a", "y1[k-1] - 0.1*y1[k-1]**3"), Term("g", "u[k]"), Term("d", "y1[k-2]", 0.2, fixed=True)],
+        [
+            Term("a", "y1[k-1] - 0.1*y1[k-1]**3"),
+            Term("g", "u[k]"),
+            Term("d", "y1[k-2]", 0.2, fixed=True),
+        ],
         None,
         NETWORK,
     ),
@@ -76,7 +84,9 @@ def case(name):
     terms, lags, learner = CASES[name]
     ny = OUTPUTS[name]
     rng = np.random.default_rng(len(name))
-    posed = pose(record_of(ny), Baseline.from_terms(terms), lags, None if learner is None else learner.inputs)
+    posed = pose(
+        record_of(ny), Baseline.from_terms(terms), lags, None if learner is None else learner.inputs
+    )
     nz = posed.feature_rows().shape[1]
     bound = None if learner is None else Bound(learner, nz, ny)
     form = Lagged(posed.baseline, posed.features, posed.layout, posed.outputs, bound)
@@ -87,9 +97,16 @@ def case(name):
         scaling = (rng.normal(size=nz), 1 + rng.random(nz), 0.5 * (1 + rng.random(ny)))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(orthaug.fitting.segments, "CHUNK", 9)
-        segments = lay_segments(posed.record, form, SEGMENT, WASHOUT)
+        segments = build_segments(posed.record, form, SEGMENT, WASHOUT)
     states = np.asarray(segments.start) + 0.3 * rng.normal(size=segments.start.shape)
-    return Case(posed.record, form, Numbers(c, 0 * c, w, *scaling), segments, states, rng.normal(size=(ny, ny)))
+    return Case(
+        posed.record,
+        form,
+        Numbers(c, 0 * c, w, *scaling),
+        segments,
+        states,
+        rng.normal(size=(ny, ny)),
+    )
 
 
 def spread_out(part):
@@ -100,7 +117,7 @@ def spread_out(part):
 # --- layout
 
 
-def laid_out(record, start, memory, segment, washout):
+def build_chunk(record, start, memory, segment, washout):
     """[(experiment, first row, scored rows)] of all segments, by counting."""
     longest = max(len(e) - start for e in record.experiments)
     steps = min(segment, longest) if segment else longest
@@ -109,7 +126,13 @@ def laid_out(record, start, memory, segment, washout):
     for i, experiment in enumerate(record.experiments):
         first = start
         while first == start or first + washout < len(experiment):
-            found.append((i, first, [k for k in range(first + washout, first + steps) if k < len(experiment)]))
+            found.append(
+                (
+                    i,
+                    first,
+                    [k for k in range(first + washout, first + steps) if k < len(experiment)],
+                )
+            )
             first += steps - washout
     return found, steps, washout
 
@@ -121,8 +144,8 @@ SIZES = [(0, 0), (1, 0), (5, 0), (7, 0), (500, 0), (0, 3), (5, 3), (7, 3), (7, 6
 @pytest.mark.parametrize("name", ["gaps between lags", "two outputs share theta", "no feedback"])
 def test_layout_by_a_double_loop(name, segment, washout):
     record, form = case(name).record, case(name).form
-    found = lay_segments(record, form, segment, washout)
-    expected, steps, _ = laid_out(record, form.first_row, form.memory, segment, washout)
+    found = build_segments(record, form, segment, washout)
+    expected, steps, _ = build_chunk(record, form.first_row, form.memory, segment, washout)
     start, inputs, target, scored = map(spread_out, found)
     assert inputs.shape[1] == target.shape[1] == scored.shape[1] == steps
     assert start.shape[1:] == (form.states,) == (form.memory * OUTPUTS[name],)
@@ -136,28 +159,36 @@ def test_layout_by_a_double_loop(name, segment, washout):
             np.testing.assert_array_equal(target[s, t], experiment.outputs[first + t])
             lagged = [experiment.inputs[first + t - lag.lag, 0] for lag in form.input_layout]
             np.testing.assert_array_equal(inputs[s, t], lagged)
-    assert not scored[len(expected) :].any() and found.count == sum(len(rows) for *_, rows in expected)
+    assert not scored[len(expected) :].any() and found.count == sum(
+        len(rows) for *_, rows in expected
+    )
 
 
 @pytest.mark.parametrize(("segment", "washout"), [(0, 0), (0, 4), (7, 3), (7, 0), (9, 8)])
 def test_every_usable_row_is_scored_once_but_the_first_washout(segment, washout):
     record, form = case("one output").record, case("one output").form
-    layout, _, washout = laid_out(record, form.first_row, form.memory, segment, washout)
+    layout, _, washout = build_chunk(record, form.first_row, form.memory, segment, washout)
     rows = [(i, k) for i, _, scored in layout for k in scored]
-    usable = [(i, k) for i, e in enumerate(record.experiments) for k in range(form.first_row + washout, len(e))]
+    usable = [
+        (i, k)
+        for i, e in enumerate(record.experiments)
+        for k in range(form.first_row + washout, len(e))
+    ]
     assert sorted(rows) == usable
-    assert lay_segments(record, form, segment, washout).count == len(usable)
+    assert build_segments(record, form, segment, washout).count == len(usable)
 
 
 def test_segments_stand_in_chunks_of_one_width(monkeypatch):
     record, form = case("one output").record, case("one output").form
     monkeypatch.setattr(orthaug.fitting.segments, "CHUNK", 4)
-    chunked = lay_segments(record, form, SEGMENT, WASHOUT)
+    chunked = build_segments(record, form, SEGMENT, WASHOUT)
     monkeypatch.undo()
-    one = lay_segments(record, form, SEGMENT, WASHOUT)
+    one = build_segments(record, form, SEGMENT, WASHOUT)
     assert one.start.shape[0] == 1 and chunked.start.shape[0] == 4 and chunked.start.shape[-1] <= 4
-    assert {part.shape[0] for part in chunked} == {4} and {part.shape[-1] for part in one} == {one.start.shape[-1]}
-    count = len(laid_out(record, form.first_row, form.memory, SEGMENT, WASHOUT)[0])
+    assert {part.shape[0] for part in chunked} == {4} and {part.shape[-1] for part in one} == {
+        one.start.shape[-1]
+    }
+    count = len(build_chunk(record, form.first_row, form.memory, SEGMENT, WASHOUT)[0])
     for found, expected in zip(chunked, one, strict=True):
         np.testing.assert_array_equal(spread_out(found)[:count], spread_out(expected)[:count])
 
@@ -165,7 +196,7 @@ def test_segments_stand_in_chunks_of_one_width(monkeypatch):
 def test_an_experiment_shorter_than_the_washout_is_not_scored():
     form = case("one output").form
     record = record_of(1, (30, 5))
-    found = lay_segments(record, form, 7, 4)
+    found = build_segments(record, form, 7, 4)
     assert found.count == 30 - form.first_row - 4
 
 
@@ -177,7 +208,7 @@ def test_respond_is_a_loop_over_time(name):
     given = case(name)
     found = spread_out(respond(given.form, given.numbers, given.segments, given.states))
     model, start = SimpleNamespace(form=given.form, numbers=given.numbers), given.form.first_row
-    layout, steps, _ = laid_out(given.record, start, given.form.memory, SEGMENT, WASHOUT)
+    layout, steps, _ = build_chunk(given.record, start, given.form.memory, SEGMENT, WASHOUT)
     past = spread_out(given.states)
     past = past.reshape(len(past), given.form.memory, OUTPUTS[name])
     for s, (i, first, _) in enumerate(layout):
@@ -198,10 +229,15 @@ def test_respond_over_whole_experiments_is_simulate(ny):
     name = "two outputs share theta" if ny == 2 else "one output"
     terms, lags, learner = CASES[name]
     record = record_of(ny)
-    options = {"lags": lags, "learner": learner, "solver": LevenbergMarquardt(5), "regularization": 1.0}
+    options = {
+        "lags": lags,
+        "learner": learner,
+        "solver": LevenbergMarquardt(5),
+        "regularization": 1.0,
+    }
     model = estimate(record, Baseline.from_terms(terms), **options).model
     assert np.abs(model.theta_aux).max() > 1e-3
-    whole = lay_segments(record, model.form, 0, 0)
+    whole = build_segments(record, model.form, 0, 0)
     found = spread_out(respond(model.form, model.numbers, whole, whole.start))
     for s, trajectory in enumerate(model.simulate(record).trajectories):
         expected = trajectory.model[model.form.first_row :]
@@ -222,7 +258,9 @@ class Dense(NamedTuple):
 def errors(given, p, states):
     nt = len(given.form.baseline.names)
     numbers = given.numbers._replace(theta=p[:nt], weights=p[nt:])
-    miss = jnp.where(given.segments.scored[:, :, None], respond(given.form, numbers, given.segments, states), 0.0)
+    miss = jnp.where(
+        given.segments.scored[:, :, None], respond(given.form, numbers, given.segments, states), 0.0
+    )
     return jnp.einsum("oi,ktim->ktom", given.weight, miss)
 
 
@@ -240,13 +278,21 @@ def dense(name):
 
 def assert_close(found, expected, relative):
     assert found.shape == expected.shape
-    assert np.max(np.abs(found - expected), initial=0.0) <= relative * np.max(np.abs(expected), initial=1e-300)
+    assert np.max(np.abs(found - expected), initial=0.0) <= relative * np.max(
+        np.abs(expected), initial=1e-300
+    )
 
 
 @cache
 def found_of(name):
     given = case(name)
-    return sensitivity(given.form, given.numbers, given.segments, jnp.asarray(given.states), jnp.asarray(given.weight))
+    return sensitivity(
+        given.form,
+        given.numbers,
+        given.segments,
+        jnp.asarray(given.states),
+        jnp.asarray(given.weight),
+    )
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -269,7 +315,11 @@ def test_gram_matrices_of_the_states_are_those_of_autodiff(name):
             others[:, :, k, :, m] = 0
             assert not others.any()  # a state touches its own segment only
             rows = np.column_stack(
-                [start, exact.shared[k, :, :, m].reshape(len(start), -1), exact.error[k, :, :, m].ravel()]
+                [
+                    start,
+                    exact.shared[k, :, :, m].reshape(len(start), -1),
+                    exact.error[k, :, :, m].ravel(),
+                ]
             )
             own[k, :, :, m] = start.T @ rows
     assert_close(np.asarray(found_of(name).own), own, 1e-8)
@@ -295,7 +345,7 @@ def test_a_kink_without_a_derivative_counts_as_flat():
     record = Record.from_arrays(np.arange(9.0), np.r_[0.0, np.arange(8.0)], outputs=["y1"])
     form = replace(case("no learner").form, baseline=Baseline.from_terms([Term("a", "sqrt(max(y1[k-1], 0))")]),
                    layout=case("gaps between lags").form.layout[:1])  # fmt: skip
-    segments = lay_segments(record, form, 0, 0)
+    segments = build_segments(record, form, 0, 0)
     numbers = case("no learner").numbers._replace(theta=np.ones(1), theta_aux=np.zeros(1))
     found = sensitivity(form, numbers, segments, segments.start, jnp.eye(1))
     assert np.isfinite(found.shared).all() and np.isfinite(found.own).all()

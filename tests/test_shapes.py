@@ -33,5 +33,7 @@ print("shapes hold")
 @pytest.mark.proof
 def test_shapes_of_whole_fits():
     pytest.importorskip("beartype")
-    done = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=False
+    )
     assert done.stdout.strip() == "shapes hold", done.stderr[-3000:]

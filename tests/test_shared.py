@@ -62,7 +62,11 @@ def shared(baseline, inputs, x=None):
         (CURVED, ["u[k-1]"], [{"c": 1.0}, {"o": 1.0}]),
         (CURVED, ["u[k-1]**2"], [{"o": 1.0}]),  # −u has the same square
         (CURVED, ["u[k-1]**3"], [{"c": 1.0}, {"o": 1.0}]),
-        (CURVED, ["y[k-1]"], [{"b": 1.0}, {"o": 1.0}]),  # a jump is no constant, though its derivative is zero
+        (
+            CURVED,
+            ["y[k-1]"],
+            [{"b": 1.0}, {"o": 1.0}],
+        ),  # a jump is no constant, though its derivative is zero
         (CURVED, ["sign(y[k-1])"], [{"b": 1.0}, {"o": 1.0}]),
     ],
 )
@@ -74,7 +78,9 @@ def test_known_directions(baseline, inputs, directions):
     assert set(found.untouched) == set(found.names) - {name for d in directions for name in d}
 
 
-@pytest.mark.parametrize("inputs", [["y[k-1]", "y[k-2]", "u[k-1]"], ["u[k-1]", "y[k-2]", "y[k-1]", "u[k-1]**2"]])
+@pytest.mark.parametrize(
+    "inputs", [["y[k-1]", "y[k-2]", "u[k-1]"], ["u[k-1]", "y[k-2]", "y[k-1]", "u[k-1]**2"]]
+)
 def test_a_learner_that_sees_all_lags_shares_everything(inputs):
     found = shared(LINEAR, inputs)
     assert found.all and np.array_equal(found.basis, np.eye(3))
@@ -95,7 +101,9 @@ def test_directions_that_leave_some_entries_where_they_are(seed):
 
 
 def linear_form(coefficients, names):
-    return "+".join(f"{c:g}*{n}" for c, n in zip(coefficients, names, strict=True) if c).replace("+-", "-")
+    return "+".join(f"{c:g}*{n}" for c, n in zip(coefficients, names, strict=True) if c).replace(
+        "+-", "-"
+    )
 
 
 def random_case(rng, names):
@@ -130,23 +138,37 @@ def test_two_hundred_random_bases_against_algebra():
         points = rng.normal(size=(200, len(names)))
         gradient = np.concatenate(
             [
-                np.stack([p * (points @ form) ** (p - 1) * (form @ step) for form, p in physics], axis=1)
+                np.stack(
+                    [p * (points @ form) ** (p - 1) * (form @ step) for form, p in physics], axis=1
+                )
                 for step in null.T
             ]
             or [np.zeros((1, len(physics)))]
         )
-        rank = np.linalg.matrix_rank(gradient / np.linalg.norm(phi, axis=0), 1e-10) if np.any(gradient) else 0
-        terms = [Term(f"t{i}", f"({linear_form(form, names)})**{p}") for i, (form, p) in enumerate(physics)]
+        rank = (
+            np.linalg.matrix_rank(gradient / np.linalg.norm(phi, axis=0), 1e-10)
+            if np.any(gradient)
+            else 0
+        )
+        terms = [
+            Term(f"t{i}", f"({linear_form(form, names)})**{p}")
+            for i, (form, p) in enumerate(physics)
+        ]
         features = Features(tuple(parse(linear_form(row, names), {}) for row in z))
         found = shared_directions(Baseline.from_terms(terms), features, layout, ("y",), x)
-        if found.on_data:  # a form that lies within some per cent of the learner's: 300 rows do not tell it apart
+        if (
+            found.on_data
+        ):  # a form that lies within some per cent of the learner's: 300 rows do not tell it apart
             by_rows += 1
             cases += 1
             continue
         assert found.basis.shape[1] == len(physics) - rank, (z, physics)
         if found.basis.size:
             change = gradient @ found.basis
-            assert np.abs(change).max() <= 1e-5 * np.abs(gradient).max(initial=1.0) * np.abs(found.basis).max()
+            assert (
+                np.abs(change).max()
+                <= 1e-5 * np.abs(gradient).max(initial=1.0) * np.abs(found.basis).max()
+            )
         cases += 1
     assert by_rows <= 6
 
@@ -190,7 +212,9 @@ def oscillator(noise=0.0, seed=0, rows=3000):
     force, y = np.repeat(rng.uniform(-100, 100, rows // 50), 50), np.zeros(rows)
     for i in range(2, rows):
         friction = 10 * np.tanh((y[i - 1] - y[i - 2]) / TS / 0.05)
-        y[i] = ((2 * m + c * TS) * y[i - 1] - m * y[i - 2] + TS**2 * (force[i - 1] - friction)) / gamma
+        y[i] = (
+            (2 * m + c * TS) * y[i - 1] - m * y[i - 2] + TS**2 * (force[i - 1] - friction)
+        ) / gamma
         y[i] += noise * rng.normal()
     return Record.from_arrays(force, y, inputs=["u"], outputs=["y"], sampling_time=TS)
 
@@ -215,7 +239,10 @@ def test_all_is_the_papers_least_squares():
 
 
 def test_predictions_do_not_depend_on_the_split():
-    one, two = (fitted(choice).model.predict(oscillator()).trajectories[0].model for choice in ("auto", "all"))
+    one, two = (
+        fitted(choice).model.predict(oscillator()).trajectories[0].model
+        for choice in ("auto", "all")
+    )
     np.testing.assert_allclose(one[2:], two[2:], rtol=0, atol=1e-13)
 
 
@@ -233,7 +260,8 @@ def test_the_learner_is_orthogonal_along_the_shared_direction_alone():
 def test_auto_is_all_where_the_learner_sees_all_lags():
     options = {"learner": MLP((4,)), "solver": LevenbergMarquardt(20)}
     one, two = (
-        estimate(oscillator(), OSCILLATOR, structure=Orthogonal(shared=choice), **options) for choice in ("auto", "all")
+        estimate(oscillator(), OSCILLATOR, structure=Orthogonal(shared=choice), **options)
+        for choice in ("auto", "all")
     )
     np.testing.assert_array_equal(one.theta, two.theta)
     np.testing.assert_array_equal(one.covariance, two.covariance)
@@ -254,12 +282,16 @@ def test_intervals_cover_beside_a_learner(record_property):
     for draw in range(200):
         rng = np.random.default_rng([7, draw])
         y = clean @ truth + 0.8 * clean[:, 1] ** 2 + 0.1 * rng.normal(size=400)
-        fit = estimate(Record.from_arrays(clean, y), baseline, learner=learner, solver=LevenbergMarquardt(20))
+        fit = estimate(
+            Record.from_arrays(clean, y), baseline, learner=learner, solver=LevenbergMarquardt(20)
+        )
         split = truth[1] + 0.8 * clean[:, 1] @ clean[:, 1] ** 2 / (clean[:, 1] @ clean[:, 1])
         target = np.array([truth[0], split])
         thetas.append((fit.theta - target) / fit.std)
         holds.append((fit.interval[:, 0] <= target) & (target <= fit.interval[:, 1]))
-    record_property("covered by 95 % [%]", ", ".join(f"{100 * share:.1f}" for share in np.mean(holds, axis=0)))
+    record_property(
+        "covered by 95 % [%]", ", ".join(f"{100 * share:.1f}" for share in np.mean(holds, axis=0))
+    )
     assert np.abs(np.mean(thetas, axis=0)).max() < 0.2
     assert np.all((np.mean(holds, axis=0) >= 0.91) & (np.mean(holds, axis=0) <= 0.985))
 
@@ -294,7 +326,9 @@ def test_on_the_free_run():
 
 
 def test_a_bound_holds_beside_the_learner():
-    bounded = Baseline.from_terms([Term("t1", "y[k-1]"), Term("t2", "y[k-2]"), Term("t3", "u[k-1]", max=3e-5)])
+    bounded = Baseline.from_terms(
+        [Term("t1", "y[k-1]"), Term("t2", "y[k-2]"), Term("t3", "u[k-1]", max=3e-5)]
+    )
     fit = estimate(oscillator(), bounded, learner=VELOCITY, solver=LevenbergMarquardt(50))
     assert fit.theta[2] == 3e-5 and fit.at_bound == {"t3": 3e-5}
     assert np.isfinite(fit.std[:2]).all() and np.isnan(fit.std[2])
@@ -322,8 +356,9 @@ def test_what_could_be_imitated_in_words():
     problem = pose(oscillator(), OSCILLATOR, None, VELOCITY.inputs)
     told = imitation(problem, PHYSICS)
     assert told.text == (
-        "The learner sees y[k-1]-y[k-2] and could imitate t1 - t2: there, and only there, θ is split off. The fit "
-        "determines t3 beside any learner of these inputs. Of the physical parameters it determines ks so."
+        "The learner sees y[k-1]-y[k-2] and could imitate t1 - t2. The orthogonal split sets θ "
+        "along this direction only. The fit determines t3 beside any learner of these inputs. Of the physical "
+        "parameters it determines ks."
     )
     others = {other.inputs: (other.shared, other.physical) for other in told.alternatives}
     assert others[("u[k-1]",)][0] == 1 and ("y[k-1]-y[k-2]",) not in others
@@ -333,7 +368,9 @@ def test_a_learner_that_sees_everything_in_words():
     told = imitation(pose(oscillator(), OSCILLATOR), PHYSICS)
     assert told.everything and told.text.endswith("along every direction.")
     assert told.physical == ()
-    assert {other.inputs: other.physical for other in told.alternatives}[("y[k-1]-y[k-2]",)] == ("ks",)
+    assert {other.inputs: other.physical for other in told.alternatives}[("y[k-1]-y[k-2]",)] == (
+        "ks",
+    )
 
 
 STAGE = """
@@ -363,7 +400,10 @@ inputs = ["speed[k]", "place[k]"]
 COMPUTED = {  # from what the learner sees, and what the rows must say of it
     "sign": (lambda v, p, rng: np.sign(v), "shared_on_data"),
     "product": (lambda v, p, rng: v * p, "shared_on_data"),
-    "noisy sign": (lambda v, p, rng: np.sign(v + 0.1 * v.std() * rng.normal(size=len(v))), "nearly_shared"),
+    "noisy sign": (
+        lambda v, p, rng: np.sign(v + 0.1 * v.std() * rng.normal(size=len(v))),
+        "nearly_shared",
+    ),
     "lagged": (lambda v, p, rng: np.roll(v, 20), None),
     "filtered": (lambda v, p, rng: scipy.signal.lfilter([0.05], [1, -0.95], v), None),
     "independent": (lambda v, p, rng: rng.normal(size=len(v)), None),
@@ -375,7 +415,10 @@ def stage(column, seed: int = 0, rows: int = 800) -> tuple[np.ndarray, np.ndarra
     """Signals (rows, 4) and force of a stage whose friction is a function of speed and place."""
     rng = np.random.default_rng(seed)
     t = 0.01 * np.arange(rows)
-    v = sum(rng.uniform(0.3, 1) * np.sin(2 * np.pi * f * t + rng.uniform(0, 6.28)) for f in rng.uniform(0.2, 3, 6))
+    v = sum(
+        rng.uniform(0.3, 1) * np.sin(2 * np.pi * f * t + rng.uniform(0, 6.28))
+        for f in rng.uniform(0.2, 3, 6)
+    )
     p, a = 0.01 * np.cumsum(v), np.gradient(v, 0.01)
     extra = column(v, p, rng)
     friction = 0.4 * np.sin(3 * p) + 0.3 * np.exp(-np.abs(v) / 0.1) * np.sign(v)
@@ -387,7 +430,13 @@ def stage(column, seed: int = 0, rows: int = 800) -> tuple[np.ndarray, np.ndarra
 def test_check_asks_the_rows_what_the_learner_could_imitate(tmp_path, column, code):
     signals, force = stage(column)
     head = "speed,place,acceleration,extra,force"
-    np.savetxt(tmp_path / "stage.csv", np.column_stack([signals, force]), delimiter=",", header=head, comments="")
+    np.savetxt(
+        tmp_path / "stage.csv",
+        np.column_stack([signals, force]),
+        delimiter=",",
+        header=head,
+        comments="",
+    )
     (tmp_path / "stage.toml").write_text(STAGE)
     done = run("check", tmp_path / "stage.toml", "--json")
     assert done.code == 0, done.err
@@ -404,12 +453,18 @@ def test_check_asks_the_rows_what_the_learner_could_imitate(tmp_path, column, co
 def test_a_computed_column_has_the_papers_projection_and_the_rest_stays_determined():
     signals, force = stage(COMPUTED["sign"][0])
     names = ["speed", "place", "acceleration", "extra"]
-    record = oa.Record.from_arrays(signals, force, sampling_time=0.01, inputs=names, outputs=["force"])
+    record = oa.Record.from_arrays(
+        signals, force, sampling_time=0.01, inputs=names, outputs=["force"]
+    )
     terms = {"damping": "speed[k]", "e": "extra[k]", "m": "acceleration[k]", "offset": "1"}
     baseline = oa.Baseline.from_terms([oa.Term(*term) for term in terms.items()])
-    fit = oa.estimate(record, baseline, learner=oa.MLP(hidden=(8,), inputs=("speed[k]", "place[k]")))
+    fit = oa.estimate(
+        record, baseline, learner=oa.MLP(hidden=(8,), inputs=("speed[k]", "place[k]"))
+    )
     phi = np.column_stack([signals[:, 0], signals[:, 3], np.ones(len(force))])
-    rest = force - 0.8 * signals[:, 2]  # the paper's projection on the shared directions, beside the known mass
+    rest = (
+        force - 0.8 * signals[:, 2]
+    )  # the paper's projection on the shared directions, beside the known mass
     expected = np.linalg.lstsq(phi, rest, rcond=None)[0]
     assert fit.theta[[0, 1, 3]] == pytest.approx(expected, abs=0.02)
     low, high = fit.interval[2]
@@ -421,8 +476,12 @@ def test_independent_columns_are_hardly_ever_called_shared():
     rng, called = np.random.default_rng(7), 0
     for _ in range(200):
         rows, nz = int(rng.integers(100, 800)), int(rng.integers(1, 4))
-        z = scipy.signal.lfilter([1.0], [1, -rng.uniform(0, 0.95)], rng.normal(size=(rows, nz)), axis=0)
-        noise = scipy.signal.lfilter([1.0], [1, -rng.uniform(0, 0.95)], rng.standard_t(4, size=(rows, 3)), axis=0)
+        z = scipy.signal.lfilter(
+            [1.0], [1, -rng.uniform(0, 0.95)], rng.normal(size=(rows, nz)), axis=0
+        )
+        noise = scipy.signal.lfilter(
+            [1.0], [1, -rng.uniform(0, 0.95)], rng.standard_t(4, size=(rows, 3)), axis=0
+        )
         rest = left_over(noise[:, None, :], z)
         assert rest is not None
         called += rest.imitated(np.zeros((3, 0))).shape[1] > 0
@@ -441,19 +500,37 @@ def test_a_motion_asks_the_rows_too():
                 extra[k] = np.sign(v[k])
             x[k + 1], v[k + 1] = x[k], v[k]
             for _ in range(20):  # the input is held between samples; the physics lacks the sine
-                pull = drive[k] - 3.0 * v[k + 1] - 8.0 * x[k + 1] - 1.5 * extra[k] - 3.0 * np.sin(2 * v[k + 1])
+                pull = (
+                    drive[k]
+                    - 3.0 * v[k + 1]
+                    - 8.0 * x[k + 1]
+                    - 1.5 * extra[k]
+                    - 3.0 * np.sin(2 * v[k + 1])
+                )
                 v[k + 1] += step / 20 * pull
                 x[k + 1] += step / 20 * v[k + 1]
         record = oa.Record.from_arrays(
-            np.column_stack([drive, extra]), x, sampling_time=step, inputs=["drive", "extra"], outputs=["place"]
+            np.column_stack([drive, extra]),
+            x,
+            sampling_time=step,
+            inputs=["drive", "extra"],
+            outputs=["place"],
         )
         physics = oa.Motion.from_equations(
             states=[
                 oa.State("x", "v", start="place"),
-                oa.State("v", "(drive - c*v - k*x - e*extra)/m", start="derivative of place", learned=True),
+                oa.State(
+                    "v",
+                    "(drive - c*v - k*x - e*extra)/m",
+                    start="derivative of place",
+                    learned=True,
+                ),
             ],
             outputs=[oa.Output("place", "x")],
-            parameters=[oa.PhysicalParameter(n, s) for n, s in (("m", 1.0), ("c", 3.0), ("k", 8.0), ("e", 1.5))],
+            parameters=[
+                oa.PhysicalParameter(n, s)
+                for n, s in (("m", 1.0), ("c", 3.0), ("k", 8.0), ("e", 1.5))
+            ],
             inputs=["drive", "extra"],
         )
         fit = oa.estimate(record, physics, learner=oa.MLP(hidden=(4,), inputs=("v",)))

@@ -74,7 +74,9 @@ def test_schroeders_phases_keep_the_crest_factor_low():
     spectrum = np.r_[0.0, np.exp(2j * np.pi * rng.uniform(size=499)), 0.0]
     assert crest_factor(u) < 1.6 < 2.5 < crest_factor(np.fft.irfft(spectrum))
     assert crest_factor(multisine(1000, amplitude=1.0, odd=True)) < 1.6
-    assert crest_factor(multisine(1000, amplitude=1.0, band=(0.01, 0.01))) == pytest.approx(np.sqrt(2))
+    assert crest_factor(multisine(1000, amplitude=1.0, band=(0.01, 0.01))) == pytest.approx(
+        np.sqrt(2)
+    )
 
 
 def test_an_odd_multisine_is_orthogonal_to_even_terms():
@@ -93,23 +95,31 @@ def test_prbs_is_white_over_its_period():
     correlation = np.fft.ifft(np.abs(np.fft.fft(u)) ** 2).real
     np.testing.assert_allclose(correlation, [127.0] + [-1.0] * 126, atol=1e-9)
     np.testing.assert_array_equal(prbs(300, amplitude=1.0, bits=7), np.resize(u, 300))
-    np.testing.assert_array_equal(prbs(380, amplitude=2.0, bits=7, hold=3), np.repeat(2 * u, 3)[:380])
+    np.testing.assert_array_equal(
+        prbs(380, amplitude=2.0, bits=7, hold=3), np.repeat(2 * u, 3)[:380]
+    )
 
 
 @pytest.mark.parametrize("samples", [1, 2, 3, 4, 7, 8, 1023, 1024])
 def test_prbs_does_not_repeat_unless_asked(samples):
     bits = max(2, int(np.ceil(np.log2(samples + 1))))
-    np.testing.assert_array_equal(prbs(samples, amplitude=1.0), prbs(samples, amplitude=1.0, bits=bits))
+    np.testing.assert_array_equal(
+        prbs(samples, amplitude=1.0), prbs(samples, amplitude=1.0, bits=bits)
+    )
     assert 2**bits - 1 >= samples and (bits == 2 or 2 ** (bits - 1) - 1 < samples)
 
 
 @pytest.mark.parametrize("logarithmic", [False, True])
 def test_a_sweep_runs_through_its_band(logarithmic):
-    u = swept_sine(10_000, amplitude=1.0, sampling_time=0.001, band=(2.0, 50.0), logarithmic=logarithmic)
+    u = swept_sine(
+        10_000, amplitude=1.0, sampling_time=0.001, band=(2.0, 50.0), logarithmic=logarithmic
+    )
     assert u[0] == 0.0 and u[1] > 0
     crossings = np.flatnonzero(np.diff(np.sign(u)) != 0) * 0.001
     frequency = 0.5 / np.diff(crossings)
-    assert frequency[0] == pytest.approx(2.1 if logarithmic else 2.5, rel=0.01)  # the mean of its first half wave
+    assert frequency[0] == pytest.approx(
+        2.1 if logarithmic else 2.5, rel=0.01
+    )  # the mean of its first half wave
     assert frequency[-1] == pytest.approx(50.0, rel=0.03)
     middle = frequency[np.searchsorted(crossings, 5.0)]
     assert middle == pytest.approx(10.0 if logarithmic else 26.0, rel=0.03)
@@ -124,21 +134,31 @@ def test_a_sweep_may_fall_and_has_a_square_companion():
 
 def test_square_and_pattern():
     np.testing.assert_array_equal(square(7, amplitude=2.0, period=4), [2, 2, -2, -2, 2, 2, -2])
-    np.testing.assert_array_equal(binary_pattern(7, [0, 1, 1], amplitude=1.0, hold=2), [-1, -1, 1, 1, 1, 1, -1])
-    np.testing.assert_array_equal(binary_pattern(3, np.array([True, False]), amplitude=1.0), [1, -1, 1])
+    np.testing.assert_array_equal(
+        binary_pattern(7, [0, 1, 1], amplitude=1.0, hold=2), [-1, -1, 1, 1, 1, 1, -1]
+    )
+    np.testing.assert_array_equal(
+        binary_pattern(3, np.array([True, False]), amplitude=1.0), [1, -1, 1]
+    )
 
 
 def test_statistics_of_white_signals():
     n = 20_000
     gaussian = white_gaussian(n, amplitude=3.0, seed=2)
     assert gaussian.std() == pytest.approx(1.0, abs=0.03)  # amplitude / 3
-    assert np.mean(np.abs(white_gaussian(n, amplitude=1.0, seed=2, deviation=1.0)) == 1.0) == pytest.approx(
-        0.317, abs=0.01
-    )
+    assert np.mean(
+        np.abs(white_gaussian(n, amplitude=1.0, seed=2, deviation=1.0)) == 1.0
+    ) == pytest.approx(0.317, abs=0.01)
     assert white_uniform(n, amplitude=3.0, seed=2).std() == pytest.approx(3 / np.sqrt(3), rel=0.01)
-    for u in (gaussian, white_uniform(n, amplitude=1.0, seed=2), white_binary(n, amplitude=1.0, seed=2)):
+    for u in (
+        gaussian,
+        white_uniform(n, amplitude=1.0, seed=2),
+        white_binary(n, amplitude=1.0, seed=2),
+    ):
         assert abs(u.mean()) < 0.03 and abs(np.mean(u[1:] * u[:-1])) < 0.03
-    assert np.any(white_uniform(9, amplitude=1.0, seed=0) != white_uniform(9, amplitude=1.0, seed=1))
+    assert np.any(
+        white_uniform(9, amplitude=1.0, seed=0) != white_uniform(9, amplitude=1.0, seed=1)
+    )
     held = white_binary(999, amplitude=1.0, seed=3, hold=10)
     np.testing.assert_array_equal(held[:990].reshape(-1, 10), held[:990:10, None] * np.ones(10))
 
@@ -165,7 +185,9 @@ def test_lag_vectors():
     np.testing.assert_array_equal(lag_vectors(np.arange(4.0), 2), [[1, 0], [2, 1], [3, 2]])
 
 
-@pytest.mark.parametrize(("levels", "order"), [(2, 1), (9, 1), (2, 2), (16, 2), (3, 3), (10, 3), (2, 8), (4, 5)])
+@pytest.mark.parametrize(
+    ("levels", "order"), [(2, 1), (9, 1), (2, 2), (16, 2), (3, 3), (10, 3), (2, 8), (4, 5)]
+)
 def test_one_circuit_visits_every_cell_once(levels, order):
     samples = levels**order + order - 1
     for spread in (0.0, 0.5, 1.0):
@@ -198,7 +220,9 @@ def test_space_filling_against_white_uniform(samples, order):
 
     assert distance(u) < 0.85 * min(map(distance, white))
     assert discrepancy(u) < 0.5 * min(map(discrepancy, white))
-    assert distance(space_filling(samples, order, amplitude=5.0, seed=0, spread=0.0)) < 0.85 * distance(u)
+    assert distance(
+        space_filling(samples, order, amplitude=5.0, seed=0, spread=0.0)
+    ) < 0.85 * distance(u)
 
 
 def test_fill_distance_of_known_points():
@@ -211,13 +235,29 @@ REFUSALS = [
     (multisine, {"samples": 3}, "`samples` must be a whole number, 4 or more; got 3"),
     (multisine, {"amplitude": 0.0}, "`amplitude` must be a positive number; got 0.0"),
     (multisine, {"sampling_time": -1.0}, "`sampling_time` must be a positive number; got -1.0"),
-    (multisine, {"periods": 3}, "100 samples do not divide into 3 periods of 4 or more whole samples"),
+    (
+        multisine,
+        {"periods": 3},
+        "100 samples do not divide into 3 periods of 4 or more whole samples",
+    ),
     (multisine, {"periods": 50}, "100 samples do not divide into 50 periods"),
-    (multisine, {"samples": 99, "odd": True}, "needs an even number of samples in a period; got 99"),
+    (
+        multisine,
+        {"samples": 99, "odd": True},
+        "needs an even number of samples in a period; got 99",
+    ),
     (multisine, {"band": (0.011, 0.019)}, r"holds no harmonic: they are 0.01 Hz apart"),
     (multisine, {"band": (0.02, 0.02), "odd": True}, "holds no odd harmonic"),
-    (multisine, {"band": (0.2, 0.1)}, r"must run from the lower to the higher of two frequencies; got \(0.2, 0.1\)"),
-    (multisine, {"band": (0.2, 0.6)}, r"`band` must lie between 0 and 0.5 Hz, half the sampling frequency; got \(0.2"),
+    (
+        multisine,
+        {"band": (0.2, 0.1)},
+        r"must run from the lower to the higher of two frequencies; got \(0.2, 0.1\)",
+    ),
+    (
+        multisine,
+        {"band": (0.2, 0.6)},
+        r"`band` must lie between 0 and 0.5 Hz, half the sampling frequency; got \(0.2",
+    ),
     (multisine, {"band": (-0.2, 0.1)}, "`band` must lie between 0 and 0.5 Hz"),
     (multisine, {"band": 0.1}, "`band` must be two frequencies in Hz; got 0.1"),
     (multisine, {"band": (0.1, float("nan"))}, "`band` must be two frequencies in Hz"),
@@ -226,21 +266,49 @@ REFUSALS = [
     (prbs, {"bits": 1}, "`bits` must be a whole number, 2 or more; got 1"),
     (prbs, {"bits": 30}, "a register of 30 bits is too long; at most 24"),
     (swept_sine, {"band": (0.1, 0.1)}, "must run from the lower to the higher of two frequencies"),
-    (swept_sine, {"band": (0.0, 0.1), "logarithmic": True}, "a logarithmic sweep needs two frequencies above zero"),
-    (swept_square, {"band": (0.0, 0.1), "amplitude": -1.0}, "`amplitude` must be a positive number; got -1.0"),
-    (square, {"period": 5}, "`period` must be an even number of samples, half for each level; got 5"),
+    (
+        swept_sine,
+        {"band": (0.0, 0.1), "logarithmic": True},
+        "a logarithmic sweep needs two frequencies above zero",
+    ),
+    (
+        swept_square,
+        {"band": (0.0, 0.1), "amplitude": -1.0},
+        "`amplitude` must be a positive number; got -1.0",
+    ),
+    (
+        square,
+        {"period": 5},
+        "`period` must be an even number of samples, half for each level; got 5",
+    ),
     (binary_pattern, {"pattern": [0, 2]}, r"`pattern` must be a sequence of 0 and 1; got \[0, 2\]"),
     (binary_pattern, {"pattern": []}, "`pattern` must be a sequence of 0 and 1"),
     (binary_pattern, {"pattern": "0101"}, "`pattern` must be a sequence of 0 and 1; got '0101'"),
-    (white_gaussian, {"seed": 0, "deviation": 0.0}, "`deviation` must be a positive number; got 0.0"),
+    (
+        white_gaussian,
+        {"seed": 0, "deviation": 0.0},
+        "`deviation` must be a positive number; got 0.0",
+    ),
     (white_gaussian, {"seed": -1}, "`seed` must be a whole number, 0 or more; got -1"),
     (white_uniform, {"seed": None}, "`seed` must be a whole number, 0 or more; got None"),
-    (white_uniform, {"seed": 0, "samples": 1.5}, "`samples` must be a whole number, 1 or more; got 1.5"),
+    (
+        white_uniform,
+        {"seed": 0, "samples": 1.5},
+        "`samples` must be a whole number, 1 or more; got 1.5",
+    ),
     (white_binary, {"seed": 0, "hold": -1}, "`hold` must be a whole number, 1 or more; got -1"),
     (space_filling, {"seed": 0, "order": 0}, "`order` must be a whole number, 1 or more; got 0"),
-    (space_filling, {"seed": 0, "order": 21}, "`order` must be at most 20 and `spread` at most 1; got 21 and 1.0"),
+    (
+        space_filling,
+        {"seed": 0, "order": 21},
+        "`order` must be at most 20 and `spread` at most 1; got 21 and 1.0",
+    ),
     (space_filling, {"seed": 0, "order": 2, "spread": 1.1}, "`spread` at most 1; got 2 and 1.1"),
-    (space_filling, {"seed": 0, "order": 7}, "100 samples cannot fill 7 lags; give at least 134, or white_uniform"),
+    (
+        space_filling,
+        {"seed": 0, "order": 7},
+        "100 samples cannot fill 7 lags; give at least 134, or white_uniform",
+    ),
 ]
 
 
@@ -255,13 +323,22 @@ def test_refusals(signal, change, message):
     ("call", "message"),
     [
         (lambda: crest_factor(np.zeros(3)), "zero everywhere has no crest factor"),
-        (lambda: sign_symmetric(np.ones((3, 2))), r"`u` must be one channel of at least one sample, \(N,\); got shape"),
+        (
+            lambda: sign_symmetric(np.ones((3, 2))),
+            r"`u` must be one channel of at least one sample, \(N,\); got shape",
+        ),
         (lambda: sign_symmetric(np.array([])), r"got shape \(0,\)"),
         (lambda: sign_symmetric(np.array([1.0, np.nan])), "`u` is not finite at row 1, channel 0"),
         (lambda: limit_rate(np.ones(3), 0.0), "`largest_step` must be a positive number; got 0.0"),
-        (lambda: limit_rate(np.ones(3), 1.0, start=float("inf")), "`start` must be a finite number; got inf"),
+        (
+            lambda: limit_rate(np.ones(3), 1.0, start=float("inf")),
+            "`start` must be a finite number; got inf",
+        ),
         (lambda: lag_vectors(np.ones(3), 4), "3 samples hold no vector of 4 lags"),
-        (lambda: fill_distance(np.ones(3), 2, amplitude=0.0), "`amplitude` must be a positive number"),
+        (
+            lambda: fill_distance(np.ones(3), 2, amplitude=0.0),
+            "`amplitude` must be a positive number",
+        ),
     ],
 )
 def test_refusals_of_given_signals(call, message):

@@ -25,7 +25,9 @@ def test_silent_misses_are_few(name, record_property, monkeypatch):
     where, system, noise = SYSTEMS[name]
     if where == "coverage_noise":
         monkeypatch.setattr(coverage_noise, "row", lambda *given: given)
-        (given,) = [given for given in coverage_noise.lagged_rows(DRAWS) if given[:2] == (system, noise)]
+        (given,) = [
+            given for given in coverage_noise.lagged_rows(DRAWS) if given[:2] == (system, noise)
+        ]
         monkeypatch.undo()
         row = coverage_noise.row(*given)
     else:
@@ -36,5 +38,8 @@ def test_silent_misses_are_few(name, record_property, monkeypatch):
         monkeypatch.setattr(coverage_causes, "MOTIONS", {})
         (row,) = coverage_causes.rows(DRAWS, 0)
     record_property("silent misses [%]", f"{row.silent:.0f}")
-    assert row.silent <= silent_misses.Row(system, str(noise), "", DRAWS, row.held, row.silent, row.width).most
+    assert (
+        row.silent
+        <= silent_misses.Row(system, str(noise), "", DRAWS, row.held, row.silent, row.width).most
+    )
     assert row.held > 0

@@ -45,10 +45,17 @@ def result(data_folder, tmp_path_factory):
     if not file.is_file():
         pytest.skip(f"no {file}; set ORTHAUG_DATA to the folder of the data sets")
     folder = tmp_path_factory.mktemp("silverbox")
-    terms = (f'[[baseline.terms]]\nparameter = "t{i}"\nregressor = "{r}"\n' for i, r in enumerate(REGRESSORS))
+    terms = (
+        f'[[baseline.terms]]\nparameter = "t{i}"\nregressor = "{r}"\n'
+        for i, r in enumerate(REGRESSORS)
+    )
     (folder / "silverbox.toml").write_text(SPEC.format(file=file) + "".join(terms))
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(io.StringIO()):
-        patch.setattr(sys, "argv", ["orthaug", "fit", str(folder / "silverbox.toml"), "--out", str(folder / "out")])
+        patch.setattr(
+            sys,
+            "argv",
+            ["orthaug", "fit", str(folder / "silverbox.toml"), "--out", str(folder / "out")],
+        )
         patch.setattr("orthaug._base.jax.use_compilation_cache", lambda: None)
         with pytest.raises(SystemExit) as stop:
             cli.main()
@@ -66,5 +73,7 @@ def test_the_physics_is_determined_by_the_data(result):
     assert result["status"]["code"] == "exact"
     assert result["excitation"]["rank"] == len(REGRESSORS)
     warnings = {warning["code"]: warning["text"] for warning in result["warnings"]}
-    assert "biases the one-step θ" in warnings["coloured_residual"]  # the cubic spring that the physics lacks
+    assert (
+        "biases the one-step θ" in warnings["coloured_residual"]
+    )  # the cubic spring that the physics lacks
     assert set(warnings) <= {"coloured_residual", "unexplained"}

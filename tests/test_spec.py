@@ -118,7 +118,10 @@ def test_a_full_spec(tmp_path):
     assert list(spec.data.tests) == ["steps", "sweep"]
     assert spec.data.tests["steps"].rows == [0, 9000]
     assert spec.data.tests["steps"].columns == {"position": "yVal"}
-    assert spec.channels(spec.data.inputs) == (Channel("force", "N", "F (N)", 0.001, -2.0), Channel("voltage"))
+    assert spec.channels(spec.data.inputs) == (
+        Channel("force", "N", "F (N)", 0.001, -2.0),
+        Channel("voltage"),
+    )
     assert spec.channels(spec.data.outputs) == (Channel("position"), Channel("angle", "rad"))
     assert spec.lag_orders() == Lags(na=(2, 1), nb=1, nk=(0, 1))
     assert spec.learner_inputs() == ("position[k-1]", "sin(force[k])")
@@ -144,15 +147,24 @@ def test_defaults(tmp_path):
     assert spec.channels(spec.data.inputs) == (Channel("u"),)
     assert (spec.lag_orders(), spec.learner_inputs()) == (None, None)
     assert (learner.kind, learner.hidden, learner.activation) == ("mlp", [16], "tanh")
-    assert (spec.structure.kind, spec.structure.measure.kind, spec.structure.weight) == ("orthogonal", "training", 1.0)
-    assert (training.solver, training.focus, training.iterations) == ("levenberg-marquardt", "auto", 300)
+    assert (spec.structure.kind, spec.structure.measure.kind, spec.structure.weight) == (
+        "orthogonal",
+        "training",
+        1.0,
+    )
+    assert (training.solver, training.focus, training.iterations) == (
+        "levenberg-marquardt",
+        "auto",
+        300,
+    )
     assert (training.restarts, training.seed, training.regularization) == (1, 0, "auto")
     assert (training.segment, training.washout) == ("auto", 40)
 
 
 def test_without_inputs_with_a_time_column_and_without_a_learner(tmp_path):
     text = (
-        edited(LEAST, 'inputs = ["u"]', 'inputs = []\ntime = "t"') + '[learner]\nkind = "none"\ninputs = ["y[k-1]"]\n'
+        edited(LEAST, 'inputs = ["u"]', 'inputs = []\ntime = "t"')
+        + '[learner]\nkind = "none"\ninputs = ["y[k-1]"]\n'
     )
     spec = load_spec(put(tmp_path, text))
     assert (spec.data.inputs, spec.data.time, spec.data.sampling_time) == ([], "t", None)
@@ -160,9 +172,15 @@ def test_without_inputs_with_a_time_column_and_without_a_learner(tmp_path):
 
 
 def test_known_keys_without_effect_for_the_chosen_kind_are_accepted(tmp_path):
-    text = LEAST + '[learner]\nkind = "none"\nhidden = [3]\n[training]\nsegment = 0\nwashout = 0\nlearning_rate = 1.0\n'
+    text = (
+        LEAST
+        + '[learner]\nkind = "none"\nhidden = [3]\n[training]\nsegment = 0\nwashout = 0\nlearning_rate = 1.0\n'
+    )
     assert load_spec(put(tmp_path, text)).learner.kind == "none"
-    text = LEAST + '[structure]\nkind = "additive"\nmeasure = { kind = "uniform", box = { "u[k-1]" = [-1, 1] } }\n'
+    text = (
+        LEAST
+        + '[structure]\nkind = "additive"\nmeasure = { kind = "uniform", box = { "u[k-1]" = [-1, 1] } }\n'
+    )
     assert load_spec(put(tmp_path, text)).structure.kind == "additive"
 
 
@@ -231,7 +249,9 @@ PLACES = [  # what is added or changed in FULL, the key that is unknown, the nea
 ]
 
 
-@pytest.mark.parametrize(("old", "new", "key", "nearest"), PLACES, ids=[place[2] for place in PLACES])
+@pytest.mark.parametrize(
+    ("old", "new", "key", "nearest"), PLACES, ids=[place[2] for place in PLACES]
+)
 def test_unknown_keys_name_the_nearest_known_one(tmp_path, old, new, key, nearest):
     message = refused(tmp_path, edited(FULL, old, new))
     assert f"unknown key '{key}'" in message
@@ -268,17 +288,59 @@ VALUES = [  # (changed in FULL), the key, what was found, what is expected
     ("sampling_time = 0.01", 'sampling_time = "0.01"', "data.sampling_time", '"0.01"', "number"),
     ("sampling_time = 0.01", "sampling_time = true", "data.sampling_time", "true", "number"),
     ("sampling_time = 0.01", "sampling_time = 0", "data.sampling_time", "0", "greater than 0"),
-    ("sampling_time = 0.01", "sampling_time = -0.01", "data.sampling_time", "-0.01", "greater than 0"),
-    ("sampling_time = 0.01", "sampling_time = 1e300", "data.sampling_time", "1e+300", "less than or equal to"),
+    (
+        "sampling_time = 0.01",
+        "sampling_time = -0.01",
+        "data.sampling_time",
+        "-0.01",
+        "greater than 0",
+    ),
+    (
+        "sampling_time = 0.01",
+        "sampling_time = 1e300",
+        "data.sampling_time",
+        "1e+300",
+        "less than or equal to",
+    ),
     ("sampling_time = 0.01", "sampling_time = inf", "data.sampling_time", "inf", "finite"),
     ('inputs = ["force", "voltage"]', 'inputs = "force"', "data.inputs", '"force"', "list"),
     ('outputs = ["position", "angle"]', "outputs = []", "data.outputs", "[]", "at least one entry"),
     ('outputs = ["position", "angle"]', "outputs = [1]", "data.outputs[0]", "1", "string"),
-    ('files = ["run1.csv", "sub/run2.csv"]', "files = []", "data.train.files", "[]", "at least one entry"),
-    ('files = ["run1.csv", "sub/run2.csv"]', 'files = "run1.csv"', "data.train.files", '"run1.csv"', "list"),
-    ("rows = [0, 9000]", "rows = [0]", "data.tests.steps.rows", "[0]", "two numbers, [start, stop]"),
-    ("rows = [0, 9000]", "rows = [0, 10, 20]", "data.tests.steps.rows", "[0, 10, 20]", "two numbers, [start, stop]"),
-    ("rows = [0, 9000]", "rows = [-5, 10]", "data.tests.steps.rows[0]", "-5", "greater than or equal to 0"),
+    (
+        'files = ["run1.csv", "sub/run2.csv"]',
+        "files = []",
+        "data.train.files",
+        "[]",
+        "at least one entry",
+    ),
+    (
+        'files = ["run1.csv", "sub/run2.csv"]',
+        'files = "run1.csv"',
+        "data.train.files",
+        '"run1.csv"',
+        "list",
+    ),
+    (
+        "rows = [0, 9000]",
+        "rows = [0]",
+        "data.tests.steps.rows",
+        "[0]",
+        "two numbers, [start, stop]",
+    ),
+    (
+        "rows = [0, 9000]",
+        "rows = [0, 10, 20]",
+        "data.tests.steps.rows",
+        "[0, 10, 20]",
+        "two numbers, [start, stop]",
+    ),
+    (
+        "rows = [0, 9000]",
+        "rows = [-5, 10]",
+        "data.tests.steps.rows[0]",
+        "-5",
+        "greater than or equal to 0",
+    ),
     ("rows = [0, 9000]", "rows = [0, 1.5]", "data.tests.steps.rows[1]", "1.5", "integer"),
     ("rows = [0, 9000]", 'rows = "all"', "data.tests.steps.rows", '"all"', "list"),
     ("rows = [0, 9000]", "rows = []", "data.tests.steps.rows", "[]", "two numbers, [start, stop]"),
@@ -292,33 +354,89 @@ VALUES = [  # (changed in FULL), the key, what was found, what is expected
     ("na = [2, 1]", "na = [2, -1]", "lags.na[1]", "-1", "greater than or equal to 0"),
     ("na = [2, 1]", "na = 1.5", "lags.na", "1.5", "integer"),
     ('parameter = "theta1"', 'parameter = ""', "baseline.terms[0].parameter", '""', "some text"),
-    ('regressor = "g*position[k-1]"', "regressor = []", "baseline.terms[0].regressor", "[]", "string or a number"),
+    (
+        'regressor = "g*position[k-1]"',
+        "regressor = []",
+        "baseline.terms[0].regressor",
+        "[]",
+        "string or a number",
+    ),
     ("initial = 0.61", 'initial = "big"', "baseline.terms[0].initial", '"big"', "number"),
     ("initial = 0.61", "initial = nan", "baseline.terms[0].initial", "nan", "finite"),
     ("fixed = true", 'fixed = "yes"', "baseline.terms[2].fixed", '"yes"', "boolean"),
     ("g = 9.81", 'g = "9.81 m/s2"', "baseline.constants.g", '"9.81 m/s2"', "number"),
     ('kind = "mlp"', 'kind = "gp"', "learner.kind", '"gp"', "'mlp', 'terms' or 'none'"),
     ("hidden = [16, 8]", "hidden = 16", "learner.hidden", "16", "list"),
-    ("hidden = [16, 8]", "hidden = [16, 0]", "learner.hidden[1]", "0", "greater than or equal to 1"),
+    (
+        "hidden = [16, 8]",
+        "hidden = [16, 0]",
+        "learner.hidden[1]",
+        "0",
+        "greater than or equal to 1",
+    ),
     ("hidden = [16, 8]", "hidden = [16.5]", "learner.hidden[0]", "16.5", "integer"),
-    ('activation = "gelu"', 'activation = "relu6"', "learner.activation", '"relu6"', "'tanh', 'relu'"),
-    ('kind = "additive"', 'kind = "parallel"', "structure.kind", '"parallel"', "'additive', 'orthogonal'"),
+    (
+        'activation = "gelu"',
+        'activation = "relu6"',
+        "learner.activation",
+        '"relu6"',
+        "'tanh', 'relu'",
+    ),
+    (
+        'kind = "additive"',
+        'kind = "parallel"',
+        "structure.kind",
+        '"parallel"',
+        "'additive', 'orthogonal'",
+    ),
     ("weight = 2.0", "weight = -2.0", "structure.weight", "-2.0", "greater than or equal to 0"),
-    ('kind = "training"', 'kind = "gauss"', "structure.measure.kind", '"gauss"', "'training', 'symmetrized'"),
-    ('solver = "levenberg-marquardt"', 'solver = "lm"', "training.solver", '"lm"', "'levenberg-marquardt'"),
+    (
+        'kind = "training"',
+        'kind = "gauss"',
+        "structure.measure.kind",
+        '"gauss"',
+        "'training', 'symmetrized'",
+    ),
+    (
+        'solver = "levenberg-marquardt"',
+        'solver = "lm"',
+        "training.solver",
+        '"lm"',
+        "'levenberg-marquardt'",
+    ),
     ("iterations = 50", "iterations = 0", "training.iterations", "0", "greater than or equal to 1"),
     ("restarts = 3", "restarts = 0", "training.restarts", "0", "greater than or equal to 1"),
     ("seed = 7", "seed = -1", "training.seed", "-1", "greater than or equal to 0"),
     ("seed = 7", "seed = 1.0", "training.seed", "1.0", "integer"),
     ("learning_rate = 1e-2", "learning_rate = 0", "training.learning_rate", "0", "greater than 0"),
-    ('focus = "prediction"', 'focus = "free"', "training.focus", '"free"', "'prediction' or 'simulation'"),
-    ("regularization = 0.1", "regularization = -0.1", "training.regularization", "-0.1", "greater than or equal to 0"),
-    ("regularization = 0.1", 'regularization = "l1"', "training.regularization", '"l1"', "'none', 'evidence' or 'ard'"),
+    (
+        'focus = "prediction"',
+        'focus = "free"',
+        "training.focus",
+        '"free"',
+        "'prediction' or 'simulation'",
+    ),
+    (
+        "regularization = 0.1",
+        "regularization = -0.1",
+        "training.regularization",
+        "-0.1",
+        "greater than or equal to 0",
+    ),
+    (
+        "regularization = 0.1",
+        'regularization = "l1"',
+        "training.regularization",
+        '"l1"',
+        "'none', 'evidence' or 'ard'",
+    ),
     ("regularization = 0.1", "regularization = inf", "training.regularization", "inf", "finite"),
 ]
 
 
-@pytest.mark.parametrize(("old", "new", "key", "found", "expected"), VALUES, ids=[v[1] for v in VALUES])
+@pytest.mark.parametrize(
+    ("old", "new", "key", "found", "expected"), VALUES, ids=[v[1] for v in VALUES]
+)
 def test_wrong_values(tmp_path, old, new, key, found, expected):
     message = refused(tmp_path, edited(FULL, old, new))
     assert f"'{key}': found {found}; expected" in message
@@ -342,11 +460,16 @@ def test_values_that_should_be_tables(tmp_path, old, new, key):
 
 
 MEANING = [
-    ("sampling_time = 0.01", 'sampling_time = 0.01\ntime = "t"', r"'data'.*`sampling_time` and `time` are both given"),
+    (
+        "sampling_time = 0.01",
+        'sampling_time = 0.01\ntime = "t"',
+        r"'data'.*`sampling_time` and `time` are both given",
+    ),
     (
         "[data.channels.angle]",
         "[data.channels.angel]",
-        "'data'.*`channels.angel` is neither an input nor an output, and `outputs` has 'angle', of which `channels`",
+        "'data'.*`channels.angel` is neither an input nor an output, and `outputs` has "
+        "'angle', of which `channels`",
     ),
 ]
 
@@ -386,25 +509,40 @@ def test_deep_nesting_is_one_line(tmp_path):
 
 @pytest.mark.parametrize("number", ["9" * 5000, "-" + "9" * 5000, "1e999"])
 def test_numbers_beyond_all_bounds(tmp_path, number):
-    for old in ("restarts = 3", "hidden = [16, 8]", "iterations = 50", "rows = [0, 9000]", "g = 9.81"):
+    for old in (
+        "restarts = 3",
+        "hidden = [16, 8]",
+        "iterations = 50",
+        "rows = [0, 9000]",
+        "g = 9.81",
+    ):
         with pytest.raises(InputError, match="machine.toml"):
-            load_spec(put(tmp_path, edited(FULL, old, re.sub(r"\d[\d.]*", number, old, count=1)))).declared_baseline()
+            load_spec(
+                put(tmp_path, edited(FULL, old, re.sub(r"\d[\d.]*", number, old, count=1)))
+            ).declared_baseline()
 
 
 @pytest.mark.parametrize("name", ["train", "validation"])
 def test_a_test_is_called_otherwise_than_another_part(tmp_path, name):
-    with pytest.raises(InputError, match=f"`tests.{name}` has the name of another part of the data"):
+    with pytest.raises(
+        InputError, match=f"`tests.{name}` has the name of another part of the data"
+    ):
         load_spec(put(tmp_path, edited(FULL, "[data.tests.steps]", f"[data.tests.{name}]")))
 
 
 @pytest.mark.parametrize("name", ['"a\\nb"', '"\\u001b[31m"', '"' + "x" * 61 + '"'])
 def test_names_of_tests_are_visible_and_short(tmp_path, name):
-    with pytest.raises(InputError, match="the name of a test must be visible characters on one line, at most 60"):
+    with pytest.raises(
+        InputError, match="the name of a test must be visible characters on one line, at most 60"
+    ):
         load_spec(put(tmp_path, edited(FULL, "[data.tests.steps]", f"[data.tests.{name}]")))
 
 
 def test_long_keys_and_values_are_cut(tmp_path):
-    for old, new in (("restarts = 3", "x" * 10_000 + " = 3"), ("seed = 7", 'seed = "' + "y" * 10_000 + '"')):
+    for old, new in (
+        ("restarts = 3", "x" * 10_000 + " = 3"),
+        ("seed = 7", 'seed = "' + "y" * 10_000 + '"'),
+    ):
         with pytest.raises(InputError) as refused:
             load_spec(put(tmp_path, edited(FULL, old, new)))
         assert len(str(refused.value)) < 900

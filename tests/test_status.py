@@ -22,13 +22,13 @@ MESSAGES = {
         "the model is usable, more iterations may improve it"
     ),
     "no_descent": (
-        "no step lowered the loss; the start is already a minimum, or the learner's gradient is wrong. "
-        "Try another seed or another activation"
+        "no step lowered the loss; the start is already a minimum, or the learner's gradient "
+        "is wrong. Try another seed or another activation"
     ),
     "non_finite": (
-        "the loss is not finite: (a) a learner input grows without bound, (b) the learner returns NaN, "
-        "(c) channels differ by many orders of magnitude, or (d) `learning_rate` is too large. "
-        "Rescale the channels, choose other learner inputs, or lower the rate"
+        "the loss is not finite: (a) a learner input grows without bound, (b) the learner "
+        "returns NaN, (c) channels differ by many orders of magnitude, or (d) `learning_rate` "
+        "is too large. Rescale the channels, choose other learner inputs, or lower the rate"
     ),
 }
 """What each code has always said."""
@@ -42,7 +42,10 @@ def test_every_ending_says_what_it_always_said(ending):
 
 def test_no_code_is_without_an_ending():
     assert {ending.code for ending in Ending} == set(MESSAGES)
-    assert [ending.name for ending in Ending if ending.code == "converged"] == ["CONVERGED", "SPANNED"]
+    assert [ending.name for ending in Ending if ending.code == "converged"] == [
+        "CONVERGED",
+        "SPANNED",
+    ]
 
 
 @pytest.mark.parametrize("ending", Ending, ids=lambda ending: ending.name)

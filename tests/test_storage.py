@@ -35,7 +35,9 @@ def make_record() -> Record:
         y[k, 1] = 0.3 * y[k - 1, 1] + 0.2 * y[k - 1, 0] + 0.5 * u[k, 1]
     y += 0.01 * rng.normal(size=y.shape)
     inputs = [Channel("force", "N", column="F (N)", scale=0.001, offset=-2.0), Channel("volt", "V")]
-    return Record.from_arrays(u, y, sampling_time=0.01, inputs=inputs, outputs=[Channel("pos", "m"), "angle"])
+    return Record.from_arrays(
+        u, y, sampling_time=0.01, inputs=inputs, outputs=[Channel("pos", "m"), "angle"]
+    )
 
 
 RECORD = make_record()
@@ -43,9 +45,13 @@ ONE = Record(
     RECORD.inputs,
     RECORD.outputs[:1],
     0.01,
-    tuple(Record.from_arrays(e.inputs, e.outputs[:, :1]).experiments[0] for e in RECORD.experiments),
+    tuple(
+        Record.from_arrays(e.inputs, e.outputs[:, :1]).experiments[0] for e in RECORD.experiments
+    ),
 )
-TERMS = Baseline.from_terms([Term("a", "pos[k-1]", 0.4, "1"), Term("b", "g*force[k-1]", 1.0, "m/N")], {"g": 0.5})
+TERMS = Baseline.from_terms(
+    [Term("a", "pos[k-1]", 0.4, "1"), Term("b", "g*force[k-1]", 1.0, "m/N")], {"g": 0.5}
+)
 
 
 def phi(x):
@@ -111,14 +117,20 @@ def same(a: Model, b: Model, record: Record) -> None:
         first, second = (getattr(model, response)(record).trajectories[0] for model in (a, b))
         for part in ("baseline", "learner", "learner_before", "model"):
             np.testing.assert_array_equal(getattr(first, part), getattr(second, part))
-    np.testing.assert_array_equal(a.predict(record, horizon=4).model, b.predict(record, horizon=4).model)
+    np.testing.assert_array_equal(
+        a.predict(record, horizon=4).model, b.predict(record, horizon=4).model
+    )
 
 
 @pytest.mark.parametrize(("name", "record"), [("mlp", ONE), ("physics", ONE), ("several", RECORD)])
 def test_what_is_read_is_what_was_written(models, tmp_path, name, record):
     model = models[name]
     save(model, tmp_path / "model")
-    assert sorted(p.name for p in (tmp_path / "model").iterdir()) == [*FILES[:1], "manifest.json", FILES[1]]
+    assert sorted(p.name for p in (tmp_path / "model").iterdir()) == [
+        *FILES[:1],
+        "manifest.json",
+        FILES[1],
+    ]
     again = load(tmp_path / "model")
     same(model, again, record)
     assert again.form == model.form
@@ -126,7 +138,9 @@ def test_what_is_read_is_what_was_written(models, tmp_path, name, record):
     assert (again.sampling_time, again.structure) == (model.sampling_time, model.structure)
     np.testing.assert_array_equal(again.largest_output, model.largest_output)
     for kept in ("gram", "noise", "ridge"):
-        np.testing.assert_array_equal(getattr(again.statistics, kept), getattr(model.statistics, kept))
+        np.testing.assert_array_equal(
+            getattr(again.statistics, kept), getattr(model.statistics, kept)
+        )
 
 
 def test_channels_terms_and_constants_are_kept(models, saved):
@@ -146,17 +160,24 @@ def test_the_folder_of_a_result_is_read_too(models, tmp_path):
 
 def test_fixed_terms_are_kept(models, tmp_path):
     save(models["several"], tmp_path / "model")
-    assert [t.fixed for t in load(tmp_path / "model").form.baseline.terms] == [False, True, False, False]
+    assert [t.fixed for t in load(tmp_path / "model").form.baseline.terms] == [
+        False,
+        True,
+        False,
+        False,
+    ]
 
 
 def test_python_callables_are_asked_for_again(models, tmp_path):
     save(models["callables"], tmp_path / "model")
     with pytest.raises(
-        InputError, match=r"model.json: the baseline was a Python function; give it again, load\(…, baseline=…\)"
+        InputError,
+        match=r"model.json: the baseline was a Python function; give it again, load\(…, baseline=…\)",
     ):
         load(tmp_path / "model")
     with pytest.raises(
-        InputError, match=r"model.json: the learner was a Python callable; give it again, load\(…, learner=…\)"
+        InputError,
+        match=r"model.json: the learner was a Python callable; give it again, load\(…, learner=…\)",
     ):
         load(tmp_path / "model", baseline=CALLED)
     same(load(tmp_path / "model", baseline=CALLED, learner=WAVE), models["callables"], ONE)
@@ -187,7 +208,10 @@ def test_reformatted_json_is_the_same_model(models, saved):
 
 
 ALTERED = [
-    (lambda c: c.update(structure="additive"), "model.json: the file was altered .its checksum differs"),
+    (
+        lambda c: c.update(structure="additive"),
+        "model.json: the file was altered .its checksum differs",
+    ),
     (lambda c: c["baseline"]["terms"][0].update(regressor="pos[k-2]"), "the file was altered"),
     (lambda c: c.update(more=1), "the file was altered"),
     (lambda c: c.pop("checksum"), "the file was altered"),
@@ -214,7 +238,8 @@ def test_altered_declarations(saved, edit, message):
 def test_a_declaration_that_is_no_json(saved, content):
     (saved / "model.json").write_bytes(content)
     with pytest.raises(
-        InputError, match=r"model.json: the file is cut or altered \(no JSON\); fit again, or copy it again"
+        InputError,
+        match=r"model.json: the file is cut or altered \(no JSON\); fit again, or copy it again",
     ):
         load(saved)
 
@@ -239,14 +264,18 @@ def test_one_flipped_bit_in_the_arrays(saved):
     content = bytearray((saved / "arrays.safetensors").read_bytes())
     content[-3] ^= 1
     (saved / "arrays.safetensors").write_bytes(content)
-    with pytest.raises(InputError, match="arrays.safetensors: the file is cut or altered .its checksum differs"):
+    with pytest.raises(
+        InputError, match="arrays.safetensors: the file is cut or altered .its checksum differs"
+    ):
         load(saved)
 
 
 @pytest.mark.parametrize("name", FILES)
 def test_a_missing_file(saved, name):
     (saved / name).unlink()
-    with pytest.raises(InputError, match="no saved model there; expected model.json and arrays.safetensors"):
+    with pytest.raises(
+        InputError, match="no saved model there; expected model.json and arrays.safetensors"
+    ):
         load(saved)
 
 
@@ -286,7 +315,11 @@ FORGED = [
     ({"layout": [["pos", 10**30], ["force", 1]]}, {}, "a lag of"),
     ({"features": {}}, {}, "."),
     ({"features": [{"text": 1e308, "constants": {}}, {"text": "x", "constants": {}}]}, {}, "."),
-    ({"features": [{"text": "x", "constants": {}}, {"text": "pos[k-1]", "constants": {}}]}, {}, "."),
+    (
+        {"features": [{"text": "x", "constants": {}}, {"text": "pos[k-1]", "constants": {}}]},
+        {},
+        ".",
+    ),
 ]
 
 
@@ -303,7 +336,9 @@ def test_a_forged_model_is_refused_where_it_is_read(saved, declared, arrays, wor
 def test_a_folder_of_something_else_is_refused_and_kept(models, tmp_path):
     (tmp_path / "model").mkdir()
     (tmp_path / "model" / "notes.txt").write_text("mine")
-    with pytest.raises(InputError, match="model: holds notes.txt and no manifest.json that says orthaug wrote it"):
+    with pytest.raises(
+        InputError, match="model: holds notes.txt and no manifest.json that says orthaug wrote it"
+    ):
         save(models["physics"], tmp_path / "model")
     assert [p.name for p in (tmp_path / "model").iterdir()] == ["notes.txt"]
     with pytest.raises(InputError, match="notes.txt: not a folder"):
@@ -342,7 +377,10 @@ def test_a_model_of_the_first_format_loads(tmp_path):
     found = model.predict(record).trajectories[0].model[1:, 0]
     np.testing.assert_allclose(found, [0.40008235013798166, -0.401744532272874], rtol=1e-13)
     save(model, tmp_path / "again")
-    kept = [json.loads((folder / "model.json").read_text())["learner"] for folder in (tmp_path / "again", FIRST)]
+    kept = [
+        json.loads((folder / "model.json").read_text())["learner"]
+        for folder in (tmp_path / "again", FIRST)
+    ]
     assert kept[0] == kept[1] | {"beyond": "auto"}
 
 
@@ -362,12 +400,21 @@ def test_files_that_cannot_be_read(tmp_path, monkeypatch):
                 load(tmp_path / "model")
 
 
-NO_DECLARATIONS = ["[" * 100_000, '{"format": 2, "a": ' + "9" * 5000 + "}", "[]", "null", '"x"', "\ud800"]
+NO_DECLARATIONS = [
+    "[" * 100_000,
+    '{"format": 2, "a": ' + "9" * 5000 + "}",
+    "[]",
+    "null",
+    '"x"',
+    "\ud800",
+]
 
 
 @pytest.mark.parametrize("text", NO_DECLARATIONS, ids=range(len(NO_DECLARATIONS)))
 def test_declarations_that_are_none(tmp_path, text):
     save(estimate(ONE, TERMS, learner=None).model, tmp_path / "model")
     (tmp_path / "model" / "model.json").write_bytes(text.encode("utf-8", "surrogatepass"))
-    with pytest.raises(InputError, match="model.json: (the file is cut or altered|not a model of orthaug)"):
+    with pytest.raises(
+        InputError, match="model.json: (the file is cut or altered|not a model of orthaug)"
+    ):
         load(tmp_path / "model")

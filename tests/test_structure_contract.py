@@ -34,7 +34,12 @@ TERMS = {
     (1, False): [("a", "y1[k-1]", "y1"), ("b", "u[k]", "y1")],
     (1, True): [("a", "y1[k-1]", "y1"), ("b", "u[k]", "y1"), ("b", "u[k-1]", "y1")],
     (2, False): [("a", "y1[k-1]", "y1"), ("b", "u[k]", "y2")],
-    (2, True): [("a", "y1[k-1]", "y1"), ("b", "u[k]", "y1"), ("a", "y2[k-1]", "y2"), ("b", "u[k-1]", "y2")],
+    (2, True): [
+        ("a", "y1[k-1]", "y1"),
+        ("b", "u[k]", "y1"),
+        ("a", "y2[k-1]", "y2"),
+        ("b", "u[k-1]", "y2"),
+    ],
 }
 CASES = [(structure, *key) for structure in STRUCTURES for key in TERMS]
 IDS = [f"{s.name}, {ny} outputs{', θ shared' if shared else ''}" for s, ny, shared in CASES]
@@ -143,12 +148,16 @@ def test_matrix_and_gradient_are_those_of_the_joint_criterion(structure, ny, sha
         assert apart(found.gradient, gradient) < RELATIVE
         losses.append((float(found.loss), loss))
     found, expected = np.array(losses).T
-    np.testing.assert_allclose(found - found[0], expected - expected[0], atol=RELATIVE * expected.max())
+    np.testing.assert_allclose(
+        found - found[0], expected - expected[0], atol=RELATIVE * expected.max()
+    )
 
 
 def fit(structure, ny, shared, solver):
     record, baseline = declared(ny, shared)
-    return estimate(record, baseline, lags=LAGS, learner=LEARNER, structure=structure, solver=solver)
+    return estimate(
+        record, baseline, lags=LAGS, learner=LEARNER, structure=structure, solver=solver
+    )
 
 
 @pytest.mark.parametrize("solver", SOLVERS, ids=lambda s: type(s).__name__)
@@ -162,7 +171,9 @@ def test_every_solver_fits_every_structure(structure, ny, shared, solver):
     if isinstance(structure, Orthogonal):
         phi, y = raw_physics(ny, shared), signals(ny)[1][1:]
         spread = y.std(axis=0)
-        least = np.linalg.lstsq((phi / spread[:, None]).reshape(-1, 2), (y / spread).ravel(), rcond=None)[0]
+        least = np.linalg.lstsq(
+            (phi / spread[:, None]).reshape(-1, 2), (y / spread).ravel(), rcond=None
+        )[0]
         np.testing.assert_allclose(found.theta, least, rtol=1e-11)
         assert found.defect < 1e-12
     else:
@@ -183,6 +194,9 @@ def test_theta_at_the_end_minimises_the_joint_criterion(structure, ny):
 
 def test_both_solvers_end_with_one_criterion():
     """With a weight so large that the optimum is all but fixed, both solvers agree on θ."""
-    thetas = [fit(BaselinePenalty(1e9), 1, False, solver).theta for solver in (SOLVERS[0], AdamLBFGS(6, 60))]
+    thetas = [
+        fit(BaselinePenalty(1e9), 1, False, solver).theta
+        for solver in (SOLVERS[0], AdamLBFGS(6, 60))
+    ]
     np.testing.assert_allclose(thetas[0], list(INITIAL.values()), rtol=1e-6)
     np.testing.assert_allclose(thetas[1], thetas[0], rtol=1e-6)

@@ -56,7 +56,9 @@ def test_rows_of_the_baseline_penalty():
     theta, f = np.array([1.0, 2.0, 3.0]), np.array([0.1, -0.2, 0.4])
     rows = BaselinePenalty(0.3).penalty(NAMES, INITIAL, 2.0)
     rest = rows.target - rows.theta @ theta - rows.learner @ f
-    np.testing.assert_allclose(rest @ rest, 0.3 * 2.0**2 * np.sum(((theta - INITIAL) / INITIAL) ** 2))
+    np.testing.assert_allclose(
+        rest @ rest, 0.3 * 2.0**2 * np.sum(((theta - INITIAL) / INITIAL) ** 2)
+    )
 
 
 def test_the_baseline_penalty_needs_initial_values():
@@ -65,7 +67,10 @@ def test_the_baseline_penalty_needs_initial_values():
 
 
 def test_an_initial_value_of_zero_is_refused_before_training():
-    record, baseline = Record.from_arrays(np.arange(9.0), np.arange(9.0) ** 2), Baseline.from_terms([Term("b", "u[k]")])
+    record, baseline = (
+        Record.from_arrays(np.arange(9.0), np.arange(9.0) ** 2),
+        Baseline.from_terms([Term("b", "u[k]")]),
+    )
     with pytest.raises(InputError, match="but b starts at 0"):
         estimate(record, baseline, structure=BaselinePenalty())
 
@@ -79,8 +84,14 @@ FIXED = ({}, {1: 0.7}, {2: -0.3, 0: 1.2}, {0: 0.1, 1: 0.2, 2: 0.3})
 def elimination(rows=0, bounds=NO_BOUNDS, seed=0):
     """Random coordinates, outputs and rows for three entries of θ; one direction of the learner is moved to θ."""
     rng = np.random.default_rng(seed)
-    penalty = PenaltyRows(rng.normal(size=(rows, 3)), rng.normal(size=(rows, 3)), rng.normal(size=rows))
-    coordinates, outputs, direction = rng.normal(size=(3, 3)), 3 * rng.normal(size=3), rng.normal(size=3)
+    penalty = PenaltyRows(
+        rng.normal(size=(rows, 3)), rng.normal(size=(rows, 3)), rng.normal(size=rows)
+    )
+    coordinates, outputs, direction = (
+        rng.normal(size=(3, 3)),
+        3 * rng.normal(size=3),
+        rng.normal(size=3),
+    )
     taken = np.outer(direction, direction) / (direction @ direction)
     return Elimination(coordinates, outputs, taken, penalty, *bounds)
 
@@ -88,7 +99,9 @@ def elimination(rows=0, bounds=NO_BOUNDS, seed=0):
 def stacked(given, f):
     """Matrix and right-hand side of the whole quadratic in θ, written out."""
     matrix = np.vstack([given.to_coordinates, given.rows.theta])
-    return matrix, np.concatenate([given.outputs - f + given.taken @ f, given.rows.target - given.rows.learner @ f])
+    return matrix, np.concatenate(
+        [given.outputs - f + given.taken @ f, given.rows.target - given.rows.learner @ f]
+    )
 
 
 def least(given, f, fixed):
@@ -107,7 +120,10 @@ def test_what_remains_is_the_minimum_over_theta(rows, fixed):
     given = elimination(rows)
     matrix, target = given.hold(fixed)
     assert matrix.shape == (3, 3) and target.shape == (3,)
-    many = np.random.default_rng(1).normal(size=(8, 3)) * np.array([0.01, 0.1, 1, 1, 1, 10, 10, 100])[:, None]
+    many = (
+        np.random.default_rng(1).normal(size=(8, 3))
+        * np.array([0.01, 0.1, 1, 1, 1, 10, 10, 100])[:, None]
+    )
     minima = np.array([least(given, f, fixed)[0] for f in many])
     constants = minima - np.sum((target - many @ matrix.T) ** 2, axis=1)
     np.testing.assert_allclose(constants, constants[0], atol=1e-12 * np.sum(many**2))
@@ -140,11 +156,14 @@ def test_theta_minimises(rows, fixed):
 def enumerated(given, f):
     """The bounded minimum by trying every set of entries at a bound."""
     choices = [
-        [None, *(b for b in (given.lower[i], given.upper[i]) if np.isfinite(b))] for i in range(len(given.lower))
+        [None, *(b for b in (given.lower[i], given.upper[i]) if np.isfinite(b))]
+        for i in range(len(given.lower))
     ]
     found = []
     for sides in itertools.product(*choices):
-        value, theta = least(given, f, {i: side for i, side in enumerate(sides) if side is not None})
+        value, theta = least(
+            given, f, {i: side for i, side in enumerate(sides) if side is not None}
+        )
         if np.all(theta >= given.lower - 1e-12) and np.all(theta <= given.upper + 1e-12):
             found.append((value, *theta))
     return np.array(min(found)[1:])
@@ -191,7 +210,9 @@ def test_columns_of_very_different_size():
     given = Elimination(square * size, outputs, nothing, rows, *box)
     plain = Elimination(square, outputs, nothing, rows, box[0] * size, box[1] * size)
     f = np.zeros(3)
-    np.testing.assert_allclose(given.theta(f, given.active(f)) * size, enumerated(plain, f), rtol=1e-9)
+    np.testing.assert_allclose(
+        given.theta(f, given.active(f)) * size, enumerated(plain, f), rtol=1e-9
+    )
 
 
 def test_without_bounds_nothing_is_active():
@@ -200,8 +221,12 @@ def test_without_bounds_nothing_is_active():
 
 # --- the unit of λ
 
-LEARNER = Function(lambda w, z: w @ jnp.stack([z[0] ** 2, z[0] * z[1], z[1] ** 2]), lambda key: jnp.zeros((1, 3)))
-TWO = Function(lambda w, z: w @ jnp.stack([z[0] ** 2, z[0] * z[1], z[1] ** 2]), lambda key: jnp.zeros((2, 3)))
+LEARNER = Function(
+    lambda w, z: w @ jnp.stack([z[0] ** 2, z[0] * z[1], z[1] ** 2]), lambda key: jnp.zeros((1, 3))
+)
+TWO = Function(
+    lambda w, z: w @ jnp.stack([z[0] ** 2, z[0] * z[1], z[1] ** 2]), lambda key: jnp.zeros((2, 3))
+)
 SOLVER = LevenbergMarquardt(200, tolerance=1e-14)
 
 
@@ -237,7 +262,9 @@ def by_hand(structure, u, y, initial, spread):
     else:
         rows = np.hstack([root * np.diag(1 / np.array(initial)), np.zeros((2 * ny, 3 * ny))])
         extra = root * np.ones(2 * ny)
-    found = np.linalg.lstsq(np.vstack([np.hstack([phi, psi]), rows]), np.concatenate([right, extra]), rcond=None)[0]
+    found = np.linalg.lstsq(
+        np.vstack([np.hstack([phi, psi]), rows]), np.concatenate([right, extra]), rcond=None
+    )[0]
     fitted = (np.hstack([phi, psi]) @ found).reshape(ny, n).T * spread
     return found[: 2 * ny], fitted
 
@@ -308,5 +335,9 @@ def test_the_elimination_of_a_problem_is_in_whitened_outputs():
     u, y, record = measured((1000.0,))
     fit = estimate(record, physics(1, [1.0, 1.0]), learner=None)
     given = eliminate(Additive(), fit.problem)
-    np.testing.assert_allclose(given.theta(np.zeros(2), {}), np.linalg.lstsq(u, y[:, 0], rcond=None)[0], rtol=1e-10)
-    np.testing.assert_allclose(np.linalg.norm(given.to_coordinates, axis=0), np.linalg.norm(u, axis=0) / y.std())
+    np.testing.assert_allclose(
+        given.theta(np.zeros(2), {}), np.linalg.lstsq(u, y[:, 0], rcond=None)[0], rtol=1e-10
+    )
+    np.testing.assert_allclose(
+        np.linalg.norm(given.to_coordinates, axis=0), np.linalg.norm(u, axis=0) / y.std()
+    )

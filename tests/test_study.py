@@ -42,18 +42,32 @@ def counted(calls: list):
 
 def test_the_last_axis_is_the_fastest():
     cases = Study("s", one, GRID).cases()
-    assert [(c["level"], c["seed"]) for c in cases] == [(0.1, 0), (0.1, 1), (0.1, 2), (0.3, 0), (0.3, 1), (0.3, 2)]
+    assert [(c["level"], c["seed"]) for c in cases] == [
+        (0.1, 0),
+        (0.1, 1),
+        (0.1, 2),
+        (0.3, 0),
+        (0.3, 1),
+        (0.3, 2),
+    ]
 
 
 def test_where_leaves_combinations_out():
     study = Study("s", one, GRID, where=lambda level, seed: level < 0.2 or seed == 2)
-    assert [(c["level"], c["seed"]) for c in study.cases()] == [(0.1, 0), (0.1, 1), (0.1, 2), (0.3, 2)]
+    assert [(c["level"], c["seed"]) for c in study.cases()] == [
+        (0.1, 0),
+        (0.1, 1),
+        (0.1, 2),
+        (0.3, 2),
+    ]
     assert len(run(study)) == 4
 
 
 def test_numpy_axes_are_plain():
     study = Study("s", one, {"level": np.array([0.1, 0.3]), "seed": np.arange(3)})
-    assert [study.key(case) for case in study.cases()] == [Study("s", one, GRID).key(c) for c in study.cases()]
+    assert [study.key(case) for case in study.cases()] == [
+        Study("s", one, GRID).key(c) for c in study.cases()
+    ]
     assert run(study).value.tolist() == run(Study("s", one, GRID)).value.tolist()
 
 
@@ -180,16 +194,27 @@ def test_without_a_store_nothing_is_kept(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "value", [object(), {"a": 1}, 1j, {1, 2}, [1, object()], lambda: 0], ids=lambda value: type(value).__name__
+    "value",
+    [object(), {"a": 1}, 1j, {1, 2}, [1, object()], lambda: 0],
+    ids=lambda value: type(value).__name__,
 )
 def test_results_must_be_plain(tmp_path, value):
-    with pytest.raises(InputError, match=r"study 's': 'bad' is a .*; expected numbers, texts or lists"):
+    with pytest.raises(
+        InputError, match=r"study 's': 'bad' is a .*; expected numbers, texts or lists"
+    ):
         run(Study("s", lambda: {"bad": value}, {}), store=tmp_path)
     assert not list(tmp_path.rglob("*.json"))
 
 
 def test_what_is_plain():
-    result = {"a": np.float64(1.5), "b": np.arange(3), "c": (1, "x"), "d": None, "e": True, "f": np.eye(2)}
+    result = {
+        "a": np.float64(1.5),
+        "b": np.arange(3),
+        "c": (1, "x"),
+        "d": None,
+        "e": True,
+        "f": np.eye(2),
+    }
     row = run(Study("s", lambda: result, {})).iloc[0]
     assert row.a == 1.5 and row.b == [0, 1, 2] and row.c == [1, "x"] and row.d is None and row.e
     assert row.f == [[1.0, 0.0], [0.0, 1.0]]
@@ -207,7 +232,9 @@ def test_what_is_not_finite_is_none(tmp_path, store):
 def test_stored_results_are_json_that_others_can_read(tmp_path):
     run(Study("s", lambda: {"a": math.nan, "b": "θ"}, {}), store=tmp_path)
     (path,) = (tmp_path / "s").iterdir()
-    content = json.loads(path.read_text(encoding="utf-8"), parse_constant=lambda text: pytest.fail(text))
+    content = json.loads(
+        path.read_text(encoding="utf-8"), parse_constant=lambda text: pytest.fail(text)
+    )
     assert content["result"] == {"a": None, "b": "θ"}
 
 
@@ -219,10 +246,16 @@ def test_a_stored_result_keeps_when_it_was_made_and_how_long_it_took(tmp_path):
     before = datetime.now(UTC).replace(microsecond=0)
     first = runs(Study("s", slow, {"seed": range(2)}), store=tmp_path)
     second = runs(Study("s", slow, {"seed": range(3)}), store=tmp_path)
-    assert [one.stored for one in first] == [False, False] and [one.stored for one in second] == [True, True, False]
+    assert [one.stored for one in first] == [False, False] and [one.stored for one in second] == [
+        True,
+        True,
+        False,
+    ]
     assert all(before <= datetime.fromisoformat(one.made) <= datetime.now(UTC) for one in second)
     assert all(one.seconds >= 0.02 for one in second)
-    assert [(one.made, one.seconds) for one in second[:2]] == [(one.made, one.seconds) for one in first]
+    assert [(one.made, one.seconds) for one in second[:2]] == [
+        (one.made, one.seconds) for one in first
+    ]
     # the table is the same whether results are new or stored
     pd.testing.assert_frame_equal(as_table(first), as_table(second[:2]))
 
@@ -311,12 +344,16 @@ assert table.value.tolist() == [[seed] * 200 for seed in range(30)]
 """
 
 
-@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM], ids=lambda s: s.name)
+@pytest.mark.parametrize(
+    "end", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM], ids=lambda s: s.name
+)
 def test_ended_at_any_point_the_next_run_goes_on(tmp_path, end, monkeypatch, capsys):
     program, store = tmp_path / "program.py", tmp_path / "store"
     program.write_text(PROGRAM)
     command = [sys.executable, str(program), str(store)]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=dict(os.environ))
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=dict(os.environ)
+    )
     assert process.stdout is not None
     for _ in range(6):
         process.stdout.readline()

@@ -15,7 +15,7 @@ import pytest
 from test_cli import SPEC, make_project, one_line, run
 
 from orthaug._base.errors import InputError
-from orthaug._base.jax import Checked
+from orthaug._base.jax import ChecksummedCache
 from orthaug.commands import streams
 from orthaug.commands.folder import check_figure, check_folder
 
@@ -26,12 +26,16 @@ def shell(script: str, cwd: Path, **environment: str) -> subprocess.CompletedPro
     """A script in which `$O` is the program."""
     command = ["bash", "-c", script.replace("$O", f"{sys.executable} -c '{MAIN}'")]
     settings = {**os.environ, **environment}
-    return subprocess.run(command, cwd=cwd, env=settings, capture_output=True, text=True, timeout=120, check=False)
+    return subprocess.run(
+        command, cwd=cwd, env=settings, capture_output=True, text=True, timeout=120, check=False
+    )
 
 
 def test_the_user_s_settings_do_not_matter(tmp_path):
     make_project(tmp_path, SPEC.replace('"a"', '"θ"'))
-    (tmp_path / "matplotlibrc").write_text("text.usetex: true\nbanana: 1\nno colon\nlines.linewidth: x\n")
+    (tmp_path / "matplotlibrc").write_text(
+        "text.usetex: true\nbanana: 1\nno colon\nlines.linewidth: x\n"
+    )
     (tmp_path / "cache").touch()
     done = shell(
         "$O fit plant.toml --out out",
@@ -46,16 +50,24 @@ def test_the_user_s_settings_do_not_matter(tmp_path):
         JAX_DEBUG_NANS="1",
     )
     assert (done.returncode, done.stderr) == (0, "")
-    assert "\ntheta  " in done.stdout and (tmp_path / "out" / "figures" / "simulation.png").is_file()
-    assert list(json.loads((tmp_path / "out" / "manifest.json").read_text())) == ["orthaug", "files"]
+    assert (
+        "\ntheta  " in done.stdout and (tmp_path / "out" / "figures" / "simulation.png").is_file()
+    )
+    assert list(json.loads((tmp_path / "out" / "manifest.json").read_text())) == [
+        "orthaug",
+        "files",
+    ]
 
 
 ENDS = [
-    ("$O schema >/dev/full", "standard output: cannot be read or written (No space left on device)"),
+    (
+        "$O schema >/dev/full",
+        "standard output: cannot be read or written (No space left on device)",
+    ),
     ("$O schema >&-", "standard output"),
     ("$O fit absent.toml 2>&-", None),
     ("mkdir w; cd w; rmdir ../w; $O schema", "the working folder is gone"),
-    ("ulimit -v 1500000; $O schema", "the limit on memory (ulimit -v) is 1.43 GiB"),
+    ("ulimit -v 1500000; $O schema", "the memory limit (ulimit -v) is 1.43 GiB"),
 ]
 
 
@@ -67,22 +79,25 @@ def test_what_cannot_be_done_is_one_line_and_exit_code_2(tmp_path, script, words
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(("number", "words"), [(signal.SIGINT, "interrupted"), (signal.SIGTERM, "terminated")])
+@pytest.mark.parametrize(
+    ("number", "words"), [(signal.SIGINT, "interrupted"), (signal.SIGTERM, "terminated")]
+)
 def test_a_signal_while_a_folder_is_written(tmp_path, number, words):
     """It ends at once though the main thread takes no notice of it."""
     program = (
-        "from pathlib import Path; import signal, time; from orthaug.commands.signals import WATCH\n"
-        "signal.signal(signal.SIGINT, signal.default_int_handler)  # children of a background job ignore it\n"
-        "WATCH.start()\n"
-        "from orthaug._base.folders import whole_folder\n"
-        "with whole_folder(Path('deep/out')) as partial:\n"
-        "    (partial / 'half').touch(); print('ready', flush=True)\n"
-        "    while True:\n"
-        "        try: time.sleep(100)\n"
-        "        except BaseException: pass\n"
+        "from pathlib import Path; import signal, time; from orthaug.commands.signals import "
+        "WATCH\nsignal.signal(signal.SIGINT, signal.default_int_handler)  # children of a "
+        "background job ignore it\nWATCH.start()\nfrom orthaug._base.folders import "
+        "whole_folder\nwith whole_folder(Path('deep/out')) as partial:\n    (partial / "
+        "'half').touch(); print('ready', flush=True)\n    while True:\n        try: "
+        "time.sleep(100)\n        except BaseException: pass\n"
     )
     process = subprocess.Popen(
-        [sys.executable, "-c", program], cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [sys.executable, "-c", program],
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
     )
     try:
         assert process.stdout is not None and process.stdout.readline() == "ready\n"
@@ -105,9 +120,33 @@ def test_a_model_is_not_lost_to_what_is_computed_from_it(tmp_path, monkeypatch):
     assert run("fit", "plant.toml", "--out", "out").code == 0
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     for words, *arguments in (
-        ("holds the model out", "compare", "plant.toml", "--model", "out", "--out", "out", "--force"),
-        ("is read by this run", "simulate", "out", "run.csv", "--out", "out/model/model.json", "--force"),
-        ("exists; give another name, or replace it with --force", "predict", "out", "run.csv", "--out", "steps.csv"),
+        (
+            "holds the model out",
+            "compare",
+            "plant.toml",
+            "--model",
+            "out",
+            "--out",
+            "out",
+            "--force",
+        ),
+        (
+            "is read by this run",
+            "simulate",
+            "out",
+            "run.csv",
+            "--out",
+            "out/model/model.json",
+            "--force",
+        ),
+        (
+            "exists; give another name, or replace it with --force",
+            "predict",
+            "out",
+            "run.csv",
+            "--out",
+            "steps.csv",
+        ),
         ("expected .png, .pdf or .svg", "check", "plant.toml", "--figure", "x.xyz"),
         ("exists", "check", "plant.toml", "--figure", "out/figures/simulation.png"),
     ):
@@ -121,7 +160,9 @@ def test_a_model_is_not_lost_to_what_is_computed_from_it(tmp_path, monkeypatch):
 def test_a_folder_with_the_two_keys_and_more_is_not_ours(tmp_path):
     (tmp_path / "result.json").write_text('{"schema": 2, "orthaug": "0.1.0"}')
     (tmp_path / "thesis.tex").touch()
-    with pytest.raises(InputError, match="holds .* and no manifest.json that says orthaug wrote it; .* --force"):
+    with pytest.raises(
+        InputError, match="holds .* and no manifest.json that says orthaug wrote it; .* --force"
+    ):
         check_folder(tmp_path)
     (tmp_path / "thesis.tex").unlink()
     (tmp_path / "result.json").write_text("[" * 100_000)
@@ -131,7 +172,9 @@ def test_a_folder_with_the_two_keys_and_more_is_not_ours(tmp_path):
 
 @pytest.mark.parametrize("name", ["x.xyz", "x", "png"])
 def test_figures_have_a_known_ending(name):
-    with pytest.raises(InputError, match=f"{name}: found the ending '.*'; expected .png, .pdf or .svg"):
+    with pytest.raises(
+        InputError, match=f"{name}: found the ending '.*'; expected .png, .pdf or .svg"
+    ):
         check_figure(Path(name))
 
 
@@ -161,7 +204,7 @@ class Store(dict):
 
 def test_programs_that_were_exchanged_or_cut_are_not_used(tmp_path):
     store = Store()
-    cache = Checked(store, str(tmp_path))
+    cache = ChecksummedCache(store, str(tmp_path))
     cache.put("one", b"first")
     cache.put("two", b"second")
     assert cache.get("one") == b"first" and cache.get("three") is None

@@ -36,7 +36,9 @@ WIDE = ("stribeck", "stribeck_gauss", "dead_zone", "saturation")
 
 def of(kind, **more):
     """A suspect on the velocity, with a width where its kind has one."""
-    return Suspect.of(kind, VELOCITY, constants=TS, **({"width": 0.3} if kind in WIDE else {}), **more)
+    return Suspect.of(
+        kind, VELOCITY, constants=TS, **({"width": 0.3} if kind in WIDE else {}), **more
+    )
 
 
 @pytest.mark.parametrize("kind", FORMS)
@@ -61,7 +63,9 @@ def test_offset():
 def test_the_papers_friction_is_coulomb_and_stribeck():
     system = MassSpringDamper()
     coulomb = Suspect.of("coulomb", VELOCITY, constants=TS).values(X, LAYOUT, ["y"])[:, 0]
-    stribeck = Suspect.of("stribeck", VELOCITY, width=system.stribeck, constants=TS).values(X, LAYOUT, ["y"])[:, 0]
+    stribeck = Suspect.of("stribeck", VELOCITY, width=system.stribeck, constants=TS).values(
+        X, LAYOUT, ["y"]
+    )[:, 0]
     total = system.coulomb * coulomb + (system.static - system.coulomb) * stribeck
     np.testing.assert_allclose(total, system.friction(V), rtol=1e-12)
 
@@ -74,7 +78,10 @@ def test_names():
 
 
 def test_width_may_be_a_numpy_number():
-    assert Suspect.of("saturation", "u[k-1]", width=np.float64(0.5)).expression == "max(min(u[k-1], 0.5), -0.5)"
+    assert (
+        Suspect.of("saturation", "u[k-1]", width=np.float64(0.5)).expression
+        == "max(min(u[k-1], 0.5), -0.5)"
+    )
 
 
 def test_constants_are_sorted_pairs_and_suspects_hashable():
@@ -94,7 +101,9 @@ def test_columns_stand_in_their_output():
 
 def test_data_width_is_the_median_of_what_moves():
     assert data_width(VELOCITY, X, LAYOUT, TS) == pytest.approx(np.median(np.abs(V[1:])))
-    assert data_width("y[k-1]/3", X, LAYOUT, TS) == float(f"{np.median(np.abs(X[1:, 0])) / 3:.6g}")  # in expressions
+    assert data_width("y[k-1]/3", X, LAYOUT, TS) == float(
+        f"{np.median(np.abs(X[1:, 0])) / 3:.6g}"
+    )  # in expressions
     inside = np.abs(V[1:]) < data_width(VELOCITY, X, LAYOUT, TS)
     assert abs(inside.mean() - 0.5) < 0.02
 
@@ -109,20 +118,44 @@ def test_data_width_is_the_median_of_what_moves():
         ({"kind": "", "on": "v[k-1]"}, r"unknown kind of suspect ''"),
         ({"kind": "cubic"}, r"a suspect of kind cubic needs `on`, an expression such as v\[k-1\]"),
         ({"kind": "offset", "on": "v[k-1]"}, r"an offset .* takes no `on`; got 'v\[k-1\]'"),
-        ({"kind": "stribeck", "on": "v[k-1]"}, r"stribeck needs `width`, in the unit of v\[k-1\]; data_width suggests"),
+        (
+            {"kind": "stribeck", "on": "v[k-1]"},
+            r"stribeck needs `width`, in the unit of v\[k-1\]; data_width suggests",
+        ),
         ({"kind": "cubic", "on": "v[k-1]", "width": 1.0}, "kind cubic takes no `width`; got 1.0"),
-        ({"kind": "dead_zone", "on": "v[k-1]", "width": 0.0}, "`width` must be a positive number; got 0.0"),
-        ({"kind": "dead_zone", "on": "v[k-1]", "width": float("nan")}, "`width` must be a positive number; got nan"),
-        ({"kind": "cubic", "on": "v"}, r"unknown constant 'v'; declare it .* give its lag, v\[k-1\]"),
+        (
+            {"kind": "dead_zone", "on": "v[k-1]", "width": 0.0},
+            "`width` must be a positive number; got 0.0",
+        ),
+        (
+            {"kind": "dead_zone", "on": "v[k-1]", "width": float("nan")},
+            "`width` must be a positive number; got nan",
+        ),
+        (
+            {"kind": "cubic", "on": "v"},
+            r"unknown constant 'v'; declare it .* give its lag, v\[k-1\]",
+        ),
         ({"kind": "coulomb", "on": "v[k-1]) + (1"}, "is not an expression"),
-        ({"kind": "cubic", "on": "v[k-1]", "name": " "}, "' ' cannot name a suspect; use visible characters"),
-        ({"kind": "cubic", "on": "v[k-1]", "output": 1}, "`output` must be the name of a channel; got 1"),
+        (
+            {"kind": "cubic", "on": "v[k-1]", "name": " "},
+            "' ' cannot name a suspect; use visible characters",
+        ),
+        (
+            {"kind": "cubic", "on": "v[k-1]", "output": 1},
+            "`output` must be the name of a channel; got 1",
+        ),
         (
             {"kind": "cubic", "on": "v[k-1]", "coefficient": float("inf")},
             "`coefficient` must be a finite number; got inf",
         ),
-        ({"kind": "cubic", "on": "v[k-1]", "coefficient": "1"}, "`coefficient` must be a finite number; got '1'"),
-        ({"kind": "cubic", "on": "v[k-1]", "constants": {"sin": 1.0}}, "'sin' cannot name a constant"),
+        (
+            {"kind": "cubic", "on": "v[k-1]", "coefficient": "1"},
+            "`coefficient` must be a finite number; got '1'",
+        ),
+        (
+            {"kind": "cubic", "on": "v[k-1]", "constants": {"sin": 1.0}},
+            "'sin' cannot name a constant",
+        ),
         (
             {"kind": "cubic", "on": "v[k-1]", "constants": {"c": float("nan")}},
             "constant 'c' must be a finite number; got n",
@@ -136,7 +169,9 @@ def test_refusals(arguments, message):
 
 
 def test_an_expression_that_does_not_parse_names_its_suspect():
-    with pytest.raises(InputError, match="suspect 'drag': 'u.k': 'u.k' is not allowed in an expression"):
+    with pytest.raises(
+        InputError, match="suspect 'drag': 'u.k': 'u.k' is not allowed in an expression"
+    ):
         Suspect("drag", "u.k")
 
 
@@ -149,8 +184,16 @@ def test_an_expression_that_does_not_parse_names_its_suspect():
             r"'a' reads w\[k-1\], u\[k-3\], which the regressor does not hold; it ho",
         ),
         (Suspect("a", "1"), ["y", "z"], "suspect 'a': `output` is missing; one of y, z"),
-        (Suspect("a", "1", output="zz"), ["y", "zet"], "suspect 'a': unknown output 'zz'; known are y, zet"),
-        (Suspect("a", "log(y[k-1])"), ["y"], r"suspect 'a' = log\(y\[k-1\]\) is not finite at row 0 of the regressor"),
+        (
+            Suspect("a", "1", output="zz"),
+            ["y", "zet"],
+            "suspect 'a': unknown output 'zz'; known are y, zet",
+        ),
+        (
+            Suspect("a", "log(y[k-1])"),
+            ["y"],
+            r"suspect 'a' = log\(y\[k-1\]\) is not finite at row 0 of the regressor",
+        ),
     ],
 )
 def test_refusals_on_data(suspect, outputs, message):
@@ -175,8 +218,14 @@ def test_a_difference_that_keeps_its_sign_has_no_friction(rising, named):
     rng = np.random.default_rng(2)
     y = np.cumsum(rng.uniform(0.5, 1.5, 60)) if rising else np.cumsum(rng.normal(size=60))
     record = Record.from_arrays(rng.normal(size=60), y)
-    problem = pose(record, Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "y[k-2]"), Term("g", "u[k]")]))
-    kinds = {suspect.name.split(" of ")[0] for suspect in usual_suspects(problem) if "y[k-1] - y[k-2]" in suspect.name}
+    problem = pose(
+        record, Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "y[k-2]"), Term("g", "u[k]")])
+    )
+    kinds = {
+        suspect.name.split(" of ")[0]
+        for suspect in usual_suspects(problem)
+        if "y[k-1] - y[k-2]" in suspect.name
+    }
     assert kinds == {"quadratic_drag", "cubic"} | ({"coulomb", "stribeck"} if named else set())
 
 
@@ -188,4 +237,6 @@ def test_friction_of_an_output_that_is_read_at_one_lag_and_changes_its_sign(shif
     terms = [Term(f"a{lag}", f"y[k-{lag}]") for lag in range(1, lags + 1)]
     problem = pose(record, Baseline.from_terms([*terms, Term("g", "u[k]")]))
     names = [suspect.name for suspect in usual_suspects(problem)]
-    assert ("coulomb of y[k-1]" in names) == named and ("saturation of y[k-1]" in names) == (lags == 1)
+    assert ("coulomb of y[k-1]" in names) == named and ("saturation of y[k-1]" in names) == (
+        lags == 1
+    )

@@ -38,7 +38,9 @@ def test_static_example(data_set, noise):
     e = [rng.normal(0.0, 0.009) if noise else 0.0 for _ in u]
     example = static(data_set, noise=noise)
     np.testing.assert_array_equal(signals(example.train)[0], u)
-    np.testing.assert_allclose(signals(example.train)[1], [polynomial(a) + b for a, b in zip(u, e, strict=True)])
+    np.testing.assert_allclose(
+        signals(example.train)[1], [polynomial(a) + b for a, b in zip(u, e, strict=True)]
+    )
     np.testing.assert_array_equal(signals(example.test)[0], u_test)
     np.testing.assert_allclose(signals(example.test)[1], [polynomial(a) for a in u_test])
 
@@ -65,7 +67,9 @@ def test_static_example_has_three_sets():
 def step(theta, y1, y2, force):
     """One step of the mass-spring-damper with Stribeck friction, as the paper prints it."""
     velocity = (y1 - y2) / 0.01
-    friction = 0.8 * np.sign(velocity) + (1.2 - 0.8) * np.exp(-abs(velocity) / 0.02) * np.sign(velocity)
+    friction = 0.8 * np.sign(velocity) + (1.2 - 0.8) * np.exp(-abs(velocity) / 0.02) * np.sign(
+        velocity
+    )
     return theta[0] * y1 + theta[1] * y2 + theta[2] * (force - friction)
 
 
@@ -93,7 +97,11 @@ def test_mass_spring_damper_channels_and_baseline(example):
     assert [channel.label for channel in example.train.channels] == ["position [m]", "force [N]"]
     assert example.train.sampling_time == 0.01
     assert (len(example.train), len(example.test)) == (10_000, 1000)
-    assert [term.regressor for term in example.baseline.terms] == ["position[k-1]", "position[k-2]", "force[k-1]"]
+    assert [term.regressor for term in example.baseline.terms] == [
+        "position[k-1]",
+        "position[k-2]",
+        "force[k-1]",
+    ]
     np.testing.assert_array_equal(example.baseline.initial, [0.61, -0.52, 4.7e-5])
 
 
@@ -108,4 +116,6 @@ def test_least_squares_on_the_mass_spring_damper(example):
 def test_friction_is_odd_and_decays_from_static_to_coulomb():
     friction = MassSpringDamper().friction
     assert friction(0.0) == 0.0
-    np.testing.assert_allclose(friction(np.array([1e-9, -1e-9, 10.0, -10.0])), [1.2, -1.2, 0.8, -0.8], rtol=1e-6)
+    np.testing.assert_allclose(
+        friction(np.array([1e-9, -1e-9, 10.0, -10.0])), [1.2, -1.2, 0.8, -0.8], rtol=1e-6
+    )

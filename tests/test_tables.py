@@ -67,7 +67,11 @@ def test_csv_as_it_is_found(tmp_path, content):
 
 @pytest.mark.parametrize(
     ("content", "names"),
-    [("# u,y\n1,2\n", ["# u", "y"]), ("# a run\n# u,y\n", ["# u", "y"]), ("#\nu;y\n1,5;2\n", ["u", "y"])],
+    [
+        ("# u,y\n1,2\n", ["# u", "y"]),
+        ("# a run\n# u,y\n", ["# u", "y"]),
+        ("#\nu;y\n1,5;2\n", ["u", "y"]),
+    ],
 )
 def test_names_may_stand_behind_the_sign_of_a_remark(tmp_path, content, names):
     """As NumPy writes them: the last line before the numbers is the header."""
@@ -82,7 +86,11 @@ def test_numpy_and_pandas_read_the_same_numbers(tmp_path, monkeypatch):
     small = read_table(path, ("y", "u"))
     monkeypatch.setattr(tables, "_SMALL", 0)
     large = read_table(path, ("y", "u"))
-    assert [small.filled, small.where(2), small.cell("u", 2)] == [large.filled, large.where(2), large.cell("u", 2)]
+    assert [small.filled, small.where(2), small.cell("u", 2)] == [
+        large.filled,
+        large.where(2),
+        large.cell("u", 2),
+    ]
     for name in ("u", "y"):
         np.testing.assert_array_equal(small.columns[name], large.columns[name])
     np.testing.assert_array_equal(small.columns["u"], numbers[:, 0])
@@ -104,7 +112,9 @@ ENCODED = ["utf-8", "utf-8-sig", "utf-16", "cp1252"]
 def test_encodings_of_windows(tmp_path, encoding):
     path = put(tmp_path, "run.csv", "Kraft [µN];Wärme [°C]\n1,5;2\n3;4\n".encode(encoding))
     assert values(path, "Kraft [µN]", "Wärme [°C]") == [[1.5, 3.0], [2.0, 4.0]]
-    assert layout(path).note == ("no UTF-8, so read as Windows-1252" if encoding == "cp1252" else "")
+    assert layout(path).note == (
+        "not UTF-8, so read as Windows-1252" if encoding == "cp1252" else ""
+    )
 
 
 @pytest.mark.parametrize(
@@ -131,9 +141,13 @@ def test_columns_of_one_name_are_told_apart(tmp_path):
 def test_columns_of_one_name_in_a_workbook(tmp_path):
     pandas = pytest.importorskip("pandas")
     pytest.importorskip("openpyxl")
-    pandas.DataFrame([["y", "y"], [1, 2], [3, 4]]).to_excel(tmp_path / "a.xlsx", index=False, header=False)
+    pandas.DataFrame([["y", "y"], [1, 2], [3, 4]]).to_excel(
+        tmp_path / "a.xlsx", index=False, header=False
+    )
     assert values(tmp_path / "a.xlsx", "y.1", "y.0") == [[2.0, 4.0], [1.0, 3.0]]
-    with pytest.raises(InputError, match=r"stands 2 times; names must differ, or be told apart .* 'y.0', 'y.1'"):
+    with pytest.raises(
+        InputError, match=r"2 times; names must differ, or be numbered .* 'y.0', 'y.1'"
+    ):
         read_table(tmp_path / "a.xlsx", ("y",))
 
 
@@ -143,14 +157,18 @@ def test_headers_with_spaces_units_and_quotes(tmp_path, content, names):
 
 
 @pytest.mark.parametrize(
-    "content", ["u;y\n1,5;-2,25\n3;4e1\n", "u;y\n1.5;-2.25\n3;4e1\n", '"u";"y"\n1,5;"-2,25"\n3;40\n']
+    "content",
+    ["u;y\n1,5;-2,25\n3;4e1\n", "u;y\n1.5;-2.25\n3;4e1\n", '"u";"y"\n1,5;"-2,25"\n3;40\n'],
 )
 def test_semicolons_go_with_decimal_commas_and_points(tmp_path, content):
     assert values(put(tmp_path, "run.csv", content), "u", "y") == [[1.5, 3.0], [-2.25, 40.0]]
 
 
 def test_tsv(tmp_path):
-    assert values(put(tmp_path, "run.tsv", "u (N)\ty\t\n1.5\t2\t\n3\t4\t\n"), "u (N)", "y") == [[1.5, 3.0], [2.0, 4.0]]
+    assert values(put(tmp_path, "run.tsv", "u (N)\ty\t\n1.5\t2\t\n3\t4\t\n"), "u (N)", "y") == [
+        [1.5, 3.0],
+        [2.0, 4.0],
+    ]
 
 
 def test_the_ending_may_be_upper_case(tmp_path):
@@ -180,7 +198,11 @@ def test_separators_are_known_by_the_content(tmp_path, kind, headed, ending, mon
     content, names, expected = SEPARATED[kind], ["x1", "x2"], [[1.5, -3.0], [2.0, 40.0]]
     if headed:
         commas = "decimal commas" in kind
-        separator = next(mark for mark in (";", "\t", " " if commas else ",", " ") if mark in content.split("\n")[0])
+        separator = next(
+            mark
+            for mark in (";", "\t", " " if commas else ",", " ")
+            if mark in content.split("\n")[0]
+        )
         names, content = ["Weg [mm]", "F"], f"Weg [mm]{separator}F\n{content}"
     path = put(tmp_path, f"run.{ending}", content)
     assert column_names(path) == names
@@ -191,9 +213,17 @@ def test_separators_are_known_by_the_content(tmp_path, kind, headed, ending, mon
 
 UNNAMED = [
     ("# bench 3, 4 May\n% of u and y\n1,2\n3,4\n", ["x1", "x2"], [[1, 3], [2, 4]]),
-    ("# t u y\n0 1 2\n1 3 4\n", ["t", "u", "y"], [[0, 1], [1, 3], [2, 4]]),  # as numpy.savetxt writes it
+    (
+        "# t u y\n0 1 2\n1 3 4\n",
+        ["t", "u", "y"],
+        [[0, 1], [1, 3], [2, 4]],
+    ),  # as numpy.savetxt writes it
     ("0\n1\n3\n", ["x1"], [[0, 1, 3]]),
-    ("0,1\n0.5,7\n1,2\n", ["x1", "x2"], [[0, 0.5, 1], [1, 7, 2]]),  # time goes on from the first line
+    (
+        "0,1\n0.5,7\n1,2\n",
+        ["x1", "x2"],
+        [[0, 0.5, 1], [1, 7, 2]],
+    ),  # time goes on from the first line
     ("0,1\n3.5,7\n2,2\n", ["0", "1"], [[3.5, 2], [7, 2]]),  # columns that pandas counted
     ("nan,1\n0.5,\n1,2\n", ["x1", "x2"], [[np.nan, 0.5, 1], [1, np.nan, 2]]),
     (".5 -.25\n1 2\n", ["x1", "x2"], [[0.5, 1], [-0.25, 2]]),
@@ -219,7 +249,10 @@ def test_a_row_of_a_file_without_header_is_named_by_its_line(tmp_path):
     table = read_table(path, ["x1", "x2"])
     assert (table.where(1), table.cell("x2", 1), table.first_line) == ("line 3 (row 1)", "x", 2)
     assert layout(path).note == "no header, so the columns are called x1 to x2"
-    with pytest.raises(InputError, match="line 3 has 3 cells and line 1 has 2; is a separator or a decimal comma wr"):
+    with pytest.raises(
+        InputError,
+        match="line 3 has 3 cells and line 1 has 2; is a separator or a decimal comma wr",
+    ):
         read_table(put(tmp_path, "run.dat", "1 2\n3 4\n5 6 7\n"), ["x1"])
 
 
@@ -249,8 +282,16 @@ def test_parquet(tmp_path):
 
 def test_npz_vectors_and_columns_of_a_matrix(tmp_path):
     u = np.arange(6.0).reshape(2, 3)
-    path = put_npz(tmp_path, a=np.arange(2), b=np.array([[1.5, 2.5]]), c=np.array([[3.0], [4.0]]), U=u)
-    assert values(path, "a", "b", "c", "U[2]", "U[0]") == [[0, 1], [1.5, 2.5], [3, 4], [2, 5], [0, 3]]
+    path = put_npz(
+        tmp_path, a=np.arange(2), b=np.array([[1.5, 2.5]]), c=np.array([[3.0], [4.0]]), U=u
+    )
+    assert values(path, "a", "b", "c", "U[2]", "U[0]") == [
+        [0, 1],
+        [1.5, 2.5],
+        [3, 4],
+        [2, 5],
+        [0, 3],
+    ]
 
 
 def test_a_variable_may_have_brackets_in_its_name(tmp_path):
@@ -259,7 +300,9 @@ def test_a_variable_may_have_brackets_in_its_name(tmp_path):
 
 def test_unused_variables_of_an_npz_do_not_matter(tmp_path):
     """Also one that would have to be unpickled: it is not."""
-    path = put_npz(tmp_path, y=np.ones(2), note=np.array({"made": "by hand"}, dtype=object), z=np.array([1j]))
+    path = put_npz(
+        tmp_path, y=np.ones(2), note=np.array({"made": "by hand"}, dtype=object), z=np.array([1j])
+    )
     assert values(path, "y") == [[1.0, 1.0]]
 
 
@@ -274,7 +317,7 @@ def test_has_column(tmp_path):
     ("name", "content", "message"),
     [
         ("run.csv", "", "0 bytes"),
-        ("run.csv", "y,y\n1,2\n", "the column 'y' stands 2 times; names must differ"),
+        ("run.csv", "y,y\n1,2\n", "the header has the column 'y' 2 times; names must differ"),
         ("run.npz", "y", "cannot be read as .npz"),
         ("run.log", "y\n1\n", "unknown file type '.log'"),
     ],
@@ -293,17 +336,25 @@ REFUSED_TEXT = [
     ("run.csv", "\r\n  \r\n", "holds only blank lines"),
     ("run.csv", bytes(range(256)) * 4, "not a text table; expected UTF-8 text with a header row"),
     ("run.csv", b"u,y\n\x00\x01\xff\xfe\n", "not a text table; expected UTF-8"),
-    ("run.csv", "u,y\n1,2\n".encode("utf-16-le"), "not a text table; expected UTF-8"),  # no mark says so
+    (
+        "run.csv",
+        "u,y\n1,2\n".encode("utf-16-le"),
+        "not a text table; expected UTF-8",
+    ),  # no mark says so
     ("run.csv", b"u,y,\xfc\x01\n1,2,3\n", "not a text table; expected UTF-8"),
     ("run.csv", b"\xef\xbb\xbfu,y,\xfc\n1,2,3\n", "not a text table; expected UTF-8"),
-    ("run.csv", "1.5,2\n1,2\n", "no column 'u': the file has no header, so its columns are called x1, x2"),
+    (
+        "run.csv",
+        "1.5,2\n1,2\n",
+        "no column 'u': the file has no header, so its columns are called x1, x2",
+    ),
     ("run.csv", "u,y\n1,2\n3,4,5\n", "line 3.*3 cells.*2"),
     ("run.csv", 'u,y\n1,2\n3,"4\n5,6\n', "not a readable table.*row 2"),
     ("run.csv", "force,position\n1,2\n", "no column 'u'; the file has 'force', 'position'"),
     ("run.csv", "U,y\n1,2\n", "no column 'u', did you mean 'U'.; the file has 'U', 'y'"),
     ("run.csv", "u (N),y\n1,2\n", r"no column 'u', did you mean 'u \(N\)'\?"),
     ("run.csv", ",,\n1,2,3\n", "no column 'u'; the file has no column names"),
-    ("run.csv", "u,y,y\n1,2,3\n", "column 'y' stands 2 times; names must differ"),
+    ("run.csv", "u,y,y\n1,2,3\n", "column 'y' 2 times; names must differ"),
     ("run.txt", "1 2\n3 4\n5 6 7\n", "no column 'u': the file has no header"),
     ("run.tsv", "u,y\n1,2\n", "no column 'u'.*the file has 'u,y'"),
     ("run.xml", "<a/>", r"unknown file type '.xml'; known are .csv, .tsv, .txt, .dat, .parquet"),
@@ -352,18 +403,38 @@ def test_a_folder_is_no_file(tmp_path):
 
 REFUSED_NPZ = [
     ("v", {"vel": np.ones(3)}, r"no variable 'v', did you mean 'vel'\?; the file holds vel \(3\)"),
-    ("y", {"a": np.ones((2, 3)), "b": 1.0}, r"no variable 'y'; the file holds a \(2×3\), b \(a scalar\)"),
+    (
+        "y",
+        {"a": np.ones((2, 3)), "b": 1.0},
+        r"no variable 'y'; the file holds a \(2×3\), b \(a scalar\)",
+    ),
     ("y", {}, "no variable 'y'; the file holds nothing"),
-    ("y", {"y": np.ones((2, 3))}, r"'y' is no vector; write a column of a matrix as \"y\[0\]\".*y \(2×3\)"),
+    (
+        "y",
+        {"y": np.ones((2, 3))},
+        r"'y' is no vector; write a column of a matrix as \"y\[0\]\".*y \(2×3\)",
+    ),
     ("y", {"y": 1.0}, "'y' is no vector"),
     ("y", {"y": np.ones((2, 2, 2))}, "'y' is no vector"),
-    ("y[3]", {"y": np.ones((2, 3))}, r"'y\[3\]': no such column \(counted from 0\); the file holds y \(2×3\)"),
+    (
+        "y[3]",
+        {"y": np.ones((2, 3))},
+        r"'y\[3\]': no such column \(counted from 0\); the file holds y \(2×3\)",
+    ),
     ("y[0]", {"y": np.ones(3)}, r"'y\[0\]': no such column"),
-    ("y[-1]", {"y": np.ones((2, 3))}, r"'y\[-1\]': a column of a matrix is written \"y\[0\]\", a row .*counted from"),
+    (
+        "y[-1]",
+        {"y": np.ones((2, 3))},
+        r"'y\[-1\]': a column of a matrix is written \"y\[0\]\", a row .*counted from",
+    ),
     ("x[0]", {"y": np.ones(3)}, "no variable 'x'"),
     ("y", {"y": np.array([1j, 2])}, "'y' is complex; expected real numbers"),
     ("y", {"y": np.array(["a", "b"])}, "'y' is text, no numbers; the file holds y"),
-    ("y", {"y": np.array(["2020-01-01"], dtype="datetime64[s]")}, r"'y' is datetime64\[s\] values, no numbers"),
+    (
+        "y",
+        {"y": np.array(["2020-01-01"], dtype="datetime64[s]")},
+        r"'y' is datetime64\[s\] values, no numbers",
+    ),
 ]
 
 

@@ -92,7 +92,9 @@ def test_wide_tables_stand_one_below_the_other():
     head = ["name", *(f"column {i}" for i in range(12)), "95 % interval"]
     lines = table([head, [f"cell {i}" for i in range(14)]])
     assert fits("\n".join(lines)) and "" in lines
-    assert [line.split("  ")[0] for line in lines if line] == ["name", "cell 0"] * (len(lines) // 3 + 1)
+    assert [line.split("  ")[0] for line in lines if line] == ["name", "cell 0"] * (
+        len(lines) // 3 + 1
+    )
     last = lines[lines.index("") + 1 :]
     assert "column 11" in last[0] and "95 % interval" in last[0]
 
@@ -102,7 +104,9 @@ def test_a_reader_that_leaves_is_no_error(project):
     os.close(reader)
     command = [*COMMAND, "schema", "fit"]
     try:
-        done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, cwd=project, timeout=60, check=False)
+        done = subprocess.run(
+            command, stdout=writer, stderr=subprocess.PIPE, cwd=project, timeout=60, check=False
+        )
     finally:
         os.close(writer)
     assert (done.returncode, done.stderr) == (0, b"")
@@ -132,12 +136,16 @@ def no_log():
 
 def test_the_log_tells_the_stages_of_a_fit(project, monkeypatch, caplog, no_log):
     monkeypatch.chdir(project)
-    monkeypatch.setattr("orthaug.commands.fit.advised", lambda fitted: fitted)  # which fits other specs
+    monkeypatch.setattr(
+        "orthaug.commands.fit.with_advice", lambda fitted: fitted
+    )  # which fits other specs
     with caplog.at_level(logging.DEBUG, logger="orthaug"):
         assert run("fit", "plant.toml", "--out", "logged", "--force").code == 0
     told = [record.getMessage() for record in caplog.records if record.name == "orthaug"]
     assert told[0].startswith("training: 4 runs of LevenbergMarquardt, orthogonal")
-    assert sum("seed" in line and "iterations" in line for line in told) == 4 and "is chosen of 4" in " ".join(told)
+    assert sum(
+        "seed" in line and "iterations" in line for line in told
+    ) == 4 and "run 1 of 4 is chosen" in " ".join(told)
 
 
 def test_the_log_is_silent_until_somebody_listens(capsys, no_log):
@@ -157,4 +165,8 @@ def test_verbose(no_log):
 def test_what_the_log_may_be(monkeypatch, no_log):
     monkeypatch.setenv("ORTHAUG_LOG", "loud")
     done = run("schema", "fit")
-    assert (done.code, done.out, done.err) == (2, "", "error: ORTHAUG_LOG must be one of info, debug; got 'loud'.\n")
+    assert (done.code, done.out, done.err) == (
+        2,
+        "",
+        "error: ORTHAUG_LOG must be one of info, debug; got 'loud'.\n",
+    )

@@ -20,9 +20,15 @@ TESTS = Path(__file__).parent
 PAPER = json.loads((TESTS / "references" / "paper.json").read_text(encoding="utf-8"))
 SOURCE = TESTS.parents[1] / "shared" / "paper" / "orthogonal-by-construction.tex"
 STATEMENTS = ("assum", "cond", "exmp", "lem", "property", "thm")
-COMMANDS = {command.name or getattr(command.callback, "__name__", "") for command in app.registered_commands}
+COMMANDS = {
+    command.name or getattr(command.callback, "__name__", "") for command in app.registered_commands
+}
 FUNCTIONS = {
-    path.stem: {node.name for node in ast.parse(path.read_text(encoding="utf-8")).body if hasattr(node, "name")}
+    path.stem: {
+        node.name
+        for node in ast.parse(path.read_text(encoding="utf-8")).body
+        if hasattr(node, "name")
+    }
     for path in TESTS.glob("test_*.py")
 }
 
@@ -35,7 +41,9 @@ def places(statement: Statement) -> list[str]:
 def cited(statement: Statement) -> list[tuple[str, str]]:
     """File and function, or none for a whole file, of every test; a function alone is in the file named before."""
     found, file = [], ""
-    for whole, given, name in re.findall(r"tests/(test_\w+)\.py|(?:(test_\w+)\.)?(test_\w+)", statement.shown):
+    for whole, given, name in re.findall(
+        r"tests/(test_\w+)\.py|(?:(test_\w+)\.)?(test_\w+)", statement.shown
+    ):
         file = whole or given or file
         found.append((file, name))
     return found
@@ -68,11 +76,15 @@ def thing(place: str) -> Any:
 def test_what_a_row_names_exists(statement):
     assert [place for place in places(statement) if thing(place) is None] == []
     assert [(file, name) for file, name in cited(statement) if file not in FUNCTIONS] == []
-    assert [(file, name) for file, name in cited(statement) if name and name not in FUNCTIONS[file]] == []
+    assert [
+        (file, name) for file, name in cited(statement) if name and name not in FUNCTIONS[file]
+    ] == []
     assert set(studies(statement)) <= set(catalogue())
     assert set(re.findall(r"`orthaug (\w+)", " ".join(statement))) <= COMMANDS
     for study, figure in re.findall(r"study (\w+), figure (\w+)", statement.shown):
-        text = Path(importlib.import_module(f"orthaug.studies.{study}").__file__ or "").read_text(encoding="utf-8")
+        text = Path(importlib.import_module(f"orthaug.studies.{study}").__file__ or "").read_text(
+            encoding="utf-8"
+        )
         assert f'"{figure}":' in text
     labels = re.findall(rf"\b(?:eqs?|{'|'.join(STATEMENTS)}):[\w-]+", " ".join(statement))
     assert [label for label in labels if label not in PAPER["labels"]] == []
@@ -86,9 +98,17 @@ def test_the_names_are_found():
     assert len({place for statement in THEORY for place in places(statement)}) > 25
     assert len({test for statement in THEORY for test in cited(statement)}) > 15
     assert thing("fitting.status.Ending.SPANNED") and thing("analysis.validation.dominance")
-    assert thing("fitting.status.Ending.SPANED") is None and thing("fitting.statuses.Ending") is None
-    one = Statement("", "", "", "test_paper.test_lemma_1, test_example_1; tests/test_bias.py; study consistency")
-    assert cited(one) == [("test_paper", "test_lemma_1"), ("test_paper", "test_example_1"), ("test_bias", "")]
+    assert (
+        thing("fitting.status.Ending.SPANED") is None and thing("fitting.statuses.Ending") is None
+    )
+    one = Statement(
+        "", "", "", "test_paper.test_lemma_1, test_example_1; tests/test_bias.py; study consistency"
+    )
+    assert cited(one) == [
+        ("test_paper", "test_lemma_1"),
+        ("test_paper", "test_example_1"),
+        ("test_bias", ""),
+    ]
     assert studies(one) == ["consistency"]
 
 
@@ -103,6 +123,10 @@ def test_the_stored_statements_are_those_of_the_paper():
     if not SOURCE.is_file():
         pytest.skip("the paper's source is not here")
     source = SOURCE.read_text(encoding="utf-8")
-    found = re.findall(r"\\begin\{(?:assum|exmp|cond|lem|thm)\}(?:\[[^]]*\])?\s*\\label\{([^}]*)\}", source)
-    assert sorted(found) == sorted(label for label in PAPER["labels"] if label.partition(":")[0] in STATEMENTS)
+    found = re.findall(
+        r"\\begin\{(?:assum|exmp|cond|lem|thm)\}(?:\[[^]]*\])?\s*\\label\{([^}]*)\}", source
+    )
+    assert sorted(found) == sorted(
+        label for label in PAPER["labels"] if label.partition(":")[0] in STATEMENTS
+    )
     assert len(re.findall(r"\\begin\{rem\}", source)) == PAPER["remarks"]

@@ -28,7 +28,13 @@ def project(tmp_path_factory):
 def test_result_figure_table_and_state_are_written(project):
     folder, done = project
     names = listing(folder / "first")
-    assert {"result.json", "report.txt", "table.csv", "figures/parameters.png", "state/recursive.json"} <= set(names)
+    assert {
+        "result.json",
+        "report.txt",
+        "table.csv",
+        "figures/parameters.png",
+        "state/recursive.json",
+    } <= set(names)
     result = finite_json((folder / "first" / "result.json").read_text())
     table = pd.read_csv(folder / "first" / "table.csv")
     assert result["rows"] == 300 and result["alarms"] == [] and not result["alarmed"]
@@ -43,11 +49,23 @@ def test_result_figure_table_and_state_are_written(project):
 def test_a_later_run_goes_on_from_the_state(project, tmp_path):
     folder, _ = project
     step = ("--data", folder / "later.csv")
-    done = run("track", folder / "fit", *step, "--state", folder / "first", "--out", tmp_path / "second", "--json")
+    done = run(
+        "track",
+        folder / "fit",
+        *step,
+        "--state",
+        folder / "first",
+        "--out",
+        tmp_path / "second",
+        "--json",
+    )
     assert done.code == 0 and done.err == ""
     both = ("--data", folder / "new.csv", *step, "--training", folder / "run.csv", "--memory", 20)
     assert run("track", folder / "fit", *both, "--out", tmp_path / "both").code == 0
-    second, whole = finite_json(done.out), finite_json((tmp_path / "both" / "result.json").read_text())
+    second, whole = (
+        finite_json(done.out),
+        finite_json((tmp_path / "both" / "result.json").read_text()),
+    )
     assert second["rows"] == whole["rows"] == 600
     for one, other in zip(second["parameters"], whole["parameters"], strict=True):
         assert one["value"] == pytest.approx(other["value"], rel=1e-12)
@@ -58,7 +76,9 @@ def test_a_changed_system_raises_the_alarm(project, tmp_path):
     folder, _ = project
     u, y = signals(300, 8)
     write_csv(
-        tmp_path / "changed.csv", u=u, y=y + np.where(np.arange(300) < 200, 0.0, 3 * y.std() * np.sin(np.arange(300)))
+        tmp_path / "changed.csv",
+        u=u,
+        y=y + np.where(np.arange(300) < 200, 0.0, 3 * y.std() * np.sin(np.arange(300))),
     )
     data = ("--data", tmp_path / "changed.csv", "--training", folder / "run.csv")
     done = run("track", folder / "fit", *data, "--out", tmp_path / "out")
@@ -72,21 +92,37 @@ REFUSED = [
     (("--training", "run.csv", "--state", "first"), ("--training: found beside --state",)),
     (("--state", "fit"), ("no saved recursive estimate there",)),
     (("--state", "first", "--memory", "3"), ("--forgetting, --memory: found beside --state",)),
-    (("--training", "steps.csv"), ("is not the least-squares estimate of these", "Give the training data")),
-    (("--training", "run.csv", "--forgetting", "1.5"), ("`forgetting` must lie between 0.3 and 1; got 1.5",)),
-    (("--training", "run.csv", "--forgetting", "0.9", "--memory", "3"), ("give `forgetting` or `memory`, not both",)),
+    (
+        ("--training", "steps.csv"),
+        ("is not the least-squares estimate of these", "Give the training data"),
+    ),
+    (
+        ("--training", "run.csv", "--forgetting", "1.5"),
+        ("`forgetting` must lie between 0.3 and 1; got 1.5",),
+    ),
+    (
+        ("--training", "run.csv", "--forgetting", "0.9", "--memory", "3"),
+        ("give `forgetting` or `memory`, not both",),
+    ),
     (("--training", "nothing.csv"), ("nothing.csv",)),
     (("--training", "run.csv", "--out", "fit"), ("holds fit, which is read; give another folder",)),
 ]
 
 
 @pytest.mark.parametrize(("options", "words"), REFUSED, ids=range(len(REFUSED)))
-def test_bad_input_is_one_line_and_nothing_is_written(project, tmp_path, monkeypatch, options, words):
+def test_bad_input_is_one_line_and_nothing_is_written(
+    project, tmp_path, monkeypatch, options, words
+):
     folder, _ = project
     monkeypatch.chdir(folder)
     before = listing(folder)
     done = run(
-        "track", "fit", "--data", "new.csv", *(() if "--out" in options else ("--out", tmp_path / "out")), *options
+        "track",
+        "fit",
+        "--data",
+        "new.csv",
+        *(() if "--out" in options else ("--out", tmp_path / "out")),
+        *options,
     )
     assert done.code == 2 and one_line(done.err, *words)
     assert listing(folder) == before and not (tmp_path / "out").exists()
@@ -95,7 +131,9 @@ def test_bad_input_is_one_line_and_nothing_is_written(project, tmp_path, monkeyp
 def test_new_data_are_needed_and_checked(project, tmp_path):
     folder, _ = project
     done = run("track", folder / "fit", "--training", folder / "run.csv", "--out", tmp_path / "out")
-    assert done.code == 2 and one_line(done.err, "--data: is missing; give at least one file of new data")
+    assert done.code == 2 and one_line(
+        done.err, "--data: is missing; give at least one file of new data"
+    )
     (tmp_path / "half.csv").write_text("u\n1\n2\n")
     data = ("--data", tmp_path / "half.csv", "--training", folder / "run.csv")
     done = run("track", folder / "fit", *data, "--out", tmp_path / "out")

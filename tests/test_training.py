@@ -46,7 +46,9 @@ def test_the_lowest_error_on_held_out_blocks_is_chosen():
 
 
 def test_the_lowest_generalised_cross_validation_is_chosen_one_step_ahead_and_told():
-    found = estimate(record(), PHYSICS, learner=NETWORK, solver=LM, regularization="auto", restarts=3)
+    found = estimate(
+        record(), PHYSICS, learner=NETWORK, solver=LM, regularization="auto", restarts=3
+    )
     scores = [run.score for run in found.restarts]
     assert [run.chosen for run in found.restarts] == [score == min(scores) for score in scores]
     assert all(run.score > run.loss and run.validation is None for run in found.restarts)
@@ -60,7 +62,9 @@ def test_where_no_learner_is_better_the_result_is_physics_alone(seed):
     assert found.model.form.bound is None and "physics_alone" in [w.code for w in found.warnings]
     np.testing.assert_allclose(found.theta, alone.theta, rtol=1e-9)
     np.testing.assert_allclose(found.std, alone.std, rtol=1e-6)
-    assert found.status.loss == found.status.start_loss and not any(run.chosen for run in found.restarts)
+    assert found.status.loss == found.status.start_loss and not any(
+        run.chosen for run in found.restarts
+    )
 
 
 def test_the_fallback_can_be_declined():
@@ -69,7 +73,9 @@ def test_the_fallback_can_be_declined():
     assert found.status.loss <= found.status.start_loss and found.restarts[0].chosen
 
 
-@pytest.mark.parametrize("structure", [Orthogonal(), Additive(), OrthogonalPenalty(1.0), BaselinePenalty(1.0)])
+@pytest.mark.parametrize(
+    "structure", [Orthogonal(), Additive(), OrthogonalPenalty(1.0), BaselinePenalty(1.0)]
+)
 def test_no_start_ends_above_physics_alone(structure):
     """Not even where iterations are few."""
     options = {**OPTIONS, "solver": type(LM)(4), "structure": structure, "restarts": 4, "blocks": 0}
@@ -80,7 +86,9 @@ def test_no_start_ends_above_physics_alone(structure):
 
 
 def test_one_step_does_not_end_above_physics_alone_either():
-    found = estimate(linear(), PHYSICS, learner=NETWORK, solver=type(LM)(1), restarts=4, regularization="none")
+    found = estimate(
+        linear(), PHYSICS, learner=NETWORK, solver=type(LM)(1), restarts=4, regularization="none"
+    )
     assert all(run.loss <= found.status.start_loss for run in found.restarts)
 
 
@@ -97,13 +105,21 @@ def test_a_start_that_fails_is_told_and_replaced(monkeypatch):
     run = FreeRunTask.run
 
     def failing(self, solver, w, *rest):
-        flight = run(self, solver, w, *rest)
+        free_fit = run(self, solver, w, *rest)
         first = np.array_equal(np.asarray(w), np.asarray(self.bound.init(jax.random.key(1))))
-        return flight._replace(end=flight.end._replace(ending=Ending.NON_FINITE)) if first else flight
+        return (
+            free_fit._replace(end=free_fit.end._replace(ending=Ending.NON_FINITE))
+            if first
+            else free_fit
+        )
 
     monkeypatch.setattr(FreeRunTask, "run", failing)
     found = estimate(record(), PHYSICS, restarts=2, seed=1, blocks=0, **OPTIONS)
-    assert [(r.seed, r.code == "non_finite") for r in found.restarts] == [(1, True), (2, False), (3, False)]
+    assert [(r.seed, r.code == "non_finite") for r in found.restarts] == [
+        (1, True),
+        (2, False),
+        (3, False),
+    ]
     assert "start_replaced" in [w.code for w in found.warnings] and found.status.ok
 
 
@@ -150,12 +166,17 @@ def test_the_ratio_of_errors():
     errors = coloured(np.random.default_rng(0))
     assert Ratio.of([errors], [errors]) == Ratio(1.0, 1.0, 1.0)
     half = Ratio.of([errors / 4], [errors])
-    assert (half.value, half.low, half.high) == pytest.approx((0.5, 0.5, 0.5)) and half.code == "helps"
+    assert (half.value, half.low, half.high) == pytest.approx(
+        (0.5, 0.5, 0.5)
+    ) and half.code == "helps"
     assert Ratio.of([errors * 1.01], [errors]).code == "no_help"
     assert Ratio.of([None, errors], [errors, errors]).code == "hurts"
     assert Ratio.of([errors], [None]).code == "helps"
     assert Ratio.of([None], [None]).code == "no_help"
-    assert Ratio.of([errors], [0 * errors]).code == "hurts" and Ratio.of([0 * errors], [0 * errors]).code == "no_help"
+    assert (
+        Ratio.of([errors], [0 * errors]).code == "hurts"
+        and Ratio.of([0 * errors], [0 * errors]).code == "no_help"
+    )
 
 
 def test_equal_models_are_rarely_told_apart():

@@ -16,7 +16,13 @@ from orthaug.fitting.criteria import Simulation
 from orthaug.fitting.estimation import estimate
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.structures import Additive, OrthogonalPenalty
-from orthaug.inference.covariance import interval, newey_west, prediction_std, robust_split_covariance
+from orthaug.inference.covariance import (
+    interval,
+    joint_covariance,
+    newey_west,
+    prediction_std,
+    robust_split_covariance,
+)
 from orthaug.inference.measures import Samples, Training, Uniform
 from orthaug.models.learners import MLP, Function
 from orthaug.physics.baseline import Baseline, Term
@@ -24,7 +30,9 @@ from orthaug.studies.synthetic import NOISE_30_DB, static
 
 RIDGE = 1e-4
 NODE, SHARE = np.polynomial.legendre.leggauss(200)
-WIDE = Samples({"u[k]": 0.6 * NODE}, weights=SHARE)  # uniform on ±0.6, exact for smooth physics, and quick
+WIDE = Samples(
+    {"u[k]": 0.6 * NODE}, weights=SHARE
+)  # uniform on ±0.6, exact for smooth physics, and quick
 QUICK = LevenbergMarquardt(iterations=12)
 EXAMPLE = static(1)
 
@@ -46,9 +54,13 @@ def dense(fit, rows=None):
     """Φ (N, ny, nθ) and J (N, ny, nw) in the outputs' units, one automatic derivative per row."""
     model, x = fit.model, fit.problem.rows.x if rows is None else rows
     bound, numbers, form = model.form.bound, model.numbers, model.form
-    z = (np.asarray(form.features.evaluate(x, form.layout, np)) - numbers.centre) / numbers.halfwidth
+    z = (
+        np.asarray(form.features.evaluate(x, form.layout, np)) - numbers.centre
+    ) / numbers.halfwidth
     slope = slope_of(bound)
-    jacobian = np.asarray(slope(jnp.asarray(numbers.weights), z)) * np.reshape(numbers.gain, (-1, 1))
+    jacobian = np.asarray(slope(jnp.asarray(numbers.weights), z)) * np.reshape(
+        numbers.gain, (-1, 1)
+    )
     return np.asarray(form.baseline.phi(x, form.layout, form.outputs, np)), jacobian
 
 
@@ -72,13 +84,17 @@ def residual_of(fit):
 def psi_of(fit):
     """[Φ P⊥J] of every row in whitened outputs, (N, ny, nθ + nw)."""
     phi, jacobian = dense(fit)
-    return np.concatenate([phi / fit.model.deviation[:, None], projected(fit, phi, jacobian)], axis=2)
+    return np.concatenate(
+        [phi / fit.model.deviation[:, None], projected(fit, phi, jacobian)], axis=2
+    )
 
 
 def pinv(matrix, cut=1e-13):
     """Pseudo-inverse of a Gram matrix, its columns scaled."""
     unit = 1 / np.sqrt(np.diag(matrix))
-    return np.linalg.pinv(matrix * np.outer(unit, unit), rcond=cut, hermitian=True) * np.outer(unit, unit)
+    return np.linalg.pinv(matrix * np.outer(unit, unit), rcond=cut, hermitian=True) * np.outer(
+        unit, unit
+    )
 
 
 def paper(fit):
@@ -108,7 +124,9 @@ def noisy():
 def estimable():
     """The same draw with a learner of which the data determine every weight."""
     example = static(1, noise=True)
-    return estimate(example.train, example.baseline, learner=LINEAR, solver=QUICK, regularization="none")
+    return estimate(
+        example.train, example.baseline, learner=LINEAR, solver=QUICK, regularization="none"
+    )
 
 
 # --- θ under a measure
@@ -119,7 +137,9 @@ def draws(count, seed=0):
     rng = np.random.default_rng(seed)
     (quiet,) = EXAMPLE.train.experiments
     for _ in range(count):
-        yield Record.from_arrays(quiet.inputs, quiet.outputs + rng.normal(scale=NOISE_30_DB, size=quiet.outputs.shape))
+        yield Record.from_arrays(
+            quiet.inputs, quiet.outputs + rng.normal(scale=NOISE_30_DB, size=quiet.outputs.shape)
+        )
 
 
 @pytest.mark.proof
@@ -130,10 +150,14 @@ def test_intervals_cover_under_the_training_and_the_uniform_measure(clean, recor
         fit = estimate(record, EXAMPLE.baseline, initial=clean, regularization=RIDGE, solver=QUICK)
         pair = (fit, fit.split(WIDE))
         for i, found in enumerate(pair):
-            inside[i] += (found.interval[:, 0] <= EXAMPLE.theta) & (EXAMPLE.theta <= found.interval[:, 1])
+            inside[i] += (found.interval[:, 0] <= EXAMPLE.theta) & (
+                EXAMPLE.theta <= found.interval[:, 1]
+            )
         thetas.append([found.theta for found in pair])
         std.append([found.std for found in pair])
-    record_property("covered by 95 % [%]", ", ".join(f"{100 * share:.1f}" for share in inside.ravel() / 120))
+    record_property(
+        "covered by 95 % [%]", ", ".join(f"{100 * share:.1f}" for share in inside.ravel() / 120)
+    )
     assert (inside / 120 >= 0.885).all() and (inside < 120).any()
     np.testing.assert_allclose(np.std(thetas, axis=0), np.mean(std, axis=0), rtol=0.22)
 
@@ -154,12 +178,16 @@ def spread_of(fit, rows):
     unit = 1 / np.linalg.norm(stacked, axis=0)
     _, singular, vectors = np.linalg.svd(stacked * unit, full_matrices=False)
     half = (rows * unit) @ (vectors.T / singular)
-    return np.sqrt(np.sum(half**2, axis=1) * fit.model.statistics.noise[0, 0]) / fit.model.deviation[0]
+    return (
+        np.sqrt(np.sum(half**2, axis=1) * fit.model.statistics.noise[0, 0]) / fit.model.deviation[0]
+    )
 
 
 def test_the_covariance_under_a_measure_is_the_delta_method(noisy):
     """K Cov(c, w) Kᵀ, K = [I, Φ_μ⁺J_μ]."""
-    phi, jacobian = (part[:, 0] * np.sqrt(SHARE)[:, None] for part in dense(noisy, 0.6 * NODE[:, None]))
+    phi, jacobian = (
+        part[:, 0] * np.sqrt(SHARE)[:, None] for part in dense(noisy, 0.6 * NODE[:, None])
+    )
     k = np.hstack([np.eye(2), np.linalg.lstsq(phi, jacobian, rcond=None)[0]])
     np.testing.assert_allclose(noisy.split(WIDE).std, spread_of(noisy, k), rtol=1e-6)
 
@@ -178,7 +206,11 @@ def test_variances_of_the_learner_are_not_negative(noisy, convention):
     psi, covariance = psi_of(noisy)[:, 0, 2:], noisy.joint_covariance(convention)[2:, 2:]
     variance = np.einsum("kn,np,kp->k", psi, covariance, psi)
     assert variance.min() >= 0
-    factor = 2 * np.mean(residual_of(noisy) ** 2) if convention == "paper" else noisy.model.statistics.noise[0, 0]
+    factor = (
+        2 * np.mean(residual_of(noisy) ** 2)
+        if convention == "paper"
+        else noisy.model.statistics.noise[0, 0]
+    )
     rank = variance.sum() / factor / noisy.model.weight[0, 0] ** 2
     assert 8 < rank <= psi.shape[1] + 1e-6
 
@@ -188,10 +220,31 @@ def test_the_whole_covariance_where_every_weight_is_estimable(convention):
     fit = estimable()
     expected = paper(fit)
     if convention == "calibrated":
-        expected = expected * fit.model.statistics.noise[0, 0] / (2 * np.mean(residual_of(fit) ** 2))
+        expected = (
+            expected * fit.model.statistics.noise[0, 0] / (2 * np.mean(residual_of(fit) ** 2))
+        )
     size = np.sqrt(np.diag(expected))
     found = fit.joint_covariance(convention)
-    np.testing.assert_allclose(found / np.outer(size, size), expected / np.outer(size, size), rtol=0, atol=1e-8)
+    np.testing.assert_allclose(
+        found / np.outer(size, size), expected / np.outer(size, size), rtol=0, atol=1e-8
+    )
+
+
+def test_a_pseudo_inverse_in_own_units_leaves_out_what_is_rounding(noisy):
+    """It is the whole where every weight is estimable; elsewhere no variance is so large that rounding shows."""
+    fit = estimable()
+    found = joint_covariance(fit.problem, fit.model, "paper", own_units=True)
+    size = np.sqrt(np.diag(found))
+    np.testing.assert_allclose(
+        (found - fit.joint_covariance("paper")) / np.outer(size, size), 0.0, atol=1e-8
+    )
+    own, unit = (
+        joint_covariance(noisy.problem, noisy.model, "paper", own_units=units)
+        for units in (True, False)
+    )
+    assert np.diag(own).max() < 0.01 * np.diag(unit).max()
+    np.testing.assert_allclose(own[:2, :2], unit[:2, :2], rtol=1e-9)
+    assert np.abs(own[:2, 2:]).max() * len(noisy.problem.rows) < 1e-6
 
 
 def test_the_calibrated_convention_is_the_textbook(noisy):
@@ -225,9 +278,15 @@ def two_outputs(shared, count=400):
     y = np.hstack([u + 0.3 * u**2, 2 * u + u**3]) + rng.normal(size=(count, 2)) * [0.1, 0.2]
     names = ("a", "a") if shared else ("a", "b")
     terms = [Term(names[0], "u[k]", output="y1"), Term(names[1], "2*u[k]**3", output="y2")]
-    terms += [Term("b", "u[k]**3", output="y1")] if shared else []  # two parameters in both, so one compiled program
+    terms += (
+        [Term("b", "u[k]**3", output="y1")] if shared else []
+    )  # two parameters in both, so one compiled program
     return estimate(
-        Record.from_arrays(u, y), Baseline.from_terms(terms), learner=MLP((3,)), solver=QUICK, regularization=1e-3
+        Record.from_arrays(u, y),
+        Baseline.from_terms(terms),
+        learner=MLP((3,)),
+        solver=QUICK,
+        regularization=1e-3,
     )
 
 
@@ -256,12 +315,21 @@ def test_the_joint_covariance_of_two_outputs_is_a_sum_over_rows(shared, conventi
     fit = two_outputs(shared)
     psi, weight = psi_of(fit), 1 / fit.model.deviation
     residual = residual_of(fit)
-    noise = residual.T @ residual / len(residual) if convention == "paper" else fit.model.statistics.noise
+    noise = (
+        residual.T @ residual / len(residual)
+        if convention == "paper"
+        else fit.model.statistics.noise
+    )
     whitened = noise * np.outer(weight, weight)
-    outer, middle = np.einsum("koa,kob->ab", psi, psi), np.einsum("koa,op,kpb->ab", psi, whitened, psi)
+    outer, middle = (
+        np.einsum("koa,kob->ab", psi, psi),
+        np.einsum("koa,op,kpb->ab", psi, whitened, psi),
+    )
     expected = (2 if convention == "paper" else 1) * pinv(outer) @ middle @ pinv(outer)
     nt = len(fit.theta)
-    np.testing.assert_allclose(fit.joint_covariance(convention)[:nt, :nt], expected[:nt, :nt], rtol=1e-8)
+    np.testing.assert_allclose(
+        fit.joint_covariance(convention)[:nt, :nt], expected[:nt, :nt], rtol=1e-8
+    )
 
 
 @pytest.mark.parametrize("count", [(), (6000,)], ids=["400", "6000"])
@@ -275,7 +343,9 @@ def test_one_pass_over_chunks_is_a_sum_over_rows(count):
     whitened = model.statistics.noise * np.outer(1 / model.deviation, 1 / model.deviation)
     for found, mix in ((model.statistics.gram, np.eye(2)), (model.statistics.middle, whitened)):
         expected = np.einsum("koa,op,kpb->ab", psi, mix, psi, optimize=True)
-        np.testing.assert_allclose(found / np.outer(size, size), expected / np.outer(size, size), rtol=0, atol=1e-10)
+        np.testing.assert_allclose(
+            found / np.outer(size, size), expected / np.outer(size, size), rtol=0, atol=1e-10
+        )
 
 
 def test_physics_alone_has_its_textbook_as_joint_covariance():
@@ -287,13 +357,23 @@ def test_physics_alone_has_its_textbook_as_joint_covariance():
 
 
 def test_what_has_no_joint_covariance(noisy):
-    with pytest.raises(InputError, match="`convention` must be one of calibrated, paper; got 'ljung'"):
+    with pytest.raises(
+        InputError, match="`convention` must be one of calibrated, paper; got 'ljung'"
+    ):
         noisy.joint_covariance("ljung")
     example = static(1, noise=True)
     ensemble = estimate(
-        example.train, example.baseline, learner=MLP((6,)), solver=QUICK, restarts=2, seed=3, ensemble=True
+        example.train,
+        example.baseline,
+        learner=MLP((6,)),
+        solver=QUICK,
+        restarts=2,
+        seed=3,
+        ensemble=True,
     )
-    with pytest.raises(InputError, match="an ensemble has no gradient in its weights; use a single learner"):
+    with pytest.raises(
+        InputError, match="an ensemble has no gradient in its weights; use a single learner"
+    ):
         ensemble.joint_covariance()
 
 
@@ -326,20 +406,29 @@ def test_prediction_std_of_linear_physics_is_the_textbook():
     rng = np.random.default_rng(4)
     u = rng.normal(size=(50, 2))
     record = Record.from_arrays(u, u @ [1.0, -2.0] + rng.normal(scale=0.1, size=50))
-    fit = estimate(record, Baseline.from_terms([Term("a", "u1[k]"), Term("b", "u2[k-1]")]), learner=None)
+    fit = estimate(
+        record, Baseline.from_terms([Term("a", "u1[k]"), Term("b", "u2[k-1]")]), learner=None
+    )
     rows = fit.problem.rows.x[:, [0, 1]]
     (found,) = prediction_std(fit.model, record)
     assert np.isnan(found[0, 0])
-    np.testing.assert_allclose(found[1:, 0] ** 2, np.einsum("ki,ij,kj->k", rows, fit.covariance, rows), rtol=1e-9)
+    np.testing.assert_allclose(
+        found[1:, 0] ** 2, np.einsum("ki,ij,kj->k", rows, fit.covariance, rows), rtol=1e-9
+    )
 
 
 def test_prediction_std_of_every_experiment_and_output():
     fit = two_outputs(True)
     (experiment,) = fit.problem.record.experiments
-    halves = [Record.from_arrays(experiment.inputs[a:b], experiment.outputs[a:b]) for a, b in ((0, 150), (150, 400))]
+    halves = [
+        Record.from_arrays(experiment.inputs[a:b], experiment.outputs[a:b])
+        for a, b in ((0, 150), (150, 400))
+    ]
     found = prediction_std(fit.model, Record.join(halves))
     assert [part.shape for part in found] == [(150, 2), (250, 2)]
-    np.testing.assert_allclose(np.concatenate(found), prediction_std(fit.model, fit.problem.record)[0], rtol=1e-12)
+    np.testing.assert_allclose(
+        np.concatenate(found), prediction_std(fit.model, fit.problem.record)[0], rtol=1e-12
+    )
 
 
 def test_prediction_intervals_cover_the_truth():
@@ -368,7 +457,7 @@ def test_a_split_leaves_the_standard_errors_of_predictions(noisy):
 
 def test_predictions_without_statistics_are_refused():
     model = orthogonalize(EXAMPLE.train, EXAMPLE.baseline, lambda x: x + x**2).model
-    with pytest.raises(InputError, match="the model has no statistics to take standard errors from"):
+    with pytest.raises(InputError, match="the model has no statistics for standard errors"):
         prediction_std(model, EXAMPLE.test)
 
 
@@ -453,7 +542,9 @@ def uneven_line(seed, rows=300, uneven=True):
     """y = u − 2 + e, the size of e going with |u|."""
     u, e = np.random.default_rng([seed, 23]).normal(size=(2, rows))
     gain = Baseline.from_terms([Term("a", "u[k]"), Term("b", "1")])
-    return estimate(Record.from_arrays(u, u - 2 + 0.3 * e * (np.abs(u) if uneven else 1)), gain, learner=None)
+    return estimate(
+        Record.from_arrays(u, u - 2 + 0.3 * e * (np.abs(u) if uneven else 1)), gain, learner=None
+    )
 
 
 def by_default(fit):
@@ -469,12 +560,17 @@ def test_noise_of_uneven_size_has_hc3_by_default():
         for i, found in enumerate((plain, fit)):
             inside[i] += (found.interval[:, 0] <= [1, -2]) & (found.interval[:, 1] >= [1, -2])
     assert inside[0, 0] < 80 and (inside[1] >= 90).all()
-    assert fit.std_kind == "hc3" and "robust (HC3), for the errors are of uneven size" in fit.summary()
+    assert (
+        fit.std_kind == "hc3"
+        and "robust (HC3), because the variance of the errors is not constant" in fit.summary()
+    )
     phi = np.column_stack([plain.problem.record.experiments[0].inputs[:, 0], np.ones(300)])
     e = plain.problem.record.experiments[0].outputs[:, 0] - phi @ plain.theta
     inverse = np.linalg.inv(phi.T @ phi)
     own = e / (1 - np.einsum("ki,ij,kj->k", phi, inverse, phi))
-    np.testing.assert_allclose(fit.covariance, inverse @ (phi.T * own**2) @ phi @ inverse, rtol=1e-8)
+    np.testing.assert_allclose(
+        fit.covariance, inverse @ (phi.T * own**2) @ phi @ inverse, rtol=1e-8
+    )
     np.testing.assert_array_equal(fit.plain_covariance, plain.covariance)
     np.testing.assert_allclose(fit.split(Training()).covariance, fit.covariance, rtol=1e-6)
 
@@ -517,13 +613,15 @@ def other(kind):
 
 @pytest.mark.parametrize("kind", ["additive", "penalty", "bound", "elsewhere"])
 def test_robust_errors_need_standard_errors(kind):
-    with pytest.raises(InputError, match="robust standard errors are those of a fit that has standard errors"):
+    with pytest.raises(InputError, match="robust standard errors need a fit with standard errors"):
         other(kind).robust()
 
 
 def test_robust_errors_of_a_split_come_from_the_influence_of_every_row(noisy):
     """Under the training measure that influence is `Φ⁺e`, whatever the learner; under another it is near the plain."""
-    residual = (noisy.model.predict(noisy.problem.record).trajectories[0].model - noisy.problem.rows.y) * -1
+    residual = (
+        noisy.model.predict(noisy.problem.record).trajectories[0].model - noisy.problem.rows.y
+    ) * -1
     problem, used = noisy.problem, noisy.effective_weights
     found = robust_split_covariance(problem, noisy.model, noisy._slope(), residual, used)
     np.testing.assert_allclose(found, noisy.robust().covariance, rtol=1e-6)

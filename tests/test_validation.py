@@ -29,7 +29,9 @@ CHOICES = ("none", "evidence", 1.0)
 
 @pytest.fixture(scope="module")
 def chosen():
-    return estimate(TRAIN, PHYSICS, regularization=CHOICES, restarts=3, seed=2, validation=VALIDATION, **OPTIONS)
+    return estimate(
+        TRAIN, PHYSICS, regularization=CHOICES, restarts=3, seed=2, validation=VALIDATION, **OPTIONS
+    )
 
 
 @pytest.fixture(scope="module")
@@ -68,14 +70,19 @@ def test_the_lowest_validation_error_is_chosen(chosen, candidates):
     losses = [r.loss for r in chosen.restarts]
     assert np.argmin(losses) != np.argmin(errors)  # training loss would have chosen another
     best = list(candidates.values())[int(np.argmin(errors))]
-    assert np.asarray(chosen.model.numbers.weights).tobytes() == np.asarray(best.model.numbers.weights).tobytes()
+    assert (
+        np.asarray(chosen.model.numbers.weights).tobytes()
+        == np.asarray(best.model.numbers.weights).tobytes()
+    )
     assert chosen.status.loss == best.status.loss
     assert chosen.std.tobytes() == best.std.tobytes()
 
 
 def test_another_validation_record_changes_the_choice_and_nothing_else(chosen):
     """The training data themselves: the lowest loss is the lowest error."""
-    other = estimate(TRAIN, PHYSICS, regularization=CHOICES, restarts=3, seed=2, validation=TRAIN, **OPTIONS)
+    other = estimate(
+        TRAIN, PHYSICS, regularization=CHOICES, restarts=3, seed=2, validation=TRAIN, **OPTIONS
+    )
     assert [r.loss for r in other.restarts] == [r.loss for r in chosen.restarts]
     losses = [r.loss for r in other.restarts]
     np.testing.assert_allclose([r.validation for r in other.restarts], losses, rtol=1e-6)
@@ -90,11 +97,17 @@ def auto():
 
 def test_auto_runs_none_and_ard_and_keeps_the_lowest_score(auto, candidates):
     samples, fits = len(auto.problem.rows), [candidates[s, "none"] for s in (2, 3, 4)]
-    fits += [estimate(TRAIN, PHYSICS, regularization="ard", seed=seed, **OPTIONS) for seed in (2, 3, 4)]
+    fits += [
+        estimate(TRAIN, PHYSICS, regularization="ard", seed=seed, **OPTIONS) for seed in (2, 3, 4)
+    ]
     left = [samples - len(fit.theta) - 1.4 * fit.effective_weights for fit in fits]
-    scores = [fit.restarts[0].loss / n**2 if n > 0 else np.inf for fit, n in zip(fits, left, strict=True)]
+    scores = [
+        fit.restarts[0].loss / n**2 if n > 0 else np.inf for fit, n in zip(fits, left, strict=True)
+    ]
     best = int(np.argmin(scores))
-    kept = [i if scores[i] <= scores[i + 3] else i + 3 for i in range(3)]  # of each start the better one
+    kept = [
+        i if scores[i] <= scores[i + 3] else i + 3 for i in range(3)
+    ]  # of each start the better one
     told = [fits[i].restarts[0] for i in kept]
     assert [(r.seed, r.regularization, r.loss) for r in auto.restarts] == [
         (r.seed, r.regularization, r.loss) for r in told
@@ -133,7 +146,12 @@ STANDS_FOR = [
 
 @pytest.mark.parametrize(("change", "expected"), STANDS_FOR)
 def test_what_auto_stands_for(change, expected):
-    usual = {"given": "auto", "solver": LevenbergMarquardt(), "criterion": Prediction(), "structure": Orthogonal()}
+    usual = {
+        "given": "auto",
+        "solver": LevenbergMarquardt(),
+        "criterion": Prediction(),
+        "structure": Orthogonal(),
+    }
     assert tried(**(usual | {"linear": True, "validated": False} | change)) == expected
 
 
@@ -165,7 +183,10 @@ def test_ard_is_refused(arguments, words):
             {"regularization": ["none", "ridge"], "validation": VALIDATION},
             "must be one of none, evidence, ard; got 'ridge'",
         ),
-        ({"regularization": ["none", -1.0], "validation": VALIDATION}, "`regularization` must be 0 or more; got -1.0"),
+        (
+            {"regularization": ["none", -1.0], "validation": VALIDATION},
+            "`regularization` must be 0 or more; got -1.0",
+        ),
         ({"validation": np.zeros((9, 2))}, "`validation` must be a Record or None"),
         ({"seed": 2**63}, "`seed` must be below 2..63"),
         ({"seed": 2**63 - 2, "restarts": 2}, "`seed` must be below 2..63"),
@@ -198,7 +219,11 @@ def test_the_table_of_a_fit(project):
     done = run("fit", project, "--json", "--out", "out")
     assert (done.code, done.err) == (0, "")
     result = json.loads(done.out)
-    assert result["data"]["validation"][0] | {"sha256": ""} == {"file": "valid.csv", "sha256": "", "rows": 80}
+    assert result["data"]["validation"][0] | {"sha256": ""} == {
+        "file": "valid.csv",
+        "sha256": "",
+        "rows": 80,
+    }
     assert list(result["scores"]) == ["train", "validation", "tests.steps"]
     assert result["scores"]["validation"]["prediction"]["rmse"][0] > 0
     assert result["validation"]["verdict"] in (
@@ -221,7 +246,9 @@ def test_the_table_of_a_fit(project):
     project.write_text(spec(part="[data.channels.y]"))
     alone = json.loads(run("fit", project, "--json", "--out", "alone").out)
     assert [r["seed"] for r in alone["restarts"]] == [5, 6]
-    assert {r["loss"] for r in alone["restarts"]} <= {r["loss"] for r in table}  # of each start the better one
+    assert {r["loss"] for r in alone["restarts"]} <= {
+        r["loss"] for r in table
+    }  # of each start the better one
     assert [r["validation"] for r in alone["restarts"]] == [None, None]
     assert [p["value"] for p in alone["parameters"]] == [p["value"] for p in result["parameters"]]
     assert "validation" not in alone["scores"]
@@ -256,16 +283,37 @@ def test_skipped_samples_do_not_choose(project):
 
 REFUSED = [
     (
-        spec(NETWORK + 'regularization = ["none", 0.5]\n', "[validation]\nblocks = 0\n[data.channels.y]"),
+        spec(
+            NETWORK + 'regularization = ["none", 0.5]\n',
+            "[validation]\nblocks = 0\n[data.channels.y]",
+        ),
         ["list; expected [data.validation] or `validation.blocks`"],
     ),
-    (spec(NETWORK + "regularization = []\n"), ["'training.regularization': found []", "at least one entry"]),
-    (spec(NETWORK + 'regularization = ["none", "ridge"]\n'), ["'training.regularization[1]'", '"ridge"', "evidence"]),
-    (spec(NETWORK + 'solver = "adam-lbfgs"\nregularization = ["none", "evidence"]\n'), ["levenberg-marquardt"]),
+    (
+        spec(NETWORK + "regularization = []\n"),
+        ["'training.regularization': found []", "at least one entry"],
+    ),
+    (
+        spec(NETWORK + 'regularization = ["none", "ridge"]\n'),
+        ["'training.regularization[1]'", '"ridge"', "evidence"],
+    ),
+    (
+        spec(NETWORK + 'solver = "adam-lbfgs"\nregularization = ["none", "evidence"]\n'),
+        ["levenberg-marquardt"],
+    ),
     (spec(part=PART.replace("valid.csv", "absent.csv")), ["absent.csv: no such file"]),
-    (spec(part=PART.replace("skip = 3", "skip = 80")), ["valid.csv", "data.validation has 80 rows, too few"]),
-    (spec(part=PART.replace("skip = 3", "every = 2")), ["data.validation: sampled every 1 s, the training data"]),
-    (spec(part=PART.replace("skip = 3", 'columns = { z = "y" }')), ["'data.validation.columns'", "'z' is neither"]),
+    (
+        spec(part=PART.replace("skip = 3", "skip = 80")),
+        ["valid.csv", "data.validation has 80 rows, too few"],
+    ),
+    (
+        spec(part=PART.replace("skip = 3", "every = 2")),
+        ["data.validation: sampled every 1 s, the training data"],
+    ),
+    (
+        spec(part=PART.replace("skip = 3", 'columns = { z = "y" }')),
+        ["'data.validation.columns'", "'z' is neither"],
+    ),
 ]
 
 

@@ -18,7 +18,14 @@ from orthaug.data.variables import read_variables
 
 h5py = pytest.importorskip("h5py")
 
-CLASSES = {"f8": "double", "f4": "single", "i4": "int32", "i2": "int16", "u1": "logical", "u2": "char"}
+CLASSES = {
+    "f8": "double",
+    "f4": "single",
+    "i4": "int32",
+    "i2": "int16",
+    "u1": "logical",
+    "u2": "char",
+}
 
 
 # --- files as the programs write them
@@ -49,8 +56,13 @@ def _put_v73(group, references, name, value):
         for key, item in value.items():
             _put_v73(inner, references, key, item)
     elif isinstance(value, list):
-        held = [references.create_dataset(f"{name}{i}", data=np.atleast_2d(item)).ref for i, item in enumerate(value)]
-        made = group.create_dataset(name, data=np.array([held], dtype=h5py.ref_dtype), dtype=h5py.ref_dtype)
+        held = [
+            references.create_dataset(f"{name}{i}", data=np.atleast_2d(item)).ref
+            for i, item in enumerate(value)
+        ]
+        made = group.create_dataset(
+            name, data=np.array([held], dtype=h5py.ref_dtype), dtype=h5py.ref_dtype
+        )
         made.attrs["MATLAB_class"] = np.bytes_("cell")
     elif isinstance(value, str):
         made = group.create_dataset(name, data=np.array([[ord(c)] for c in value], dtype="u2"))
@@ -58,7 +70,10 @@ def _put_v73(group, references, name, value):
         made.attrs["MATLAB_int_decode"] = np.int32(2)
     elif scipy.sparse.issparse(value):
         inner = group.create_group(name)
-        inner.attrs["MATLAB_class"], inner.attrs["MATLAB_sparse"] = np.bytes_("double"), np.uint64(value.shape[0])
+        inner.attrs["MATLAB_class"], inner.attrs["MATLAB_sparse"] = (
+            np.bytes_("double"),
+            np.uint64(value.shape[0]),
+        )
         inner.create_dataset("data", data=value.tocsc().data)
     else:
         array = np.atleast_2d(value)
@@ -88,7 +103,9 @@ def put_npz(path: Path, **variables) -> Path:
 
 
 def put_excel(path: Path, **columns) -> Path:
-    pd.DataFrame({name: np.ravel(values) for name, values in columns.items()}).to_excel(path, index=False)
+    pd.DataFrame({name: np.ravel(values) for name, values in columns.items()}).to_excel(
+        path, index=False
+    )
     return path
 
 
@@ -202,7 +219,14 @@ def refused(folder: Path, spec: str, *words: str) -> str:
 def from_csv(tmp_path_factory):
     folder = tmp_path_factory.mktemp("csv")
     u, y = signals(80, 1)
-    np.savetxt(folder / "run.csv", np.stack([u, y], axis=1), delimiter=",", header="u,y", comments="", fmt="%.17g")
+    np.savetxt(
+        folder / "run.csv",
+        np.stack([u, y], axis=1),
+        delimiter=",",
+        header="u,y",
+        comments="",
+        fmt="%.17g",
+    )
     return theta(fitted(folder, SPEC.format(file="run.csv", u="u", y="y")))
 
 
@@ -230,7 +254,9 @@ def test_a_fit_of_integers_and_logicals(tmp_path, writer):
     path = put(tmp_path, writer, u=u, y=y)
     found = theta(fitted(tmp_path, SPEC.format(file=path.name, u="u", y="y")))
     phi = np.stack([y[:-1], u[:-1]], axis=1).astype(float)
-    np.testing.assert_allclose(found, np.linalg.lstsq(phi, y[1:].astype(float), rcond=None)[0], rtol=1e-10)
+    np.testing.assert_allclose(
+        found, np.linalg.lstsq(phi, y[1:].astype(float), rcond=None)[0], rtol=1e-10
+    )
 
 
 DAMPER = """
@@ -257,12 +283,17 @@ def test_the_mr_damper_fits_from_a_spec(tmp_path, data_folder):
     if not file.is_file():
         pytest.skip(f"no {file}; set ORTHAUG_DATA to the folder of the data sets")
     regressors = ("F[k-1]", "v[k]", "v[k-1]", "sign(v[k])", "1")
-    terms = (f'[[baseline.terms]]\nparameter = "t{i}"\nregressor = "{r}"\n' for i, r in enumerate(regressors))
+    terms = (
+        f'[[baseline.terms]]\nparameter = "t{i}"\nregressor = "{r}"\n'
+        for i, r in enumerate(regressors)
+    )
     result = fitted(tmp_path, DAMPER.format(file=file) + "".join(terms))
     held = scipy.io.loadmat(file)
     v, force = held["X"].ravel()[:2000], held["y"].ravel()[:2000]
     phi = np.stack([force[:-1], v[1:], v[:-1], np.sign(v[1:]), np.ones(1999)], axis=1)
-    np.testing.assert_allclose(theta(result), np.linalg.lstsq(phi, force[1:], rcond=None)[0], rtol=1e-8)
+    np.testing.assert_allclose(
+        theta(result), np.linalg.lstsq(phi, force[1:], rcond=None)[0], rtol=1e-8
+    )
     free_run = result["scores"]["tests.rest"]["simulation"]
     assert free_run["fit"][0] == pytest.approx(65.3, abs=0.1)
     assert free_run["rmse"][0] == pytest.approx(19.2, abs=0.1)
@@ -314,14 +345,23 @@ U, Y = (values[None] for values in signals(20, 1))
 @each(EVERY)
 def test_a_missing_variable(tmp_path, writer):
     path = put(tmp_path, writer, force=U, speed=Y)
-    refused(tmp_path, SPEC.format(file=path.name, u="forc", y="speed"), path.name, "'forc'", "'force'", "speed")
+    refused(
+        tmp_path,
+        SPEC.format(file=path.name, u="forc", y="speed"),
+        path.name,
+        "'forc'",
+        "'force'",
+        "speed",
+    )
 
 
 @each(WRITERS)
 @pytest.mark.parametrize("name", ["U[3]", "u[1]"])
 def test_a_column_out_of_range(tmp_path, writer, name):
     path = put(tmp_path, writer, U=np.ones((20, 3)), u=np.ones((20, 1)), y=Y)
-    refused(tmp_path, SPEC.format(file=path.name, u=name, y="y"), path.name, f"'{name}'", "U (20×3)")
+    refused(
+        tmp_path, SPEC.format(file=path.name, u=name, y="y"), path.name, f"'{name}'", "U (20×3)"
+    )
 
 
 @each(WRITERS)
@@ -333,7 +373,9 @@ def test_a_column_that_is_no_number(tmp_path, writer):
 @each(WRITERS)
 def test_a_matrix_without_a_column(tmp_path, writer):
     path = put(tmp_path, writer, U=np.ones((20, 3)), y=Y)
-    refused(tmp_path, SPEC.format(file=path.name, u="U", y="y"), path.name, "'U'", "U[0]", "U (20×3)")
+    refused(
+        tmp_path, SPEC.format(file=path.name, u="U", y="y"), path.name, "'U'", "U[0]", "U (20×3)"
+    )
 
 
 @each(WRITERS)
@@ -370,41 +412,74 @@ def test_what_holds_no_numbers(tmp_path, writer, value, word):
     if isinstance(value, list) and writer[1] is put_v5:
         value = np.array([*value, None], dtype=object)[:-1]
     path = put(tmp_path, writer, thing=value, y=Y)
-    refused(tmp_path, SPEC.format(file=path.name, u="thing", y="y"), path.name, "'thing'", word, "y (1×20)")
+    refused(
+        tmp_path,
+        SPEC.format(file=path.name, u="thing", y="y"),
+        path.name,
+        "'thing'",
+        word,
+        "y (1×20)",
+    )
 
 
 @each(MATLAB)
 def test_a_struct_beside_vectors_does_not_disturb(tmp_path, writer, from_csv):
     u, y = signals(80, 1)
-    path = put(tmp_path, writer, info={"x": np.ones((1, 3)), "note": "text"}, title="run 1", u=u[None], y=y[None])
+    path = put(
+        tmp_path,
+        writer,
+        info={"x": np.ones((1, 3)), "note": "text"},
+        title="run 1",
+        u=u[None],
+        y=y[None],
+    )
     found = theta(fitted(tmp_path, SPEC.format(file=path.name, u="u", y="y")))
     np.testing.assert_allclose(found, from_csv, rtol=1e-12)
 
 
 def test_an_array_of_structs(tmp_path):
     path = put_v5(tmp_path / "run.mat", thing=np.array([(1.0,), (2.0,)], dtype=[("x", "f8")]), y=Y)
-    refused(tmp_path, SPEC.format(file=path.name, u="thing", y="y"), "run.mat", "'thing' is a struct", "y (1×20)")
+    refused(
+        tmp_path,
+        SPEC.format(file=path.name, u="thing", y="y"),
+        "run.mat",
+        "'thing' is a struct",
+        "y (1×20)",
+    )
 
 
 def test_text_in_hdf5(tmp_path):
     path = put_hdf5(tmp_path / "run.h5", u=np.array([b"a", b"b"]), y=Y)
-    refused(tmp_path, SPEC.format(file=path.name, u="u", y="y"), "run.h5", "'u'", "no numbers", "y (1×20)")
+    refused(
+        tmp_path,
+        SPEC.format(file=path.name, u="u", y="y"),
+        "run.h5",
+        "'u'",
+        "no numbers",
+        "y (1×20)",
+    )
 
 
 def test_paths_with_points_or_slashes(tmp_path):
     path = put_hdf5(tmp_path / "run.h5", **{"run/deep/u": U, "y": Y})
-    matlab = put_v73(tmp_path / "run.mat", run={"deep": {"u": U}, "cell": [np.stack([np.ravel(U), np.ravel(Y)])]})
+    matlab = put_v73(
+        tmp_path / "run.mat", run={"deep": {"u": U}, "cell": [np.stack([np.ravel(U), np.ravel(Y)])]}
+    )
     for file in (path, matlab):
         for name in ("run.deep.u", "run/deep/u", "/run/deep/u"):
             np.testing.assert_array_equal(read_variables(file, (name,))[name], np.ravel(U))
-    np.testing.assert_array_equal(read_variables(matlab, ("run.cell[1]",))["run.cell[1]"], np.ravel(Y))
+    np.testing.assert_array_equal(
+        read_variables(matlab, ("run.cell[1]",))["run.cell[1]"], np.ravel(Y)
+    )
 
 
 def put_references(file, name: str, held: list, *, cell: bool) -> None:
     """Elements behind references, in a cell or in a field of an array of structs."""
     made = [file.require_group("#refs#").create_dataset(f"{name[-1]}{i}", data=np.atleast_2d(v).T).ref
             for i, v in enumerate(held)]  # fmt: skip
-    data = file.create_dataset(name, data=np.array([made], dtype=h5py.ref_dtype), dtype=h5py.ref_dtype)
+    data = file.create_dataset(
+        name, data=np.array([made], dtype=h5py.ref_dtype), dtype=h5py.ref_dtype
+    )
     if cell:
         data.attrs["MATLAB_class"] = np.bytes_("cell")
 
@@ -418,8 +493,18 @@ def test_cells_and_arrays_of_structs_of_v73(tmp_path):
         struct = file["#refs#"].create_group("struct")
         struct.create_dataset("y", data=7 * u[:, None])
         reference = np.array([[struct.ref, file["c"].ref]], dtype=h5py.ref_dtype)
-        file.create_dataset("deep", data=reference, dtype=h5py.ref_dtype).attrs["MATLAB_class"] = np.bytes_("cell")
-    wanted = {"c[0]": 1, "c[1]": 3, "runs[0].u": 1, "runs[1].u": 5, "runs[0].w": 2, "deep[0].y": 7, "deep[1][1]": 3}
+        file.create_dataset("deep", data=reference, dtype=h5py.ref_dtype).attrs["MATLAB_class"] = (
+            np.bytes_("cell")
+        )
+    wanted = {
+        "c[0]": 1,
+        "c[1]": 3,
+        "runs[0].u": 1,
+        "runs[1].u": 5,
+        "runs[0].w": 2,
+        "deep[0].y": 7,
+        "deep[1][1]": 3,
+    }
     for name, values in read_variables(path, tuple(wanted)).items():
         np.testing.assert_array_equal(values, wanted[name] * u, err_msg=name)
     with pytest.raises(InputError, match="'c' is a cell, no numbers"):
@@ -442,20 +527,36 @@ def test_signals_that_a_file_names(tmp_path):
     scope = {"time": u, "signals": {"label": "Speed", "values": 3 * u}}
     scipy.io.savemat(tmp_path / "run.mat", {"run": {"Y": signals_}, "scope": scope})
     assert column_names(tmp_path / "run.mat") == ["Force", "run.Y[1].Data", "scope.time", "Speed"]
-    wanted = {"Force": 1, "run.Y[0].Data": 1, "run.Y[1].Data": 2, "Speed": 3, "scope.signals.values": 3}
+    wanted = {
+        "Force": 1,
+        "run.Y[0].Data": 1,
+        "run.Y[1].Data": 2,
+        "Speed": 3,
+        "scope.signals.values": 3,
+    }
     for name, factor in wanted.items():
-        np.testing.assert_array_equal(read_variables(tmp_path / "run.mat", (name,))[name], factor * u)
+        np.testing.assert_array_equal(
+            read_variables(tmp_path / "run.mat", (name,))[name], factor * u
+        )
 
 
 def test_a_group_of_hdf5(tmp_path):
     path = put_hdf5(tmp_path / "run.h5", **{"run/u": U, "y": Y})
-    refused(tmp_path, SPEC.format(file=path.name, u="run", y="y"), "run.h5", "'run' is a group", "run/u (1×20)")
+    refused(
+        tmp_path,
+        SPEC.format(file=path.name, u="run", y="y"),
+        "run.h5",
+        "'run' is a group",
+        "run/u (1×20)",
+    )
 
 
 @each(EVERY)
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
 def test_a_file_that_is_cut(tmp_path, writer, share):
-    path = put(tmp_path, writer, u=np.random.default_rng(0).normal(size=(1, 900)), y=np.ones((1, 900)))
+    path = put(
+        tmp_path, writer, u=np.random.default_rng(0).normal(size=(1, 900)), y=np.ones((1, 900))
+    )
     content = path.read_bytes()
     path.write_bytes(content[: int(share * len(content))])
     refused(tmp_path, SPEC.format(file=path.name, u="u", y="y"), path.name)

@@ -55,7 +55,14 @@ def fitted(record, **options):
 
 # --- blocks
 
-SHAPES = [((100,), 4, 2), ((103,), 3, 5), ((50, 60, 70), 4, 2), ((30,) * 8, 4, 2), ((200, 9, 9), 4, 2), ((90,), 2, 0)]
+SHAPES = [
+    ((100,), 4, 2),
+    ((103,), 3, 5),
+    ((50, 60, 70), 4, 2),
+    ((30,) * 8, 4, 2),
+    ((200, 9, 9), 4, 2),
+    ((90,), 2, 0),
+]
 UNEVEN = [((100, 100, *(4,) * 50), 2, 3)]  # to even out the rows one experiment is not enough
 
 
@@ -65,12 +72,18 @@ def short(value):
 
 def numbered(lengths):
     """Experiments whose input holds the experiment's number and whose output the row's."""
-    parts = [Record.from_arrays(np.full(n, float(i)), np.arange(float(n))) for i, n in enumerate(lengths)]
+    parts = [
+        Record.from_arrays(np.full(n, float(i)), np.arange(float(n))) for i, n in enumerate(lengths)
+    ]
     return Record.join(parts)
 
 
 def places(record):
-    return [(int(i), int(k)) for e in record.experiments for i, k in zip(e.inputs[:, 0], e.outputs[:, 0], strict=True)]
+    return [
+        (int(i), int(k))
+        for e in record.experiments
+        for i, k in zip(e.inputs[:, 0], e.outputs[:, 0], strict=True)
+    ]
 
 
 def usable(record, start):
@@ -100,21 +113,30 @@ def test_training_rows_keep_the_lag_length_away(lengths, blocks, start):
 def test_training_experiments_are_unbroken(lengths, blocks, start):
     for training, _ in blocked(numbered(lengths), blocks, start):
         for experiment in training.experiments:
-            assert (np.diff(experiment.outputs[:, 0]) == 1).all() and len(set(experiment.inputs[:, 0])) == 1
+            assert (np.diff(experiment.outputs[:, 0]) == 1).all() and len(
+                set(experiment.inputs[:, 0])
+            ) == 1
             assert experiment.first_row == experiment.outputs[0, 0]
 
 
 @pytest.mark.parametrize(("lengths", "blocks", "start"), SHAPES + UNEVEN, ids=short)
 def test_all_folds_have_as_many_usable_rows(lengths, blocks, start):
-    assert len({usable(training, start) for training, _ in blocked(numbered(lengths), blocks, start)}) == 1
+    assert (
+        len({usable(training, start) for training, _ in blocked(numbered(lengths), blocks, start)})
+        == 1
+    )
 
 
 @pytest.mark.parametrize(
-    ("lengths", "blocks", "start"), [((60,), 4, 2), ((200,), 1, 2), ((100,), 50, 0), ((4,) * 60, 4, 3)], ids=short
+    ("lengths", "blocks", "start"),
+    [((60,), 4, 2), ((200,), 1, 2), ((100,), 50, 0), ((4,) * 60, 4, 3)],
+    ids=short,
 )
 def test_too_few_rows_for_the_blocks(lengths, blocks, start):
     rows = sum(lengths)
-    with pytest.raises(InputError, match=f"{rows} rows are too few for {blocks} blocks with gaps of {start} rows"):
+    with pytest.raises(
+        InputError, match=f"{rows} rows are too few for {blocks} blocks with gaps of {start} rows"
+    ):
         blocked(numbered(lengths), blocks, start)
 
 
@@ -131,18 +153,27 @@ def layout_of():
 
 def test_a_part_within_the_training_range_leaves_nothing():
     record = system(0, 300)
-    assert extrapolation("tests.in", rows_of(record.rows(50, 200)), rows_of(record), layout_of()) == []
+    assert (
+        extrapolation("tests.in", rows_of(record.rows(50, 200)), rows_of(record), layout_of()) == []
+    )
 
 
 def test_the_range_that_is_left_is_told_once_for_a_channel():
     record, far = system(0, 300), system(1, 200, scale=2.0)
-    found = {e.lag: e for e in extrapolation("tests.far", rows_of(far), rows_of(record), layout_of())}
+    found = {
+        e.lag: e for e in extrapolation("tests.far", rows_of(far), rows_of(record), layout_of())
+    }
     assert set(found) == {"y[k-1]", "u[k-1]"}
     inside = record.experiments[0].inputs[1:-1, 0]
     outside = far.experiments[0].inputs[1:-1, 0]
     entry = found["u[k-1]"]
-    assert entry.training == (inside.min(), inside.max()) and entry.reach == (outside.min(), outside.max())
-    assert entry.share == pytest.approx(np.mean((outside < inside.min()) | (outside > inside.max())))
+    assert entry.training == (inside.min(), inside.max()) and entry.reach == (
+        outside.min(),
+        outside.max(),
+    )
+    assert entry.share == pytest.approx(
+        np.mean((outside < inside.min()) | (outside > inside.max()))
+    )
 
 
 @pytest.mark.parametrize(("over", "rows", "told"), [
@@ -156,7 +187,10 @@ def test_a_range_that_is_hardly_left_is_not_told(over, rows, told):
 
 
 def test_the_words_of_a_range():
-    words = "In u[k-1], tests.far leaves the training range of -1 to 1: it goes from -2.5 to 2, outside on 25 % of its"
+    words = (
+        "In u[k-1], tests.far leaves the training range of -1 to 1: it goes from -2.5 to 2, "
+        "outside on 25 % of its"
+    )
     assert words in str(BEYOND)
 
 
@@ -182,16 +216,27 @@ CASES = [
     ([("tests.a", INF, 1.0)], "helps"),
     ([("tests.a", 0.0, 0.0)], "no_help"),
     ([(BLOCK[0], 1.0, 0.1), (BLOCK[1], 1.0, INF)], "hurts"),
-    ([(BLOCK[0], INF, 0.1), (BLOCK[1], 1.0, INF)], "hurts"),  # it runs away where physics alone does not
+    (
+        [(BLOCK[0], INF, 0.1), (BLOCK[1], 1.0, INF)],
+        "hurts",
+    ),  # it runs away where physics alone does not
 ]
 
 
 @pytest.mark.parametrize(("trials", "code"), CASES, ids=str)
 def test_the_verdict_on_trials(trials, code):
     found = judge([Trial(*trial, block=trial[0] in BLOCK) for trial in trials])
-    opening = {"helps": "The learner helps", "no_help": "The learner does not help", "hurts": "The learner hurts"}
+    opening = {
+        "helps": "The learner helps",
+        "no_help": "The learner does not help",
+        "hurts": "The learner hurts",
+    }
     assert [warning.code for warning in found.warnings] == ["learner_hurts"] * (code == "hurts")
-    assert found.code == code and found.text.startswith(f"{opening[code]}. ") and found.text.endswith(".")
+    assert (
+        found.code == code
+        and found.text.startswith(f"{opening[code]}. ")
+        and found.text.endswith(".")
+    )
     content = json.loads(ValidationResult.model_validate(found).to_json())
     assert content["verdict"] == code and len(content["trials"]) == len(trials)
 
@@ -215,7 +260,9 @@ def test_a_part_that_is_worse_is_never_help():
     rng = np.random.default_rng(0)
     for _ in range(300):
         alone, model = rng.choice([0.5, 0.99, 1.0, 1.01, 2.0, INF], size=(2, 3))
-        found = judge([Trial(f"tests.{i}", *pair) for i, pair in enumerate(zip(alone, model, strict=True))])
+        found = judge(
+            [Trial(f"tests.{i}", *pair) for i, pair in enumerate(zip(alone, model, strict=True))]
+        )
         if (model >= alone).any():
             assert found.code != "helps"
         if (np.isinf(model) & np.isfinite(alone)).any():
@@ -223,23 +270,40 @@ def test_a_part_that_is_worse_is_never_help():
 
 
 def test_the_text_gives_the_errors_and_how_many_blocks_are_better():
-    found = judge([Trial(BLOCK[0], 1.0, 0.3, True), Trial(BLOCK[1], 1.0, 1.1, True), Trial("tests.a", 0.8, 0.4)])
+    found = judge(
+        [
+            Trial(BLOCK[0], 1.0, 0.3, True),
+            Trial(BLOCK[1], 1.0, 1.1, True),
+            Trial("tests.a", 0.8, 0.4),
+        ]
+    )
     error = math.sqrt((0.3**2 + 1.1**2) / 2)
-    assert f"(2 blocks, 1 of them better): free-run NRMSE {error:.4g} with the learner, 1 with" in found.text
+    assert (
+        f"(2 blocks, 1 of them better): free-run NRMSE {error:.4g} with the learner, 1 with"
+        in found.text
+    )
     assert "On tests.a: free-run NRMSE 0.4 with the learner, 0.8 with physics alone" in found.text
 
 
 def test_harm_outside_the_training_range_is_called_so():
     found = judge([Trial("tests.far", 1.0, 2.0)], [BEYOND])
-    assert found.text.startswith("The learner hurts in extrapolation. ") and str(BEYOND) in found.text
-    assert ValidationResult.model_validate(found).content()["extrapolation"][0]["regressor"] == "u[k-1]"
+    assert (
+        found.text.startswith("The learner hurts in extrapolation. ") and str(BEYOND) in found.text
+    )
+    assert (
+        ValidationResult.model_validate(found).content()["extrapolation"][0]["regressor"]
+        == "u[k-1]"
+    )
 
 
 def test_harm_elsewhere_is_not_blamed_on_extrapolation():
     found = judge([Trial("tests.far", 1.0, 0.5), Trial("tests.near", 1.0, 2.0)], [BEYOND])
     assert found.text.startswith("The learner hurts. ")
     seldom = judge([Trial("tests.far", 1.0, 2.0)], [replace(BEYOND, share=0.02)])
-    assert seldom.text.startswith("The learner hurts. ") and "outside on 2 % of its rows" in seldom.text
+    assert (
+        seldom.text.startswith("The learner hurts. ")
+        and "outside on 2 % of its rows" in seldom.text
+    )
 
 
 def test_what_diverges_is_null_in_json_and_told():
@@ -260,21 +324,30 @@ def test_the_error_of_a_free_run_is_that_of_simulate():
     e = (model.simulate(part).model - part.experiments[0].outputs)[7:, 0]
     y = part.experiments[0].outputs[7:, 0]
     assert free_run_error(model, part, 7) == pytest.approx(np.sqrt(np.mean(e**2)) / y.std())
-    assert free_run_error(model, part, 7, unit=np.array([2.0])) == pytest.approx(np.sqrt(np.mean(e**2)) / 2)
-    assert trial_on("here", part, (7,), model, model) == Trial("here", *[free_run_error(model, part, 7)] * 2)
+    assert free_run_error(model, part, 7, unit=np.array([2.0])) == pytest.approx(
+        np.sqrt(np.mean(e**2)) / 2
+    )
+    assert trial_on("here", part, (7,), model, model) == Trial(
+        "here", *[free_run_error(model, part, 7)] * 2
+    )
 
 
 def test_free_runs_that_exist_are_not_run_again(monkeypatch):
     model, part = fitted(system(0, 200)).model, system(1, 100)
     plain, response = trial_on("here", part, (7,), model, model), model.simulate(part)
     monkeypatch.setattr(Model, "simulate", lambda *_: pytest.fail("run again"))
-    assert trial_on("here", part, (7,), model, model, alone_response=response, response=response) == plain
+    assert (
+        trial_on("here", part, (7,), model, model, alone_response=response, response=response)
+        == plain
+    )
 
 
 def test_a_constant_output_is_not_taken_for_a_free_run_that_diverges():
     record = system(0, 200)
     rest = Record.from_arrays(np.zeros(50), np.zeros(50))
-    found = judge([trial_on("tests.rest", rest, (0,), fitted(record).model, fitted(record, **SMALL).model)])
+    found = judge(
+        [trial_on("tests.rest", rest, (0,), fitted(record).model, fitted(record, **SMALL).model)]
+    )
     assert found is None or "diverges" not in found.text
 
 
@@ -333,7 +406,9 @@ def test_a_fit_that_fails_counts_as_a_free_run_that_diverges():
 
     errors = cross_validate(system(0, 120), [fitted, refused, non_finite], blocks=2, start=2)
     for fit in (1, 2):
-        assert all(0 < trial.alone < 1 and trial.model == INF for trial in block_trials(errors, fit))
+        assert all(
+            0 < trial.alone < 1 and trial.model == INF for trial in block_trials(errors, fit)
+        )
 
 
 def test_too_few_rows_are_refused_before_any_fit():
@@ -352,7 +427,10 @@ def test_an_overfitted_learner_hurts_in_extrapolation(seed):
     x = rows_of(far, fit.problem.layout)
     found = judge([trial], extrapolation("tests.far", x, fit.problem.rows.x, fit.problem.layout))
     assert trial.model > trial.alone
-    assert found.text.startswith("The learner hurts in extrapolation") and "tests.far leaves" in found.text
+    assert (
+        found.text.startswith("The learner hurts in extrapolation")
+        and "tests.far leaves" in found.text
+    )
 
 
 def test_dominance_is_the_learners_part_against_the_physics():

@@ -16,12 +16,18 @@ _LOWERED = dict(zip("₀₁₂₃₄₅₆₇₈₉", "0123456789", strict=True)
 _ACCENTS = {"\u0302": "^", "\u0303": "~", "\u0304": "¯", "\u0307": "˙"}
 _WORDS = ("tr", "ln", "Ts")  # names of two letters; other pairs are products
 _GREEK = "Α-Ωα-ω"
-_MARK = re.compile(rf"[{_GREEK}{''.join(_RAISED)}{''.join(_LOWERED)}{''.join(_ACCENTS)}‖√∂⊥ŷẋŶ]|[A-Za-z]_\{{")
-_CODE = re.compile(r"[\"`]|\w\[|[A-Za-z]\.\w|[a-z]{2}[A-Z]|\w\(\w+=|[a-z0-9]{2,}_[a-z]{2,}|//|==|→|\w{2,}\*\w|\*\*")
+_MARK = re.compile(
+    rf"[{_GREEK}{''.join(_RAISED)}{''.join(_LOWERED)}{''.join(_ACCENTS)}‖√∂⊥ŷẋŶ]|[A-Za-z]_\{{"
+)
+_CODE = re.compile(
+    r"[\"`]|\w\[|[A-Za-z]\.\w|[a-z]{2}[A-Z]|\w\(\w+=|[a-z0-9]{2,}_[a-z]{2,}|//|==|→|\w{2,}\*\w|\*\*"
+)
 _PROSE = re.compile(r"[A-Za-z]{3,}[ ,]+[A-Za-z]{2,}")
 _LETTERS = rf"A-Za-z{_GREEK}𝕏ŷŶẋ"
 _INDEX = rf"[_^](?:\{{[^{{}}]*\}}|[{_GREEK}]?[A-Za-z0-9*]{{0,4}}(?![A-Za-z0-9_]))"
-_INDEXED = re.compile(rf"(?<![A-Za-z0-9_/.])[{_LETTERS}][{''.join(_ACCENTS)}]?{_INDEX}[{''.join(_RAISED)}*]*")
+_INDEXED = re.compile(
+    rf"(?<![A-Za-z0-9_/.])[{_LETTERS}][{''.join(_ACCENTS)}]?{_INDEX}[{''.join(_RAISED)}*]*"
+)
 _RUN = rf"(?:[{_LETTERS}0-9()\[\]|‖*'/·√∂∫⊥{''.join(_RAISED)}{''.join(_LOWERED)}{''.join(_ACCENTS)}]|{_INDEX})+"
 _SUM = re.compile(rf"(?<![\w/.]){_RUN}(?:\s[=+−·≤≥≈→]\s{_RUN})*(?![\w.]\w)")
 _NAME = re.compile(r"[a-z]{2,}(?:_[a-z]{2,})+")  # of code, as in a heading
@@ -83,7 +89,9 @@ def rows(text: str) -> str:
 
 def _apart(text: str) -> str:
     """Accents apart from their letters, as marks behind them."""
-    return "".join(unicodedata.normalize("NFD", letter) if letter in "ŷŶẋẏx̂" else letter for letter in text)
+    return "".join(
+        unicodedata.normalize("NFD", letter) if letter in "ŷŶẋẏx̂" else letter for letter in text
+    )
 
 
 def _letter(letter: str, accent: str | None) -> str:
@@ -139,9 +147,13 @@ def _prose(text: str) -> str:
 
 def _run(match: re.Match[str]) -> str:
     run = match[0]
-    if _NAME.fullmatch(run) or not re.search(rf"{_INDEX}|[{_GREEK}].*[{''.join(_RAISED)}{''.join(_ACCENTS)}]", run):
+    if _NAME.fullmatch(run) or not re.search(
+        rf"{_INDEX}|[{_GREEK}].*[{''.join(_RAISED)}{''.join(_ACCENTS)}]", run
+    ):
         return run
     bare = re.sub(_INDEX, "", run)
-    if re.search(r"[A-Za-z]{3,}|[*]{2}", bare) or any(run.count(a) != run.count(b) for a, b in ("()", "[]")):
+    if re.search(r"[A-Za-z]{3,}|[*]{2}", bare) or any(
+        run.count(a) != run.count(b) for a, b in ("()", "[]")
+    ):
         return _INDEXED.sub(lambda one: mathml(one[0]), run)
     return mathml(run)

@@ -27,7 +27,13 @@ NAMED = re.compile(  # a section of the navigation, by a label that may be hidde
     r'(<nav class="md-nav" data-md-level="\d+") aria-labelledby="\w+"'
     r'([^>]*>\s*<label class="md-nav__title"[^>]*>\s*<span[^>]*></span>\s*)([^<]*[^<\s])'
 )
-ALWAYS = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "examples/README.md", "benchmarks/README.md")
+ALWAYS = (
+    "README.md",
+    "CONTRIBUTING.md",
+    "CHANGELOG.md",
+    "examples/README.md",
+    "benchmarks/README.md",
+)
 
 
 def place(path: str) -> str:
@@ -85,7 +91,11 @@ def on_page_markdown(markdown: str, page, config, files: Files) -> str:
 
     def bent(match: re.Match[str]) -> str:
         path = found.get(match[2])
-        return match[0] if path is None else match[1] + posixpath.relpath(place(path), here or ".") + match[3]
+        return (
+            match[0]
+            if path is None
+            else match[1] + posixpath.relpath(place(path), here or ".") + match[3]
+        )
 
     return NOT_RUN.sub(r"*The tests do not run this block: \1.*\n", LINK.sub(bent, markdown))
 
@@ -93,7 +103,10 @@ def on_page_markdown(markdown: str, page, config, files: Files) -> str:
 def on_post_page(output: str, page, config) -> str:
     """Under `strict` refuses a page that would load something from a network; typesets formulas, names the search."""
     for tag in LOADED.findall(output):
-        logging.getLogger("mkdocs.hooks").warning("%s loads from a network: %s", page.file.src_uri, tag)
+        logging.getLogger("mkdocs.hooks").warning(
+            "%s loads from a network: %s", page.file.src_uri, tag
+        )
     return formulas.typeset(NAMED.sub(r'\1 aria-label="\3"\2\3', output)).replace(
-        'data-md-component="search" role="dialog"', 'data-md-component="search" role="dialog" aria-label="Search"'
+        'data-md-component="search" role="dialog"',
+        'data-md-component="search" role="dialog" aria-label="Search"',
     )

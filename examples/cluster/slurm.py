@@ -27,12 +27,20 @@ def with_engine(spec: Path, scheduler: str) -> Path:
 def main(workers: int, spec: Path, out: Path) -> int:
     from dask_jobqueue import SLURMCluster  # pyright: ignore[reportMissingImports]
 
-    job = {"cores": 1, "processes": 1, "memory": MEMORY, "walltime": WALLTIME, "job_script_prologue": SINGLE_THREADED}
+    job = {
+        "cores": 1,
+        "processes": 1,
+        "memory": MEMORY,
+        "walltime": WALLTIME,
+        "job_script_prologue": SINGLE_THREADED,
+    }
     with SLURMCluster(**job) as cluster:
         cluster.scale(jobs=workers)
         cluster.wait_for_workers(workers)
         path = with_engine(spec, cluster.scheduler_address)
-        return subprocess.run(["orthaug", "fit", str(path), "--out", str(out), "--resume"], check=False).returncode
+        return subprocess.run(
+            ["orthaug", "fit", str(path), "--out", str(out), "--resume"], check=False
+        ).returncode
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
-"""orthaug: physics with a learned correction, and parameters that keep all that physics can explain.
+"""orthaug: models of physics and a learned correction that share no directions of θ.
 
-Names load on first use, so that `orthaug --help` and reading data do not import JAX; `__init__.pyi` lists them.
+Names load on first use, so that `orthaug --help` and reading data do not import JAX; `__init__.pyi`
+lists them.
 """
 
 from typing import Any

@@ -1,4 +1,4 @@
-"""What every room stands on: errors, checks of arguments, JAX in double precision, threads, whole folders."""
+"""Base of all rooms: errors, checks of arguments, JAX in double precision, threads, folders."""
 
 import lazy_loader
 

@@ -18,10 +18,13 @@ Matrix = Float[np.ndarray, "_ _"]
 
 
 def as_signal(values: Any, name: str, *, gaps: bool = False) -> Matrix:
-    """Samples as a float matrix (N, channels); a vector is one channel. NaN may stand for missing ones if `gaps`.
+    """Return samples as a float matrix (N, channels); a vector is one channel.
+
+    NaN may mark missing ones if `gaps`.
 
     Raises:
-        InputError: not numeric, more than two axes, or a cell that is not finite (named by its row).
+        InputError: not numeric, more than two axes, or a cell that is not finite (named by its
+            row).
     """
     try:
         array = np.asarray(values)
@@ -29,11 +32,15 @@ def as_signal(values: Any, name: str, *, gaps: bool = False) -> Matrix:
             raise InputError(f"`{name}` is complex; expected real numbers.")
         array = np.array(array, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
-        raise InputError(f"`{name}` is not an array of numbers: {str(error).rstrip('.')}.") from None
+        raise InputError(
+            f"`{name}` is not an array of numbers: {str(error).rstrip('.')}."
+        ) from None
     if array.ndim == 1:
         array = array[:, None]
     if array.ndim != 2:
-        raise InputError(f"`{name}` has {array.ndim} axes; expected (samples,) or (samples, channels).")
+        raise InputError(
+            f"`{name}` has {array.ndim} axes; expected (samples,) or (samples, channels)."
+        )
     bad = np.argwhere(np.isinf(array) if gaps else ~np.isfinite(array))
     if bad.size:
         row, column = bad[0]
@@ -45,7 +52,7 @@ def as_signal(values: Any, name: str, *, gaps: bool = False) -> Matrix:
 
 
 def check_unique(names: Iterable[str], what: str) -> None:
-    """Raise InputError where a name stands twice."""
+    """Raise InputError where a name is given twice."""
     seen: set[str] = set()
     for name in names:
         if name in seen:
@@ -54,10 +61,14 @@ def check_unique(names: Iterable[str], what: str) -> None:
 
 
 def check_label(value: Any, what: str) -> str:
-    """Return `value` if it is text that stands on one line, at most `LONGEST` long, otherwise raise InputError."""
+    """Return `value` if it is text on one line, at most `LONGEST` long.
+
+    Raise InputError otherwise.
+    """
     if not isinstance(value, str) or not value.isprintable() or len(value) > LONGEST:
         raise InputError(
-            f"{what} must be visible characters on one line, at most {LONGEST} of them; got {shown(value)}."
+            f"{what} must be visible characters on one line, at most {LONGEST} of them; got "
+            f"{shown(value)}."
         )
     return value
 
@@ -71,22 +82,29 @@ def check_choice(value: str, choices: Iterable[str], what: str) -> str:
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """`, did you mean 'x'?` for the closest known name, or nothing."""
+    """Return `, did you mean 'x'?` for the closest known name, or nothing."""
     name, known = name[:LONGEST], list(known)[:_COMPARED]
-    close = [k for k in known if k.lower().startswith(name.lower())] or difflib.get_close_matches(name, known, n=1)
+    close = [k for k in known if k.lower().startswith(name.lower())] or difflib.get_close_matches(
+        name, known, n=1
+    )
     return f", did you mean '{close[0]}'?" if close else ""
 
 
 def check_count(value: Any, name: str, least: int = 1, *, of: str = "") -> int:
-    """Return `value` if it is a whole number (`of` something) of at least `least`, otherwise raise InputError."""
+    """Return `value` if it is a whole number of at least `least`, otherwise raise InputError.
+
+    `of` names what is counted in the message.
+    """
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
         counted = f" of {of}" if of else ""
-        raise InputError(f"`{name}` must be a whole number{counted}, {least} or more; got {shown(value)}.")
+        raise InputError(
+            f"`{name}` must be a whole number{counted}, {least} or more; got {shown(value)}."
+        )
     return int(value)
 
 
 def is_number(value: Any) -> bool:
-    """Whether `value` is a finite real number; a truth value is none."""
+    """Return whether `value` is a finite real number; a truth value is none."""
     if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
         return False
     try:
@@ -96,15 +114,19 @@ def is_number(value: Any) -> bool:
 
 
 def finite_or_none(value: float) -> float | None:
-    """`value`, or None where it is not finite: JSON has no infinity."""
+    """Return `value`, or None where it is not finite: JSON has no infinity."""
     return value if math.isfinite(value) else None
 
 
 def check_number(value: Any, name: str, *, positive: bool = False) -> float:
-    """Return `value` if it is a finite number, 0 or more (above 0 if `positive`), otherwise raise InputError."""
+    """Return `value` if it is a finite number, 0 or more (above 0 if `positive`).
+
+    Raise InputError otherwise.
+    """
     if not is_number(value) or value < 0 or (positive and value == 0):
         raise InputError(
-            f"`{name}` must be {'a positive number' if positive else 'a number, 0 or more'}; got {shown(value)}."
+            f"`{name}` must be {'a positive number' if positive else 'a number, 0 or more'}; "
+            f"got {shown(value)}."
         )
     return float(value)
 

@@ -1,6 +1,6 @@
-"""What can go wrong because of what was asked, always with the remedy in the text, on one line; and warnings.
+"""Errors of the user's input, with the remedy in the text, on one line; and warnings.
 
-A warning is what the user must know about a result that stands all the same.
+A warning is what the user must know about a result that is valid all the same.
 """
 
 from __future__ import annotations
@@ -11,7 +11,10 @@ from typing import Any, NamedTuple
 
 LONGEST = 60  # characters of a name or value in a message
 _FEW = 4  # entries of an array that is shown
-_MOST, _HEAD = 1200, 900  # characters of a message, and of its beginning where the middle is left out
+_MOST, _HEAD = (
+    1200,
+    900,
+)  # characters of a message, and of its beginning where the middle is left out
 _SEARCHED = 6 * _MOST  # characters that are looked at for names and values
 _QUOTED = re.compile(r"""(?<!\w)(['"`])(?!\1)(.*?)\1(?!\w)""")
 _LISTED = re.compile(r"\[[^][]+\]")
@@ -19,12 +22,14 @@ _WORD = re.compile(r"""[^\s/\\'"`]+""")
 
 
 def visible(text: str) -> str:
-    """The text with line breaks, terminal controls and invisible characters escaped."""
-    return text if text.isprintable() else "".join(c if c.isprintable() else _escaped(c) for c in text)
+    """Return the text with line breaks, terminal controls and invisible characters escaped."""
+    return (
+        text if text.isprintable() else "".join(c if c.isprintable() else _escaped(c) for c in text)
+    )
 
 
 def shown(value: Any) -> str:
-    """A value as Python writes it, on one line, cut where it is long."""
+    """Return a value as Python writes it, on one line, cut where it is long."""
     try:
         if math.prod(getattr(value, "shape", ())) > _FEW:
             return f"an array of shape {tuple(value.shape)}"
@@ -34,12 +39,15 @@ def shown(value: Any) -> str:
 
 
 def cut(text: str) -> str:
-    """At most `LONGEST` characters of a text."""
+    """Return at most `LONGEST` characters of a text."""
     return text if len(text) <= LONGEST else text[: LONGEST - 1] + "…"
 
 
 def message(text: str) -> str:
-    """A message as users see it: one line, its names, values and paths visible and cut where they are long."""
+    """Return a message as users see it, on one line.
+
+    Its names, values and paths are visible, and cut where they are long.
+    """
     text = visible(_ends(text, _SEARCHED))
     text = _QUOTED.sub(lambda found: f"{found[1]}{cut(found[2])}{found[1]}", text)
     text = _LISTED.sub(lambda found: f"[{cut(found[0][1:-1])}]", text)
@@ -48,7 +56,7 @@ def message(text: str) -> str:
 
 
 def _ends(text: str, most: int) -> str:
-    """The text without its middle where it is longer."""
+    """Return the text without its middle where it is longer."""
     head = most * _HEAD // _MOST
     return text if len(text) <= most else f"{text[:head]} … {text[head - most :]}"
 
@@ -58,7 +66,10 @@ def _escaped(character: str) -> str:
 
 
 class InputError(ValueError):
-    """Bad input. The text says what is there and what was expected. The command line exits with 2."""
+    """Bad input.
+
+    The text says what is there and what was expected. The command line exits with 2.
+    """
 
     def __init__(self, text: str = "") -> None:
         super().__init__(message(str(text)))
@@ -70,7 +81,8 @@ class KeyedError(InputError):
     Args:
         text: the whole sentence, for users of Python.
         key: the key at fault.
-        words: what a spec's or an option's message says after the key, such as `: found 3; expected less than 2`.
+        words: what a spec's or an option's message says after the key, such as `: found 3; expected
+            less than 2`.
     """
 
     def __init__(self, text: str, key: str, words: str) -> None:

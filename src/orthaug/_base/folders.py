@@ -1,8 +1,8 @@
 """Folders and files that appear whole or not at all: written beside their place, then renamed.
 
-What stands in the place is replaced only where orthaug wrote it and nobody changed it, or by force. The manifest of a
-folder tells: every file that orthaug wrote into it, with its checksum. What is not in its place yet is named after the
-process, and removed when that ends early.
+What is in the place is replaced only where orthaug wrote it and nobody changed it, or by force.
+The manifest of a folder lists every file that orthaug wrote into it, with its checksum. What is
+not in its place yet is named after the process, and removed when that ends early.
 """
 
 from __future__ import annotations
@@ -25,47 +25,60 @@ from orthaug._base.errors import InputError
 
 MANIFEST = "manifest.json"
 _PARTIAL, _OLD = ".orthaug-partial-", ".orthaug-old-"
-_HOST = hashlib.sha256(platform.node().encode()).hexdigest()[:8]  # of a folder that several machines share
-_OF_THE_SYSTEM = {".DS_Store", "Thumbs.db", "desktop.ini"}  # file managers write these into every folder
+_HOST = hashlib.sha256(platform.node().encode()).hexdigest()[
+    :8
+]  # of a folder that several machines share
+_OF_THE_SYSTEM = {
+    ".DS_Store",
+    "Thumbs.db",
+    "desktop.ini",
+}  # file managers write these into every folder
 
 
 class Partials:
-    """The partial folders and files of this process. `lock` is held while one is put in its place."""
+    """The partial folders and files of this process.
+
+    `lock` is held while one is put in its place.
+    """
 
     def __init__(self) -> None:
         self.lock = threading.RLock()
         self.placed: list[Path] = []
         self.seen: dict[str, str] = {}
-        """By folder, the checksum of its manifest when a command that writes it began."""
+        """Checksum of each folder's manifest when a command that writes it began."""
         self.overtaken: list[Path] = []
         """Folders that were replaced although another run had written them meanwhile."""
         self._open: dict[Path, Sequence[Path]] = {}
         self._swept: set[Path] = set()
 
     def folder(self, parent: Path, made: Sequence[Path] = ()) -> Path:
-        """A new folder in `parent`; `made` are the parents that vanish with it."""
+        """Return a new folder in `parent`; `made` are the parents that vanish with it."""
         with self.lock:
             partial = self._named(parent, made)
             partial.mkdir()
             return partial
 
     def file(self, parent: Path) -> Path:
-        """A new empty file in `parent`."""
+        """Return a new empty file in `parent`."""
         with self.lock:
             partial = self._named(parent, ())
             partial.touch(exist_ok=False)
             return partial
 
     def shelter(self, parent: Path) -> Path:
-        """A new folder for what stood there before, until the new one stands."""
+        """Return a new folder for the former content, until the new one is in its place."""
         shelter = parent / _name(_OLD)
         shelter.mkdir()
         return shelter
 
-    def stands(self, partial: Path, place: Path) -> None:
-        """Note that a partial one is in its place."""
+    def mark_placed(self, partial: Path, place: Path, *, result: bool = True) -> None:
+        """Note that a partial one is in its place.
+
+        `placed` has only what is a result of the command.
+        """
         self._open.pop(partial, None)
-        self.placed.append(place)
+        if result:
+            self.placed.append(place)
 
     def discard(self, partial: Path) -> None:
         """Remove a partial one, and the parents that were made for it."""
@@ -84,7 +97,7 @@ class Partials:
                 parent.rmdir()
 
     def discard_all(self) -> None:
-        """Remove all of them, and let no other be made or put in its place: the process ends."""
+        """Remove all of them, and let no other be made or put in its place, as the process ends."""
         self.lock.acquire()
         for partial in list(self._open):
             self.discard(partial)
@@ -102,7 +115,10 @@ PARTIALS = Partials()  # of the process, as its signals are
 
 
 def remove_stale(parent: Path, alive: Sequence[Path] | dict[Path, Sequence[Path]] = ()) -> None:
-    """Remove what processes of this machine left in `parent` when they were killed; what stood there comes back."""
+    """Remove what processes of this machine left in `parent` when they were killed.
+
+    Folders that were being replaced are restored.
+    """
     if os.name != "posix":  # elsewhere asking for a process may end it
         return
     with suppress(OSError):
@@ -124,7 +140,7 @@ def _name(kind: str) -> str:
 
 
 def _lives(name: str) -> bool:
-    """Whether the process in a name may be alive; one of another machine may be."""
+    """Return whether the process in a name may be alive; one of another machine may be."""
     parts = name.split("-")
     if len(parts) != 5 or parts[2] != _HOST or not parts[3].isdecimal():
         return True
@@ -141,7 +157,9 @@ def _lives(name: str) -> bool:
 
 
 def check_replaceable(folder: Path, *, force: bool = False) -> None:
-    """Raise InputError unless `folder` is absent, empty or unchanged orthaug's, and stands where one may write.
+    """Raise InputError unless `folder` may be written.
+
+    It must be absent, empty or unchanged since orthaug wrote it, in a place that can be written.
 
     Args:
         force: whatever the folder holds may be lost.
@@ -154,7 +172,9 @@ def check_replaceable(folder: Path, *, force: bool = False) -> None:
     except OSError as error:
         raise InputError(f"{folder}: cannot be written ({error.strerror}).") from None
     if mine is not None:
-        raise InputError(f"{folder}: holds {mine}; give another folder, or replace all of it with --force.")
+        raise InputError(
+            f"{folder}: holds {mine}; give another folder, or replace all of it with --force."
+        )
     if there:
         _check_parts_writable(folder)
     if there and force:
@@ -169,7 +189,7 @@ def check_replaceable(folder: Path, *, force: bool = False) -> None:
 
 
 def remember(folder: Path) -> None:
-    """Keep which result a folder holds now, so that another run that writes it meanwhile is noticed."""
+    """Note the result that a folder holds now, to notice a run that replaces it meanwhile."""
     place = os.path.realpath(folder)
     PARTIALS.seen[place] = file_digest(Path(place, MANIFEST))
 
@@ -182,7 +202,10 @@ def _check_parts_writable(folder: Path) -> None:
 
 
 def _check_no_one_lives_there(folder: Path) -> None:
-    """Even by force neither the home nor the working folder is replaced, nor a folder above them."""
+    """Raise InputError for the home, the working folder, or a folder above them.
+
+    Not even by force are they replaced.
+    """
     place = os.path.realpath(folder)
     for taken, what in ((os.getcwd(), "working folder"), (os.path.expanduser("~"), "home folder")):
         if Path(os.path.realpath(taken)).is_relative_to(place):
@@ -191,7 +214,9 @@ def _check_no_one_lives_there(folder: Path) -> None:
 
 @contextmanager
 def whole_folder(folder: Path, *, force: bool = False) -> Iterator[Path]:
-    """A temporary folder that takes the place of `folder` at the end, and vanishes on any exception.
+    """Yield a temporary folder that takes the place of `folder` at the end.
+
+    It vanishes on any exception.
 
     A manifest is added. A link is followed: its target is replaced.
 
@@ -213,7 +238,7 @@ def whole_folder(folder: Path, *, force: bool = False) -> Iterator[Path]:
             if file_digest(place / MANIFEST) != before:
                 PARTIALS.overtaken.append(folder)
             _put_in_place(partial, place)
-            PARTIALS.stands(partial, folder)
+            PARTIALS.mark_placed(partial, folder)
     except OSError as error:
         raise InputError(f"{folder}: cannot be written ({error.strerror or error}).") from None
     finally:
@@ -222,7 +247,7 @@ def whole_folder(folder: Path, *, force: bool = False) -> Iterator[Path]:
 
 
 def _put_in_place(partial: Path, place: Path) -> None:
-    """Rename. The folder that was there is kept until the new one stands."""
+    """Rename a folder; the former one is kept until the new one is in its place."""
     if not place.exists():
         partial.rename(place)
         return
@@ -244,7 +269,7 @@ def _nearest_ancestor(folder: Path) -> Path:
 
 
 def check_new_file(path: Path, *, force: bool = False) -> None:
-    """Raise InputError where a file could not be written, or would replace another without force."""
+    """Raise InputError where a file could not be written, or would replace one without force."""
     try:
         if path.is_dir() or not path.name:
             raise InputError(f"{path}: is a folder; expected the name of a file.")
@@ -265,19 +290,27 @@ def check_new_file(path: Path, *, force: bool = False) -> None:
     except InputError:
         raise
     except (OSError, ValueError) as error:  # such as a NUL byte in the name
-        raise InputError(f"{path}: cannot be written ({getattr(error, 'strerror', None) or error}).") from None
+        raise InputError(
+            f"{path}: cannot be written ({getattr(error, 'strerror', None) or error})."
+        ) from None
 
 
 @contextmanager
-def whole_file(path: Path, *, force: bool = False) -> Iterator[Path]:
+def whole_file(path: Path, *, force: bool = False, result: bool = True) -> Iterator[Path]:
     """A file beside `path` that takes its place at the end, and vanishes on any exception.
 
-    A link is followed: its target is written. What is no regular file, such as a pipe, is written into.
+    A link is followed: its target is written. What is no regular file, such as a pipe, is written
+    into.
+
+    Args: force: replace whatever is there. result: whether a command that a signal ends names the
+        file among what it wrote; False for a cache.
 
     Raises:
         InputError: the file cannot be written, or exists already and holds something else.
     """
-    check_new_file(path, force=True)  # whether it may be replaced is asked at the end: others write the same
+    check_new_file(
+        path, force=True
+    )  # whether it may be replaced is asked at the end: others write the same
     target = Path(os.path.realpath(path))
     partial = None
     try:
@@ -288,10 +321,13 @@ def whole_file(path: Path, *, force: bool = False) -> Iterator[Path]:
         yield partial
         with PARTIALS.lock:
             _place_file(partial, target, force)
-            PARTIALS.stands(partial, path)
+            PARTIALS.mark_placed(partial, path, result=result)
     except FileExistsError:
-        told = f"{path}: exists and holds something else; give another name, or replace it with --force."
-        raise InputError(told) from None
+        text = (
+            f"{path}: exists and holds something else; give another name, or replace it with "
+            "--force."
+        )
+        raise InputError(text) from None
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror or error}).") from None
     finally:
@@ -300,7 +336,10 @@ def whole_file(path: Path, *, force: bool = False) -> Iterator[Path]:
 
 
 def _place_file(partial: Path, target: Path, force: bool) -> None:
-    """Rename; without force only where nothing else has appeared. Whoever wrote the same bytes is no one else."""
+    """Rename a file; without force only where no other file has appeared.
+
+    A file of the same bytes is no other file.
+    """
     if not force:
         try:
             os.link(partial, target)
@@ -322,13 +361,18 @@ def write_manifest(folder: Path) -> None:
     """Write `manifest.json` about all files of a folder."""
     files = {name: file_digest(folder / name) for name in sorted(_names(folder))}
     content = {"orthaug": __version__, "files": files}
-    (folder / MANIFEST).write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    (folder / MANIFEST).write_text(
+        json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8"
+    )
 
 
 def not_ours(folder: Path) -> str | None:
-    """A file of a folder that orthaug did not write or that was changed, in words; None where all may be replaced.
+    """Return a file of a folder that orthaug did not write or that was changed, in words.
 
-    Without a manifest nothing says who wrote a file, whatever its name: each counts as the user's own.
+    None where all may be replaced.
+
+    Without a manifest nothing says who wrote a file, whatever its name: each counts as the user's
+    own.
     """
     listed = _listed(folder / MANIFEST)
     if listed is None:
@@ -345,7 +389,7 @@ def not_ours(folder: Path) -> str | None:
 
 
 def _names(folder: Path) -> Iterator[str]:
-    """Relative names of all files below a folder, of links to folders too."""
+    """Return relative names of all files below a folder, and of links to folders."""
     for place, folders, files in os.walk(folder):
         folders.sort()
         links = [name for name in folders if os.path.islink(os.path.join(place, name))]
@@ -355,7 +399,7 @@ def _names(folder: Path) -> Iterator[str]:
 
 
 def file_digest(path: Path) -> str:
-    """The sha256 of a file; empty where there is none."""
+    """Return the sha256 of a file; empty where there is none."""
     if not path.is_file():
         return ""
     with path.open("rb") as file:
@@ -363,11 +407,15 @@ def file_digest(path: Path) -> str:
 
 
 def _listed(path: Path) -> dict[str, str] | None:
-    """The checksums of a manifest; None where there is none of orthaug's."""
+    """Return the checksums of a manifest; None where there is none of orthaug's."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
         return None
-    if not isinstance(content, dict) or "orthaug" not in content or not isinstance(content.get("files"), dict):
+    if (
+        not isinstance(content, dict)
+        or "orthaug" not in content
+        or not isinstance(content.get("files"), dict)
+    ):
         return None
     return content["files"]

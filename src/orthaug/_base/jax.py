@@ -1,10 +1,13 @@
-"""JAX in double precision, imported when it is first used. A declaration of a learner or solver costs no import.
+"""JAX in double precision, imported when it is first used.
 
-`jax` and `jnp` stand for the modules. `jax.jit` compiles at the first call, so that a module with compiled functions
-can be imported without JAX.
+A declaration of a learner or solver costs no import.
 
-Programs that it keeps on disk end with a checksum, and one that was cut, altered or exchanged is compiled again: JAX
-runs whatever it finds under a program's name, and two that are exchanged give an error, or other numbers.
+`jax` and `jnp` are lazy modules. `jax.jit` compiles at the first call, so that a module with
+compiled functions can be imported without JAX.
+
+Programs that it keeps on disk end with a checksum, and one that was cut, altered or exchanged is
+compiled again: JAX runs whatever it finds under a program's name, and two that are exchanged give
+an error, or other numbers.
 """
 
 from __future__ import annotations
@@ -27,14 +30,16 @@ if TYPE_CHECKING:
     import jax.numpy as jnp
     from jax import Array
 else:
-    Array = Any  # in annotations; at run time jaxtyping checks shape and type of whatever is an array
+    Array = (
+        Any  # in annotations; at run time jaxtyping checks shape and type of whatever is an array
+    )
 
 _LENGTH = hashlib.sha256().digest_size
 __all__ = ["Array", "is_traced", "jax", "jnp", "padded_length", "starts", "use_compilation_cache"]
 
 
 def _real_jax() -> Any:
-    """JAX, with double precision turned on.
+    """Return JAX, with double precision turned on.
 
     Raises:
         PrecisionError: the environment forbids double precision.
@@ -55,7 +60,7 @@ def _real_jnp() -> Any:
     return _real_jax().numpy
 
 
-class _Late:
+class _LazyModule:
     """A module that is imported when one of its names is first asked for."""
 
     def __init__(self, real: Callable[[], Any], **own: Any) -> None:
@@ -69,7 +74,7 @@ class _Late:
 
 
 def _late_jit(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
-    """`jax.jit(function, **options)`, made at the first call."""
+    """Return `jax.jit(function, **options)`, made at the first call."""
     made: list[Callable[..., Any]] = []
     one_at_a_time = threading.Lock()
 
@@ -85,7 +90,10 @@ def _late_jit(function: Callable[..., Any], **options: Any) -> Callable[..., Any
 
 
 def starts() -> bool:
-    """Whether JAX finds a device to compute on; what it raises where it does not depends on the platform asked for."""
+    """Return whether JAX finds a device to compute on.
+
+    Otherwise its exception depends on the platform that is asked for.
+    """
     try:
         return bool(_real_jax().devices())
     except Exception:
@@ -93,14 +101,14 @@ def starts() -> bool:
 
 
 def is_traced(value: Any) -> bool:
-    """Whether a value stands for numbers that are not there yet, because a program is being made of it."""
+    """Return whether a value is a tracer, whose numbers are not known yet."""
     from jax.core import Tracer
 
     return isinstance(value, Tracer)
 
 
-class _Compiling(threading.local):
-    """When this thread traced and compiled, as disjoint spans of time [s] in order."""
+class _CompileTimes(threading.local):
+    """Spans of time [s] in which this thread traced and compiled, disjoint and in order."""
 
     def __init__(self) -> None:
         self.spans: list[tuple[float, float]] = []
@@ -110,7 +118,9 @@ class _Compiling(threading.local):
         if not event.startswith("/jax/core/compile/"):
             return
         end = time.perf_counter()
-        while self.spans and self.spans[-1][1] > end - duration:  # what a program calls is traced within it
+        while (
+            self.spans and self.spans[-1][1] > end - duration
+        ):  # what a program calls is traced within it
             begin, last = self.spans.pop()
             self.total -= last - begin
             duration = max(duration, end - begin)
@@ -118,19 +128,24 @@ class _Compiling(threading.local):
         self.total += duration
 
 
-_compiling: list[_Compiling] = []
+_compiling: list[_CompileTimes] = []
 
 
 def training_clock() -> float:
-    """A clock of this thread [s] that stands still while JAX compiles: its differences are what computing took."""
+    """Return a clock of this thread [s] without the time in which JAX compiles.
+
+    Its differences are the time of the computation.
+    """
     if not _compiling:
-        _compiling.append(_Compiling())
+        _compiling.append(_CompileTimes())
         _real_jax().monitoring.register_event_duration_secs_listener(_compiling[0].note)
     return time.perf_counter() - _compiling[0].total
 
 
 def padded_length(rows: int) -> int:
-    """What to pad a number of rows to: lengths grow by powers of two, so that few programs are compiled.
+    """Return the length that a number of rows is padded to.
+
+    Lengths grow by powers of two, so that few programs are compiled.
 
     To compile one takes longer than a thousand rows.
     """
@@ -138,13 +153,18 @@ def padded_length(rows: int) -> int:
 
 
 if not TYPE_CHECKING:
-    jax, jnp = _Late(_real_jax, jit=_late_jit), _Late(_real_jnp)
-    if "jax" in sys.modules:  # then it costs nothing, and what the user computes is in double precision too
+    jax, jnp = _LazyModule(_real_jax, jit=_late_jit), _LazyModule(_real_jnp)
+    if (
+        "jax" in sys.modules
+    ):  # then it costs nothing, and what the user computes is in double precision too
         _real_jax()
 
 
 def use_compilation_cache() -> None:
-    """Keep compiled programs between processes (the command line does; the library never on its own)."""
+    """Keep compiled programs between processes.
+
+    The command line does; the library never does on its own.
+    """
     import platformdirs
 
     folder = os.environ.get("JAX_COMPILATION_CACHE_DIR") or platformdirs.user_cache_dir("orthaug")
@@ -154,15 +174,18 @@ def use_compilation_cache() -> None:
     _check_cached_programs()
 
 
-class Checked:
-    """A cache of JAX whose entries end with a checksum of their key and content; a cache without writing is silent."""
+class ChecksummedCache:
+    """A cache of JAX whose entries end with a checksum of their key and content.
+
+    A cache without writing is silent.
+    """
 
     def __init__(self, cache: Any, folder: str) -> None:
         self._cache, self._folder = cache, Path(folder)
         self._path = getattr(cache, "_path", folder)
 
     def get(self, key: str) -> bytes | None:
-        """The content of an entry; None where there is none, or not that one."""
+        """Return the content of an entry; None where there is none, or not that one."""
         try:
             entry = self._cache.get(key)
         except Exception:  # JAX words each failure in a warning of many lines
@@ -184,7 +207,10 @@ def _digest(key: str, content: bytes) -> bytes:
 
 
 def _check_cached_programs() -> None:
-    """From now on JAX's cache is a checked one. Where JAX is built otherwise than known, nothing is kept."""
+    """Make JAX's cache a checked one from now on.
+
+    If this version of JAX has another cache, nothing is kept.
+    """
     try:
         from jax._src import compilation_cache
 
@@ -201,6 +227,6 @@ def _check_cached_programs() -> None:
             made = make(path)
         except Exception:  # a place that cannot be written
             return None
-        return made and (Checked(made[0], path), made[1])
+        return made and (ChecksummedCache(made[0], path), made[1])
 
     compilation_cache.get_file_cache = checked

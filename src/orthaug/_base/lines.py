@@ -15,17 +15,22 @@ _GAP = "  "
 
 
 def fit_screen(columns: int) -> None:
-    """Let what is printed from now on fit a terminal of so many columns, 40 to 100; 0 where they are not known."""
+    """Let what is printed from now on fit a terminal of so many columns, 40 to 100.
+
+    0 where they are not known.
+    """
     _screen[0] = min(WIDTH, max(columns, _NARROWEST)) if columns > 0 else WIDTH
 
 
 def counted(number: int, thing: str) -> str:
-    """`1 sample`, `2 samples`."""
+    """Return `1 sample`, `2 samples`."""
     return f"{number} {thing}" + ("" if number == 1 else "s")
 
 
 def percent(share: float, digits: int = 2, *, sign: str = "") -> str:
-    """A share in per cent with so many digits, and without an exponent unless it is tiny or huge.
+    """Return a share in per cent with so many digits.
+
+    It has no exponent unless it is tiny or huge.
 
     Examples:
         >>> [percent(share) for share in (0.0123, 0.999, 26.04)]
@@ -37,7 +42,9 @@ def percent(share: float, digits: int = 2, *, sign: str = "") -> str:
 
 
 def plain_number(value: float, digits: int = 2, *, sign: str = "") -> str:
-    """A number with so many digits, and without an exponent unless it is tiny or huge.
+    """Return a number with so many digits.
+
+    It has no exponent unless it is tiny or huge.
 
     Examples:
         >>> [plain_number(value) for value in (0.0123, 1634.2)]
@@ -49,10 +56,12 @@ def plain_number(value: float, digits: int = 2, *, sign: str = "") -> str:
 
 
 def table(rows: Sequence[Sequence[str]], width: int | None = None) -> list[str]:
-    """Rows of cells as lines of at most `width` columns (None: the screen's), the first row the head.
+    """Return rows of cells as lines of at most `width` columns, the first row the head.
 
-    Rows may be of different lengths. Columns that do not fit stand below, under the first column again; an interval
-    stays beside its value.
+    `width` None is that of the screen.
+
+    Rows may be of different lengths. Columns that do not fit are below, under the first column
+    again; an interval stays beside its value.
 
     Examples:
         >>> table([["part", "RMSE", "FIT %"], ["test", "0.1 m", "90"]])
@@ -71,7 +80,10 @@ def table(rows: Sequence[Sequence[str]], width: int | None = None) -> list[str]:
 
 
 def _blocks(head: Sequence[str], widths: Sequence[int], width: int) -> list[list[int]]:
-    """Columns that stand side by side. A last one that is too wide by itself is left for `fold`."""
+    """Return groups of columns for one block each.
+
+    A last one that is too wide by itself is left for `fold`.
+    """
     groups: list[list[int]] = []
     for i in range(1, len(head)):
         if groups and (not head[i] or head[i].startswith("95 %")):
@@ -90,7 +102,7 @@ def _blocks(head: Sequence[str], widths: Sequence[int], width: int) -> list[list
 
 
 def fold(lines: Iterable[str], width: int | None = None) -> list[str]:
-    r"""Lines of at most `width` columns (None: the screen's).
+    r"""Return lines of at most `width` columns (None: the screen's).
 
     Sentences go on indented, the last cell of a row under itself.
 
@@ -104,7 +116,9 @@ def fold(lines: Iterable[str], width: int | None = None) -> list[str]:
     """
     most = width or _screen[0]
     single = (one for line in lines for one in line.split("\n"))
-    return [part for line in single for part in (_folded(line, most) if len(line) > most else [line])]
+    return [
+        part for line in single for part in (_folded(line, most) if len(line) > most else [line])
+    ]
 
 
 def _folded(line: str, width: int) -> list[str]:

@@ -1,4 +1,4 @@
-"""How much memory there is, and the refusal of what would not fit."""
+"""Available memory, and the refusal of arrays that do not fit."""
 
 from __future__ import annotations
 
@@ -14,12 +14,15 @@ _ARENA_MAX = -8  # glibc's name for the number of arenas
 
 
 def available() -> float:
-    """Bytes that this process may still take; infinite where the system does not say."""
+    """Return the bytes that this process may still take; infinite where they are not known."""
     return min(_unused(), _allowed())
 
 
 def limit() -> float:
-    """Bytes of addresses that this process may take at most (`ulimit -v`); infinite where nothing says so."""
+    """Return the bytes of addresses that this process may take at most (`ulimit -v`).
+
+    Infinite where nothing says so.
+    """
     try:
         import resource
     except ImportError:
@@ -29,24 +32,32 @@ def limit() -> float:
 
 
 def check_limit(size: float, what: str) -> None:
-    """Raise InputError where a limit on the process, which ends it without a word, leaves less than `size` bytes."""
+    """Raise InputError where a limit on the process leaves less than `size` bytes.
+
+    The system would end the process without a message.
+    """
     there = _allowed()
     if size > there:
-        raise InputError(f"{what} takes {in_words(size)} of memory; the limit (ulimit -v) leaves {in_words(there)}.")
+        raise InputError(
+            f"{what} takes {in_words(size)} of memory; the limit (ulimit -v) leaves "
+            f"{in_words(there)}."
+        )
 
 
 def check_memory(size: float, what: str) -> None:
     """Raise InputError where `size` bytes are more than there are; `what` begins the sentence."""
     there = available()
     if size > there:
-        raise InputError(f"{what} would take {in_words(size)} of memory; {in_words(there)} are available.")
+        raise InputError(
+            f"{what} would take {in_words(size)} of memory; {in_words(there)} are available."
+        )
 
 
 def few_arenas() -> None:
     """Let threads share what they allocate from, where the C library is glibc.
 
-    By default each thread has an arena of its own, which hardly shrinks: with the threads of XLA a streamed fit took a
-    fifth more memory. Threads that run already keep theirs.
+    By default each thread has an arena of its own, which hardly shrinks: with the threads of XLA a
+    streamed fit took a fifth more memory. Threads that run already keep theirs.
     """
     if sys.platform != "linux":
         return
@@ -55,7 +66,7 @@ def few_arenas() -> None:
 
 
 def in_words(size: float) -> str:
-    """Bytes in the unit that suits them."""
+    """Return bytes in the unit that suits them."""
     step = max(0, min(int(math.log(max(size, 1), 1024)), 5))
     return f"{size / 1024**step:.3g} {('bytes', 'KiB', 'MiB', 'GiB', 'TiB', 'PiB')[step]}"
 
@@ -73,7 +84,7 @@ def _unused() -> float:
 
 
 def _allowed() -> float:
-    """What limits on the process (`ulimit -v`) leave."""
+    """Return the bytes that limits on the process (`ulimit -v`) leave."""
     most = limit()
     if math.isinf(most):
         return most

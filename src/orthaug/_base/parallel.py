@@ -1,4 +1,7 @@
-"""Independent runs spread over cores by threads: compiled programs release Python's lock, results keep their order."""
+"""Independent runs spread over cores by threads.
+
+Compiled programs release Python's lock; results keep their order.
+"""
 
 from __future__ import annotations
 
@@ -16,18 +19,21 @@ from threadpoolctl import ThreadpoolController
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 Heard = Callable[..., None]
-"""Called with the number of a run, and what that run tells of itself."""
+"""Called with the number of a run, and with its reports."""
 _own_cores: ContextVar[int | None] = ContextVar("own_cores", default=None)
 
 
 def cores() -> int:
-    """How many runs this process makes at a time: the machine's cores, or those that it was left."""
+    """Return the number of simultaneous runs of this process.
+
+    It is the machine's cores, or those that are left to it.
+    """
     return _own_cores.get() or os.cpu_count() or 1
 
 
 @contextmanager
 def one_core() -> Iterator[None]:
-    """Runs inside are made one after another: others have the other cores."""
+    """Make runs inside one after another, since others have the other cores."""
     before = _own_cores.set(1)
     try:
         yield
@@ -37,11 +43,12 @@ def one_core() -> Iterator[None]:
 
 @contextmanager
 def one_blas_thread() -> Iterator[None]:
-    """BLAS on one thread.
+    """Limit BLAS to one thread.
 
-    Its other threads would wait actively after every call, for longer than a pass over 10⁵ rows takes. LAPACK makes the
-    Cholesky factors of a step; XLA's own threads do everything else. Where they shared the cores with waiting threads,
-    an iteration took 45 % longer (benchmarks/lm_iteration.py).
+    Its other threads would wait actively after every call, for longer than a pass over 10⁵ rows
+    takes. LAPACK makes the Cholesky factors of a step; XLA's own threads do everything else. Where
+    they shared the cores with waiting threads, an iteration took 45 % longer
+    (benchmarks/lm_iteration.py).
     """
     with _blas().limit(limits=1):
         yield
@@ -49,43 +56,51 @@ def one_blas_thread() -> Iterator[None]:
 
 @cache
 def _blas() -> ThreadpoolController:
-    """The BLAS libraries of NumPy and SciPy, found once.
+    """Return the BLAS libraries of NumPy and SciPy, found once.
 
-    To find them is to read the process's memory map, which gets longer with every compiled program: after some hundred
-    of them it took longer than a small fit.
+    To find them is to read the process's memory map, which gets longer with every compiled program:
+    after some hundred of them it took longer than a small fit.
     """
     import scipy.linalg  # noqa: F401  (brings its own BLAS, which is JAX's as well)
 
     return ThreadpoolController().select(user_api="blas")
 
 
-class Stopped(Exception):
+class RunCancelled(Exception):
     """Another run failed, or the user pressed Ctrl-C: this run's result is no longer wanted."""
 
 
 def spread(
-    function: Callable[[Item, Callable[[], None]], Result], items: Sequence[Item], workers: int | None = None
+    function: Callable[[Item, Callable[[], None]], Result],
+    items: Sequence[Item],
+    workers: int | None = None,
 ) -> list[Result]:
-    """`[function(item, check) for item in items]`, several at a time; arguments as of `each`."""
+    """Return `[function(item, check) for item in items]`, several at a time.
+
+    Arguments are those of `each`.
+    """
     return list(each(function, items, workers))
 
 
 def each(
-    function: Callable[[Item, Callable[[], None]], Result], items: Sequence[Item], workers: int | None = None
+    function: Callable[[Item, Callable[[], None]], Result],
+    items: Sequence[Item],
+    workers: int | None = None,
 ) -> Iterator[Result]:
-    """`function(item, check)` of every item, in their order as they come, several at a time.
+    """Yield `function(item, check)` of every item in order, several at a time.
 
     The first that fails ends the others, and so does a caller that takes no more.
 
     Args:
-        function: calls `check()` now and then, which raises `Stopped` once the results are not wanted.
+        function: calls `check()` now and then, which raises `RunCancelled` once the results are not
+            wanted.
         workers: how many at a time; by default the machine's cores.
     """
     stop = threading.Event()
 
     def check() -> None:
         if stop.is_set():
-            raise Stopped
+            raise RunCancelled
 
     workers = min(len(items), workers or cores())
     if workers <= 1:
@@ -109,11 +124,11 @@ def each(
 
 
 def nobody(*_: Any) -> None:
-    """Hears nothing."""
+    """Ignore a report."""
 
 
 class Threads:
-    """Makes independent runs on this machine's cores."""
+    """Runner of independent runs on this machine's cores."""
 
     def map(
         self,
@@ -122,28 +137,28 @@ class Threads:
         items: Sequence[Any],
         heard: Heard = nobody,
     ) -> Iterator[Result]:
-        """`function(given, item, tell)` of every item, in their order as they come.
+        """Yield `function(given, item, report)` of every item in order.
 
-        Args:
-            function: of a module, so that it can be sent elsewhere. It calls `tell(…)` now and then, which raises
-                `Stopped` once the results are not wanted.
+        Args: function: of a module, so that it can be sent elsewhere. It calls `report(…)` now and
+            then, which raises
+                `RunCancelled` once the results are not wanted.
             given: what all runs share.
-            heard: called with the number of an item and what its run tells.
+            heard: called with the number of an item and the reports of its run.
         """
 
         def one(numbered: tuple[int, Any], check: Callable[[], None]) -> Result:
             i, item = numbered
 
-            def tell(*what: Any) -> None:
+            def report(*what: Any) -> None:
                 check()
                 heard(i, *what)
 
-            return function(given, item, tell)
+            return function(given, item, report)
 
         return each(one, list(enumerate(items)))
 
 
 def in_threads(function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
-    """`[function(item) for item in items]`, as many at a time as there are cores."""
+    """Return `[function(item) for item in items]`, as many at a time as there are cores."""
     with ThreadPoolExecutor(min(len(items), cores())) as pool:
         return list(pool.map(function, items))

@@ -1,6 +1,7 @@
-"""What is told of work: progress of training, to whoever shows it, and the logger `orthaug`, silent until one listens.
+"""Progress of training, and the logger `orthaug`, which is silent until a handler is added.
 
-Stages of a fit are INFO, what was tried instead is DEBUG. What a user must know stands in warnings of results.
+Stages of a fit are INFO, what was tried instead is DEBUG. What a user must know is in warnings
+of results.
 """
 
 from __future__ import annotations
@@ -13,68 +14,71 @@ from typing import Any
 LOG = logging.getLogger("orthaug")
 LOG.addHandler(logging.NullHandler())
 
-Tell = Callable[[int, int, float], None]
-"""Called now and then with the number of the run, its iteration and the loss; it may raise to stop the training.
+ProgressCallback = Callable[[int, int, float], None]
+"""Called now and then with the number of the run, its iteration and the loss; it may raise to stop
+the training.
 
-What it raises ends it without a result, but for `Enough`.
+What it raises ends it without a result, but for `StopTraining`.
 """
 
 
 Plan = Sequence[Mapping[str, Any]]
-"""What is known of each run of a fit: `structure`, `start` from 1 on, `regularization`."""
+"""Description of each run of a fit: `structure`, `start` from 1 on, `regularization`."""
 
 
-RunTell = Callable[[int, float], None]
-"""The same of one run: called with its iteration and the loss."""
+RunProgress = Callable[[int, float], None]
+"""Progress callback of one run: called with its iteration and the loss."""
 
 
-class Enough(Exception):
-    """Raised by whoever is told: end this run with what it has reached, as its result."""
+class StopTraining(Exception):
+    """Raised by a progress callback: end this run with its present result."""
 
 
 def quiet(iteration: int, loss: float) -> None:
-    """Nobody listens to a run."""
+    """Ignore the progress of a run."""
 
 
 def _unplanned(first: int, plan: Plan) -> None:
-    """Nobody asks what the runs are."""
+    """Ignore the plan of the runs."""
 
 
 def _nothing(run: int, iteration: int, loss: float) -> None:
-    """Nobody listens to any."""
+    """Ignore the progress of all runs."""
 
 
 @dataclass(frozen=True)
 class Progress:
-    """Tells `(run, iteration, loss)`. Runs and iterations are counted on from those that were told before.
+    """Callback of `(run, iteration, loss)`.
+
+    Runs and iterations are counted on from those that were reported before.
 
     Examples:
-        >>> told = Progress(lambda run, iteration, loss: print(run, iteration, loss))
-        >>> told.after(runs=3)(0, 1, 0.5)
+        >>> progress = Progress(lambda run, iteration, loss: print(run, iteration, loss))
+        >>> progress.after(runs=3)(0, 1, 0.5)
         3 1 0.5
-        >>> told.of(2)(20, 0.5)
+        >>> progress.of(2)(20, 0.5)
         2 20 0.5
     """
 
-    tell: Tell = _nothing
+    report: ProgressCallback = _nothing
     runs: int = 0
     iterations: int = 0
     plan: Callable[[int, Plan], None] = _unplanned
-    """Called with the number of the first run of a fit, and what is known of its runs."""
+    """Called with the number of the first run of a fit, and with its plan."""
 
     def __call__(self, run: int, iteration: int, loss: float) -> None:
-        self.tell(self.runs + run, self.iterations + iteration, loss)
+        self.report(self.runs + run, self.iterations + iteration, loss)
 
     def after(self, *, runs: int = 0, iterations: int = 0) -> Progress:
-        """The progress of what follows so many runs or iterations."""
+        """Return the progress of the runs and iterations after so many."""
         return replace(self, runs=self.runs + runs, iterations=self.iterations + iterations)
 
     def planned(self, plan: Plan) -> None:
-        """Say what the runs that follow are."""
+        """Pass on the plan of the runs that follow."""
         self.plan(self.runs, plan)
 
-    def of(self, run: int) -> RunTell:
-        """What one run tells: its iteration and the loss."""
+    def of(self, run: int) -> RunProgress:
+        """Return the progress callback of one run: its iteration and the loss."""
         return lambda iteration, loss: self(run, iteration, loss)
 
 
@@ -82,7 +86,10 @@ SILENT = Progress()
 
 
 def show_log(level: str) -> None:
-    """Write the log to standard error from `level` on, info or debug, with the time of each line."""
+    """Write the log to standard error from `level` on, with the time of each line.
+
+    The level is info or debug.
+    """
     if any(isinstance(handler, logging.StreamHandler) for handler in LOG.handlers):
         return
     handler = logging.StreamHandler()

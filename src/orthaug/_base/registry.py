@@ -1,8 +1,10 @@
-"""Registries: the kinds of learners, structures, measures, criteria and solvers, each a declaration under a name.
+"""Registries of learners, structures, measures, criteria and solvers by name.
 
-A declaration is a frozen dataclass. Its fields are the keys of its section in a spec: name, type, limits
-(`Annotated[int, Ge(1)]`) and default. A declaration that stands for something else, such as files that hold points,
-has a method `resolve(context)` that makes the real thing.
+Each kind is a declaration.
+
+A declaration is a frozen dataclass. Its fields are the keys of its section in a spec: name, type,
+limits (`Annotated[int, Ge(1)]`) and default. A declaration of something else, such as
+files that hold points, has a method `resolve(context)` that makes the real thing.
 """
 
 from __future__ import annotations
@@ -22,7 +24,9 @@ from orthaug._base.checks import check_choice, check_count, check_number, neares
 from orthaug._base.errors import InputError, KeyedError
 
 LIBRARY_ONLY = {"library_only": True}
-"""Metadata of a dataclass field that is no key of the spec: `field(default=…, metadata=LIBRARY_ONLY)`."""
+"""Metadata of a dataclass field that is no key of the spec: `field(default=…,
+metadata=LIBRARY_ONLY)`.
+"""
 
 
 @dataclass(frozen=True)
@@ -33,7 +37,7 @@ class OneOf:
 
 
 @dataclass(frozen=True)
-class InSpec:
+class SpecLimit:
     """In `Annotated`: a limit that holds in a spec only."""
 
     limit: Any
@@ -66,7 +70,7 @@ class Key:
 
     @property
     def metadata(self) -> tuple[Any, ...]:
-        """What stands beside the type in `Annotated`."""
+        """Limits and marks next to the type in `Annotated`."""
         return getattr(self.annotation, "__metadata__", ())
 
     @property
@@ -76,13 +80,13 @@ class Key:
 
 
 class Registry(Mapping[str, Any]):
-    """The declarations of one axis by the name of their kind, in the order in which they were added.
+    """The declarations of one axis by the name of their kind, in the order of their addition.
 
     Args:
         axis: what the kinds are kinds of, for messages.
         entries: the first declarations.
         reserved: keys that the section has beside those of the declarations.
-        beside: another registry whose keys stand in the same section.
+        beside: another registry whose keys are in the same section.
     """
 
     def __init__(
@@ -116,22 +120,32 @@ class Registry(Mapping[str, Any]):
         """Register a declaration.
 
         Raises:
-            InputError: a name that is taken, no frozen dataclass, or a key that means something else already.
+            InputError: a name that is taken, no frozen dataclass, or a key that means something
+                else already.
         """
         if kind in self._entries:
-            raise InputError(f"the {self.axis} '{kind}' is registered already; give it another name.")
-        if not dataclasses.is_dataclass(declaration) or not declaration.__dataclass_params__.frozen:  # type: ignore[attr-defined]
-            raise InputError(f"the {self.axis} '{kind}' must be a frozen dataclass; got {declaration!r}.")
+            raise InputError(
+                f"the {self.axis} '{kind}' is registered already; give it another name."
+            )
+        parameters = getattr(declaration, "__dataclass_params__", None)
+        if parameters is None or not parameters.frozen:
+            raise InputError(
+                f"the {self.axis} '{kind}' must be a frozen dataclass; got {declaration!r}."
+            )
         for key in keys_of(declaration).values():
             if key.name in self._reserved:
-                raise InputError(f"the {self.axis} '{kind}' has a key '{key.name}', which its section has already.")
+                raise InputError(
+                    f"the {self.axis} '{kind}' has a key '{key.name}', which its section has "
+                    "already."
+                )
             for registry in self._section:
                 for other, known in registry._entries.items():
                     same = keys_of(known).get(key.name)
                     if same is not None and same.meaning != key.meaning:
                         raise InputError(
-                            f"the {self.axis} '{kind}' and the {registry.axis} '{other}' declare the key '{key.name}' "
-                            f"differently: {key.annotation} and {same.annotation}; give one of them another name."
+                            f"the {self.axis} '{kind}' and the {registry.axis} '{other}' "
+                            f"declare the key '{key.name}' differently: {key.annotation} and "
+                            f"{same.annotation}; give one of them another name."
                         )
         self._entries[kind] = declaration
 
@@ -141,7 +155,7 @@ class Registry(Mapping[str, Any]):
 
     @contextmanager
     def added(self, kind: str, declaration: type) -> Iterator[None]:
-        """A declaration that is registered inside a `with` block only."""
+        """Register a declaration inside a `with` block only."""
         self.add(kind, declaration)
         try:
             yield
@@ -149,18 +163,24 @@ class Registry(Mapping[str, Any]):
             self.remove(kind)
 
     def section_keys(self) -> dict[str, Key]:
-        """The keys of all kinds."""
+        """Return the keys of all kinds."""
         keys: dict[str, Key] = {}
         for declaration in self._entries.values():
             keys = keys_of(declaration) | keys
         return keys
 
     def kind_of(self, declared: object) -> str | None:
-        """The name under which a declaration's class is registered; None for a foreign one."""
-        return next((kind for kind, declaration in self._entries.items() if type(declared) is declaration), None)
+        """Return the name under which a declaration's class is registered.
+
+        None for a foreign one.
+        """
+        return next(
+            (kind for kind, declaration in self._entries.items() if type(declared) is declaration),
+            None,
+        )
 
     def kind_with(self, option: str) -> tuple[str, Key] | None:
-        """The kind that a command-line option belongs to, with the key that it gives."""
+        """Return the kind that a command-line option belongs to, with the key that it gives."""
         for kind, declaration in self._entries.items():
             for key in keys_of(declaration).values():
                 if key.option == option:
@@ -168,23 +188,32 @@ class Registry(Mapping[str, Any]):
         return None
 
     def declare(self, kind: str, values: Mapping[str, Any]) -> Any:
-        """The declaration of a kind; `values` of keys that it does not have are left out.
+        """Return the declaration of a kind; `values` of keys that it does not have are left out.
 
         Raises:
             InputError: an unknown kind, a missing key, or what the declaration refuses.
         """
         if kind not in self._entries:
-            raise InputError(f"unknown {self.axis} '{kind}'{nearest(kind, self) or ', known are ' + ', '.join(self)}.")
+            raise InputError(
+                f"unknown {self.axis} "
+                f"'{kind}'{nearest(kind, self) or ', known are ' + ', '.join(self)}."
+            )
         known = keys_of(self._entries[kind])
         for name, key in known.items():
             if key.default is dataclasses.MISSING and name not in values:
-                raise KeyedError(f"the {self.axis} '{kind}' needs `{name}`.", name, f" is missing; {kind} needs it")
-        return self._entries[kind](**{name: frozen(value) for name, value in values.items() if name in known})
+                raise KeyedError(
+                    f"the {self.axis} '{kind}' needs `{name}`.",
+                    name,
+                    f" is missing; {kind} needs it",
+                )
+        return self._entries[kind](
+            **{name: frozen(value) for name, value in values.items() if name in known}
+        )
 
 
 @functools.cache
 def keys_of(declaration: type) -> dict[str, Key]:
-    """The keys that a declaration's fields are."""
+    """Return the keys that a declaration's fields are."""
     hints = typing.get_type_hints(declaration, include_extras=True)
     return {
         field.name: Key(field.name, hints[field.name], _default(field))
@@ -194,12 +223,15 @@ def keys_of(declaration: type) -> dict[str, Key]:
 
 
 def resolve(declared: Any, context: Any = None) -> Any:
-    """What a declaration stands for: itself, or what its `resolve(context)` makes."""
+    """Return a declaration itself, or the result of its `resolve(context)`."""
     return declared.resolve(context) if hasattr(declared, "resolve") else declared
 
 
 def check_fields(declared: Any) -> None:
-    """Raise InputError for a field outside of the limits of its type; for the `__post_init__` of declarations."""
+    """Raise InputError for a field outside the limits of its type.
+
+    It is called in the `__post_init__` of declarations.
+    """
     for name, key in keys_of(type(declared)).items():
         value, metadata = getattr(declared, name), key.metadata
         low = next((mark.ge for mark in metadata if isinstance(mark, Ge)), None)
@@ -220,7 +252,7 @@ def _default(field: dataclasses.Field[Any]) -> Any:
 
 
 def frozen(value: Any) -> Any:
-    """Lists, as files hold them, as tuples."""
+    """Return lists, as files hold them, as tuples."""
     if isinstance(value, list | tuple):
         return tuple(frozen(item) for item in value)
     if isinstance(value, Mapping):

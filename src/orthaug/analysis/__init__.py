@@ -1,4 +1,4 @@
-"""Is the model to be trusted? Residuals, validation, stability, suspects, the next experiment."""
+"""Analysis of fitted models: residuals, validation, stability, suspects, the next experiment."""
 
 import lazy_loader
 

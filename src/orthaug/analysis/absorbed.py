@@ -1,8 +1,9 @@
-"""What a fit makes of a term that the physics lacks: how far it moves c, and what the learner holds of it (F8).
+"""Effect of a missing term on a fit: how far it moves c, and how much of it the learner holds (F8).
 
-With `Y = Φθ* + Δ` a learner that can be any function of its features z takes the mean of `Δ − Φd` given z, with
-`d = c − θ*` from the partially linear regression `d = ((I − M)Φ)⁺(I − M)Δ`, M the mean given z. A Δ that is a function
-of z has `(I − M)Δ = 0`: it moves nothing that the learner could not imitate.
+With `Y = Φθ* + Δ` a learner that can be any function of its features z takes the mean of `Δ − Φd`
+given z, with `d = c − θ*` from the partially linear regression `d = ((I − M)Φ)⁺(I − M)Δ`, M the
+mean given z. A Δ that is a function of z has `(I − M)Δ = 0`: it moves nothing that the learner
+could not imitate.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from orthaug._base.parallel import one_blas_thread
 from orthaug.physics.output_weights import times
 from orthaug.physics.problem import Problem
 
-_MOST_WAVES = 100  # tanh functions of z that stand for any function of it
+_MOST_WAVES = 100  # tanh functions of z, for any function of it
 _ROWS_PER_WAVE = 20
 WAVES = 24  # the same, before there is a fit
 _STEEPEST = 30.0  # of their slopes, in units of 1 / range of z
@@ -33,11 +34,12 @@ _SEED = 20_241_122
 
 
 @dataclass(frozen=True, eq=False)
-class Absorbed:
+class TermAfterFit:
     """A term of coefficient 1 after the fit.
 
-    `moved` (nθ,) is what it adds to c. `held` (M, ny) is what the learner holds of it on a measure's points. `seen`
-    tells whether it is a function of what the learner sees; None where the learner could imitate all of the physics.
+    `moved` (nθ,) is what it adds to c. `held` (M, ny) is what the learner holds of it on a
+    measure's points. `seen` is whether it is a function of what the learner sees; None where the
+    learner could imitate all of the physics.
     """
 
     moved: Vector
@@ -47,10 +49,12 @@ class Absorbed:
 
 @dataclass(frozen=True, eq=False)
 class Smoother:
-    """The mean given the learner's features, over the training rows: least squares on many functions of these.
+    """Mean given the learner's features over the training rows, by least squares.
 
-    The functions are tanh waves with centres on the data, and the shared part of the physics. Of a learner that is
-    linear in its features they are these.
+    Squares are taken on many functions of the features.
+
+    The functions are tanh waves with centres on the data, and the shared part of the physics. Of a
+    learner that is linear in its features they are these.
     """
 
     problem: Problem
@@ -70,12 +74,17 @@ class Smoother:
         return (low + high) / 2, np.where(high > low, (high - low) / 2, 1.0)
 
     def _z(self, x: Matrix) -> Matrix:
-        """z on rows of the regressor, over its range in the data; kept, for the same rows are asked for again."""
+        """Return z on rows of the regressor, over its range in the data.
+
+        Kept, for the same rows are asked for again.
+        """
         known = self._evaluated.get(id(x))
         if known is None or known[0] is not x:
             centre, half = self._unit
             with np.errstate(all="ignore"):
-                z = (np.asarray(self.problem.features.evaluate(x, self.problem.layout, np)) - centre) / half
+                z = (
+                    np.asarray(self.problem.features.evaluate(x, self.problem.layout, np)) - centre
+                ) / half
             known = self._evaluated[id(x)] = (x, np.nan_to_num(z))
         return known[1]
 
@@ -117,14 +126,16 @@ class Smoother:
         return self._z(self.problem.rows.x[self.every])
 
     def left(self, values: Float[np.ndarray, "n *m"]) -> Float[np.ndarray, "n *m"]:
-        """(I − M)v of values on the training rows that are used."""
+        """Return (I − M)v of values on the training rows that are used."""
         flat = values.reshape(len(values), -1)
         return (flat - self._basis @ (self._basis.T @ flat)).reshape(values.shape)
 
     def mean(self, values: Float[np.ndarray, "n ny"], x: Matrix) -> Matrix:
-        """Mv at rows of the regressor, of values on the training rows that are used: that at the nearest z of these.
+        """Return Mv at rows of the regressor, from values on the training rows that are used.
 
-        Of a linear combination of the features it is that combination.
+        A row takes the value of the training row with the nearest z.
+
+        A linear combination of the features is returned as it is.
         """
         if self.problem.features.linear:
             return self._z(x) @ (self._inverse @ values)
@@ -139,8 +150,8 @@ def absorbed(
     terms: Iterable[Callable[[Matrix], Matrix]],
     seen: Iterable[bool],
     x: Matrix,
-) -> list[Absorbed]:
-    """What a fit makes of each term, to first order.
+) -> list[TermAfterFit]:
+    """Return the effect of each term on a fit, to first order.
 
     Args:
         terms: the value (M, ny) of each on rows of the regressor.
@@ -151,13 +162,13 @@ def absorbed(
     found = []
     for term, visible in zip(terms, seen, strict=True):
         if visible:
-            found.append(Absorbed(np.zeros(nt), term(x), True))
+            found.append(TermAfterFit(np.zeros(nt), term(x), True))
         else:
             found.append(_unseen(smoother, term, x))
     return found
 
 
-def _unseen(smoother: Smoother, term: Callable[[Matrix], Matrix], x: Matrix) -> Absorbed:
+def _unseen(smoother: Smoother, term: Callable[[Matrix], Matrix], x: Matrix) -> TermAfterFit:
     problem = smoother.problem
     rows = problem.rows.x[smoother.every]
     phi = np.asarray(problem.baseline.phi(rows, problem.layout, problem.outputs, np))
@@ -170,11 +181,11 @@ def _unseen(smoother: Smoother, term: Callable[[Matrix], Matrix], x: Matrix) -> 
         size = np.sqrt(np.sum(times(gain, phi)[..., others] ** 2, axis=(0, 1)))
         size = np.where(size > 0, size, 1.0)
         moved[others] = np.linalg.lstsq(columns / size, target.reshape(-1), rcond=1e-8)[0] / size
-    return Absorbed(moved, smoother.mean(delta - phi @ moved, x), False)
+    return TermAfterFit(moved, smoother.mean(delta - phi @ moved, x), False)
 
 
 def completing(basis: Matrix) -> list[int]:
-    """Parameters whose directions complete the shared ones."""
+    """Return the parameters whose directions complete the shared ones."""
     if not basis.shape[1]:
         return list(range(len(basis)))
     order = scipy.linalg.qr(basis.T, mode="r", pivoting=True)[-1]
@@ -198,14 +209,14 @@ class Waves:
 
 @lru_cache(maxsize=16)
 def _drawn(nz: int) -> tuple[Matrix, Vector]:
-    """Slopes (WAVES, nz) and offsets: every wave has its centre among the features."""
+    """Return slopes (WAVES, nz) and offsets; every wave has its centre among the features."""
     rng = np.random.default_rng(_SEED)
     slopes, centres = _slopes(rng, WAVES, nz), rng.uniform(-1, 1, size=(WAVES, nz))
     return slopes, np.sum(slopes * centres, axis=1)
 
 
 def _slopes(rng: np.random.Generator, count: int, nz: int) -> Matrix:
-    """Of waves in random directions, gentle ones as often as steep ones (count, nz)."""
+    """Return slopes (count, nz) of waves in random directions, gentle and steep ones alike."""
     slopes = rng.normal(size=(count, nz))
     steep = np.exp(rng.uniform(0.0, np.log(_STEEPEST), size=(count, 1)))
     return slopes * (steep / np.linalg.norm(slopes, axis=1)[:, None])

@@ -1,9 +1,12 @@
-"""Is the free run bounded whatever bounded inputs come? A proof where the correction is held or fades.
+"""Proof that the free run stays bounded for any bounded inputs, far beyond the training data.
 
-Far beyond its training the model is `x_{k+1} = A x_k + b(x_k, u_k)`. Where the correction is held, or gone, and the
-physics is linear in the state, A is one matrix and b is bounded: with all eigenvalues of A inside the unit circle,
-bounded inputs give a bounded free run. A is read off as the derivative of a step at states far away in many directions;
-physics that is not linear gives another one in each, and nothing is said.
+It applies where the correction is constant far out, or fades.
+
+Far beyond its training the model is `x_{k+1} = A x_k + b(x_k, u_k)`. Where the correction is held,
+or gone, and the physics is linear in the state, A is one matrix and b is bounded: with all
+eigenvalues of A inside the unit circle, bounded inputs give a bounded free run. A is read off as
+the derivative of a step at states far away in many directions; physics that is not linear gives
+another one in each, and nothing is said.
 """
 
 from __future__ import annotations
@@ -26,7 +29,9 @@ _LONGEST_STATE = 200
 
 
 def radius_beyond(model: Model | MotionModel, states: Matrix, inputs: Matrix) -> float | None:
-    """Return the spectral radius of A; None without a bounded correction, or where A is not one matrix.
+    """Return the spectral radius of A.
+
+    None without a bounded correction, or where A is not one matrix.
 
     Args:
         model: fitted, with a learner.
@@ -36,30 +41,41 @@ def radius_beyond(model: Model | MotionModel, states: Matrix, inputs: Matrix) ->
     bound: Any = getattr(model.form, "bound", None)
     does, size = getattr(model.form, "beyond", "free"), states.shape[1]
     finite = np.isfinite(states).all(axis=1)
-    if does == "free" or model.numbers.limits is None or not 0 < size <= _LONGEST_STATE or not finite.any():
+    if (
+        does == "free"
+        or model.numbers.limits is None
+        or not 0 < size <= _LONGEST_STATE
+        or not finite.any()
+    ):
         return None
     if does != "hold" and not hasattr(bound.learner, "beyond"):
         return None
-    found = [_far_away(_going_on(model, kind), states[finite], inputs[finite]) for kind in sorted({does, "hold"})]
+    found = [
+        _far_away(_going_on(model, kind), states[finite], inputs[finite])
+        for kind in sorted({does, "hold"})
+    ]
     every = np.concatenate(found)
-    # what fades must leave the same physics as what is held: else its share of the physics comes and goes, unbounded
-    if not np.isfinite(every).all() or np.ptp(every, axis=0).max() > _SAME * max(np.abs(every).max(), 1.0):
+    # A correction that fades must leave the same physics as a constant one: else its share of the
+    # physics changes without bound.
+    if not np.isfinite(every).all() or np.ptp(every, axis=0).max() > _SAME * max(
+        np.abs(every).max(), 1.0
+    ):
         return None
     return float(np.abs(np.linalg.eigvals(every[0])).max())
 
 
 def describe_beyond(model: Model | MotionModel, radius: float | None) -> str:
-    """Return what the radius says of the free run, in a sentence; nothing without one."""
+    """Return a sentence on what the radius says of the free run; empty without a radius."""
     if radius is None:
         return ""
-    does = "fades" if model.form.beyond == "fade" else "is held"
+    does = "fades" if model.form.beyond == "fade" else "stays constant"
     text = (
-        f"Beyond its training the learned correction {does}, so it is bounded; the physics goes on alone there, with "
+        f"Beyond the training data the learned correction {does}, so it is bounded. The physics "
+        f"alone has a spectral radius of {radius:.4g} there"
     )
-    text += f"a spectral radius of {radius:.4g}"
     if radius < 1:
         return f"{text}: bounded inputs give a bounded free run. This is a proof, not a sample."
-    return f"{text}: nothing there bounds the free run."
+    return f"{text}, so the free run is not bounded."
 
 
 def _going_on(model: Model | MotionModel, kind: str) -> Model | MotionModel:
@@ -72,14 +88,18 @@ def _going_on(model: Model | MotionModel, kind: str) -> Model | MotionModel:
     return replace(model, form=form)
 
 
-def _far_away(model: Model | MotionModel, states: Matrix, inputs: Matrix) -> Float[np.ndarray, "m n0 n0"]:
+def _far_away(
+    model: Model | MotionModel, states: Matrix, inputs: Matrix
+) -> Float[np.ndarray, "m n0 n0"]:
     """Return the derivative of a step at states far away, each at inputs that the run had."""
     random = np.random.default_rng(0)
     reach = np.abs(states).max(axis=0)
     directions = random.choice([-1.0, 1.0], (_DIRECTIONS, states.shape[1])) * random.uniform(
         0.5, 1.0, (_DIRECTIONS, states.shape[1])
     )
-    points = np.concatenate([scale * np.where(reach > 0, reach, 1.0) * directions for scale in _FAR])
+    points = np.concatenate(
+        [scale * np.where(reach > 0, reach, 1.0) * directions for scale in _FAR]
+    )
     rows = inputs[random.integers(len(inputs), size=len(points))]
     with np.errstate(all="ignore"):
         return transitions(model, points, rows)

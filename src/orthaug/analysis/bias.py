@@ -1,11 +1,12 @@
-"""What unmodelled terms do to θ: bias per unit of each suspect, and whether any measure can remove it.
+"""Bias of θ by unmodelled terms: per unit of each suspect, and whether a measure can remove it.
 
-With the truth `Y = Φθ* + Δ + E` (`eq:data_gen_sys_reformed_vect`) the estimate under a measure μ errs by
-`θ̂ − θ* = Φ_μ⁺(Δ_μ − ε_μ)` (eq:error_val), ε the misfit of the whole model. Here Φ_μ and Δ_μ are the
-rows multiplied by the square root of their weight.
+With the truth `Y = Φθ* + Δ + E` (`eq:data_gen_sys_reformed_vect`) the estimate under a measure μ
+errs by `θ̂ − θ* = Φ_μ⁺(Δ_μ − ε_μ)` (eq:error_val), ε the misfit of the whole model. Here Φ_μ and
+Δ_μ are the rows multiplied by the square root of their weight.
 
-A learner that sees only some features shares only some directions B of θ with the physics. Along these alone the
-measure decides: the estimate errs by `d + B(Φ_μB)⁺G_μ`, d what the term moves c by and G what the learner holds of it.
+A learner that sees only some features shares only some directions B of θ with the physics. Along
+these alone the measure decides: the estimate errs by `d + B(Φ_μB)⁺G_μ`, d what the term moves c by
+and G what the learner holds of it.
 """
 
 from __future__ import annotations
@@ -20,15 +21,18 @@ from jaxtyping import Float
 from orthaug._base.checks import Matrix, Vector, check_unique
 from orthaug._base.errors import InputError
 from orthaug._base.lines import percent
-from orthaug.analysis.absorbed import Absorbed
+from orthaug.analysis.absorbed import TermAfterFit
 from orthaug.analysis.suspects import Suspect
 from orthaug.physics.excitation import excitation, require_rank
 from orthaug.physics.output_weights import times
 from orthaug.physics.projection import Projection
 
-NEGLIGIBLE = 1e-12  # rows whose ‖φᵀδ‖ is below this share of the largest ‖φ‖‖δ‖: only weights of 1e12 could use them
-SMALLEST_COSINE = 1e-6  # between Φa and Δ; below it the optimum of the linear program counts as zero
-VIOLATION = 1e-9  # of (φᵀa)δ, rows and a of unit length; the linear program itself is solved to 1e-10
+# Rows whose ‖φᵀδ‖ is below this share of the largest ‖φ‖‖δ‖: only weights of 1e12 could use them
+NEGLIGIBLE = 1e-12
+# Between Φa and Δ; below it the optimum of the linear program counts as zero
+SMALLEST_COSINE = 1e-6
+# Of (φᵀa)δ, rows and a of unit length; the linear program itself is solved to 1e-10
+VIOLATION = 1e-9
 WORKING_SET = 1000  # rows of the first linear program, and the most that are added at a time
 MOST_ROUNDS = 50
 IN_SPAN = 1e-10  # ‖P⊥Δ‖/‖Δ‖ below which Δ counts as physics
@@ -39,15 +43,17 @@ RemovedBy = Literal["learner", "learner and measure", "learner in part", "measur
 
 @dataclass(frozen=True)
 class Certificate:
-    """Whether a measure on the given points can make φ and δ orthogonal.
+    """Certificate that a measure on the given points can, or cannot, make φ and δ orthogonal.
 
-    By Stiemke's lemma exactly one of the two holds: positive weights on all points with `Σ μ_k φ_kᵀδ_k = 0`
-    (`removable`), or a direction a with `(φ_kᵀa)δ_k ≥ 0` on all points and `> 0` on some (`unremovable`).
-    `undecided` is a numerical failure; `orthogonal` means that `φ_kᵀδ_k` is zero on every point.
+    By Stiemke's lemma exactly one of the two holds: positive weights on all points with `Σ μ_k
+    φ_kᵀδ_k = 0` (`removable`), or a direction a with `(φ_kᵀa)δ_k ≥ 0` on all points and `> 0` on
+    some (`unremovable`). `undecided` is a numerical failure; `orthogonal` means that `φ_kᵀδ_k` is
+    zero on every point.
 
-    `direction` (nt,) is a in the units of θ, `Φa` of root mean square 1; `shares` (nt,) is the same with the
-    columns of Φ scaled to root mean square 1 and the largest entry 1, to read. `cosine` is that between Φa and Δ,
-    `positive` the fraction of points where `(φᵀa)δ > 0`: a measure on the rest alone is not excluded.
+    `direction` (nt,) is a in the units of θ, `Φa` of root mean square 1; `shares` (nt,) is the same
+    with the columns of Φ scaled to root mean square 1 and the largest entry 1, to read. `cosine` is
+    that between Φa and Δ, `positive` the fraction of points where `(φᵀa)δ > 0`: a measure on the
+    rest alone is not excluded.
     """
 
     verdict: Removability
@@ -59,13 +65,14 @@ class Certificate:
 
 @dataclass(frozen=True)
 class SuspectedBias:
-    """What a suspect does to θ if it is there, per unit of its coefficient.
+    """Bias of θ by a suspect, per unit of the suspect's coefficient.
 
-    `bias` (nt,) is `Φ_μ⁺Δ_μ`, in the unit of θ per unit of the coefficient; `relative` the same divided by θ
-    (None where θ is 0); `physical` the same for physical parameters, to first order; `expected` is `bias` times the
-    guessed coefficient. `cosine` is `‖QᵀΔ‖/‖Δ‖` in [0, 1], 0 where the paper's `cond:special_PE` holds: None for
-    Δ = 0. `explained` is the squared cosine between P⊥Δ and the learner's values, and `coefficient_found` that
-    with which P⊥Δ fits them best: both None without a learner, or where Δ lies in the span of Φ.
+    `bias` (nt,) is `Φ_μ⁺Δ_μ`, in the unit of θ per unit of the coefficient; `relative` the same
+    divided by θ (None where θ is 0); `physical` the same for physical parameters, to first order;
+    `expected` is `bias` times the guessed coefficient. `cosine` is `‖QᵀΔ‖/‖Δ‖` in [0, 1], 0 where
+    the paper's `cond:special_PE` holds: None for Δ = 0. `explained` is the squared cosine between
+    P⊥Δ and the learner's values, and `coefficient_found` that with which P⊥Δ fits them best: both
+    None without a learner, or where Δ lies in the span of Φ.
     """
 
     suspect: Suspect
@@ -79,14 +86,16 @@ class SuspectedBias:
     coefficient_found: float | None
     certificate: Certificate | None
     seen: bool | None = None
-    """Whether it is a function of what the learner sees, where that leaves some directions of θ to the fit."""
+    """Whether it is a function of what the learner sees, where that leaves some directions of θ to
+    the fit.
+    """
 
     @property
     def removed_by(self) -> RemovedBy | None:
-        """What leaves θ unbiased by it; None where that is not known.
+        """Change that removes this bias from θ; None where none is known.
 
-        A learner that sees the term removes its bias from all that the learner could not imitate. Along the shared
-        directions a measure may remove the rest.
+        A learner that sees the term removes its bias from all that the learner could not imitate.
+        Along the shared directions a measure may remove the rest.
         """
         if self.seen and not any(self.bias):
             return "learner"
@@ -106,17 +115,23 @@ class SuspectedBias:
         certificate = self.certificate
         if self.seen is False:
             return (
-                f"{self.suspect.name}: the learner does not see all of it, so that it biases also what no measure "
-                "changes."
+                f"{self.suspect.name}: the learner does not see all of this term, so the term "
+                "biases θ under every measure."
             )
         if certificate is None:
             return ""
         if certificate.verdict == "orthogonal":
-            return f"{self.suspect.name}: φᵀδ is zero on all of these points, so that it biases nothing there."
+            return (
+                f"{self.suspect.name}: φᵀδ is zero on all of these points, so this term "
+                "biases nothing there."
+            )
         if certificate.verdict == "removable":
             return f"{self.suspect.name}: some weighting of these points leaves θ unbiased."
         if certificate.verdict == "undecided":
-            return f"{self.suspect.name}: whether a weighting of these points leaves θ unbiased could not be decided."
+            return (
+                f"{self.suspect.name}: whether a weighting of these points leaves θ unbiased "
+                "could not be decided."
+            )
         assert certificate.shares is not None and certificate.positive is not None
         terms = [
             f"{share:+.3g} {name}"
@@ -124,13 +139,14 @@ class SuspectedBias:
             if abs(share) > 5e-3
         ]
         return (
-            f"{self.suspect.name}: no weighting of these points leaves θ unbiased if it counts any of the "
-            f"{percent(certificate.positive, 3)} where (φᵀa)δ is positive, for it is nowhere negative; "
-            f"a = {' '.join(terms)} (columns scaled to root mean square 1). Only the least bias can be asked for."
+            f"{self.suspect.name}: no weighting that counts any of "
+            f"{percent(certificate.positive, 3)} of these points leaves θ unbiased. There "
+            f"(φᵀa)δ is positive, and it is nowhere negative; a = {' '.join(terms)} (columns "
+            "scaled to root mean square 1). Only the least bias can be asked for."
         )
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain numbers, text and None, for JSON."""
+        """Return plain numbers, text and None, for JSON."""
         certificate = self.certificate
 
         def by_name(values: tuple[float | None, ...] | None) -> dict[str, float | None] | None:
@@ -175,14 +191,15 @@ def bias_table(
     learned: Matrix | None = None,
     certify: bool = True,
     directions: Matrix | None = None,
-    absorbed: Sequence[Absorbed] | None = None,
+    absorbed: Sequence[TermAfterFit] | None = None,
 ) -> tuple[SuspectedBias, ...]:
-    """One `SuspectedBias` for each suspect, under the measure that `projection` was made with.
+    """Return one `SuspectedBias` for each suspect, under the measure of `projection`.
 
     Args:
         projection: of the rows of φ, their outputs multiplied by `gain`.
         names: the nt parameters.
-        suspects: their forms; `deltas` (ns, N, ny) their values, as `suspects.suspect_columns` gives them.
+        suspects: their forms; `deltas` (ns, N, ny) their values, as `suspects.suspect_columns`
+            gives them.
         gain: a matrix (ny, ny) for all rows, or one of each row (N, ny, ny); None for none.
         theta: θ (nt,), for relative biases.
         physical: a row of dp/dθ (nt,) for each physical parameter p, by name.
@@ -192,16 +209,22 @@ def bias_table(
         absorbed: what the fit makes of each suspect, where `directions` are not all.
 
     Raises:
-        InputError: shapes that do not fit, values that are not finite, suspects of one name; RankError for
-            physics that the points do not determine.
+        InputError: shapes that do not fit, values that are not finite, suspects of one name;
+            RankError for physics that the points do not determine.
     """
     names = tuple(names)
     if not names:
-        raise InputError("the physics has no parameters; there is nothing that a suspect could bias.")
+        raise InputError(
+            "the physics has no parameters; there is nothing that a suspect could bias."
+        )
     _check_shapes(projection, names, suspects, deltas, theta, physical, learned)
     gain = np.eye(deltas.shape[2]) if gain is None else _row_gain(gain, deltas.shape[1:])
     require_rank(excitation(projection.r, names), projection.q.shape[0] * projection.q.shape[1])
-    tilde = None if learned is None else orthogonal_part(projection, times(gain, np.asarray(learned)), directions)
+    tilde = (
+        None
+        if learned is None
+        else orthogonal_part(projection, times(gain, np.asarray(learned)), directions)
+    )
     entries = []
     for i, (suspect, delta) in enumerate(zip(suspects, deltas, strict=True)):
         if not np.all(np.isfinite(delta)):
@@ -216,9 +239,13 @@ def bias_table(
                 suspect,
                 names,
                 _numbers(bias),
-                None if theta is None else tuple(float(b / t) if t else None for b, t in zip(bias, theta, strict=True)),
+                None
+                if theta is None
+                else tuple(float(b / t) if t else None for b, t in zip(bias, theta, strict=True)),
                 None if suspect.coefficient is None else _numbers(suspect.coefficient * bias),
-                None if physical is None else tuple((p, float(np.dot(row, bias))) for p, row in physical.items()),
+                None
+                if physical is None
+                else tuple((p, float(np.dot(row, bias))) for p, row in physical.items()),
                 cosine,
                 explained,
                 coefficient,
@@ -232,7 +259,10 @@ def bias_table(
 def _overlaps(
     projection: Projection, delta: Matrix, tilde: Matrix | None, directions: Matrix | None
 ) -> tuple[float | None, float | None, float | None]:
-    """cos(Δ, span Φ); R² of the learner's P⊥F on P⊥Δ; the coefficient of that fit. Along `directions` only."""
+    """Return cos(Δ, span Φ), R² of the learner's P⊥F on P⊥Δ, and the coefficient of that fit.
+
+    All are taken along `directions` only.
+    """
     size = np.abs(delta).max(initial=0.0)
     if size == 0:
         return None, None, None
@@ -251,7 +281,7 @@ def _overlaps(
 
 
 def orthogonal_part(projection: Projection, values: Matrix, directions: Matrix | None) -> Matrix:
-    """P⊥v, or what is left of v along some directions of θ."""
+    """Return P⊥v, or what is left of v along some directions of θ."""
     if directions is None:
         return projection.orthogonal_part(values)
     return values - projection.phi @ projection.solve_along(values, directions)
@@ -262,9 +292,10 @@ def find_certificate(
 ) -> Certificate:
     """Maximise `Σ (φᵀa)δ` subject to `(φᵀa)δ ≥ 0` on every point and `|a| ≤ 1`.
 
-    In the coordinates of Q, so that neither units nor conditioning of Φ matter; a row of several outputs counts
-    the sum over them, weighted as in `projection`. The linear program is solved on a working set, to which the
-    most violated rows are added until there are none: the optimum of a subset bounds that of all.
+    The program is in the coordinates of Q, so that neither units nor conditioning of Φ matter; a
+    row of several outputs counts the sum over them, weighted as in `projection`. The linear program
+    is solved on a working set, to which the most violated rows are added until there are none: the
+    optimum of a subset bounds that of all.
 
     Args:
         projection: of the weighted rows of φ.
@@ -315,8 +346,8 @@ def find_certificate(
 
 
 def _certificate_along(projection: Projection, delta: Matrix, directions: Matrix) -> Certificate:
-    """The certificate among some directions, told in all parameters."""
-    directions = projection.told_of(directions)
+    """Return the certificate among some directions, as weights of all parameters."""
+    directions = projection.without_null(directions)
     if not directions.shape[1]:
         return Certificate("orthogonal")
     found = find_certificate(Projection.factor(projection.phi @ directions), delta)
@@ -324,12 +355,20 @@ def _certificate_along(projection: Projection, delta: Matrix, directions: Matrix
         return found
     direction = directions @ np.array(found.direction)
     shares = direction * np.linalg.norm(projection.phi, axis=(0, 1))
-    return replace(found, direction=_numbers(direction), shares=_numbers(shares / np.abs(shares).max()))
+    return replace(
+        found, direction=_numbers(direction), shares=_numbers(shares / np.abs(shares).max())
+    )
 
 
-def _certificate(projection: Projection, a: Vector, cosine: float, margin: Vector, points: int) -> Certificate:
-    direction = projection.from_coordinates(a) * np.sqrt(points)  # ‖Qa‖ = 1, so Φa has root mean square 1
-    sizes = np.sqrt(np.square(projection.phi * projection.scale).sum(axis=(0, 1))) / projection.scale
+def _certificate(
+    projection: Projection, a: Vector, cosine: float, margin: Vector, points: int
+) -> Certificate:
+    direction = projection.from_coordinates(a) * np.sqrt(
+        points
+    )  # ‖Qa‖ = 1, so Φa has root mean square 1
+    sizes = (
+        np.sqrt(np.square(projection.phi * projection.scale).sum(axis=(0, 1))) / projection.scale
+    )
     shares = direction * sizes
     return Certificate(
         "unremovable",
@@ -345,10 +384,12 @@ def _numbers(values: Vector) -> tuple[float, ...]:
 
 
 def _row_gain(gain: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """`gain`, checked against rows of the shape (N, ny)."""
+    """Return `gain`, checked against rows of the shape (N, ny)."""
     gain, ny = np.asarray(gain, dtype=float), shape[1]
     if gain.shape not in ((ny, ny), (*shape, ny)):
-        raise InputError(f"`gain` has shape {gain.shape}, which does not fit rows of shape {shape}.")
+        raise InputError(
+            f"`gain` has shape {gain.shape}, which does not fit rows of shape {shape}."
+        )
     if not np.all(np.isfinite(gain)):
         raise InputError("`gain` must be finite.")
     return gain

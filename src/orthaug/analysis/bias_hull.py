@@ -1,14 +1,15 @@
-"""The bias that a learner implies is a set: the hull over all causes that noise cannot tell from the best.
+"""Hull of the biases that a learner implies, over all causes that noise cannot separate.
 
-A cause that explains the share s of what the learner holds beside the physics leaves 1 − s of it. The truth leaves what
-the noise puts into the learner, `ν = E‖noise of it‖²/‖it‖²`, and what no form of the catalogue has; so a cause may be
-the true one where
+A cause that explains the share s of what the learner holds beside the physics leaves 1 − s of it.
+The truth leaves what the noise puts into the learner, `ν = E‖noise of it‖²/‖it‖²`, and what no form
+of the catalogue has; so a cause may be the true one where
 
     1 − s ≤ 12 (1 − s_best + ν),    and s at least 0.8 of s_best.
 
-Terms that are nearly the physics itself, `|v|^1.1`, fit anything with a huge size and stay out. Every such cause has an
-interval about the estimate less its bias, as wide as noise and what it leaves. What is shown is the hull of them; where
-that is wider than the value itself, the data do not determine it beside this learner.
+Terms that are nearly the physics itself, `|v|^1.1`, fit anything with a huge size and stay out.
+Every such cause has an interval about the estimate less its bias, as wide as noise and what it
+leaves. What is shown is the hull of them; where that is wider than the value itself, the data do
+not determine it beside this learner.
 """
 
 from __future__ import annotations
@@ -24,15 +25,17 @@ from orthaug._base.errors import Warning
 from orthaug._base.lines import percent
 from orthaug.inference.covariance import interval, reach
 
-_AS_CLOSE = 12.0  # over 17 forms, half of them in no catalogue, the right bias was within in 130 draws; in 128 by 8
-MOST_PHYSICS = 0.986  # cosine with the physics: beyond it a term is six times larger than what the learner shows of it
+# Over 17 forms, half of them in no catalogue, the right bias was within in 130 draws; in 128 by 8
+_AS_CLOSE = 12.0
+# Cosine with the physics: beyond it a term is six times larger than what the learner shows of it
+MOST_PHYSICS = 0.986
 _LEAST = 0.8  # of the best share: what explains less is no likely cause
-_TOLD = 4  # parameters that a warning lists at most
+_LISTED = 4  # parameters that a warning lists at most
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A cause that may be the true one: by how much the size found moves the parameters, estimate less truth."""
+    """Candidate for the true cause, with the parameters' shift by its size, estimate less truth."""
 
     name: str
     share: float
@@ -41,12 +44,15 @@ class Candidate:
 
     @property
     def unsure(self) -> Vector:
-        """Standard deviation of the bias that it does not explain: biased by as much for its size as the cause."""
+        """Standard deviation of the bias that the candidate leaves unexplained.
+
+        Relative to its size that part is assumed to be as biased as the cause.
+        """
         return np.abs(self.moved) * np.sqrt(max(1 - self.share, 0.0) / self.share)
 
 
 @dataclass(frozen=True, eq=False)
-class Named(Candidate):
+class NamedCause(Candidate):
     """The cause that is named, with the standard deviation of what it leaves."""
 
     rest: Vector | float = 0.0
@@ -58,7 +64,9 @@ class Named(Candidate):
 
 
 def compatible(candidates: Sequence[Candidate], noise: float) -> list[Candidate]:
-    """Return the causes that noise cannot tell from the best; of these the declared ones alone where there are any.
+    """Return the causes that noise cannot distinguish from the best.
+
+    Where any of these is declared, only declared ones are returned.
 
     Args:
         noise: ν, the share of what the learner holds that is noise.
@@ -73,26 +81,39 @@ def compatible(candidates: Sequence[Candidate], noise: float) -> list[Candidate]
 
 
 def hull(
-    value: Vector, std: Vector, freedom: float, candidates: Sequence[Candidate], extra: Vector | float = 0.0
+    value: Vector,
+    std: Vector,
+    freedom: float,
+    candidates: Sequence[Candidate],
+    extra: Vector | float = 0.0,
 ) -> Float[np.ndarray, "n 2"]:
     """Return 95 % intervals (n, 2) that hold the truth whichever of the candidates is the cause.
 
     Args:
         extra: a standard deviation that every cause has beside its own.
     """
-    each = np.array([interval(value - c.moved, np.sqrt(std**2 + c.unsure**2 + extra**2), freedom) for c in candidates])
+    each = np.array(
+        [
+            interval(value - c.moved, np.sqrt(std**2 + c.unsure**2 + extra**2), freedom)
+            for c in candidates
+        ]
+    )
     return np.stack([each[..., 0].min(axis=0), each[..., 1].max(axis=0)], axis=-1)
 
 
 def is_determined(value: float, std: float, freedom: float, low: float, high: float) -> bool:
-    """Return False where an interval is wider than the value itself and it is not noise that makes it so wide."""
+    """Return False where an interval is wider than its value and noise does not make it so wide."""
     noise = 2 * reach(freedom) * std
     return not (high - low > abs(value) and high - low > 2 * noise)
 
 
-def undetermined_warning(names: Sequence[str], candidates: Sequence[Candidate], remedies: Sequence[str]) -> Warning:
-    """The warning on parameters that the hull leaves open: why, and what would determine them."""
-    shown = ", ".join(names[:_TOLD]) + (f" and {len(names) - _TOLD} more" if len(names) > _TOLD else "")
+def undetermined_warning(
+    names: Sequence[str], candidates: Sequence[Candidate], remedies: Sequence[str]
+) -> Warning:
+    """Return the warning on parameters that the hull leaves open, with reason and remedy."""
+    shown = ", ".join(names[:_LISTED]) + (
+        f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
+    )
     apart = sorted(candidates, key=lambda c: float(np.sum(np.sign(c.moved) * c.moved**2)))
     pair = [apart[0], apart[-1]] if len(apart) > 1 else apart
     causes = " and ".join(f"{c.name}, {percent(c.share)} of what it found" for c in pair)
@@ -107,5 +128,7 @@ def undetermined_warning(names: Sequence[str], candidates: Sequence[Candidate], 
     )
     verb = "is" if len(names) == 1 else "are"
     return Warning(
-        "not_determined", f"{shown} {verb} not determined by these data beside this learner{of}. To determine: {cure}."
+        "not_determined",
+        f"{shown} {verb} not determined by these data beside this learner{of}. To determine: "
+        f"{cure}.",
     )

@@ -1,4 +1,4 @@
-"""Does the free run stay within bounds where its inputs grow? The factor from which it leaves them."""
+"""Bounds of the free run under growing inputs: the factor from which it leaves them."""
 
 from __future__ import annotations
 
@@ -20,27 +20,36 @@ from orthaug.models.model import Model
 from orthaug.models.motion_model import MotionModel
 from orthaug.models.on_records import RUNAWAY
 
-_LARGEST_FACTOR = 1e4  # outputs of a stable linear model grow with its inputs, and 10⁶ times the largest is "diverged"
+# Outputs of a stable linear model grow with its inputs, and 10⁶ times the largest is "diverged"
+_LARGEST_FACTOR = 1e4
 _SIDE_BY_SIDE = 16  # runs of one compiled call
-_MARGIN = 1.5  # a factor below is told as a warning
+_MARGIN = 1.5  # a factor below is a warning
 _CLOSE = 1.05  # ratio of two factors at which the bisection ends
 
 Diverging = Callable[[list[float]], np.ndarray]
 
 
-def divergence_scaling(model: Model | MotionModel, record: Record, largest: float = 1024.0) -> float | None:
-    """Factor on the inputs from which the free run leaves all bounds (10⁶ times the largest training output).
+def divergence_scaling(
+    model: Model | MotionModel, record: Record, largest: float = 1024.0
+) -> float | None:
+    """Return the factor on the inputs from which the free run leaves all bounds.
 
-    It scales each input's deviation from its mean over the record; the measured outputs that the run starts from stay.
-    Doubled until a run diverges, then bisected to 5 %; what is returned did diverge, and others below it may. Of longer
-    records 20000 rows are used, the first of each experiment. None where no run up to `largest` diverges, as without
-    a state; at most 1 where the record's own run does, and 0 where it does with its inputs at their means.
+    The bounds are 10⁶ times the largest training output.
+
+    It scales each input's deviation from its mean over the record; the measured outputs that the
+    run starts from stay. Doubled until a run diverges, then bisected to 5 %; what is returned did
+    diverge, and others below it may. Of longer records 20000 rows are used, the first of each
+    experiment. None where no run up to `largest` diverges, as without a state; at most 1 where the
+    record's own run does, and 0 where it does with its inputs at their means.
 
     Raises:
-        InputError: a record that does not fit the model, or a `largest` that is not above 1 and at most 10⁴.
+        InputError: a record that does not fit the model, or a `largest` that is not above 1 and at
+            most 10⁴.
     """
     if not 1 < check_number(largest, "largest", positive=True) <= _LARGEST_FACTOR:
-        raise InputError(f"`largest` must be a factor above 1 and at most {_LARGEST_FACTOR:g}; got {largest!r}.")
+        raise InputError(
+            f"`largest` must be a factor above 1 and at most {_LARGEST_FACTOR:g}; got {largest!r}."
+        )
     if not model.form.states:
         return None
     rows = max(MOST_STEPS // len(record.experiments), model.form.first_row + 1)
@@ -55,23 +64,33 @@ def divergence_scaling(model: Model | MotionModel, record: Record, largest: floa
 
 
 def margin(factor: float | None, searched: float, driven: bool) -> tuple[str, str]:
-    """Such a factor, or that there is none up to `searched`, in a sentence; with the code of a warning, or nothing.
+    """Return a sentence on the factor, or that there is none up to `searched`.
 
-    A model that is not `driven`, by inputs, has none to scale: its own run leaves the bounds or does not.
+    The second text is the code of a warning, or empty.
+
+    A model that is not `driven`, by inputs, has none to scale: its own run leaves the bounds or
+    does not.
     """
     if not driven:
-        stays = "stays within all bounds" if factor is None else "leaves all bounds from where it starts"
+        stays = (
+            "stays within all bounds"
+            if factor is None
+            else "leaves all bounds from where it starts"
+        )
         return (
             f"The free run {stays}; it has no inputs that could be larger.",
             "small_margin" if factor is not None else "",
         )
     stays, times = ("stays within", searched) if factor is None else ("leaves", factor)
-    told = f"The free run {stays} all bounds with the inputs' deviations from their means {times:.4g} times as large."
-    return told, "small_margin" if factor is not None and factor < _MARGIN else ""
+    text = (
+        f"The free run {stays} all bounds with the inputs' deviations from their means "
+        f"{times:.4g} times as large."
+    )
+    return text, "small_margin" if factor is not None and factor < _MARGIN else ""
 
 
 def _doubled(largest: float) -> list[float]:
-    """1, 2, 4, …, `largest`."""
+    """Return the factors 1, 2, 4, …, `largest`."""
     factors = [1.0]
     while factors[-1] < largest:
         factors.append(min(2 * factors[-1], largest))
@@ -79,7 +98,11 @@ def _doubled(largest: float) -> list[float]:
 
 
 def _below_one(diverges: Diverging) -> float:
-    """The factor where a run with the record's own inputs diverges: below 10⁻⁴ the last one tried, or 0."""
+    """Return the factor below 1 from which the run diverges.
+
+    The run diverges with the record's own inputs. Below 10⁻⁴ the factor is the last one tried, or
+    0.
+    """
     falling = [1.0]
     while falling[-1] >= 1 / _LARGEST_FACTOR:
         falling.append(falling[-1] / 2)
@@ -91,7 +114,10 @@ def _below_one(diverges: Diverging) -> float:
 
 
 def _bisected(low: float, high: float, diverges: Diverging) -> float:
-    """The lowest factor that is known to diverge once `low` and `high` are close; every middle is tried at once."""
+    """Return the lowest factor that is known to diverge once `low` and `high` are close.
+
+    Every middle is tried at once.
+    """
     middles = _middles(low, high)
     if not middles:
         return high
@@ -103,7 +129,10 @@ def _bisected(low: float, high: float, diverges: Diverging) -> float:
 
 
 def _middles(low: float, high: float) -> list[float]:
-    """All factors that a bisection between two, at most one double the other, can come to: 15 or fewer."""
+    """Return all factors that a bisection of an interval can reach: 15 or fewer.
+
+    The upper end is at most double the lower one.
+    """
     if not high > _CLOSE * low:
         return []
     middle = _middle(low, high)
@@ -114,8 +143,12 @@ def _middle(low: float, high: float) -> float:
     return float(np.sqrt(low * high))
 
 
-def _diverging(model: Model | MotionModel, record: Record, factors: Sequence[float]) -> Bool[np.ndarray, "f"]:
-    """Whether the free run diverges with the inputs' deviations from their means times each of up to 16 factors.
+def _diverging(
+    model: Model | MotionModel, record: Record, factors: Sequence[float]
+) -> Bool[np.ndarray, "f"]:
+    """Return whether the free run diverges with its inputs scaled by each of up to 16 factors.
+
+    A factor scales the inputs' deviations from their means.
 
     The runs start from the measured outputs of each experiment and go side by side.
 
@@ -123,7 +156,9 @@ def _diverging(model: Model | MotionModel, record: Record, factors: Sequence[flo
         InputError: a record that does not fit the model, or has no outputs to start from.
     """
     if not record.outputs:
-        raise InputError("the record has no measured outputs to start from; give those of its first rows.")
+        raise InputError(
+            "the record has no measured outputs to start from; give those of its first rows."
+        )
     form: Dynamics = model.form
     record = usable(model, record)
     mean = np.concatenate([e.inputs for e in record.experiments]).mean(axis=0)
@@ -133,11 +168,18 @@ def _diverging(model: Model | MotionModel, record: Record, factors: Sequence[flo
         if wild.all():
             break
         inputs = form.inputs(experiment, record)
-        resting = form.inputs(replace(experiment, inputs=np.tile(mean, (len(experiment), 1))), record)
+        resting = form.inputs(
+            replace(experiment, inputs=np.tile(mean, (len(experiment), 1))), record
+        )
         padded = np.zeros((2, padded_length(len(inputs)), inputs.shape[1]))
         padded[:, : len(inputs)] = resting, inputs
-        state, bound = form.start(experiment.outputs, [form.first_row])[0], RUNAWAY * model.largest_output
-        wild |= np.asarray(_side_by_side(form, model.numbers, state, *padded, len(inputs), scales, bound))
+        state, bound = (
+            form.start(experiment.outputs, [form.first_row])[0],
+            RUNAWAY * model.largest_output,
+        )
+        wild |= np.asarray(
+            _side_by_side(form, model.numbers, state, *padded, len(inputs), scales, bound)
+        )
     return wild[: len(factors)]
 
 
@@ -152,7 +194,10 @@ def _side_by_side(
     factors: Float[Array, "f"],
     bound: Float[Array, "ny"],
 ) -> Bool[Array, "f"]:
-    """Whether an output leaves `bound` within `steps` of free runs with `resting + factor (inputs − resting)`."""
+    """Return whether an output leaves `bound` within `steps` of each scaled free run.
+
+    The inputs of a run are `resting + factor (inputs − resting)`.
+    """
     one = jax.vmap(lambda state, row: form.step(numbers, state, row))
 
     def going_on(carry: tuple[Any, Any, Any]) -> Any:

@@ -1,15 +1,16 @@
-"""What the learner found, explained by a cause, and the bias of every parameter that follows from it.
+"""Bias budget: the cause that explains the learner, and the bias of every parameter by it.
 
-With F the learner's values under the measure and Δ a cause's, the coefficient is that of P⊥F on P⊥Δ and the bias,
-estimate less truth, `Φ_μ⁺Δ` times it. One cause is named: the declared suspect that explains most of ‖P⊥F‖² if that is
-enough, else the usual suspect or product of lags that does, or the member of a family (`catalogue`) that explains
-clearly more; one of each output where none is sure to be all of it. The interval is the hull over all causes that noise
-cannot tell from it (`bias_hull`).
+With F the learner's values under the measure and Δ a cause's, the coefficient is that of P⊥F on P⊥Δ
+and the bias, estimate less truth, `Φ_μ⁺Δ` times it. One cause is named: the declared suspect that
+explains most of ‖P⊥F‖² if that is enough, else the usual suspect or product of lags that does, or
+the member of a family (`catalogue`) that explains clearly more; one of each output where none is
+sure to be all of it. The interval is the hull over all causes that noise cannot separate
+from it (`bias_hull`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -23,38 +24,127 @@ from orthaug.analysis.bias import SuspectedBias, orthogonal_part
 from orthaug.analysis.bias_hull import (
     MOST_PHYSICS,
     Candidate,
-    Named,
+    NamedCause,
     compatible,
     hull,
     is_determined,
     undetermined_warning,
 )
 from orthaug.analysis.catalogue import catalogue
-from orthaug.analysis.measure_bias import Ground, physical_with_bias
-from orthaug.analysis.remedies import remedies
+from orthaug.analysis.imitation import other_inputs
+from orthaug.analysis.measure_bias import MeasureLinearization, physical_with_bias
 from orthaug.analysis.suspects import Suspect, saturations, usual_suspects, usual_terms
+from orthaug.data.expressions import parse
+from orthaug.data.regressors import Features
 from orthaug.fitting.estimates import Estimate
-from orthaug.inference.measures import Measure, Training, weigh_problem
+from orthaug.inference.measures import Measure, Symmetrized, Training, Uniform, weigh_problem
 from orthaug.physics.output_weights import times
 from orthaug.physics.parameters import PhysicsMap
+from orthaug.physics.shared import seen, shared_directions
 
 if TYPE_CHECKING:
     from orthaug.analysis.motion_bias import TermBias
 
+_REMOVED = 0.1  # of the bias may remain
+_MEASURED_ROWS = 50_000  # above which no other measure is tried
+
+
+def remedies(
+    linearization: MeasureLinearization, cause: SuspectedBias, biased: Sequence[str]
+) -> list[str]:
+    """Return sentences on how to remove the bias of the named parameters, the easiest first."""
+    return [*_by_inputs(linearization, cause, biased), *_by_measure(linearization, cause, biased)]
+
+
+def _by_inputs(
+    linearization: MeasureLinearization, cause: SuspectedBias, biased: Sequence[str]
+) -> Iterator[str]:
+    """Yield the choice of learner inputs that frees most of the parameters."""
+    problem, suspect = linearization.problem, cause.suspect
+    layout, x = problem.layout, problem.rows.x
+    now = {str(entry) for entry in problem.features.entries}
+    best: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())
+    for inputs in dict.fromkeys(
+        (*(((suspect.on,),) if suspect.on else ()), *other_inputs(problem))
+    ):
+        if set(inputs) == now:
+            continue
+        features = Features(tuple(parse(text, dict(problem.baseline.constants)) for text in inputs))
+        if not set(features.lags) <= set(layout):
+            continue
+        if not seen(features, layout, x, lambda rows: suspect.form(rows, layout)[:, None])[0]:
+            continue
+        shared = shared_directions(problem.baseline, features, layout, problem.outputs, x)
+        if shared.all:
+            continue
+        left = _bias(replace(linearization, directions=shared.basis), suspect)
+        freed = _freed(linearization, cause, left, biased)
+        if len(freed) > len(best[1]):
+            best = (inputs, freed)
+    if best[1]:
+        listed = ", ".join(f'"{text}"' for text in best[0])
+        rest = "" if len(best[1]) == len(biased) else f" for {', '.join(best[1])}"
+        yield f"set learner.inputs = [{listed}]{rest}"
+
+
+def _by_measure(
+    linearization: MeasureLinearization, cause: SuspectedBias, biased: Sequence[str]
+) -> Iterator[str]:
+    """Yield a measure that brings the bias of all of them near zero."""
+    if cause.seen is False or len(linearization.problem.rows) > _MEASURED_ROWS:
+        return
+    for measure in (Symmetrized(), Uniform()):
+        if measure.name == linearization.weighed.measure.name:
+            continue
+        try:
+            other = replace(
+                linearization, weighed=weigh_problem(measure, linearization.problem), learned=None
+            )
+            left = _bias(other, cause.suspect)
+        except InputError:
+            continue
+        if len(_freed(linearization, cause, left, biased)) == len(biased):
+            yield f"split under the {measure.name} measure"
+            return
+
+
+def _bias(linearization: MeasureLinearization, suspect: Suspect) -> Vector:
+    """Return the bias per unit of a suspect that the learner sees."""
+    values = suspect.values(
+        linearization.weighed.points.x, linearization.problem.layout, linearization.problem.outputs
+    )
+    return linearization.weighed.projection.solve_along(
+        times(linearization.weighed.unit, values), linearization.directions
+    )
+
+
+def _freed(
+    linearization: MeasureLinearization, cause: SuspectedBias, left: Vector, biased: Sequence[str]
+) -> tuple[str, ...]:
+    """Return the parameters, physical ones by their slopes, whose bias shrinks to a small part."""
+    names, before = linearization.problem.baseline.names, np.array(cause.bias)
+    rows = dict(zip(names, np.eye(len(names)), strict=True)) | (
+        linearization.slopes[0] if linearization.slopes else {}
+    )
+    return tuple(
+        name for name in biased if abs(rows[name] @ left) <= _REMOVED * abs(rows[name] @ before)
+    )
+
+
 LEAST_SHARE = 0.5  # of the learner's energy that a cause must explain to be named
 _NOTHING = 0.01  # of the noise: a learner that is smaller found nothing that could be explained
 _FEWEST_LEFT = 5  # rows beyond what was fitted: where fewer are left any term explains the learner
-AS_MUCH = 0.98  # of what the cause explains: a rival cannot be told from it
-SURE_SHARE = 0.9  # from which on a cause is told without a doubt
+AS_MUCH = 0.98  # of what the cause explains: a rival is as good
+SURE_SHARE = 0.9  # from which on a cause is named without a doubt
 _NEAR = 0.5  # of what the cause explains: a rival that is named beside it
 _MOST_RIVALS = 3
 _ROUNDING = 1e-9  # of a parameter: a bias that no one can speak of
-_TOLD = 4  # parameters that a warning lists at most
+_LISTED = 4  # parameters that a warning lists at most
 
 
 @dataclass(frozen=True)
 class ParameterBias:
-    """The bias of a parameter, estimate less truth, and an interval that covers bias and noise together."""
+    """Bias of a parameter, estimate less truth, with an interval that covers bias and noise."""
 
     name: str
     value: float
@@ -64,14 +154,16 @@ class ParameterBias:
     errors: float | None
     """Its size in standard errors; None where there are none."""
     ci95: tuple[float, float] | None
-    """The hull over all causes that noise cannot tell apart; None where that determines nothing."""
+    """The hull over all causes that noise cannot separate; None where that determines nothing."""
     determined: bool = True
-    """Whether the data determine the parameter beside this learner: the hull is no wider than the value itself."""
+    """Whether the data determine the parameter beside this learner: the hull is no wider than the
+    value itself.
+    """
 
 
 @dataclass(frozen=True, eq=False)
 class Budget:
-    """The bias of every parameter by the causes that explain the learner, that of the largest part first."""
+    """Bias of every parameter by the causes that explain the learner, the largest part first."""
 
     causes: tuple[SuspectedBias, ...]
     parameters: tuple[ParameterBias, ...]
@@ -80,25 +172,32 @@ class Budget:
 
     @property
     def cause(self) -> SuspectedBias:
-        """What explains most."""
+        """Cause that explains most."""
         return self.causes[0]
 
     @property
     def share(self) -> float:
-        """How much of the learner that explains; where each output has a cause, of what is learned of its own."""
+        """Share of the learner that the causes explain.
+
+        Where each output has a cause, of what is learned of its own.
+        """
         return explains(self.cause)
 
     def of(self, name: str) -> ParameterBias | None:
-        """The bias of a parameter or physical parameter."""
-        return next((entry for entry in (*self.parameters, *self.physical) if entry.name == name), None)
+        """Return the bias of a parameter or physical parameter."""
+        return next(
+            (entry for entry in (*self.parameters, *self.physical) if entry.name == name), None
+        )
 
 
-def ground_of(fit: Estimate, measure: Measure, physics: PhysicsMap | None = None) -> Ground:
-    """What biases of a fit are computed on; `measure` is the one that θ was split under."""
+def linearization_of(
+    fit: Estimate, measure: Measure, physics: PhysicsMap | None = None
+) -> MeasureLinearization:
+    """Return the linearization of a fit for biases, under the measure that θ was split under."""
     weighed = weigh_problem(measure, fit.problem)
     learns = fit.model.form.bound is not None
     learned = fit.model.learner_at(weighed.points.x) if learns else None
-    return Ground(weighed, fit.problem, fit.theta, physics, learned, fit.model.shared)
+    return MeasureLinearization(weighed, fit.problem, fit.theta, physics, learned, fit.model.shared)
 
 
 def lagged_budget(
@@ -114,72 +213,107 @@ def lagged_budget(
     measure = Training() if measure is None else measure
     name = "training" if fit.measure is None else fit.measure.name
     if measure.name != name:
-        raise InputError(f"`measure` is the {measure.name} measure, but θ was split under the {name} measure.")
-    return budget_on(ground_of(fit, measure, physics), fit, suspects)
+        raise InputError(
+            f"`measure` is the {measure.name} measure, but θ was split under the {name} measure."
+        )
+    return budget_on(linearization_of(fit, measure, physics), fit, suspects)
 
 
-def budget_on(ground: Ground, fit: Estimate, suspects: Sequence[Suspect]) -> Budget | None:
-    """The same on a ground that is there already."""
-    if not ground.problem.baseline.names or ground.learned is None or not np.all(np.isfinite(ground.learned)):
+def budget_on(
+    linearization: MeasureLinearization, fit: Estimate, suspects: Sequence[Suspect]
+) -> Budget | None:
+    """Return the budget of a fit on a given linearization."""
+    if (
+        not linearization.problem.baseline.names
+        or linearization.learned is None
+        or not np.all(np.isfinite(linearization.learned))
+    ):
         return None
     if fit.freedom < _FEWEST_LEFT:
         return None
     noise = fit.model.statistics.noise
     least = 0.0 if noise is None else _NOTHING**2 * np.diag(noise)
-    something = np.mean(ground.learned**2, axis=0) >= least
-    found, nameless = _causes(ground, suspects, something) if something.any() else ([], [])
+    something = np.mean(linearization.learned**2, axis=0) >= least
+    found, nameless = _causes(linearization, suspects, something) if something.any() else ([], [])
     if not found:
         return None
-    causes, moved = tuple(cause for _, cause in found), np.array([_moved(cause) for _, cause in found])
-    bias, rest = moved.sum(axis=0), [row for own, cause in found for row in left_over(own, cause, suspects)]
+    causes, moved = (
+        tuple(cause for _, cause in found),
+        np.array([_moved(cause) for _, cause in found]),
+    )
+    bias, rest = (
+        moved.sum(axis=0),
+        [row for own, cause in found for row in left_over(own, cause, suspects)],
+    )
     rest = np.array([*rest, *map(_moved, nameless)])
     candidates = _candidates(found, bias, np.linalg.norm(rest, axis=0), suspects, fit)
     std = np.full(len(bias), np.nan) if fit.std is None else fit.std
     other = _norm([_moved(cause) for cause in nameless])
     ends = hull(fit.theta, std, fit.freedom, candidates, other)
-    names = ground.problem.baseline.names
-    parameters = parameter_biases(names, fit.theta, std, bias, ends, _owners(causes, moved), fit.freedom)
+    names = linearization.problem.baseline.names
+    parameters = parameter_biases(
+        names, fit.theta, std, bias, ends, _owners(causes, moved), fit.freedom
+    )
     rows, warnings = (), []
-    if ground.physics is not None:
-        rows, warnings = _physical_rows(ground, fit, candidates, moved, causes, other)
-    told = (_warning(own, cause, (*rows, *parameters), suspects, own is not ground) for own, cause in found)
-    told = [warning for warning in told if warning is not None]
+    if linearization.physics is not None:
+        rows, warnings = _physical_rows(linearization, fit, candidates, moved, causes, other)
+    raised = (
+        _warning(own, cause, (*rows, *parameters), suspects, own is not linearization)
+        for own, cause in found
+    )
+    raised = [warning for warning in raised if warning is not None]
     open_ones = [row.name for row in (*rows, *parameters) if not row.determined]
     if open_ones:
         own, cause = found[0]
-        told.append(undetermined_warning(open_ones, candidates, remedies(own, cause, open_ones)))
-    return Budget(causes, parameters, rows, (*told, *warnings))
+        raised.append(undetermined_warning(open_ones, candidates, remedies(own, cause, open_ones)))
+    return Budget(causes, parameters, rows, (*raised, *warnings))
 
 
 def _norm(rows: Sequence[Vector]) -> Vector | float:
     return np.linalg.norm(np.array(rows), axis=0) if len(rows) else 0.0
 
 
-def noise_share(ground: Ground, fit: Estimate) -> float:
-    """ν: how much of what the learner holds beside the physics is noise, of which it takes σ² a weight that it uses."""
+def noise_share(linearization: MeasureLinearization, fit: Estimate) -> float:
+    """Return ν, the share of noise in what the learner holds beside the physics.
+
+    Noise takes σ² for each weight that the learner uses.
+    """
     noise = fit.model.statistics.noise
     if noise is None:
         return 0.0
-    unit = ground.weighed.unit
-    own = orthogonal_part(ground.weighed.projection, times(unit, np.asarray(ground.learned)), ground.directions)
+    unit = linearization.weighed.unit
+    own = orthogonal_part(
+        linearization.weighed.projection,
+        times(unit, np.asarray(linearization.learned)),
+        linearization.directions,
+    )
     rows = np.ones((len(own), 1)) * np.sqrt(np.diag(noise))
-    taken = fit.effective_weights / ground.problem.count * np.sum(times(unit, rows) ** 2) / own.shape[1]
+    taken = (
+        fit.effective_weights
+        / linearization.problem.count
+        * np.sum(times(unit, rows) ** 2)
+        / own.shape[1]
+    )
     return float(taken / max(np.sum(own**2), np.finfo(float).tiny))
 
 
 def _candidates(
-    found: Sequence[tuple[Ground, SuspectedBias]],
+    found: Sequence[tuple[MeasureLinearization, SuspectedBias]],
     bias: Vector,
     rest: Vector,
     suspects: Sequence[Suspect],
     fit: Estimate,
 ) -> list[Candidate]:
-    """Return the named causes, and what may stand instead of one of them."""
+    """Return the named causes and their rivals."""
     several = " and ".join(cause.suspect.name for _, cause in found)
-    kept: list[Candidate] = [Named(several, min(explains(cause) for _, cause in found), bias, rest=rest)]
+    kept: list[Candidate] = [
+        NamedCause(several, min(explains(cause) for _, cause in found), bias, rest=rest)
+    ]
     for own, cause in found:
         others = (*_declared(own, suspects), *_usual(own), *_families(own))
-        others += own.table(saturations([entry.suspect for entry in others]), certify=False, every=False)
+        others += own.table(
+            saturations([entry.suspect for entry in others]), certify=False, every=False
+        )
         likely = [
             Candidate(entry.suspect.name, explains(entry), _moved(entry) + bias - _moved(cause),
                       entry.suspect in suspects)
@@ -191,40 +325,61 @@ def _candidates(
 
 
 def _physical_rows(
-    ground: Ground,
+    linearization: MeasureLinearization,
     fit: Estimate,
     candidates: Sequence[Candidate],
     moved: Float[np.ndarray, "k n"],
     causes: Sequence[SuspectedBias],
     other: Vector | float,
 ) -> tuple[tuple[ParameterBias, ...], list[Warning]]:
-    """The biases of the physical parameters: the hull over the causes that move any of them farthest."""
-    assert ground.physics is not None
-    physical, slopes, bias = fit.physical(ground.physics), ground.slopes, moved.sum(axis=0)
+    """Return the biases of the physical parameters: the hull over the causes that matter.
+
+    Those are the causes that move any of them farthest.
+    """
+    assert linearization.physics is not None
+    physical, slopes, bias = (
+        fit.physical(linearization.physics),
+        linearization.slopes,
+        moved.sum(axis=0),
+    )
     own = np.array([np.nan if s is None else s for s in physical.std])
-    turned = np.array([slopes[0][name] for name in physical.names]) if slopes else np.zeros((0, len(bias)))
+    turned = (
+        np.array([slopes[0][name] for name in physical.names])
+        if slopes
+        else np.zeros((0, len(bias)))
+    )
     chosen = [candidates[0]]
     for row in turned:
         for sign in (-1.0, 1.0):
-            wide = [sign * row @ c.moved + np.sqrt(np.sum((row * c.unsure) ** 2)) for c in candidates]
+            wide = [
+                sign * row @ c.moved + np.sqrt(np.sum((row * c.unsure) ** 2)) for c in candidates
+            ]
             chosen.append(candidates[int(np.argmax(np.nan_to_num(wide, nan=-np.inf)))])
     ends, shifts = [], np.zeros(len(physical.names))
     for i, c in enumerate({id(c): c for c in chosen}.values()):
         spread = np.outer(c.unsure, c.unsure) + np.diag(np.zeros(len(bias)) + other) ** 2
         spread = spread + (0.0 if fit.covariance is None else fit.covariance)
-        moves, limits = physical_with_bias(ground, c.moved, fit.covariance, spread, fit.freedom)
+        moves, limits = physical_with_bias(
+            linearization, c.moved, fit.covariance, spread, fit.freedom
+        )
         shifts = shifts if i else moves
         ends.append(limits)
-    ends = np.stack([np.min(ends, axis=0)[:, 0], np.max(ends, axis=0)[:, 1]], axis=-1)  # NaN where one has none
+    ends = np.stack(
+        [np.min(ends, axis=0)[:, 0], np.max(ends, axis=0)[:, 1]], axis=-1
+    )  # NaN where one has none
     owners = _owners(causes, moved @ turned.T) if slopes else []
     rows = parameter_biases(physical.names, physical.value, own, shifts, ends, owners, fit.freedom)
     return rows, _unbounded(physical.names, own, ends)
 
 
 def _causes(
-    ground: Ground, suspects: Sequence[Suspect], something: Bool[np.ndarray, "ny"]
-) -> tuple[list[tuple[Ground, SuspectedBias]], list[SuspectedBias]]:
-    """What explains the learner, with the ground that it does so on: all of it, or what is learned of one output.
+    linearization: MeasureLinearization,
+    suspects: Sequence[Suspect],
+    something: Bool[np.ndarray, "ny"],
+) -> tuple[list[tuple[MeasureLinearization, SuspectedBias]], list[SuspectedBias]]:
+    """Return the causes that explain the learner, each with its linearization.
+
+    One cause explains all of it, or one cause each output's part.
 
     Args:
         something: whether anything is learned of an output.
@@ -232,34 +387,52 @@ def _causes(
     Returns:
         The causes; and of each output without one what explains most, where that is less than half.
     """
-    whole, outputs = named_cause(ground, suspects), ground.problem.outputs
-    found = [] if whole is None else [(ground, whole)]
+    whole, outputs = named_cause(linearization, suspects), linearization.problem.outputs
+    found = [] if whole is None else [(linearization, whole)]
     if len(outputs) == 1 or (whole is not None and explains(whole) >= SURE_SHARE):
         return found, []
     each, nameless = [], []
     for i in np.flatnonzero(something):
-        own = replace(ground, learned=np.asarray(ground.learned) * np.eye(len(outputs))[i])
+        own = replace(
+            linearization, learned=np.asarray(linearization.learned) * np.eye(len(outputs))[i]
+        )
         cause = named_cause(own, suspects) or _likeliest(own, suspects)
         if cause is not None and explains(cause) < LEAST_SHARE:
             nameless.append(cause)
         elif cause is not None and cause.suspect.column_of(outputs) == i:
             each.append((own, cause))
-    each.sort(key=lambda part: -np.linalg.norm(times(ground.weighed.unit, np.asarray(part[0].learned))))
+    each.sort(
+        key=lambda part: (
+            -np.linalg.norm(times(linearization.weighed.unit, np.asarray(part[0].learned)))
+        )
+    )
     return each if len(each) > len(found) else found, nameless
 
 
-def _owners(causes: Sequence[SuspectedBias], moved: Float[np.ndarray, "k n"]) -> list[tuple[str, float]]:
-    """Of each parameter the cause that moves it most, and its share."""
+def _owners(
+    causes: Sequence[SuspectedBias], moved: Float[np.ndarray, "k n"]
+) -> list[tuple[str, float]]:
+    """Return for each parameter the cause that moves it most, and its share."""
     return [(causes[i].suspect.name, explains(causes[i])) for i in np.argmax(np.abs(moved), axis=0)]
 
 
-def named_cause(ground: Ground, suspects: Sequence[Suspect], least: float = LEAST_SHARE) -> SuspectedBias | None:
-    """The cause that explains most of the learner, the declared ones first; None where that is less than `least`.
+def named_cause(
+    linearization: MeasureLinearization, suspects: Sequence[Suspect], least: float = LEAST_SHARE
+) -> SuspectedBias | None:
+    """Return the cause that explains most of the learner, the declared ones first.
 
-    Of what no one declared only what the learner sees counts: the rest is no likely cause of what it found.
+    None where that is less than `least`.
+
+    Undeclared terms count only if the learner sees them: others are no likely cause.
     """
-    for table, families in ((_declared(ground, suspects), ()), (_usual(ground), _families(ground))):
-        best, other = max(table, key=explains, default=None), max(families, key=explains, default=None)
+    for table, families in (
+        (_declared(linearization, suspects), ()),
+        (_usual(linearization), _families(linearization)),
+    ):
+        best, other = (
+            max(table, key=explains, default=None),
+            max(families, key=explains, default=None),
+        )
         if other is not None and (best is None or explains(best) < AS_MUCH * explains(other)):
             best = other
         if best is not None and explains(best) >= least:
@@ -267,58 +440,87 @@ def named_cause(ground: Ground, suspects: Sequence[Suspect], least: float = LEAS
     return None
 
 
-def _likeliest(ground: Ground, suspects: Sequence[Suspect]) -> SuspectedBias | None:
-    """What explains most of the learner, however little, declared or not."""
-    found = (*_declared(ground, suspects), *_usual(ground))
+def _likeliest(
+    linearization: MeasureLinearization, suspects: Sequence[Suspect]
+) -> SuspectedBias | None:
+    """Return the suspect that explains most of the learner, however little, declared or not."""
+    found = (*_declared(linearization, suspects), *_usual(linearization))
     return max((entry for entry in found if entry.explained), key=explains, default=None)
 
 
 def explains(entry: SuspectedBias | TermBias) -> float:
-    """Its share of the learner."""
+    """Return the share of the learner that an entry explains."""
     return entry.explained or 0.0
 
 
-def _declared(ground: Ground, suspects: Sequence[Suspect]) -> tuple[SuspectedBias, ...]:
-    return ground.table(tuple(suspects), certify=False, every=False) if suspects else ()
+def _declared(
+    linearization: MeasureLinearization, suspects: Sequence[Suspect]
+) -> tuple[SuspectedBias, ...]:
+    return linearization.table(tuple(suspects), certify=False, every=False) if suspects else ()
 
 
-def _usual(ground: Ground) -> tuple[SuspectedBias, ...]:
-    terms = (*usual_suspects(ground.problem), *usual_terms(ground.problem))
-    return tuple(entry for entry in ground.table(terms, certify=False, every=False) if entry.seen is not False)
+def _usual(linearization: MeasureLinearization) -> tuple[SuspectedBias, ...]:
+    terms = (*usual_suspects(linearization.problem), *usual_terms(linearization.problem))
+    return tuple(
+        entry
+        for entry in linearization.table(terms, certify=False, every=False)
+        if entry.seen is not False
+    )
 
 
-def _families(ground: Ground) -> tuple[SuspectedBias, ...]:
-    """What every member of the catalogue does that the learner sees."""
-    table = ground.table(catalogue(ground.problem), certify=False, every=False)
-    return tuple(entry for entry in table if entry.seen is not False and (entry.cosine or 0.0) <= MOST_PHYSICS)
+def _families(linearization: MeasureLinearization) -> tuple[SuspectedBias, ...]:
+    """Return the biases by every member of the catalogue that the learner sees."""
+    table = linearization.table(catalogue(linearization.problem), certify=False, every=False)
+    return tuple(
+        entry
+        for entry in table
+        if entry.seen is not False and (entry.cosine or 0.0) <= MOST_PHYSICS
+    )
 
 
-def rival_of(ground: Ground, cause: SuspectedBias, suspects: Sequence[Suspect]) -> SuspectedBias | None:
-    """A term that explains as much as a cause that no one declared, and moves θ elsewhere; None where there is none.
+def rival_of(
+    linearization: MeasureLinearization, cause: SuspectedBias, suspects: Sequence[Suspect]
+) -> SuspectedBias | None:
+    """Return a term that explains as much as a cause that no one declared, and moves θ elsewhere.
 
-    As a dead zone and a saturation of what the physics has a term in: their sum is that term.
+    None where there is none.
+
+    An example is a dead zone and a saturation where the physics has a linear term: their sum is
+    that term.
     """
     assert cause.explained
     if cause.suspect in suspects:
         return None
-    usual = _usual(ground)
-    usual += ground.table(saturations([entry.suspect for entry in usual]), certify=False, every=False)
+    usual = _usual(linearization)
+    usual += linearization.table(
+        saturations([entry.suspect for entry in usual]), certify=False, every=False
+    )
     equal = [entry for entry in usual if explains(entry) >= AS_MUCH * cause.explained]
-    to_coordinates, own = ground.weighed.projection.to_coordinates, _moved(cause)
+    to_coordinates, own = linearization.weighed.projection.to_coordinates, _moved(cause)
 
     def apart(entry: SuspectedBias) -> float:
         return float(np.linalg.norm(to_coordinates @ (_moved(entry) - own)))
 
     farthest = max(equal, key=apart, default=None)
-    return farthest if farthest and apart(farthest) > 0.5 * np.linalg.norm(to_coordinates @ own) else None
+    return (
+        farthest
+        if farthest and apart(farthest) > 0.5 * np.linalg.norm(to_coordinates @ own)
+        else None
+    )
 
 
-def near_causes(ground: Ground, cause: SuspectedBias, suspects: Sequence[Suspect]) -> list[SuspectedBias]:
-    """The next best causes, one of each variable, beside one that no one declared and that is not sure."""
+def near_causes(
+    linearization: MeasureLinearization, cause: SuspectedBias, suspects: Sequence[Suspect]
+) -> list[SuspectedBias]:
+    """Return the next best causes, one per variable, for a cause undeclared and unsure."""
     assert cause.explained
     if cause.suspect in suspects or cause.explained >= SURE_SHARE:
         return []
-    others = [entry for entry in _usual(ground) if entry.suspect != cause.suspect and entry.explained]
+    others = [
+        entry
+        for entry in _usual(linearization)
+        if entry.suspect != cause.suspect and entry.explained
+    ]
     near = [entry for entry in others if explains(entry) >= _NEAR * cause.explained]
     best: dict[str, SuspectedBias] = {}
     for entry in sorted(near, key=explains, reverse=True):
@@ -326,20 +528,26 @@ def near_causes(ground: Ground, cause: SuspectedBias, suspects: Sequence[Suspect
     return list(best.values())[:_MOST_RIVALS]
 
 
-def left_over(ground: Ground, cause: SuspectedBias, suspects: Sequence[Suspect]) -> Float[np.ndarray, "k nt"]:
-    """Standard deviations of the bias of θ that the cause does not tell: k directions, each of one unknown size.
+def left_over(
+    linearization: MeasureLinearization, cause: SuspectedBias, suspects: Sequence[Suspect]
+) -> Float[np.ndarray, "k nt"]:
+    """Return the standard deviations of the bias of θ that the cause leaves open.
 
-    What it leaves of the learner counts as biased by as much for its size as the cause, of unknown sign; beside that by
-    what the next best cause makes of it. What may stand instead of the cause is in the hull.
+    They are k directions, each of one unknown size.
+
+    The unexplained part of the learner is assumed to be as biased for its size as the cause, with
+    unknown sign; the next best cause adds its own bias. Rivals of the cause are in the hull.
     """
     assert cause.explained
-    after = _likeliest(ground.without(cause), [suspect for suspect in suspects if suspect != cause.suspect])
+    after = _likeliest(
+        linearization.without(cause), [suspect for suspect in suspects if suspect != cause.suspect]
+    )
     rows = [_moved(cause) * np.sqrt((1 - cause.explained) / cause.explained)]
     return np.array([*rows, *([] if after is None else [_moved(after)])])
 
 
 def _moved(cause: SuspectedBias) -> Vector:
-    """What a cause of the size found makes of θ."""
+    """Return θ moved by a cause of the size found."""
     return (cause.coefficient_found or 0.0) * np.array(cause.bias)
 
 
@@ -352,45 +560,86 @@ def parameter_biases(
     causes: Sequence[tuple[str, float]],
     freedom: float,
 ) -> tuple[ParameterBias, ...]:
-    """A row for each parameter whose bias is known; `ends` are those of its interval, `causes` names and shares."""
+    """Return a row for each parameter whose bias is known.
+
+    `ends` are those of its interval, `causes` names and shares.
+    """
     found = []
-    for name, v, s, b, ci, (cause, share) in zip(names, value, std, bias, ends, causes, strict=True):
+    for name, v, s, b, ci, (cause, share) in zip(
+        names, value, std, bias, ends, causes, strict=True
+    ):
         if np.isfinite(b):
             errors, relative = float(abs(b) / s) if s > 0 else None, float(b / v) if v else None
             limits = (float(ci[0]), float(ci[1])) if np.isfinite(ci).all() else None
-            told = limits is None or is_determined(float(v), float(s), freedom, *limits)
-            found.append(ParameterBias(name, float(b), cause, share, relative, errors, limits if told else None, told))
+            determined = limits is None or is_determined(float(v), float(s), freedom, *limits)
+            found.append(
+                ParameterBias(
+                    name,
+                    float(b),
+                    cause,
+                    share,
+                    relative,
+                    errors,
+                    limits if determined else None,
+                    determined,
+                )
+            )
     return tuple(found)
 
 
 def _unbounded(names: Sequence[str], std: Vector, ends: Matrix) -> list[Warning]:
-    """Which physical parameters have an interval, but none with their bias."""
-    none = [name for name, s, e in zip(names, std, ends, strict=True) if np.isfinite(s) and not np.isfinite(e).all()]
+    """Return a warning where physical parameters have an interval but no bounded bias."""
+    none = [
+        name
+        for name, s, e in zip(names, std, ends, strict=True)
+        if np.isfinite(s) and not np.isfinite(e).all()
+    ]
     if not none:
         return []
-    told = f"no interval of {', '.join(none)} counts the bias: some theta within those that do have"
-    return [Warning("physics_not_met", f"{told} no physical parameters.")]
+    text = (
+        f"no interval of {', '.join(none)} includes the bias: some theta within the intervals that"
+    )
+    return [Warning("physics_not_met", f"{text} do belongs to no physical parameters.")]
 
 
 def _warning(
-    ground: Ground, cause: SuspectedBias, rows: Sequence[ParameterBias], suspects: Sequence[Suspect], of_one: bool
+    linearization: MeasureLinearization,
+    cause: SuspectedBias,
+    rows: Sequence[ParameterBias],
+    suspects: Sequence[Suspect],
+    of_one: bool,
 ) -> Warning | None:
-    """What a cause biases by more than the standard error: its size, remedies; and how sure the cause is."""
+    """Return the warning on biases above the standard error: cause, size and remedies.
+
+    The warning also says how sure the cause is.
+    """
     own, name = [row for row in rows if row.cause == cause.suspect.name], cause.suspect.name
     large = [row for row in own if (row.errors or 0.0) > 1 and abs(row.relative or 1.0) > _ROUNDING]
     if not large:
         return None
-    listed, share, there = told_biases(large), explains(cause), f" in {cause.suspect.output}" if of_one else ""
-    rival, cure = rival_of(ground, cause, suspects), " or ".join(remedies(ground, cause, [row.name for row in large]))
-    other = "" if rival is None else f" ({rival.suspect.name} explains as much and would move them elsewhere)"
+    listed, share, there = (
+        list_biases(large),
+        explains(cause),
+        f" in {cause.suspect.output}" if of_one else "",
+    )
+    rival, cure = (
+        rival_of(linearization, cause, suspects),
+        " or ".join(remedies(linearization, cause, [row.name for row in large])),
+    )
+    other = (
+        ""
+        if rival is None
+        else f" ({rival.suspect.name} explains as much and would move them elsewhere)"
+    )
     if share < SURE_SHARE:
-        near = near_causes(ground, cause, suspects)
+        near = near_causes(linearization, cause, suspects)
         close = ", ".join(f"{entry.suspect.name} {percent(explains(entry))}" for entry in near)
         beside = f"; next: {close}" if near else ""
         return Warning(
             "biased",
-            f"what the learner found{there} looks most like {name} ({percent(share)} of it{beside}), which would move "
-            f"{listed}, and the standard errors do not cover that{other}{f': if it is that, {cure}' if cure else ''}.",
+            f"what the learner found{there} looks most like {name} ({percent(share)} of "
+            f"it{beside}), which would move {listed}, and the standard errors do not cover "
+            f"that{other}{f': if it is that, {cure}' if cure else ''}.",
         )
     return Warning(
         "biased",
@@ -399,13 +648,16 @@ def _warning(
     )
 
 
-def told_biases(large: Sequence[ParameterBias]) -> str:
-    """The largest biases in words."""
-    shown = sorted(large, key=lambda entry: -(entry.errors or 0.0))[:_TOLD]
+def list_biases(large: Sequence[ParameterBias]) -> str:
+    """Return the largest biases in words."""
+    shown = sorted(large, key=lambda entry: -(entry.errors or 0.0))[:_LISTED]
     more = f" and {len(large) - len(shown)} more" if len(large) > len(shown) else ""
-    return f"{', '.join(map(_told_bias, shown))}{more}"
+    return f"{', '.join(map(_describe_bias, shown))}{more}"
 
 
-def _told_bias(entry: ParameterBias) -> str:
+def _describe_bias(entry: ParameterBias) -> str:
     share = "" if entry.relative is None else f", {percent(entry.relative, sign='+')}"
-    return f"{entry.name} by {entry.value:+.2g} ({plain_number(entry.errors or 0.0)} standard errors{share})"
+    return (
+        f"{entry.name} by {entry.value:+.2g} ({plain_number(entry.errors or 0.0)} standard "
+        f"errors{share})"
+    )

@@ -1,4 +1,4 @@
-"""The verb `bias_budget`: what the learner found and the bias that follows, of lagged physics and of a motion."""
+"""The verb `bias_budget`: the cause that explains the learner and the bias that follows from it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from orthaug._base.checks import check_type
 from orthaug._base.errors import InputError
 from orthaug.analysis.budget import Budget, lagged_budget
 from orthaug.analysis.motion_bias import suspected_bias
-from orthaug.analysis.motion_budget import MotionBudget, told_budget
+from orthaug.analysis.motion_budget import MotionBudget, declared_budget
 from orthaug.analysis.motion_suspects import MotionSuspect
 from orthaug.analysis.suspects import Suspect
 from orthaug.fitting.estimates import Estimate
@@ -25,22 +25,27 @@ def bias_budget(
     physics: PhysicsMap | None = None,
     measure: Measure | None = None,
 ) -> Budget | MotionBudget | None:
-    """Return the bias that what the learner found implies; None where no cause explains enough of it.
+    """Return the bias that what the learner found implies.
+
+    None where no cause explains enough of it.
 
     Args:
-        fit: with a learner and the orthogonal structure; of others there is no budget. Of lagged physics or a motion.
+        fit: with a learner and the orthogonal structure; of others there is no budget. Of lagged
+            physics or a motion.
         suspects: terms that may be missing, looked at first; of a motion `MotionSuspect`.
         physics: the map from physical parameters to θ, for their biases; a motion has none.
-        measure: what θ was split under, where that is not the training measure; a motion's fit knows its own.
+        measure: what θ was split under, where that is not the training measure; a motion's fit
+            knows its own.
 
     Returns:
-        The `cause`, the `share` of the learner that it explains, and the bias of each of `parameters` and `physical`,
-        estimate less truth, with an interval that covers bias and noise together: the hull over all causes that noise
-        cannot tell apart. Where `determined` is False that is wider than the value itself, and there is none.
+        The `cause`, the `share` of the learner that it explains, and the bias of each of
+        `parameters` and `physical`, estimate less truth, with an interval that covers bias and
+        noise together: the hull over all causes that noise cannot separate. Where `determined` is
+        False that is wider than the value itself, and there is none.
 
     Raises:
-        InputError: arguments that the kind of physics does not take; another measure than that of the fit; a suspect on
-            channels or lags that the data do not have.
+        InputError: arguments that the kind of physics does not take; another measure than that of
+            the fit; a suspect on channels or lags that the data do not have.
 
     Examples:
         >>> import numpy as np
@@ -57,13 +62,20 @@ def bias_budget(
     moves = isinstance(fit, MotionEstimate)
     wanted = MotionSuspect if moves else Suspect
     for suspect in suspects:
-        check_type(suspect, wanted, "suspects", f"a sequence of {wanted.__name__}, as the fit's physics asks for")
+        check_type(
+            suspect,
+            wanted,
+            "suspects",
+            f"a sequence of {wanted.__name__}, as the fit's physics asks for",
+        )
     if not moves:
         return lagged_budget(fit, cast(Any, suspects), physics=physics, measure=measure)
     for name, given in (("physics", physics), ("measure", measure)):
         if given is not None:
-            raise InputError(f"`{name}` does not apply to a fit of equations of motion; leave it out.")
+            raise InputError(
+                f"`{name}` does not apply to a fit of equations of motion; leave it out."
+            )
     if not fit.status.ok:
         return None
     declared = cast("Sequence[MotionSuspect]", suspects)
-    return told_budget(fit, declared, suspected_bias(fit, declared) if declared else [])
+    return declared_budget(fit, declared, suspected_bias(fit, declared) if declared else [])

@@ -1,6 +1,7 @@
-"""Families of terms that a physics may lack, their width or power profiled: one catalogue for both kinds of physics.
+"""Families of terms that a physics may lack, with width or power profiled, for both kinds.
 
-A family is one line of `FAMILIES`. Of every family each member is tried on everything that the learner sees.
+A family is one line of `FAMILIES`. Of every family each member is tried on everything that the
+learner sees.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ _MOST_ARGUMENTS = 8  # expressions that the families are tried on
 class Family(NamedTuple):
     """Terms of one form: `text(x, w)` writes one from what it acts on and its width or power.
 
-    `members` are the widths in median sizes of x, or the powers themselves where the family is not `scaled`.
+    `members` are the widths in median sizes of x, or the powers themselves where the family is not
+    `scaled`.
     """
 
     name: str
@@ -46,7 +48,7 @@ FAMILIES = (
 
 
 def members_on(on: str, values: Vector) -> Iterator[tuple[str, str]]:
-    """Yield name and expression of every member of every family on an expression with these values."""
+    """Yield name and expression of every member of every family for an expression `on`."""
     size = np.abs(values[np.isfinite(values)])
     if not np.any(size > 0):
         return
@@ -58,7 +60,7 @@ def members_on(on: str, values: Vector) -> Iterator[tuple[str, str]]:
 
 
 def catalogue(problem: Problem) -> tuple[Suspect, ...]:
-    """Return every member on the learner's own inputs as declared, and on what usual suspects act on."""
+    """Return every member for the learner's declared inputs and the variables of usual suspects."""
     constants = dict(problem.baseline.constants)
     texts = [*map(str, problem.features.entries), *(s.on for s in usual_suspects(problem) if s.on)]
     arguments = list({text.replace(" ", ""): text for text in texts}.values())[:_MOST_ARGUMENTS]
@@ -70,7 +72,14 @@ def catalogue(problem: Problem) -> tuple[Suspect, ...]:
             continue
         for name, text in members_on(on, values):
             found += [
-                Suspect(name if len(problem.outputs) == 1 else f"{name} in {output}", text, output, None, constants, on)
+                Suspect(
+                    name if len(problem.outputs) == 1 else f"{name} in {output}",
+                    text,
+                    output,
+                    None,
+                    constants,
+                    on,
+                )
                 for output in problem.outputs
             ]
     return tuple(found)
@@ -79,7 +88,7 @@ def catalogue(problem: Problem) -> tuple[Suspect, ...]:
 def motion_catalogue(
     motion: Motion, p: Vector, x: Matrix, u: Matrix, features: Sequence[str]
 ) -> tuple[MotionSuspect, ...]:
-    """Return every member on the learner's own inputs as declared, in every equation that may lack a term.
+    """Return every member for the learner's declared inputs, in each equation that may lack a term.
 
     Args:
         p: parameters (np,); states x (M, nx) and inputs u (M, nu) give the widths.
@@ -91,5 +100,8 @@ def motion_catalogue(
         for place in places:
             equation = motion.states[place].name
             where = f" in {equation}" if len(places) > 1 else ""
-            found += [MotionSuspect(f"{name}{where}", text, equation) for name, text in members_on(on, values)]
+            found += [
+                MotionSuspect(f"{name}{where}", text, equation)
+                for name, text in members_on(on, values)
+            ]
     return tuple(found)

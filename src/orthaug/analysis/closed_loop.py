@@ -1,7 +1,7 @@
-"""Were the inputs recorded under feedback? Whether past outputs tell an input beside its own past.
+"""Detection of feedback in the record: past outputs that predict an input beside its own past.
 
-In open loop an input is told by nothing but its own past. Under feedback, past outputs carry the reference and the
-disturbances into it (Granger 1969; Söderström and Stoica 1989, ch. 10).
+In open loop only its own past predicts an input. Under feedback, past outputs carry the
+reference and the disturbances into it (Granger 1969; Söderström and Stoica 1989, ch. 10).
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from orthaug.analysis.predictability import BlockSums, Share
 from orthaug.data.record import Record
 
 _LEVEL = 0.001  # of the test, divided by the number of inputs
-_SHARE = 0.02  # of what the own past leaves of an input: what the outputs tell counts from there on
-_SURE = 4.0  # standard errors over blocks by which it stands out
+_SHARE = 0.02  # of what its own past leaves of an input: the share by outputs counts from there on
+_SURE = 4.0  # standard errors over blocks by which it is significant
 _INPUT_LAGS, _OUTPUT_LAGS = 40, 4
 _BESIDE = 10  # lags of the other inputs
 _LEVELS = 6  # of an input that is held: those before the last change that count as its past
@@ -31,12 +31,15 @@ _NOTHING = 1e-3  # of an input's deviation: what its own past leaves is then no 
 _RANK = 1e-10
 _JUMP = 8.0  # times the median size of what its own past leaves of an input
 _ROUNDS = 4
-_PERIODIC = 0.9  # autocorrelation at a period, beyond what short lags tell
+_PERIODIC = 0.9  # autocorrelation at a period, beyond what short lags explain
 
 
 @dataclass(frozen=True)
 class Feedback:
-    """That past outputs tell `share` of what the own past of the input `name` leaves, at the level `p`."""
+    """Feedback found on an input: past outputs predict a `share` of what its own past leaves.
+
+    `name` is the input, `p` the level of the test.
+    """
 
     name: str
     share: float
@@ -44,51 +47,70 @@ class Feedback:
 
 
 def feedback_in(record: Record) -> tuple[Feedback, ...]:
-    """The inputs that surely follow past outputs; of an input that its own past tells, nothing can be said."""
+    """Return the inputs that surely follow past outputs.
+
+    Nothing can be said of an input that its own past predicts.
+    """
     found = []
     with one_blas_thread():
         for j, channel in enumerate(record.inputs):
-            told = _told(record, j)
-            if told is not None and told[1] < _LEVEL / len(record.inputs):
-                found.append(Feedback(channel.name, *told))
+            tested = _input_share(record, j)
+            if tested is not None and tested[1] < _LEVEL / len(record.inputs):
+                found.append(Feedback(channel.name, *tested))
     return tuple(found)
 
 
 def closed_loop(record: Record) -> tuple[Warning, ...]:
-    """A warning where inputs follow outputs: what that does to estimates, and what to do."""
+    """Return a warning where inputs follow outputs: what that does to estimates, and what to do."""
     found = feedback_in(record)
     if not found:
         return ()
-    named = ", ".join(f"{one.name} ({percent(one.share)} of what its own past leaves)" for one in found)
+    named = ", ".join(
+        f"{one.name} ({percent(one.share)} of what its own past leaves)" for one in found
+    )
     outputs = ", ".join(channel.name for channel in record.outputs)
     text = (
-        f"past {outputs} predict{'s' if len(record.outputs) == 1 else ''} {named}: the data look recorded under "
-        "feedback. An estimate is then consistent only with the right noise: one step ahead white noise in the "
-        "equation, on the free run white noise on the sensor, in both the whole physics; else what the feedback makes "
-        "of noise and of missing physics is taken for an effect of the input. Record the reference and model the loop "
-        "with it as the input, move the reference much more than the noise is, or record without the controller."
+        f"past {outputs} predict{'s' if len(record.outputs) == 1 else ''} {named}: the data "
+        "look recorded under feedback. An estimate is then consistent only with complete "
+        "physics and the right noise: white in the equation for one step ahead, white on the "
+        "sensor for the free run. Otherwise feedback of noise and of missing physics counts as "
+        "an effect of the input. Record the reference and model the loop with it as the input, "
+        "make the reference much larger than the noise, or record without the controller."
     )
     return (Warning("closed_loop", text),)
 
 
-def _told(record: Record, j: int) -> tuple[float, float] | None:
-    """Share and level by which past outputs tell input j; None where that is not enough, or cannot be told."""
-    every = (_rows(e.inputs[:, j], np.delete(e.inputs, j, axis=1), e.outputs) for e in record.experiments)
+def _input_share(record: Record, j: int) -> tuple[float, float] | None:
+    """Return share and level of the prediction of input j by past outputs.
+
+    None where that is not enough, or cannot be tested.
+    """
+    every = (
+        _rows(e.inputs[:, j], np.delete(e.inputs, j, axis=1), e.outputs) for e in record.experiments
+    )
     pieces = [piece for piece in every if piece is not None and len(piece[2])]
     if not pieces:
         return None
     widths = {(own.shape[1], outputs.shape[1]) for own, outputs, _ in pieces}
     if len(widths) > 1:  # some are held and some are not: those of which there are more
-        best = max(widths, key=lambda width: sum(len(p[2]) for p in pieces if (p[0].shape[1], p[1].shape[1]) == width))
+        best = max(
+            widths,
+            key=lambda width: sum(
+                len(p[2]) for p in pieces if (p[0].shape[1], p[1].shape[1]) == width
+            ),
+        )
         pieces = [p for p in pieces if (p[0].shape[1], p[1].shape[1]) == best]
     own, outputs, target = (np.concatenate(parts) for parts in zip(*pieces, strict=True))
-    return told_beside(own, outputs, target)
+    return predicted_share(own, outputs, target)
 
 
-def told_beside(own: Matrix, others: Matrix, target: Vector) -> tuple[float, float] | None:
-    """Cross-validated share of what `own` leaves of a target that `others` tell, and the level of a robust Wald test.
+def predicted_share(own: Matrix, others: Matrix, target: Vector) -> tuple[float, float] | None:
+    """Return the share of a target that `others` predict beside `own`, and its level.
 
-    None where there are too few rows, `own` leaves nothing, or the share is not surely large enough.
+    The share is cross-validated, of what `own` leaves; the level is that of a robust Wald test.
+
+    None where there are too few rows, `own` leaves nothing, or the share is not surely large
+    enough.
     """
     usual = _usual(own, target)
     own, others, target = _scaled(own[usual]), _scaled(others[usual]), target[usual]
@@ -102,15 +124,23 @@ def told_beside(own: Matrix, others: Matrix, target: Vector) -> tuple[float, flo
         return None
     beside = others - q @ (q.T @ others)
     sums = BlockSums.of(np.column_stack([base, others]), target)
-    share: Share = sums.share(range(base.shape[1], base.shape[1] + others.shape[1]), range(base.shape[1]))
+    share: Share = sums.share(
+        range(base.shape[1], base.shape[1] + others.shape[1]), range(base.shape[1])
+    )
     if share.value < _SHARE or share.value < _SURE * share.error:
         return None
     return share.value, _wald(beside, left)
 
 
 def _usual(own: Matrix, target: Vector) -> np.ndarray:
-    """The rows on which an input does not jump: those of a reference would hide all that lies between them."""
-    base, kept = np.column_stack([np.ones(len(target)), _scaled(own)]), np.ones(len(target), dtype=bool)
+    """Return the rows on which an input does not jump.
+
+    Jumps of a reference would hide everything between them.
+    """
+    base, kept = (
+        np.column_stack([np.ones(len(target)), _scaled(own)]),
+        np.ones(len(target), dtype=bool),
+    )
     for _ in range(_ROUNDS):
         if kept.sum() < _ROWS_PER_COLUMN * base.shape[1]:
             break
@@ -120,18 +150,18 @@ def _usual(own: Matrix, target: Vector) -> np.ndarray:
 
 
 def _wald(columns: Matrix, target: Vector) -> float:
-    """Level at which all coefficients are 0, robust against errors of unequal size (White 1980)."""
+    """Return the level at which all coefficients are 0, robust to unequal errors (White 1980)."""
     u, size, _ = np.linalg.svd(columns, full_matrices=False)
     u = u[:, size > 1e-9 * size.max(initial=0.0)]
-    told = u.T @ target
-    scores = u * (target - u @ told)[:, None]
+    moments = u.T @ target
+    scores = u * (target - u @ moments)[:, None]
     spread = scores.T @ scores * len(target) / max(len(target) - u.shape[1], 1)
-    statistic = float(told @ np.linalg.lstsq(spread, told, rcond=None)[0])
+    statistic = float(moments @ np.linalg.lstsq(spread, moments, rcond=None)[0])
     return float(scipy.special.chdtrc(max(u.shape[1], 1), statistic))
 
 
 def _rows(u: Vector, beside: Matrix, y: Matrix) -> tuple[Matrix, Matrix, Vector] | None:
-    """Past of an input and those `beside` it, past outputs, and the input's value, on the rows that are looked at."""
+    """Return an input's past and that of those `beside` it, past outputs, and the input."""
     u, beside, y = u[-_MOST:], beside[-_MOST:], y[-_MOST:]
     changes = np.flatnonzero(np.diff(u)) + 1
     if len(changes) < (1 - _HELD) * (len(u) - 1):
@@ -139,7 +169,11 @@ def _rows(u: Vector, beside: Matrix, y: Matrix) -> tuple[Matrix, Matrix, Vector]
         period = _period(levels, _LEVELS)
         past = _LEVELS if period is None else max(period + 1, _LEVELS)
         rows, own = changes[past - 1 :], _own_past(levels, _LEVELS, period, past)
-        own = np.column_stack([own, levels[past - 1 : -1] ** 2, levels[past - 1 : -1] ** 3]) if len(own) else own
+        own = (
+            np.column_stack([own, levels[past - 1 : -1] ** 2, levels[past - 1 : -1] ** 3])
+            if len(own)
+            else own
+        )
         enough = rows >= _BESIDE
         own = np.column_stack([own[enough], _past(beside, rows[enough], _BESIDE)])
         return own, _past(y, rows[enough], _OUTPUT_LAGS), u[rows[enough]]
@@ -150,14 +184,20 @@ def _rows(u: Vector, beside: Matrix, y: Matrix) -> tuple[Matrix, Matrix, Vector]
         return None
     own = _own_past(u, lags, period, past)
     rows = np.arange(past, len(u))
-    return np.column_stack([own, _past(beside, rows, _BESIDE)]), _past(y, rows, _OUTPUT_LAGS), u[past:]
+    return (
+        np.column_stack([own, _past(beside, rows, _BESIDE)]),
+        _past(y, rows, _OUTPUT_LAGS),
+        u[past:],
+    )
 
 
 def _own_past(x: Vector, count: int, period: int | None, first: int) -> Matrix:
-    """So many lags, and those about a period."""
+    """Return the first `count` lags, and those about a period."""
     lags = [*range(1, count + 1), *(() if period is None else range(period - 1, period + 2))]
     rows = np.arange(first, len(x))
-    return np.column_stack([x[rows - lag] for lag in lags]) if len(rows) else np.zeros((0, len(lags)))
+    return (
+        np.column_stack([x[rows - lag] for lag in lags]) if len(rows) else np.zeros((0, len(lags)))
+    )
 
 
 def _past(y: Matrix, rows: np.ndarray, lags: int) -> Matrix:
@@ -165,7 +205,10 @@ def _past(y: Matrix, rows: np.ndarray, lags: int) -> Matrix:
 
 
 def _period(x: Vector, beyond: int) -> int | None:
-    """The lag, larger than `beyond`, at which a signal repeats itself; None where it does not within its half."""
+    """Return the lag, larger than `beyond`, at which a signal repeats itself.
+
+    None where it does not within its half.
+    """
     n = len(x)
     centred = x - x.mean()
     power = np.abs(np.fft.rfft(centred, 2 * n)) ** 2
@@ -176,7 +219,9 @@ def _period(x: Vector, beyond: int) -> int | None:
     r = (acf / norm)[: n // 2 + 1]
     later = np.arange(beyond + 1, len(r) - 1)
     peaks = (
-        later[(r[later] > _PERIODIC) & (r[later] >= r[later - 1]) & (r[later] >= r[later + 1])] if len(later) else []
+        later[(r[later] > _PERIODIC) & (r[later] >= r[later - 1]) & (r[later] >= r[later + 1])]
+        if len(later)
+        else []
     )
     return int(peaks[np.argmax(r[peaks])]) if len(peaks) else None
 

@@ -1,4 +1,7 @@
-"""Does a free run forget its start? The quadratic norm in which sampled A_k contract (Lohmiller and Slotine 1998)."""
+"""Contraction of a free run: a quadratic norm in which sampled A_k contract.
+
+After Lohmiller and Slotine (1998): a contracting run forgets its start.
+"""
 
 from __future__ import annotations
 
@@ -12,13 +15,16 @@ from scipy import linalg
 from orthaug._base.checks import Matrix, Vector, check_count
 from orthaug._base.parallel import one_blas_thread
 from orthaug.analysis.feedback import MOST_WORK, Feedback, feedback, linearised
-from orthaug.analysis.visited import Place, evenly
+from orthaug.analysis.visited import RunPoint, evenly
 from orthaug.data.record import Record
 from orthaug.models.model import Model
 from orthaug.models.response import Response
 
 _SAMPLES = 2000  # points at most
-_STEEPEST, _ACTIVE = 50, 64  # points of largest radius always among them; worst points that a round of search adds
+_STEEPEST, _ACTIVE = (
+    50,
+    64,
+)  # points of largest radius always among them; worst points that a round of search adds
 _LARGEST_SEARCH = 12  # n0 with a metric better than Lyapunov's
 
 
@@ -26,9 +32,10 @@ _LARGEST_SEARCH = 12  # n0 with a metric better than Lyapunov's
 class Contraction:
     """The best norm that was found, `|x|_P = √(xᵀ P x)` of the state, P (n0, n0) up to a factor.
 
-    `rate` is the largest `‖A_k‖_P` over the samples; `bound`, the largest spectral radius, is the least that any norm
-    has. `share`, 0 to 1, is that of the samples with `‖A_k‖_P < 1`. Were it so at all points between two runs under one
-    input: `|x_k − x̃_k| ≤ overshoot · rateᵏ |x_0 − x̃_0|`, each entry of the state in its deviation.
+    `rate` is the largest `‖A_k‖_P` over the samples; `bound`, the largest spectral radius, is the
+    least that any norm has. `share`, 0 to 1, is that of the samples with `‖A_k‖_P < 1`. Were it so
+    at all points between two runs under one input: `|x_k − x̃_k| ≤ overshoot · rateᵏ |x_0 − x̃_0|`,
+    each entry of the state in its deviation.
     """
 
     rate: float
@@ -37,7 +44,7 @@ class Contraction:
     samples: int
     overshoot: float
     metric: Matrix
-    worst: Place
+    worst: RunPoint
 
 
 @one_blas_thread()
@@ -49,12 +56,15 @@ def contraction(
     along: Feedback | None = None,
     response: Response | None = None,
 ) -> Contraction | None:
-    """The quadratic norm in which the free run contracts on as many of at most 2000 sampled points as was reached.
+    """Return a quadratic norm in which the free run contracts on as many points as possible.
 
-    It minimises `max_k ‖T A_k T⁻¹‖₂`, P = TᵀT. Along `T(t) = exp(tX) T`, X symmetric, the logarithm of each norm is
-    convex in t with the slope `uᵀXu − vᵀXv`, u and v its singular vectors: there are no false minima. The search starts
-    from Lyapunov's P of the mean A_k and takes quasi-Newton steps on a smooth maximum over the worst points. Where not
-    all points contract, it starts again without the worst of them. None where no A_k is there.
+    At most 2000 points are sampled.
+
+    It minimises `max_k ‖T A_k T⁻¹‖₂`, P = TᵀT. Along `T(t) = exp(tX) T`, X symmetric, the logarithm
+    of each norm is convex in t with the slope `uᵀXu − vᵀXv`, u and v its singular vectors: there
+    are no false minima. The search starts from Lyapunov's P of the mean A_k and takes quasi-Newton
+    steps on a smooth maximum over the worst points. Where not all points contract, it starts again
+    without the worst of them. None where no A_k is there.
 
     Args:
         box: how many points to add, uniform in the box of the states and inputs that the run met.
@@ -76,29 +86,40 @@ def contraction(
     sizes, metric = _sizes(t := _best_metric(a), a), (t / unit).T @ (t / unit)
     rate, worst = points.worst(record, sizes, model.form.describe)
     assert rate is not None and worst is not None  # there are points, and no norm is infinite
-    bound, share, overshoot = float(radius.max()), float(np.mean(sizes < 1)), float(np.linalg.cond(t))
+    bound, share, overshoot = (
+        float(radius.max()),
+        float(np.mean(sizes < 1)),
+        float(np.linalg.cond(t)),
+    )
     return Contraction(rate, bound, share, len(a), overshoot, metric / np.trace(metric), worst)
 
 
 def _sizes(t: Matrix, a: Float[np.ndarray, "m n n"]) -> Vector:
-    """‖T A T⁻¹‖₂ of each matrix."""
+    """Return ‖T A T⁻¹‖₂ of each matrix."""
     b = t @ a @ np.linalg.inv(t)
     return np.sqrt(np.linalg.eigvalsh(b.swapaxes(1, 2) @ b)[:, -1])
 
 
 def _best_metric(a: Float[np.ndarray, "m n n"]) -> Matrix:
-    """T (n, n) in which all of the matrices contract, or else as many as was reached; deterministic."""
+    """Return T (n, n) in which all of the matrices contract, or else as many as was reached.
+
+    Deterministic.
+    """
     tried, some = [_metric(a)], a[:: -(-len(a) // 500)]
     shares = [np.mean(_sizes(tried[0], a) < 1)]
     for quantile in (1.0, 0.95, 0.8, 0.5) if shares[0] < 1 else ():
         sizes = _sizes(tried[int(np.argmax(shares))], some)
-        new = [_metric(some[sizes <= np.quantile(sizes, quantile)])] if quantile < 1 else [*_lyapunov(a.mean(axis=0))]
+        new = (
+            [_metric(some[sizes <= np.quantile(sizes, quantile)])]
+            if quantile < 1
+            else [*_lyapunov(a.mean(axis=0))]
+        )
         tried, shares = tried + new, shares + [np.mean(_sizes(t, a) < 1) for t in new]
     return tried[int(np.argmax(shares))]
 
 
 def _metric(a: Float[np.ndarray, "m n n"]) -> Matrix:
-    """T (n, n) with a small largest `‖T A T⁻¹‖₂`, close to the least."""
+    """Return T (n, n) with a small largest `‖T A T⁻¹‖₂`, close to the least."""
     n, bound, active = a.shape[1], np.abs(np.linalg.eigvals(a)).max(), evenly(len(a), _ACTIVE)
     best = t = min([np.eye(n), *_lyapunov(a.mean(axis=0))], key=lambda t: _sizes(t, a).max())
     sizes, least = _sizes(t, a), max(_sizes(t, a).max(), 1e-9)
@@ -106,14 +127,20 @@ def _metric(a: Float[np.ndarray, "m n n"]) -> Matrix:
         if (gap := np.log(least / max(bound, 1e-3 * least))) <= 0.06 * abs(np.log(least)):
             break  # the rest would cost overshoot
         active = np.union1d(active, np.argsort(-sizes, kind="stable")[:_ACTIVE])
-        t = _descend(t @ a[active] @ np.linalg.inv(t), sharpness * np.log(n * len(active)) / gap) @ t
+        t = (
+            _descend(t @ a[active] @ np.linalg.inv(t), sharpness * np.log(n * len(active)) / gap)
+            @ t
+        )
         sizes = _sizes(t := t / np.linalg.norm(t), a)
         best, least = (t, sizes.max()) if sizes.max() < least else (best, least)
     return best
 
 
 def _lyapunov(mean: Matrix) -> Iterator[Matrix]:
-    """Factors T of P = TᵀT with `(A/c)ᵀ P (A/c) − P = −I`, so that `‖A‖_P < c`, for some c above the radius of A."""
+    """Yield factors T of P = TᵀT with `‖A‖_P < c`, for some c above the radius of A.
+
+    They solve `(A/c)ᵀ P (A/c) − P = −I`.
+    """
     radius = max(float(np.abs(np.linalg.eigvals(mean)).max()), 1e-3)
     for c in (radius**0.95, radius**0.8, radius**0.5, 1.1 * radius, 1.5 * radius):
         if c > radius:
@@ -124,7 +151,7 @@ def _lyapunov(mean: Matrix) -> Iterator[Matrix]:
 
 
 def _descend(a: Float[np.ndarray, "m n n"], sharpness: float) -> Matrix:
-    """Y that lowers `log Σ σ^sharpness / sharpness`, over all singular values σ of all Y A Y⁻¹, from Y = I."""
+    """Return Y that lowers `log Σ σ^sharpness / sharpness` over the σ of all Y A Y⁻¹, from I."""
     from scipy import optimize  # slow to import
 
     n = a.shape[1]
@@ -142,5 +169,7 @@ def _descend(a: Float[np.ndarray, "m n n"], sharpness: float) -> Matrix:
         slope = both * np.concatenate([weight / squares, -weight]).ravel() @ both.T
         return total / sharpness, (slope @ inverse.T).ravel()
 
-    lowest = optimize.minimize(value, np.eye(n).ravel(), jac=True, method="L-BFGS-B", options={"maxiter": 30})
+    lowest = optimize.minimize(
+        value, np.eye(n).ravel(), jac=True, method="L-BFGS-B", options={"maxiter": 30}
+    )
     return np.asarray(lowest.x).reshape(n, n)

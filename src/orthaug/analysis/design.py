@@ -1,15 +1,16 @@
 """Experiment design: an input within limits under which suspected terms and noise disturb θ least.
 
-The physics at θ, with the suspected terms at their guessed coefficients, is simulated for each candidate input without
-noise. Its rows give Φ and Δ, and these what least squares would do on a record of that input (eq:error_val; Ljung 1999,
-ch. 9 and 13):
+The physics at θ, with the suspected terms at their guessed coefficients, is simulated for each
+candidate input without noise. Its rows give Φ and Δ, and these what least squares would do on a
+record of that input (eq:error_val; Ljung 1999, ch. 9 and 13):
 
-    bias = Φ⁺Δ,   Cov θ̂ = Φ⁺Σ_eΦ⁺ᵀ,   cost = ‖W bias‖² + tr(W Cov θ̂ Wᵀ),   W = diag(1/|θ|) by default,
+    bias = Φ⁺Δ,   Cov θ̂ = Φ⁺Σ_eΦ⁺ᵀ,   cost = ‖W bias‖² + tr(W Cov θ̂ Wᵀ),   W = diag(1/|θ|) by
+    default,
 
-so that √cost is the root mean square of `‖(θ̂ − θ)/θ‖`. Outputs are weighted by one over their deviations. The search
-is deterministic. It tries the families of `orthaug.signals`, then periodic patterns of levels and hold lengths. A
-pattern is improved by one level, pair or length at a time on a shortened record. The best are simulated again over all
-N samples.
+so that √cost is the root mean square of `‖(θ̂ − θ)/θ‖`. Outputs are weighted by one over their
+deviations. The search is deterministic. It tries the families of `orthaug.signals`, then periodic
+patterns of levels and hold lengths. A pattern is improved by one level, pair or length at a time on
+a shortened record. The best are simulated again over all N samples.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -25,13 +27,119 @@ from jaxtyping import Float
 from orthaug._base.checks import Matrix, Vector, check_choice, check_count, check_number, is_number
 from orthaug._base.errors import InputError, shown
 from orthaug._base.memory import check_memory
-from orthaug.analysis.candidates import Pattern, families, starting_patterns
 from orthaug.analysis.plant import Plant
 from orthaug.analysis.suspects import Suspect
 from orthaug.physics.baseline import Baseline
 
-SEARCH_ROWS, SEARCH_PERIODS = 512, 40  # of the shortened record: samples, or periods of the best square if more
-STARTS, FINALISTS = 6, 12  # patterns that are improved, each of another length; that are tried over all N samples
+LONGEST_PATTERN = 32  # held samples; a longer period needs a longer hold
+_STEPS = (2.0, 1.0, 0.5, 0.25, 0.1)  # changes of one level of a pattern, in units of the amplitude
+
+
+class Pattern(NamedTuple):
+    """Levels in [−1, 1], each held, repeated; with `odd` they are followed by their negatives."""
+
+    levels: tuple[float, ...]
+    hold: int
+    odd: bool
+
+    @property
+    def name(self) -> str:
+        shown = "".join("-0+"[int(v) + 1] for v in self.levels)
+        if any(v not in (-1, 0, 1) for v in self.levels):
+            shown = " ".join(f"{v:.3g}" for v in self.levels)
+        return (
+            "pattern "
+            f"[{shown}]{', then its negative' * self.odd}{f', hold {self.hold}' * (self.hold > 1)}"
+        )
+
+    def __call__(self, samples: int) -> Vector:
+        unit = np.array(self.levels + tuple(-v for v in self.levels) * self.odd)
+        return unit[np.arange(samples) // self.hold % len(unit)]
+
+    def neighbours(self) -> list[Pattern]:
+        """Return patterns with one level or a pair's signs changed, or a level taken or doubled."""
+        x, near = self.levels, set()
+        for i, v in enumerate(x):
+            near |= {
+                (*x[:i], min(max(v + s * d, -1.0), 1.0), *x[i + 1 :])
+                for d in _STEPS
+                for s in (-1, 1)
+            }
+            near |= {(*x[:i], -v, *x[i + 1 : j], -x[j], *x[j + 1 :]) for j in range(i + 1, len(x))}
+            near |= {(*x[:i], *x[i + 1 :])} if len(x) > 2 else set()
+            near |= {(*x[:i], v, *x[i:])} if len(x) < LONGEST_PATTERN else set()
+        return [Pattern(levels, self.hold, self.odd) for levels in sorted(near - {x})]
+
+
+def starting_patterns(period: int, seed: int) -> list[Pattern]:
+    """Return patterns to start from: cut squares of about this period, short ones, and random ones.
+
+    Squares are cut at every length; short patterns have two or four levels.
+    """
+    rng, patterns = np.random.default_rng(seed), []
+    for hold in sorted({1} if period <= 16 else {round(period / 6), round(period / 12)}):
+        square = [1.0 if k * hold % period < period / 2 else -1.0 for k in range(LONGEST_PATTERN)]
+        for n, odd in product(range(2, LONGEST_PATTERN + 1), (False, True)):
+            patterns += [
+                Pattern(tuple(x), hold, odd)
+                for x in (square[:n], rng.choice([-1.0, 1.0], n).tolist())
+            ]
+        patterns += [
+            Pattern(levels, hold, False)
+            for n in range(3, 8)
+            for levels in product((-1.0, 1.0), repeat=n)
+        ]
+        patterns += [
+            Pattern(levels, hold, True) for levels in product((-1.0, -0.5, 0.5, 1.0), repeat=4)
+        ]
+    return sorted(set(patterns))
+
+
+def families(samples: int, seed: int) -> tuple[dict[str, Vector], dict[str, int]]:
+    """Return named signals of amplitude 1, and the periods of the square waves among them."""
+    from orthaug.analysis import signals  # scipy.signal is slow to import
+
+    def spaced(first: int, last: int) -> list[int]:
+        return sorted(
+            {
+                *range(first, min(last, 8) + 1),
+                *(round(8 * 1.4**i) for i in range(60) if 8 * 1.4**i <= last),
+            }
+        )
+
+    squares = {f"square, period {2 * half}": 2 * half for half in spaced(1, samples // 8)}
+    waves = {"white Gaussian": signals.white_gaussian(samples, amplitude=1, seed=seed)}
+    waves["white uniform"] = signals.white_uniform(samples, amplitude=1, seed=seed)
+    for h in spaced(1, max(samples // 64, 1))[::2]:
+        waves[f"white binary, hold {h}"] = signals.white_binary(
+            samples, amplitude=1, seed=seed, hold=h
+        )
+        waves[f"PRBS, hold {h}"] = signals.prbs(samples, amplitude=1, hold=h)
+    even = samples + samples % 2
+    for part in [s for s in (1.0, 0.5, 0.2, 0.1, 0.03, 0.01) if s * samples > 16]:
+        band, name = (1 / samples, part / 2), f"up to {part:g} Nyquist"
+        waves[f"multisine {name}"] = signals.multisine(samples, amplitude=1, band=band)
+        waves[f"odd multisine {name}"] = signals.multisine(even, amplitude=1, band=band, odd=True)[
+            :samples
+        ]
+        waves[f"swept square {name}"] = signals.swept_square(
+            samples, amplitude=1, band=band, logarithmic=True
+        )
+    waves |= {
+        name: signals.square(samples, amplitude=1, period=period)
+        for name, period in squares.items()
+    }
+    return waves, squares
+
+
+SEARCH_ROWS, SEARCH_PERIODS = (
+    512,
+    40,
+)  # of the shortened record: samples, or periods of the best square if more
+STARTS, FINALISTS = (
+    6,
+    12,
+)  # patterns that are improved, each of another length; that are tried over all N samples
 LEAST_GAIN = 1e-4  # of the cost, relative, for another change of a pattern
 SINGULAR = 1e12  # condition number of Φ above which neither bias nor variance is computed
 MOST_SAMPLES = 10_000_000  # of a design: its candidates take hours then
@@ -39,12 +147,17 @@ LARGEST = 1e100  # amplitude, and one over the smallest: squares are finite
 _SIGNALS = 120  # of N samples that are held at once
 BATCH = 2_000_000  # samples that are simulated side by side
 
-Factors = Float[np.ndarray, "M 2 n n"]  # per candidate the R of rows [Φ Δ] and of σ[Φ Δ], n = nt + 1
+Factors = Float[
+    np.ndarray, "M 2 n n"
+]  # per candidate the R of rows [Φ Δ] and of σ[Φ Δ], n = nt + 1
 
 
 @runtime_checkable
 class DesignPlant(Protocol):
-    """What is simulated for inputs side by side: `Plant`, or that of a motion. `theta` are the parameters."""
+    """Simulated system for many inputs side by side: `Plant`, or that of a motion.
+
+    `theta` are the parameters.
+    """
 
     names: tuple[str, ...]
     theta: Vector
@@ -54,13 +167,18 @@ class DesignPlant(Protocol):
     others: dict[str, np.ndarray]
     """Inputs beside the one that is designed, (N, 1) or one number for all rows."""
 
-    def rows(self, u: Float[np.ndarray, "N M"]) -> tuple[Float[np.ndarray, "M R ny nt+1"], np.ndarray]:
-        """Rows `[Φ Δ]`, zero where they run away, and the weights of the outputs (M, 1, ny, 1)."""
+    def rows(
+        self, u: Float[np.ndarray, "N M"]
+    ) -> tuple[Float[np.ndarray, "M R ny nt+1"], np.ndarray]:
+        """Return rows `[Φ Δ]`, zero where they run away, and the outputs' weights (M, 1, ny, 1)."""
         ...
 
 
 class Candidate(NamedTuple):
-    """A signal tried over N samples: cost, ‖W bias‖, √tr(W Cov Wᵀ), condition of Φ; infinite where it has none."""
+    """A signal tried over N samples: cost, ‖W bias‖, √tr(W Cov Wᵀ), condition of Φ.
+
+    Infinite where it has none.
+    """
 
     name: str
     cost: float
@@ -71,7 +189,10 @@ class Candidate(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """An input (N,) and its prediction: `bias` and `std` (nt,) in θ's units, √cost, what else was tried, best first."""
+    """An input (N,) and its predicted `bias` and `std` (nt,) in θ's units, with √cost.
+
+    `tried` lists the other inputs, best first.
+    """
 
     signal: Vector
     kind: str
@@ -106,19 +227,25 @@ def design_input(
     initial_outputs: Any = 0.0,
     iterations: int = 30,
 ) -> Design:
-    """The input of least predicted error of θ within minimum ≤ u ≤ maximum and |u_k − u_{k−1}| ≤ rate · Ts.
+    """Return the input of least predicted error of θ within limits of amplitude and rate.
+
+    The limits are minimum ≤ u ≤ maximum and |u_k − u_{k−1}| ≤ rate · Ts.
 
     Args:
         baseline: made of terms; of channels with the names `outputs` and `inputs`.
         sampling_time: Ts, s.
         samples: N.
-        amplitude: the limits are ±amplitude, in the channel's unit; or `minimum` and `maximum` instead.
-        rate: in the channel's unit per second, counted from 0, or from the limit next to it, before the first sample.
-        suspects: with their coefficients; without any the design has least variance (A-optimal for W θ).
-        noise: standard deviation of the equation noise in the output's unit, or one for each; 0 counts the bias alone.
-            Without suspects 0 means 1, and `std` is per unit of noise.
+        amplitude: the limits are ±amplitude, in the channel's unit; or `minimum` and `maximum`
+            instead.
+        rate: in the channel's unit per second, counted from 0, or from the limit next to it, before
+            the first sample.
+        suspects: with their coefficients; without any the design has least variance (A-optimal for
+            W θ).
+        noise: standard deviation of the equation noise in the output's unit, or one for each; 0
+            counts the bias alone. Without suspects 0 means 1, and `std` is per unit of noise.
         theta: θ to simulate with (nt,); None for the baseline's initial values.
-        weights: W, (nt,) for a diagonal, or (m, nt), such as dp/dθ / p for physical parameters p; None for 1/|θ|.
+        weights: W, (nt,) for a diagonal, or (m, nt), such as dp/dθ / p for physical parameters p;
+            None for 1/|θ|.
         condition: cap on the condition number of Φ with columns of unit norm.
         channel: the input that is designed; may be left out where there is one.
         known_inputs: samples (N,) of other inputs, by name; zero where absent.
@@ -126,32 +253,45 @@ def design_input(
         iterations: the most improvements of one pattern; `seed` is that of the random candidates.
 
     Raises:
-        InputError: numbers out of range, unknown channels, a suspect without coefficient, θ of 0 without `weights`,
-            a simulated output that runs away, no candidate within the cap on the condition number.
+        InputError: numbers out of range, unknown channels, a suspect without coefficient, θ of 0
+            without `weights`, a simulated output that runs away, no candidate within the cap on the
+            condition number.
     """
     sampling_time = check_number(sampling_time, "sampling_time", positive=True)
     limits = input_limits(amplitude, minimum, maximum), rate, condition
     suspects = tuple(suspects)
     if baseline.function is not None or not baseline.names:
-        raise InputError("a design needs physics that is made of terms, with one parameter or more.")
+        raise InputError(
+            "a design needs physics that is made of terms, with one parameter or more."
+        )
     theta = _numbers(baseline.initial if theta is None else theta, (len(baseline.names),), "theta")
     known = [suspect.sampled(sampling_time) for suspect in suspects]
-    plant = Plant(baseline.sampled(sampling_time), (tuple(outputs), tuple(inputs)), known, theta, channel)
+    plant = Plant(
+        baseline.sampled(sampling_time), (tuple(outputs), tuple(inputs)), known, theta, channel
+    )
     samples = check_samples(samples, plant)
     set_known(plant, known_inputs, samples)
     plant.before = _numbers(initial_outputs, (plant.start, len(outputs)), "initial_outputs")
-    return searched(plant, limits, sampling_time, samples, noise, bool(suspects), weights, (seed, iterations))
+    return searched(
+        plant, limits, sampling_time, samples, noise, bool(suspects), weights, (seed, iterations)
+    )
 
 
 def set_known(plant: DesignPlant, known_inputs: Mapping[str, Any] | None, samples: int) -> None:
-    """Give a plant the samples (N,) of inputs beside the one that is designed, by name; InputError for wrong ones."""
+    """Give a plant the samples (N,) of inputs beside the one that is designed, by name.
+
+    InputError for wrong ones.
+    """
     for name, values in (known_inputs or {}).items():
         check_choice(name, plant.others, "a channel of `known_inputs`")
         plant.others[name] = _numbers(values, (samples,), f"known_inputs['{name}']")[:, None]
 
 
 def check_samples(samples: Any, plant: DesignPlant) -> int:
-    """How many samples are designed; raises InputError for too few, too many, or more than fit into memory."""
+    """Return the number of samples to design.
+
+    Raises InputError for too few, too many, or more than fit into memory.
+    """
     nt, ny = len(plant.theta), len(plant.outputs)
     samples = check_count(samples, "samples", plant.start + 4 * nt + 16)
     if samples > MOST_SAMPLES:
@@ -170,7 +310,7 @@ def searched(
     weights: Vector | Matrix | None,
     effort: tuple[int, int],
 ) -> Design:
-    """The best input of a plant; the arguments as in `design_input`.
+    """Return the best input of a plant; the arguments as in `design_input`.
 
     Args:
         limits: of the input, its rate, and the cap on the condition number.
@@ -191,22 +331,32 @@ def searched(
             return _Search(plant, _weights(weights, plant), sigma, *bounds).run(seed, iterations)
     except np.linalg.LinAlgError:
         raise InputError(
-            "the simulated rows are too large or too small for double precision; change the limits or the units."
+            "the simulated rows are too large or too small for double precision; change the "
+            "limits or the units."
         ) from None
 
 
 def input_limits(amplitude: Any, minimum: Any, maximum: Any) -> tuple[float, float]:
-    """Lower and upper limit of the input."""
-    if (amplitude is None) == (minimum is None and maximum is None) or (minimum is None) != (maximum is None):
+    """Return the lower and upper limit of the input."""
+    if (amplitude is None) == (minimum is None and maximum is None) or (minimum is None) != (
+        maximum is None
+    ):
         given = {"amplitude": amplitude, "minimum": minimum, "maximum": maximum}
-        named = " and ".join(name for name, value in given.items() if value is not None) or "none of them"
+        named = (
+            " and ".join(name for name, value in given.items() if value is not None)
+            or "none of them"
+        )
         raise InputError(f"give `amplitude`, or `minimum` and `maximum`; got {named}.")
     if amplitude is not None:
         amplitude = check_number(amplitude, "amplitude", positive=True)
         if not 1 / LARGEST <= amplitude <= LARGEST:
-            raise InputError(f"`amplitude` must lie between {1 / LARGEST:g} and {LARGEST:g}; got {amplitude:g}.")
+            raise InputError(
+                f"`amplitude` must lie between {1 / LARGEST:g} and {LARGEST:g}; got {amplitude:g}."
+            )
         return -amplitude, amplitude
-    low, high = (_limit(name, value) for name, value in (("minimum", minimum), ("maximum", maximum)))
+    low, high = (
+        _limit(name, value) for name, value in (("minimum", minimum), ("maximum", maximum))
+    )
     if not high - low >= max(1 / LARGEST, 1e-9 * max(abs(low), abs(high))):
         raise InputError(f"`minimum` must be less than `maximum`; got {low:g} and {high:g}.")
     return low, high
@@ -214,7 +364,9 @@ def input_limits(amplitude: Any, minimum: Any, maximum: Any) -> tuple[float, flo
 
 def _limit(name: str, value: Any) -> float:
     if not is_number(value) or abs(value) > LARGEST:
-        raise InputError(f"`{name}` must be a number between {-LARGEST:g} and {LARGEST:g}; got {shown(value)}.")
+        raise InputError(
+            f"`{name}` must be a number between {-LARGEST:g} and {LARGEST:g}; got {shown(value)}."
+        )
     return float(value)
 
 
@@ -229,12 +381,14 @@ def _numbers(values: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
 
 
 def _weights(weights: Any, plant: DesignPlant) -> Matrix:
-    """W, (m, nt)."""
+    """Return W, (m, nt)."""
     nt = len(plant.theta)
     if weights is None:
         if not plant.theta.all():
             zero = plant.names[int(np.argmin(np.abs(plant.theta)))]
-            raise InputError(f"θ of {zero} is 0, so that its relative error has no meaning; give `weights`.")
+            raise InputError(
+                f"θ of {zero} is 0, so that its relative error has no meaning; give `weights`."
+            )
         weights = 1 / np.abs(plant.theta)
     try:
         shape = np.shape(weights)
@@ -247,7 +401,7 @@ def _weights(weights: Any, plant: DesignPlant) -> Matrix:
 
 
 class _Scores(NamedTuple):
-    """Of M candidates: as in `Candidate`, then bias and std (M, nt)."""
+    """Scores of M candidates: as in `Candidate`, then bias and std (M, nt)."""
 
     cost: Vector
     relative_bias: Vector
@@ -260,7 +414,7 @@ class _Scores(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Search:
-    """What is asked for; see `design_input`."""
+    """Settings of a search; see `design_input`."""
 
     plant: DesignPlant
     weights: Matrix
@@ -275,26 +429,37 @@ class _Search:
         named, squares = families(self.samples, seed)
         u, factors = self.measured(np.stack(list(named.values()), axis=1))
         if not factors.any():
-            raise InputError("the simulated output runs away under every input; give a `theta` that is stable.")
+            raise InputError(
+                "the simulated output runs away under every input; give a `theta` that is stable."
+            )
         rank = dict(zip(named, self.scores(factors).ranked, strict=True))
-        patterns = self.patterns(squares[min(squares, key=lambda name: rank[name])], seed, iterations)
-        more, theirs = self.measured(np.stack([pattern(self.samples) for pattern in patterns], axis=1))
+        patterns = self.patterns(
+            squares[min(squares, key=lambda name: rank[name])], seed, iterations
+        )
+        more, theirs = self.measured(
+            np.stack([pattern(self.samples) for pattern in patterns], axis=1)
+        )
         u, scores = np.hstack([u, more]), self.scores(np.concatenate([factors, theirs]))
         names = [*named, *(pattern.name for pattern in patterns)]
         order = np.lexsort((scores.cost, scores.ranked))
-        table = tuple(Candidate(names[i], *(float(column[i]) for column in scores[:4])) for i in order)
+        table = tuple(
+            Candidate(names[i], *(float(column[i]) for column in scores[:4])) for i in order
+        )
         if not table[0].condition <= self.cap:
             best = min(table, key=lambda row: row.condition)
             raise InputError(
-                f"no candidate has a condition number of Φ of {self.cap:g} or less; the best has {best.condition:.4g}: "
-                f"{best.name}. Raise `condition`, or fix a parameter."
+                f"no candidate has a condition number of Φ of {self.cap:g} or less; the best "
+                f"has {best.condition:.4g}: {best.name}. Raise `condition`, or fix a parameter."
             )
         (name, cost, _, _, condition), k = table[0], order[0]
         own = u[:, k].copy(), name, self.plant.names, scores.bias[k], scores.std[k]
         return Design(*own, math.sqrt(cost), condition, cost, table)
 
     def measured(self, waves: Matrix, period: Vector | None = None) -> tuple[Matrix, Factors]:
-        """The limited signals (N, M) of waves of amplitude 1, and their factors per row; of whole periods if given."""
+        """Return the limited signals (N, M) of waves of amplitude 1, and their factors per row.
+
+        Factors are those of whole periods if given.
+        """
         signals, factors, size = [], [], max(1, BATCH // len(waves))
         for first in range(0, waves.shape[1], size):
             u = self.limited(waves[:, first : first + size])
@@ -302,47 +467,67 @@ class _Search:
             counted = np.full(len(rows), rows.shape[1])
             if period is not None:  # a quarter is left to the transient
                 here = period[first : first + size]
-                counted = np.maximum(rows.shape[1] * 3 // 4 // here, 1) * np.minimum(here, rows.shape[1])
-            rows *= (np.arange(rows.shape[1]) >= rows.shape[1] - counted[:, None])[:, :, None, None] * weight
+                counted = np.maximum(rows.shape[1] * 3 // 4 // here, 1) * np.minimum(
+                    here, rows.shape[1]
+                )
+            rows *= (np.arange(rows.shape[1]) >= rows.shape[1] - counted[:, None])[
+                :, :, None, None
+            ] * weight
             shape = len(rows), -1, rows.shape[-1]
             r = np.linalg.qr(rows.reshape(shape), mode="r")
             noisy = rows * weight * self.sigma[:, None]
-            s = np.linalg.qr(noisy.reshape(shape), mode="r") if len(self.sigma) > 1 else r * self.sigma
+            s = (
+                np.linalg.qr(noisy.reshape(shape), mode="r")
+                if len(self.sigma) > 1
+                else r * self.sigma
+            )
             signals.append(u)
             factors.append(np.stack([r, s], axis=1) / np.sqrt(counted)[:, None, None, None])
         return np.hstack(signals), np.concatenate(factors)
 
     def limited(self, waves: Matrix) -> Matrix:
-        """Signals within the limits to the last bit: steps are shortened by what rounding could add."""
+        """Return signals within the limits to the last bit, with steps shortened for rounding."""
         low, high = self.low, self.high
         u = np.clip((low + high) / 2 + (high - low) / 2 * waves, low, high)
         if self.step >= high - low:
             return u
-        from orthaug.analysis.signals import limit_rate  # after scipy.signal, which is slow to import
+        from orthaug.analysis.signals import (
+            limit_rate,
+        )  # after scipy.signal, which is slow to import
 
         step = max(self.step - 4 * np.spacing(max(-low, high)), self.step / 2)
         before = min(max(0.0, low), high)
         return np.stack([limit_rate(column, step, before) for column in u.T], axis=1)
 
     def scores(self, factors: Factors) -> _Scores:
-        """Bias, variance and cost over all N samples."""
+        """Return bias, variance and cost over all N samples."""
         nt = len(self.plant.theta)
         r = factors[:, 0, :nt, :nt]
         norms = np.where((norms := np.linalg.norm(r, axis=1)) > 0, norms, 1.0)
         unit = r / norms[:, None]
         sigma = np.linalg.svd(unit, compute_uv=False)
-        condition = np.divide(sigma[:, 0], sigma[:, -1], out=np.full(len(r), np.inf), where=sigma[:, -1] > 0)
+        condition = np.divide(
+            sigma[:, 0], sigma[:, -1], out=np.full(len(r), np.inf), where=sigma[:, -1] > 0
+        )
         fine = condition < SINGULAR
         inverse = np.linalg.inv(np.where(fine[:, None, None], unit, np.eye(nt))) / norms[:, :, None]
         bias = (inverse @ factors[:, 0, :nt, nt:])[:, :, 0]
         half = factors[:, 1, :nt, :nt] @ inverse @ inverse.transpose(0, 2, 1)  # Cov = halfᵀ half
-        relative = [np.linalg.norm(bias @ self.weights.T, axis=1), np.linalg.norm(half @ self.weights.T, axis=(1, 2))]
+        relative = [
+            np.linalg.norm(bias @ self.weights.T, axis=1),
+            np.linalg.norm(half @ self.weights.T, axis=(1, 2)),
+        ]
         parts = [np.where(fine, values, np.inf) for values in relative]
         ranked = np.where(condition <= self.cap, cost := parts[0] ** 2 + parts[1] ** 2, np.inf)
-        return _Scores(cost, parts[0], parts[1], condition, bias, np.linalg.norm(half, axis=1), ranked)
+        return _Scores(
+            cost, parts[0], parts[1], condition, bias, np.linalg.norm(half, axis=1), ranked
+        )
 
     def patterns(self, period: int, seed: int, iterations: int) -> list[Pattern]:
-        """The best patterns, best first; the first few of different lengths were improved."""
+        """Return the best patterns, best first.
+
+        The first few of different lengths were improved.
+        """
         length = min(self.samples, max(SEARCH_ROWS, SEARCH_PERIODS * period) + self.plant.start)
 
         def tried(patterns: list[Pattern]) -> Vector:
@@ -352,7 +537,9 @@ class _Search:
 
         starts = starting_patterns(period, seed)
         pool = dict(zip(starts, tried(starts), strict=True))
-        chosen = {(len(p.levels), p.odd): p for p in sorted(pool, key=lambda p: -pool[p])}  # the best of each length
+        chosen = {
+            (len(p.levels), p.odd): p for p in sorted(pool, key=lambda p: -pool[p])
+        }  # the best of each length
         for pattern in sorted(chosen.values(), key=lambda p: pool[p])[:STARTS]:
             for _ in range(iterations):
                 values = tried(near := pattern.neighbours())

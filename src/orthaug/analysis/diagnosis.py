@@ -1,8 +1,9 @@
-"""What the residual says about the noise, which criterion the data ask for, and which change would help.
+"""Diagnosis of a fit by its residual: the kind of noise, the right criterion, and useful changes.
 
-Noise in the equation leaves a white one-step residual. Noise on the measured output leaves a coloured one. It makes
-one-step least squares inconsistent, and a free run then explains the data as well as a prediction from measured lags.
-With many rows every test rejects; so effects are measured, as shares of variance that could be predicted.
+Noise in the equation leaves a white one-step residual. Noise on the measured output leaves a
+coloured one. It makes one-step least squares inconsistent, and a free run then explains the data as
+well as a prediction from measured lags. With many rows every test rejects; so effects are measured,
+as shares of variance that could be predicted.
 """
 
 from __future__ import annotations
@@ -34,29 +35,37 @@ from orthaug.inference.covariance import by_experiment
 from orthaug.models.response import Response
 from orthaug.physics.problem import Problem
 
-_LITTLE_COLOUR = 0.2  # of a free run's errors that are noise, beside a start from noisy lags and a fit of finite length
+# Of a free run's errors that are noise, beside a start from noisy lags and a fit of finite length
+_LITTLE_COLOUR = 0.2
 _LITTLE_FOLLOWED = 0.1  # correlation of such errors with an input
 _AS_GOOD = 1.05  # free-run error / one-step error up to which measured lags add nothing
 _SMALL = 0.05  # of the residual's variance: what could be predicted below that is a small effect
 _SMALL_SIZE = 0.05  # of the output's deviation, beside it
-_SMALL_COLOUR = 0.2  # the same of what a free run's own past tells: more of it is hardly noise
-_HOLD = 0.5  # share of the squares that stands in wild rows
-_FEW, _LEAST = 0.005, 6  # share of the rows that these are at most, and the number that is always few
+_SMALL_COLOUR = 0.2  # the same of what a free run's own past explains: more is hardly noise
+_HOLD = 0.5  # share of the squares in wild rows
+_FEW, _LEAST = (
+    0.005,
+    6,
+)  # share of the rows that these are at most, and the number that is always few
 _WILD = 20.0  # robust deviations; a normal residual reaches five
 _MAD = 1.4826
 _NAMED = 3
 
 
 def diagnose(
-    fit: Estimate | MotionEstimate, *, one_step: Response | None = None, free_run: Response | None = None
+    fit: Estimate | MotionEstimate,
+    *,
+    one_step: Response | None = None,
+    free_run: Response | None = None,
 ) -> Diagnosis | None:
     """Analyse the residuals of a fit on its training data; None where they cannot be tested.
 
-    Of lagged physics those one step ahead and of the free run; of a motion those of the free run, for its states are
-    not measured, with a test of the terms that its equations could lack (`missing`).
+    Lagged physics is tested one step ahead and on the free run; a motion on its free run, since its
+    states are not measured, with a test of the terms that its equations could lack (`missing`).
 
     Args:
-        one_step: the prediction of the training data, if it is there already; likewise their `free_run`.
+        one_step: the prediction of the training data, if it is there already; likewise their
+            `free_run`.
 
     Raises:
         InputError: an estimate that is not usable.
@@ -79,31 +88,38 @@ def diagnose(
     return diagnose_motion(fit, own)
 
 
-def _of_lagged(fit: Estimate, one_step: Response | None, free_run: Response | None) -> Diagnosis | None:
-    """By its one-step residual and its free run.
+def _of_lagged(
+    fit: Estimate, one_step: Response | None, free_run: Response | None
+) -> Diagnosis | None:
+    """Return the diagnosis of lagged physics by its one-step residual and its free run.
 
-    A one-step fit whose residual is coloured is set beside the free run of the physics alone, trained on it: that is
-    what sensor noise asks for, and it does not suffer from the bias of the fit in question.
+    A one-step fit whose residual is coloured is set beside the free run of the physics alone,
+    trained on it: that is what sensor noise asks for, and it does not suffer from the bias of the
+    fit in question.
     """
-    problem, model, simulated = fit.problem, fit.model, fit.criterion.flown is not None
+    problem, model, simulated = fit.problem, fit.model, fit.criterion.free_run is not None
     one_step = model.predict(problem.record) if one_step is None else one_step
     tests = _tests(problem, one_step)
-    if any(test.white is None for test in tests) or np.all(rms_errors(one_step) / problem.deviation < ROUNDING):
+    if any(test.white is None for test in tests) or np.all(
+        rms_errors(one_step) / problem.deviation < ROUNDING
+    ):
         return None
     white = all(test.practically_white() for test in tests)
-    seen = Finding(fit, simulated, one_step, tests, white=white, free_white=True, ratio=None, noise=None)
+    seen = Finding(
+        fit, simulated, one_step, tests, white=white, free_white=True, ratio=None, noise=None
+    )
     seen = replace(seen, steps={} if white else _steps(problem, tests))
     if not model.form.states:
         return _concluded(replace(seen, **_effects(fit, one_step, one_step, False)))
     free_run = model.simulate(problem.record) if free_run is None else free_run
     skip = fit.criterion.washout
-    flown = [(free_run, skip)] if not any(t.diverged for t in free_run.trajectories) else []
-    free_tests = _tests(problem, free_run, skip) if flown else None
-    trained = _physics_flown(fit) if not simulated and not white else []
-    ratios = [_ratio(run, one_step, first) for run, first in flown + trained]
+    free_runs = [(free_run, skip)] if not any(t.diverged for t in free_run.trajectories) else []
+    free_tests = _tests(problem, free_run, skip) if free_runs else None
+    trained = _physics_runs(fit) if not simulated and not white else []
+    ratios = [_ratio(run, one_step, first) for run, first in free_runs + trained]
     good = [
         ratio
-        for ratio, (run, first) in zip(ratios, flown + trained, strict=True)
+        for ratio, (run, first) in zip(ratios, free_runs + trained, strict=True)
         if ratio and ratio < _AS_GOOD and _accounts(problem, run, first)
     ]
     sensor = not white and bool(good)
@@ -115,18 +131,24 @@ def _of_lagged(fit: Estimate, one_step: Response | None, free_run: Response | No
         noise=_noise_in_lags(problem, ratio, one_step) if sensor else None,
         free_white=free_tests is not None and all(test.practically_white() for test in free_tests),
         free_tests=free_tests,
-        **_effects(fit, one_step, free_run if flown else None, fit.criterion.simulates),
-        inconsistent=None if sensor or seen.steps else _inconsistent(fit, one_step, free_run if flown else None),
+        **_effects(fit, one_step, free_run if free_runs else None, fit.criterion.simulates),
+        inconsistent=None
+        if sensor or seen.steps
+        else _inconsistent(fit, one_step, free_run if free_runs else None),
     )
     if not simulated and not white:
-        seen = replace(seen, changes=_with_criterion(seen, free_run if flown else None, trained))
+        seen = replace(
+            seen, changes=_with_criterion(seen, free_run if free_runs else None, trained)
+        )
     return _concluded(seen)
 
 
 def _concluded(seen: Finding) -> Diagnosis:
-    """The verdict and its words."""
+    """Return the verdict and its words."""
     misfit = any(t.follows() or t.curved_over(SHARE) for t in seen.tests) or seen.lacks
-    if not seen.fit.criterion.simulates:  # errors along a free run are slow, and look like functions of what is slow
+    if (
+        not seen.fit.criterion.simulates
+    ):  # errors along a free run are slow, and look like functions of what is slow
         misfit = misfit or any(one.functions > _SMALL for one in seen.predictable)
     complete = seen.white and not misfit and not seen.follows(_SMALL)
     white = (seen.free_white and seen.white) or not seen.fit.model.form.states
@@ -141,22 +163,29 @@ def _concluded(seen: Finding) -> Diagnosis:
         seen = replace(seen, changes=_toward_prediction(seen))
     wild = wild_rows(seen.one_step, seen.fit.problem.record.experiments)
     if wild:  # a larger learner would follow them
-        seen = replace(seen, changes=tuple(change for change in seen.changes if change.kind != "learner"))
+        seen = replace(
+            seen, changes=tuple(change for change in seen.changes if change.kind != "learner")
+        )
     text, warnings = words(verdict, seen)
     warnings = (*wild, *warnings)
     tested = seen.tests, seen.free_tests, seen.ratio, seen.noise
-    return Diagnosis(verdict, text, *tested, warnings, seen.predictable, seen.changes, steps=seen.steps or None)
+    return Diagnosis(
+        verdict, text, *tested, warnings, seen.predictable, seen.changes, steps=seen.steps or None
+    )
 
 
 def _inconsistent(fit: Estimate, one_step: Response, free_run: Response | None) -> Warning | None:
-    """Return the warning that coloured errors move the one-step θ; None where they do not, as far as is seen."""
+    """Return the warning that coloured errors move the one-step θ.
+
+    None where they do not, as far as is seen.
+    """
     with one_blas_thread():
         found = inconsistency(fit, one_step, free_run)
     return found.warning if found is not None and found.found else None
 
 
 def _steps(problem: Problem, tests: tuple[ResidualTest, ...]) -> dict[str, float]:
-    """The steps of the outputs that are measured in such as the one-step error has the size of."""
+    """Return the steps of outputs that are recorded in steps as large as the one-step error."""
     found = {}
     for i, test in enumerate(tests):
         step = quantum_of(np.concatenate([e.outputs[:, i] for e in problem.record.experiments]))
@@ -166,40 +195,58 @@ def _steps(problem: Problem, tests: tuple[ResidualTest, ...]) -> dict[str, float
 
 
 def _is_small(seen: Finding) -> bool:
-    """Whether what could be predicted is a small effect: no change is worth making."""
+    """Return whether what could be predicted is a small effect: no change is worth making."""
     if seen.lacks or not seen.predictable or seen.drifts or seen.follows(_SMALL):
         return False
     shares = [one.largest(own_past=not seen.simulated) for one in seen.predictable]
     unit = zip(seen.predictable, seen.fit.problem.deviation, strict=True)
     rms = np.array([one.rms / deviation for one, deviation in unit])
     colour = np.array([one.own_past for one in seen.predictable])
-    small = bool(np.all(np.sqrt(shares) * rms < _SMALL_SIZE) and np.all(np.sqrt(colour) * rms < _SMALL_COLOUR))
+    small = bool(
+        np.all(np.sqrt(shares) * rms < _SMALL_SIZE)
+        and np.all(np.sqrt(colour) * rms < _SMALL_COLOUR)
+    )
     return max(shares) < _SMALL and small
 
 
-def _effects(fit: Estimate, one_step: Response, free_run: Response | None, flown: bool) -> dict:
-    """What could be predicted of the error that was minimised, and which changes would do it."""
-    response, skip = (free_run, fit.criterion.washout) if flown else (one_step, 0)
-    several = fit.criterion.flown is not None and not fit.criterion.simulates
+def _effects(fit: Estimate, one_step: Response, free_run: Response | None, simulates: bool) -> dict:
+    """Return the predictable shares of the minimised error, and the changes that would use them."""
+    response, skip = (free_run, fit.criterion.washout) if simulates else (one_step, 0)
+    several = fit.criterion.free_run is not None and not fit.criterion.simulates
     if response is None or several:  # it ran away, or is the error of some steps ahead
         return {}
     with one_blas_thread():
-        shares = predictable(fit.problem, response, skip, flown=flown)
-    squares = [(one.rms / deviation) ** 2 for one, deviation in zip(shares, fit.problem.deviation, strict=True)]
-    functions = 0.0 if flown else float(np.average([one.functions for one in shares], weights=squares))
-    told: dict[str, Any] = {"flown": flown, "skip": skip, "one_step": one_step, "functions": functions}
-    return {"predictable": shares, "changes": model_changes(fit, response, **told)}
+        shares = predictable(fit.problem, response, skip, simulates=simulates)
+    squares = [
+        (one.rms / deviation) ** 2
+        for one, deviation in zip(shares, fit.problem.deviation, strict=True)
+    ]
+    functions = (
+        0.0 if simulates else float(np.average([one.functions for one in shares], weights=squares))
+    )
+    known: dict[str, Any] = {
+        "simulates": simulates,
+        "skip": skip,
+        "one_step": one_step,
+        "functions": functions,
+    }
+    return {"predictable": shares, "changes": model_changes(fit, response, **known)}
 
 
 def _with_criterion(
     seen: Finding, free_run: Response | None, trained: list[tuple[Response, int]]
 ) -> tuple[Change, ...]:
-    """The changes of a one-step fit with that of the criterion: in front where it is sensor noise, else if alone."""
+    """Return the changes of a one-step fit, with the change of criterion.
+
+    It comes first where noise is on the sensor, else only if there is no other.
+    """
     if not trained:
         return seen.changes
     (run, skip), unit = trained[0], seen.fit.problem.deviation
     after = float(np.mean((rms_errors(run, skip) / unit) ** 2))
-    before = np.inf if free_run is None else float(np.mean((rms_errors(free_run, skip) / unit) ** 2))
+    before = (
+        np.inf if free_run is None else float(np.mean((rms_errors(free_run, skip) / unit) ** 2))
+    )
     share = 1 - after / before
     change = (Change("criterion", "simulation", fall_of(share), "simulation"),)
     if seen.sensor:
@@ -208,7 +255,7 @@ def _with_criterion(
 
 
 def _toward_prediction(seen: Finding) -> tuple[Change, ...]:
-    """One step ahead instead of the free run, where its θ would predict better."""
+    """Return one step ahead instead of the free run, where its θ would predict better."""
     share = own_share(seen.fit, seen.one_step)
     if share.value < _SMALL or not share.sure:
         return ()
@@ -216,18 +263,23 @@ def _toward_prediction(seen: Finding) -> tuple[Change, ...]:
 
 
 def _accounts(problem: Problem, free_run: Response, skip: int) -> bool:
-    """Whether the errors of a free run look like noise on a sensor: white enough, and not following the inputs."""
+    """Return whether a free run's errors look like sensor noise: white, unrelated to inputs."""
     tests = _tests(problem, free_run, skip)
-    return all(test.practically_white(_LITTLE_COLOUR) and not test.follows(_LITTLE_FOLLOWED) for test in tests)
+    return all(
+        test.practically_white(_LITTLE_COLOUR) and not test.follows(_LITTLE_FOLLOWED)
+        for test in tests
+    )
 
 
-def _physics_flown(fit: Estimate) -> list[tuple[Response, int]]:
-    """The free run of the physics alone, trained on the free run; with the rows to skip."""
+def _physics_runs(fit: Estimate) -> list[tuple[Response, int]]:
+    """Return the free run of the physics alone, trained on the free run; with the rows to skip."""
     problem, criterion = fit.problem, Simulation()
     longest = max(len(e) for e in problem.record.experiments) - fit.model.form.first_row
     if longest <= 2 * criterion.washout:
         criterion = Simulation(segment=0, washout=0)
-    physics = estimate(problem.record, problem.baseline, lags=_lags_of(fit), learner=None, criterion=criterion)
+    physics = estimate(
+        problem.record, problem.baseline, lags=_lags_of(fit), learner=None, criterion=criterion
+    )
     if not physics.status.ok:
         return []
     run = physics.model.simulate(problem.record)
@@ -235,11 +287,14 @@ def _physics_flown(fit: Estimate) -> list[tuple[Response, int]]:
 
 
 def _lags_of(fit: Estimate) -> Lags | None:
-    """The lags that a baseline function needs; terms know their own."""
+    """Return the lags that a baseline function needs; terms know their own."""
     if fit.problem.baseline.function is None:
         return None
     layout, outputs = fit.problem.layout, fit.problem.outputs
-    reach = {name: [lag.lag for lag in layout if lag.channel == name] for name in dict.fromkeys(c for c, _ in layout)}
+    reach = {
+        name: [lag.lag for lag in layout if lag.channel == name]
+        for name in dict.fromkeys(c for c, _ in layout)
+    }
     inputs = [c.name for c in fit.problem.record.inputs]
     return Lags(
         na=[len(reach.get(name, [])) for name in outputs],
@@ -249,20 +304,24 @@ def _lags_of(fit: Estimate) -> Lags | None:
 
 
 def _tests(problem: Problem, response: Response, skip: int = 0) -> tuple[ResidualTest, ...]:
-    """The tests of measured minus model on every usable row of the problem after the first `skip`."""
+    """Return the tests of measured minus model on every usable row after the first `skip`."""
     record, start = problem.record, problem.rows.start
     residuals, inputs = [], []
     for experiment, trajectory in zip(record.experiments, response.trajectories, strict=True):
         residuals.append((experiment.outputs - trajectory.model)[start:][skip:])
         inputs.append(experiment.inputs[start:][skip:])
     regressors = [x[skip:] for x in by_experiment(problem, problem.rows.x)]
-    names = ([c.name for c in record.outputs], [c.name for c in record.inputs], [str(lag) for lag in problem.layout])
+    names = (
+        [c.name for c in record.outputs],
+        [c.name for c in record.inputs],
+        [str(lag) for lag in problem.layout],
+    )
     with one_blas_thread():
         return analyse(residuals, inputs, regressors, *names, lags=LAGS)
 
 
 def _ratio(free_run: Response, one_step: Response, skip: int) -> float | None:
-    """Geometric mean over outputs of the free run's RMS error against the one-step error."""
+    """Return the free run's RMS error over the one-step error, the geometric mean over outputs."""
     free, one = rms_errors(free_run, skip), rms_errors(one_step, skip)
     if not (np.isfinite(free).all() and np.all(one > 0) and np.all(free > 0)):
         return None
@@ -270,7 +329,7 @@ def _ratio(free_run: Response, one_step: Response, skip: int) -> float | None:
 
 
 def _noise_in_lags(problem: Problem, ratio: float | None, one_step: Response) -> float | None:
-    """Noise variance against the smallest variance among the lagged outputs that the other regressors do not explain.
+    """Return the noise variance over the least variance of lagged outputs beside other regressors.
 
     It is the share by which one-step least squares shrinks what it estimates in that direction.
     """
@@ -288,7 +347,7 @@ def _noise_in_lags(problem: Problem, ratio: float | None, one_step: Response) ->
 
 
 def wild_rows(response: Response, experiments: Sequence[Experiment]) -> tuple[Warning, ...]:
-    """A warning for each output whose error is mostly that of a few rows, far from all others."""
+    """Return a warning for each output whose error comes mostly from a few distant rows."""
     found = []
     errors = errors_of(response)
     starts = [t.start for t in response.trajectories]
@@ -298,14 +357,19 @@ def wild_rows(response: Response, experiments: Sequence[Experiment]) -> tuple[Wa
         size = np.abs(error - np.median(error))
         wild = np.flatnonzero(size > _WILD * _MAD * np.median(size))
         held = float(np.sum(size[wild] ** 2)) / max(float(np.sum(size**2)), 1e-300)
-        if not len(wild) or len(wild) > max(_LEAST, _FEW * len(error)) or held < _HOLD or not np.median(size):
+        if (
+            not len(wild)
+            or len(wild) > max(_LEAST, _FEW * len(error))
+            or held < _HOLD
+            or not np.median(size)
+        ):
             continue
         named = [experiments[rows[k][0]].where(rows[k][1]) for k in wild[:_NAMED]]
         more = f" and {len(wild) - _NAMED} more" if len(wild) > _NAMED else ""
         text = (
-            f"{percent(held, 3)} of the squares of the one-step residual of {output.name} stand in "
-            f"{counted(len(wild), 'row')} of {len(error)}: {'; '.join(named)}{more}. If samples are wrong there, so is "
-            'θ: mark them (step = "outliers" of data.prepare), or leave them out.'
+            f"{counted(len(wild), 'row')} of {len(error)} make up {percent(held, 3)} of the "
+            f"squared one-step residual of {output.name}: {'; '.join(named)}{more}. Wrong samples "
+            'there bias θ: mark them (step = "outliers" of data.prepare), or leave them out.'
         )
         found.append(Warning("wild_rows", text))
     return tuple(found)

@@ -1,7 +1,8 @@
-"""How does a step depend on the one before? A_k = ∂x_{k+1}/∂x_k along a run, and its spectral radius.
+"""Dependence of a step on the one before: A_k = ∂x_{k+1}/∂x_k along a run, and spectral radius.
 
-A small change of the state obeys `δx_{k+1} = A_k δx_k` in a free run. The state of the lagged form is
-`x_k = (y_{k−1}, …, y_{k−na})`: its A_k is a companion matrix, with ∂g/∂y_{k−i} in the first ny rows and shifts below.
+A small change of the state obeys `δx_{k+1} = A_k δx_k` in a free run. The state of the lagged form
+is `x_k = (y_{k−1}, …, y_{k−na})`: its A_k is a companion matrix, with ∂g/∂y_{k−i} in the first ny
+rows and shifts below.
 """
 
 from __future__ import annotations
@@ -15,7 +16,14 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Vector, check_choice
 from orthaug._base.jax import Array, jax, jnp
-from orthaug.analysis.visited import MOST_STEPS, Place, Visited, measured_by, positive, visited_by
+from orthaug.analysis.visited import (
+    MOST_STEPS,
+    RunPoint,
+    RunPoints,
+    measured_by,
+    positive,
+    visited_by,
+)
 from orthaug.data.record import Record
 from orthaug.models.dynamics import Dynamics, Numbers
 from orthaug.models.model import Model
@@ -29,8 +37,10 @@ MOST_WORK = 4e7  # rows times n0³
 _LONGEST_STATE = 200  # n0 with eigenvalues at all
 
 
-def linearised(model: Model, visited: Visited) -> tuple[Visited, Float[np.ndarray, "m n0 n0"], Vector]:
-    """The points with finite derivatives, A_k there, and its spectral radii (m,)."""
+def linearised(
+    model: Model, visited: RunPoints
+) -> tuple[RunPoints, Float[np.ndarray, "m n0 n0"], Vector]:
+    """Return the points with finite derivatives, A_k there, and its spectral radii (m,)."""
     transition = transitions(model, visited.states, visited.inputs)
     finite = (np.abs(transition) < _NO_DERIVATIVE).all(axis=(1, 2))
     radius = np.abs(np.linalg.eigvals(transition[finite])).max(axis=1, initial=0.0)
@@ -40,60 +50,71 @@ def linearised(model: Model, visited: Visited) -> tuple[Visited, Float[np.ndarra
 def transitions(
     model: Model | MotionModel, states: Float[np.ndarray, "m n0"], inputs: Float[np.ndarray, "m nu"]
 ) -> Float[np.ndarray, "m n0 n0"]:
-    """A_k at m points; not finite where there is no derivative."""
+    """Return A_k at m points; not finite where there is no derivative."""
     n0 = states.shape[1]
     width = difference_width(states) if len(states) else np.ones(n0)
     batches = [np.zeros((0, n0, n0))]
     for begin in range(0, len(states), _BATCH):
-        rows = np.minimum(np.arange(begin, begin + _BATCH), len(states) - 1)  # the last one again: one shape
+        rows = np.minimum(
+            np.arange(begin, begin + _BATCH), len(states) - 1
+        )  # the last one again: one shape
         found = _transitions(model.form, model.numbers, states[rows], inputs[rows], width)
         batches.append(np.asarray(found)[: len(states) - begin])
     return np.concatenate(batches)
 
 
 def difference_width(points: Float[np.ndarray, "m n"]) -> Vector:
-    """How far differences reach to each side of a point, in each entry."""
+    """Return the reach of differences to each side of a point, in each entry."""
     return _WIDTH * positive(points.std(axis=0))
 
 
 def by_differences(function: Any, point: Any, width: Any) -> Any:
-    """∂function/∂point (outputs, n) from differences of `width` (n,)."""
+    """Return ∂function/∂point (outputs, n) from differences of `width` (n,)."""
     aside, each = jnp.diag(width), jax.vmap(function)
     return ((each(point + aside) - each(point - aside)) / (2 * width[:, None])).T
 
 
 @partial(jax.jit, static_argnames="form")
 def _transitions(
-    form: Dynamics, numbers: Numbers, states: Float[Array, "m n0"], inputs: Float[Array, "m nu"], width: Any
+    form: Dynamics,
+    numbers: Numbers,
+    states: Float[Array, "m n0"],
+    inputs: Float[Array, "m nu"],
+    width: Any,
 ) -> Float[Array, "m n0 n0"]:
-    """A_k at m points, by differences where a learner has no derivative."""
+    """Return A_k at m points, by differences where a learner has no derivative."""
 
     def at(state: Any, row: Any) -> Any:
         def following(state: Any) -> Any:
             return form.step(numbers, state, row)[0]
 
-        return jax.jacrev(following)(state) if form.differentiable else by_differences(following, state, width)
+        return (
+            jax.jacrev(following)(state)
+            if form.differentiable
+            else by_differences(following, state, width)
+        )
 
     return jax.vmap(at)(states, inputs)
 
 
 @dataclass(frozen=True, eq=False)
 class Feedback:
-    """How m of the `steps` of a run, spread evenly, depend on the state before.
+    """Dependence on the state before of m of the `steps` of a run, spread evenly.
 
-    `transition` are the A_k in the units of the state, `radius` (m,) their spectral radii, and their summary is None
-    where there are none. `skipped` points are left out because the model has no finite derivative there; `diverged`
-    says in which output and where a free run left all bounds; `unit` (n0,) is the deviation of each entry of the state.
+    `transition` are the A_k in the units of the state, `radius` (m,) their spectral radii, and
+    their summary is None where there are none. `skipped` points are left out because the model has
+    no finite derivative there; `diverged` says in which output and where a free run left all
+    bounds; `unit` (n0,) is the deviation of each entry of the state.
     """
 
-    points: Visited
+    points: RunPoints
     transition: Float[np.ndarray, "m n0 n0"]
     radius: Vector
     unit: Vector
     largest: float | None
     median: float | None
     share_above_one: float | None
-    worst: Place | None
+    worst: RunPoint | None
     steps: int
     skipped: int
     diverged: tuple[str, ...]
@@ -102,13 +123,15 @@ class Feedback:
 def feedback(
     model: Model, record: Record, *, along: str = "simulation", response: Response | None = None
 ) -> Feedback | None:
-    """A_k = ∂x_{k+1}/∂x_k and its spectral radius along a run; None for a model without a state.
+    """Return A_k = ∂x_{k+1}/∂x_k and its spectral radius along a run; None without a state.
 
-    At most 20000 steps, spread evenly: fewer where the state is large, none where n0 is above 200. Radii below 1 do not
-    make a nonlinear run stable, nor do some above 1 make it unstable. They say where to look.
+    At most 20000 steps, spread evenly: fewer where the state is large, none where n0 is above 200.
+    Radii below 1 do not make a nonlinear run stable, nor do some above 1 make it unstable. They say
+    where to look.
 
     Args:
-        along: "simulation", states of the free run up to where it diverges, or "measured", as the outputs give them.
+        along: "simulation", states of the free run up to where it diverges, or "measured", as the
+            outputs give them.
         response: the model's free run of the record, if it is there already.
 
     Raises:
@@ -119,13 +142,27 @@ def feedback(
         return None
     most = 0 if size > _LONGEST_STATE else min(MOST_STEPS, int(MOST_WORK / size**3))
     if along == "simulation":
-        run = visited_by(model, record, model.simulate(record) if response is None else response, most)
+        run = visited_by(
+            model, record, model.simulate(record) if response is None else response, most
+        )
     else:
         run = measured_by(model, record, most)
     points, transition, radius = linearised(model, run.points)
     largest, worst = points.worst(record, radius, model.form.describe)
-    median, share = (float(np.median(radius)), float(np.mean(radius > 1 + 1e-6))) if worst else (None, None)
+    median, share = (
+        (float(np.median(radius)), float(np.mean(radius > 1 + 1e-6))) if worst else (None, None)
+    )
     skipped = len(run.points) - len(points)
     return Feedback(
-        points, transition, radius, run.unit, largest, median, share, worst, run.steps, skipped, run.diverged
+        points,
+        transition,
+        radius,
+        run.unit,
+        largest,
+        median,
+        share,
+        worst,
+        run.steps,
+        skipped,
+        run.diverged,
     )

@@ -1,10 +1,11 @@
-"""Does a model's free run stay bounded and forget its start? All checks together, and what they say in words.
+"""Stability of a free run: all checks of boundedness and contraction together, with their report.
 
-They are evidence from sampled points, no proof, but for the last: beyond the training a held correction is bounded, and
-stable linear physics keeps it so (`beyond_training`). Two of them look at A_k, the derivative of a step by the state:
-its spectral radius at every step (`feedback`), and a quadratic norm in which all sampled A_k contract (`contraction`).
-A third runs the model on larger and larger inputs (`boundedness`). The paper's `cond:pred_stab` is another matter: it
-asks for the one-step predictor, whose past is measured (`lipschitz`).
+They are evidence from sampled points, no proof, but for the last: beyond the training a held
+correction is bounded, and stable linear physics keeps it so (`beyond_training`). Two of them look
+at A_k, the derivative of a step by the state: its spectral radius at every step (`feedback`), and a
+quadratic norm in which all sampled A_k contract (`contraction`). A third runs the model on larger
+and larger inputs (`boundedness`). The paper's `cond:pred_stab` is another matter: it asks for the
+one-step predictor, whose past is measured (`lipschitz`).
 """
 
 from __future__ import annotations
@@ -27,10 +28,13 @@ from orthaug.models.response import Response
 
 @dataclass(frozen=True, eq=False)
 class Stability:
-    """Evidence on the free run (None without a state); `diverges_at` is searched up to the factor `searched`.
+    """Evidence on the free run (None without a state).
 
-    `lipschitz` is None for a model that does not predict from lagged signals. `radius_beyond` is the spectral radius of
-    what goes on far beyond the training (`beyond_training`), None where that is not one linear system.
+    `diverges_at` is searched up to the factor `searched`.
+
+    `lipschitz` is None for a model that does not predict from lagged signals. `radius_beyond` is
+    the spectral radius of what goes on far beyond the training (`beyond_training`), None where that
+    is not one linear system.
     """
 
     feedback: Feedback | None
@@ -52,11 +56,12 @@ def stability(
     box: int = 0,
     largest: float = 1024.0,
 ) -> Stability:
-    """All checks of a model on a record, with a text that says what they mean.
+    """Return all checks of a model on a record, with a text that says what they mean.
 
     Args:
         response: the model's free run of the record, if it is there already.
-        x: the record's usable regressors (N, nx) in the model's layout, if they are stacked already.
+        x: the record's usable regressors (N, nx) in the model's layout, if they are stacked
+            already.
         box, largest: as in `contraction` and `divergence_scaling`.
 
     Raises:
@@ -83,33 +88,61 @@ def stability(
 
 
 def _sentences(checks: Stability, driven: bool) -> Iterator[tuple[str, str]]:
-    """What the checks say, sentence by sentence; with the code of a warning, or nothing."""
+    """Yield what the checks say, sentence by sentence; with the code of a warning, or nothing."""
     run, contracts = checks.feedback, checks.contraction
     if checks.lipschitz:
         steepest = checks.lipschitz.gradient
-        gradient = "no finite gradient" if steepest is None else f"a gradient of at most {steepest:.4g}"
-        yield f"The one-step predictor has {gradient} on measured rows; that says nothing about the free run.", ""
+        gradient = (
+            "no finite gradient" if steepest is None else f"a gradient of at most {steepest:.4g}"
+        )
+        yield (
+            f"The one-step predictor has {gradient} on measured rows; that says nothing about "
+            "the free run.",
+            "",
+        )
     if run is None:
-        yield "The model uses no past outputs: its free run cannot diverge, and keeps nothing of its start.", ""
+        yield (
+            "The model uses no past outputs: its free run cannot diverge, and does not depend "
+            "on its start.",
+            "",
+        )
         return
     if run.diverged:
-        yield f"The free run diverges ({'; '.join(run.diverged)}); it is looked at up to there.", "free_run_diverges"
+        yield (
+            f"The free run diverges ({'; '.join(run.diverged)}); the checks end there.",
+            "free_run_diverges",
+        )
     if run.share_above_one is not None:
-        above = f"above 1 at {percent(run.share_above_one, 3)} of {len(run.radius)} steps of the free run"
+        above = (
+            f"above 1 at {percent(run.share_above_one, 3)} of {len(run.radius)} steps of the "
+            "free run"
+        )
         peak = f"median {run.median:.4g}, largest {run.largest:.4g} at {run.worst}"
         warns = "spectral_radius_above_one" if run.share_above_one > 0.01 else ""
         yield f"The local spectral radius is {above}; {peak}.", warns
     if run.skipped:
-        told = f"At {run.skipped} points more the model has no finite derivative; they are left out."
-        yield told, "derivative_not_finite"
+        text = (
+            f"At {run.skipped} points more the model has no finite derivative; they are left out."
+        )
+        yield text, "derivative_not_finite"
     if contracts is None:
-        told = "Contraction could not be checked: no finite derivatives, or more than 200 past outputs."
-        yield told, "contraction_not_checked"
+        text = (
+            "Contraction could not be checked: no finite derivatives, or more than 200 past "
+            "outputs."
+        )
+        yield text, "contraction_not_checked"
     elif contracts.rate < 1:
-        how = f"contracts in one metric (rate {contracts.rate:.4g}): evidence, not proof, that it forgets its start"
+        how = (
+            f"contracts in one metric (rate {contracts.rate:.4g}): evidence, not proof, that "
+            "it forgets its start"
+        )
         yield f"On all {contracts.samples} sampled points the free run {how}.", ""
     else:
         share = f"{percent(1 - contracts.share, 3)} of the {contracts.samples} sampled points"
         worst = f"worst at {contracts.worst}, rate {contracts.rate:.4g}"
-        yield f"At {share} the free run does not contract in the best metric that was found, {worst}.", ""
+        yield (
+            f"At {share} the free run does not contract in the best metric that was found, "
+            f"{worst}.",
+            "",
+        )
     yield margin(checks.diverges_at, checks.searched, driven)

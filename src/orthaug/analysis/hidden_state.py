@@ -1,11 +1,13 @@
-"""Does the model leave structure that noise does not explain, and does the past beyond its states tell it?
+"""Test for structure in a free run's errors that noise does not explain, and for hidden states.
 
-The errors of the free run are regressed on how the outputs follow, to first order, the parameters, the starts and any
-function of what a learner sees (`output_response`). What is added to that are simple functions of a state or an input,
-and terms with memory of it (`memory`). Run and inputs are no function of the noise: noise of any colour, on the sensor
-or in the equation, is no reason to find one. Rows and columns are filtered by the autoregression of the errors beside
-the model (Cochrane and Orcutt 1949), so that what remains of noise is white. A family of terms counts where its F-test
-rejects at the level divided by the number of families and it predicts blocks of rows that it was not fitted to.
+The errors of the free run are regressed on how the outputs follow, to first order, the parameters,
+the starts and any function of what a learner sees (`output_response`). What is added to that are
+simple functions of a state or an input, and terms with memory of it (`memory`). Run and inputs are
+no function of the noise: noise of any colour, on the sensor or in the equation, is no reason to
+find one. Rows and columns are filtered by the autoregression of the errors beside the model
+(Cochrane and Orcutt 1949), so that what remains of noise is white. A family of terms counts where
+its F-test rejects at the level divided by the number of families and it predicts blocks of rows
+that it was not fitted to.
 """
 
 from __future__ import annotations
@@ -32,19 +34,35 @@ _LEVEL = 0.01
 _ROWS_PER_COLUMN = 4
 _ROUNDING = 1e-7  # of the outputs' deviation: errors below that are rounding and the integrator's
 _OWN = 1e-3  # of a column's size: what is left of it beside the model, so that it is one of its own
-_CENTRES = (0.05, 0.2, 0.35, 0.5, 0.65, 0.8, 0.95)  # quantiles about which a function of a learner's feature bends
+_CENTRES = (
+    0.05,
+    0.2,
+    0.35,
+    0.5,
+    0.65,
+    0.8,
+    0.95,
+)  # quantiles about which a function of a learner's feature bends
 _STATIC = 5
 _LEAST_LAG = 3.0  # samples: a faster state is a lag that is missing
-_CLEARLY = 0.1  # of the filtered errors' square, by which memory predicts more than functions of one row
-_SETTLING, _HALVINGS, _SETTLED = 8, 4, 0.01  # steps, shorter ones, and the fall of the squares that ends them
+# Of the filtered errors' square, by which memory predicts more than functions of one row
+_CLEARLY = 0.1
+_SETTLING, _HALVINGS, _SETTLED = (
+    8,
+    4,
+    0.01,
+)  # steps, shorter ones, and the fall of the squares that ends them
 
 
 @dataclass(frozen=True)
 class FamilyTest:
-    """A family of terms in one equation: `share` of the filtered errors' square that it predicts on held-out blocks.
+    """A family of terms in one equation, and the `share` of the errors that it predicts.
 
-    `error` is the standard error of the share, `p` that of the F-test, times the number of families. `moves` is by how
-    much each parameter moves once the best `term` is fitted beside it, in the coordinates that are estimated.
+    The share is of the filtered errors' square, on held-out blocks.
+
+    `error` is the standard error of the share, `p` that of the F-test, times the number of
+    families. `moves` is by how much each parameter moves once the best `term` is fitted beside it,
+    in the coordinates that are estimated.
     """
 
     equation: str
@@ -58,7 +76,7 @@ class FamilyTest:
 
     @property
     def name(self) -> str:
-        """What it is, in words."""
+        """Name of the family, in words."""
         return f"a function of {self.on}" if self.term is None else f"a {self.term.name}"
 
     def is_short(self, least: float) -> bool:
@@ -67,16 +85,17 @@ class FamilyTest:
 
     @property
     def sure(self) -> bool:
-        """Whether it is surely there."""
+        """True if the family is surely present."""
         return self.p < _LEVEL and self.share > 2 * self.error
 
 
 @dataclass(frozen=True)
 class StructureTest:
-    """What the errors of a free run hold beside noise.
+    """Structure beside noise in the errors of a free run.
 
-    `static` is the best family of functions of a state or an input, `memory` the best with memory, each beside what the
-    model has; `hidden` the best with memory beside all static ones, too. None where none is sure.
+    `static` is the best family of functions of a state or an input, `memory` the best with memory,
+    each beside what the model has; `hidden` the best with memory beside all static ones, too. None
+    where none is sure.
     """
 
     static: FamilyTest | None
@@ -89,7 +108,7 @@ class StructureTest:
 
     @property
     def found(self) -> bool:
-        """Whether there is any structure."""
+        """True if there is any structure."""
         return self.static is not None or self.memory is not None
 
     def is_a_lag(self, one: FamilyTest) -> bool:
@@ -98,10 +117,13 @@ class StructureTest:
 
     @property
     def has_memory(self) -> bool:
-        """Whether a hidden state is the likely cause: memory is sure beside static terms, and predicts clearly more.
+        """True if a hidden state is the likely cause.
 
-        Play and hysteresis of a position follow the sign of its speed, so they stand in for friction that is not quite
-        right; a lag of a sample or two is a lag that the physics has too few of.
+        Memory is sure beside static terms, and predicts clearly more.
+
+        Play and hysteresis of a position follow the sign of its speed, so they replace
+        friction that is not quite right; a lag of a sample or two is a lag that the physics has too
+        few of.
         """
         if self.hidden is None or self.memory is None:
             return False
@@ -136,10 +158,12 @@ def structure_test(model: Model | MotionModel, record: Record) -> StructureTest 
 
 
 def _settled(model: Model | MotionModel, record: Record) -> tuple[Vector, list[LinearRun]] | None:
-    """Move the parameters of the physics to where the filtered errors of the free run are least (Gauss-Newton).
+    """Return parameters of the physics with the least filtered free-run errors, and the runs.
 
-    Noise on the sensor, or coloured noise, biases what was fitted one step ahead: its run is then far from the data
-    even though nothing is missing.
+    They are found by Gauss-Newton steps.
+
+    Noise on the sensor, or coloured noise, biases what was fitted one step ahead: its run is then
+    far from the data even though nothing is missing.
     """
     theta = np.asarray(model.numbers.theta, dtype=float)
     runs = linear_runs(model, record, _MOST_ROWS, theta)
@@ -149,13 +173,18 @@ def _settled(model: Model | MotionModel, record: Record) -> tuple[Vector, list[L
         base = _base_columns(model, runs)
         pieces, colours = _coloured(runs, base)
         rows, nt = np.concatenate([_filtered(piece, colours) for piece in pieces]), len(theta)
-        step, before = _least_squares(rows[:, :-1], rows[:, -1])[:nt], _left(rows[:, nt:-1], rows[:, -1])
+        step, before = (
+            _least_squares(rows[:, :-1], rows[:, -1])[:nt],
+            _left(rows[:, nt:-1], rows[:, -1]),
+        )
         scale, trial, after = _scale(runs), None, np.inf
         for _ in range(_HALVINGS):
             trial, after = linear_runs(model, record, _MOST_ROWS, theta + step), np.inf
             if trial is not None:
                 beside = [one[..., nt:] for one in _base_columns(model, trial)]
-                moved = np.concatenate([_filtered(piece, colours) for piece in _pieces(trial, beside, scale)])
+                moved = np.concatenate(
+                    [_filtered(piece, colours) for piece in _pieces(trial, beside, scale)]
+                )
                 after = _left(moved[:, :-1], moved[:, -1])
             if after < before:
                 break
@@ -182,13 +211,20 @@ def _left(columns: Matrix, target: Vector) -> float:
 
 
 def _signals(model: Model | MotionModel, run: LinearRun) -> dict[str, Vector]:
-    """Return what terms may be of: each channel of the regressor and its velocity, or states and inputs."""
+    """Return the signals that terms may depend on.
+
+    They are each channel of the regressor and its velocity, or states and inputs.
+    """
     form: Any = model.form
     if isinstance(model, MotionModel):
         names = (*model.form.motion.names_of_states, *model.form.motion.inputs)
         found = dict(zip(names, np.concatenate([run.states, run.inputs], axis=1).T, strict=True))
         seen = form.seen(run.states.T, run.inputs.T, np) if form.bound is not None else ()
-        found |= {str(entry): row for entry, row in zip(form.features, seen, strict=False) if str(entry) not in found}
+        found |= {
+            str(entry): row
+            for entry, row in zip(form.features, seen, strict=False)
+            if str(entry) not in found
+        }
     else:
         x, layout = form.regressor(run.states.T, run.rows.T, np), form.layout
         found = {}
@@ -198,26 +234,34 @@ def _signals(model: Model | MotionModel, run: LinearRun) -> dict[str, Vector]:
             found[str(lags[0])] = first
             if others and channel in form.outputs:
                 found[f"{lags[0]} - {lags[1]}"] = first - others[0]
-    moving = {name: row for name, row in found.items() if np.isfinite(row).all() and np.ptp(row) > 0}
+    moving = {
+        name: row for name, row in found.items() if np.isfinite(row).all() and np.ptp(row) > 0
+    }
     return dict(list(moving.items())[:_VARIABLES])
 
 
 def _features(model: Model | MotionModel, run: LinearRun) -> Matrix:
-    """Return what the learner sees along the run, (T, nz)."""
+    """Return the learner's inputs along the run, (T, nz)."""
     form: Any = model.form
     if form.bound is None:
         return np.zeros((len(run.error), 0))
     if isinstance(model, MotionModel):
         return np.asarray(form.seen(run.states.T, run.inputs.T, np)).T
-    return np.asarray(form.features.evaluate(form.regressor(run.states.T, run.rows.T, np).T, form.layout, np))
+    return np.asarray(
+        form.features.evaluate(form.regressor(run.states.T, run.rows.T, np).T, form.layout, np)
+    )
 
 
 def _equations(model: Model | MotionModel) -> tuple[tuple[int, str], ...]:
-    """Return the equations that may lack something: of outputs, or of states that have a parameter or a learner."""
+    """Return the equations that may lack a term: outputs, or states with parameter or learner."""
     if isinstance(model, MotionModel):
         motion = model.form.motion
         names, places = motion.names_of_states, set(motion.learned[0])
-        places |= {i for i, name in enumerate(names) if motion.functions is not None or motion.parameters_in(name)}
+        places |= {
+            i
+            for i, name in enumerate(names)
+            if motion.functions is not None or motion.parameters_in(name)
+        }
         return tuple((i, names[i]) for i in sorted(places))[:_EQUATIONS]
     return tuple(enumerate(model.form.outputs))[:_EQUATIONS]
 
@@ -240,7 +284,10 @@ def _respond(model: Model | MotionModel, run: LinearRun, place: int, columns: Ma
 
 
 def _base_columns(model: Model | MotionModel, runs: list[LinearRun]) -> list[np.ndarray]:
-    """Return what the model explains, of every run (T, ny, k): starts, parameters, functions of what it sees."""
+    """Return the model's own columns of every run (T, ny, k).
+
+    They are starts, parameters, and functions of the learner's inputs.
+    """
     features = [_features(model, run) for run in runs]
     bends = _bends(np.concatenate(features))
     places = [i for i, _ in _equations(model)]
@@ -257,7 +304,7 @@ def _base_columns(model: Model | MotionModel, runs: list[LinearRun]) -> list[np.
 
 
 def _bends(z: Matrix):
-    """Return a flexible function of features: of each its bends at quantiles, and products of pairs."""
+    """Return a flexible function of features: their bends at quantiles, and products of pairs."""
     centre, size = z.mean(axis=0), np.where(z.std(axis=0) > 0, z.std(axis=0), 1.0)
     scaled = (z - centre) / size
     knots = [np.unique(np.quantile(column, _CENTRES)) for column in scaled.T]
@@ -266,10 +313,18 @@ def _bends(z: Matrix):
         own = np.clip((rows - centre) / size, -5, 5)
         found = [np.ones(len(rows))]
         for v, at in zip(own.T, knots, strict=True):
-            found += [v, v**3, *(np.tanh((v - knot) / width) for knot in at for width in (0.05, 0.4))]
+            found += [
+                v,
+                v**3,
+                *(np.tanh((v - knot) / width) for knot in at for width in (0.05, 0.4)),
+            ]
         for i in range(own.shape[1]):
             for j in range(i):
-                found += [own[:, i] * own[:, j], own[:, i] ** 2 * own[:, j], own[:, i] * own[:, j] ** 2]
+                found += [
+                    own[:, i] * own[:, j],
+                    own[:, i] ** 2 * own[:, j],
+                    own[:, i] * own[:, j] ** 2,
+                ]
         return np.stack(found, axis=1)
 
     return columns
@@ -281,8 +336,10 @@ def _static(values: Vector, size: float) -> list[Vector]:
     return [v, np.abs(v), v * np.abs(v), v**3, np.tanh(10 * v)]
 
 
-def _added_columns(model: Model | MotionModel, runs: list[LinearRun]) -> tuple[list[_Family], list[np.ndarray]]:
-    """Return the families of terms, and of every run the responses to all their terms, (T, ny, K)."""
+def _added_columns(
+    model: Model | MotionModel, runs: list[LinearRun]
+) -> tuple[list[_Family], list[np.ndarray]]:
+    """Return the families of terms, and each run's responses to all their terms, (T, ny, K)."""
     step, signals = model.sampling_time, [_signals(model, run) for run in runs]
     names = [name for name in signals[0] if all(name in other for other in signals)]
     families, columns = [], [[] for _ in runs]
@@ -295,7 +352,9 @@ def _added_columns(model: Model | MotionModel, runs: list[LinearRun]) -> tuple[l
         for place, equation in _equations(model):
             families += [_Family(equation, name, kind, own) for kind, own in kinds]
             for found, own, run in zip(columns, signals, runs, strict=True):
-                values = _static(own[name], size) + [filtered(term, own[name], step) / size for term in terms]
+                values = _static(own[name], size) + [
+                    filtered(term, own[name], step) / size for term in terms
+                ]
                 found.append(_respond(model, run, place, np.stack(values, axis=1)))
     return families, [np.concatenate(found, axis=2) for found in columns]
 
@@ -306,13 +365,17 @@ def _scale(runs: list[LinearRun]) -> Vector:
 
 
 def _pieces(runs: list[LinearRun], columns: list[np.ndarray], scale: Vector) -> list[np.ndarray]:
-    """Return columns and errors of every run (T, ny, k + 1), outputs divided by the size of their errors."""
+    """Return columns and errors of every run (T, ny, k + 1), in units of each output's errors."""
     joined = zip(columns, runs, strict=True)
-    return [np.concatenate([one, run.error[..., None]], axis=2) / scale[:, None] for one, run in joined]
+    return [
+        np.concatenate([one, run.error[..., None]], axis=2) / scale[:, None] for one, run in joined
+    ]
 
 
-def _coloured(runs: list[LinearRun], base: list[np.ndarray]) -> tuple[list[np.ndarray], list[Vector]]:
-    """Return columns and errors, and of each output the autoregression of what the columns leave of its errors."""
+def _coloured(
+    runs: list[LinearRun], base: list[np.ndarray]
+) -> tuple[list[np.ndarray], list[Vector]]:
+    """Return columns and errors, and the autoregression of each output's remaining errors."""
     pieces = _pieces(runs, base, _scale(runs))
     rest = _beside([piece[..., :-1] for piece in pieces], [piece[..., -1] for piece in pieces])
     colours = [whitening([piece[:, o] for piece in rest]) for o in range(base[0].shape[1])]
@@ -320,22 +383,32 @@ def _coloured(runs: list[LinearRun], base: list[np.ndarray]) -> tuple[list[np.nd
 
 
 def _tested(
-    runs: list[LinearRun], base: list[np.ndarray], families: list[_Family], added: list[np.ndarray], shift: Vector
+    runs: list[LinearRun],
+    base: list[np.ndarray],
+    families: list[_Family],
+    added: list[np.ndarray],
+    shift: Vector,
 ) -> StructureTest | None:
-    """Filter rows and columns by the colour of the errors beside the model, and test every family."""
+    """Filter rows and columns by the colour of the remaining errors, and test every family."""
     nt, known, colours = len(shift), base[0].shape[2], _coloured(runs, base)[1]
     both = [np.concatenate(columns, axis=2) for columns in zip(base, added, strict=True)]
-    whole = np.concatenate([_filtered(piece, colours) for piece in _pieces(runs, both, _scale(runs))])
+    whole = np.concatenate(
+        [_filtered(piece, colours) for piece in _pieces(runs, both, _scale(runs))]
+    )
     if len(whole) < _ROWS_PER_COLUMN * (known + len(families)) or not np.isfinite(whole).all():
         return None
     starts = slice(nt, nt + runs[0].states.shape[1] * len(runs))
     q = _range(whole[:, starts])
-    whole = whole - q @ (q.T @ whole)  # they move a few rows of one run only: blocks would not tell them
+    whole = whole - q @ (
+        q.T @ whole
+    )  # they move a few rows of one run only: blocks would not show them
     whole[:, starts] = 0.0
     size = np.linalg.norm(whole, axis=0)
     size = np.where(size > 0, size, 1.0)
     whole = whole / size
-    static = np.concatenate([np.full(len(family.terms), family.kind == "static") for family in families])
+    static = np.concatenate(
+        [np.full(len(family.terms), family.kind == "static") for family in families]
+    )
     own, simple = list(range(known)), [known + int(j) for j in np.flatnonzero(static)]
     beside = _family_tests(whole, own, known, families, size, shift)
     hidden = _family_tests(whole, own + simple, known, families, size, None)
@@ -349,11 +422,13 @@ def _tested(
 
 
 def _best(entries: list[FamilyTest]) -> FamilyTest | None:
-    return max((entry for entry in entries if entry.sure), key=lambda entry: entry.share, default=None)
+    return max(
+        (entry for entry in entries if entry.sure), key=lambda entry: entry.share, default=None
+    )
 
 
 def _beside(columns: list[np.ndarray], errors: list[np.ndarray]) -> list[np.ndarray]:
-    """Return what least squares on the columns leaves of errors, pieces of (T, ny)."""
+    """Return the errors that least squares on the columns leaves, pieces of (T, ny)."""
     flat, lengths = np.concatenate(columns), np.cumsum([len(piece) for piece in columns])[:-1]
     target, ny = np.concatenate(errors), errors[0].shape[1]
     q = _range(flat.reshape(len(flat) * ny, -1))
@@ -372,16 +447,26 @@ def _range(columns: Matrix) -> Matrix:
 
 
 def _filtered(piece: np.ndarray, colours: list[Vector]) -> Matrix:
-    """Return columns and errors (T, ny, k) filtered by the autoregression of each output, rows in their order."""
+    """Return columns and errors (T, ny, k), filtered by the autoregression of each output."""
     memory = max(map(len, colours)) - 1
-    rows = np.stack([lfilter(a, [1.0], piece[:, o], axis=0)[memory:] for o, a in enumerate(colours)], axis=1)
+    rows = np.stack(
+        [lfilter(a, [1.0], piece[:, o], axis=0)[memory:] for o, a in enumerate(colours)], axis=1
+    )
     return rows.reshape(-1, piece.shape[2])
 
 
 def _family_tests(
-    whole: Matrix, base: list[int], known: int, families: list[_Family], size: Vector, shift: Vector | None
+    whole: Matrix,
+    base: list[int],
+    known: int,
+    families: list[_Family],
+    size: Vector,
+    shift: Vector | None,
 ) -> list[FamilyTest]:
-    """Test every family beside the columns of a base; `size` are the norms that columns were divided by."""
+    """Test every family beside the columns of a base.
+
+    `size` are the norms that columns were divided by.
+    """
     q = _range(whole[:, base])
     rest = whole[:, known:] - q @ (q.T @ whole[:, known:])
     target, terms = rest[:, -1], rest[:, :-1]
@@ -397,13 +482,19 @@ def _family_tests(
         basis = _range(terms[:, own])
         gained, rank = float(np.sum((basis.T @ target) ** 2)), basis.shape[1]
         freedom = left - rank
-        p = scipy.special.fdtrc(rank, freedom, gained / rank / (max(total - gained, 1e-300) / freedom))
+        p = scipy.special.fdtrc(
+            rank, freedom, gained / rank / (max(total - gained, 1e-300) / freedom)
+        )
         share: Share = sums.share([len(blocks) + j for j in own], blocks)
         chosen = max(own, key=lambda j: (terms[:, j] @ target) ** 2 / (terms[:, j] @ terms[:, j]))
         term = family.terms[chosen - (place - len(family.terms))]
-        entry = FamilyTest(family.equation, family.on, family.kind, share.value, share.error, float(p), term)
+        entry = FamilyTest(
+            family.equation, family.on, family.kind, share.value, share.error, float(p), term
+        )
         if shift is not None and term is not None:
             step = _least_squares(whole[:, [*base, known + chosen]], whole[:, -1])[: len(shift)]
-            entry = replace(entry, moves=tuple(map(float, shift + step * size[-1] / size[: len(shift)])))
+            entry = replace(
+                entry, moves=tuple(map(float, shift + step * size[-1] / size[: len(shift)]))
+            )
         found.append(entry)
     return [replace(entry, p=min(entry.p * len(found), 1.0)) for entry in found]

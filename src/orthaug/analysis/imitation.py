@@ -1,4 +1,4 @@
-"""What a learner could imitate of the physics, in words, in physical parameters, and with other learner inputs (F8)."""
+"""Directions of the physics that a learner could imitate, also with other learner inputs (F8)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from orthaug.analysis.measure_bias import physical_slopes
 from orthaug.data.expressions import parse, parse_named
 from orthaug.data.regressors import Features
 from orthaug.inference.motion_split import shared_of_motion
-from orthaug.models.moving import Moving
+from orthaug.models.moving import MotionDynamics
 from orthaug.physics.motion import Motion
 from orthaug.physics.parameters import PhysicsMap
 from orthaug.physics.problem import Problem
@@ -22,12 +22,13 @@ from orthaug.physics.shared import Shared, shared_directions
 
 _STILL = 1e-8  # change of a physical parameter along a shared direction, relative: rounding
 _ALTERNATIVES = 8
-_NEARLY = 0.05  # of a regressor's norm: what widens a standard error twenty times, as in `orthaug select`
+# Of a regressor's norm: what widens a standard error twenty times, as in `orthaug select`
+_NEARLY = 0.05
 
 
 @dataclass(frozen=True)
 class Alternative:
-    """Other learner inputs: how many directions they share, and what is determined beside such a learner."""
+    """Other learner inputs: the directions they share, and the parameters they leave determined."""
 
     inputs: tuple[str, ...]
     shared: int
@@ -35,16 +36,19 @@ class Alternative:
     physical: tuple[str, ...] | None
 
     @classmethod
-    def of(cls, inputs: tuple[str, ...], shared: Shared, physical: tuple[str, ...] | None = None) -> Alternative:
+    def of(
+        cls, inputs: tuple[str, ...], shared: Shared, physical: tuple[str, ...] | None = None
+    ) -> Alternative:
         return cls(inputs, shared.basis.shape[1], shared.untouched, physical)
 
 
 @dataclass(frozen=True)
 class Imitation:
-    """What a learner on these inputs could imitate.
+    """Parts of the physics that a learner on these inputs could imitate.
 
-    `directions` are those of θ that it shares with the physics. `determined` are the parameters, and `physical` the
-    physical parameters, that no shared direction moves: the fit determines them beside any learner of these inputs.
+    `directions` are those of θ that it shares with the physics. `determined` are the parameters,
+    and `physical` the physical parameters, that no shared direction moves: the fit determines them
+    beside any learner of these inputs.
     """
 
     inputs: tuple[str, ...]
@@ -58,11 +62,13 @@ class Imitation:
     held: tuple[str, ...] = ()
     """Parameters at a bound: known terms, along which nothing is split off."""
     weakest: tuple[str, float] | None = None
-    """The determined parameter that a learner of terms comes nearest to, and what it leaves of its regressor."""
+    """The determined parameter that a learner of terms comes nearest to, and what it leaves of its
+    regressor.
+    """
 
     @classmethod
     def of(cls, inputs: Sequence[str], shared: Shared, *others: Any) -> Self:
-        """Of the directions that a learner on these inputs shares; `others` are the last fields."""
+        """Return the imitation for the shared directions; `others` are the last fields."""
         return cls(tuple(inputs), shared.all, shared.directions, shared.untouched, *others)
 
     @property
@@ -72,56 +78,90 @@ class Imitation:
         if self.terms:
             sees = f"The learner is a sum of {len(self.inputs)} terms"
         if self.everything:
-            return f"{sees} and could imitate all of the physics: θ is split off along every direction."
+            return (
+                f"{sees} and could imitate all of the physics: the orthogonal split sets θ along "
+                "every direction."
+            )
         if self.held:
-            stand, them = ("stands", "it") if len(self.held) == 1 else ("stand", "them")
-            sees = f"{_listed(self.held)} {stand} at a bound: θ is not split off along {them}. {sees}"
+            are, them = ("is", "it") if len(self.held) == 1 else ("are", "them")
+            sees = (
+                f"{_listed(self.held)} {are} at a bound: the orthogonal split does not move "
+                f"{them}. {sees}"
+            )
         if not self.directions:
             rest = " other" if self.held else ""
-            told = f"{sees} and could imitate nothing of the{rest} physics"
-            return f"{told}: the fit determines every{rest} parameter beside it.{self._nearly}"
+            text = f"{sees} and could imitate nothing of the{rest} physics"
+            return f"{text}: the fit determines every{rest} parameter beside it.{self._nearly}"
         could = _listed([_combination(direction) for direction in self.directions])
-        told = [f"{sees} and could imitate {could}: there, and only there, θ is split off."]
+        along = "this direction" if len(self.directions) == 1 else "these directions"
+        sentences = [
+            f"{sees} and could imitate {could}. The orthogonal split sets θ along {along} only."
+        ]
         if self.determined:
-            told.append(f"The fit determines {_listed(self.determined)} beside any learner of these inputs.")
+            sentences.append(
+                f"The fit determines {_listed(self.determined)} beside any learner of these inputs."
+            )
         if self.physical:
-            told.append(f"Of the physical parameters it determines {_listed(self.physical)} so.")
-        return " ".join(told) + self._nearly
+            sentences.append(f"Of the physical parameters it determines {_listed(self.physical)}.")
+        return " ".join(sentences) + self._nearly
 
     @property
     def _nearly(self) -> str:
-        """A sentence where the terms leave so little of a regressor that its parameter rests on next to nothing."""
+        """A sentence on the parameter whose regressor is nearly spanned by the terms.
+
+        It is empty where none is.
+        """
         if self.weakest is None or self.weakest[1] >= _NEARLY:
             return ""
         name, left = self.weakest
         return (
-            f" On these rows, however, the terms leave {100 * left:.2g} % of what physics alone has to determine "
-            f"{name}: its value rests on that part, and the terms may have taken over the rest."
+            f" On these rows, however, the terms span all but {100 * left:.2g} % of the regressor "
+            f"of {name}. Only that part determines its value; the terms may have taken over the "
+            "rest."
         )
 
 
 class MotionImitation(Imitation):
-    """The same of a motion; directions are those of the parameters' coordinates, logarithms of positive ones."""
+    """Parts of a motion that a learner on these inputs could imitate.
+
+    Directions are those of the parameters' coordinates, logarithms of positive ones.
+    """
 
     @property
     def text(self) -> str:
         """In sentences."""
         sees = f"The learner sees {', '.join(self.inputs)}"
         if self.everything:
-            return f"{sees} and could imitate a change of every parameter: they are those of the nearest physics."
+            return (
+                f"{sees} and could imitate a change of every parameter: the nearest physics "
+                "sets them."
+            )
         if not self.directions:
-            return f"{sees} and could imitate no change of a parameter: the fit determines all of them beside it."
+            return (
+                f"{sees} and could imitate no change of a parameter: the fit determines all of "
+                "them beside it."
+            )
         moved = "; ".join(" with ".join(direction) for direction in self.directions)
-        told = f"{sees} and could imitate a change of {moved}: there, and only there, the nearest physics decides."
+        text = (
+            f"{sees} and could imitate a change of {moved}. Only there the nearest physics sets "
+            "the parameters."
+        )
         if self.determined:
-            told += f" The fit determines {', '.join(self.determined)} beside any learner of these inputs."
-        return told
+            text += (
+                f" The fit determines {', '.join(self.determined)} beside any learner of these "
+                "inputs."
+            )
+        return text
 
 
 def imitation(
-    problem: Problem, physics: PhysicsMap | None = None, *, others: bool = True, held: Collection[str] = ()
+    problem: Problem,
+    physics: PhysicsMap | None = None,
+    *,
+    others: bool = True,
+    held: Collection[str] = (),
 ) -> Imitation:
-    """What the problem's learner could imitate, and what `others`, other inputs, would make of it.
+    """Return the imitation for the problem's learner, and for `others`, other inputs.
 
     Args:
         held: parameters at a bound.
@@ -132,17 +172,24 @@ def imitation(
     alternatives = []
     for other in other_inputs(problem) if others and not problem.features.linear else ():
         features = Features(tuple(parse(text, {}) for text in other))
-        shared = shared_directions(problem.baseline, features, problem.layout, problem.outputs, problem.rows.x)
+        shared = shared_directions(
+            problem.baseline, features, problem.layout, problem.outputs, problem.rows.x
+        )
         if not shared.all and set(other) != set(inputs):
             alternatives.append(Alternative.of(other, shared, _untouched(shared, slopes)))
     shown, terms = tuple(alternatives[:_ALTERNATIVES]), problem.features.linear
     found = Imitation.of(inputs, own, _untouched(own, slopes), shown, terms, tuple(held))
     determined = tuple(name for name in found.determined if name not in held)
-    return replace(found, determined=determined, weakest=_weakest(problem, determined) if terms else None)
+    return replace(
+        found, determined=determined, weakest=_weakest(problem, determined) if terms else None
+    )
 
 
 def _weakest(problem: Problem, determined: Collection[str]) -> tuple[str, float] | None:
-    """Return the parameter whose regressor the others leave least of, relative to what they do without the terms."""
+    """Return the parameter whose regressor loses most of its norm to the terms.
+
+    It is measured relative to the regressor without the terms.
+    """
     if len(problem.outputs) > 1 or not determined or not problem.count:
         return None
     physics, terms = problem.projection.phi[:, 0], problem.feature_rows()
@@ -152,36 +199,45 @@ def _weakest(problem: Problem, determined: Collection[str]) -> tuple[str, float]
         r = np.linalg.qr(columns / np.where(size > 0, size, 1.0), mode="r")
         inverse = np.linalg.pinv(r, rcond=1e-12)
         left.append(1 / np.maximum(np.linalg.norm(inverse[: physics.shape[1]], axis=1), 1.0))
-    share = dict(zip(problem.baseline.names, np.minimum(left[0] / left[1], 1.0).tolist(), strict=True))
+    share = dict(
+        zip(problem.baseline.names, np.minimum(left[0] / left[1], 1.0).tolist(), strict=True)
+    )
     name = min(determined, key=lambda one: share[one])
     return name, share[name]
 
 
 def _slopes(problem: Problem, physics: PhysicsMap | None) -> dict[str, np.ndarray] | None:
-    """dp/dθ by name, at the spec's initial values or, without any, at least squares; None where there is none."""
+    """Return dp/dθ by name, at the spec's initial values or, without any, at least squares.
+
+    None where there is none.
+    """
     if physics is None:
         return None
     initial = problem.baseline.initial
     try:
-        found = physical_slopes(physics, problem, initial if np.all(initial) else problem.least_squares)
+        found = physical_slopes(
+            physics, problem, initial if np.all(initial) else problem.least_squares
+        )
     except InputError:
         return None
     return None if found is None else found[0]
 
 
 def _untouched(shared: Shared, slopes: dict[str, np.ndarray] | None) -> tuple[str, ...] | None:
-    """Physical parameters that no shared direction moves."""
+    """Return the physical parameters that no shared direction moves."""
     if slopes is None:
         return None
     return tuple(
         name
         for name, row in slopes.items()
-        if all(abs(row @ column) <= _STILL * np.sum(np.abs(row * column)) for column in shared.basis.T)
+        if all(
+            abs(row @ column) <= _STILL * np.sum(np.abs(row * column)) for column in shared.basis.T
+        )
     )
 
 
 def other_inputs(problem: Problem) -> Iterator[tuple[str, ...]]:
-    """Choices of learner inputs that an engineer would think of: velocities, outputs, inputs, single lags."""
+    """Return plausible choices of learner inputs: velocities, outputs, inputs, single lags."""
     for name in problem.outputs:
         lags = [str(lag) for lag in problem.layout if lag.channel == name]
         yield from ((f"{one}-{two}",) for one, two in zip(lags, lags[1:], strict=False))
@@ -192,7 +248,7 @@ def other_inputs(problem: Problem) -> Iterator[tuple[str, ...]]:
 
 
 def _combination(direction: dict[str, float]) -> str:
-    """A direction as a sum: `theta1 - theta2`."""
+    """Return a direction as a sum: `theta1 - theta2`."""
     text = ""
     for name, factor in direction.items():
         size = "" if abs(abs(factor) - 1) < 1e-9 else f"{abs(factor):.4g}*"
@@ -202,11 +258,17 @@ def _combination(direction: dict[str, float]) -> str:
 
 
 def _listed(words: tuple[str, ...] | list[str]) -> str:
-    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}" if words else "nothing"
+    return (
+        words[0]
+        if len(words) == 1
+        else f"{', '.join(words[:-1])} and {words[-1]}"
+        if words
+        else "nothing"
+    )
 
 
-def imitation_before(form: Moving, q: Vector, x: Matrix, u: Matrix) -> MotionImitation:
-    """What a learner on the form's features would share with the physics, and what others would.
+def imitation_before(form: MotionDynamics, q: Vector, x: Matrix, u: Matrix) -> MotionImitation:
+    """Return the imitation for a learner on the form's features, and for others.
 
     Args:
         x: states (M, nx) of a run at the coordinates q; `u` its inputs (M, nu).
@@ -215,13 +277,17 @@ def imitation_before(form: Moving, q: Vector, x: Matrix, u: Matrix) -> MotionImi
     others = []
     for texts in dict.fromkeys(_choices(form.motion)):
         if set(texts) != set(own):
-            features = tuple(parse_named(text, form.motion.known, "learner input") for text in texts)
-            others.append(Alternative.of(texts, shared_of_motion(replace(form, features=features), q, x, u)))
+            features = tuple(
+                parse_named(text, form.motion.known, "learner input") for text in texts
+            )
+            others.append(
+                Alternative.of(texts, shared_of_motion(replace(form, features=features), q, x, u))
+            )
     return MotionImitation.of(own, shared_of_motion(form, q, x, u), None, tuple(others))
 
 
 def _choices(motion: Motion) -> Iterator[tuple[str, ...]]:
-    """Each state alone, all states, all states and inputs."""
+    """Yield each state alone, all states, all states and inputs."""
     states = motion.names_of_states
     yield from ((name,) for name in states)
     yield from (several for several in (states, (*states, *motion.inputs)) if len(several) > 1)

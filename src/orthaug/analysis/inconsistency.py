@@ -1,16 +1,18 @@
-"""Is one-step θ inconsistent? A test of coloured errors in the equation, in standard errors of θ (Hausman 1978).
+"""Test for inconsistent one-step θ by coloured errors, in standard errors of θ (Hausman 1978).
 
-Coloured errors stand in the lagged outputs of the next rows, which moves θ̂ by an amount that more rows do not
-lessen. With a model of the colour, `e_k = Σ_j ρ_j e_{k−j} + ν_k` with ν white, they do not. One Gauss-Newton step
-from ρ = 0 gives ρ̂ and what it moves θ̂ by (Durbin 1970, Breusch 1978, Godfrey 1978): with the past errors E and `E⊥`
-what the model's derivatives ψ leave of them, `ρ̂ = (EᵀE⊥)⁻¹Eᵀe` and `Δp̂ = −M⁻¹ψᵀE ρ̂`. The derivatives in the
-learner's weights are among ψ, with their prior, so that what a learner takes is partialled out (Frisch and Waugh
-1933, Lovell 1963). The Wald test of ρ takes the errors as uneven (White 1980), and knows nothing of the standard
-errors of the fit: robust ones cannot silence it. A short and a longer autoregression are tried: the first finds weak
-colour, the second that of noise on a sensor or of a disturbance that swings.
+Coloured errors are in the lagged outputs of the next rows, which moves θ̂ by an amount that more
+rows do not lessen. With a model of the colour, `e_k = Σ_j ρ_j e_{k−j} + ν_k` with ν white, they do
+not. One Gauss-Newton step from ρ = 0 gives ρ̂ and what it moves θ̂ by (Durbin 1970, Breusch 1978,
+Godfrey 1978): with the past errors E and `E⊥` what the model's derivatives ψ leave of them, `ρ̂ =
+(EᵀE⊥)⁻¹Eᵀe` and `Δp̂ = −M⁻¹ψᵀE ρ̂`. The derivatives in the learner's weights are among ψ, with
+their prior, so that what a learner takes is partialled out (Frisch and Waugh 1933, Lovell 1963).
+The Wald test of ρ takes the errors as uneven (White 1980), and knows nothing of the standard errors
+of the fit: robust ones cannot silence it. A short and a longer autoregression are tried: the first
+finds weak colour, the second that of noise on a sensor or of a disturbance that swings.
 
-What θ is with the colour modelled comes from iterating; instruments, the outputs of the free run in place of the
-measured ones (Young 1970, Söderström and Stoica 1983), need no model of the colour and judge it.
+What θ is with the colour modelled comes from iterating; instruments, the outputs of the free run in
+place of the measured ones (Young 1970, Söderström and Stoica 1983), need no model of the colour and
+judge it.
 """
 
 from __future__ import annotations
@@ -35,15 +37,16 @@ _WORTH = 0.5  # standard errors of θ: by less, coverage falls from 95 to 92 % a
 _ORDERS = (1, 4)  # of the autoregressions that are tried
 _FEWEST = 100  # rows
 _STEPS, _CLOSE = 30, 1e-6  # of the iteration, and the relative fall of the squares at which it ends
-_VAGUE = 10.0  # times the standard errors of the fit: instruments that tell less are not shown
+_VAGUE = 10.0  # times the standard errors of the fit: less accurate instruments are not shown
 
 
 @dataclass(frozen=True, eq=False)
 class Inconsistency:
     """θ̂ one step ahead beside θ with a model of the errors' colour; vectors (nθ,).
 
-    `p` is that of white errors against an autoregression of `order`, `apart` the difference in standard errors of white
-    errors. `instruments` and `instruments_std` are those of the free run's outputs as instruments; None without any.
+    `p` is that of white errors against an autoregression of `order`, `apart` the difference in
+    standard errors of white errors. `instruments` and `instruments_std` are those of the free run's
+    outputs as instruments; None without any.
     """
 
     names: tuple[str, ...]
@@ -58,7 +61,7 @@ class Inconsistency:
 
     @property
     def found(self) -> bool:
-        """Whether the errors are surely coloured, and θ is off by enough to spoil its intervals."""
+        """True if the errors are surely coloured and θ is off by enough to spoil its intervals."""
         return bool(self.p < LEVEL and np.abs(self.apart).max(initial=0.0) > _WORTH)
 
     @property
@@ -69,25 +72,26 @@ class Inconsistency:
 
     @property
     def warning(self) -> Warning:
-        """What to be warned of, with the values that the remedies give."""
+        """Warning on the inconsistency, with the values that the remedies give."""
         each = [
-            f"{self.names[i]} is then {self.modelled[i]:.6g} (std {self.modelled_std[i]:.2g}) instead of "
-            f"{self.theta[i]:.6g}, {abs(self.apart[i]):.1f} standard errors away"
+            f"{self.names[i]} is then {self.modelled[i]:.6g} (std {self.modelled_std[i]:.2g}) "
+            f"instead of {self.theta[i]:.6g}, {abs(self.apart[i]):.1f} standard errors away"
             for i in self.moved
         ]
         text = (
-            "one-step θ is inconsistent: its errors are coloured, so they stand in the lagged outputs of later rows, "
-            f"and more rows do not help. With a model of the colour (autoregression of order {self.order}) "
-            f"{'; '.join(each)}."
+            "one-step θ is inconsistent: its errors are coloured and so correlated with "
+            "the lagged outputs, and more rows do not help. With a model of the colour "
+            f"(autoregression of order {self.order}) {'; '.join(each)}."
         )
         if self.instruments is not None and self.instruments_std is not None:
             given = [
-                f"{self.names[i]} = {self.instruments[i]:.6g} (std {self.instruments_std[i]:.2g})" for i in self.moved
+                f"{self.names[i]} = {self.instruments[i]:.6g} (std {self.instruments_std[i]:.2g})"
+                for i in self.moved
             ]
             text += f" Instruments (the outputs of the free run) give {', '.join(given)}."
         text += (
-            ' No interval of the one-step θ counts that, robust or not: train on the free run (focus = "simulation"), '
-            "which has no such bias."
+            " No interval of the one-step θ covers this bias. Train on the free run "
+            '(focus = "simulation"), which does not have it.'
         )
         return Warning("inconsistent", text)
 
@@ -115,7 +119,7 @@ class _Rows(NamedTuple):
         return float(np.sum(self.errors**2) / max(self.errors.size - used, 1.0))
 
     def past(self, errors: Matrix, order: int) -> Matrix:
-        """The errors 1 … `order` rows before (N ny, ny order), zero before the start of an experiment.
+        """Return the errors 1 … `order` rows before (N ny, ny order), zero before an experiment.
 
         Every output has coefficients of its own.
         """
@@ -131,7 +135,7 @@ class _Rows(NamedTuple):
         return columns.reshape(errors.size, ny * order)
 
     def filtered(self, columns: Matrix, rho: Matrix) -> Matrix:
-        """`x_k − Σ_j ρ_j x_{k−j}` of columns (N ny, r), ρ (ny, order)."""
+        """Return `x_k − Σ_j ρ_j x_{k−j}` of columns (N ny, r), ρ (ny, order)."""
         ny = len(rho)
         x = columns.reshape(-1, ny, columns.shape[1])
         result = x.copy()
@@ -143,7 +147,9 @@ class _Rows(NamedTuple):
         return result.reshape(columns.shape)
 
 
-def inconsistency(fit: Estimate, one_step: Response, free_run: Response | None = None) -> Inconsistency | None:
+def inconsistency(
+    fit: Estimate, one_step: Response, free_run: Response | None = None
+) -> Inconsistency | None:
     """Compare one-step θ with that beside a model of the errors' colour.
 
     None where nothing feeds back, where there are no standard errors, or too few rows.
@@ -155,7 +161,11 @@ def inconsistency(fit: Estimate, one_step: Response, free_run: Response | None =
     rows = _rows(fit, one_step)
     if rows is None:
         return None
-    tried = [(*_durbin(rows, order), order) for order in _ORDERS if rows.errors.size > 20 * (order + len(fit.theta))]
+    tried = [
+        (*_durbin(rows, order), order)
+        for order in _ORDERS
+        if rows.errors.size > 20 * (order + len(fit.theta))
+    ]
     if not tried:
         return None
     p, step, order = min(tried, key=lambda one: one[0])
@@ -173,16 +183,30 @@ def inconsistency(fit: Estimate, one_step: Response, free_run: Response | None =
         return found
     modelled, std = _with_colour(rows, order)
     if modelled is not None:
-        found = replace(found, modelled=fit.theta + modelled, modelled_std=std, apart=modelled / _plain_std(rows))
+        found = replace(
+            found,
+            modelled=fit.theta + modelled,
+            modelled_std=std,
+            apart=modelled / _plain_std(rows),
+        )
     given = None if free_run is None else _by_instruments(rows, free_run)
-    return found if given is None else replace(found, instruments=fit.theta + given[0], instruments_std=given[1])
+    return (
+        found
+        if given is None
+        else replace(found, instruments=fit.theta + given[0], instruments_std=given[1])
+    )
 
 
 def _rows(fit: Estimate, one_step: Response) -> _Rows | None:
     problem, model, statistics = fit.problem, fit.model, fit.model.statistics
     plain = fit.plain_statistics or statistics
     rows = len(problem.rows) if problem.rows is not None else 0
-    if not model.form.states or fit.criterion.flown is not None or plain.gram is None or not len(fit.theta):
+    if (
+        not model.form.states
+        or fit.criterion.free_run is not None
+        or plain.gram is None
+        or not len(fit.theta)
+    ):
         return None
     if isinstance(problem, StreamedProblem) or fit.std is None or model.numbers.tilt is not None:
         return None
@@ -205,13 +229,13 @@ def _rows(fit: Estimate, one_step: Response) -> _Rows | None:
 
 
 def _plain_std(rows: _Rows) -> Vector:
-    """Standard errors of θ for white and even noise."""
+    """Return standard errors of θ for white and even noise."""
     along, root = rows.influence.along, rows.flat
     return np.sqrt(rows.noise * np.sum((along @ (root.T @ root + rows.stiff)) * along, axis=1))
 
 
 def _durbin(rows: _Rows, order: int) -> tuple[float, Vector]:
-    """p of white errors, and what one step of Gauss-Newton towards an autoregression moves θ by."""
+    """Return p of white errors, and the shift of θ by one Gauss-Newton step towards colour."""
     past, a, e = rows.past(rows.errors, order), rows.flat, rows.errors.ravel()
     across = a.T @ past
     beside = past - a @ across
@@ -225,11 +249,16 @@ def _durbin(rows: _Rows, order: int) -> tuple[float, Vector]:
     freedom = max(e.size - np.sum(a**2) - len(rho), 1.0)
     covariance = inverse @ (scores.T @ scores) @ inverse * e.size / freedom
     wald = float(rho @ np.linalg.solve(covariance, rho)) / len(rho)
-    return float(scipy.special.fdtrc(len(rho), freedom, wald)), -rows.influence.along @ (across @ rho)
+    return float(scipy.special.fdtrc(len(rho), freedom, wald)), -rows.influence.along @ (
+        across @ rho
+    )
 
 
 def _with_colour(rows: _Rows, order: int) -> tuple[Vector | None, Vector]:
-    """How θ moves with an autoregression of the errors beside it, and its standard errors; None where it diverges."""
+    """Return the shift of θ beside an autoregression of the errors, and its standard errors.
+
+    None where it diverges.
+    """
     a, ny, r = rows.flat, rows.errors.shape[1], rows.flat.shape[1]
     moved, rho = np.zeros(r), np.zeros((ny, order))
     nothing = np.zeros(len(rows.influence.along))
@@ -260,17 +289,25 @@ def _with_colour(rows: _Rows, order: int) -> tuple[Vector | None, Vector]:
             break
     if not np.isfinite(loss):
         return None, nothing
-    covariance = np.linalg.pinv(normal) * float(white @ white) / max(white.size - np.sum(a**2) - rho.size, 1.0)
+    covariance = (
+        np.linalg.pinv(normal)
+        * float(white @ white)
+        / max(white.size - np.sum(a**2) - rho.size, 1.0)
+    )
     along = rows.influence.along
-    return along @ moved, np.sqrt(np.maximum(np.sum((along @ covariance[:r, :r]) * along, axis=1), 0.0))
+    return along @ moved, np.sqrt(
+        np.maximum(np.sum((along @ covariance[:r, :r]) * along, axis=1), 0.0)
+    )
 
 
 def _by_instruments(rows: _Rows, free_run: Response) -> tuple[Vector, Vector] | None:
-    """How θ moves with the free run's outputs in place of the measured ones, and its standard errors; or None."""
+    """Return the shift of θ with the free run's outputs as instruments, and its standard errors."""
     fit = rows.fit
     form, record = fit.model.form, fit.problem.record
     pieces: Sequence[Matrix] = [
-        form.regressors(replace(e, outputs=np.where(np.isfinite(t.model), t.model, e.outputs)), record)
+        form.regressors(
+            replace(e, outputs=np.where(np.isfinite(t.model), t.model, e.outputs)), record
+        )
         for e, t in zip(record.experiments, free_run.trajectories, strict=True)
     ]
     x = np.concatenate(pieces)

@@ -1,8 +1,8 @@
-"""Is a residual independent of the inputs, and flat over the regressors?
+"""Tests of a residual: independent of the inputs, and flat over the regressors.
 
-A coloured residual is `e = H ε` with the autoregression `H = 1/A`. The tests filter residual and regressors by A, for
-`e = Z β + H ε` is `A e = (A Z) β + ε`. The F-test of β then keeps its level, also where Z holds past outputs. What Z β
-adds to the colour costs some power, most with a sine.
+A coloured residual is `e = H ε` with the autoregression `H = 1/A`. The tests filter residual and
+regressors by A, for `e = Z β + H ε` is `A e = (A Z) β + ε`. The F-test of β then keeps its level,
+also where Z holds past outputs. What Z β adds to the colour costs some power, most with a sine.
 """
 
 from __future__ import annotations
@@ -16,16 +16,25 @@ import scipy.special
 from jaxtyping import Int
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug.analysis.whiteness import LARGEST, Pieces, cross_correlation, cut, pieces_of, standardised, whitening
+from orthaug.analysis.whiteness import (
+    LARGEST,
+    Pieces,
+    cross_correlation,
+    cut,
+    pieces_of,
+    standardised,
+    whitening,
+)
 
-_ROWS = 4096  # rows of a regressor matrix that exist at a time: 26 columns of them stay in the cache
+# Rows of a regressor matrix that exist at a time: 26 columns of them stay in the cache
+_ROWS = 4096
 _ROWS_PER_BIN = 5  # fewer would make bins of chance
 _RANK = 1e-10  # eigenvalues of a unit-diagonal Gram matrix below this, of the largest, are rounding
 
 
 @dataclass(frozen=True, eq=False)
 class CrossTest:
-    """Residual against an input: `values` (2M + 1,) are r_eu(τ), τ = −M…M, and `band` holds one of them."""
+    """Residual against an input: `values` (2M + 1,) are r_eu(τ), τ = −M…M, each with a `band`."""
 
     values: Vector
     band: float
@@ -38,12 +47,13 @@ class CrossTest:
 
 @dataclass(frozen=True, eq=False)
 class RegressorTest:
-    """Residual against a regressor, by bins: p-value of no relation, share of the residual's variance explained.
+    """Residual against a regressor, by bins: p-value of no relation, explained share of variance.
 
-    Per bin: `centres` (mean of the regressor, in its unit), `means` of the residual and their standard `errors` (in the
-    residual's unit), and `counts` of rows. The means are those that the test looks at: of a coloured residual by
-    generalised least squares, less the mean of all rows where the test is centred. Where the rows do not tell them
-    apart they are plain means, with errors that take the residual as white.
+    Per bin: `centres` (mean of the regressor, in its unit), `means` of the residual and their
+    standard `errors` (in the residual's unit), and `counts` of rows. The means are those that the
+    test looks at: of a coloured residual by generalised least squares, less the mean of all rows
+    where the test is centred. Where the rows do not separate them they are plain means, with
+    errors that take the residual as white.
     """
 
     p: float | None
@@ -55,15 +65,24 @@ class RegressorTest:
 
 
 def against_input(
-    residual: Pieces, inputs: Pieces, lags: int = 25, *, level: float = 0.01, a: Vector | None = None
+    residual: Pieces,
+    inputs: Pieces,
+    lags: int = 25,
+    *,
+    level: float = 0.01,
+    a: Vector | None = None,
 ) -> CrossTest | None:
-    """Is the residual independent of an input? Band of r_eu(τ) and joint test of the causal lags (Ljung, sect. 16.6).
+    """Test the residual's independence of an input: band of r_eu(τ), joint test of the causal lags.
 
-    Band of one value: `Var r_eu(τ) = P/N` with `P = Σ_m r_e(m) r_u(m)` over all m, which is 1 for a white residual
-    whatever the input. r_e is that of 1/A: a sum over two sample functions would not settle as N grows.
-    Joint test: `ζ = N r_euᵀ P⁻¹ r_eu` ~ χ²(M + 1) of A e and A u, for which P is the correlation matrix of A u,
-    taken from the record; as ζ/(M + 1) with the variance left over it has an F-distribution. Directions of the
-    lags that the input does not excite (a sine excites two) are left out. None where either signal is constant.
+    Ljung (1999), sect. 16.6.
+
+    Band of one value: `Var r_eu(τ) = P/N` with `P = Σ_m r_e(m) r_u(m)` over all m, which is 1 for a
+    white residual whatever the input. r_e is that of 1/A: a sum over two sample functions would not
+    settle as N grows.
+    Joint test: `ζ = N r_euᵀ P⁻¹ r_eu` ~ χ²(M + 1) of A e and A u, for which P is the correlation
+    matrix of A u, taken from the record; as ζ/(M + 1) with the variance left over it has an
+    F-distribution. Directions of the lags that the input does not excite (a sine excites two) are
+    left out. None where either signal is constant.
 
     Args:
         residual, inputs: per experiment (N_i,).
@@ -76,25 +95,36 @@ def against_input(
     a = whitening(residual, lags) if a is None else a
     if values is None or e is None or u is None or a is None:
         return None
-    band = float(-scipy.special.ndtri(level / 2) * np.sqrt(_spectral_product(a, u) / sum(map(len, e))))
+    band = float(
+        -scipy.special.ndtri(level / 2) * np.sqrt(_spectral_product(a, u) / sum(map(len, e)))
+    )
     found = _relation(_lag_blocks(e, u, a, len(values) // 2), intercept=True)
     causal = np.abs(values[len(values) // 2 :])
-    return CrossTest(values, band, None if found is None else found.p, int(causal.argmax()), float(causal.max()))
+    return CrossTest(
+        values, band, None if found is None else found.p, int(causal.argmax()), float(causal.max())
+    )
 
 
 def against_regressor(
-    residual: Pieces, regressor: Pieces, bins: int = 20, *, centred: bool = False, a: Vector | None = None
+    residual: Pieces,
+    regressor: Pieces,
+    bins: int = 20,
+    *,
+    centred: bool = False,
+    a: Vector | None = None,
 ) -> RegressorTest | None:
-    """Is the mean residual zero wherever the regressor stands? An F-test over bins of equal count.
+    """Test whether the mean residual is zero over the regressor, by an F-test over equal bins.
 
-    For a white residual the one-way analysis of variance against zero, `F = Σ n_b m_b² / B : Σ (e − m_b)² / (N − B)`;
-    for a coloured one the same hypothesis on A e with filtered indicators of the bins. Equal values share a bin.
-    None for a regressor or residual that is constant or not finite, or fewer than 10 rows.
+    A white residual is tested by the one-way analysis of variance against zero, `F = Σ n_b m_b² / B
+    : Σ (e − m_b)² / (N − B)`; for a coloured one the same hypothesis on A e with filtered
+    indicators of the bins. Equal values share a bin. None for a regressor or residual that is
+    constant or not finite, or fewer than 10 rows.
 
     Args:
         residual, regressor: per experiment (N_i,).
         bins: B at most; fewer where values repeat, or where bins would have fewer than 5 rows.
-        centred: test against the mean of the residual instead of zero, with B − 1 degrees of freedom.
+        centred: test against the mean of the residual instead of zero, with B − 1 degrees of
+            freedom.
         a: `whitening(residual)`, where it is known already.
     """
     e, x = pieces_of(residual), np.concatenate(pieces_of(regressor))
@@ -116,24 +146,38 @@ def against_regressor(
         means = contrast @ found.coefficients
         errors = np.sqrt(np.maximum(np.diag(contrast @ found.covariance @ contrast.T), 0.0))
     centres, p = np.bincount(placed, x) / counts, None if found is None else found.p
-    return RegressorTest(p, min(explained / total, 1.0), centres, size * means, size * errors, counts)
+    return RegressorTest(
+        p, min(explained / total, 1.0), centres, size * means, size * errors, counts
+    )
 
 
 def _spectral_product(a: Vector, u: list[Vector]) -> float:
-    """Σ_m r_e(m) r_u(m), with r_e of 1/A and r_u of the record, as the integral of the product of their spectra."""
+    """Return Σ_m r_e(m) r_u(m) as the integral of the product of their spectra.
+
+    r_e is that of 1/A, r_u that of the record.
+    """
     if len(a) == 1:
         return 1.0
     product = 0.0
     for one in u:
-        size = 1 << max(2 * len(one), 2048).bit_length()  # zeros behind the record, so that it does not meet its start
-        gain = 1 / np.maximum(np.abs(np.fft.fft(a, size)), np.finfo(float).eps * np.abs(a).sum()) ** 2
+        size = (
+            1 << max(2 * len(one), 2048).bit_length()
+        )  # zeros behind the record, so that it does not meet its start
+        gain = (
+            1 / np.maximum(np.abs(np.fft.fft(a, size)), np.finfo(float).eps * np.abs(a).sum()) ** 2
+        )
         product += float(np.mean(np.abs(np.fft.fft(one, size)) ** 2 * gain) / np.mean(gain))
     return product
 
 
 def _lag_blocks(e: list[Vector], u: list[Vector], a: Vector, lags: int) -> Iterator[Matrix]:
-    """Rows of `(1, A u_k, …, A u_{k−lags}, A e_k)`; if rows are few also the first, with lags at the input's mean."""
-    known = lags if 2 * lags * len(e) < sum(map(len, e)) else 0  # a start from rest would excite all directions
+    """Yield rows of `(1, A u_k, …, A u_{k−lags}, A e_k)`.
+
+    If rows are few also the first, with lags at the input's mean.
+    """
+    known = (
+        lags if 2 * lags * len(e) < sum(map(len, e)) else 0
+    )  # a start from rest would excite all directions
     for one, other in zip(e, u, strict=True):
         if len(one) >= len(a):
             target = np.convolve(one, a, "valid")
@@ -145,7 +189,7 @@ def _lag_blocks(e: list[Vector], u: list[Vector], a: Vector, lags: int) -> Itera
 
 
 def _bin_blocks(e: list[Vector], placed: list[Any], a: Vector, bins: int) -> Iterator[Matrix]:
-    """Rows of the indicators of all bins, filtered by A, between 1 and `A e_k`."""
+    """Yield rows of the indicators of all bins, filtered by A, between 1 and `A e_k`."""
     memory = len(a) - 1
     for one, bin_of in zip(e, placed, strict=True):
         for i in range(memory, len(one), _ROWS):
@@ -157,7 +201,7 @@ def _bin_blocks(e: list[Vector], placed: list[Any], a: Vector, bins: int) -> Ite
 
 
 def _bins(x: Vector, bins: int) -> Int[np.ndarray, "_"] | None:
-    """The bin of each sample, numbered from 0: each distinct value goes where the middle of its ranks falls."""
+    """Return the bin of each sample, from 0; equal values share the bin of their middle rank."""
     bins = min(bins, len(x) // _ROWS_PER_BIN)
     if bins < 2 or not np.abs(x).max() < LARGEST:  # true for NaN, too
         return None
@@ -169,7 +213,10 @@ def _bins(x: Vector, bins: int) -> Int[np.ndarray, "_"] | None:
 
 @dataclass(frozen=True, eq=False)
 class _Relation:
-    """Least squares `target = Z β + ε`: p-value of `β = 0`, and β with its covariance in the directions of Z's rank."""
+    """Least squares `target = Z β + ε`: p-value of `β = 0`, and β with its covariance.
+
+    Both are in the directions of Z's rank.
+    """
 
     p: float
     rank: int
@@ -178,10 +225,12 @@ class _Relation:
 
 
 def _relation(blocks: Iterable[Matrix], intercept: bool) -> _Relation | None:
-    """β of `target = Z β + ε`, or `+ constant`, from blocks of rows (1, Z, target); p by F(rank, rest).
+    """Return β of `target = Z β + ε`, or `+ constant`, from blocks of rows (1, Z, target).
 
-    A Gram matrix suffices: only the part of the target that Z explains is needed, and directions that
-    it cannot resolve are dropped. They depend on Z alone, so the level stays.
+    P by F(rank, rest).
+
+    A Gram matrix suffices: only the part of the target that Z explains is needed, and directions
+    that it cannot resolve are dropped. They depend on Z alone, so the level stays.
     """
     gram = np.asarray(sum(block.T @ block for block in blocks))
     if not gram.ndim:
@@ -195,7 +244,9 @@ def _relation(blocks: Iterable[Matrix], intercept: bool) -> _Relation | None:
     rank, freedom = int(kept.sum()), rows - kept.sum() - intercept
     if rank == 0 or freedom < 1 or total <= 0:
         return None
-    root = unit[:, None] * vectors[:, kept] / np.sqrt(values[kept])  # of the inverse of the inner products
+    root = (
+        unit[:, None] * vectors[:, kept] / np.sqrt(values[kept])
+    )  # of the inverse of the inner products
     explained = np.sum((root.T @ moment) ** 2)
     left = max(total - explained, np.finfo(float).eps * total) / freedom
     p = float(scipy.special.fdtrc(rank, freedom, explained / rank / left))

@@ -1,4 +1,4 @@
-"""When the inputs of a motion act: physics alone, fitted under each hold between samples and with inputs delayed."""
+"""Timing of a motion's inputs: physics fitted under each hold, and with inputs delayed."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import numpy as np
 
 from orthaug._base.errors import InputError, Warning
 from orthaug.data.record import Record
-from orthaug.fitting.course import Flight
 from orthaug.fitting.criteria import Criterion
-from orthaug.fitting.motion_course import MotionCourse
 from orthaug.fitting.motion_task import MotionTask
+from orthaug.fitting.segmented_motion import SegmentedMotion
+from orthaug.fitting.segmented_problem import FreeRunFit
 from orthaug.fitting.structures import Structure
 from orthaug.models.learners import Learner
 from orthaug.physics.motion import HOLDS, Motion
@@ -27,8 +27,11 @@ _REFITTED = 30  # iterations from where the declared hold ended
 
 
 @dataclass(frozen=True)
-class Held:
-    """The residual of physics alone under a hold, RMS in deviations of the outputs; None where it has no run."""
+class HoldTrial:
+    """The residual of physics alone under a hold, RMS in deviations of the outputs.
+
+    None where it has no run.
+    """
 
     hold: str
     residual: float | None
@@ -39,11 +42,11 @@ class Held:
 
 @dataclass(frozen=True)
 class Trial:
-    """Physics alone on the first rows of the longest experiment: its substeps, and every hold's residual."""
+    """Physics on the first rows of the longest experiment: substeps, and every hold's residual."""
 
     rows: int
     substeps: int | None
-    holds: tuple[Held, ...]
+    holds: tuple[HoldTrial, ...]
     task: MotionTask = field(repr=False, compare=False)
     """With physics alone trained."""
 
@@ -55,11 +58,19 @@ class Trial:
         if own is None or len(known) < 2:
             return None
         least = min(known, key=lambda h: h.residual or 0.0)
-        return least.hold if least.residual is not None and least.residual < (1 - _CLEARLY) * own else None
+        return (
+            least.hold
+            if least.residual is not None and least.residual < (1 - _CLEARLY) * own
+            else None
+        )
 
 
 def try_holds(
-    problem: MotionProblem, criterion: Criterion, solver: Any, structure: Structure, learner: Learner | None = None
+    problem: MotionProblem,
+    criterion: Criterion,
+    solver: Any,
+    structure: Structure,
+    learner: Learner | None = None,
 ) -> Trial:
     """Fit physics alone with the declared hold, and go on from there with every other.
 
@@ -69,68 +80,95 @@ def try_holds(
         learner: what the trial's task has beside the physics; it is not trained.
     """
     task = on_longest(problem, criterion, solver, structure, learner)
-    motion, flight = problem.motion, task.physics
-    found = [_held(task.plan, flight, declared=True)]
-    several = motion.integrator != "discrete" and bool(motion.inputs) and flight is not None
+    motion, free_fit = problem.motion, task.physics
+    found = [_held(task.plan, free_fit, declared=True)]
+    several = motion.integrator != "discrete" and bool(motion.inputs) and free_fit is not None
     for hold in HOLDS if several else ():
         if hold != motion.hold:
             found.append(_under(hold, task, solver))
-    substeps = None if flight is None else task.plan.dynamics.substeps
+    substeps = None if free_fit is None else task.plan.dynamics.substeps
     return Trial(len(task.problem.record), substeps, tuple(found), task)
 
 
 def on_longest(
-    problem: MotionProblem, criterion: Criterion, solver: Any, structure: Structure, learner: Learner | None = None
+    problem: MotionProblem,
+    criterion: Criterion,
+    solver: Any,
+    structure: Structure,
+    learner: Learner | None = None,
 ) -> MotionTask:
-    """Physics alone trained on the first rows of the longest experiment; arguments as in `try_holds`."""
+    """Return the physics trained on the first rows of the longest experiment.
+
+    Arguments as in `try_holds`.
+    """
     longest = max(problem.record.experiments, key=len)
     record = replace(problem.record, experiments=(longest.rows(0, ROWS),))
     return MotionTask.of(problem.on(record), learner, criterion).prepared(solver, structure)
 
 
-def _under(hold: str, task: MotionTask, solver: Any) -> Held:
+def _under(hold: str, task: MotionTask, solver: Any) -> HoldTrial:
     assert task.physics is not None
     try:
         motion = replace(task.problem.motion, hold=hold)
-        return _held(*refitted(task, task.physics, motion, task.problem.record, solver), declared=False)
+        return _held(
+            *refitted(task, task.physics, motion, task.problem.record, solver), declared=False
+        )
     except InputError:
-        return Held(hold, None, False)
+        return HoldTrial(hold, None, False)
 
 
 def refitted(
-    task: MotionTask, flight: Flight, motion: Motion, record: Record, solver: Any
-) -> tuple[MotionCourse, Flight | None]:
-    """Physics alone, trained on from where a flight ended, with another motion or record; None without a usable end.
+    task: MotionTask, free_fit: FreeRunFit, motion: Motion, record: Record, solver: Any
+) -> tuple[SegmentedMotion, FreeRunFit | None]:
+    """Return the physics trained on from the end of a fit, with another motion or record.
+
+    None without a usable end.
 
     Raises:
         InputError: the motion does not take the record.
     """
     plan = task.plan
-    course = MotionCourse.of(replace(plan.problem, motion=motion, record=record), None, plan.criterion)
-    course = course.alone.refined(plan.dynamics.substeps).from_states(flight.end.flown.states)
-    again = course.descend(course.objective(), flight.end.flown.theta, solver.at_most(_REFITTED))
-    return course, again if again.ending.usable else None
+    segmented = SegmentedMotion.of(
+        replace(plan.problem, motion=motion, record=record), None, plan.criterion
+    )
+    segmented = segmented.alone.refined(plan.dynamics.substeps).from_states(
+        free_fit.end.point.states
+    )
+    again = segmented.descend(
+        segmented.objective(), free_fit.end.point.theta, solver.at_most(_REFITTED)
+    )
+    return segmented, again if again.ending.usable else None
 
 
-def residual_of(course: MotionCourse, flight: Flight | None) -> float:
-    """RMS of what a flight leaves, in deviations of the outputs; inf without a flight."""
-    if flight is None:
+def residual_of(segmented: SegmentedMotion, free_fit: FreeRunFit | None) -> float:
+    """Return the RMS of a free run's error, in deviations of the outputs; inf without a run."""
+    if free_fit is None:
         return float("inf")
-    value = float(np.sqrt(np.sum((flight.end.flown.errors / course.deviation[:, None]) ** 2) / course.residuals))
+    value = float(
+        np.sqrt(
+            np.sum((free_fit.end.point.errors / segmented.deviation[:, None]) ** 2)
+            / segmented.residuals
+        )
+    )
     return value if np.isfinite(value) else float("inf")
 
 
-def _held(course: MotionCourse, flight: Flight | None, *, declared: bool) -> Held:
-    motion, value = course.problem.motion, residual_of(course, flight)
-    if flight is None or value == float("inf"):
-        return Held(motion.hold, None, declared)
-    p = motion.coordinates.physical(flight.end.flown.theta)
-    return Held(motion.hold, value, declared, dict(zip(motion.names, map(float, p), strict=True)))
+def _held(segmented: SegmentedMotion, free_fit: FreeRunFit | None, *, declared: bool) -> HoldTrial:
+    motion, value = segmented.problem.motion, residual_of(segmented, free_fit)
+    if free_fit is None or value == float("inf"):
+        return HoldTrial(motion.hold, None, declared)
+    p = motion.coordinates.physical(free_fit.end.point.theta)
+    return HoldTrial(
+        motion.hold, value, declared, dict(zip(motion.names, map(float, p), strict=True))
+    )
 
 
 @dataclass(frozen=True)
 class DeadTime:
-    """An input that acts `samples` later: what physics alone then leaves, and leaves without, in deviations."""
+    """An input that acts `samples` later, with the residuals of the physics with and without it.
+
+    Residuals are in deviations of the outputs.
+    """
 
     input: str
     samples: int
@@ -139,11 +177,11 @@ class DeadTime:
 
     @property
     def gain(self) -> str:
-        """What a delay explains, in words."""
+        """Gain by the delay, in words."""
         late = f"{self.samples} sample{'s' * (self.samples > 1)}"
         return (
-            f"with a delay of {late} physics alone leaves {self.residual:.3g} deviations of the output instead of "
-            f"{self.undelayed:.3g}"
+            f"with a delay of {late} the error of physics alone is {self.residual:.3g} "
+            f"standard deviations of the output instead of {self.undelayed:.3g}"
         )
 
     @property
@@ -151,17 +189,18 @@ class DeadTime:
         """With what to write into the spec."""
         return Warning(
             "dead_time",
-            f"{self.input} seems to act late: {self.gain}, and its parameters are others. If there is a dead time, "
-            f'delay the input by [[data.prepare]] with step = "shift", channel = "{self.input}", samples = '
-            f"{self.samples}; a lag of its drive belongs into the equations.",
+            f"{self.input} seems to act late: {self.gain}, with other parameters. If there is a "
+            'dead time, delay the input by [[data.prepare]] with step = "shift", '
+            f'channel = "{self.input}", samples = {self.samples}; if its drive is slow, '
+            "model that in the equations.",
         )
 
 
 def dead_times(task: MotionTask, solver: Any) -> tuple[DeadTime, ...]:
-    """The inputs that act clearly later than they do in the equations, and by how many samples.
+    """Return the inputs that act clearly later than in the equations, and by how many samples.
 
-    Each input is delayed in turn, by 1, 2, 4, … samples while that explains the data better, then by what lies
-    between; physics alone is refitted each time from where the last one ended.
+    Each input is delayed in turn, by 1, 2, 4, … samples while that explains the data better, then
+    by what lies between; physics alone is refitted each time from where the last one ended.
 
     Args:
         task: with physics alone trained; what it leaves is set against.
@@ -170,7 +209,9 @@ def dead_times(task: MotionTask, solver: Any) -> tuple[DeadTime, ...]:
         return ()
     found, most = [], len(task.problem.record) // _LONGEST
     for number, name in enumerate(task.problem.motion.inputs):
-        delays = _Delays(task, solver, number, {0: (residual_of(task.plan, task.physics), task.physics)})
+        delays = _Delays(
+            task, solver, number, {0: (residual_of(task.plan, task.physics), task.physics)}
+        )
         best = _least(delays.leaves, most)
         if delays.leaves(best) < (1 - _LATE) * delays.leaves(0):
             found.append(DeadTime(name, best, delays.leaves(best), delays.leaves(0)))
@@ -184,22 +225,24 @@ class _Delays:
     task: MotionTask
     solver: Any
     number: int
-    tried: dict[int, tuple[float, Flight]]
+    tried: dict[int, tuple[float, FreeRunFit]]
     """What each delay leaves, and where it ended; none is there from the start."""
 
     def leaves(self, samples: int) -> float:
-        """What physics alone leaves with the input so many samples later."""
+        """Return the residual of the physics with the input so many samples later."""
         if samples not in self.tried:
-            near = self.tried[min(self.tried, key=lambda known: (abs(known - samples), self.tried[known][0]))][1]
+            near = self.tried[
+                min(self.tried, key=lambda known: (abs(known - samples), self.tried[known][0]))
+            ][1]
             problem = self.task.problem
             late = _delayed(problem.record, self.number, samples)
-            course, flight = refitted(self.task, near, problem.motion, late, self.solver)
-            self.tried[samples] = residual_of(course, flight), flight or self.tried[0][1]
+            segmented, free_fit = refitted(self.task, near, problem.motion, late, self.solver)
+            self.tried[samples] = residual_of(segmented, free_fit), free_fit or self.tried[0][1]
         return self.tried[samples][0]
 
 
 def _least(leaves: Callable[[int], float], most: int) -> int:
-    """Where a function of whole numbers from 0 on that falls and rises is least."""
+    """Return the argument from 0 on at which a function that falls and then rises is least."""
     best, step = 0, 1
     while step <= most and leaves(step) < leaves(best):
         best, step = step, 2 * step
@@ -211,11 +254,18 @@ def _least(leaves: Callable[[int], float], most: int) -> int:
 
 
 def _delayed(record: Record, number: int, samples: int) -> Record:
-    """An input later by so many samples; what it was before the record is its first value."""
+    """Return an input later by so many samples.
+
+    Before the record it has its first value.
+    """
 
     def moved(inputs: np.ndarray) -> np.ndarray:
         column = inputs[:, number]
-        late = np.concatenate([np.full(min(samples, len(column)), column[0]), column])[: len(column)]
+        late = np.concatenate([np.full(min(samples, len(column)), column[0]), column])[
+            : len(column)
+        ]
         return np.where(np.arange(inputs.shape[1]) == number, late[:, None], inputs)
 
-    return replace(record, experiments=tuple(replace(e, inputs=moved(e.inputs)) for e in record.experiments))
+    return replace(
+        record, experiments=tuple(replace(e, inputs=moved(e.inputs)) for e in record.experiments)
+    )

@@ -1,7 +1,7 @@
-"""What a motion learned beside its physics: how sure it is at a point, and its share of each equation.
+"""Learned part of a motion: its uncertainty at a point, and its share of each equation.
 
-The learner's part `f(x, u; c) + g(x, u; w) − f(x, u; p̂)` follows (c, w) by itself and by p̂, which the split makes of
-them: both count in its intervals.
+The learner's part `f(x, u; c) + g(x, u; w) − f(x, u; p̂)` follows (c, w) by itself and by p̂, which
+the split makes of them: both count in its intervals.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from orthaug.inference.covariance import reach
 from orthaug.inference.motion_split import rest_of
 from orthaug.models.dynamics import Numbers
 from orthaug.models.motion_field import labels_of, parts_at
-from orthaug.models.moving import Moving
+from orthaug.models.moving import MotionDynamics
 
 
 @dataclass(frozen=True)
@@ -36,10 +36,12 @@ class EquationParts:
 
 
 def equation_parts(fit: MotionEstimate, x: Matrix, u: Matrix) -> tuple[EquationParts, ...]:
-    """Of every learned equation and output, over states (M, nx) and inputs (M, nu)."""
+    """Return the parts of every learned equation and output, over x (M, nx) and u (M, nu)."""
     physics, learner = parts_at(fit.model.form, fit.model.numbers, x, u)
     units, found = {channel.name: channel.unit for channel in fit.model.outputs}, []
-    for (name, unit), own, beside in zip(labels_of(fit.model.form), physics.T, learner.T, strict=True):
+    for (name, unit), own, beside in zip(
+        labels_of(fit.model.form), physics.T, learner.T, strict=True
+    ):
         finite = np.isfinite(own) & np.isfinite(beside)
         if not finite.any():
             continue
@@ -51,9 +53,10 @@ def equation_parts(fit: MotionEstimate, x: Matrix, u: Matrix) -> tuple[EquationP
 
 
 def learned_reach(fit: MotionEstimate, x: Matrix, u: Matrix) -> Matrix | None:
-    """Half the length of 95 % intervals of the learner's part (M, nl), point by point.
+    """Return half the length of 95 % intervals of the learner's part (M, nl), point by point.
 
-    None without intervals, and where some parameter is not identified: the prior of the weights then holds both.
+    None without intervals, and where some parameter is not identified: the prior of the weights
+    then holds both.
     """
     made, slope = free_covariance(fit), fit.split_by.slope
     if made is None or slope is None or fit.model.form.bound is None or fit.unidentified:
@@ -66,9 +69,9 @@ def learned_reach(fit: MotionEstimate, x: Matrix, u: Matrix) -> Matrix | None:
 
 @partial(jax.jit, static_argnames="form")
 def _slopes(
-    form: Moving, numbers: Numbers, x: Float[Array, "m nx"], u: Float[Array, "m nu"]
+    form: MotionDynamics, numbers: Numbers, x: Float[Array, "m nx"], u: Float[Array, "m nu"]
 ) -> tuple[Float[Array, "m nl np"], Float[Array, "m nl n"]]:
-    """How the learner's part follows p̂, and (c, w)."""
+    """Return the derivatives of the learner's part by p̂, and by (c, w)."""
     c = numbers.theta - numbers.theta_aux
 
     def at(x: Any, u: Any) -> Any:

@@ -1,7 +1,7 @@
-"""A model's step as a function to linearise: of its own state and inputs, and what that state holds at rest.
+"""Step of a model as a function to linearise: of its state and inputs, and their rest.
 
-The state of a lagged model is its memory of outputs and inputs, that of a motion its states. At rest the first is made
-of the outputs, so that these are what is looked for.
+The state of a lagged model is its memory of outputs and inputs, that of a motion its states. At
+rest the first is made of the outputs, so that these are what is looked for.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from jaxtyping import Float
 from orthaug._base.checks import Vector
 from orthaug._base.jax import Array, jax, jnp
 from orthaug.analysis.feedback import by_differences
-from orthaug.fitting.motion_course import LOOSE
+from orthaug.fitting.segmented_motion import LOOSE
 from orthaug.models.dynamics import Numbers
 from orthaug.models.lagged import Lagged
 from orthaug.models.model import Model
 from orthaug.models.motion_model import MotionModel
-from orthaug.models.moving import Moving
+from orthaug.models.moving import MotionDynamics
 from orthaug.models.stepping import Memory, step_inputs, step_lagged
 
 _WIDTH = 1e-3  # of differences, in sizes: bears a learner in single precision
@@ -54,21 +54,26 @@ class LaggedStep:
         return self.memory.inputs
 
     def state_at(self, rest: Any, inputs: Any) -> Any:
-        """The state that keeps outputs `rest` and inputs for long."""
+        """Return the state that keeps outputs `rest` and inputs for long."""
         now = dict(zip((*self.rest, *self.inputs), (*rest, *inputs), strict=True))
-        return jnp.stack([now[lag.channel] for lag in self.memory.lags] or [jnp.zeros(())])[: len(self.memory.lags)]
+        return jnp.stack([now[lag.channel] for lag in self.memory.lags] or [jnp.zeros(())])[
+            : len(self.memory.lags)
+        ]
 
     def advance(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Any]:
-        """The next state and the outputs."""
+        """Return the next state and the outputs."""
         return step_lagged(self.form, numbers, self.memory, state, inputs)
 
     def unrest(self, numbers: Numbers, rest: Any, inputs: Any) -> tuple[Any, Any]:
-        """What is zero at rest, and the outputs."""
+        """Return the residual of rest, zero at rest, and the outputs."""
         y = self.advance(numbers, self.state_at(rest, inputs), inputs)[1]
         return y - rest, y
 
     def seen(self, rest: Vector, inputs: Vector) -> Vector | None:
-        """The learner's features at rest; None where there is no telling what training reached of them."""
+        """Return the learner's features at rest.
+
+        None where it is unknown which of them training reached.
+        """
         if self.form.bound is None or not self.form.differentiable:
             return None
         now = dict(zip((*self.rest, *self.inputs), (*rest, *inputs), strict=True))
@@ -80,7 +85,7 @@ class LaggedStep:
 class MotionStep:
     """As `LaggedStep`, of a motion; it rests where no state changes."""
 
-    form: Moving
+    form: MotionDynamics
 
     @property
     def continuous(self) -> bool:
@@ -103,7 +108,7 @@ class MotionStep:
         return self.form.motion.inputs
 
     def state_at(self, rest: Any, inputs: Any) -> Any:
-        """The state itself."""
+        """Return the state itself."""
         return jnp.asarray(rest)
 
     def advance(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Any]:
@@ -111,8 +116,10 @@ class MotionStep:
         return following, parts.total
 
     def field(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Any]:
-        """The derivatives in time, or the next state of a discrete motion, and the outputs."""
-        return sum(self.form.rates(numbers, state, inputs)), self.form.observed(numbers, state, inputs)
+        """Return the derivatives in time, or a discrete motion's next state, and the outputs."""
+        return sum(self.form.rates(numbers, state, inputs)), self.form.observed(
+            numbers, state, inputs
+        )
 
     def unrest(self, numbers: Numbers, rest: Any, inputs: Any) -> tuple[Any, Any]:
         rates, y = self.field(numbers, rest, inputs)
@@ -128,7 +135,10 @@ Step = LaggedStep | MotionStep
 
 
 def step_of(model: Model | MotionModel) -> Step:
-    """The step to linearise; a spline through the record is replaced by straight lines between samples."""
+    """Return the step to linearise.
+
+    A spline through the record is replaced by straight lines between samples.
+    """
     if isinstance(model, Model):
         return LaggedStep(model.form, model.memory)
     form = model.form
@@ -139,7 +149,7 @@ def step_of(model: Model | MotionModel) -> Step:
 
 
 def sizes_of(model: Model | MotionModel) -> Vector:
-    """How large what is looked for at rest is over the training data."""
+    """Return the sizes of the unknowns of rest over the training data."""
     if isinstance(model, Model):
         size = np.asarray(model.largest_output, dtype=float)
     else:
@@ -148,11 +158,18 @@ def sizes_of(model: Model | MotionModel) -> Vector:
 
 
 @partial(jax.jit, static_argnames="step")
-def at_rest(step: Step, numbers: Numbers, rest: Any, inputs: Any, width: Any) -> tuple[Any, Any, Any]:
-    """What is zero at rest (ne,), the outputs (ny,), and how both follow rest and inputs (ne + ny, ne + nu)."""
+def at_rest(
+    step: Step, numbers: Numbers, rest: Any, inputs: Any, width: Any
+) -> tuple[Any, Any, Any]:
+    """Return residual of rest (ne,), outputs (ny,), and slopes of both (ne + ny, ne + nu).
+
+    The slopes are those by rest and inputs.
+    """
     both, point = partial(_unrest, step, numbers), jnp.concatenate([rest, inputs])
     value = both(point)
-    slope = jax.jacfwd(both)(point) if step.form.differentiable else by_differences(both, point, width)
+    slope = (
+        jax.jacfwd(both)(point) if step.form.differentiable else by_differences(both, point, width)
+    )
     ne = len(step.rest)
     return value[:ne], value[ne:], slope
 
@@ -163,15 +180,17 @@ def _unrest(step: Step, numbers: Numbers, point: Any) -> Any:
 
 
 def _moved(numbers: Numbers, unknowns: Any) -> Numbers:
-    """The numbers with others for (θ, weights), or for θ alone."""
+    """Return the numbers with others for (θ, weights), or for θ alone."""
     nt = len(numbers.theta)
     weights = unknowns[nt:] if len(unknowns) > nt else numbers.weights
     return numbers._replace(theta=unknowns[:nt], weights=weights)
 
 
 @partial(jax.jit, static_argnames="step")
-def unrest_along(step: Step, numbers: Numbers, rest: Any, inputs: Any, unknowns: Any, root: Any) -> Float[Array, "m r"]:
-    """How what is zero at rest, and the outputs, move along the columns of `root` (n, r)."""
+def unrest_along(
+    step: Step, numbers: Numbers, rest: Any, inputs: Any, unknowns: Any, root: Any
+) -> Float[Array, "m r"]:
+    """Return the change of rest's residual and of the outputs along columns of `root` (n, r)."""
 
     def of(p: Any) -> Any:
         return _unrest(step, _moved(numbers, p), jnp.concatenate([rest, inputs]))
@@ -180,46 +199,61 @@ def unrest_along(step: Step, numbers: Numbers, rest: Any, inputs: Any, unknowns:
 
 
 def _of_point(step: Step, field: bool, numbers: Numbers) -> Callable[[Any], Any]:
-    """A step, or the field, as a function of state and inputs in one vector."""
+    """Return a step, or the field, as a function of state and inputs in one vector."""
     n = len(step.states)
     function = step.field if field and isinstance(step, MotionStep) else step.advance
     return lambda point: jnp.concatenate(function(numbers, point[:n], point[n:]))
 
 
-def _laid_out(step: Step, field: bool, rest: Any, inputs: Any) -> Any:
-    """State and inputs of a step in one vector; of the field the inputs stand at one instant."""
+def _build_rows(step: Step, field: bool, rest: Any, inputs: Any) -> Any:
+    """Return state and inputs of a step in one vector; of the field the inputs at one instant."""
     return jnp.concatenate([step.state_at(rest, inputs), *([inputs] * (1 if field else step.ends))])
 
 
 def _slope(step: Step, field: bool, numbers: Numbers, rest: Any, inputs: Any, width: Any) -> Any:
-    """`[[A, B], [C, D]]` of a step, or of the field."""
-    both, point = _of_point(step, field, numbers), _laid_out(step, field, rest, inputs)
+    """Return `[[A, B], [C, D]]` of a step, or of the field."""
+    both, point = _of_point(step, field, numbers), _build_rows(step, field, rest, inputs)
     if step.form.differentiable:
         return jax.jacfwd(both)(point)
-    return by_differences(both, point, _laid_out(step, field, width[: len(rest)], width[len(rest) :]))
+    return by_differences(
+        both, point, _build_rows(step, field, width[: len(rest)], width[len(rest) :])
+    )
 
 
 @partial(jax.jit, static_argnames="step")
 def one_sided(step: Step, numbers: Numbers, rest: Any, inputs: Any, width: Any) -> tuple[Any, Any]:
-    """`[A B]` by differences to each side, (2, n, k), and how far these reach, (k,)."""
-    both, point = _of_point(step, False, numbers), _laid_out(step, False, rest, inputs)
-    full = _laid_out(step, False, width[: len(rest)], width[len(rest) :])
+    """Return `[A B]` by differences to each side, (2, n, k), and their reach, (k,)."""
+    both, point = _of_point(step, False, numbers), _build_rows(step, False, rest, inputs)
+    full = _build_rows(step, False, width[: len(rest)], width[len(rest) :])
     each, middle, n = jax.vmap(both), both(point), len(step.states)
-    sides = [(each(point + sign * jnp.diag(full)) - middle) / (sign * full[:, None]) for sign in (-1, 1)]
+    sides = [
+        (each(point + sign * jnp.diag(full)) - middle) / (sign * full[:, None]) for sign in (-1, 1)
+    ]
     return jnp.stack([side.T[:n] for side in sides]), full
 
 
 @partial(jax.jit, static_argnames=("step", "field"))
-def slope_at(step: Step, field: bool, numbers: Numbers, rest: Any, inputs: Any, width: Any) -> Float[Array, "m n"]:
-    """`[[A, B], [C, D]]` at a point of rest."""
+def slope_at(
+    step: Step, field: bool, numbers: Numbers, rest: Any, inputs: Any, width: Any
+) -> Float[Array, "m n"]:
+    """Return `[[A, B], [C, D]]` at a point of rest."""
     return _slope(step, field, numbers, rest, inputs, width)
 
 
 @partial(jax.jit, static_argnames=("step", "field"))
 def slope_along(
-    step: Step, field: bool, numbers: Numbers, rest: Any, inputs: Any, unknowns: Any, along: tuple[Any, Any, Any]
+    step: Step,
+    field: bool,
+    numbers: Numbers,
+    rest: Any,
+    inputs: Any,
+    unknowns: Any,
+    along: tuple[Any, Any, Any],
 ) -> Float[Array, "r m n"]:
-    """How `[[A, B], [C, D]]` moves where (rest, inputs, unknowns) move along the columns of `along`."""
+    """Return the change of `[[A, B], [C, D]]` along each column of `along`.
+
+    The columns are directions of (rest, inputs, unknowns).
+    """
 
     def of(rest: Any, inputs: Any, p: Any) -> Any:
         return _slope(step, field, _moved(numbers, p), rest, inputs, None)
@@ -229,5 +263,5 @@ def slope_along(
 
 
 def difference_widths(size: Vector, inputs: Vector) -> Vector:
-    """How far differences reach, for rest and inputs."""
+    """Return the reach of differences, for rest and inputs."""
     return _WIDTH * np.concatenate([size, np.maximum(np.abs(inputs), 1.0)])

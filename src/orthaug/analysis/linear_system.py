@@ -1,11 +1,13 @@
-"""A linear system with what its matrices move along the directions of a covariance: poles, gains and responses of both.
+"""Linear system with uncertain matrices: poles, gains and responses, each with its covariance.
 
-The covariance of `vec [[A, B], [C, D]]` is `Σ_j m_j m_jᵀ` with the r matrices m_j of `moved`. A function of the
-matrices then has the variance `Σ_j δ_j²`, δ_j its derivative along m_j (delta method): sums of squares.
+The covariance of `vec [[A, B], [C, D]]` is `Σ_j m_j m_jᵀ` with the r matrices m_j of `moved`. A
+function of the matrices then has the variance `Σ_j δ_j²`, δ_j its derivative along m_j (delta
+method): sums of squares.
 
-For continuous time a lagged model is written first with as many states as its transfer function needs (observer form),
-less dead time that belongs to an input alone. Then `zoh`: `[[A, B], [0, 0]] = ln [[A_d, B_d], [0, I]] / Ts`, exact for
-inputs that are held between samples; or `tustin`: `z = (1 + s Ts/2) / (1 − s Ts/2)`.
+For continuous time a lagged model is written first with as many states as its transfer function
+needs (observer form), less dead time that belongs to an input alone. Then `zoh`: `[[A, B], [0, 0]]
+= ln [[A_d, B_d], [0, I]] / Ts`, exact for inputs that are held between samples; or `tustin`: `z =
+(1 + s Ts/2) / (1 − s Ts/2)`.
 """
 
 from __future__ import annotations
@@ -30,9 +32,12 @@ _ROUNDING = 1e-8  # of a matrix: what the logarithm must give back
 
 @dataclass(frozen=True, eq=False)
 class System:
-    """`x⁺ = A x + B u` of a sampling time `step` [s], or `ẋ = A x + B u` where that is None; `y = C x + D u`.
+    """`x⁺ = A x + B u` of a sampling time `step` [s], or `ẋ = A x + B u` where that is None.
 
-    `matrix` is [[A, B], [C, D]], (n + ny, n + nu); `moved` (r, n + ny, n + nu), None where nothing is known.
+    `y = C x + D u`.
+
+    `matrix` is [[A, B], [C, D]], (n + ny, n + nu); `moved` (r, n + ny, n + nu), None where nothing
+    is known.
     """
 
     matrix: Matrix
@@ -68,10 +73,12 @@ class System:
     @cached_property
     def modes(self) -> Modes:
         """Poles with their derivatives."""
-        return modes_of(self.a, None if self.moved is None else self.moved[:, : self.states, : self.states])
+        return modes_of(
+            self.a, None if self.moved is None else self.moved[:, : self.states, : self.states]
+        )
 
     def response(self, z: Complex[np.ndarray, "m"]) -> Response:
-        """`C (zI − A)⁻¹ B + D` at m points of the plane."""
+        """Return `C (zI − A)⁻¹ B + D` at m points of the plane."""
         n = self.states
         inverse = z[:, None, None] * np.eye(n) - self.a
         right = _solved(inverse, np.broadcast_to(self.b.astype(complex), (len(z), *self.b.shape)))
@@ -83,24 +90,30 @@ class System:
         ny, nu = self.d.shape
         left = np.concatenate([left, np.broadcast_to(np.eye(ny), (len(z), ny, ny))], axis=2)
         right = np.concatenate([right, np.broadcast_to(np.eye(nu), (len(z), nu, nu))], axis=1)
-        return Response(value, np.einsum("mij,rjk,mkl->mril", left, self.moved, right, optimize=True))
+        return Response(
+            value, np.einsum("mij,rjk,mkl->mril", left, self.moved, right, optimize=True)
+        )
 
     @property
     def integrates(self) -> bool:
-        """Whether a pole stands where the static gain is asked for."""
+        """True if there is a pole where the static gain is evaluated."""
         rest = 1.0 if self.step is not None else 0.0
-        size = 1.0 if self.step is not None else max(np.abs(self.modes.values).max(initial=0.0), 1e-300)
+        size = (
+            1.0
+            if self.step is not None
+            else max(np.abs(self.modes.values).max(initial=0.0), 1e-300)
+        )
         return bool(np.any(np.abs(self.modes.values - rest) < _UNIT * size)) or (
             self.step is None and self.modes.at_zero > 0
         )
 
     def at(self, frequency: Vector) -> Response:
-        """The response to sines at frequencies [Hz]."""
+        """Return the response to sines at frequencies [Hz]."""
         turn = 2j * np.pi * frequency
         return self.response(turn if self.step is None else np.exp(turn * self.step))
 
     def gain(self) -> Response | None:
-        """The static gain (1, ny, nu); None for a system that integrates."""
+        """Return the static gain (1, ny, nu); None for a system that integrates."""
         if self.integrates:
             return None
         found = self.response(np.array([1.0 + 0j if self.step is not None else 0j]))
@@ -115,9 +128,11 @@ class Response(NamedTuple):
 
 
 class Modes(NamedTuple):
-    """Eigenvalues other than 0, how each moves along the covariance (None where it has no derivative), how many are 0.
+    """Eigenvalues other than 0, their derivatives along the covariance, and the number of zeros.
 
-    In the order of decreasing magnitude, the upper one of a conjugate pair first.
+    A derivative is None where it does not exist.
+
+    They are in the order of decreasing magnitude, the upper one of a conjugate pair first.
     """
 
     values: Complex[np.ndarray, "k"]
@@ -126,10 +141,10 @@ class Modes(NamedTuple):
 
 
 def modes_of(a: Matrix, moved: Float[np.ndarray, "r n n"] | None) -> Modes:
-    """Eigenvalues of A; `dλ = wᴴ dA v / wᴴv` with its eigenvectors.
+    """Return the eigenvalues of A; `dλ = wᴴ dA v / wᴴv` with its eigenvectors.
 
-    Those at 0, which shift registers have, are split off before: a chain of k of them is moved by rounding as far as
-    `ε^(1/k)`.
+    Those at 0, which shift registers have, are split off before: a chain of k of them is moved by
+    rounding as far as `ε^(1/k)`.
     """
     if not len(a):
         return Modes(np.zeros(0, dtype=complex), (), 0)
@@ -138,7 +153,13 @@ def modes_of(a: Matrix, moved: Float[np.ndarray, "r n n"] | None) -> Modes:
     nothing = np.zeros(0, dtype=complex), core
     found: Any = scipy.linalg.eig(core, left=True, right=False) if len(core) else nothing
     values, left = found
-    order = np.lexsort((-np.sign(values.imag), np.round(np.abs(np.angle(values)), 9), -np.round(np.abs(values), 12)))
+    order = np.lexsort(
+        (
+            -np.sign(values.imag),
+            np.round(np.abs(np.angle(values)), 9),
+            -np.round(np.abs(values), 12),
+        )
+    )
     slopes: list[Any] = []
     for i in order:
         if moved is None:
@@ -148,12 +169,16 @@ def modes_of(a: Matrix, moved: Float[np.ndarray, "r n n"] | None) -> Modes:
         v = _right(balanced, values[i], w)
         inner = w.conj() @ v
         sure = abs(inner) > _DEFECTIVE * np.linalg.norm(w) * np.linalg.norm(v)
-        slopes.append(np.einsum("i,rij,j->r", w.conj() / scale[0], moved, v * scale[0]) / inner if sure else None)
+        slopes.append(
+            np.einsum("i,rij,j->r", w.conj() / scale[0], moved, v * scale[0]) / inner
+            if sure
+            else None
+        )
     return Modes(values[order], tuple(slopes), len(a) - len(core))
 
 
 def _core(a: Matrix) -> tuple[Matrix, Matrix]:
-    """A on what it never forgets: `Qᵀ A Q` with all eigenvalues but 0, and Q.
+    """Return a on what it never forgets: `Qᵀ A Q` with all eigenvalues but 0, and Q.
 
     Kernels are divided out one after the other, each by an orthogonal basis.
     """
@@ -169,7 +194,7 @@ def _core(a: Matrix) -> tuple[Matrix, Matrix]:
 
 
 def _right(a: Matrix, value: complex, start: Any) -> Any:
-    """The right eigenvector of a pole, by inverse iteration."""
+    """Return the right eigenvector of a pole, by inverse iteration."""
     shifted = a - value * (1 + 1e-12) * np.eye(len(a))
     for _ in range(2):
         start = np.linalg.solve(shifted, start / np.linalg.norm(start))
@@ -177,7 +202,7 @@ def _right(a: Matrix, value: complex, start: Any) -> Any:
 
 
 def _solved(left: Any, right: Any) -> Any:
-    """`left⁻¹ right`; NaN where a pole stands at the point."""
+    """Return `left⁻¹ right`; NaN at a pole."""
     if not left.shape[-1]:
         return np.zeros(right.shape, dtype=complex)
     try:
@@ -190,7 +215,9 @@ def _solved(left: Any, right: Any) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Continuous:
-    """The system in continuous time; `dead_time` [s] (nu,) delays its inputs. `method` is that of the conversion.
+    """The system in continuous time; `dead_time` [s] (nu,) delays its inputs.
+
+    `method` is that of the conversion.
 
     "equations" are a motion's own. `states` are their names.
     """
@@ -201,8 +228,10 @@ class Continuous:
     states: tuple[str, ...]
 
 
-def converted(system: System, method: str, memory: Memory | None, names: tuple[str, ...]) -> Continuous | str:
-    """The system in continuous time, or why there is none."""
+def converted(
+    system: System, method: str, memory: Memory | None, names: tuple[str, ...]
+) -> Continuous | str:
+    """Return the system in continuous time, or why there is none."""
     step = system.step
     assert step is not None
     dead = np.zeros(system.d.shape[1], dtype=int)
@@ -213,26 +242,36 @@ def converted(system: System, method: str, memory: Memory | None, names: tuple[s
     if method == "tustin":
         if np.any(np.abs(poles.values + 1) < 1e-9):
             return "a pole at -1 has no counterpart under Tustin's rule."
-        return Continuous(System(_tustin(system, step), system.states, None), dead * step, method, names)
+        return Continuous(
+            System(_tustin(system, step), system.states, None), dead * step, method, names
+        )
     if poles.at_zero:
         count = "a pole at 0 has" if poles.at_zero == 1 else f"{poles.at_zero} poles at 0 have"
-        return f"{count} no counterpart under a hold (what is forgotten within a sample); tustin gives one."
+        return (
+            f"{count} no counterpart under a hold (what is forgotten within a sample); tustin "
+            "gives one."
+        )
     values: Any = poles.values
     negative = values[(values.real < 0) & (np.abs(values.imag) < 1e-9 * np.abs(values))]
     if len(negative):
-        told = ", ".join(f"{value.real:.4g}" for value in negative)
+        listed = ", ".join(f"{value.real:.4g}" for value in negative)
         return (
-            f"a real pole below 0 ({told}) alternates from sample to sample, which no real system does under a hold; "
-            "tustin gives one."
+            f"a real pole below 0 ({listed}) alternates from sample to sample, which no real "
+            "system does under a hold; tustin gives one."
         )
     found = _logarithm(system, step)
     if found is None:
-        return "the matrix logarithm cannot be computed to the digits that are needed; tustin gives a system."
+        return (
+            "the matrix logarithm cannot be computed to the digits that are needed; tustin "
+            "gives a system."
+        )
     return Continuous(System(found, system.states, None), dead * step, method, names)
 
 
 def observer_form(system: System, memory: Memory) -> tuple[System, Any]:
-    """A lagged system with `Σ n_i` states, n_i the largest lag in the equation of output i; and dead samples (nu,).
+    """Return a lagged system with `Σ n_i` states, n_i the largest lag in the equation of output i.
+
+    The dead samples (nu,) come with it.
 
     `s_i,l⁺ = s_i,l+1 + Σ_j a_ij,l y_j + Σ_j b_ij,l u_j`, `y_i = s_i,1 + Σ_j d_ij u_j`.
     """
@@ -279,7 +318,9 @@ def _logarithm(system: System, step: float) -> Matrix | None:
     whole[:n] = system.matrix[:n]
     with np.errstate(all="ignore"):
         found: Any = np.asarray(scipy.linalg.logm(whole)) if n else np.zeros((nu, nu))
-    if not np.isfinite(found).all() or np.abs(found.imag).max(initial=0.0) > _ROUNDING * np.abs(found).max(initial=0.0):
+    if not np.isfinite(found).all() or np.abs(found.imag).max(initial=0.0) > _ROUNDING * np.abs(
+        found
+    ).max(initial=0.0):
         return None
     back = scipy.linalg.expm(found.real)
     if np.abs(back - whole).max(initial=0.0) > _ROUNDING * np.abs(whole).max(initial=1.0):

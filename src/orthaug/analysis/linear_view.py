@@ -1,8 +1,8 @@
-"""A model near a point of rest as a linear system: matrices, poles, static gain and frequency response with intervals.
+"""Linear view of a model at a point of rest: matrices, poles, gain and response with intervals.
 
-All intervals are 95 % by the delta method from Cov(c, w), the joint covariance of parameters and learner weights that
-training left, with the quantile of Student's t. The point of rest moves with them. Of positive quantities (magnitudes,
-frequencies) the logarithm is taken as normal.
+All intervals are 95 % by the delta method from Cov(c, w), the joint covariance of parameters and
+learner weights that training left, with the quantile of Student's t. The point of rest moves with
+them. Of positive quantities (magnitudes, frequencies) the logarithm is taken as normal.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ _REAL = 1e-9  # imaginary part beside the magnitude: a real pole
 class Pole:
     """A pole z of the sampled system and `s` [1/s] in continuous time, with 95 % intervals.
 
-    `s` is that of a motion's equations, or else ln(z)/Ts; None for a real z below 0, which is that of no real system
-    under a hold. Then and for s = 0 there are neither frequency nor damping. `time_constant` −1/s [s] is that of real
-    poles that decay.
+    `s` is that of a motion's equations, or else ln(z)/Ts; None for a real z below 0, which is that
+    of no real system under a hold. Then and for s = 0 there are neither frequency nor damping.
+    `time_constant` −1/s [s] is that of real poles that decay.
     """
 
     z: complex
@@ -70,7 +70,9 @@ class Pole:
 
 @dataclass(frozen=True, eq=False)
 class Bode:
-    """The frequency response at `frequency` [Hz], (m, ny, nu): `value`, and intervals of magnitude and phase [deg].
+    """Frequency response at `frequency` [Hz], (m, ny, nu), with intervals of magnitude and phase.
+
+    Phases are in degrees.
 
     Phases are unwrapped along the frequency. None where there is no covariance.
     """
@@ -92,7 +94,7 @@ class Bode:
 
 
 def phase_of(value: Complex[np.ndarray, "m ny nu"]) -> Float[np.ndarray, "m ny nu"]:
-    """arg G [deg], unwrapped over what is finite."""
+    """Return arg G [deg], unwrapped over what is finite."""
     found = np.full(value.shape, np.nan)
     for i in np.ndindex(value.shape[1:]):
         there = np.isfinite(value[:, *i])
@@ -102,10 +104,13 @@ def phase_of(value: Complex[np.ndarray, "m ny nu"]) -> Float[np.ndarray, "m ny n
 
 @dataclass(frozen=True, eq=False)
 class LinearView:
-    """A model as a linear system about a point of rest: `δx⁺ = A δx + B δu`, `δy = C δx + D δu`, in physical units.
+    """Linear model about a point of rest: `δx⁺ = A δx + B δu`, `δy = C δx + D δu`.
 
-    `continuous` is the same in continuous time, or the sentence why there is none. `gain` (ny, nu) is ∂y/∂u at rest,
-    None for a system that integrates. `freedom` are the degrees of freedom of the intervals.
+    All are in physical units.
+
+    `continuous` is the same in continuous time, or the sentence why there is none. `gain` (ny, nu)
+    is ∂y/∂u at rest, None for a system that integrates. `freedom` are the degrees of freedom of the
+    intervals.
     """
 
     point: OperatingPoint
@@ -125,12 +130,18 @@ class LinearView:
     freedom: float
     warnings: tuple[Warning, ...]
     smooth: bool = False
-    """Whether inputs run smoothly between samples (a spline), so that `bode` is the response of the equations."""
+    """Whether inputs run smoothly between samples (a spline), so that `bode` is the response of the
+    equations.
+    """
 
     @property
     def responding(self) -> System:
-        """The system whose response `bode` is: the sampled one, or under smooth inputs that in continuous time."""
-        return self.continuous.system if self.smooth and isinstance(self.continuous, Continuous) else self.system
+        """System whose response is `bode`: sampled, or under smooth inputs in continuous time."""
+        return (
+            self.continuous.system
+            if self.smooth and isinstance(self.continuous, Continuous)
+            else self.system
+        )
 
     @property
     def a(self) -> Matrix:
@@ -160,30 +171,36 @@ class LinearView:
 
     @property
     def stable(self) -> bool:
-        """Whether all poles lie inside the unit circle."""
+        """True if all poles lie inside the unit circle."""
         return all(pole.magnitude < 1 for pole in self.poles)
 
     @cached_property
     def matrix_ci95(self) -> Float[np.ndarray, "m k 2"] | None:
-        """Intervals of [[A, B], [C, D]]; of entries that are no estimates both ends are the entry."""
+        """Intervals of [[A, B], [C, D]].
+
+        Both ends of an entry that is no estimate are the entry.
+        """
         std = self.system.std
         return None if std is None else interval(self.system.matrix, std, self.freedom)
 
     def to_control(self, time: str = "discrete") -> control.StateSpace:
-        """The system for python-control, with the names of states, inputs and outputs.
+        """Return the system for python-control, with the names of states, inputs and outputs.
 
         Args:
-            time: "discrete" at the sampling time, or "continuous". Dead time is no part of a continuous system.
+            time: "discrete" at the sampling time, or "continuous". Dead time is no part of a
+                continuous system.
 
         Raises:
-            InputError: python-control is not installed, another `time`, or no system in continuous time.
+            InputError: python-control is not installed, another `time`, or no system in continuous
+                time.
         """
         check_choice(time, ("discrete", "continuous"), "`time`")
         try:
             import control
         except ImportError:
             raise InputError(
-                "python-control is not installed; pip install control, or orthaug with its extra 'control'."
+                "python-control is not installed; pip install control, or orthaug with its "
+                "extra 'control'."
             ) from None
         if time == "discrete":
             system, states = self.system, self.states
@@ -191,24 +208,34 @@ class LinearView:
             raise InputError(self.continuous)
         else:
             system, states = self.continuous.system, self.continuous.states
-        labels = {"states": list(states), "inputs": list(self.inputs), "outputs": list(self.outputs)}
+        labels = {
+            "states": list(states),
+            "inputs": list(self.inputs),
+            "outputs": list(self.outputs),
+        }
         dt = 0 if system.step is None else system.step
         return control.StateSpace(system.a, system.b, system.c, system.d, dt, **labels)
 
     def __repr__(self) -> str:
         n, (ny, nu) = self.system.states, self.d.shape
-        return f"LinearView({self.point}: {n} states, {nu} inputs, {ny} outputs, {len(self.poles)} poles)"
+        return (
+            f"LinearView({self.point}: {n} states, {nu} inputs, {ny} outputs, "
+            f"{len(self.poles)} poles)"
+        )
 
 
 def about(value: Any, relative: Any, freedom: float) -> Any:
-    """Intervals of positive values whose logarithms are normal, (…, 2)."""
+    """Return intervals (…, 2) of positive values whose logarithms are normal."""
     with np.errstate(all="ignore"):
         times = np.exp(reach(freedom) * relative)
         return np.stack([value / times, value * times], axis=-1)
 
 
 def bode_of(system: System, frequency: Vector, freedom: float) -> Bode:
-    """The response on a grid, with bands of `ln G`: `δ ln|G| = Re(δG/G)`, `δ arg G = Im(δG/G)`."""
+    """Return the response on a grid, with bands of `ln G`.
+
+    They follow from `δ ln|G| = Re(δG/G)` and `δ arg G = Im(δG/G)`.
+    """
     found = system.at(frequency)
     if found.moved is None:
         return Bode(frequency, found.value, None, None)
@@ -220,7 +247,7 @@ def bode_of(system: System, frequency: Vector, freedom: float) -> Bode:
 
 
 def gain_of(system: System, freedom: float) -> tuple[Matrix | None, Any]:
-    """The static gain (ny, nu) and its intervals."""
+    """Return the static gain (ny, nu) and its intervals."""
     found = system.gain()
     if found is None:
         return None, None
@@ -231,20 +258,29 @@ def gain_of(system: System, freedom: float) -> tuple[Matrix | None, Any]:
 
 
 def poles_of(system: System, own: System | None, freedom: float) -> tuple[Pole, ...]:
-    """Poles of a sampled system; `own` are a motion's equations, whose poles are matched to these."""
+    """Return the poles of a sampled system.
+
+    `own` are a motion's equations, whose poles are matched to these.
+    """
     modes, step = system.modes, system.step
     assert step is not None
     with np.errstate(all="ignore"):
-        found = [(z, None if d is None else d / z) for z, d in zip(modes.values, modes.moved, strict=True)]
+        found = [
+            (z, None if d is None else d / z)
+            for z, d in zip(modes.values, modes.moved, strict=True)
+        ]
     if own is None:
         logs = [(np.log(z) / step, None if r is None else r / step) for z, r in found]
     else:
         logs = _matched(modes.values, own, step)
-    return tuple(_pole(z, r, s, d, own is not None, freedom) for (z, r), (s, d) in zip(found, logs, strict=True))
+    return tuple(
+        _pole(z, r, s, d, own is not None, freedom)
+        for (z, r), (s, d) in zip(found, logs, strict=True)
+    )
 
 
 def _matched(z: Any, own: System, step: float) -> list[tuple[complex, Any]]:
-    """The equations' poles in the order of the sampled ones, each with how it moves."""
+    """Return the equations' poles in the order of the sampled ones, each with how it moves."""
     from scipy.optimize import linear_sum_assignment
 
     modes = own.modes
@@ -258,13 +294,15 @@ def _matched(z: Any, own: System, step: float) -> list[tuple[complex, Any]]:
 
 
 def _pole(z: complex, relative: Any, s: complex, moved: Any, exact: bool, freedom: float) -> Pole:
-    """With `relative` = δz/z and `moved` = δs along the covariance."""
+    """Return a pole with `relative` = δz/z and `moved` = δs along the covariance."""
     size = lambda part: float(np.sqrt(np.sum(part**2)))  # noqa: E731
     magnitude = float(abs(z))
     radius = None if relative is None else _pair(about(magnitude, size(relative.real), freedom))
     alternates = z.real < 0 and abs(z.imag) <= _REAL * magnitude and not exact
     if alternates or abs(s) <= 1e-12:
-        return Pole(complex(z), None if alternates else 0j, magnitude, radius, None, None, None, None)
+        return Pole(
+            complex(z), None if alternates else 0j, magnitude, radius, None, None, None, None
+        )
     frequency, damping, real = abs(s), -s.real / abs(s), abs(s.imag) <= _REAL * abs(s)
     if real:
         damping = float(np.sign(damping))
@@ -272,9 +310,22 @@ def _pole(z: complex, relative: Any, s: complex, moved: Any, exact: bool, freedo
     if moved is not None:
         change = moved / s
         sine = abs(s.imag) / abs(s)
-        turn = None if real else _pair(np.clip(interval(damping, sine * size(change.imag), freedom), -1.0, 1.0))
+        turn = (
+            None
+            if real
+            else _pair(np.clip(interval(damping, sine * size(change.imag), freedom), -1.0, 1.0))
+        )
         spans = (_pair(about(frequency, size(change.real), freedom)), turn)
-    return Pole(complex(z), complex(s), magnitude, radius, float(frequency), spans[0], float(damping), spans[1])
+    return Pole(
+        complex(z),
+        complex(s),
+        magnitude,
+        radius,
+        float(frequency),
+        spans[0],
+        float(damping),
+        spans[1],
+    )
 
 
 def _pair(ends: Any) -> Interval:
@@ -282,7 +333,10 @@ def _pair(ends: Any) -> Interval:
 
 
 class Agreement(NamedTuple):
-    """Medians of the differences in magnitude [dB] and phase [deg] over so many `points` of frequencies and pairs."""
+    """Medians of the differences in magnitude [dB] and phase [deg], over so many `points`.
+
+    A point is a frequency of a pair of input and output.
+    """
 
     decibel: float
     degrees: float
@@ -291,7 +345,7 @@ class Agreement(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Linearization:
-    """What `linearize` returns: a `LinearView` for each point of rest, and what data alone say of the response.
+    """Result of `linearize`: a `LinearView` for each point of rest, and the measured response.
 
     It has a length and is indexed and iterated over as the tuple of its `views`.
     """
@@ -299,7 +353,9 @@ class Linearization:
     views: tuple[LinearView, ...]
     measured: MeasuredResponse | None
     held: str
-    """What inputs that nobody named are held at: "zero", "mean" (of the record), "found"; "given" if all are named."""
+    """What inputs that nobody named are held at: "zero", "mean" (of the record), "found"; "given"
+    if all are named.
+    """
     warnings: tuple[Warning, ...]
 
     def __len__(self) -> int:
@@ -312,7 +368,10 @@ class Linearization:
         return iter(self.views)
 
     def agreement(self, view: LinearView) -> Agreement | None:
-        """How near a view comes to what data alone say, where coherence is at least a half; None without any."""
+        """Return the differences of a view from the measured response, at coherence ≥ 0.5.
+
+        None without any.
+        """
         if self.measured is None:
             return None
         known = self.measured.coherence[:, :, None] >= COHERENT
@@ -323,16 +382,20 @@ class Linearization:
         if not len(ratio):
             return None
         decibel = 20 * np.median(np.abs(np.log10(np.abs(ratio))))
-        return Agreement(float(decibel), float(np.degrees(np.median(np.abs(np.angle(ratio))))), len(ratio))
+        return Agreement(
+            float(decibel), float(np.degrees(np.median(np.abs(np.angle(ratio))))), len(ratio)
+        )
 
     def to_control(self, time: str = "discrete") -> control.StateSpace:
-        """That of its only view.
+        """Return the state space of the only view.
 
         Raises:
             InputError: several points of rest; as `LinearView.to_control`.
         """
         if len(self.views) != 1:
-            raise InputError(f"there are {len(self.views)} operating points; take one, such as linearization[0].")
+            raise InputError(
+                f"there are {len(self.views)} operating points; take one, such as linearization[0]."
+            )
         return self.views[0].to_control(time)
 
     def __repr__(self) -> str:

@@ -34,7 +34,7 @@ _POINTS = 400  # of the frequency grid
 _DECADES = 3  # below Nyquist's frequency at least
 _BELOW = 10  # times below the slowest pole
 _LOWEST = 1e-5  # of Nyquist's frequency
-_STEEP = 0.1  # of its matrix: what differences may change before a kink is told
+_STEEP = 0.1  # of its matrix: what differences may change before a kink is reported
 _WIDE = 0.5  # standard error of ln G beyond which the delta method is rough
 
 
@@ -54,18 +54,21 @@ def linearize(
     frequencies: Any = None,
     continuous: str = "zoh",
 ) -> Linearization:
-    """The model about its points of rest as linear systems, with 95 % intervals from its joint covariance.
+    """Return the model about its points of rest as linear systems, with 95 % intervals.
 
     Args:
         model: a fitted model; of a fit the record is that of training.
-        at: inputs that are held, and outputs or states that are fixed, `"force=0, position=1"` or a mapping. Inputs
-            that nobody names are 0, or their means over the record; with outputs or states fixed, they are looked for.
+        at: inputs that are held, and outputs or states that are fixed, `"force=0, position=1"` or a
+            mapping. Inputs that nobody names are 0, or their means over the record; with outputs or
+            states fixed, they are looked for.
         record: measured data whose own frequency response is put beside.
-        frequencies: of the frequency response [Hz]; by default 400 up to Nyquist's, on a logarithmic grid.
+        frequencies: of the frequency response [Hz]; by default 400 up to Nyquist's, on a
+            logarithmic grid.
         continuous: how a lagged model is converted to continuous time, zoh or tustin.
 
     Raises:
-        InputError: no point of rest, a name that the model does not have, a record that does not fit.
+        InputError: no point of rest, a name that the model does not have, a record that does not
+            fit.
 
     Examples:
         >>> import orthaug as oa
@@ -94,12 +97,12 @@ def linearize(
     outputs = [channel.name for channel in model.outputs]
     search = Search.of(step, model, outputs, given, held)
     points, warnings = operating_points(search)
-    spread, told = _spread(model, fit)
-    warnings += told
+    spread, of_spread = _spread(model, fit)
+    warnings += of_spread
     if _smooth(model):
         text = (
-            "a spline through the record has no step: the sampled system is that of straight lines between samples, "
-            "the frequency response that of the equations."
+            "a spline through the record has no step: the sampled system is that of straight "
+            "lines between samples, the frequency response that of the equations."
         )
         warnings.append(Warning("hold_replaced", text))
     views = tuple(_view(model, search, point, spread, frequency, continuous) for point in points)
@@ -108,7 +111,7 @@ def linearize(
 
 
 def _held(search: Search, given: Mapping[str, float], record: Record | None) -> str:
-    """Where inputs come from that nobody named."""
+    """Return a clause on the source of inputs that nobody fixed."""
     if all(name in given for name in search.step.inputs):
         return "given"
     if search.free[len(search.step.rest) :].any():
@@ -124,16 +127,26 @@ def _frequencies(given: Any, step: float) -> Vector | None:
     except (TypeError, ValueError, OverflowError):
         found = np.zeros(0)
     nyquist = 0.5 / step
-    if not len(found) or not np.isfinite(found).all() or np.any(found <= 0) or np.any(found > nyquist * (1 + 1e-9)):
-        raise InputError(f"`frequencies` must be numbers above 0 up to half the sampling rate, {nyquist:.6g} Hz.")
+    if (
+        not len(found)
+        or not np.isfinite(found).all()
+        or np.any(found <= 0)
+        or np.any(found > nyquist * (1 + 1e-9))
+    ):
+        raise InputError(
+            f"`frequencies` must be numbers above 0 up to half the sampling rate, {nyquist:.6g} Hz."
+        )
     return found
 
 
 def _spread(model: Model | MotionModel, fit: Any) -> tuple[_Spread | None, list[Warning]]:
-    """The covariance to take intervals from, and what is to be said of it."""
+    """Return the covariance to take intervals from, and what is to be said of it."""
     joint, nt = model.statistics.joint(len(model.theta)), len(model.theta)
     if not model.form.differentiable:
-        text = "the learner has no derivatives (a function from another toolbox): differences stand in, no intervals."
+        text = (
+            "the learner has no derivatives (a function from another toolbox): finite "
+            "differences replace them, and there are no intervals."
+        )
         return None, [Warning("no_intervals", text)]
     if joint is not None and model.numbers.tilt is None:
         root = joint.root()
@@ -142,10 +155,16 @@ def _spread(model: Model | MotionModel, fit: Any) -> tuple[_Spread | None, list[
     covariance = None if fit is None or isinstance(model, MotionModel) else fit.covariance
     if fit is not None and covariance is not None and np.isfinite(covariance).all() and nt:
         values, vectors = np.linalg.eigh(covariance)
-        text = "there is no joint covariance with the learner's weights; intervals are those of θ, the learner frozen."
+        text = (
+            "there is no joint covariance with the learner's weights; intervals are those of "
+            "θ, with the learner frozen."
+        )
         spread = _Spread(vectors * np.sqrt(np.maximum(values, 0.0)), float(fit.freedom), True)
         return spread, [Warning("learner_frozen", text)]
-    text = "the model carries no covariance (an ensemble, or trained elsewhere); there are no intervals."
+    text = (
+        "the model carries no covariance (an ensemble, or trained elsewhere); there are no "
+        "intervals."
+    )
     return None, [Warning("no_intervals", text)]
 
 
@@ -164,7 +183,8 @@ def _view(
     if step.ends == 2:
         sampled = _without_next(sampled)
         text = (
-            "inputs run straight between samples: the sampled states are those of the motion less B₁ times the input."
+            "inputs run straight between samples: the sampled states are those of the motion "
+            "less B₁ times the input."
         )
         warnings.append(Warning("shifted_states", text))
     own: System | None = None
@@ -172,10 +192,18 @@ def _view(
         own = _system(search, point, spread, None)
         found: Continuous | str = Continuous(own, np.zeros(len(step.inputs)), "equations", names)
     else:
-        found = converted(sampled, method, None if isinstance(step, MotionStep) else step.memory, names)
+        found = converted(
+            sampled, method, None if isinstance(step, MotionStep) else step.memory, names
+        )
     poles = poles_of(sampled, own, freedom)
-    if any(pole.magnitude_ci95 and pole.magnitude_ci95[0] < 1 < pole.magnitude_ci95[1] for pole in poles):
-        text = "the 95 % interval of a pole contains magnitude 1: whether the point is stable is not sure."
+    if any(
+        pole.magnitude_ci95 and pole.magnitude_ci95[0] < 1 < pole.magnitude_ci95[1]
+        for pole in poles
+    ):
+        text = (
+            "the 95 % interval of a pole contains magnitude 1: whether the point is stable is "
+            "not sure."
+        )
         warnings.append(Warning("stability_not_sure", text))
     gain, gain_ci95 = gain_of(sampled, freedom)
     bode, smooth = None, _smooth(model)
@@ -192,13 +220,17 @@ def _view(
     )  # fmt: skip
 
 
-def _system(search: Search, point: OperatingPoint, spread: _Spread | None, time: float | None) -> System:
-    """The matrices of a step of `time`, or of the equations, and how they move along the covariance."""
+def _system(
+    search: Search, point: OperatingPoint, spread: _Spread | None, time: float | None
+) -> System:
+    """Return the matrices of a step of `time`, or of the equations, and their covariance."""
     step, numbers, field = search.step, search.numbers, time is None
     width = difference_widths(search.size, point.inputs)
     matrix = np.asarray(slope_at(step, field, numbers, point.rest, point.inputs, width))
     if not np.isfinite(matrix).all():
-        raise InputError(f"the model has no finite derivative at {point}; give another operating point.")
+        raise InputError(
+            f"the model has no finite derivative at {point}; give another operating point."
+        )
     moved = None
     if spread is not None:
         weights = [] if spread.frozen else [np.asarray(numbers.weights)]
@@ -208,24 +240,32 @@ def _system(search: Search, point: OperatingPoint, spread: _Spread | None, time:
         rows = [*range(ne), *(ne + i for i in point.slopes.outputs)]
         along = point.slopes.following(change[rows])
         moved = np.asarray(
-            slope_along(step, field, numbers, point.rest, point.inputs, unknowns, (along[:ne], along[ne:], root))
+            slope_along(
+                step,
+                field,
+                numbers,
+                point.rest,
+                point.inputs,
+                unknowns,
+                (along[:ne], along[ne:], root),
+            )
         )
         moved = np.where(np.isfinite(moved), moved, 0.0)
     return System(matrix, len(step.states), time, moved)
 
 
 def _smooth(model: Model | MotionModel) -> bool:
-    """Whether inputs run on a spline between samples."""
+    """Return whether inputs run on a spline between samples."""
     if not isinstance(model, MotionModel) or not model.inputs:
         return False
     return model.form.motion.hold == "spline" and model.form.motion.integrator != "discrete"
 
 
 def _without_next(system: System) -> System:
-    """A step that reads the inputs of the next sample as one that does not: `z = x − B₁ u` (first-order hold)."""
+    """Return the system without inputs of the next sample: `z = x − B₁ u` (first-order hold)."""
 
     def rewritten(matrix: Any, moved: Any = None) -> Any:
-        """Of the matrices, or of their change `moved`."""
+        """Return the matrices, or their change `moved`, in the new state."""
         n = system.states
         nu = (matrix.shape[1] - n) // 2
         a, b1, c = matrix[:n, :n], matrix[:n, n + nu :], matrix[n:, :n]
@@ -251,18 +291,24 @@ def _shape(system: System) -> tuple[int, int]:
 
 
 def _kinks(search: Search, point: OperatingPoint, system: System) -> list[Warning]:
-    """Whether differences tell of another slope than the derivative: then the view holds in no neighbourhood."""
+    """Return warnings where differences give another slope than the derivative.
+
+    The view then holds in no neighbourhood of the point.
+    """
     if not search.step.form.differentiable:
         return []
     width, n = difference_widths(search.size, point.inputs), system.states
-    sides, full = map(np.asarray, one_sided(search.step, search.numbers, point.rest, point.inputs, width))
+    sides, full = map(
+        np.asarray, one_sided(search.step, search.numbers, point.rest, point.inputs, width)
+    )
     unit = full[:n] / full[:n, None]  # entries in sizes of the states
     apart = np.abs(sides[:, :, :n] - system.a) * unit
     if np.all(apart <= _STEEP * np.abs(system.a * unit).max(initial=1e-300)):
         return []
     text = (
-        "the slope changes abruptly at this point, within a thousandth of the training data's size (such as dry "
-        "friction at rest): the linear system holds for smaller movements only."
+        "the slope changes abruptly at this point, within a thousandth of the training data's "
+        "size (such as dry friction at rest): the linear system holds for smaller movements "
+        "only."
     )
     return [Warning("kink", text)]
 
@@ -282,5 +328,8 @@ def _rough(bode: Any) -> list[Warning]:
     share = float(np.mean(wide))
     if share < 0.05:
         return []
-    text = f"at {percent(share)} of the frequencies the band is so wide that the delta method is rough there."
+    text = (
+        f"at {percent(share)} of the frequencies the band is so wide that the delta method is "
+        "rough there."
+    )
     return [Warning("wide_band", text)]

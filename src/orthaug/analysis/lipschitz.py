@@ -1,4 +1,4 @@
-"""How steep is the one-step predictor? Gradients over measured regressors (`cond:pred_stab`)."""
+"""Steepness of the one-step predictor: gradients over measured regressors (`cond:pred_stab`)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
 from orthaug._base.jax import Array, jax, jnp
 from orthaug.analysis.feedback import by_differences, difference_width
-from orthaug.analysis.visited import MOST_STEPS, Place, Where, evenly, positive, usable
+from orthaug.analysis.visited import MOST_STEPS, RowIndex, RunPoint, evenly, positive, usable
 from orthaug.data.record import Record
 from orthaug.models.dynamics import Numbers
 from orthaug.models.lagged import Lagged
@@ -28,42 +28,50 @@ _FEWEST = 16  # rows, however many weights
 
 @dataclass(frozen=True)
 class Lipschitz:
-    """Largest ‖∂g/∂x‖, ‖∂φ/∂x‖ and ‖∂²g/∂w∂x‖ (Frobenius, no less than ‖·‖₂) over rows; None where none is finite.
+    """Largest ‖∂g/∂x‖, ‖∂φ/∂x‖ and ‖∂²g/∂w∂x‖ (Frobenius, no less than ‖·‖₂) over rows.
 
-    ∂g/∂x is (ny, nx) in output units per regressor unit, ∂φ/∂x is (ny nθ, nx), ∂²g/∂w∂x is (ny nw, nx) at
-    `weights_rows` of the rows. The scaled ones, and the places, are for regressors and outputs in their standard
-    deviations and columns of φ in their RMS. Of a learner without weights or derivative `weights` is None.
+    None where none is finite.
+
+    ∂g/∂x is (ny, nx) in output units per regressor unit, ∂φ/∂x is (ny nθ, nx), ∂²g/∂w∂x is (ny nw,
+    nx) at `weights_rows` of the rows. The scaled ones, and the places, are for regressors and
+    outputs in their standard deviations and columns of φ in their RMS. Of a learner without weights
+    or derivative `weights` is None.
     """
 
     gradient: float | None
     gradient_scaled: float | None
-    worst: Place | None
+    worst: RunPoint | None
     phi: float | None
     phi_scaled: float | None
-    phi_worst: Place | None
+    phi_worst: RunPoint | None
     weights: float | None
     weights_scaled: float | None
-    weights_worst: Place | None
+    weights_worst: RunPoint | None
     rows: int
     weights_rows: int
 
 
 def lipschitz(model: Model, record: Record, *, x: Matrix | None = None) -> Lipschitz | None:
-    """Gradients of the one-step predictor g, of ∂g/∂θ = φ and of ∂g/∂w, over measured regressors (`cond:pred_stab`).
+    """Return gradients of the one-step predictor g, of ∂g/∂θ = φ and of ∂g/∂w, over the regressors.
 
-    The predictor γ_k = g(x_k) reads the last n samples only. With ‖∂g/∂x‖ ≤ L on a convex set of all regressors,
-    `|γ − γ̃| ≤ L Σ_{i≥k−n} (|u_i − ũ_i| + |y_i − ỹ_i|) ≤ L λ⁻ⁿ Γ_k` for every λ in (0, 1), because λ^{k−i} ≥ λⁿ there:
-    the condition holds with `C = max(L λ⁻ⁿ, |g(0)|)`, and likewise for ∂γ/∂θ and ∂γ/∂w. Bounded gradients are all that
-    it asks of a finite memory. Here θ_aux is a number. Where it follows w, as in the paper, ∂γ/∂w is `∂g/∂w − φK` with
-    the constant K = ∂θ_aux/∂w, and bounded when these two are.
+    The regressors are measured ones (`cond:pred_stab`).
 
-    The bounds are those of at most 20000 measured rows, fewer for many weights, and of these θ and w, where the
-    condition asks for all; they may be larger elsewhere. A kink, as of relu, makes ∂g/∂w jump between rows and is not
-    seen. None of it tells about the free run: y_k = 2 y_{k−1} fulfils the condition.
-    A model whose state is not made of measured signals has no such predictor: None.
+    The predictor γ_k = g(x_k) reads the last n samples only. With ‖∂g/∂x‖ ≤ L on a convex set of
+    all regressors, `|γ − γ̃| ≤ L Σ_{i≥k−n} (|u_i − ũ_i| + |y_i − ỹ_i|) ≤ L λ⁻ⁿ Γ_k` for every λ in
+    (0, 1), because λ^{k−i} ≥ λⁿ there: the condition holds with `C = max(L λ⁻ⁿ, |g(0)|)`, and
+    likewise for ∂γ/∂θ and ∂γ/∂w. Bounded gradients are all that it asks of a finite memory. Here
+    θ_aux is a number. Where it follows w, as in the paper, ∂γ/∂w is `∂g/∂w − φK` with the constant
+    K = ∂θ_aux/∂w, and bounded when these two are.
+
+    The bounds are those of at most 20000 measured rows, fewer for many weights, and of these θ and
+    w, where the condition asks for all; they may be larger elsewhere. A kink, as of relu, makes
+    ∂g/∂w jump between rows and is not seen. None of it is about the free run: y_k = 2 y_{k−1}
+    fulfils the condition. A model whose state is not made of measured signals has no such
+    predictor: None.
 
     Args:
-        x: the record's usable regressors (N, nx) in the model's layout, if they are stacked already.
+        x: the record's usable regressors (N, nx) in the model's layout, if they are stacked
+            already.
 
     Raises:
         InputError: a record that does not fit the model, or has no outputs.
@@ -85,41 +93,55 @@ def lipschitz(model: Model, record: Record, *, x: Matrix | None = None) -> Lipsc
         scales = (y_scale, np.outer(y_scale, positive(rms)).ravel())
         sizes = []
         for batch in _gradients(form, model.numbers, x):
-            slopes = [g.reshape(len(g), len(scale), x.shape[1]) for g, scale in zip(batch, scales, strict=True)]
+            slopes = [
+                g.reshape(len(g), len(scale), x.shape[1])
+                for g, scale in zip(batch, scales, strict=True)
+            ]
             scaled = [g * x_scale / scale[:, None] for g, scale in zip(slopes, scales, strict=True)]
             sizes.append([*map(size, slopes), *map(size, scaled)])
-        of_g, of_phi, scaled_g, scaled_phi = (np.concatenate(column) for column in zip(*sizes, strict=True))
+        of_g, of_phi, scaled_g, scaled_phi = (
+            np.concatenate(column) for column in zip(*sizes, strict=True)
+        )
         for plain, scaled in ((of_g, scaled_g), (of_phi, scaled_phi)):
-            largest += [where.worst(record, plain, entries)[0], *where.worst(record, scaled, entries)]
+            largest += [
+                where.worst(record, plain, entries)[0],
+                *where.worst(record, scaled, entries),
+            ]
     fewer, plain, scaled = _weight_sizes(form, model.numbers, x, x_scale, y_scale)
     of_weights, there = where.take(fewer), lambda i: entries(int(fewer[i]))
     largest += [of_weights.worst(record, plain, there)[0], *of_weights.worst(record, scaled, there)]
     return Lipschitz(*largest, rows=len(x), weights_rows=len(fewer))
 
 
-def _measured(model: Model, record: Record, x: Matrix | None) -> tuple[Matrix, Where, Vector]:
-    """Regressors of measured outputs, where each stands, and deviations of these outputs (ny,)."""
+def _measured(model: Model, record: Record, x: Matrix | None) -> tuple[Matrix, RowIndex, Vector]:
+    """Return measured regressors, the row of each, and deviations of the outputs (ny,)."""
     form, record = model.form, usable(model, record)
     lengths = [len(e) - form.first_row for e in record.experiments]
     if x is None:
         x = np.concatenate([form.regressors(e, record) for e in record.experiments])
     elif np.shape(x) != (wanted := (sum(lengths), len(form.layout))):
-        raise InputError(f"`x` has shape {np.shape(x)}; the usable regressors of the record have {wanted}.")
+        raise InputError(
+            f"`x` has shape {np.shape(x)}; the usable regressors of the record have {wanted}."
+        )
     outputs = np.concatenate([e.outputs for e in record.experiments])
-    return x, Where.of(lengths, form.first_row), positive(outputs.std(axis=0))
+    return x, RowIndex.of(lengths, form.first_row), positive(outputs.std(axis=0))
 
 
 def _gradients(form: Lagged, numbers: Numbers, x: Matrix) -> Iterator[list[Any]]:
-    """∂g/∂x and ∂φ/∂x at regressors (m, nx), in batches that are computed at one shape."""
+    """Yield ∂g/∂x and ∂φ/∂x at regressors (m, nx), in batches of one shape."""
     width = difference_width(x)
     for begin in range(0, len(x), _BATCH):
         rows = np.minimum(np.arange(begin, begin + _BATCH), len(x) - 1)  # the last one again
-        yield [np.asarray(g)[: len(x) - begin] for g in _gradient_rows(form, numbers, x[rows], width)]
+        yield [
+            np.asarray(g)[: len(x) - begin] for g in _gradient_rows(form, numbers, x[rows], width)
+        ]
 
 
 @partial(jax.jit, static_argnames="form")
-def _gradient_rows(form: Lagged, numbers: Numbers, x: Float[Array, "m nx"], width: Any) -> tuple[Array, Array]:
-    """∂g/∂x (m, ny, nx), by differences of `width` (nx,) where a learner has no derivative, and ∂φ/∂x."""
+def _gradient_rows(
+    form: Lagged, numbers: Numbers, x: Float[Array, "m nx"], width: Any
+) -> tuple[Array, Array]:
+    """Return ∂g/∂x (m, ny, nx) and ∂φ/∂x, by differences of `width` (nx,) without a derivative."""
 
     def g(row: Any) -> Any:
         return form.at(numbers, row).total
@@ -134,7 +156,7 @@ def _gradient_rows(form: Lagged, numbers: Numbers, x: Float[Array, "m nx"], widt
 def _weight_sizes(
     form: Lagged, numbers: Numbers, x: Matrix, x_scale: Vector, y_scale: Vector
 ) -> tuple[Int[np.ndarray, "r"], Vector, Vector]:
-    """Which rows of x (m, nx) are looked at, as many as are affordable, and ‖∂²g/∂w∂x‖ there: plain (r,), scaled."""
+    """Return the affordable rows of x (m, nx), and ‖∂²g/∂w∂x‖ there: plain (r,), scaled."""
     cells, directions = len(form.outputs) * np.size(numbers.weights), np.eye(x.shape[1])
     if not form.differentiable or not cells * len(directions):
         return np.arange(0), np.zeros(0), np.zeros(0)
@@ -142,9 +164,13 @@ def _weight_sizes(
     size = min(_BATCH, max(1, _BATCH_CELLS // cells))
     squares = []
     for begin in range(0, len(some), size):
-        rows = some[np.minimum(np.arange(begin, begin + size), len(some) - 1)]  # the last one again: one shape
+        rows = some[
+            np.minimum(np.arange(begin, begin + size), len(some) - 1)
+        ]  # the last one again: one shape
         columns = [_weight_squares(form, numbers, x[rows], direction) for direction in directions]
-        squares.append(np.stack([np.asarray(column) for column in columns], axis=-1)[: len(some) - begin])
+        squares.append(
+            np.stack([np.asarray(column) for column in columns], axis=-1)[: len(some) - begin]
+        )
     every = np.concatenate(squares)
     scaled = every * (x_scale / y_scale[:, None]) ** 2
     return some, np.sqrt(every.sum(axis=(1, 2))), np.sqrt(scaled.sum(axis=(1, 2)))
@@ -154,10 +180,12 @@ def _weight_sizes(
 def _weight_squares(
     form: Lagged, numbers: Numbers, x: Float[Array, "m nx"], direction: Float[Array, "nx"]
 ) -> Float[Array, "m ny"]:
-    """Σ_w (∂²g/∂w∂x)² along one direction of x."""
+    """Return Σ_w (∂²g/∂w∂x)² along one direction of x."""
 
     def slopes(row: Any) -> Any:
-        return jax.jacrev(lambda w: form.at(numbers._replace(weights=w), row).total)(numbers.weights)
+        return jax.jacrev(lambda w: form.at(numbers._replace(weights=w), row).total)(
+            numbers.weights
+        )
 
     change = jax.vmap(lambda row: jax.jvp(slopes, (row,), (direction,))[1])(x)
     return jnp.sum(change.reshape(*change.shape[:2], -1) ** 2, axis=2)

@@ -1,4 +1,4 @@
-"""What each suspect does to θ and to the physical parameters, under the measure that a spec declares."""
+"""Bias of θ and of physical parameters by each suspect, under the measure of a spec."""
 
 from __future__ import annotations
 
@@ -10,34 +10,36 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug.analysis.absorbed import Absorbed, absorbed
+from orthaug.analysis.absorbed import TermAfterFit, absorbed
 from orthaug.analysis.bias import SuspectedBias, bias_table
 from orthaug.analysis.suspects import Suspect, suspect_columns, usual_suspects
 from orthaug.inference.covariance import reach
-from orthaug.inference.measures import Weighed
+from orthaug.inference.measures import WeighedPhysics
 from orthaug.inference.physical import PhysicalEstimate, solve
 from orthaug.physics.output_weights import times
 from orthaug.physics.parameters import PhysicsMap
 from orthaug.physics.problem import Problem
 from orthaug.physics.shared import seen
 
-CERTIFIED_ROWS = 200_000  # of a measure at most, over which certificates are sought for suspects that no one named
+# Of a measure at most, over which certificates are sought for suspects that no one named
+CERTIFIED_ROWS = 200_000
 _ROUNDING = 1e-9  # of a parameter: an end of its interval that lies so little on the wrong side
 
 
 @dataclass(frozen=True, eq=False)
-class Ground:
-    """What biases are computed on.
+class MeasureLinearization:
+    """Linearization that biases under a measure are computed on.
 
     Args:
         weighed: the measure's points and the physics there, of one parameter or more.
         physics: the map from physical parameters to θ.
         theta: θ̂ for relative biases and for dp/dθ.
-        learned: f at the measure's points (M, ny) after a fit, to tell how much of it a suspect explains.
+        learned: f at the measure's points (M, ny) after a fit, to find how much of it a suspect
+            explains.
         directions: (nθ, s) along which θ is split; None for all.
     """
 
-    weighed: Weighed
+    weighed: WeighedPhysics
     problem: Problem
     theta: Vector
     physics: PhysicsMap | None = None
@@ -49,8 +51,10 @@ class Ground:
         """dp/dθ by name, and p."""
         return physical_slopes(self.physics, self.problem, self.theta)
 
-    def table(self, suspects: Sequence[Suspect], *, certify: bool, every: bool = True) -> tuple[SuspectedBias, ...]:
-        """What every suspect does to θ.
+    def table(
+        self, suspects: Sequence[Suspect], *, certify: bool, every: bool = True
+    ) -> tuple[SuspectedBias, ...]:
+        """Return the bias by every suspect.
 
         Args:
             every: also what is zero on all points.
@@ -75,16 +79,18 @@ class Ground:
             absorbed=None if self.directions is None else self._absorbed(chosen),
         )
 
-    def without(self, entry: SuspectedBias) -> Ground:
-        """The same with what a suspect explains of the learner taken off it."""
+    def without(self, entry: SuspectedBias) -> MeasureLinearization:
+        """Return the linearization less the part of the learner that a suspect explains."""
         held = (
             entry.suspect.values(self.weighed.points.x, self.problem.layout, self.problem.outputs)
             if self.directions is None
             else self._absorbed([entry.suspect])[0].held
         )
-        return replace(self, learned=np.asarray(self.learned) - (entry.coefficient_found or 0.0) * held)
+        return replace(
+            self, learned=np.asarray(self.learned) - (entry.coefficient_found or 0.0) * held
+        )
 
-    def _absorbed(self, suspects: Sequence[Suspect]) -> list[Absorbed]:
+    def _absorbed(self, suspects: Sequence[Suspect]) -> list[TermAfterFit]:
         problem = self.problem
         layout, outputs = problem.layout, problem.outputs
 
@@ -98,15 +104,23 @@ class Ground:
         return absorbed(problem, map(term, suspects), visible, self.weighed.points.x)
 
 
-def bias_under(ground: Ground, suspects: Sequence[Suspect] = (), *, certify_usual: bool = True) -> list[dict[str, Any]]:
-    """The bias of every suspect under a measure, for θ and, to first order, for the physical parameters; for JSON.
+def bias_under(
+    linearization: MeasureLinearization,
+    suspects: Sequence[Suspect] = (),
+    *,
+    certify_usual: bool = True,
+) -> list[dict[str, Any]]:
+    """Return the bias by every suspect under a measure, as plain data for JSON.
+
+    It is that of θ and, to first order, of the physical parameters.
 
     Args:
         suspects: those that were named; without any, the usual ones that have an effect.
-        certify_usual: seek certificates, a linear program each, for suspects that no one named, too.
+        certify_usual: seek certificates, a linear program each, for suspects that no one named,
+            too.
     """
-    named, problem, points = bool(suspects), ground.problem, ground.weighed.points
-    table = ground.table(
+    named, problem, points = bool(suspects), linearization.problem, linearization.weighed.points
+    table = linearization.table(
         suspects or usual_suspects(problem),
         certify=named or (certify_usual and len(points.x) <= CERTIFIED_ROWS),
         every=named,
@@ -115,9 +129,11 @@ def bias_under(ground: Ground, suspects: Sequence[Suspect] = (), *, certify_usua
     for entry in table:
         delta = entry.suspect.values(points.x, problem.layout, problem.outputs)
         own = {
-            "relative_physical_bias": _relative(entry, ground.slopes),
-            "size": float(np.linalg.norm(times(ground.weighed.unit, delta))),
-            "expected_physical_bias": _expected(entry, ground.physics, problem, ground.theta),
+            "relative_physical_bias": _relative(entry, linearization.slopes),
+            "size": float(np.linalg.norm(times(linearization.weighed.unit, delta))),
+            "expected_physical_bias": _expected(
+                entry, linearization.physics, problem, linearization.theta
+            ),
         }
         found.append(entry.as_dict() | own)
     return found
@@ -126,31 +142,43 @@ def bias_under(ground: Ground, suspects: Sequence[Suspect] = (), *, certify_usua
 def _expected(
     entry: SuspectedBias, physics: PhysicsMap | None, problem: Problem, theta: Vector
 ) -> dict[str, dict[str, float | None]] | None:
-    """What the guessed coefficient does to each physical parameter: p of θ̂ less p without the bias."""
+    """Return the shift of each physical parameter by the guessed coefficient.
+
+    It is p of θ̂ less p without the bias.
+    """
     if physics is None or entry.expected is None:
         return None
-    biased, true = (physical_of(physics, problem, t) for t in (theta, theta - np.array(entry.expected)))
+    biased, true = (
+        physical_of(physics, problem, t) for t in (theta, theta - np.array(entry.expected))
+    )
     return {
         name: {"bias": float(b - t), "relative": float((b - t) / t) if t else None}
         for name, b, t in zip(physics.names, biased, true, strict=True)
     }
 
 
-def _relative(entry: SuspectedBias, slopes: tuple[dict[str, Vector], Vector] | None) -> dict[str, float | None] | None:
-    """The bias of each physical parameter over its value."""
+def _relative(
+    entry: SuspectedBias, slopes: tuple[dict[str, Vector], Vector] | None
+) -> dict[str, float | None] | None:
+    """Return the bias of each physical parameter over its value."""
     if slopes is None or entry.physical is None:
         return None
-    return {name: bias / p if p else None for (name, bias), p in zip(entry.physical, slopes[1], strict=True)}
+    return {
+        name: bias / p if p else None
+        for (name, bias), p in zip(entry.physical, slopes[1], strict=True)
+    }
 
 
 def physical_slopes(
     physics: PhysicsMap | None, problem: Problem, theta: Vector
 ) -> tuple[dict[str, Vector], Vector] | None:
-    """dp/dθ, in the order of the baseline's θ, at the p that θ gives; and that p."""
+    """Return dp/dθ, in the order of the baseline's θ, at the p that θ gives; and that p."""
     if physics is None:
         return None
     p = physical_of(physics, problem, theta)
-    of_theta = np.abs(physics.theta(p))  # scales of θ and p, so that the pseudo-inverse sees numbers of one size
+    of_theta = np.abs(
+        physics.theta(p)
+    )  # scales of θ and p, so that the pseudo-inverse sees numbers of one size
     of_theta, of_p = np.where(of_theta > 0, of_theta, 1.0), np.where(p != 0, np.abs(p), 1.0)
     inverse = np.linalg.pinv(physics.jacobian(p) / of_theta[:, None] * of_p)
     rows = np.zeros((len(p), len(problem.baseline.names)))
@@ -158,39 +186,55 @@ def physical_slopes(
     return dict(zip(physics.names, rows, strict=True)), p
 
 
-def physical_of(physics: PhysicsMap, problem: Problem, theta: Vector, covariance: Matrix | None = None) -> Vector:
-    """p of θ, weighted by its covariance where that is given."""
+def physical_of(
+    physics: PhysicsMap, problem: Problem, theta: Vector, covariance: Matrix | None = None
+) -> Vector:
+    """Return p of θ, weighted by its covariance where that is given."""
     return _solved(physics, problem, theta, covariance).value
 
 
-def _solved(physics: PhysicsMap, problem: Problem, theta: Vector, covariance: Matrix | None) -> PhysicalEstimate:
+def _solved(
+    physics: PhysicsMap, problem: Problem, theta: Vector, covariance: Matrix | None
+) -> PhysicalEstimate:
     order = _order(physics, problem)
     covariance = None if covariance is None else covariance[np.ix_(order, order)]
     return solve(physics, theta[order], covariance, freedom=np.inf)
 
 
 def physical_with_bias(
-    ground: Ground, bias: Vector, covariance: Matrix | None, spread: Matrix, freedom: float
+    linearization: MeasureLinearization,
+    bias: Vector,
+    covariance: Matrix | None,
+    spread: Matrix,
+    freedom: float,
 ) -> tuple[Vector, Matrix]:
-    """Biases of the physical parameters (np,), and ends (np, 2) of 95 % intervals that cover bias and noise.
+    """Return biases of the physical parameters (np,), and ends (np, 2) of 95 % intervals.
 
-    The interval of p is that of θ in the direction in which p moves most, mapped: p of both of its ends, or p's bound
-    where an end has none. Biases are NaN where θ̂ less its bias has no p.
+    The intervals cover bias and noise.
+
+    The interval of p is that of θ in the direction in which p moves most, mapped: p of both of its
+    ends, or p's bound where an end has none. Biases are NaN where θ̂ less its bias has no p.
 
     Args:
         bias: of θ̂.
-        covariance: of θ̂, by which p is weighted; `spread` counts also what is not known of the bias.
+        covariance: of θ̂, by which p is weighted; `spread` counts also what is not known of the
+            bias.
     """
-    physics, problem = ground.physics, ground.problem
+    physics, problem = linearization.physics, linearization.problem
     assert physics is not None
-    centre, order = ground.theta - bias, _order(physics, problem)
-    now, free = (_solved(physics, problem, theta, covariance) for theta in (ground.theta, centre))
+    centre, order = linearization.theta - bias, _order(physics, problem)
+    now, free = (
+        _solved(physics, problem, theta, covariance) for theta in (linearization.theta, centre)
+    )
     ends = np.full((len(free.value), 2), np.nan)
     if not _met(free):
         return ends[:, 0], ends
     if free.sensitivities is None or covariance is None:
         return now.value - free.value, ends
-    slopes, at_bounds = np.zeros((len(free.value), len(centre))), physical_slopes(physics, problem, centre)
+    slopes, at_bounds = (
+        np.zeros((len(free.value), len(centre))),
+        physical_slopes(physics, problem, centre),
+    )
     assert at_bounds is not None
     with np.errstate(all="ignore"):
         slopes[:, order] = free.sensitivities * free.value[:, None] / centre[order]
@@ -206,7 +250,7 @@ def physical_with_bias(
 
 
 def _met(found: PhysicalEstimate) -> bool:
-    """Whether there is p that gives θ."""
+    """Return whether there is p that gives θ."""
     return all(warning.code != "physics_not_met" for warning in found.warnings)
 
 

@@ -1,8 +1,9 @@
-"""A frequency response from data alone: Welch's spectra with coherence, or the periods of a periodic input.
+"""Frequency response from data: Welch's spectra with coherence, or periods of a periodic input.
 
-Welch: `Ĝ = S_yu S_uu⁻¹` of Hann windows that overlap by half; the multiple coherence of an output is the share of its
-spectrum that the inputs explain. Where an input repeats itself exactly, the empirical transfer function estimate is the
-ratio of mean spectra over whole periods, at the lines that the input excites (Pintelon and Schoukens 2012, ch. 2).
+Welch: `Ĝ = S_yu S_uu⁻¹` of Hann windows that overlap by half; the multiple coherence of an output
+is the share of its spectrum that the inputs explain. Where an input repeats itself exactly, the
+empirical transfer function estimate is the ratio of mean spectra over whole periods, at the lines
+that the input excites (Pintelon and Schoukens 2012, ch. 2).
 """
 
 from __future__ import annotations
@@ -27,8 +28,8 @@ _FEWEST_ROWS = 128
 class MeasuredResponse:
     """Ĝ (m, ny, nu) at frequencies [Hz], NaN where an input does not act; `coherence` (m, ny).
 
-    `std` are standard errors of ln|Ĝ| and of the phase [rad], from the coherence and `averages`, how many independent
-    windows or periods there are.
+    `std` are standard errors of ln|Ĝ| and of the phase [rad], from the coherence and `averages`,
+    how many independent windows or periods there are.
     """
 
     frequency: Vector
@@ -45,7 +46,7 @@ class MeasuredResponse:
 
 
 def measured_response(record: Record) -> MeasuredResponse | None:
-    """Of a record with inputs and outputs; None where it is too short for any."""
+    """Return the response of a record with inputs and outputs; None where it is too short."""
     if not record.inputs or not record.outputs or max(map(len, record.experiments)) < _FEWEST_ROWS:
         return None
     period = _period(record)
@@ -66,9 +67,13 @@ def _welch(record: Record) -> MeasuredResponse:
 
     def spectra(experiment: Experiment) -> np.ndarray:
         signals = np.concatenate([experiment.inputs, experiment.outputs], axis=1).T
-        return np.array([[csd(one, other, fs, nperseg=size)[1] for one in signals] for other in signals])
+        return np.array(
+            [[csd(one, other, fs, nperseg=size)[1] for one in signals] for other in signals]
+        )
 
-    total = sum(count * spectra(experiment) for count, experiment in zip(counts, kept, strict=True)) / sum(counts)
+    total = sum(
+        count * spectra(experiment) for count, experiment in zip(counts, kept, strict=True)
+    ) / sum(counts)
     spectrum = np.moveaxis(np.asarray(total), -1, 0)[1:]  # the mean is taken out of every window
     su, sy, syu = spectrum[:, :nu, :nu], spectrum[:, nu:, nu:], spectrum[:, nu:, :nu]
     power = np.einsum("mii->mi", su).real
@@ -80,13 +85,16 @@ def _welch(record: Record) -> MeasuredResponse:
     whole = np.einsum("mii->mi", sy).real
     with np.errstate(all="ignore"):
         coherence = np.clip(explained / whole, 0.0, 1.0)
-    value, coherence = np.where(acts[:, None, None], value, np.nan), np.where(acts[:, None], coherence, np.nan)
+    value, coherence = (
+        np.where(acts[:, None, None], value, np.nan),
+        np.where(acts[:, None], coherence, np.nan),
+    )
     frequency = np.arange(1, size // 2 + 1) * fs / size
     return MeasuredResponse(frequency, value, coherence, sum(counts) / _OVERLAP, "Welch")
 
 
 def _period(record: Record) -> int | None:
-    """The rows after which the only input of the only experiment repeats itself exactly, twice at least."""
+    """Return the period in rows of a record's only input; None without exact repetition."""
     if len(record.inputs) != 1 or len(record.experiments) != 1:
         return None
     u = record.experiments[0].inputs[:, 0] - record.experiments[0].inputs[:, 0].mean()

@@ -1,6 +1,7 @@
-"""Terms with memory: first-order lags, backlash, LuGre friction and Bouc-Wen hysteresis of a signal.
+"""Terms with memory: first-order lag, backlash, LuGre friction, Bouc-Wen hysteresis of a signal.
 
-Each has one internal state, computed by filtering the signal; its time constant or width is profiled over a small grid.
+Each has one internal state, computed by filtering the signal; its time constant or width is
+profiled over a small grid.
 """
 
 from __future__ import annotations

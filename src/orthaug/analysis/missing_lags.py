@@ -1,8 +1,9 @@
-"""Is the unmodelled part a function of what the learner sees? The residual against every lag that it does not see.
+"""Test of the residual against every lag that the learner does not see.
 
-Under that hypothesis the residual is `(I − P)ε`, P the projection onto the physics and the functions of z. So it has no
-mean product with any function h of a lag from which P is taken off: the score test of `Σ_k h̃_k e_k = 0` with
-h̃ = (I − P)h. Its covariance is that of Newey and West, so that noise may be coloured and of uneven size.
+Under that hypothesis the residual is `(I − P)ε`, P the projection onto the physics and the
+functions of z. So it has no mean product with any function h of a lag from which P is taken off:
+the score test of `Σ_k h̃_k e_k = 0` with h̃ = (I − P)h. Its covariance is that of Newey and West,
+so that noise may be coloured and of uneven size.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ _RESOLVED = 1e-6  # of a function, its part that neither the physics nor the lea
 
 @dataclass(frozen=True)
 class LagTest:
-    """The residual against a lag that the learner does not see: p-value, and share of its variance explained."""
+    """Residual against a lag that the learner does not see: p-value, explained variance share."""
 
     lag: str
     p: float
@@ -44,7 +45,10 @@ class LagTest:
 
 @dataclass(frozen=True)
 class MissingLags:
-    """The tests of all lags that the learner does not see. `missing` are those below `level`, surest first."""
+    """The tests of all lags that the learner does not see.
+
+    `missing` are those below `level`, surest first.
+    """
 
     tests: tuple[LagTest, ...]
     level: float = LEVEL
@@ -60,29 +64,42 @@ class MissingLags:
         """In a sentence."""
         tested = ", ".join(test.lag for test in self.tests)
         if not self.missing:
-            return f"The residual does not depend on what the learner does not see ({tested}), as far as it shows."
+            return (
+                f"The residual shows no dependence on lags that the learner does not see "
+                f"({tested})."
+            )
         first = self.missing[0]
-        others = f" (after it {', '.join(test.lag for test in self.missing[1:])})" if len(self.missing) > 1 else ""
+        others = (
+            f" (after it {', '.join(test.lag for test in self.missing[1:])})"
+            if len(self.missing) > 1
+            else ""
+        )
         return (
-            "What the physics lacks is no function of what the learner sees: the residual also depends on "
-            f"{first.lag}{others}, by {percent(first.share)} of its variance, so that θ beside the learner is "
-            "biased; add that lag to learner.inputs."
+            "The learner cannot express all that the physics lacks, which biases θ: "
+            f"{first.lag} explains {percent(first.share)} of the residual's variance{others}. "
+            "Add that lag to learner.inputs."
         )
 
     @property
     def warnings(self) -> tuple[Warning, ...]:
-        """Where a lag is missing."""
+        """Warnings on missing lags."""
         return (Warning("missing_lag", self.text),) if self.missing else ()
 
 
 def missing_lags(fit: Estimate, one_step: Response | None = None) -> MissingLags | None:
-    """The tests of a one-step fit; None where the learner sees all lags, without a learner, or with too few rows.
+    """Return the tests of a one-step fit.
+
+    None where the learner sees all lags, without a learner, or with too few rows.
 
     Args:
         one_step: the prediction of the training data, if it is there already.
     """
     problem = fit.problem
-    if fit.model.form.bound is None or fit.criterion.flown is not None or not problem.features.entries:
+    if (
+        fit.model.form.bound is None
+        or fit.criterion.free_run is not None
+        or not problem.features.entries
+    ):
         return None
     visible = seen(problem.features, problem.layout, problem.rows.x, lambda rows: rows)
     hidden = [j for j, one in enumerate(visible) if not one]
@@ -93,7 +110,7 @@ def missing_lags(fit: Estimate, one_step: Response | None = None) -> MissingLags
 
 
 def lag_tests(problem: Problem, residual: Matrix, hidden: Sequence[int]) -> tuple[LagTest, ...]:
-    """The test of each lag, by its place in the layout.
+    """Return the test of each lag, by its place in the layout.
 
     Args:
         residual: of every row, (N, ny), in the outputs' units.
@@ -120,7 +137,7 @@ def lag_tests(problem: Problem, residual: Matrix, hidden: Sequence[int]) -> tupl
 
 
 def _functions(lag: Vector, z: Matrix) -> Float[np.ndarray, "N h"]:
-    """Functions of a lag, and its products with learner inputs, each of mean square about 1."""
+    """Return functions of a lag and its products with learner inputs, of mean square about 1."""
     size = lag.std()
     s = np.clip((lag - lag.mean()) / (size if size > 0 else 1.0), -_FARTHEST, _FARTHEST)
     forms = [s, s**2, s**3, np.abs(s), np.sign(s), *(s * column for column in z.T[:_PRODUCTS])]
@@ -129,8 +146,10 @@ def _functions(lag: Vector, z: Matrix) -> Float[np.ndarray, "N h"]:
     return columns / np.where(norm > 0, norm, 1.0)
 
 
-def _score_test(h: Float[np.ndarray, "N ny q"], e: Matrix, cuts: list[int]) -> tuple[float, float] | None:
-    """p-value of `Σ h e = 0` and the share of e that h explains, chance taken off."""
+def _score_test(
+    h: Float[np.ndarray, "N ny q"], e: Matrix, cuts: list[int]
+) -> tuple[float, float] | None:
+    """Return the p-value of `Σ h e = 0`, and the share of e that h explains, less chance."""
     scores = np.einsum("koq,ko->kq", h, e)
     rows, rank = scores.shape
     if rank == 0:
@@ -146,7 +165,7 @@ def _score_test(h: Float[np.ndarray, "N ny q"], e: Matrix, cuts: list[int]) -> t
 
 
 def _orthonormal(columns: Matrix, size: float) -> Matrix:
-    """An orthonormal basis of the columns, without what is rounding beside `size`."""
+    """Return an orthonormal basis of the columns, without what is rounding beside `size`."""
     if not columns.shape[1] or not size:
         return columns[:, :0]
     u, sigma, _ = np.linalg.svd(columns, full_matrices=False)
@@ -158,6 +177,8 @@ def _without(basis: Matrix, values: np.ndarray) -> np.ndarray:
 
 
 def _experiments(problem: Problem, rows: int, step: int) -> list[int]:
-    """Where experiments end among every `step`-th usable row."""
-    ends = np.cumsum([len(experiment) - problem.rows.start for experiment in problem.record.experiments])[:-1]
+    """Return the ends of experiments among every `step`-th usable row."""
+    ends = np.cumsum(
+        [len(experiment) - problem.rows.start for experiment in problem.record.experiments]
+    )[:-1]
     return [min(-(-int(end) // step), rows) for end in ends]

@@ -1,29 +1,155 @@
-"""Which equation of a motion lacks what: a test of terms that could be added, of which each is tried at weight 0.
+"""Test for missing terms in a motion's equations: each is tried at weight 0.
 
-What the free run leaves is regressed on its sensitivities to simple functions of every state and input, added to one
-equation each, beside the sensitivities to all that was estimated: parameters, weights and the segments' starts. That
-is the score test of Rao (1948) of `b = 0`. To first order the errors are `S_p δ + S_b b + e`, so that the F-test of b
-is right whatever the parameters' own errors δ are. Coloured errors are `e = H ε` with the autoregression `H = 1/A`:
-rows and columns are filtered by A (Cochrane and Orcutt 1949). For the test A is that of the errors beside what was
-estimated; beside all terms it would be found too white, and the test would reject too often. To tell terms from each
-other it is that beside all terms, so that what the missing one leaves does not pass for colour.
+The error of the free run is regressed on its sensitivities to simple functions of every state and
+input, added to one equation each, beside the sensitivities to all that was estimated: parameters,
+weights and the segments' starts. That is the score test of Rao (1948) of `b = 0`. To first order
+the errors are `S_p δ + S_b b + e`, so that the F-test of b is right whatever the parameters' own
+errors δ are. Coloured errors are `e = H ε` with the autoregression `H = 1/A`: rows and columns are
+filtered by A (Cochrane and Orcutt 1949). For the test A is that of the errors beside what was
+estimated; beside all terms it would be found too white, and the test would reject too often. To
+distinguish terms from each other A is that beside all terms, so that what the missing one leaves
+does not pass for colour.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.special
+from jaxtyping import Bool, Float
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug.analysis.motion_sensitivities import Sensitivities, Terms, sensitivities
+from orthaug._base.jax import Array, jax, padded_length
 from orthaug.analysis.suspects import changes_sign
 from orthaug.analysis.whiteness import whitening
-from orthaug.fitting.motion_estimates import MotionEstimate
+from orthaug.fitting.motion_estimates import MotionEstimate, fitted_numbers
+from orthaug.models.dynamics import Numbers
+from orthaug.models.moving import MotionDynamics
 from orthaug.physics.motion import Motion
+
+_ROWS = 20_000  # that are looked at, in segments spread over the record
+_NUMBERS = 8_000_000  # that are in memory at most
+
+Terms = Callable[[Float[np.ndarray, "n r"]], Float[np.ndarray, "t r"]]
+"""Makes terms of states and inputs."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sensitivities:
+    """Errors of m segments, and their slopes by starts, unknowns and added terms, in this order.
+
+    `columns` (m, T, ny, n0 + n + q), `errors` (m, T, ny), `scored` (m, T); q counts equations times
+    terms, those of the first equation in front. `points` (n, M) are the states and inputs that were
+    scored.
+    """
+
+    columns: Float[np.ndarray, "m T ny K"]
+    errors: Float[np.ndarray, "m T ny"]
+    scored: Bool[np.ndarray, "m T"]
+    points: Matrix
+    starts: int
+    nuisance: int
+    """n0, and n0 + n."""
+
+
+@partial(jax.jit, static_argnames="form")
+def _slopes(
+    form: MotionDynamics,
+    numbers: Numbers,
+    states: Float[Array, "n0 m"],
+    inputs: Float[Array, "nu m"],
+) -> Any:
+    """Return ∂x⁺/∂(x, c, w), the outputs, and ∂y/∂(x, c, w) at every point."""
+    numbers = form.prepared(numbers)
+    return form.tangents(numbers, states, form.first_slopes(states.shape[1]), inputs)[1:]
+
+
+def sensitivities(
+    fit: MotionEstimate, equations: Sequence[int], terms: Callable[[Matrix], Terms], count: int
+) -> Sensitivities | None:
+    """Return the sensitivities along the training segments; None where a value is not finite.
+
+    Args:
+        equations: states whose equations the terms are added to.
+        terms: makes the terms, given the points (n, M) of the runs.
+        count: of terms.
+    """
+    segmented, numbers = fit.segmented, fitted_numbers(fit.model.numbers)
+    form = segmented.dynamics
+    runs = np.moveaxis(
+        segmented.runs(numbers.theta, numbers.weights, fit.states), -1, 1
+    )  # (k, m, T, n0)
+    segments = [np.moveaxis(np.asarray(part), -1, 1) for part in segmented.segments[1:]]
+    k, m = runs.shape[:2]
+    x, u, target, scored = (part.reshape(k * m, *part.shape[2:]) for part in (runs, *segments))
+    n0, n, q = form.states, form.unknowns, count * len(equations)
+    steps = min(x.shape[1], max(_NUMBERS // (target.shape[2] * (n0 + n + q)), 1))
+    there = np.flatnonzero(scored[:, :steps].any(axis=1))
+    most = max(min(_ROWS, _NUMBERS // (target.shape[2] * (n0 + n + q))) // steps, 1)
+    taken = there[np.unique(np.linspace(0, len(there) - 1, min(most, len(there))).astype(int))]
+    x, u, target, scored = (part[taken, :steps] for part in (x, u, target, scored))
+    rows = np.concatenate([x, form.now(u)], axis=2)
+    points = rows[scored].T
+    if not np.isfinite(points).all():
+        return None
+    to_next, value, to_output = _at_rows(form, numbers, x, u)
+    with np.errstate(all="ignore"):
+        added = terms(points)(rows.reshape(-1, rows.shape[2]).T).reshape(count, *scored.shape)
+        columns = _followed(to_next, to_output, added, equations, form)
+    kept = np.isfinite(columns).all(axis=(2, 3)) & np.isfinite(value).all(axis=2)
+    if not kept[scored].all():
+        return None
+    return Sensitivities(columns, target - value, scored, points, n0, n0 + n)
+
+
+def _at_rows(form: MotionDynamics, numbers: Numbers, x: Any, u: Any) -> tuple[Any, Any, Any]:
+    """Return slopes (m, T, n0, n0 + n), outputs (m, T, ny) and their slopes at every row.
+
+    Slopes of outputs are (m, T, ny, n0 + n).
+    """
+    m, steps = x.shape[:2]
+    flat = [part.reshape(m * steps, -1).T for part in (x, u)]
+    length = padded_length(m * steps)
+    padded = [
+        np.concatenate([part, np.repeat(part[:, -1:], length - m * steps, axis=1)], axis=1)
+        for part in flat
+    ]
+    found = [
+        np.moveaxis(np.asarray(part)[..., : m * steps], -1, 0)
+        for part in _slopes(form, numbers, *padded)
+    ]
+    return tuple(part.reshape(m, steps, *part.shape[1:]) for part in found)  # type: ignore[return-value]
+
+
+def _followed(
+    to_next: Any, to_output: Any, added: Any, equations: Sequence[int], form: MotionDynamics
+) -> Any:
+    """Return the columns (m, T, ny, n0 + n + q) of the outputs, from one row to the next."""
+    m, steps, n0, own = to_next.shape
+    q, h = len(added), form.sampling_time
+    columns = np.zeros((m, steps, to_output.shape[2], own + q * len(equations)))
+    slope = np.zeros((m, n0, columns.shape[3]))
+    slope[:, :, :n0] = np.eye(n0)
+    for k in range(steps):
+        a, c = to_next[:, k, :, :n0], to_output[:, k, :, :n0]
+        columns[:, k] = c @ slope
+        columns[:, k, :, n0:own] += to_output[:, k, :, n0:]
+        slope = a @ slope
+        slope[:, :, n0:own] += to_next[:, k, :, n0:]
+        now, then = added[:, :, k].T, added[:, :, min(k + 1, steps - 1)].T  # (m, q)
+        for place, i in enumerate(equations):
+            to = slice(own + place * q, own + (place + 1) * q)
+            if form.motion.integrator == "discrete":
+                slope[:, i, to] += now
+                continue
+            slope[:, :, to] += h / 2 * a[:, :, i, None] * now[:, None]
+            slope[:, i, to] += h / 2 * then
+    return columns
+
 
 SHAPES = ("linear", "jump", "absolute", "square", "cube")
 _EDGE = 0.05  # of the largest value: over which a jump at zero is smoothed
@@ -36,7 +162,8 @@ _MEANINGS = (
     "odd in {} and growing faster than it, as a hardening spring",
 )
 _ONE_SIDED = ("linear in {}", "", "", "curved in {}", "curved in {}, most where that is large")
-_OWN = 0.02  # of a column's size: what remains of it beside all that was estimated, so that it is one of its own
+# Of a column's size: what remains of it beside all that was estimated, so that it is one of its own
+_OWN = 0.02
 _RANK = 1e-6  # of the largest singular value of such columns, each of size 1
 _ROWS_PER_COLUMN = 5
 _PROBED = 20  # points at which an equation is looked at
@@ -46,10 +173,10 @@ _RIVAL = 0.9  # of the best term's share, with which another one is named beside
 
 @dataclass(frozen=True)
 class MissingTerm:
-    """A term that could be added: to which equation, of which state or input, its shape, and what it would explain.
+    """A term that could be added: its equation, its variable, its shape, and what it would explain.
 
-    `coefficient` is in the units of equation and variable, `share` that of the errors' variance, less what chance
-    explains.
+    `coefficient` is in the units of equation and variable, `share` that of the errors' variance,
+    less what chance explains.
     """
 
     equation: str
@@ -66,13 +193,19 @@ class MissingTerm:
         """The term in the equation's own names."""
         if self.variable is None:
             return f"{self.coefficient:.3g}"
-        return f"{self.coefficient:.3g}*{_EXPRESSIONS[SHAPES.index(self.shape)].format(self.variable)}"
+        return (
+            f"{self.coefficient:.3g}*{_EXPRESSIONS[SHAPES.index(self.shape)].format(self.variable)}"
+        )
 
     @property
     def meaning(self) -> str:
         """Its kind in words."""
         words = _ONE_SIDED if self.one_sided else _MEANINGS
-        return "constant" if self.variable is None else words[SHAPES.index(self.shape)].format(self.variable)
+        return (
+            "constant"
+            if self.variable is None
+            else words[SHAPES.index(self.shape)].format(self.variable)
+        )
 
     def __str__(self) -> str:
         return f"the equation of {self.equation} lacks something {self.meaning}: {self.expression}"
@@ -80,9 +213,10 @@ class MissingTerm:
 
 @dataclass(frozen=True)
 class MissingTest:
-    """Whether terms that could be added explain the errors of a free run: `p` of none, F-distributed.
+    """Test that added terms explain the free run's errors: `p` of none, F-distributed.
 
-    `share` is what all of them together explain of the variance, `terms` the best single one and its near rivals.
+    `share` is what all of them together explain of the variance, `terms` the best single one and
+    its near rivals.
     """
 
     p: float
@@ -91,12 +225,15 @@ class MissingTest:
     terms: tuple[MissingTerm, ...]
 
     def found(self, level: float, share: float) -> bool:
-        """Whether a term is surely missing and explains more than a share."""
+        """Return whether a term is surely missing and explains more than a share."""
         return bool(self.p < level and self.terms and self.terms[0].share > share)
 
 
 class _Regression(NamedTuple):
-    """Rows of terms and errors beside what was estimated; `left` counts rows less what that used."""
+    """Rows of terms and errors beside what was estimated.
+
+    `left` counts rows less what that used.
+    """
 
     terms: Matrix
     errors: Vector
@@ -104,12 +241,12 @@ class _Regression(NamedTuple):
 
 
 def missing_terms(fit: MotionEstimate) -> MissingTest | None:
-    """Try terms of every state and input in every equation that has parameters or a learner.
+    """Try terms of every state and input in every equation with parameters or a learner.
 
     None where the runs have no slopes, or there are too few rows.
     """
     motion = fit.problem.motion
-    if not fit.course.dynamics.differentiable:
+    if not fit.segmented.dynamics.differentiable:
         return None
     names = (*motion.names_of_states, *motion.inputs)
     equations = doubted(fit)
@@ -135,11 +272,14 @@ def missing_terms(fit: MotionEstimate) -> MissingTest | None:
 
 
 def doubted(fit: MotionEstimate) -> tuple[int, ...]:
-    """Equations with a parameter or a learner; others, such as ẋ = v, say what a state is. All, if there is none."""
-    motion, course = fit.problem.motion, fit.course
+    """Return the equations with a parameter or a learner; others, such as ẋ = v, define a state.
+
+    All, if there is none.
+    """
+    motion, segmented = fit.problem.motion, fit.segmented
     c = np.asarray(fit.model.numbers.theta - fit.model.numbers.theta_aux)
     p = motion.coordinates.physical(c)
-    x, u = course.trajectory(c, fit.model.numbers.weights, fit.states)
+    x, u = segmented.trajectory(c, fit.model.numbers.weights, fit.states)
     every = np.unique(np.linspace(0, len(x) - 1, _PROBED).astype(int))
     moved = set(motion.learned[0])
     with np.errstate(all="ignore"):
@@ -147,14 +287,17 @@ def doubted(fit: MotionEstimate) -> tuple[int, ...]:
             here = np.asarray(motion.rates(point, row, p, np))
             for i in range(len(p)):
                 there = p + _MOVED * np.where(p != 0, np.abs(p), 1.0) * (np.arange(len(p)) == i)
-                moved |= set(np.flatnonzero(np.asarray(motion.rates(point, row, there, np)) != here).tolist())
+                moved |= set(
+                    np.flatnonzero(np.asarray(motion.rates(point, row, there, np)) != here).tolist()
+                )
     return tuple(sorted(moved)) or tuple(range(len(motion.states)))
 
 
 def _values(z: Matrix, one_sided: list[bool]) -> Any:
-    """A constant, then the shapes of each variable: (1 + 5 n, r) of z (n, r).
+    """Return a constant, then the shapes of each variable: (1 + 5 n, r) of z (n, r).
 
-    Where a variable keeps its sign a jump at zero is a constant, and its size itself: zeros stand for them.
+    Where a variable keeps its sign a jump at zero is a constant, and its size is itself: zeros take
+    their places.
     """
     shaped = [
         [one, np.tanh(one / _EDGE) * both, np.abs(one) * both, one**2, one**3]
@@ -181,11 +324,18 @@ def _term(
     variable, shape = divmod(number - 1, len(SHAPES))
     power = (1, 0, 1, 2, 3)[shape]
     coefficient /= float(sizes[variable]) ** power
-    return MissingTerm(equation, names[variable], SHAPES[shape], coefficient, share, one_sided[variable])
+    return MissingTerm(
+        equation, names[variable], SHAPES[shape], coefficient, share, one_sided[variable]
+    )
 
 
-def _tested(found: Sensitivities) -> tuple[float, tuple[int, int], float, Vector, Vector, Vector] | None:
-    """p, degrees of freedom and share of all terms; of each its gain in filtered rows, its share and coefficient."""
+def _tested(
+    found: Sensitivities,
+) -> tuple[float, tuple[int, int], float, Vector, Vector, Vector] | None:
+    """Return p, degrees of freedom and share of all terms.
+
+    Each term has its gain in filtered rows, its share and its coefficient.
+    """
     plain = _regression(found, None)
     null = None if plain is None else _regression(found, _filters(found, plain.errors))
     if plain is None or null is None:
@@ -208,21 +358,26 @@ def _tested(found: Sensitivities) -> tuple[float, tuple[int, int], float, Vector
 
 
 def _share(plain: _Regression, basis: Matrix) -> float:
-    """Of the errors' variance that all terms explain, less what chance does."""
+    """Return the share of the errors' variance that all terms explain, less that of chance."""
     total = float(plain.errors @ plain.errors)
     rest = total - float(np.sum((basis.T @ plain.errors) ** 2))
     return max(1 - rest / max(plain.left - basis.shape[1], 1) / (total / plain.left), 0.0)
 
 
 def _shares(plain: _Regression) -> Vector:
-    """The same of each term by itself."""
-    total, size = float(plain.errors @ plain.errors), np.einsum("rj,rj->j", plain.terms, plain.terms)
+    """Return the share of the errors' variance that each term explains by itself."""
+    total, size = (
+        float(plain.errors @ plain.errors),
+        np.einsum("rj,rj->j", plain.terms, plain.terms),
+    )
     explained = (plain.terms.T @ plain.errors) ** 2 / np.where(size > 0, size, np.inf) / total
     return np.maximum(1 - (1 - explained) * plain.left / max(plain.left - 1, 1), 0.0)
 
 
-def _regression(found: Sensitivities, filters: tuple[list[Vector], Vector] | None) -> _Regression | None:
-    """Terms and errors with starts and all unknowns projected out, of rows that are filtered first."""
+def _regression(
+    found: Sensitivities, filters: tuple[list[Vector], Vector] | None
+) -> _Regression | None:
+    """Return filtered terms and errors, with starts and all unknowns projected out."""
     rows = [_filtered(found, i, filters) for i in range(len(found.scored))]
     parts, used = [], 0
     for block in rows:  # the starts move their own segment only
@@ -245,7 +400,7 @@ def _regression(found: Sensitivities, filters: tuple[list[Vector], Vector] | Non
 
 
 def _range(columns: Matrix, rank: float = 1e-10) -> Matrix:
-    """An orthonormal basis of what columns span, each taken as of size 1."""
+    """Return an orthonormal basis of what columns span, each taken as of size 1."""
     size = np.linalg.norm(columns, axis=0)
     columns = columns[:, size > 0] / size[size > 0]
     if not columns.size:
@@ -254,14 +409,20 @@ def _range(columns: Matrix, rank: float = 1e-10) -> Matrix:
     return u[:, s > rank * s[0]]
 
 
-def _filtered(found: Sensitivities, segment: int, filters: tuple[list[Vector], Vector] | None) -> Matrix:
-    """Columns and errors of one segment, all outputs below each other, filtered by their autoregressions."""
+def _filtered(
+    found: Sensitivities, segment: int, filters: tuple[list[Vector], Vector] | None
+) -> Matrix:
+    """Return columns and errors of one segment, outputs stacked, filtered by their colours."""
     there = found.scored[segment]
-    both = np.concatenate([found.columns[segment], found.errors[segment][..., None]], axis=-1)[there]  # (r, ny, K + 1)
+    both = np.concatenate([found.columns[segment], found.errors[segment][..., None]], axis=-1)[
+        there
+    ]  # (r, ny, K + 1)
     ny = both.shape[1]
     if filters is None:
         size = np.sqrt(np.mean(found.errors[found.scored] ** 2, axis=0))
-        return np.moveaxis(both / np.where(size > 0, size, 1.0)[:, None], 1, 0).reshape(ny * len(both), -1)
+        return np.moveaxis(both / np.where(size > 0, size, 1.0)[:, None], 1, 0).reshape(
+            ny * len(both), -1
+        )
     coefficients, unit = filters
     memory = max(map(len, coefficients)) - 1
     filtered = []
@@ -276,7 +437,7 @@ def _filtered(found: Sensitivities, segment: int, filters: tuple[list[Vector], V
 
 
 def _filters(found: Sensitivities, left: Vector) -> tuple[list[Vector], Vector]:
-    """The autoregression of what is left of each output's errors, and the size of its innovations."""
+    """Return the autoregression of each output's remaining errors, and their innovations' size."""
     ny = found.errors.shape[2]
     pieces: list[list[Vector]] = [[] for _ in range(ny)]
     for one in _cut(found, left):
@@ -286,7 +447,9 @@ def _filters(found: Sensitivities, left: Vector) -> tuple[list[Vector], Vector]:
     known = [np.ones(1) if a is None else a for a in coefficients]
     unit = []
     for own, a in zip(pieces, known, strict=True):
-        innovations = np.concatenate([np.convolve(part, a, "valid") for part in own if len(part) >= len(a)])
+        innovations = np.concatenate(
+            [np.convolve(part, a, "valid") for part in own if len(part) >= len(a)]
+        )
         size = float(np.sqrt(np.mean(innovations**2)))
         unit.append(size if size > 0 else 1.0)
     scale = np.sqrt(np.mean(found.errors[found.scored] ** 2, axis=0))
@@ -294,7 +457,7 @@ def _filters(found: Sensitivities, left: Vector) -> tuple[list[Vector], Vector]:
 
 
 def _cut(found: Sensitivities, whole: Vector) -> Iterator[Vector]:
-    """A vector over all rows in the pieces of its segments."""
+    """Yield a vector over all rows in the pieces of its segments."""
     ny, place = found.errors.shape[2], 0
     for there in found.scored:
         count = int(there.sum()) * ny

@@ -1,10 +1,11 @@
-"""What terms that a motion's equations may lack do to its parameters, and what tells of them.
+"""Bias of a motion's parameters by terms that its equations may lack, and the evidence for them.
 
-The free run answers for what the fit determines: a term moves these parameters as `motion_response` says. Along the
-directions that the learner could imitate the nearest physics decides, so that there a term moves p̂ by what the measure
-makes of it: `d + B(Φ_μB)⁺G_μ` with d what the term moves c by, Φ the slopes ∂f/∂q of the learned equations over the
-measure's points, and G what the learner holds of the term: all of it, and d = 0, where it is a function of what the
-learner sees.
+The free run answers for what the fit determines: a term moves these parameters as `motion_response`
+says. Along the directions that the learner could imitate the nearest physics decides, so that there
+a term moves p̂ by what the measure
+makes of it: `d + B(Φ_μB)⁺G_μ` with d what the term moves c by, Φ the slopes ∂f/∂q of the learned
+equations over the measure's points, and G what the learner holds of the term: all of it, and d = 0,
+where it is a function of what the learner sees.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import numpy as np
 from orthaug._base.checks import Matrix, Vector, check_type
 from orthaug.analysis.absorbed import completing
 from orthaug.analysis.bias import IN_SPAN, Certificate, SuspectedBias, find_certificate
-from orthaug.analysis.motion_response import Place, TermsResponse, respond_to
+from orthaug.analysis.motion_response import FreeRunPoint, TermsResponse, respond_to
 from orthaug.analysis.motion_suspects import (
     MotionSuspect,
     check_motion_suspects,
@@ -32,21 +33,29 @@ from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.fitting.motion_measures import field_under
 from orthaug.fitting.motion_task import MotionTask
 from orthaug.fitting.structures import Structure
-from orthaug.inference.motion_split import Field, MotionSplit, learned_places, shared_of_motion, slopes_at
+from orthaug.inference.motion_split import (
+    Field,
+    MotionSplit,
+    learned_places,
+    shared_of_motion,
+    slopes_at,
+)
 from orthaug.models.motion_field import parts_at
 from orthaug.physics.motion import Motion
 from orthaug.physics.projection import Projection
 from orthaug.physics.shared import Shared, moves
 
 _SAME = 1e-6  # of its size: what a term may change over a move that the learner does not see
-CERTIFIED_POINTS = 20_000  # of a measure at most, over which certificates and terms of each equation are sought
+# Of a measure at most, over which certificates and terms of each equation are sought
+CERTIFIED_POINTS = 20_000
 
 
 @dataclass(frozen=True)
-class Told:
-    """What the free run's residual tells of a term beside all that was fitted: one Gauss-Newton step.
+class ResidualStep:
+    """Effect of a term on the free run's residual beside the fit, by one Gauss-Newton step.
 
-    `share` is by how much of the residual's squares it falls, `left` what stays of them beyond white noise.
+    `share` is by how much of the residual's squares it falls, `left` what stays of them beyond
+    white noise.
     """
 
     coefficient: float
@@ -58,9 +67,10 @@ class Told:
 
 @dataclass(frozen=True, eq=False)
 class TermBias:
-    """What a term of a motion does to its parameters if it is there.
+    """Bias of a motion's parameters by a term.
 
-    `moved` (np,) are the coordinates of p̂ less those without the term, per unit of its coefficient.
+    `moved` (np,) are the coordinates of p̂ less those without the term, per unit of its
+    coefficient.
     """
 
     suspect: MotionSuspect
@@ -78,26 +88,34 @@ class TermBias:
     explained: float | None
     coefficient_found: float | None
     certificate: Certificate | None
-    residual: Told | None
+    residual: ResidualStep | None
 
     @property
     def removed_by(self) -> str | None:
-        """What leaves the parameters unbiased by it; None where that is not known, or nothing is to remove."""
+        """Change that removes this bias from the parameters.
+
+        None where that is not known, or nothing is to remove.
+        """
         if self.seen is None:
             return "nothing" if self.moved.any() else None
-        return self._told.removed_by
+        return self._as_suspected.removed_by
 
     @property
-    def _told(self) -> SuspectedBias:
+    def _as_suspected(self) -> SuspectedBias:
         relative = [b / v if v else None for b, v in zip(self.per_unit, self.value, strict=True)]
         shown: Any = self.suspect
-        own = (self.names, tuple(self.per_unit), tuple(relative), None if self.expected is None else (*self.expected,))
+        own = (
+            self.names,
+            tuple(self.per_unit),
+            tuple(relative),
+            None if self.expected is None else (*self.expected,),
+        )
         found = (self.cosine, self.explained, self.coefficient_found, self.certificate, self.seen)
         return SuspectedBias(shown, *own, None, *found)
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain numbers, text and None, for JSON."""
-        return self._told.as_dict() | {
+        """Return plain numbers, text and None, for JSON."""
+        return self._as_suspected.as_dict() | {
             "removed_by": self.removed_by,
             "equation": self.equation,
             "unit": self.suspect.unit,
@@ -109,17 +127,17 @@ class TermBias:
 
 
 @dataclass(frozen=True, eq=False)
-class MotionGround:
-    """What biases of a motion are computed on: where it is linearised, and the points that p̂ was split over.
+class MotionLinearization:
+    """Linearization of a motion for biases: the linearized free run, and the points of p̂'s split.
 
     Args:
-        q: coordinates of p̂; those in `shared` directions are told by the nearest physics.
+        q: coordinates of p̂; those in `shared` directions come from the nearest physics.
         field: the measure's points.
         learned: the learner (M, nl) there beside p̂; None before a fit, and without one.
-        unknown: parameters that no output tells: a term does anything to them.
+        unknown: parameters that no output determines: a term does anything to them.
     """
 
-    place: Place
+    place: FreeRunPoint
     q: Vector
     shared: Shared
     field: Field
@@ -130,17 +148,22 @@ class MotionGround:
 
     @property
     def motion(self) -> Motion:
-        return self.place.course.problem.motion
+        return self.place.segmented.problem.motion
 
     @property
     def learns(self) -> bool:
-        """Whether there is a learner."""
-        return self.place.course.bound is not None
+        """True if there is a learner."""
+        return self.place.segmented.bound is not None
 
     @cached_property
     def phi(self) -> Projection:
-        """∂f/∂q of the learned equations over the points, rows times the root of their weights over their sizes."""
-        slopes = np.asarray(slopes_at(self.place.course.dynamics.alone, self.q, self.field.x, self.field.u))
+        """∂f/∂q of the learned equations over the points, with rows weighted.
+
+        A row is multiplied by the root of its weight over its size.
+        """
+        slopes = np.asarray(
+            slopes_at(self.place.segmented.dynamics.alone, self.q, self.field.x, self.field.u)
+        )
         slopes = slopes[:, learned_places(self.motion)]
         return Projection.factor(self.weighed(np.moveaxis(slopes, 2, 0)).transpose(1, 2, 0))
 
@@ -149,42 +172,55 @@ class MotionGround:
         return rows * np.sqrt(self.field.weight)[:, None] / self.field.size
 
     def usual(self) -> tuple[MotionSuspect, ...]:
-        """What is often missing, with widths by where its run goes."""
+        """Return the usual suspects, with widths from the range of the run."""
         place = self.place
-        course = place.course if len(place.w) else place.course.alone
-        x, u = course.trajectory(place.c, place.w, place.states)
+        segmented = place.segmented if len(place.w) else place.segmented.alone
+        x, u = segmented.trajectory(place.c, place.w, place.states)
         there = np.isfinite(x).all(axis=1)
-        on = [entry.text for entry in course.problem.features]
+        on = [entry.text for entry in segmented.problem.features]
         return usual_motion_suspects(self.motion, x[there], u[there], on)
 
     def table(
         self, suspects: Sequence[MotionSuspect], used: float | None = None, steps: int | None = None
     ) -> list[TermBias]:
-        """What every suspect does; nothing where the free run has no sensitivities.
+        """Return the bias by every suspect; empty where the free run has no sensitivities.
 
         Args:
-            used: weights that a fit used, where it is asked what its residual tells; `steps` of a block, where its
-                errors are coloured.
+            used: weights that a fit used, where its residual is to be used; `steps` of a
+                block, where its errors are coloured.
         """
         added = tuple(suspect.term(self.motion) for suspect in suspects)
         response = respond_to(self.place, added)
         if not np.isfinite(response.information).all() or not np.isfinite(response.gradient).all():
             return []
         seen = [self.sees(suspect) if self.learns else None for suspect in suspects]
-        residuals: list[Told | None] = [None] * len(added)
-        if used is not None and not all(seen):  # what the learner sees it has taken from the residual
-            residuals = told_by_residual(response, used, steps)
+        residuals: list[ResidualStep | None] = [None] * len(added)
+        if used is not None and not all(
+            seen
+        ):  # what the learner sees it has taken from the residual
+            residuals = residual_steps(response, used, steps)
         rows = enumerate(zip(suspects, seen, residuals, strict=True))
         return [self._entry(response, k, *row) for k, row in rows]
 
     def _entry(
-        self, response: TermsResponse, k: int, suspect: MotionSuspect, seen: bool | None, residual: Told | None
+        self,
+        response: TermsResponse,
+        k: int,
+        suspect: MotionSuspect,
+        seen: bool | None,
+        residual: ResidualStep | None,
     ) -> TermBias:
         motion, names = self.motion, self.motion.names
         place = suspect.place(motion)
         basis, certificate, explained, found = self.shared.basis, None, None, None
-        trained = bool(len(self.place.w))  # a learner that is not may hold all along shared directions
-        apart = np.zeros(len(names), dtype=bool) if trained else ~np.isin(np.arange(len(names)), completing(basis))
+        trained = bool(
+            len(self.place.w)
+        )  # a learner that is not may hold all along shared directions
+        apart = (
+            np.zeros(len(names), dtype=bool)
+            if trained
+            else ~np.isin(np.arange(len(names)), completing(basis))
+        )
         moved, dw = response.moved(k, apart)
         if self.learns:
             delta = self._rows(suspect, place)
@@ -206,16 +242,21 @@ class MotionGround:
         if suspect.coefficient is not None:
             expected = suspect.coefficient * per_unit
         own = (suspect, equations_of(motion)[place], names, moved, per_unit, value, expected)
-        told = (response.cosine(k), response.size(k), seen, explained, found, certificate)
-        return TermBias(*own, *told, None if seen else residual)
+        effect = (response.cosine(k), response.size(k), seen, explained, found, certificate)
+        return TermBias(*own, *effect, None if seen else residual)
 
     def after(self, causes: Sequence[TermBias], table: Sequence[TermBias]) -> list[TermBias]:
-        """What terms that the learner sees explain of it without causes that it sees; nothing of other causes."""
+        """Return the suspects that the learner sees, by their shares beside given causes.
+
+        Nothing of other causes.
+        """
         if self.learned is None or not all(cause.seen for cause in causes):
             return []
         learned, gone = np.array(self.learned), {cause.suspect for cause in causes}
         for cause in causes:
-            learned -= (cause.coefficient_found or 0.0) * self._rows(cause.suspect, cause.suspect.place(self.motion))
+            learned -= (cause.coefficient_found or 0.0) * self._rows(
+                cause.suspect, cause.suspect.place(self.motion)
+            )
         rest, found = replace(self, learned=learned), []
         for entry in table:
             if entry.seen and entry.suspect not in gone:
@@ -224,17 +265,21 @@ class MotionGround:
         return found
 
     def held(self, suspect: MotionSuspect) -> Matrix:
-        """A term that the learner sees (M, nl), weighed."""
+        """Return a term that the learner sees (M, nl), weighed."""
         return self.weighed(self._rows(suspect, suspect.place(self.motion)))
 
     def physics_cosine(self, suspect: MotionSuspect) -> float:
-        """Return the cosine of a term that the learner sees with what the shared directions move."""
+        """Return the cosine between a term that the learner sees and the shared directions."""
         held = self.held(suspect)
         size = float(np.linalg.norm(held))
-        return float(np.sqrt(max(1 - (np.linalg.norm(self.beside(held)) / size) ** 2, 0.0))) if size > 0 else 0.0
+        return (
+            float(np.sqrt(max(1 - (np.linalg.norm(self.beside(held)) / size) ** 2, 0.0)))
+            if size > 0
+            else 0.0
+        )
 
     def seen_entry(self, suspect: MotionSuspect) -> TermBias:
-        """Return what a term that the learner sees does, by the measure alone: the free run need not be asked."""
+        """Return the bias by a term that the learner sees, by the measure without the free run."""
         motion, held = self.motion, self.held(suspect)
         moved = self.phi.solve_along(held, self.shared.basis)
         moved = np.where(np.isin(motion.names, self.unknown), np.nan, moved)
@@ -245,29 +290,38 @@ class MotionGround:
         own = (suspect, equation, motion.names, moved, per_unit, value, None)
         return TermBias(*own, None, size, True, explained, found, None, None)
 
-    def told(self) -> Matrix:
-        """The learner (M, nl), weighed, beside the shared directions."""
+    def learned_beside(self) -> Matrix:
+        """Return the learner (M, nl), weighed, beside the shared directions."""
         return self.beside(self.weighed(np.asarray(self.learned)))
 
     def beside(self, values: Matrix) -> Matrix:
-        """What the shared directions leave of values (M, nl) that are weighed."""
+        """Return the part of weighted values (M, nl) outside the shared directions."""
         basis = self.shared.basis
-        return values - self.phi.phi @ self.phi.solve_along(values, basis) if basis.shape[1] else values
+        return (
+            values - self.phi.phi @ self.phi.solve_along(values, basis)
+            if basis.shape[1]
+            else values
+        )
 
     def _rows(self, suspect: MotionSuspect, place: int) -> Matrix:
-        """The term (M, nl) in the learned equations, 0 where it acts elsewhere."""
+        """Return the term (M, nl) in the learned equations, 0 where it acts elsewhere."""
         learned = learned_places(self.motion)
         rows = np.zeros((len(self.field.x), len(learned)))
         if place in learned:
             p = self.motion.coordinates.physical(self.q)
-            rows[:, learned.index(place)] = suspect.values(self.motion, p, self.field.x, self.field.u)
+            rows[:, learned.index(place)] = suspect.values(
+                self.motion, p, self.field.x, self.field.u
+            )
         return np.where(np.isfinite(rows), rows, 0.0)
 
     def _explained(self, held: Matrix) -> tuple[float | None, float | None]:
-        """How much of the learner a term explains, and with which coefficient, beside the shared directions."""
+        """Return the share of the learner that a term explains, and its coefficient.
+
+        Both are taken beside the shared directions.
+        """
         if self.learned is None:
             return None, None
-        rest, tilde, size = self.beside(held), self.told(), np.linalg.norm(held)
+        rest, tilde, size = self.beside(held), self.learned_beside(), np.linalg.norm(held)
         norm = np.linalg.norm(rest)
         if not np.any(tilde) or norm <= IN_SPAN * size:
             return None, None
@@ -275,12 +329,14 @@ class MotionGround:
         return float(min((product / np.linalg.norm(tilde)) ** 2, 1.0)), float(product / norm)
 
     def sees(self, suspect: MotionSuspect) -> bool:
-        """Whether the learner is added where the term acts, and the term is a function of what the learner sees."""
+        """Return whether the term acts where the learner does, and is a function of its inputs."""
         if suspect.place(self.motion) not in learned_places(self.motion):
             return False
         start, end = self._moves
         p, nx = self.motion.coordinates.physical(self.q), len(self.motion.states)
-        pairs = np.stack([suspect.values(self.motion, p, x[:, :nx], x[:, nx:]) for x in (start, end)])
+        pairs = np.stack(
+            [suspect.values(self.motion, p, x[:, :nx], x[:, nx:]) for x in (start, end)]
+        )
         there: Any = np.isfinite(pairs).all(axis=0)
         pairs = pairs[:, there]
         size = np.sqrt(np.mean(pairs**2)) if pairs.size else 0.0
@@ -288,54 +344,73 @@ class MotionGround:
 
     @cached_property
     def _moves(self) -> tuple[Matrix, Matrix]:
-        """Pairs of points that the learner does not tell apart."""
-        form, nx = self.place.course.dynamics, len(self.motion.states)
+        """Pairs of points that the learner does not distinguish."""
+        form, nx = self.place.segmented.dynamics, len(self.motion.states)
         points = np.concatenate([self.field.x, self.field.u], axis=1)
-        return moves(lambda rows: np.asarray(form.seen(rows[:, :nx].T, rows[:, nx:].T, np)).T, points)
+        return moves(
+            lambda rows: np.asarray(form.seen(rows[:, :nx].T, rows[:, nx:].T, np)).T, points
+        )
 
 
-def told_by_residual(response: TermsResponse, used: float, steps: int | None) -> list[Told | None]:
-    """What the residual tells of every term, with standard errors that hold for coloured errors where `steps` is given.
+def residual_steps(
+    response: TermsResponse, used: float, steps: int | None
+) -> list[ResidualStep | None]:
+    """Return the effect of every term on the residual, with standard errors.
+
+    They hold for coloured errors where `steps` is given.
 
     Args:
         used: weights that the fit used.
     """
     whole, noise = response.squares()
-    free = max(response.place.course.residuals - response.parameters - used, 1.0)
-    middle = None if steps is None else response.scores().middle(steps, response.parameters + used)[0]
-    found: list[Told | None] = []
+    free = max(response.place.segmented.residuals - response.parameters - used, 1.0)
+    middle = (
+        None if steps is None else response.scores().middle(steps, response.parameters + used)[0]
+    )
+    found: list[ResidualStep | None] = []
     for k in range(response.terms):
         step = response.step(k)
         if step is None or not whole > 0:
             found.append(None)
             continue
         coefficient, fall, row = step
-        variance = whole / free * float(row @ response.information @ row) if middle is None else row @ middle @ row
+        variance = (
+            whole / free * float(row @ response.information @ row)
+            if middle is None
+            else row @ middle @ row
+        )
         std = float(np.sqrt(variance)) if variance > 0 else None
         shares = min(fall / whole, 1.0), float(np.clip((whole - noise - fall) / whole, 0.0, 1.0))
-        found.append(Told(coefficient, std, None if std is None else coefficient / std, *shares))
+        found.append(
+            ResidualStep(coefficient, std, None if std is None else coefficient / std, *shares)
+        )
     return found
 
 
 def suspected_bias(fit: MotionEstimate, suspects: Sequence[MotionSuspect]) -> list[TermBias]:
-    """What terms that the equations of a fitted motion may lack do to its parameters, and what tells of them.
+    """Return the bias of a fitted motion's parameters by terms that its equations may lack.
 
     Raises:
         InputError: suspects that the motion cannot have, or a fit of difference equations.
     """
     check_type(
-        fit, MotionEstimate, "fit", "a fit of equations of motion (of difference equations `bias_budget` tells it)"
+        fit,
+        MotionEstimate,
+        "fit",
+        "a fit of equations of motion (for difference equations use `bias_budget`)",
     )
     check_motion_suspects(suspects, fit.problem)
-    ground = ground_after(fit)
-    if ground is None or not suspects:
+    linearization = linearize_fit(fit)
+    if linearization is None or not suspects:
         return []
     steps = block_of(fit) if fit.plain_covariance is not None else None
-    return ground.table(suspects, fit.effective_weights, steps)
+    return linearization.table(suspects, fit.effective_weights, steps)
 
 
 def softened_bias(fit: MotionEstimate, suspects: Sequence[MotionSuspect]) -> list[TermBias]:
-    """What friction among the suspects does that turns round smoothly, of widths by the size of what it acts on.
+    """Return the biases by smooth forms of the friction among the suspects.
+
+    Widths follow the size of the variable.
 
     Nothing without a learner: it alone shows the shape of what is missing.
     """
@@ -347,47 +422,66 @@ def softened_bias(fit: MotionEstimate, suspects: Sequence[MotionSuspect]) -> lis
 
 
 def usual_biases(fit: MotionEstimate) -> tuple[list[TermBias], list[TermBias]]:
-    """What usual terms do that nobody declared, and their smooth forms.
+    """Return the biases by usual terms that nobody declared, and by their smooth forms.
 
-    Of these only what the learner sees counts: the rest is no likely cause of what it found. Nothing where it could
-    imitate no change of a parameter.
+    Only terms that the learner sees count: others are no likely cause. There is none where the
+    learner could imitate no change of a parameter.
     """
-    ground = ground_after(fit)
-    if ground is None or not ground.learns or not fit.shared.basis.shape[1]:
+    linearization = linearize_fit(fit)
+    if linearization is None or not linearization.learns or not fit.shared.basis.shape[1]:
         return [], []
-    seen = [suspect for suspect in ground.usual() if ground.sees(suspect)]
-    smooth = softened(seen, fit.problem.motion, fit.values, ground.field.x, ground.field.u)
-    table = ground.table((*seen, *smooth))  # one program for all
+    seen = [suspect for suspect in linearization.usual() if linearization.sees(suspect)]
+    smooth = softened(
+        seen, fit.problem.motion, fit.values, linearization.field.x, linearization.field.u
+    )
+    table = linearization.table((*seen, *smooth))  # one program for all
     return table[: len(seen)], table[len(seen) :]
 
 
-def ground_after(fit: MotionEstimate) -> MotionGround | None:
-    """Of a fitted motion under the measure that it was split under; None where it has no normal equations."""
+def linearize_fit(fit: MotionEstimate) -> MotionLinearization | None:
+    """Return the linearization of a fitted motion under the measure that it was split under.
+
+    None where it has no normal equations.
+    """
     if not fit.status.ok or fit.scores is None:
         return None
     numbers, field, learned = fit.model.numbers, fit.split_by.field, None
     ridge = fit.model.statistics.ridge / fit.scores.unit
     c, w = np.asarray(numbers.theta - numbers.theta_aux), np.asarray(numbers.weights)
-    place = Place(fit.course, c, w, fit.states, fit.scores.weight, ridge)
+    place = FreeRunPoint(fit.segmented, c, w, fit.states, fit.scores.weight, ridge)
     if fit.model.form.bound is not None:
         learned = parts_at(fit.model.form, fit.model.numbers, field.x, field.u)[1]
         learned = np.where(np.isfinite(learned), learned, 0.0)
     unknown = (*fit.unidentified, *fit.at_bound)
-    return MotionGround(place, fit.theta, fit.shared, field, learned, unknown, fit.split_by.slope)
+    return MotionLinearization(
+        place, fit.theta, fit.shared, field, learned, unknown, fit.split_by.slope
+    )
 
 
-def ground_before(task: MotionTask, structure: Structure) -> MotionGround | None:
-    """Of physics alone, with what a learner of the task's features could hold; None where it has no run."""
+def linearize_physics(task: MotionTask, structure: Structure) -> MotionLinearization | None:
+    """Return the linearization of physics without a learner, for a learner of the task's features.
+
+    None where it has no run.
+    """
     if task.physics is None:
         return None
-    course, flown = task.plan, task.physics.end.flown
-    form, names = course.dynamics, course.problem.motion.names
+    segmented, point = task.plan, task.physics.end.point
+    form, names = segmented.dynamics, segmented.problem.motion.names
     weights = np.zeros(0)
-    place = Place(course, flown.theta, weights, flown.states, task.physics.objective.weight)
-    none = MotionSplit.none("training", form, flown.theta)
-    if course.bound is None:
-        return MotionGround(place, flown.theta, none.shared, none.field)
-    field = field_under(structure.measure, course.alone, course.alone.numbers(flown.theta, weights), flown.states)[0]
+    place = FreeRunPoint(
+        segmented, point.theta, weights, point.states, task.physics.objective.weight
+    )
+    none = MotionSplit.none("training", form, point.theta)
+    if segmented.bound is None:
+        return MotionLinearization(place, point.theta, none.shared, none.field)
+    field = field_under(
+        structure.measure,
+        segmented.alone,
+        segmented.alone.numbers(point.theta, weights),
+        point.states,
+    )[0]
     if structure.shared == "all":
-        return MotionGround(place, flown.theta, Shared(names, np.eye(len(names))), field)
-    return MotionGround(place, flown.theta, shared_of_motion(form, flown.theta, field.x, field.u), field)
+        return MotionLinearization(place, point.theta, Shared(names, np.eye(len(names))), field)
+    return MotionLinearization(
+        place, point.theta, shared_of_motion(form, point.theta, field.x, field.u), field
+    )

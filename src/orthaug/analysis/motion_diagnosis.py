@@ -1,8 +1,9 @@
-"""What the free run of a motion leaves: noise, or something that a state or an input tells.
+"""Diagnosis of a motion by its free run: noise, or errors that a state or an input explains.
 
-The criterion of a motion is right for white noise on its outputs. Coloured errors that follow no input and no state are
-noise within the motion; errors that do are physics that is missing, or that the learner does not see. Simple terms,
-each tried in each equation, tell what it is (`missing_terms`).
+The criterion of a motion is right for white noise on its outputs. Coloured errors that follow no
+input and no state are noise within the motion; errors that do are physics that is missing, or that
+the learner does not see. Simple terms, each tried in each equation, show what it is
+(`missing_terms`).
 """
 
 from __future__ import annotations
@@ -24,16 +25,19 @@ from orthaug.fitting.structures import Orthogonal
 from orthaug.models.response import Response
 
 _LEVEL = 0.01  # of the test of missing terms
-_SMALL = 0.05  # of the error's variance: what inputs and states tell below that is a small effect
-_SIZABLE = 0.02  # of the output's deviation: a free run that leaves less has no dead time to look for
-_LITTLE = 0.005  # of the error's variance: what its own past tells below that is none
-_LAGS = 10  # of inputs that may tell the error
+_SMALL = 0.05  # of the error's variance: effects of inputs and states below that are small
+# Of the output's deviation: a free run that leaves less has no dead time to look for
+_SIZABLE = 0.02
+_LITTLE = 0.005  # of the error's variance: a share by its own past below that is none
+_LAGS = 10  # of inputs that may predict the error
 _ROWS_PER_LAG = 20
 _MOST_ROWS = 20_000  # at which the error is set beside states
 
 
 def diagnose_motion(fit: MotionEstimate, free_run: Response) -> Diagnosis | None:
-    """Analyse what the free run of the training data leaves; None where it ran away, or leaves rounding only.
+    """Return the diagnosis by the free run's errors on the training data.
+
+    None where it ran away, or leaves rounding only.
 
     Args:
         free_run: of the training data.
@@ -60,44 +64,63 @@ def diagnose_motion(fit: MotionEstimate, free_run: Response) -> Diagnosis | None
     followed = {test.name: test.follows() for test in tests if test.follows()}
     curved = {test.name: test.curved_over(_SMALL) for test in tests if test.curved_over(_SMALL)}
     lacks = missing if missing is not None and missing.found(_LEVEL, _SMALL) else None
-    told = any(share.inputs > _SMALL for share in shares) or bool(curved) or lacks is not None
+    explained = any(share.inputs > _SMALL for share in shares) or bool(curved) or lacks is not None
     white = all(test.practically_white() for test in tests)
     size = rms_errors(free_run) / fit.problem.deviation
-    late = _late(fit) if motion.inputs and (told or not white) and np.any(size > _SIZABLE) else ()
-    verdict = "unmodelled" if told or late else "white" if white else "equation_noise"
+    late = (
+        _late(fit) if motion.inputs and (explained or not white) and np.any(size > _SIZABLE) else ()
+    )
+    verdict = "unmodelled" if explained or late else "white" if white else "equation_noise"
     text = _words(verdict, fit, tests, shares, followed, curved, lacks, late)
     warnings = [one.warning for one in late]
-    warnings += [] if white else [Warning("coloured_residual", _coloured(fit) + (_UNCOUNTED if told else ""))]
+    warnings += (
+        []
+        if white
+        else [Warning("coloured_residual", _coloured(fit) + (_UNCOUNTED if explained else ""))]
+    )
     return Diagnosis(verdict, text, (), tests, None, None, tuple(warnings), shares, (), missing)
 
 
 def _late(fit: MotionEstimate) -> tuple[DeadTime, ...]:
-    """Inputs that act later, by physics alone, as it was trained in front of the learner: by the same programs."""
+    """Return the inputs that act later, by the physics trained before the learner.
+
+    It runs in the same compiled programs.
+    """
     solver, bound = LevenbergMarquardt().within_limit, fit.model.form.bound
     posed, learner = (fit.problem, bound.learner) if bound else (without_learner(fit.problem), None)
     return dead_times(on_longest(posed, fit.criterion, solver, Orthogonal(), learner), solver)
 
 
 def _coloured(fit: MotionEstimate) -> str:
-    """That errors are coloured, and what its standard errors are worth."""
-    told = "the errors of the free run are coloured: held-out errors say how good the model is"
+    """Return a sentence on coloured errors, and on the standard errors that follow."""
+    text = "the errors of the free run are coloured: judge the model by held-out errors"
     if fit.std is None or fit.plain_covariance is not None:
-        return f"{told}."
-    return f"{told}, and standard errors are those of white ones, as rows are too few: take them for a rough guide."
+        return f"{text}."
+    return (
+        f"{text}. The rows are too few for robust standard errors: those given assume white errors "
+        "and are a rough guide."
+    )
 
 
-_UNCOUNTED = " Intervals count noise alone: what is missing may have moved the parameters by more than that."
+_UNCOUNTED = " Intervals cover noise only: missing physics may have moved the parameters by more."
 
 
 def _predictable(i: int, test: ResidualTest, errors: list, inputs: list, every: int) -> Predictable:
-    """Shares of an output's error that its own past and lagged inputs tell, and its largest share over a state."""
+    """Return the predictable shares of an output's error.
+
+    Its own past, lagged inputs and functions of states predict it.
+    """
     signal = [piece[:, i] for piece in errors]
     longest = min(_LAGS, min(map(len, signal)) // _ROWS_PER_LAG)
     own = from_own_past(signal, max(longest, 1))
-    driven = [[u[:, j] for u in inputs] for j in range(inputs[0].shape[1])]  # of each input its experiments
-    tells = [from_lags(signal, [one], range(longest + 1)) for one in driven]
-    best = max((share.sure for share in tells), default=0.0)
-    return Predictable(test.name, float(test.rms or 0.0), own.sure, best, float(test.largest_share or 0.0))
+    driven = [
+        [u[:, j] for u in inputs] for j in range(inputs[0].shape[1])
+    ]  # of each input its experiments
+    from_inputs = [from_lags(signal, [one], range(longest + 1)) for one in driven]
+    best = max((share.sure for share in from_inputs), default=0.0)
+    return Predictable(
+        test.name, float(test.rms or 0.0), own.sure, best, float(test.largest_share or 0.0)
+    )
 
 
 def _words(
@@ -113,55 +136,79 @@ def _words(
     units = {c.name: c.unit for c in fit.problem.record.outputs}
     sizes = ", ".join(f"{s.rms:.3g} {units[s.name]}".strip() + f" of {s.name}" for s in shares)
     if verdict == "white":
-        noise = "is white: noise on the outputs, which is what it is trained for."
-        return f"What the free run leaves ({sizes}) {noise}{_traces(tests, shares)}"
+        noise = "is white: noise on the outputs, which the training assumes."
+        return f"The free run's error ({sizes}) {noise}{_traces(tests, shares)}"
     if verdict == "equation_noise":
-        learner = "that the learner does not see" if fit.model.form.bound is not None else "(a learner would tell)"
+        learner = (
+            "that the learner does not see"
+            if fit.model.form.bound is not None
+            else "(a learner would show which)"
+        )
         no_input = "no input, " if fit.problem.motion.inputs else ""
         return (
-            f"What the free run leaves ({sizes}) is coloured ({_colour(tests, shares)}), and follows {no_input}no "
-            "state at the same instant, and no simple term that an equation could lack: disturbances, or physics "
-            f"missing in an equation {learner}."
+            f"The free run's error ({sizes}) is coloured ({_colour(tests, shares)}). It follows "
+            f"{no_input}no state at the same instant, and no simple missing term. Its cause is "
+            f"disturbances, or physics missing in an equation {learner}."
         )
     if late:
         return (
-            f"What the free run leaves ({sizes}) holds more than noise. Most likely {late[0].input} acts later than "
-            f"the equations say: {late[0].gain}."
+            f"The free run's error ({sizes}) holds more than noise. Most likely "
+            f"{late[0].input} acts later than in the equations: {late[0].gain}."
         )
     if lacks is not None:
-        return f"What the free run leaves ({sizes}) holds more than noise. {_named(lacks)}"
+        return f"The free run's error ({sizes}) holds more than noise. {_named(lacks)}"
     what = [f"{name} follows {', '.join(given)}" for name, given in followed.items()]
     what += [f"{name} is not flat over {', '.join(given)}" for name, given in curved.items()]
     what = what or [f"{100 * max(s.inputs for s in shares):.0f} % follows from the inputs"]
-    held = "Physics is missing" + (", or inputs run otherwise between samples" if fit.problem.motion.inputs else "")
-    return f"What the free run leaves ({sizes}) holds more than noise: {'; '.join(what)}. {held}."
+    held = "Physics is missing" + (
+        ", or inputs run otherwise between samples" if fit.problem.motion.inputs else ""
+    )
+    return f"The free run's error ({sizes}) holds more than noise: {'; '.join(what)}. {held}."
 
 
 def _traces(tests: tuple[ResidualTest, ...], shares: tuple[Predictable, ...]) -> str:
-    """What tests surely see beside the noise, too little to conclude otherwise."""
-    told = [f"{test.name} follows {', '.join(test.correlated_inputs)}" for test in tests if test.correlated_inputs]
-    told += [f"{test.name} is not flat over {', '.join(over)}" for test in tests if (over := test.curved_over(0.0))]
-    if not told:
+    """Return a sentence on significant effects that are too small to matter."""
+    effects = [
+        f"{test.name} follows {', '.join(test.correlated_inputs)}"
+        for test in tests
+        if test.correlated_inputs
+    ]
+    effects += [
+        f"{test.name} is not flat over {', '.join(over)}"
+        for test in tests
+        if (over := test.curved_over(0.0))
+    ]
+    if not effects:
         return ""
     most = max(share.largest(own_past=False) for share in shares)
-    return f" Tests still see traces ({'; '.join(told)}): {percent(most)} of its square at most."
+    return (
+        f" Tests still detect small effects ({'; '.join(effects)}): {percent(most)} of its "
+        "square at most."
+    )
 
 
 def _colour(tests: tuple[ResidualTest, ...], shares: tuple[Predictable, ...]) -> str:
-    """Of each output that is coloured its largest autocorrelation, and how much of it its own past tells."""
-    told = []
+    """Return for each coloured output its largest autocorrelation and its predictable share."""
+    clauses = []
     for test, share in zip(tests, shares, strict=True):
         if not test.practically_white():
             past = f", and {percent(share.own_past)} of it follows from its own past"
-            past = past if share.own_past > _LITTLE else ", too little to predict it from its own past"
-            told.append(f"{test.name} has autocorrelations of up to {test.largest_acf:.2f} in size{past}")
-    return "; ".join(told)
+            past = (
+                past if share.own_past > _LITTLE else ", too little to predict it from its own past"
+            )
+            clauses.append(
+                f"{test.name} has autocorrelations of up to {test.largest_acf:.2f} in size{past}"
+            )
+    return "; ".join(clauses)
 
 
 def _named(lacks: MissingTest) -> str:
-    """The terms that are most likely missing."""
+    """Return the terms that are most likely missing."""
     best, *others = lacks.terms
     text = f"Most likely {best} would explain {percent(best.share)} of its square"
     if others:
-        text += f", as would {' or '.join(f'{term.expression} in that of {term.equation}' for term in others[:2])}"
+        text += (
+            ", as would "
+            f"{' or '.join(f'{term.expression} in that of {term.equation}' for term in others[:2])}"
+        )
     return f"{text}."

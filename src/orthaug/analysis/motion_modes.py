@@ -1,7 +1,7 @@
-"""Eigenvalues of the linearised motion along a run, in 1/s: how fast small changes of the state grow or decay there.
+"""Modes of the linearised motion along a run, in 1/s: growth or decay of small changes.
 
-They are those of ∂ẋ/∂x with the learner in it; of a discrete motion `ln(λ)/Ts` with those of ∂x⁺/∂x. They are local: a
-run may be bounded where some grow, and need not be where none does.
+They are those of ∂ẋ/∂x with the learner in it; of a discrete motion `ln(λ)/Ts` with those of
+∂x⁺/∂x. They are local: a run may be bounded where some grow, and need not be where none does.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from orthaug.analysis.boundedness import divergence_scaling, margin
 from orthaug.data.record import Record
 from orthaug.models.dynamics import Numbers
 from orthaug.models.motion_model import MotionModel
-from orthaug.models.moving import Moving
+from orthaug.models.moving import MotionDynamics
 
 _LARGEST = 1024.0  # factor on the inputs that is tried
 _POINTS = 2000  # at most
-_OFTEN = 0.01  # of the points: growing modes on more are told as a warning
+_OFTEN = 0.01  # of the points: growing modes on more are a warning
 _STILL = 1e-9  # of the fastest mode: an integrator's eigenvalue is rounding of zero
 
 
@@ -34,9 +34,10 @@ _STILL = 1e-9  # of the fastest mode: an integrator's eigenvalue is rounding of 
 class Modes:
     """Local eigenvalues over `points` of a run [1/s].
 
-    `integrators` counts those that are zero everywhere; they are in nothing else here. `rightmost` is the largest real
-    part and `worst` the state and input where it is, `median` that of the largest real part; `growing` is the share of
-    points where it is positive. `slowest` and `fastest` are the least and largest magnitude.
+    `integrators` counts those that are zero everywhere; they are in nothing else here. `rightmost`
+    is the largest real part and `worst` the state and input where it is, `median` that of the
+    largest real part; `growing` is the share of points where it is positive. `slowest` and
+    `fastest` are the least and largest magnitude.
     """
 
     points: int
@@ -57,7 +58,9 @@ class MotionStability:
     warnings: tuple[Warning, ...]
     text: str
     diverges_at: float | None = None
-    """Factor on the inputs from which the free run leaves all bounds, searched up to `searched`; None: nowhere."""
+    """Factor on the inputs from which the free run leaves all bounds, searched up to `searched`;
+    None: nowhere.
+    """
     searched: float | None = None
     radius_beyond: float | None = None
     """Spectral radius of a sample's step far beyond the training (`beyond_training`)."""
@@ -65,46 +68,53 @@ class MotionStability:
     feedback = contraction = lipschitz = None
 
 
-def motion_stability(model: MotionModel, x: Matrix, u: Matrix, record: Record | None = None) -> MotionStability:
-    """Of the states (N, nx) and inputs (N, nu) of a run; those that are not finite are left out.
+def motion_stability(
+    model: MotionModel, x: Matrix, u: Matrix, record: Record | None = None
+) -> MotionStability:
+    """Return the stability over states (N, nx) and inputs (N, nu) of a run, where these are finite.
 
-    With a `record` its free run is tried on larger and larger inputs.
+    With a `record` the free run is also tried on larger and larger inputs.
     """
     checks = _of_modes(model, x, u)
     if record is None or not record.inputs:
         return checks
     factor = divergence_scaling(model, record, _LARGEST)
-    told, code = margin(factor, _LARGEST, driven=True)
+    sentence, code = margin(factor, _LARGEST, driven=True)
     radius = radius_beyond(model, x, _of_steps(model, record))
-    text = "\n".join(part for part in (checks.text, told, describe_beyond(model, radius)) if part)
-    warnings = (*checks.warnings, *((Warning(code, told),) if code else ()))
+    text = "\n".join(
+        part for part in (checks.text, sentence, describe_beyond(model, radius)) if part
+    )
+    warnings = (*checks.warnings, *((Warning(code, sentence),) if code else ()))
     found = {"diverges_at": factor, "searched": _LARGEST, "radius_beyond": radius}
     return replace(checks, text=text, warnings=warnings, **found)
 
 
 def _of_steps(model: MotionModel, record: Record) -> Matrix:
-    """Return what the steps of a record read, (T, nu)."""
-    return np.concatenate([model.form.inputs(experiment, record) for experiment in record.experiments])
+    """Return the inputs of the steps of a record, (T, nu)."""
+    return np.concatenate(
+        [model.form.inputs(experiment, record) for experiment in record.experiments]
+    )
 
 
 def _of_modes(model: MotionModel, x: Matrix, u: Matrix) -> MotionStability:
     found = modes(model, x, u)
     if found is None:
         return MotionStability(None, (), "The motion has no finite derivative along its run.")
-    told = f"The linearised motion has {_sizes(found)} along the free run. "
+    text = f"The linearised motion has {_sizes(found)} along the free run. "
     if not found.growing:
-        return MotionStability(found, (), told + _without_growth(found))
+        return MotionStability(found, (), text + _without_growth(found))
     where = ", ".join(f"{name} = {value:.4g}" for name, value in found.worst.items())
-    told += (
-        f"At {percent(found.growing, 3)} of its points one grows, by up to {found.rightmost:.4g} 1/s ({where}); median "
-        f"of the largest real part {found.median:.4g} 1/s."
+    text += (
+        f"At {percent(found.growing, 3)} of its points one grows, by up to "
+        f"{found.rightmost:.4g} 1/s ({where}); median of the largest real part "
+        f"{found.median:.4g} 1/s."
     )
-    warnings = (Warning("growing_mode", told),) if found.growing > _OFTEN else ()
-    return MotionStability(found, warnings, told)
+    warnings = (Warning("growing_mode", text),) if found.growing > _OFTEN else ()
+    return MotionStability(found, warnings, text)
 
 
 def _sizes(found: Modes) -> str:
-    """How many integrators there are, and how fast the other modes."""
+    """Return a clause on the number of integrators and the rates of the other modes."""
     count = found.integrators
     whole = f"{count} integrators" if count > 1 else "an integrator" if count else ""
     if not found.fastest:
@@ -114,23 +124,40 @@ def _sizes(found: Modes) -> str:
 
 
 def _without_growth(found: Modes) -> str:
-    count, told = found.integrators, []
+    count, sentences = found.integrators, []
     if found.fastest and found.rightmost < 0:
         others = "All others decay" if count else "All decay"
-        told.append(f"{others} everywhere: the largest real part is {found.rightmost:.4g} 1/s.")
+        sentences.append(
+            f"{others} everywhere: the largest real part is {found.rightmost:.4g} 1/s."
+        )
     elif found.fastest:
-        told.append("None grows, and not all decay: the largest real part is 0.")
+        sentences.append("No mode grows, but not all decay: the largest real part is 0.")
     if count:
-        told.append(f"What integrates neither decays nor grows: it keeps {'their' if count > 1 else 'its'} errors.")
-    return " ".join(told)
+        sentences.append(
+            f"The integrating mode{'s' if count > 1 else ''} neither "
+            f"decay{'' if count > 1 else 's'} nor grow{'' if count > 1 else 's'}: errors in "
+            f"{'them' if count > 1 else 'it'} stay."
+        )
+    return " ".join(sentences)
 
 
 def modes(model: MotionModel, x: Matrix, u: Matrix) -> Modes | None:
-    """The eigenvalues over at most 2000 points, spread evenly; None where no derivative is finite."""
+    """Return the eigenvalues over at most 2000 points, spread evenly.
+
+    None where no derivative is finite.
+    """
     finite = np.isfinite(x).all(axis=1)
     x, u = x[finite], u[finite]
-    rows = np.linspace(0, len(x) - 1, min(len(x), _POINTS)).astype(int) if len(x) else np.zeros(0, dtype=int)
-    slopes = np.asarray(_slopes(model.form, model.numbers, x[rows], u[rows])) if len(rows) else np.zeros((0, 1, 1))
+    rows = (
+        np.linspace(0, len(x) - 1, min(len(x), _POINTS)).astype(int)
+        if len(x)
+        else np.zeros(0, dtype=int)
+    )
+    slopes = (
+        np.asarray(_slopes(model.form, model.numbers, x[rows], u[rows]))
+        if len(rows)
+        else np.zeros((0, 1, 1))
+    )
     kept = np.isfinite(slopes).all(axis=(1, 2))
     if not kept.any():
         return None
@@ -159,7 +186,7 @@ def modes(model: MotionModel, x: Matrix, u: Matrix) -> Modes | None:
 
 @partial(jax.jit, static_argnames="form")
 def _slopes(
-    form: Moving, numbers: Numbers, x: Float[Array, "m nx"], u: Float[Array, "m nu"]
+    form: MotionDynamics, numbers: Numbers, x: Float[Array, "m nx"], u: Float[Array, "m nu"]
 ) -> Float[Array, "m nx nx"]:
     def rate(x: Any, u: Any) -> Any:
         return sum(form.rates(numbers, x, u))

@@ -1,14 +1,16 @@
-"""How a motion's estimate answers to further terms in its equations: normal equations of the free run with them in it.
+"""Response of a motion's estimate to further terms in its equations, by normal equations.
 
-With S the sensitivities of the free run to the parameters' coordinates c, the terms' coefficients κ and a learner's
-weights w, the starts eliminated, a term of size κ that the fit does not know moves (c, w) by `(SᵀS + ridge)⁻¹SᵀS_κ κ`:
-estimate less truth. What the free run leaves, r, tells κ itself by one Gauss-Newton step, beside all that was fitted.
+With S the sensitivities of the free run to the parameters' coordinates c, the terms' coefficients κ
+and a learner's weights w, the starts eliminated, a term of size κ that the fit does not know moves
+(c, w) by `(SᵀS + ridge)⁻¹SᵀS_κ κ`: estimate less truth. What the free run leaves, r, determines κ
+by one Gauss-Newton step, beside all that was fitted.
 
-Before any training waves stand for the learner. They can be any function of what it sees.
+Before any training waves take the learner's place. They can be any function of what it sees.
 
-How much of the estimate is an error of its integrator follows likewise. With Δy what twice as many substeps add to the
-outputs, a fit with them ends at `(c, w) − (SᵀS + ridge)⁻¹SᵀΔy`. S is that of the coarse steps; what finer ones change
-in it acts on the residual, which hardly follows S, while Δy follows it as the outputs do.
+How much of the estimate is an error of its integrator follows likewise. With Δy what twice as many
+substeps add to the outputs, a fit with them ends at `(c, w) − (SᵀS + ridge)⁻¹SᵀΔy`. S is that of
+the coarse steps; what finer ones change in it acts on the residual, which hardly follows S, while
+Δy follows it as the outputs do.
 """
 
 from __future__ import annotations
@@ -27,27 +29,28 @@ from orthaug._base.lines import percent
 from orthaug.analysis.absorbed import Waves
 from orthaug.fitting.block_scores import FreeRunScores
 from orthaug.fitting.initial_states import InitialStates
-from orthaug.fitting.motion_course import MotionCourse
 from orthaug.fitting.motion_estimates import MotionEstimate
+from orthaug.fitting.segmented_motion import SegmentedMotion
 from orthaug.fitting.segments import respond, sensitivity
 from orthaug.models.dynamics import Numbers
 from orthaug.models.learners import Bound
-from orthaug.models.moving import Moving
+from orthaug.models.moving import MotionDynamics
 from orthaug.physics.motion import MOST_SUBSTEPS
-from orthaug.physics.suspected_motion import AddedTerm, SuspectedMotion
+from orthaug.physics.suspected_motion import SuspectedMotion, SuspectedTerm
 
 LOOSER = 1e-4  # times the weight of the guesses of the starts, as where standard errors are made
-_UNSEEN = 1e-9  # of the largest eigenvalue of normal equations with unit columns: directions that nothing tells
+# Directions without information: below so much of the largest eigenvalue, with unit columns.
+_UNSEEN = 1e-9
 ALIKE = 1e-6  # of a term's effect on the outputs: less than this beside what was fitted is rounding
 _LARGE = 0.1  # standard errors
 _LARGE_SHARE = 1e-3  # of a parameter that has no standard error
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
-    """Where a free run is linearised: a course with its coordinates, its learner's weights and its segments' starts."""
+class FreeRunPoint:
+    """Point of a free run's linearization: segments, coordinates, learner's weights, starts."""
 
-    course: MotionCourse
+    segmented: SegmentedMotion
     c: Vector
     w: Vector
     states: Any
@@ -59,13 +62,16 @@ class Place:
 
 @dataclass(frozen=True, eq=False)
 class TermsResponse:
-    """Normal equations of (c, κ, w), the starts eliminated; `fitted` are those that a fit has, κ left out.
+    """Normal equations of (c, κ, w), the starts eliminated.
 
-    `form` and `numbers` are of the motion with the terms, with waves for a learner that is not trained yet.
+    `fitted` are those that a fit has, κ left out.
+
+    `form` and `numbers` are of the motion with the terms, with waves for a learner that is not
+    trained yet.
     """
 
-    place: Place
-    form: Moving
+    place: FreeRunPoint
+    form: MotionDynamics
     numbers: Numbers
     information: Matrix
     gradient: Vector
@@ -77,8 +83,12 @@ class TermsResponse:
     def parameters(self) -> int:
         return len(self.place.c)
 
-    def moved(self, k: int, apart: Bool[np.ndarray, "np"]) -> tuple[Vector, Float[np.ndarray, "nw"]]:
-        """What a unit of term k adds to c (np,), and to the weights; parameters in `apart` stay.
+    def moved(
+        self, k: int, apart: Bool[np.ndarray, "np"]
+    ) -> tuple[Vector, Float[np.ndarray, "nw"]]:
+        """Return the changes of c (np,) and of the weights by a unit of term k.
+
+        Parameters in `apart` stay.
 
         Args:
             apart: those whose change the learner could undo, so that it holds it instead.
@@ -86,7 +96,9 @@ class TermsResponse:
         free = self.fitted.copy()
         free[: self.parameters] &= ~apart
         found = np.zeros(len(free))
-        found[free] = solved(self.penalised[np.ix_(free, free)], self.information[free, self.parameters + k])
+        found[free] = solved(
+            self.penalised[np.ix_(free, free)], self.information[free, self.parameters + k]
+        )
         return found[: self.parameters], found[self.parameters + self.terms :]
 
     @property
@@ -97,22 +109,27 @@ class TermsResponse:
         return self.information + np.diag(ridge)
 
     def held(self, dw: Vector, x: Matrix, u: Matrix) -> Matrix:
-        """What a change of the weights adds to the learner (M, nl) at states (M, nx) and inputs (M, nu)."""
+        """Return the learner's change (M, nl) by a change of weights, at x (M, nx), u (M, nu)."""
         return np.asarray(_along(self.form, self.numbers, dw, x, u))
 
     def cosine(self, k: int) -> float | None:
-        """How much of the term's effect on the outputs the fit takes up, in [0, 1]; None where it has none."""
+        """Return the share of the term's effect on the outputs that the fit takes up, in [0, 1].
+
+        None where it has none.
+        """
         own = self.information[self.parameters + k, self.parameters + k]
         return float(np.sqrt(np.clip(1 - self._beside(k)[1] / own, 0.0, 1.0))) if own > 0 else None
 
     def size(self, k: int) -> float:
-        """RMS effect of a unit of the term on the outputs, in their deviations."""
-        course, weight = self.place.course, self.place.weight
-        whole = course.segments.count * float(np.sum((weight * course.deviation) ** 2))
-        return float(np.sqrt(max(self.information[self.parameters + k, self.parameters + k], 0.0) / whole))
+        """Return the RMS effect of a unit of the term on the outputs, in their deviations."""
+        segmented, weight = self.place.segmented, self.place.weight
+        whole = segmented.segments.count * float(np.sum((weight * segmented.deviation) ** 2))
+        return float(
+            np.sqrt(max(self.information[self.parameters + k, self.parameters + k], 0.0) / whole)
+        )
 
     def step(self, k: int) -> tuple[float, float, Vector] | None:
-        """The coefficient that lowers what is left most, by how much that falls, and the row (n,) of scores it is.
+        """Return a term's best coefficient, the decrease of squares, and its row (n,) of scores.
 
         None where the fit could hold the term as well.
         """
@@ -125,30 +142,32 @@ class TermsResponse:
         return coefficient, coefficient**2 * left, row / left
 
     def squares(self) -> tuple[float, float]:
-        """The sum of squares that the free run leaves, and as much of it as neighbouring steps do not share.
+        """Return the free run's sum of squares, and the part that neighbouring steps do not share.
 
-        The second is half the sum of squared differences (von Neumann 1941): all of white noise, little of what physics
-        leaves out.
+        The second is half the sum of squared differences (von Neumann 1941): all of white noise,
+        little of what physics leaves out.
         """
         place = self.place
-        errors = place.course.objective().errors(place.c, place.w, place.states, place.course.segments)
+        errors = place.segmented.objective().errors(
+            place.c, place.w, place.states, place.segmented.segments
+        )
         errors = np.einsum("oi,ktim->ktom", place.weight, errors)
-        scored = np.asarray(place.course.segments.scored)[:, :, None]
+        scored = np.asarray(place.segmented.segments.scored)[:, :, None]
         pairs = scored[:, 1:] & scored[:, :-1]
         apart = float(np.sum(np.where(pairs, np.diff(errors, axis=1), 0.0) ** 2)) / 2
         whole = float(np.sum(errors**2))
         return whole, min(apart * float(scored.sum() / max(pairs.sum(), 1)), whole)
 
     def scores(self) -> FreeRunScores:
-        """The scores of all unknowns, for standard errors that hold for coloured errors."""
-        place, objective = self.place, self.place.course.objective()
-        missed = np.moveaxis(np.asarray(place.course.segments.start) - place.states, -1, 1)
+        """Return the scores of all unknowns, for standard errors that hold for coloured errors."""
+        place, objective = self.place, self.place.segmented.objective()
+        missed = np.moveaxis(np.asarray(place.segmented.segments.start) - place.states, -1, 1)
         prior = LOOSER**2 * objective.start_rows.T @ objective.start_rows
-        made = (self.form, self.numbers, place.course.segments, place.states, place.weight)
+        made = (self.form, self.numbers, place.segmented.segments, place.states, place.weight)
         return FreeRunScores(*made, 1.0, self.slope, missed @ prior)
 
     def _beside(self, k: int) -> tuple[Vector, float]:
-        """The row (n,) that takes what was fitted off the term, and what information on it is left."""
+        """Return the row (n,) that removes the fit from the term, and the remaining information."""
         i = self.parameters + k
         row = np.zeros(len(self.fitted))
         row[i] = 1.0
@@ -157,18 +176,18 @@ class TermsResponse:
         return row, float(self.information[i, i] + across @ row[self.fitted])
 
 
-def respond_to(place: Place, added: tuple[AddedTerm, ...]) -> TermsResponse:
+def respond_to(place: FreeRunPoint, added: tuple[SuspectedTerm, ...]) -> TermsResponse:
     """Linearise a free run with further terms, and with all that its learner could hold."""
-    course, motion = place.course, place.course.problem.motion
+    segmented, motion = place.segmented, place.segmented.problem.motion
     suspected = SuspectedMotion.of(motion, added)
-    bound, w = course.bound, place.w
+    bound, w = segmented.bound, place.w
     if bound is not None and not len(w):
         bound = Bound(Waves(), bound.nz, bound.ny)
         w = np.zeros(bound.size)
-    form = replace(course.dynamics, motion=suspected, bound=bound)
-    numbers = course.numbers(np.concatenate([place.c, np.zeros(len(added))]), w)
-    slopes = sensitivity(form, numbers, course.segments, place.states, place.weight)
-    objective = course.objective()
+    form = replace(segmented.dynamics, motion=suspected, bound=bound)
+    numbers = segmented.numbers(np.concatenate([place.c, np.zeros(len(added))]), w)
+    slopes = sensitivity(form, numbers, segmented.segments, place.states, place.weight)
+    objective = segmented.objective()
     rows = LOOSER * objective.start_rows
     information, gradient, _, slope = objective.initial.eliminate(slopes, place.states, rows)
     low, high = motion.coordinates.bounds
@@ -178,7 +197,7 @@ def respond_to(place: Place, added: tuple[AddedTerm, ...]) -> TermsResponse:
 
 
 def solved(matrix: Matrix, right: Vector) -> Vector:
-    """Least squares with unit columns; what nothing tells stays at 0."""
+    """Return least squares with unit columns; unknowns without information stay 0."""
     if not len(matrix):
         return np.zeros(0)
     scale = 1 / np.sqrt(np.where(np.diag(matrix) > 0, np.diag(matrix), 1.0))
@@ -190,7 +209,11 @@ def solved(matrix: Matrix, right: Vector) -> Vector:
 
 @partial(jax.jit, static_argnames="form")
 def _along(
-    form: Moving, numbers: Numbers, dw: Float[Array, "nw"], x: Float[Array, "m nx"], u: Float[Array, "m nu"]
+    form: MotionDynamics,
+    numbers: Numbers,
+    dw: Float[Array, "nw"],
+    x: Float[Array, "m nx"],
+    u: Float[Array, "m nu"],
 ) -> Float[Array, "m nl"]:
     def learned(w: Any) -> Any:
         return jax.vmap(lambda x, u: form.learned(numbers._replace(weights=w), x, u))(x, u)
@@ -210,36 +233,48 @@ class SubstepBias:
     warnings: tuple[Warning, ...] = ()
 
     def as_dict(self) -> dict[str, float]:
-        """By parameter."""
+        """Return the biases by parameter."""
         return dict(zip(self.names, map(float, self.value), strict=True))
 
 
 def substep_bias(fit: MotionEstimate) -> SubstepBias | None:
-    """The part of p̂ that is the integrator's; None of a motion that is not integrated, or without normal equations.
+    """Return the part of p̂ that is the integrator's.
+
+    None of a motion that is not integrated, or without normal equations.
 
     Args:
         fit: of a motion, from `estimate`.
 
     Returns:
-        p̂ less what a fit with twice the substeps would give, to first order, in the units of p and in standard errors.
+        p̂ less what a fit with twice the substeps would give, to first order, in the units of p and
+        in standard errors.
     """
-    motion, course, numbers = fit.problem.motion, fit.course, fit.model.numbers
-    slope, substeps = fit.split_by.slope, course.dynamics.substeps
-    if motion.integrator == "discrete" or fit.scores is None or slope is None or 2 * substeps > MOST_SUBSTEPS:
+    motion, segmented, numbers = fit.problem.motion, fit.segmented, fit.model.numbers
+    slope, substeps = fit.split_by.slope, segmented.dynamics.substeps
+    if (
+        motion.integrator == "discrete"
+        or fit.scores is None
+        or slope is None
+        or 2 * substeps > MOST_SUBSTEPS
+    ):
         return None
     c, w = np.asarray(numbers.theta - numbers.theta_aux), np.asarray(numbers.weights)
-    finer = course.refined(2 * substeps)
+    finer = segmented.refined(2 * substeps)
     outputs = respond(finer.dynamics, finer.numbers(c, w), finer.segments, fit.states)
-    moved = course.segments._replace(target=outputs)  # whose errors are what the finer steps add
-    slopes = sensitivity(course.dynamics, course.numbers(c, w), moved, fit.states, fit.scores.weight)
-    rows = LOOSER * course.objective().start_rows
+    moved = segmented.segments._replace(target=outputs)  # whose errors are what the finer steps add
+    slopes = sensitivity(
+        segmented.dynamics, segmented.numbers(c, w), moved, fit.states, fit.scores.weight
+    )
+    rows = LOOSER * segmented.objective().start_rows
     at = np.asarray(fit.states)
     information, gradient = InitialStates(at, free=True).eliminate(slopes, at, rows)[:2]
     if not np.isfinite(information).all() or not np.isfinite(gradient).all():
         return None
     low, high = motion.coordinates.bounds
     free = np.concatenate([(low < c) & (c < high), np.ones(len(w), dtype=bool)])
-    information = information + np.diag(np.concatenate([0 * c, fit.model.statistics.ridge / fit.scores.unit + 0 * w]))
+    information = information + np.diag(
+        np.concatenate([0 * c, fit.model.statistics.ridge / fit.scores.unit + 0 * w])
+    )
     step = np.zeros(len(free))
     step[free] = solved(information[np.ix_(free, free)], gradient[free])
     value = motion.coordinates.slopes(fit.theta) * (slope @ step)
@@ -250,19 +285,29 @@ def substep_bias(fit: MotionEstimate) -> SubstepBias | None:
 
 
 def _warnings(found: SubstepBias, fit: MotionEstimate) -> tuple[Warning, ...]:
-    """One sentence on the parameters that finer steps would move."""
-    told = []
-    for name, moved, errors, value in zip(found.names, found.value, found.errors, fit.values, strict=True):
+    """Return one sentence on the parameters that finer steps would move."""
+    shifts = []
+    for name, moved, errors, value in zip(
+        found.names, found.value, found.errors, fit.values, strict=True
+    ):
         share = f", {percent(moved / value, sign='+')}" if value else ""
         if np.isfinite(errors) and errors > _LARGE:
-            told.append(f"{name} by {moved:+.2g} ({errors:.2g} standard errors{share})")
-        elif np.isnan(errors) and name not in fit.unidentified and abs(moved) > _LARGE_SHARE * abs(value):
-            told.append(f"{name} by {moved:+.2g}{share.replace(',', ' (', 1).replace('( ', '(')}{')' if share else ''}")
-    if not told:
+            shifts.append(f"{name} by {moved:+.2g} ({errors:.2g} standard errors{share})")
+        elif (
+            np.isnan(errors)
+            and name not in fit.unidentified
+            and abs(moved) > _LARGE_SHARE * abs(value)
+        ):
+            shifts.append(
+                f"{name} by "
+                f"{moved:+.2g}{share.replace(',', ' (', 1).replace('( ', '(')}{')' if share else ''}"
+            )
+    if not shifts:
         return ()
     steps = f"{found.substeps} substep{'s' * (found.substeps > 1)} in a sample"
     text = (
-        f"the integrator is too coarse for the parameters: with {steps} instead of {2 * found.substeps} it moves "
-        f"{', '.join(told)}; give substeps = {2 * found.substeps} or more."
+        f"the integrator is too coarse for the parameters: with {steps} instead of "
+        f"{2 * found.substeps} it moves {', '.join(shifts)}; give substeps = "
+        f"{2 * found.substeps} or more."
     )
     return (Warning("too_few_substeps", text),)

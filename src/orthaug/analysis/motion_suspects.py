@@ -1,7 +1,7 @@
-"""Suspected terms of a motion: what its equations may lack, as expressions of states, inputs and parameters.
+"""Suspected terms of a motion's equations, as expressions of states, inputs and parameters.
 
-A suspect adds `coefficient * expression` to the derivative of a state, or to an output. With a `factor` such as -1/m
-the coefficient is a force in N though the equation is one of m/s².
+A suspect adds `coefficient * expression` to the derivative of a state, or to an output. With a
+`factor` such as -1/m the coefficient is a force in N though the equation is one of m/s².
 """
 
 from __future__ import annotations
@@ -13,24 +13,40 @@ import numpy as np
 
 from orthaug._base.checks import Matrix, Vector, check_label, check_unique, nearest
 from orthaug._base.errors import InputError
-from orthaug.analysis.suspects import ODD_JUMPS, WIDTHS, changes_sign, check_coefficient, check_name, written
+from orthaug.analysis.suspects import (
+    ODD_JUMPS,
+    WIDTHS,
+    changes_sign,
+    check_coefficient,
+    check_name,
+    written,
+)
 from orthaug.data.expressions import Expression, parse_named
 from orthaug.physics.motion import Motion
 from orthaug.physics.motion_problem import MotionProblem
-from orthaug.physics.suspected_motion import AddedTerm
+from orthaug.physics.suspected_motion import SuspectedTerm
 
 _OF_STATES = ("coulomb", "quadratic_drag", "cubic")
-_WIDTHS = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0)  # of friction that turns round smoothly, in median sizes of what it acts on
+_WIDTHS = (
+    0.125,
+    0.25,
+    0.5,
+    1.0,
+    2.0,
+    4.0,
+)  # of friction that turns round smoothly, in median sizes of what it acts on
 _OF_INPUTS = ("cubic", "dead_zone", "saturation")
 _OF_FEATURES = (*_OF_STATES, "dead_zone")
 
 
 @dataclass(frozen=True)
 class MotionSuspect:
-    """A term `coefficient * expression` of a state's equation, or of an output; make one of a known kind with `of`.
+    """A term `coefficient * expression` of a state's equation, or of an output.
 
-    `coefficient` is a guess of its size, None where there is none; `unit` is its unit. `equation` may be left out where
-    one state is learned, or only one equation has parameters.
+    Make one of a known kind with `of`.
+
+    `coefficient` is a guess of its size, None where there is none; `unit` is its unit. `equation`
+    may be left out where one state is learned, or only one equation has parameters.
 
     Examples:
         >>> MotionSuspect.of("coulomb", "v", factor="-1/m", equation="v", coefficient=1.5, unit="N").expression
@@ -65,7 +81,7 @@ class MotionSuspect:
         unit: str = "",
         name: str | None = None,
     ) -> MotionSuspect:
-        """A suspect of a known kind (those of `Suspect.of`), times a factor.
+        """Return a suspect of a known kind (those of `Suspect.of`), times a factor.
 
         Args:
             on: an expression of states, inputs, parameters and definitions, such as `"v"`.
@@ -73,7 +89,8 @@ class MotionSuspect:
             factor: an expression that multiplies the kind's.
 
         Raises:
-            InputError: an unknown kind, an argument that is missing, or that the kind does not take.
+            InputError: an unknown kind, an argument that is missing, or that the kind does not
+                take.
         """
         text, label, _ = written(kind, on, width, _balanced, "v")
         if factor is not None:
@@ -83,7 +100,7 @@ class MotionSuspect:
         return cls(label if name is None else name, text, equation, coefficient, unit, jump)
 
     def parsed(self, motion: Motion) -> Expression:
-        """The expression on the motion's names.
+        """Return the expression on the motion's names.
 
         Raises:
             InputError: names that the motion does not have, what is no arithmetic.
@@ -91,7 +108,7 @@ class MotionSuspect:
         return parse_named(self.expression, motion.known, f"suspect '{self.name}'")
 
     def place(self, motion: Motion) -> int:
-        """The number of its equation, outputs after states.
+        """Return the number of its equation, outputs after states.
 
         Raises:
             InputError: an unknown equation, or none where there are several.
@@ -100,31 +117,35 @@ class MotionSuspect:
         if self.equation is not None:
             if self.equation not in known:
                 hint = nearest(self.equation, known) or f"; known are {', '.join(known)}"
-                raise InputError(f"suspect '{self.name}': no equation is that of '{self.equation}'{hint}.")
+                raise InputError(
+                    f"suspect '{self.name}': no equation is that of '{self.equation}'{hint}."
+                )
             return known.index(self.equation)
         likely = usual_places(motion)
         if len(likely) != 1:
-            raise InputError(f"suspect '{self.name}': `equation` is missing; one of {', '.join(known)}.")
+            raise InputError(
+                f"suspect '{self.name}': `equation` is missing; one of {', '.join(known)}."
+            )
         return likely[0]
 
-    def term(self, motion: Motion) -> AddedTerm:
-        """It as a term of the motion."""
-        return AddedTerm(self.name, self.place(motion), self.parsed(motion))
+    def term(self, motion: Motion) -> SuspectedTerm:
+        """Return the suspect as a term of the motion."""
+        return SuspectedTerm(self.name, self.place(motion), self.parsed(motion))
 
     def values(self, motion: Motion, p: Vector, x: Matrix, u: Matrix) -> Vector:
-        """The expression (M,) at states (M, nx) and inputs (M, nu), also where it is not finite."""
+        """Return the expression (M,) at states (M, nx) and inputs (M, nu), finite or not."""
         with np.errstate(all="ignore"):
             found = self.parsed(motion).value(motion.values(x.T, u.T, p, np), np)
         return np.broadcast_to(np.asarray(found, dtype=float), (len(x),))
 
 
 def equations_of(motion: Motion) -> tuple[str, ...]:
-    """Whose equations there are, outputs after states."""
+    """Return the names of all equations, outputs after states."""
     return (*motion.names_of_states, *(output.name for output in motion.outputs))
 
 
 def usual_places(motion: Motion) -> tuple[int, ...]:
-    """The equations of states that a term is likely to lack in: the learned ones, else those that have parameters."""
+    """Return the state equations likely to lack a term: learned ones, else with parameters."""
     if motion.learned[0]:
         return motion.learned[0]
     if motion.functions is not None:
@@ -133,7 +154,7 @@ def usual_places(motion: Motion) -> tuple[int, ...]:
 
 
 def check_motion_suspects(suspects: Sequence[MotionSuspect], problem: MotionProblem) -> None:
-    """Raise InputError for suspects that the motion cannot have, or that have no value at some guessed state."""
+    """Raise InputError for suspects that the motion cannot have, or without a value somewhere."""
     motion, (x, u) = problem.motion, problem.looked_at
     check_unique((suspect.name for suspect in suspects), "suspect")
     for suspect in suspects:
@@ -143,11 +164,15 @@ def check_motion_suspects(suspects: Sequence[MotionSuspect], problem: MotionProb
             k = int(np.argmax(~np.isfinite(values)))
             at = zip((*motion.names_of_states, *motion.inputs), (*x[:, k], *u[:, k]), strict=True)
             where = ", ".join(f"{name} = {value:.4g}" for name, value in at)
-            raise InputError(f"suspect '{suspect.name}' = {suspect.expression} is not finite at {where}.")
+            raise InputError(
+                f"suspect '{suspect.name}' = {suspect.expression} is not finite at {where}."
+            )
 
 
 def motion_width(on: str, motion: Motion, x: Matrix, u: Matrix) -> float:
-    """A width from states x (M, nx) and inputs u (M, nu): the median of |on| where it is not zero, to six digits.
+    """Return a width from states x (M, nx) and inputs u (M, nu): the median of nonzero |on|.
+
+    It is rounded to six digits.
 
     Raises:
         InputError: an expression that cannot be read, that is not finite, or zero everywhere.
@@ -155,7 +180,8 @@ def motion_width(on: str, motion: Motion, x: Matrix, u: Matrix) -> float:
     size = np.abs(MotionSuspect(on, on).values(motion, motion.initial, x, u))
     if not np.isfinite(size).all() or not np.any(size > 0):
         raise InputError(
-            f"'{on}' is zero or not finite over the guessed states; give a `width`, or its state a `start`."
+            f"'{on}' is zero or not finite over the guessed states; give a `width`, or its "
+            "state a `start`."
         )
     return float(f"{np.median(size[size > 0]):.6g}")
 
@@ -168,16 +194,19 @@ def _balanced(text: str) -> None:
         if depth < 0:
             break
     if depth or not text.strip():
-        raise InputError(f"'{text}' is no expression: its parentheses are no pairs, or it is empty.")
+        raise InputError(
+            f"'{text}' is no expression: its parentheses are no pairs, or it is empty."
+        )
 
 
 def softened(
     suspects: Sequence[MotionSuspect], motion: Motion, p: Vector, x: Matrix, u: Matrix
 ) -> tuple[MotionSuspect, ...]:
-    """Friction as it is where it turns round smoothly: each suspect that jumps as tanh(v/width), of several widths.
+    """Return smooth forms of friction: each suspect that jumps as tanh(v/width), of several widths.
 
     Args:
-        p: parameters (np,); with states x (M, nx) and inputs u (M, nu) they tell the widths, in median sizes.
+        p: parameters (np,); with states x (M, nx) and inputs u (M, nu) they give the widths, in
+            median sizes.
     """
     found = []
     for suspect in suspects:
@@ -190,15 +219,19 @@ def softened(
             width = float(f"{share * np.median(size):.3g}")
             soft = f"tanh({on}/{width!r})"
             text = suspect.expression.replace(f"sign({suspect.jump})", soft)
-            found.append(replace(suspect, name=f"{suspect.name} as {soft}", expression=text, jump=None))
+            found.append(
+                replace(suspect, name=f"{suspect.name} as {soft}", expression=text, jump=None)
+            )
     return tuple(found)
 
 
-def usual_motion_suspects(motion: Motion, x: Matrix, u: Matrix, on: Sequence[str] = ()) -> tuple[MotionSuspect, ...]:
-    """What is often missing: friction, drag and hardening of every state, what bends an input, an offset.
+def usual_motion_suspects(
+    motion: Motion, x: Matrix, u: Matrix, on: Sequence[str] = ()
+) -> tuple[MotionSuspect, ...]:
+    """Return the usual suspects: friction, drag, hardening, bent inputs, an offset.
 
     Args:
-        x: states (M, nx) that it is about; with inputs u (M, nu) they tell the widths.
+        x: states (M, nx) that it is about; with inputs u (M, nu) they give the widths.
         on: expressions that the learner sees, such as the distance of two masses.
     """
     names, inputs = motion.names_of_states, motion.inputs
@@ -206,7 +239,11 @@ def usual_motion_suspects(motion: Motion, x: Matrix, u: Matrix, on: Sequence[str
     seen = [MotionSuspect(text, text).values(motion, motion.initial, x, u) for text in features]
     moving = [
         (name, kinds, row)
-        for of, rows, kinds in ((names, x.T, _OF_STATES), (inputs, u.T, _OF_INPUTS), (features, seen, _OF_FEATURES))
+        for of, rows, kinds in (
+            (names, x.T, _OF_STATES),
+            (inputs, u.T, _OF_INPUTS),
+            (features, seen, _OF_FEATURES),
+        )
         for name, row in zip(of, rows, strict=True)
         if np.ptp(row) > 0
     ]
@@ -221,6 +258,8 @@ def usual_motion_suspects(motion: Motion, x: Matrix, u: Matrix, on: Sequence[str
                     continue
                 width = motion_width(name, motion, x, u) if kind in WIDTHS else None
                 label = f"{kind} of {name}{where}"
-                found.append(MotionSuspect.of(kind, name, width=width, equation=equation, name=label))
+                found.append(
+                    MotionSuspect.of(kind, name, width=width, equation=equation, name=label)
+                )
         found.append(MotionSuspect.of("offset", equation=equation, name=f"offset{where}"))
     return tuple(found)

@@ -1,4 +1,4 @@
-"""What an observer tells along a record: outputs and states with bands, innovations, and whether those are noise."""
+"""Result of an observer along a record: outputs, states, bands, and tests of the innovations."""
 
 from __future__ import annotations
 
@@ -19,11 +19,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Consistency:
-    """Whether the innovations are what the filter expects of them.
+    """Consistency of the innovations with the filter's own covariance.
 
-    `nis` is the mean of `νᵀS⁻¹ν` per output that was measured: 1 for a filter that knows its noise. `expected` is the
-    interval that holds it in 95 % of records where that is so (χ², Bar-Shalom 2001). `whiteness` is the test of Ljung
-    and Box on each output's normalised innovations; None where there are too few, or with gaps.
+    `nis` is the mean of `νᵀS⁻¹ν` per output that was measured: 1 for a filter that knows its noise.
+    `expected` is the interval that holds it in 95 % of records where that is so (χ², Bar-Shalom
+    2001). `whiteness` is the test of Ljung and Box on each output's normalised innovations; None
+    where there are too few, or with gaps.
     """
 
     nis: float
@@ -36,14 +37,14 @@ class Consistency:
 
 
 @dataclass(frozen=True, eq=False)
-class Observed:
+class ObserverRun:
     """An observer along one experiment of N rows; NaN on rows before `start`.
 
-    `predicted` (N, ny) are the outputs as the rows before tell them, `spread` (N, ny, ny) the covariance of measured
-    less predicted ones. `outputs` (N, ny) are estimates without the sensors' noise, with the row's own measurement;
-    `outputs_std` their standard deviations. `states` (N, n), `states_std` are those of a motion at the row; a lagged
-    model's are what goes into the next row's step. `square` (N,) is `νᵀS⁻¹ν`, `count` (N,) how many outputs were
-    measured.
+    `predicted` (N, ny) are the outputs as the rows before predict them, `spread` (N, ny, ny) the
+    covariance of measured less predicted ones. `outputs` (N, ny) are estimates without the sensors'
+    noise, with the row's own measurement; `outputs_std` their standard deviations. `states` (N, n),
+    `states_std` are those of a motion at the row; a lagged model's are what goes into the next
+    row's step. `square` (N,) is `νᵀS⁻¹ν`, `count` (N,) how many outputs were measured.
     """
 
     measured: Matrix
@@ -76,20 +77,20 @@ class Observed:
 class Observations:
     """An observer along every experiment of a record."""
 
-    experiments: tuple[Observed, ...]
+    experiments: tuple[ObserverRun, ...]
     outputs: tuple[Channel, ...]
     state_names: tuple[str, ...]
     """Of a motion; a lagged model's states are its outputs."""
     sampling_time: float
     settled: int
-    """Rows of each experiment that tell where it started."""
+    """Rows of each experiment that determine where it started."""
 
     def __repr__(self) -> str:
         rows = sum(len(one.square) for one in self.experiments)
         return f"Observations({', '.join(c.name for c in self.outputs)}, {rows} samples)"
 
     def consistency(self, skip: int | None = None) -> Consistency:
-        """Whether the innovations are white and of the expected size, without the first `skip` rows (`settled`)."""
+        """Return the test of whiteness and size of innovations, after `skip` rows (`settled`)."""
         skip = self.settled if skip is None else skip
         pieces = [(one, slice(max(one.start, skip), None)) for one in self.experiments]
         total = float(sum(np.sum(one.square[rows]) for one, rows in pieces))
@@ -99,15 +100,23 @@ class Observations:
         ends = [float(scipy.special.chdtri(count, p)) / count for p in (0.975, 0.025)]
         whole = all((one.count[rows] == one.measured.shape[1]).all() for one, rows in pieces)
         normal = [(one.innovations / one.predicted_std)[rows] for one, rows in pieces]
-        tests = [ljung_box([n[:, i] for n in normal if len(n)]) if whole else None for i in range(len(self.outputs))]
+        tests = [
+            ljung_box([n[:, i] for n in normal if len(n)]) if whole else None
+            for i in range(len(self.outputs))
+        ]
         return Consistency(total / count, (ends[0], ends[1]), tuple(tests))
 
     def to_frame(self, experiment: int = 0) -> pd.DataFrame:
-        """`time` and, per output, measured and estimated with its 95 % band; the same of a motion's states."""
+        """Return `time` and, per output, measured and estimated values with the 95 % band.
+
+        The same of a motion's states.
+        """
         import pandas as pd
 
         one = self.experiments[experiment]
-        columns: dict[str, Any] = {"time": one.start_time + np.arange(len(one.square)) * self.sampling_time}
+        columns: dict[str, Any] = {
+            "time": one.start_time + np.arange(len(one.square)) * self.sampling_time
+        }
         for i, channel in enumerate(self.outputs):
             columns[channel.name] = one.measured[:, i]
             columns |= _banded(f"{channel.name}_model", one.outputs[:, i], one.outputs_std[:, i])

@@ -1,4 +1,4 @@
-"""An observer: the state of a fitted model from what is measured, by an extended Kalman filter, with bands."""
+"""Observer: the state of a fitted model from measurements, by an extended Kalman filter."""
 
 from __future__ import annotations
 
@@ -9,13 +9,21 @@ import numpy as np
 
 from orthaug._base.checks import Matrix, Vector, check_count, check_type
 from orthaug._base.errors import InputError, shown
-from orthaug.analysis.observed import Observations, Observed
+from orthaug.analysis.observed import Observations, ObserverRun
 from orthaug.analysis.observer_noise import by_verdict, most_likely, of_fit
 from orthaug.data.record import Experiment, Record
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.models.dynamics import Parts
-from orthaug.models.kalman import Belief, Noise, Told, ahead, filtered, one_row, spread_of
+from orthaug.models.kalman import (
+    FilterRow,
+    Noise,
+    StateEstimate,
+    ahead,
+    filtered,
+    one_row,
+    spread_of,
+)
 from orthaug.models.model import Model
 from orthaug.models.motion_model import MotionModel
 from orthaug.models.on_records import trajectory
@@ -28,35 +36,46 @@ class Observer:
     """An extended Kalman filter of a fitted model, lagged or a motion.
 
     Args:
-        model: the model, or the fit: of a fit the residual tells how large the noises are (`diagnose`), and where both
-            are there the likelihood of its data does; a model that `orthaug fit` saved carries what they told.
-        noise: the covariances, where they are known better: of the disturbances in a sample, of the sensors.
+        model: the model, or the fit: of a fit the residual determines how large the noises are
+            (`diagnose`), and where both are there the likelihood of its data does; a model that
+            `orthaug fit` saved carries them.
+        noise: the covariances, where they are known better: of the disturbances in a sample, of the
+            sensors.
 
     Raises:
-        InputError: a model whose learner cannot be differentiated, or that has no estimate of its noise; covariances
-            that are none, or of other sizes.
+        InputError: a model whose learner cannot be differentiated, or that has no estimate of its
+            noise; covariances that are none, or of other sizes.
     """
 
     model: Any
     noise: Noise = field(default=None)  # type: ignore[assignment]  (made of the model)
 
     def __post_init__(self) -> None:
-        check_type(self.model, Model | MotionModel | Estimate | MotionEstimate, "model", "a fitted model or a fit")
+        check_type(
+            self.model,
+            Model | MotionModel | Estimate | MotionEstimate,
+            "model",
+            "a fitted model or a fit",
+        )
         given, noise = self.model, self.noise
         fit = given if isinstance(given, Estimate | MotionEstimate) else None
         model: Any = given if fit is None else fit.model
         if not model.form.differentiable:
-            raise InputError("the learner is a function without derivatives; an observer needs them.")
+            raise InputError(
+                "the learner is a function without derivatives; an observer needs them."
+            )
         if noise is None:
             noise = by_verdict(model) if fit is None else of_fit(fit)
         object.__setattr__(self, "model", model)
-        object.__setattr__(self, "noise", _checked(noise, model.filtering[0].disturbances, len(model.outputs)))
+        object.__setattr__(
+            self, "noise", _checked(noise, model.filtering[0].disturbances, len(model.outputs))
+        )
 
     def __repr__(self) -> str:
         return f"Observer({self.model!r})"
 
     def tuned(self, record: Record) -> Observer:
-        """The observer whose noises, each times a factor, are the most likely ones for a record.
+        """Return the observer with its noises scaled to be the most likely ones for a record.
 
         A noise that is zero stays so.
 
@@ -65,10 +84,13 @@ class Observer:
         """
         return replace(self, noise=most_likely(self.model, self.noise, record))
 
-    def start(self, record: Record, row: int | None = None) -> Tracking:
-        """Where to begin, before a row of a record of one experiment, by default the first that is estimated.
+    def start(self, record: Record, row: int | None = None) -> ObserverState:
+        """Return the state before a row of a record of one experiment.
 
-        A motion's state is guessed from the outputs about the row, and unknown by the size of the states.
+        By default that is the first row that is estimated.
+
+        A motion's state is guessed from the outputs about the row, and unknown by the size of the
+        states.
 
         Raises:
             InputError: other channels, several experiments, a row that is not there.
@@ -78,57 +100,65 @@ class Observer:
         experiment = one_experiment(record)
         last = len(experiment) - form.hidden
         row = checked_row(row, form.first_row, last)
-        return Tracking(self, form.start(experiment, record, row, self.noise, size))
+        return ObserverState(self, form.start(experiment, record, row, self.noise, size))
 
     def run(self, record: Record) -> Observations:
-        """Outputs and states along a record, each row told by what was measured up to it.
+        """Return outputs and states along a record, each row estimated from measurements up to it.
 
         Raises:
             InputError: other channels, too few rows, or an estimate that leaves all bounds.
         """
         record = self._record(record)
-        told = tuple(self._along(experiment, record)[0] for experiment in record.experiments)
+        runs = tuple(self._along(experiment, record)[0] for experiment in record.experiments)
         form = self.model.filtering[0]
         names = form.names if form.hidden else ()
-        return Observations(told, self.model.outputs, names, record.sampling_time, self._settled)
+        return Observations(runs, self.model.outputs, names, record.sampling_time, self._settled)
 
     def predict(self, record: Record, horizon: int = 1) -> Response:
-        """Each row from the state that was estimated `horizon` samples before it, with its standard deviation.
+        """Return the prediction of each row from `horizon` samples before it, with its deviation.
 
-        A motion's first rows, which tell its state, have no value, as in its `predict`.
+        A motion's first rows, which determine its state, have no value, as in its `predict`.
 
         Raises:
-            InputError: other channels, a horizon below 1, too few rows, or an estimate that leaves all bounds.
+            InputError: other channels, a horizon below 1, too few rows, or an estimate that leaves
+                all bounds.
         """
         horizon = check_count(horizon, "horizon", of="steps")
         record = self._record(record)
-        trajectories = [self._ahead(experiment, record, horizon) for experiment in record.experiments]
+        trajectories = [
+            self._ahead(experiment, record, horizon) for experiment in record.experiments
+        ]
         return Response(tuple(trajectories), horizon, self.model.outputs, record.sampling_time)
 
     @property
     def _settled(self) -> int:
-        """Rows that tell where an experiment starts."""
+        """Rows that determine the start of an experiment."""
         form = self.model.filtering[0]
         return self.model.window if form.hidden else form.first_row
 
     def _record(self, record: Record) -> Record:
         return self.model.fitting(record, need_outputs=True, gaps=True)
 
-    def _along(self, experiment: Experiment, record: Record) -> tuple[Observed, Belief, Matrix]:
-        """What an experiment tells, what is believed before its rows, and what their steps read."""
+    def _along(
+        self, experiment: Experiment, record: Record
+    ) -> tuple[ObserverRun, StateEstimate, Matrix]:
+        """Return the observed run of an experiment, the predicted states, and the steps' inputs."""
         form, numbers, size = self.model.filtering
         first = form.first_row
         self.model.check_rows(experiment, first)
         begun = form.start(experiment, record, first, self.noise, size)
         inputs = form.inputs(experiment, record)
-        before, told = filtered(form, numbers, self.noise, begun, inputs, experiment.outputs[first:])
-        finite = np.isfinite(told.predicted).all(axis=1) & np.isfinite(before.state).all(axis=1)
+        before, rows = filtered(
+            form, numbers, self.noise, begun, inputs, experiment.outputs[first:]
+        )
+        finite = np.isfinite(rows.predicted).all(axis=1) & np.isfinite(before.state).all(axis=1)
         if not finite.all():
             raise InputError(
-                f"{experiment.where(first + int(np.argmin(finite)))}: the estimate leaves all bounds there; the model "
-                "does not hold on this record, or the noise of the observer is wrong."
+                f"{experiment.where(first + int(np.argmin(finite)))}: the estimate leaves all "
+                "bounds there; the model does not hold on this record, or the noise of the "
+                "observer is wrong."
             )
-        return _observed(told, experiment, first), before, inputs
+        return _observed(rows, experiment, first), before, inputs
 
     def _ahead(self, experiment: Experiment, record: Record, horizon: int) -> Trajectory:
         form, numbers, _ = self.model.filtering
@@ -143,14 +173,16 @@ class Observer:
                 known = ahead(alone[0], alone[1], self.noise, before, inputs, horizon)[0]
             parts = Parts(known.total, parts.total - known.total, parts.total - known.total)
         skip = first - form.first_row - horizon + 1
-        told = trajectory(Parts(*(part[skip:] for part in parts)), experiment, experiment.outputs, first)
+        predicted = trajectory(
+            Parts(*(part[skip:] for part in parts)), experiment, experiment.outputs, first
+        )
         whole = np.full(experiment.outputs.shape, np.nan)
         whole[first:] = std[skip:]
-        return replace(told, std=whole)
+        return replace(predicted, std=whole)
 
 
 @dataclass(frozen=True, eq=False)
-class Tracking:
+class ObserverState:
     """An observer at a sample; `update` gives that at the next one.
 
     Examples:
@@ -167,10 +199,10 @@ class Tracking:
     """
 
     observer: Observer
-    belief: Belief
+    belief: StateEstimate
     """The state before the next sample and its covariance."""
-    told: Told | None = None
-    """What the last sample told; None before the first."""
+    latest: FilterRow | None = None
+    """The filter's row of the last sample; None before the first."""
 
     @property
     def state_names(self) -> tuple[str, ...]:
@@ -178,48 +210,51 @@ class Tracking:
 
     @property
     def state(self) -> Vector:
-        """The state (n,) at the last sample of a motion; of a lagged model that which the next step starts from."""
-        return np.asarray(self.belief.state if self.told is None else self.told.state)
+        """The state (n,) at the last sample of a motion.
+
+        For a lagged model it is the state that the next step starts from.
+        """
+        return np.asarray(self.belief.state if self.latest is None else self.latest.state)
 
     @property
     def state_band(self) -> Matrix:
         """Its 95 % limits (2, n)."""
-        covariance = self.belief.covariance if self.told is None else self.told.state_covariance
+        covariance = self.belief.covariance if self.latest is None else self.latest.state_covariance
         return _band(self.state, covariance)
 
     @property
     def predicted(self) -> Vector:
-        """The outputs (ny,) at the last sample as those before it told them."""
-        return np.asarray(self._told.predicted)
+        """Outputs (ny,) at the last sample, predicted from those before it."""
+        return np.asarray(self._update.predicted)
 
     @property
     def predicted_band(self) -> Matrix:
         """The limits (2, ny) within which 95 % of measurements lie."""
-        return _band(self.predicted, self._told.spread)
+        return _band(self.predicted, self._update.spread)
 
     @property
     def outputs(self) -> Vector:
         """The outputs (ny,) at the last sample, without the sensors' noise."""
-        return np.asarray(self._told.outputs)
+        return np.asarray(self._update.outputs)
 
     @property
     def outputs_band(self) -> Matrix:
         """Their 95 % limits (2, ny)."""
-        return _band(self.outputs, self._told.outputs_covariance)
+        return _band(self.outputs, self._update.outputs_covariance)
 
     @property
     def square(self) -> float:
-        """`νᵀS⁻¹ν` of the last sample: χ² with as many degrees of freedom as outputs were measured."""
-        return float(self._told.square)
+        """`νᵀS⁻¹ν` of the last sample: χ² with one degree of freedom per measured output."""
+        return float(self._update.square)
 
     @property
-    def _told(self) -> Told:
-        if self.told is None:
+    def _update(self) -> FilterRow:
+        if self.latest is None:
             raise InputError("no sample has been measured yet; `update` first.")
-        return self.told
+        return self.latest
 
-    def update(self, inputs: Any, outputs: Any) -> Tracking:
-        """One sample later.
+    def update(self, inputs: Any, outputs: Any) -> ObserverState:
+        """Return one sample later.
 
         Args:
             inputs: those of the sample, as `model.step_inputs` lists them.
@@ -232,10 +267,10 @@ class Tracking:
         row = _row(inputs, "inputs", len(model.step_inputs))
         measured = _row(outputs, "outputs", len(model.outputs), gaps=True)
         form, numbers, _ = model.filtering
-        belief, told = one_row(form, numbers, self.observer.noise, self.belief, row, measured)
-        if not (np.isfinite(told.predicted).all() and np.isfinite(belief.state).all()):
+        belief, latest = one_row(form, numbers, self.observer.noise, self.belief, row, measured)
+        if not (np.isfinite(latest.predicted).all() and np.isfinite(belief.state).all()):
             raise InputError("the estimate leaves all bounds; the model does not hold here.")
-        return replace(self, belief=belief, told=told)
+        return replace(self, belief=belief, latest=latest)
 
 
 def _band(mean: Vector, covariance: Any) -> Matrix:
@@ -251,35 +286,40 @@ def _row(values: Any, name: str, count: int, *, gaps: bool = False) -> Vector:
     if row.shape != (count,):
         raise InputError(f"`{name}` must have {count} numbers; got the shape {row.shape}.")
     if np.isinf(row).any() or (not gaps and np.isnan(row).any()):
-        raise InputError(f"`{name}` must be finite{' or NaN, where nothing was measured' if gaps else ''}; got {row}.")
+        raise InputError(
+            f"`{name}` must be finite{' or NaN, where nothing was measured' if gaps else ''}; "
+            f"got {row}."
+        )
     return row
 
 
-def _observed(told: Told, experiment: Experiment, first: int) -> Observed:
-    """With NaN before the first row that is estimated."""
+def _observed(rows: FilterRow, experiment: Experiment, first: int) -> ObserverRun:
+    """Return the run, with NaN before the first row that is estimated."""
 
     def whole(values: Any) -> Any:
         return np.concatenate([np.full((first, *values.shape[1:]), np.nan), values])
 
-    return Observed(
+    return ObserverRun(
         measured=experiment.outputs,
-        predicted=whole(told.predicted),
-        spread=whole(told.spread),
-        outputs=whole(told.outputs),
-        outputs_std=whole(spread_of(told.outputs_covariance)),
-        states=whole(told.state),
-        states_std=whole(spread_of(told.state_covariance)),
-        square=whole(told.square),
+        predicted=whole(rows.predicted),
+        spread=whole(rows.spread),
+        outputs=whole(rows.outputs),
+        outputs_std=whole(spread_of(rows.outputs_covariance)),
+        states=whole(rows.state),
+        states_std=whole(spread_of(rows.state_covariance)),
+        square=whole(rows.square),
         start=first,
         start_time=experiment.start_time,
     )
 
 
 def _checked(noise: Any, disturbances: int, outputs: int) -> Noise:
-    """Two covariances; raises InputError for anything else."""
+    """Return two covariances; raises InputError for anything else."""
     sizes = {"state": disturbances, "output": outputs}
     if not isinstance(noise, Noise):
-        raise InputError(f"`noise` must be an oa.Noise(state, output) of two covariances; got {shown(noise)}.")
+        raise InputError(
+            f"`noise` must be an oa.Noise(state, output) of two covariances; got {shown(noise)}."
+        )
     parts = []
     for (name, size), given in zip(sizes.items(), noise, strict=True):
         try:
@@ -287,12 +327,20 @@ def _checked(noise: Any, disturbances: int, outputs: int) -> Noise:
         except (TypeError, ValueError, OverflowError):
             raise InputError(f"`noise.{name}` is not a matrix of numbers.") from None
         if matrix.shape != (size, size):
-            raise InputError(f"`noise.{name}` has the shape {matrix.shape}; expected ({size}, {size}).")
+            raise InputError(
+                f"`noise.{name}` has the shape {matrix.shape}; expected ({size}, {size})."
+            )
         largest = np.abs(matrix).max(initial=0.0)
-        sound = np.isfinite(matrix).all() and np.allclose(matrix, matrix.T, rtol=0, atol=1e-9 * largest)
+        sound = np.isfinite(matrix).all() and np.allclose(
+            matrix, matrix.T, rtol=0, atol=1e-9 * largest
+        )
         if not sound or np.linalg.eigvalsh(matrix).min(initial=0.0) < -1e-9 * largest:
-            raise InputError(f"`noise.{name}` is no covariance: it must be finite, symmetric, and not negative.")
+            raise InputError(
+                f"`noise.{name}` is no covariance: it must be finite, symmetric, and not negative."
+            )
         parts.append(matrix)
     if not parts[0].any() and not np.linalg.eigvalsh(parts[1]).min(initial=1.0) > 0:
-        raise InputError("`noise`: with no disturbance the sensors' covariance must be positive definite.")
+        raise InputError(
+            "`noise`: with no disturbance the sensors' covariance must be positive definite."
+        )
     return Noise(*parts)

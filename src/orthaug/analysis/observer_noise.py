@@ -1,9 +1,9 @@
-"""How large the noises of an observer are: by what the residual says of them, or by the likelihood of a record.
+"""Noises of an observer, from the verdict on the residual or by the likelihood of a record.
 
-Noise in the equations moves the state; noise on a sensor does not. The residual tells which (`diagnose`): a white one
-one step ahead is the equation's, R = 0 and Q its covariance; a white one of a free run is the sensors', R its
-covariance, and Q so small that it makes 3 % of the free run's variance: that is for a model that is not exact.
-Otherwise both are there.
+Noise in the equations moves the state; noise on a sensor does not. The residual shows which
+(`diagnose`): a white one one step ahead is the equation's, R = 0 and Q its covariance; a white one
+of a free run is the sensors', R its covariance, and Q so small that it makes 3 % of the free run's
+variance: that is for a model that is not exact. Otherwise both are there.
 """
 
 from __future__ import annotations
@@ -24,19 +24,22 @@ from orthaug.models.model import Model
 from orthaug.models.motion_model import MotionModel
 
 _LITTLE, _MOST = 0.03, 0.9  # shares of a free run's variance that disturbances make
-BOTH = ("equation_noise", "unmodelled")  # verdicts on a free run that tell of disturbances
+BOTH = ("equation_noise", "unmodelled")  # verdicts on a free run that mean disturbances
 _STEPS = 400  # that a disturbance is followed
 _TUNED_ROWS = 4000
-_KEPT_ROWS, _KEPT_STATES = 1000, 30  # a fit tunes on so many rows, unless the filter has more states
+_KEPT_ROWS, _KEPT_STATES = (
+    1000,
+    30,
+)  # a fit tunes on so many rows, unless the filter has more states
 _REACH = 14.0  # of the search, in e-folds
 _STEP = -1.5  # of the search at first, in e-folds
 _LARGE = 1e12
 
 
 def by_verdict(model: Model | MotionModel, verdict: str | None = None) -> Noise:
-    """The noises of a fitted model as the verdict on its residual says, by default what it carries.
+    """Return the noises of a fitted model by a verdict, by default the noises that it carries.
 
-    That are noises which the likelihood of its training data told, else those of its verdict.
+    Those are noises by the likelihood of its training data, else those of its verdict.
 
     Raises:
         InputError: a model without an estimate of its noise.
@@ -46,11 +49,11 @@ def by_verdict(model: Model | MotionModel, verdict: str | None = None) -> Noise:
         return Noise(kept.disturbance, kept.sensor)
     if not _known(kept.noise):
         raise InputError(
-            "the model has no estimate of its noise (few rows, or trained elsewhere); give the observer `noise=`, "
-            "such as oa.Noise(state, output) with two covariances."
+            "the model has no estimate of its noise (few rows, or trained elsewhere); give the "
+            "observer `noise=`, such as oa.Noise(state, output) with two covariances."
         )
     verdict, nothing = kept.verdict if verdict is None else verdict, np.zeros_like(kept.noise)
-    if not kept.flown and verdict != "sensor_noise":
+    if not kept.simulated and verdict != "sensor_noise":
         return Noise(np.array(kept.noise), nothing)
     return with_share(model, kept.noise, _MOST if verdict in BOTH else _LITTLE)
 
@@ -60,7 +63,10 @@ def _known(noise: Matrix | None) -> TypeGuard[Matrix]:
 
 
 def with_share(model: Model | MotionModel, noise: Matrix, share: float) -> Noise:
-    """Disturbances that make a share of a free run's variance `noise`, about the origin; the sensors make the rest."""
+    """Return disturbances that make up a share of a free run's variance `noise`, about the origin.
+
+    The sensors make the rest.
+    """
     form, numbers, size = model.filtering
     unit = form.unit(noise, size)
     a, c, enters, direct = form.linearised(numbers)
@@ -76,7 +82,9 @@ def with_share(model: Model | MotionModel, noise: Matrix, share: float) -> Noise
 
 
 def of_fit(fit: Estimate | MotionEstimate) -> Noise:
-    """The noises of a fit by the verdict on its residual; where both are there, by the likelihood of its data.
+    """Return the noises of a fit by the verdict on its residual.
+
+    Where both are there, by the likelihood of its data.
 
     Raises:
         InputError: a fit that failed, or without an estimate of its noise.
@@ -92,20 +100,28 @@ def of_fit(fit: Estimate | MotionEstimate) -> Noise:
 
 
 def to_keep(fit: Estimate | MotionEstimate, verdict: str) -> Noise | None:
-    """What a fit keeps with its model, by the likelihood of some of its rows, where its residual has both noises.
+    """Return the noises that a fit keeps with its model, by likelihood, if both kinds are present.
 
-    None where the verdict's rule is as good, without an estimate of the noise, and where a filter takes long.
+    None where the verdict's rule is as good, without an estimate of the noise, and where a filter
+    takes long.
     """
     model, kept = fit.model, fit.model.statistics
-    if not _known(kept.noise) or not kept.flown or verdict not in BOTH or not model.form.differentiable:
+    if (
+        not _known(kept.noise)
+        or not kept.simulated
+        or verdict not in BOTH
+        or not model.form.differentiable
+    ):
         return None
     if len(model.filtering[0].names) > _KEPT_STATES:
         return None
     return most_likely(model, by_verdict(model, verdict), fit.problem.record, _KEPT_ROWS)
 
 
-def most_likely(model: Model | MotionModel, begun: Noise, record: Record, rows: int = _TUNED_ROWS) -> Noise:
-    """The noises of most likelihood for a record among `(q Q, r R)`, over its first rows.
+def most_likely(
+    model: Model | MotionModel, begun: Noise, record: Record, rows: int = _TUNED_ROWS
+) -> Noise:
+    """Return the noises of most likelihood for a record among `(q Q, r R)`, over its first rows.
 
     Where an R or Q that is zero begins, it stays zero.
     """

@@ -1,7 +1,7 @@
-"""Points where a model rests: its equilibria with inputs held constant, found, or given and checked.
+"""Points of rest of a model: its equilibria under constant inputs, found or given and checked.
 
-Inputs that nobody fixes are 0, or their means over a record. Where outputs or states are fixed, inputs that nobody
-fixes are looked for with the rest.
+Inputs that nobody fixes are 0, or their means over a record. Where outputs or states are fixed,
+inputs that nobody fixes are looked for with the rest.
 """
 
 from __future__ import annotations
@@ -24,14 +24,17 @@ _STARTS = 32  # points of a Halton sequence in the box of the training data, bes
 _SOLVED = 1e-9  # of what is zero at rest over the starts
 _SAME = 1e-6  # of sizes: points that are as near are one
 _SINGULAR = 1e-10  # of singular values: directions along which rest does not end
-_FAR = 2.0  # times what the training data reached: an equilibrium beyond is told only where there is no other
+_FAR = 2.0  # times the training range: an equilibrium beyond is given only if there is no other
 _NOTHING = 1e-13  # of sizes: rounding of 0
 _POLISH = 5  # Newton steps
 
 
 @dataclass(frozen=True, eq=False)
 class Slopes:
-    """How the equations of a point follow (rest, inputs), (m, ne + nu), which of these are `free`, and their values."""
+    """Slopes of a point's equations by (rest, inputs), (m, ne + nu), and the `free` unknowns.
+
+    `value` holds the unknowns.
+    """
 
     matrix: Matrix
     free: Bool[np.ndarray, "k"]
@@ -39,7 +42,7 @@ class Slopes:
     """Numbers of the outputs whose values are equations too."""
 
     def following(self, change: Float[np.ndarray, "m r"]) -> Float[np.ndarray, "k r"]:
-        """How (rest, inputs) follow where the equations change (implicit function theorem)."""
+        """Return the change of (rest, inputs) by changed equations (implicit function theorem)."""
         moved = np.zeros((len(self.free), change.shape[1]))
         if self.free.any():
             moved[self.free] = -np.linalg.pinv(self.matrix[:, self.free], rcond=_SINGULAR) @ change
@@ -50,8 +53,8 @@ class Slopes:
 class OperatingPoint:
     """A point of rest: `values` of states or outputs and inputs by name, `outputs` likewise.
 
-    `outside` tells whether it lies beyond what training reached, or the learner's features do; `line` whether it is one
-    of a continuum.
+    `outside` is whether it lies beyond what training reached, or the learner's features do;
+    `line` whether it is one of a continuum.
     """
 
     rest: Vector
@@ -68,7 +71,7 @@ class OperatingPoint:
 
 
 def parse_point(at: str | Mapping[str, float] | None) -> dict[str, float]:
-    """`"force=0, position=1"` as a mapping.
+    """Return `"force=0, position=1"` as a mapping.
 
     Raises:
         InputError: no pairs of names and finite numbers, or a name twice.
@@ -89,7 +92,9 @@ def parse_point(at: str | Mapping[str, float] | None) -> dict[str, float]:
         raise InputError(f"the operating point must be {wanted}; got {shown(at)}.")
     for name, value in at.items():
         if not isinstance(name, str) or not name or not is_number(value):
-            raise InputError(f"the operating point must be {wanted}; got {shown(name)} = {shown(value)}.")
+            raise InputError(
+                f"the operating point must be {wanted}; got {shown(name)} = {shown(value)}."
+            )
     return {name: float(value) for name, value in at.items()}
 
 
@@ -102,7 +107,10 @@ def _number(text: str) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Search:
-    """What is looked for: `given` values of rest and inputs, NaN where free, and of outputs by their number."""
+    """Search for a point of rest: `given` values of rest and inputs, NaN where free, and outputs.
+
+    `outputs` are by their number.
+    """
 
     step: Step
     numbers: Numbers
@@ -117,9 +125,14 @@ class Search:
 
     @classmethod
     def of(
-        cls, step: Step, model: Model | MotionModel, outputs: Sequence[str], at: Mapping[str, float], held: Vector
+        cls,
+        step: Step,
+        model: Model | MotionModel,
+        outputs: Sequence[str],
+        at: Mapping[str, float],
+        held: Vector,
     ) -> Search:
-        """`held` (nu,) are the inputs that nobody fixes.
+        """Return the search; `held` (nu,) are the inputs that nobody fixes.
 
         Raises:
             InputError: a name that the model does not have.
@@ -135,7 +148,9 @@ class Search:
             else:
                 known = list(dict.fromkeys((*step.inputs, *step.rest, *outputs)))
                 hint = nearest(name, known)
-                raise InputError(f"the model has no '{shown(name)[1:-1]}'{hint}; known are {', '.join(known)}.")
+                raise InputError(
+                    f"the model has no '{shown(name)[1:-1]}'{hint}; known are {', '.join(known)}."
+                )
         ne = len(step.rest)
         trims = bool(wanted) or bool(np.isfinite(given[:ne]).any())
         if not trims:
@@ -146,26 +161,28 @@ class Search:
 
     @property
     def free(self) -> Bool[np.ndarray, "k"]:
-        """What is looked for, of rest and inputs."""
+        """Mask of the unknowns among rest and inputs."""
         return np.isnan(self.given)
 
     @property
     def scale(self) -> Vector:
-        """What counts as one, of rest and inputs."""
+        """Scale of rest and inputs."""
         return np.concatenate([self.size, np.maximum(np.abs(self.middle[len(self.size) :]), 1.0)])
 
     def equations(self, point: Vector) -> tuple[Vector, Matrix, Vector]:
-        """What must be zero (m,), how it follows rest and inputs (m, k), and the outputs."""
+        """Return the residuals (m,), their slopes by rest and inputs (m, k), and the outputs."""
         ne = len(self.step.rest)
         width = difference_widths(self.size, point[ne:])
-        value, outputs, slope = map(np.asarray, at_rest(self.step, self.numbers, point[:ne], point[ne:], width))
+        value, outputs, slope = map(
+            np.asarray, at_rest(self.step, self.numbers, point[:ne], point[ne:], width)
+        )
         rows = list(self.wanted)
         value = np.concatenate([value, outputs[rows] - np.array([self.wanted[i] for i in rows])])
         slope = np.concatenate([slope[:ne], slope[ne:][rows]])
         return value, np.where(np.isfinite(slope), slope, 0.0), outputs
 
     def starts(self) -> Float[np.ndarray, "s k"]:
-        """The middle, then points of the box that training reached."""
+        """Return the middle, then points of the box that training reached."""
         from scipy.stats import qmc  # slow to import
 
         free = self.free
@@ -178,7 +195,7 @@ class Search:
 
 
 def operating_points(search: Search) -> tuple[list[OperatingPoint], list[Warning]]:
-    """All that were found, the nearest to the middle first.
+    """Return all that were found, the nearest to the middle first.
 
     Raises:
         InputError: none.
@@ -194,7 +211,10 @@ def operating_points(search: Search) -> tuple[list[OperatingPoint], list[Warning
         if point is None:
             continue
         one = _point(search, point)
-        near = [np.abs((_whole(other) - point) / search.scale).max(initial=0.0) < _SAME for other in found]
+        near = [
+            np.abs((_whole(other) - point) / search.scale).max(initial=0.0) < _SAME
+            for other in found
+        ]
         if any(near) or (one.line and any(other.line for other in found)):
             continue
         found.append(one)
@@ -204,24 +224,34 @@ def operating_points(search: Search) -> tuple[list[OperatingPoint], list[Warning
     return _within_reach(search, found)
 
 
-def _within_reach(search: Search, found: list[OperatingPoint]) -> tuple[list[OperatingPoint], list[Warning]]:
-    """Those that training came near to, if there are any, and what is to be said."""
+def _within_reach(
+    search: Search, found: list[OperatingPoint]
+) -> tuple[list[OperatingPoint], list[Warning]]:
+    """Return those that training came near to, if there are any, and what is to be said."""
     warnings = []
     ne = len(search.size)
-    near = [one for one in found if np.all(np.abs(one.rest) <= _FAR * search.size[:ne])] or found[:1]
+    near = [one for one in found if np.all(np.abs(one.rest) <= _FAR * search.size[:ne])] or found[
+        :1
+    ]
     if len(near) < len(found):
-        told = f"{len(found) - len(near)} more equilibria lie far outside of the training data; they are left out."
-        warnings.append(Warning("equilibria_left_out", told))
+        text = (
+            f"{len(found) - len(near)} more equilibria lie far outside of the training data "
+            "and are left out."
+        )
+        warnings.append(Warning("equilibria_left_out", text))
     if len(near) > 1:
-        told = f"{len(near)} equilibria belong to these inputs; fix an output to choose one."
-        warnings.append(Warning("several_equilibria", told))
+        text = f"{len(near)} equilibria belong to these inputs; fix an output to choose one."
+        warnings.append(Warning("several_equilibria", text))
     if any(one.line for one in near):
-        told = "the equilibrium is one of a continuum (the model integrates, or too little is fixed); one is taken."
-        warnings.append(Warning("continuum_of_equilibria", told))
+        text = (
+            "the equilibrium is one of a continuum (the model integrates, or too little is "
+            "fixed); one is taken."
+        )
+        warnings.append(Warning("continuum_of_equilibria", text))
     if any(one.outside for one in near):
         where = "the operating point lies" if len(near) == 1 else "operating points so marked lie"
-        told = f"{where} outside of the training data, which do not tell what the model is worth there."
-        warnings.append(Warning("outside_training", told))
+        text = f"{where} outside of the training data, where the model is not validated."
+        warnings.append(Warning("outside_training", text))
     return near, warnings
 
 
@@ -230,7 +260,7 @@ def _whole(point: OperatingPoint) -> Vector:
 
 
 def _solved(search: Search, start: Vector, unit: Vector) -> Vector | None:
-    """The point of rest that a start leads to; None where it leads nowhere."""
+    """Return the point of rest that a start leads to; None where it leads nowhere."""
     from scipy.optimize import least_squares  # slow to import
 
     free, point = search.free, start.copy()
@@ -271,23 +301,35 @@ def _point(search: Search, point: Vector) -> OperatingPoint:
     free = search.free
     scaled = slope[:, free] * search.scale[free]
     sizes = np.linalg.svd(scaled, compute_uv=False) if scaled.size else np.ones(1)
-    line = bool(free.any()) and (free.sum() > len(scaled) or sizes[-1] <= _SINGULAR * max(sizes[0], 1e-300))
-    return OperatingPoint(rest, inputs, values, outputs, outside, line, Slopes(slope, free, tuple(search.wanted)))
+    line = bool(free.any()) and (
+        free.sum() > len(scaled) or sizes[-1] <= _SINGULAR * max(sizes[0], 1e-300)
+    )
+    return OperatingPoint(
+        rest, inputs, values, outputs, outside, line, Slopes(slope, free, tuple(search.wanted))
+    )
 
 
 def _nothing(search: Search, starts: Matrix, unit: Vector) -> str:
-    """Why there is no point."""
+    """Return the reason why there is no point."""
     names = (*search.step.rest, *search.step.inputs)
-    fixed = [f"{name} = {value:.6g}" for name, value in zip(names, search.given, strict=True) if np.isfinite(value)]
+    fixed = [
+        f"{name} = {value:.6g}"
+        for name, value in zip(names, search.given, strict=True)
+        if np.isfinite(value)
+    ]
     fixed += [f"{search.step.form.outputs[i]} = {value:.6g}" for i, value in search.wanted.items()]
     at = f" at {', '.join(fixed)}" if fixed else ""
     if not search.free.any():
         moves = ", ".join(search.step.rest)
-        return f"the model does not rest{at}: {moves} would move. Fix less, so that the rest can be found."
+        return (
+            f"the model does not rest{at}: {moves} would move. Fix less, so that the rest can "
+            "be found."
+        )
     found = f"no equilibrium was found{at}, from {len(starts)} starts: either the model"
     if not search.step.inputs:
         return f"{found} never rests, or these values exclude each other. Give others, or fix less."
     return (
-        f"{found} integrates (it rests at other inputs only), or these values exclude each other. Give other inputs, "
-        "or data whose mean inputs are held, or fix an output and leave inputs open."
+        f"{found} integrates (it rests at other inputs only), or these values exclude each "
+        "other. Give other inputs, or data whose mean inputs are held, or fix an output and "
+        "leave inputs open."
     )

@@ -1,7 +1,8 @@
-"""How the outputs of a free run follow a signal that is added to an equation, to first order, of any dynamics.
+"""First-order response of a free run's outputs to a signal added to an equation.
 
-With `x⁺, y = step(x)` and a signal c in an equation: `s⁺ = A s + b c`, `Δy = C s + d c`, A and C the slopes of the step
-along the run. The signal acts on the newest output of lagged physics, and on a state's derivative of a motion.
+With `x⁺, y = step(x)` and a signal c in an equation: `s⁺ = A s + b c`, `Δy = C s + d c`, A and C
+the slopes of the step along the run. The signal acts on the newest output of lagged physics, and on
+a state's derivative of a motion.
 """
 
 from __future__ import annotations
@@ -23,7 +24,10 @@ from orthaug.models.motion_model import MotionModel
 
 @dataclass(frozen=True, eq=False)
 class LinearRun:
-    """A free run of one experiment of T rows, linearised: `states` (T, n0), `error` (T, ny) measured less run."""
+    """Linearised free run of one experiment of T rows, with states, slopes and errors.
+
+    `states` are (T, n0), `error` (T, ny) is measured less run.
+    """
 
     states: Matrix
     inputs: Matrix
@@ -37,9 +41,12 @@ class LinearRun:
     theta_to_output: Float[np.ndarray, "T ny nt"]
 
     def respond(
-        self, into_state: Float[np.ndarray, "T n0 k"], into_output: Float[np.ndarray, "T ny k"], start: Matrix
+        self,
+        into_state: Float[np.ndarray, "T n0 k"],
+        into_output: Float[np.ndarray, "T ny k"],
+        start: Matrix,
     ) -> Float[np.ndarray, "T ny k"]:
-        """Compute Δy of k columns that are added to the state and the output of every step, from s (n0, k) = start."""
+        """Return Δy of k columns added to state and output of each step, from s (n0, k) = start."""
         found = np.array(into_output, dtype=float)
         if not self.states.shape[1]:
             return found
@@ -61,7 +68,9 @@ class LinearRun:
         return self.respond(self.theta_to_state, self.theta_to_output, np.zeros((n0, nt)))
 
 
-def linear_runs(model: Model | MotionModel, record: Record, most: int, theta: Vector) -> list[LinearRun] | None:
+def linear_runs(
+    model: Model | MotionModel, record: Record, most: int, theta: Vector
+) -> list[LinearRun] | None:
     """Linearise the free run over a record; None where it leaves all bounds or has no slopes.
 
     Args:
@@ -78,7 +87,9 @@ def linear_runs(model: Model | MotionModel, record: Record, most: int, theta: Ve
         first = form.first_row
         if count - first < 2:
             continue
-        part = replace(experiment, inputs=experiment.inputs[:count], outputs=experiment.outputs[:count])
+        part = replace(
+            experiment, inputs=experiment.inputs[:count], outputs=experiment.outputs[:count]
+        )
         start = model.first_state(part, record)
         rows = np.asarray(form.inputs(part, record))
         run = _linearize(form, numbers, start, rows, part.outputs[first:], part.inputs[first:])
@@ -88,12 +99,17 @@ def linear_runs(model: Model | MotionModel, record: Record, most: int, theta: Ve
     return runs or None
 
 
-def _linearize(form: Any, numbers: Any, start: Any, rows: Matrix, outputs: Matrix, inputs: Matrix) -> LinearRun | None:
+def _linearize(
+    form: Any, numbers: Any, start: Any, rows: Matrix, outputs: Matrix, inputs: Matrix
+) -> LinearRun | None:
     count = len(rows)
     padded = np.pad(rows, ((0, padded_length(count) - count), (0, 0)), mode="edge")
     found = [np.asarray(part)[:count] for part in _along(form, numbers, start, padded)]
     states, run, a, c, b, d = found
-    if not all(np.isfinite(part).all() and np.abs(part).max(initial=0.0) < LARGEST for part in (states, run)):
+    if not all(
+        np.isfinite(part).all() and np.abs(part).max(initial=0.0) < LARGEST
+        for part in (states, run)
+    ):
         return None
     a, c, b, d = (np.where(np.isfinite(part), part, 0.0) for part in (a, c, b, d))
     return LinearRun(states, inputs, rows, outputs - run, a, c, b, d)
@@ -101,7 +117,10 @@ def _linearize(form: Any, numbers: Any, start: Any, rows: Matrix, outputs: Matri
 
 @partial(jax.jit, static_argnames="form")
 def _along(form: Any, numbers: Any, start: Any, rows: Any) -> Any:
-    """States, outputs, and the slopes of both by state and parameters, at every row of a free run."""
+    """Return states, outputs, and the slopes of both, at every row of a free run.
+
+    The slopes are those by state and parameters.
+    """
 
     def step(state: Any, theta: Any, row: Any) -> tuple[Any, Any]:
         own = form.prepared(numbers._replace(theta=theta))

@@ -1,7 +1,8 @@
-"""How much of a signal could be predicted from others: cross-validated shares of its variance, from Gram sums.
+"""Share of a signal's variance that others predict, cross-validated from Gram sums.
 
-Rows are cut into contiguous blocks. Each is predicted by least squares on the others, so that the share is what a model
-with these columns would gain on rows that it has not seen; chance counts against it.
+Rows are cut into contiguous blocks. Each is predicted by least squares on the others, so that the
+share is what a model with these columns would gain on rows that it has not seen; chance counts
+against it.
 """
 
 from __future__ import annotations
@@ -32,13 +33,16 @@ _RIDGE = 1e-6  # of a column's sum of squares, so that columns that repeat each 
 
 @dataclass(frozen=True, eq=False)
 class SimpleFunctions:
-    """Directions of the regressor, of each channel its first lag and differences of lags, with mean and deviation."""
+    """Directions of the regressor: each channel's first lag and differences, with mean and size."""
 
     variables: tuple[tuple[Vector, float, float], ...]
 
     @classmethod
     def of(cls, problem: Problem) -> SimpleFunctions:
-        """Of what the physics and the learner read, the first lags and differences of all channels in front."""
+        """Return the functions for the regressors of physics and learner.
+
+        First lags and differences of all channels come first.
+        """
         layout, x, each = problem.layout, problem.rows.x, np.eye(len(problem.layout))
         places: dict[str, list[int]] = {}
         for j, lag in enumerate(layout):
@@ -56,9 +60,12 @@ class SimpleFunctions:
         return 5 * n + 3 * n * (n - 1) // 2
 
     def __call__(self, x: Matrix) -> Matrix:
-        """On rows of the regressor, (N, functions)."""
+        """Return the functions on rows of the regressor, (N, functions)."""
         columns = []
-        scaled = [np.clip((x @ d - mean) / size, -_FARTHEST, _FARTHEST) for d, mean, size in self.variables]
+        scaled = [
+            np.clip((x @ d - mean) / size, -_FARTHEST, _FARTHEST)
+            for d, mean, size in self.variables
+        ]
         for v in scaled:
             columns += [v**2, v**3, np.abs(v), v * np.abs(v), np.tanh(3 * v)]
         for i, v in enumerate(scaled):
@@ -76,12 +83,14 @@ class Share:
 
     @classmethod
     def of(cls, without: Vector, together: Vector) -> Share:
-        """By how much a sum of squares over blocks (blocks,) is smaller than another one."""
+        """Return the relative decrease of a sum of squares over blocks (blocks,)."""
         total, gained = float(without.sum()), without - together
         if not (total > 0 and np.isfinite(gained).all()):
             return cls(0.0, 0.0)
         value = float(gained.sum() / total)
-        off = gained - value * without  # of a ratio of sums: loud blocks may gain more (Cochran 1977, sect. 2.11)
+        off = (
+            gained - value * without
+        )  # of a ratio of sums: loud blocks may gain more (Cochran 1977, sect. 2.11)
         return cls(value, float(np.sqrt(len(off)) * off.std(ddof=1) / total))
 
     @property
@@ -98,17 +107,19 @@ class BlockSums:
 
     @classmethod
     def of(cls, columns: Matrix, target: Vector, blocks: int = BLOCKS) -> BlockSums:
-        """From rows in their order."""
+        """Return the sums of rows in their order."""
         both = np.column_stack([columns, target])
         edges = np.linspace(0, len(both), blocks + 1).astype(int)
-        return cls(np.stack([both[a:b].T @ both[a:b] for a, b in zip(edges[:-1], edges[1:], strict=True)]))
+        return cls(
+            np.stack([both[a:b].T @ both[a:b] for a, b in zip(edges[:-1], edges[1:], strict=True)])
+        )
 
     def share(self, columns: Sequence[int], beside: Sequence[int] = ()) -> Share:
-        """What `columns` explain of the target beyond those `beside` which they stand."""
+        """Return the share of the target that `columns` explain beyond those in `beside`."""
         return Share.of(self._missed(list(beside)), self._missed([*beside, *columns]))
 
     def _missed(self, columns: list[int]) -> Vector:
-        """Sum of squared errors on every block of the regression on the others, (blocks,)."""
+        """Return each block's sum of squared errors (blocks,), by regression on the others."""
         own = np.ix_(range(len(self.grams)), columns, columns)
         inner, moment, total = self.grams[own], self.grams[:, columns, -1], self.grams[:, -1, -1]
         if not columns:
@@ -117,16 +128,20 @@ class BlockSums:
         size = np.sqrt(np.maximum(np.einsum("bii->bi", rest), np.finfo(float).tiny))
         scaled = rest / (size[:, :, None] * size[:, None, :]) + _RIDGE * np.eye(len(columns))
         found = np.linalg.solve(scaled, (right / size)[..., None])[..., 0] / size
-        return total - 2 * np.sum(found * moment, axis=1) + np.einsum("bi,bij,bj->b", found, inner, found)
+        return (
+            total
+            - 2 * np.sum(found * moment, axis=1)
+            + np.einsum("bi,bij,bj->b", found, inner, found)
+        )
 
 
 def from_own_past(signal: Pieces, lags: int) -> Share:
-    """What a short autoregression explains of a signal less its mean."""
+    """Return the share of a signal less its mean that a short autoregression predicts."""
     return from_lags(signal, [signal], range(1, lags + 1))
 
 
 def from_lags(signal: Pieces, others: Sequence[Pieces], lags: Sequence[int]) -> Share:
-    """What lags of other signals explain of a signal, beside a constant."""
+    """Return the share of a signal that lags of other signals predict, beside a constant."""
     if not others or not len(lags):
         return Share(0.0, 0.0)
     target, columns = [], []
@@ -134,7 +149,9 @@ def from_lags(signal: Pieces, others: Sequence[Pieces], lags: Sequence[int]) -> 
         rows = range(max(lags), len(one))
         if len(rows):
             target.append(one[rows])
-            columns.append(np.column_stack([x[np.array(rows) - lag] for x in beside for lag in lags]))
+            columns.append(
+                np.column_stack([x[np.array(rows) - lag] for x in beside for lag in lags])
+            )
     count = 1 + len(lags) * len(others)
     if sum(map(len, target)) < 5 * count:
         return Share(0.0, 0.0)
@@ -146,10 +163,11 @@ def from_lags(signal: Pieces, others: Sequence[Pieces], lags: Sequence[int]) -> 
 
 
 def from_neighbours(x: Matrix, signal: Vector) -> Share:
-    """What a smooth function of the rows x explains of a signal (N,), whatever its form.
+    """Return the share of a signal (N,) that any smooth function of the rows x could explain.
 
-    Where two rows lie close to each other, their values differ by the rest alone: half the mean square of that is the
-    variance of the rest (Rice 1984). Where they lie far apart, as in many dimensions, it explains less than there is.
+    Where two rows lie close to each other, their values differ by the rest alone: half the mean
+    square of that is the variance of the rest (Rice 1984). Where they lie far apart, as in many
+    dimensions, it explains less than there is.
     """
     from scipy.spatial import KDTree
 
@@ -158,19 +176,24 @@ def from_neighbours(x: Matrix, signal: Vector) -> Share:
     if not scaled.size or len(x) < 4 * BLOCKS * _APART:
         return Share(0.0, 0.0)
     near = np.asarray(KDTree(scaled).query(scaled, 2 * _APART + 2)[1])
-    nearest = near[np.arange(len(x)), np.argmax(np.abs(near - np.arange(len(x))[:, None]) > _APART, axis=1)]
+    nearest = near[
+        np.arange(len(x)), np.argmax(np.abs(near - np.arange(len(x))[:, None]) > _APART, axis=1)
+    ]
     e = signal - signal.mean()
     both = np.stack([e**2, (e - e[nearest]) ** 2 / 2])
-    return Share.of(*np.stack([part.sum(axis=1) for part in np.array_split(both, BLOCKS, axis=1)], axis=1))
+    return Share.of(
+        *np.stack([part.sum(axis=1) for part in np.array_split(both, BLOCKS, axis=1)], axis=1)
+    )
 
 
 @dataclass(frozen=True)
 class Predictable:
-    """Of one output's error, in the output's unit: its RMS, and which shares of its square could be predicted.
+    """RMS of an output's error, in the output's unit, and its predictable shares.
 
-    From its own past, from lagged inputs, each cross-validated, and from functions of the regressors: products and
-    curves, cross-validated as well, or one step ahead whatever lets neighbours have like errors. Two standard errors
-    are taken off; 0 where that is not surely more than nothing.
+    It is predicted from its own past and from lagged inputs, both cross-validated, and from
+    functions of the regressors: products and curves, cross-validated as well, or one step ahead
+    whatever lets neighbours have like errors. Two standard errors are taken off; 0 where that is
+    not surely more than nothing.
     """
 
     name: str
@@ -180,15 +203,20 @@ class Predictable:
     functions: float
 
     def largest(self, own_past: bool = True) -> float:
-        """The largest share; without the own past where that is of no use, as in a free run."""
+        """Return the largest share.
+
+        Without the own past where that is of no use, as in a free run.
+        """
         return max(self.inputs, self.functions, self.own_past if own_past else 0.0)
 
 
-def predictable(problem: Problem, response: Response, skip: int = 0, *, flown: bool = False) -> tuple[Predictable, ...]:
-    """What could be predicted of a response's errors on the training data, after the first `skip` rows.
+def predictable(
+    problem: Problem, response: Response, skip: int = 0, *, simulates: bool = False
+) -> tuple[Predictable, ...]:
+    """Return the predictable shares of a response's errors on training data, after `skip` rows.
 
     Args:
-        flown: a free run, whose errors are no function of the regressor.
+        simulates: a free run, whose errors are no function of the regressor.
     """
     errors, functions, found = errors_of(response, skip), SimpleFunctions.of(problem), []
     starts = [run.start + skip for run in response.trajectories]
@@ -202,11 +230,13 @@ def predictable(problem: Problem, response: Response, skip: int = 0, *, flown: b
         e = [piece[:, o] for piece in errors]
         whole, lags = np.concatenate(e), range(min(longest, min(map(len, e)) // 10) + 1)
         own = from_own_past(e, _PAST)
-        driven = from_lags(e, [[u[:, j] for u in inputs] for j in range(len(problem.record.inputs))], lags)
+        driven = from_lags(
+            e, [[u[:, j] for u in inputs] for j in range(len(problem.record.inputs))], lags
+        )
         curved = Share(0.0, 0.0)
         if len(columns) > 5 * columns.shape[1] > 5:
             curved = BlockSums.of(columns, whole[every]).share(range(1, columns.shape[1]), [0])
-        near = 0.0 if flown else from_neighbours(x[few][:, read], whole[few]).sure
+        near = 0.0 if simulates else from_neighbours(x[few][:, read], whole[few]).sure
         rms = float(np.sqrt(np.mean(whole**2)))
         found.append(Predictable(name, rms, own.sure, driven.sure, max(curved.sure, near)))
     return tuple(found)

@@ -1,7 +1,8 @@
-"""Residual analysis: is what a model leaves over white, independent of the inputs, and flat over the regressors?
+"""Residual analysis: whiteness, independence of the inputs, and flatness over the regressors.
 
-The tests are those of Ljung, System Identification (1999), sect. 16.6. Experiments are pooled. On a large record every
-test rejects. The sizes of the effects stand beside the p-values for that reason. There is no verdict here.
+The tests are those of Ljung, System Identification (1999), sect. 16.6. Experiments are pooled. On a
+large record every test rejects. The sizes of the effects are given beside the p-values for that
+reason. There is no verdict here.
 """
 
 from __future__ import annotations
@@ -30,7 +31,8 @@ from orthaug.data.record import Experiment
 from orthaug.models.response import Response
 
 LAGS = 25  # as MATLAB's `resid`
-PRACTICALLY_WHITE = 0.05  # correlations below this are no matter, however sure a long record makes them
+# Correlations below this are no matter, however sure a long record makes them
+PRACTICALLY_WHITE = 0.05
 ROUNDING = 1e-14  # of the output's deviation: a residual that says nothing
 
 Channels = dict[str, list[Vector]]
@@ -38,7 +40,10 @@ Channels = dict[str, list[Vector]]
 
 @dataclass(frozen=True, eq=False)
 class ResidualTest:
-    """The tests of one output's residual; None for what does not exist, as for a residual that is constant."""
+    """The tests of one output's residual.
+
+    None for what does not exist, as for a residual that is constant.
+    """
 
     name: str
     n: int
@@ -51,32 +56,41 @@ class ResidualTest:
     white: bool | None
     """Whether Ljung-Box does not reject at `level`."""
     order: int | None
-    """Order of the autoregression that stands for the residual's colour."""
+    """Order of the autoregression that models the residual's colour."""
     cross: Mapping[str, CrossTest | None]
     correlated_inputs: tuple[str, ...]
-    """Inputs whose joint test is below `level`, divided by the number of inputs tested (Bonferroni)."""
+    """Inputs whose joint test is below `level`, divided by the number of inputs tested
+    (Bonferroni).
+    """
     regressors: Mapping[str, RegressorTest | None]
     curved_regressors: tuple[str, ...]
-    """Regressors over which the residual is not flat, at `level` divided by the number of regressors tested."""
+    """Regressors over which the residual is not flat, at `level` divided by the number of
+    regressors tested.
+    """
     normality: Normality | None
     """Of A e, the residual made white: of coloured samples Jarque-Bera rejects far too often."""
     largest_acf: float | None
     largest_cross: float | None
     largest_share: float | None
-    """Largest |r_e| beyond lag 0, largest |r_eu| over all inputs and causal lags, largest share over all regressors."""
+    """Largest |r_e| beyond lag 0, largest |r_eu| over all inputs and causal lags, largest share
+    over all regressors.
+    """
 
     def practically_white(self, small: float = PRACTICALLY_WHITE) -> bool:
-        """White by Ljung-Box, or with correlations too small to matter."""
+        """Return whether it is white by Ljung-Box, or its correlations are too small to matter."""
         return self.white is not False or self.largest_acf is None or self.largest_acf < small
 
     def follows(self, small: float = PRACTICALLY_WHITE) -> list[str]:
-        """Inputs that the residual follows: surely, by enough to matter, and beyond the band of the figure."""
+        """Return inputs that the residual follows significantly, and by enough to matter.
+
+        The correlation is also beyond the band of the figure.
+        """
         band = max([small, *(test.band for test in self.cross.values() if test is not None)])
         named = [(name, self.cross[name]) for name in self.correlated_inputs]
         return [name for name, test in named if test is not None and test.largest > band]
 
     def curved_over(self, share: float) -> list[str]:
-        """Regressors over which it is surely curved, by more than a share of its variance."""
+        """Return regressors over which it is surely curved, by more than a share of variance."""
         named = [(name, self.regressors[name]) for name in self.curved_regressors]
         return [name for name, test in named if test is not None and test.share > share]
 
@@ -93,9 +107,10 @@ def analyse(
     level: float = 0.01,
     fitted: int = 0,
 ) -> tuple[ResidualTest, ...]:
-    """All tests of the residual of every output, in their order.
+    """Return all tests of the residual of every output, in their order.
 
-    The regressor tests ask for bin means that differ from the overall mean: an offset, reported as `mean`, is no curve.
+    The regressor tests ask for bin means that differ from the overall mean: an offset, reported as
+    `mean`, is no curve.
 
     Args:
         residuals: per experiment (N_i, ny), measured less model, in the outputs' units.
@@ -107,7 +122,8 @@ def analyse(
         fitted: dynamic parameters whose fit has used up degrees of freedom of Ljung-Box.
 
     Raises:
-        InputError: experiments, rows or columns that do not match, a name twice, or a setting out of range.
+        InputError: experiments, rows or columns that do not match, a name twice, or a setting out
+            of range.
 
     Examples:
         >>> e, u = np.random.default_rng(0).normal(size=(2, 500, 1))
@@ -126,7 +142,13 @@ def analyse(
 
 
 def _one_output(
-    name: str, e: list[Vector], inputs: Channels, regressors: Channels, lags: int, level: float, fitted: int
+    name: str,
+    e: list[Vector],
+    inputs: Channels,
+    regressors: Channels,
+    lags: int,
+    level: float,
+    fitted: int,
 ) -> ResidualTest:
     whole = np.concatenate(e)
     n, finite = len(whole), len(whole) > 0 and bool(np.abs(whole).max() < LARGEST)
@@ -148,10 +170,16 @@ def _one_output(
         correlated_inputs=_rejected(cross, level),
         regressors=curves,
         curved_regressors=_rejected(curves, level),
-        normality=None if a is None else normality([np.convolve(one, a, "valid") for one in e if len(one) >= len(a)]),
+        normality=None
+        if a is None
+        else normality([np.convolve(one, a, "valid") for one in e if len(one) >= len(a)]),
         largest_acf=None if acf is None or len(acf) < 2 else float(np.abs(acf[1:]).max()),
-        largest_cross=max((test.largest for test in cross.values() if test is not None), default=None),
-        largest_share=max((test.share for test in curves.values() if test is not None), default=None),
+        largest_cross=max(
+            (test.largest for test in cross.values() if test is not None), default=None
+        ),
+        largest_share=max(
+            (test.share for test in curves.values() if test is not None), default=None
+        ),
     )
 
 
@@ -160,35 +188,45 @@ def _rejected(tests: Mapping[str, Any], level: float) -> tuple[str, ...]:
     return tuple(name for name, value in p.items() if value < level / len(p))
 
 
-def _channels(experiments: Sequence[Matrix], names: Sequence[str], what: str, lengths: Sequence[int]) -> Channels:
-    """Every channel in one piece per experiment, by its name."""
+def _channels(
+    experiments: Sequence[Matrix], names: Sequence[str], what: str, lengths: Sequence[int]
+) -> Channels:
+    """Return every channel in one piece per experiment, by its name."""
     check_unique(names, f"`{what}`:")
     if len(experiments) != len(lengths) or not lengths:
-        raise InputError(f"`{what}` has {len(experiments)} experiments but `residuals` has {len(lengths)}; at least 1.")
+        raise InputError(
+            f"`{what}` has {len(experiments)} experiments but `residuals` has {len(lengths)}; "
+            "at least 1."
+        )
     for i, (one, rows) in enumerate(zip(experiments, lengths, strict=True)):
         if np.shape(one) != (rows, len(names)):
             shape = f"{np.shape(one)}; its residuals and names make {(rows, len(names))}"
             raise InputError(f"`{what}` of experiment {i} has the shape {shape}.")
-    return {name: [np.asarray(one, dtype=float)[:, j] for one in experiments] for j, name in enumerate(names)}
+    return {
+        name: [np.asarray(one, dtype=float)[:, j] for one in experiments]
+        for j, name in enumerate(names)
+    }
 
 
 def errors_of(response: Response, skip: int = 0) -> list[Matrix]:
-    """Measured less model of each experiment, over the rows with a value, without the first `skip` of them."""
+    """Return measured less model of each experiment, on rows with a value, after `skip` of them."""
     return [(t.measured - t.model)[t.start :][skip:] for t in response.trajectories]  # type: ignore[operator]
 
 
 def rms_errors(response: Response, skip: int = 0) -> Vector:
-    """RMS error of every output."""
+    """Return the RMS error of every output."""
     with np.errstate(all="ignore"):
         return np.sqrt(np.mean(np.concatenate(errors_of(response, skip)) ** 2, axis=0))
 
 
 @dataclass(frozen=True, eq=False)
 class RunningTest:
-    """Whiteness and independence of one output's residual over all rows; None for what does not exist.
+    """Whiteness and independence of one output's residual over all rows.
 
-    The band of a cross-correlation takes `Var r_eu(τ) = P/N` with `P = Σ_m r_e(m) r_u(m)` over |m| ≤ M. There is no
-    joint test: it needs the rows.
+    None for what does not exist.
+
+    The band of a cross-correlation takes `Var r_eu(τ) = P/N` with `P = Σ_m r_e(m) r_u(m)` over |m|
+    ≤ M. There is no joint test: it needs the rows.
     """
 
     name: str
@@ -215,7 +253,7 @@ class RunningResidual:
         self._ended = ("", -1)
 
     def add(self, residual: Matrix, inputs: Matrix, *, begins: bool) -> None:
-        """Rows (m, ny) and (m, nu) that follow those before, unless an experiment `begins`."""
+        """Add rows (m, ny) and (m, nu) that follow those before, unless an experiment `begins`."""
         values = np.concatenate([residual, inputs], axis=1)
         if not len(values):
             return
@@ -234,13 +272,13 @@ class RunningResidual:
         self._before = joined[max(len(joined) - self.lags, 0) :]
 
     def watch(self, piece: Experiment, first: int, residual: Matrix) -> None:
-        """The residual of a piece from its row `first` on."""
+        """Add the residual of a piece from its row `first` on."""
         follows = self._ended == (piece.source, piece.offset + first)
         self.add(residual, piece.inputs[first:], begins=not follows)
         self._ended = piece.source, piece.offset + len(piece)
 
     def tests(self, level: float = 0.01) -> tuple[RunningTest, ...]:
-        """Of every output whose residual is finite and moves."""
+        """Return the tests of every output whose residual is finite and not constant."""
         n = int(self._pairs[0])
         if n <= self.lags or not np.abs(self._products[0]).max() < LARGEST:
             return ()
@@ -257,7 +295,9 @@ class RunningResidual:
                 continue
             acf, centre = r[:, i, i], float(self._origin[i] + mean[i])
             cross = {
-                other: self._cross(r, i, len(self.outputs) + j, n, quantile) if moves[len(self.outputs) + j] else None
+                other: self._cross(r, i, len(self.outputs) + j, n, quantile)
+                if moves[len(self.outputs) + j]
+                else None
                 for j, other in enumerate(self.inputs)
             }
             box = ljung_box_of(acf, self._pairs[1:], n)

@@ -1,4 +1,4 @@
-"""Which standard errors a fit has by default: plain ones, robust ones against colour or uneven size, or none."""
+"""Default standard errors of a fit: plain, robust against colour or uneven size, or none."""
 
 from __future__ import annotations
 
@@ -18,9 +18,14 @@ from orthaug.inference.influence import LARGEST, Influence, one_step_slopes
 from orthaug.models.response import Response
 from orthaug.physics.streamed import StreamedProblem
 
-_FEWEST_ROWS, _ROWS_PER_TERM = 100, 10  # rows that a sum of autocovariances needs, in all and for each of its lags
-_FEWEST_BLOCKS = 12  # of which the variance of a sum can be told, Student's t counting them; shorter blocks held 85 %
-_FEWEST_INDEPENDENT = 10  # errors less one, by which an autoregressive model tells a variance: Student's t counts them
+_FEWEST_ROWS, _ROWS_PER_TERM = (
+    100,
+    10,
+)  # rows that a sum of autocovariances needs, in all and for each of its lags
+# A variance of a sum needs so many blocks, which Student's t counts; shorter ones covered 85 %.
+_FEWEST_BLOCKS = 12
+# An autoregressive model needs so many independent errors, less one; Student's t counts them.
+_FEWEST_INDEPENDENT = 10
 _FEWEST_TESTED = 40  # rows from which White's test is asked
 _SHORT = 5  # steps of a block of errors that are white and of uneven size
 UNEVEN = 0.05  # level of White's test
@@ -29,14 +34,17 @@ _LEVEL = 0.01  # of the test whether a residual is white
 
 
 def robust_where_asked(fit: Estimate, response: Response) -> Estimate:
-    """The fit with the standard errors that its errors ask for: plain, or robust against colour or uneven size.
+    """Return the fit with standard errors that suit its errors: plain, or robust.
 
-    One step ahead that is HC3 where White's test finds that the size of the errors goes with what moves θ, and Newey
-    and West where they are coloured and the rows suffice. `response` is the prediction of the training rows.
+    Robust ones hold under colour or uneven size.
+
+    One step ahead that is HC3 where White's test finds that the size of the errors goes with what
+    moves θ, and Newey and West where they are coloured and the rows suffice. `response` is the
+    prediction of the training rows.
     """
     if not fit.status.ok or fit.covariance is None or fit.at_bound:
         return fit
-    if fit.criterion.flown is not None:
+    if fit.criterion.free_run is not None:
         return robust_free_run(fit)
     lags, rows = _memory(fit, response), len(fit.problem.rows)
     if lags is not None:
@@ -44,17 +52,19 @@ def robust_where_asked(fit: Estimate, response: Response) -> Estimate:
     errors = np.concatenate(errors_of(response)) @ fit.problem.weight.matrix.T
     if np.all(rms_errors(response) / fit.problem.deviation < ROUNDING) or len(errors) != rows:
         return fit
-    if not _has_rows(fit, rows) or not _is_uneven(fit, one_step_slopes(fit.problem, fit.model), errors):
+    if not _has_rows(fit, rows) or not _is_uneven(
+        fit, one_step_slopes(fit.problem, fit.model), errors
+    ):
         return fit
     return _robust(fit, None, "hc3")
 
 
 def robust_free_run(fit: Any) -> Any:
-    """The fit of a free run, of lagged physics or of a motion, with batch means where its errors ask for them.
+    """Return the fit of a free run with standard errors by batch means, where errors are coloured.
 
-    Where they are coloured and the record holds too few stretches that do not remember each other for blocks, a model
-    of their colour takes the place of these; where it says that the record is too short, there are no standard errors,
-    and no interval.
+    Where they are coloured and the record holds too few stretches that do not remember each other
+    for blocks, a model of their colour takes the place of these; where it says that the record is
+    too short, there are no standard errors, and no interval.
     """
     if not fit.status.ok or fit.covariance is None or fit.scores is None:
         return fit
@@ -64,13 +74,18 @@ def robust_free_run(fit: Any) -> Any:
         steps = block_of(fit)
         return _by_colour(fit) if steps is None else _robust(fit, steps)
     segments = fit.scores.segments
-    if not _has_rows(fit, segments.count) or not _is_uneven(fit, fit.scores.slopes(), fit.scores.whitened()):
+    if not _has_rows(fit, segments.count) or not _is_uneven(
+        fit, fit.scores.slopes(), fit.scores.whitened()
+    ):
         return fit
     return _robust(fit, _SHORT, "batch-means-uneven")
 
 
 def _by_colour(fit: Any) -> Any:
-    """The fit with the standard errors of an autoregressive model of its errors; without any where these are few."""
+    """Return the fit with the standard errors of an autoregressive model of its errors.
+
+    Without any where these are few.
+    """
     if _has_rows(fit, fit.scores.segments.count):
         found = _robust(fit, None, "autoregressive")
         if found.std_kind == "autoregressive" and found.freedom >= _FEWEST_INDEPENDENT:
@@ -79,7 +94,7 @@ def _by_colour(fit: Any) -> Any:
 
 
 def _robust(fit: Any, lags: int | None, kind: str | None = None) -> Any:
-    """The fit with robust standard errors; as it is where there can be none."""
+    """Return the fit with robust standard errors; as it is where there can be none."""
     try:
         return fit.robust(lags) if kind is None else fit.robust(lags, kind)
     except InputError:  # an ensemble, or a fit without statistics
@@ -87,15 +102,19 @@ def _robust(fit: Any, lags: int | None, kind: str | None = None) -> Any:
 
 
 def _has_rows(fit: Any, rows: int) -> bool:
-    """Whether the derivatives of every row exist, and fit into memory."""
+    """Return whether the derivatives of every row exist, and fit into memory."""
     gram = fit.model.statistics.gram
-    if gram is None or fit.model.numbers.tilt is not None or isinstance(fit.problem, StreamedProblem):
+    if (
+        gram is None
+        or fit.model.numbers.tilt is not None
+        or isinstance(fit.problem, StreamedProblem)
+    ):
         return False
     return rows >= _FEWEST_TESTED and rows * len(fit.problem.deviation) * len(gram) <= LARGEST
 
 
 def _is_uneven(fit: Any, slopes: Any, errors: Matrix) -> bool:
-    """Whether White's test rejects errors whose size has nothing to do with what moves the parameters."""
+    """Return whether White's test finds the errors' size related to the parameters' slopes."""
     made = fit.moves_by()
     if made is None or not np.isfinite(slopes).all() or not np.isfinite(errors).all():
         return False
@@ -105,30 +124,41 @@ def _is_uneven(fit: Any, slopes: Any, errors: Matrix) -> bool:
     prior = np.broadcast_to(statistics.ridge, len(statistics.gram) - nt)[moves[nt:]]
     own = replace(statistics, gram=statistics.gram[np.ix_(moves, moves)], ridge=prior)
     with one_blas_thread():
-        return Influence.of(slopes[..., moves], own, k[:, moves], int(moves[:nt].sum())).uneven(errors) < UNEVEN
+        return (
+            Influence.of(slopes[..., moves], own, k[:, moves], int(moves[:nt].sum())).uneven(errors)
+            < UNEVEN
+        )
 
 
 def _withheld(fit: Any) -> Any:
-    """The fit without standard errors, which says why."""
+    """Return the fit without standard errors, which says why."""
     segments = fit.scores.segments
     lengths = [correlation_length(errors) for errors in fit.scores.errors()]
     known = [length for length in lengths if length is not None]
     if len(known) == len(lengths) and max(known) <= fit.scores.longest:
-        why = f"for {max(known)} steps, and the {segments.count} that were trained on hold too few stretches of that"
+        why = (
+            f"over {max(known)} steps, and the {segments.count} steps of training hold too few "
+            "stretches of that length"
+        )
     else:
         why = (
-            f"for longer than the segments that were trained on ({fit.scores.longest} steps) or a good part of the data"
+            f"over more than the segments of training ({fit.scores.longest} steps) or a good "
+            "part of the data"
         )
     each = (
         ""
         if fit.std is None
-        else "; for white errors it would be "
-        + ", ".join(f"{std:.2g} of {name}" for name, std in zip(_names(fit), fit.std, strict=True) if np.isfinite(std))
+        else " White errors would give standard errors of "
+        + ", ".join(
+            f"{std:.2g} of {name}"
+            for name, std in zip(_names(fit), fit.std, strict=True)
+            if np.isfinite(std)
+        )
+        + ", which is too small."
     )
     text = (
-        f"no standard errors and no intervals: the errors of the free run remember each other {why}, so their number "
-        f"does not say how well they average out{each}, which is too small. Longer segments, a longer record, or "
-        "physics that leaves less may tell."
+        "there are no standard errors and no intervals: the errors of the free run are correlated "
+        f"{why}.{each} Use longer segments, a longer record, or physics with smaller errors."
     )
     return replace(
         fit,
@@ -144,7 +174,7 @@ def _names(fit: Any) -> tuple[str, ...]:
 
 
 def _memory(fit: Estimate, response: Response) -> int | None:
-    """Lags for the one-step residual; None where it is white, or rounding."""
+    """Return lags for the one-step residual; None where it is white, or rounding."""
     memory = 0
     if np.all(rms_errors(response) / fit.problem.deviation < ROUNDING):
         return None
@@ -159,7 +189,10 @@ def _memory(fit: Estimate, response: Response) -> int | None:
 
 
 def block_of(fit: Any) -> int | None:
-    """Steps of a block for the errors of the free run; None where these are white, or leave too few blocks."""
+    """Return steps of a block for the errors of the free run.
+
+    None where these are white, or leave too few blocks.
+    """
     if fit.scores is None or not _is_tested(fit) or not _coloured_run(fit):
         return None
     steps = fit.scores.block()
@@ -169,18 +202,26 @@ def block_of(fit: Any) -> int | None:
 
 
 def _is_tested(fit: Any) -> bool:
-    """Whether the errors of the free run are finite and more than rounding."""
+    """Return whether the errors of the free run are finite and more than rounding."""
     errors = fit.scores.errors()  # (ny, segments, steps), 0 where a step is not scored
     size = np.sqrt(np.sum(errors**2, axis=(1, 2)) / max(fit.scores.segments.count, 1))
     return bool(np.isfinite(size).all() and not np.all(size / fit.problem.deviation < ROUNDING))
 
 
 def _coloured_run(fit: Any) -> bool:
-    """Whether the errors of the free run are coloured in some output."""
+    """Return whether the errors of the free run are coloured in some output."""
     return any(_is_coloured([one[one != 0] for one in output]) for output in fit.scores.errors())
 
 
 def _is_coloured(pieces: list[Vector]) -> bool:
-    """Whether Ljung-Box rejects a white residual and a correlation is large enough to matter."""
-    box, acf = ljung_box(pieces, LAGS), autocorrelation(pieces, sum(map(len, pieces)) // ROWS_PER_LAG)
-    return box is not None and acf is not None and box.p < _LEVEL and np.abs(acf[1:]).max() >= PRACTICALLY_WHITE
+    """Return whether Ljung-Box rejects a white residual and a correlation is sizable."""
+    box, acf = (
+        ljung_box(pieces, LAGS),
+        autocorrelation(pieces, sum(map(len, pieces)) // ROWS_PER_LAG),
+    )
+    return (
+        box is not None
+        and acf is not None
+        and box.p < _LEVEL
+        and np.abs(acf[1:]).max() >= PRACTICALLY_WHITE
+    )

@@ -1,8 +1,9 @@
-"""Excitation signals: pure functions that return (N,) samples within ±amplitude, in the channel's unit.
+"""Excitation signals: functions that return (N,) samples within ±amplitude, in channel units.
 
-Which one to use is the paper's remark after `cond:special_PE`: one under which physics and suspected terms are
-orthogonal. `odd=True`, `sign_symmetric` and `space_filling` serve that; the others are the usual ones (Pintelon and
-Schoukens 2012, ch. 5; Ljung 1999, ch. 13). Anything random needs its `seed`, and the same seed gives the same samples.
+Which one to use is the paper's remark after `cond:special_PE`: one under which physics and
+suspected terms are orthogonal. `odd=True`, `sign_symmetric` and `space_filling` serve that; the
+others are the usual ones (Pintelon and Schoukens 2012, ch. 5; Ljung 1999, ch. 13). Anything random
+needs its `seed`, and the same seed gives the same samples.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ _MOST_ORDER = 20  # lags that `space_filling` fills
 
 
 def crest_factor(u: Vector) -> float:
-    """Largest magnitude over root mean square: 1 for a binary signal, 1.41 for a sine.
+    """Return the largest magnitude over root mean square: 1 for a binary signal, 1.41 for a sine.
 
     Raises:
         InputError: a signal that is not finite, or zero everywhere.
@@ -47,11 +48,13 @@ def multisine(
     odd: bool = False,
     periods: int = 1,
 ) -> Vector:
-    """Equal cosines at all harmonics in a band, Schroeder's phases `−π i(i−1)/n` for a low crest factor.
+    """Return equal cosines at all harmonics in a band, with Schroeder's phases `−π i(i−1)/n`.
 
-    `u_k = A Σ_i cos(2π h_i k/P + φ_i)` over harmonics h_i of the period of P samples, scaled so that the largest
-    sample is `amplitude` (Schroeder 1970). With `odd` the second half of a period is the first with its sign
-    turned, so that u is orthogonal to every even function of u.
+    Such phases give a low crest factor.
+
+    `u_k = A Σ_i cos(2π h_i k/P + φ_i)` over harmonics h_i of the period of P samples, scaled so
+    that the largest sample is `amplitude` (Schroeder 1970). With `odd` the second half of a period
+    is the first with its sign turned, so that u is orthogonal to every even function of u.
 
     Args:
         samples: N.
@@ -63,13 +66,20 @@ def multisine(
     Raises:
         InputError: numbers out of range, a band that holds no harmonic.
     """
-    amplitude, sampling_time = _amplitude(amplitude), check_number(sampling_time, "sampling_time", positive=True)
+    amplitude, sampling_time = (
+        _amplitude(amplitude),
+        check_number(sampling_time, "sampling_time", positive=True),
+    )
     samples, periods = check_count(samples, "samples", 4), check_count(periods, "periods")
     if samples % periods or samples // periods < 4:
-        raise InputError(f"{samples} samples do not divide into {periods} periods of 4 or more whole samples.")
+        raise InputError(
+            f"{samples} samples do not divide into {periods} periods of 4 or more whole samples."
+        )
     period = samples // periods
     if odd and period % 2:
-        raise InputError(f"an odd multisine needs an even number of samples in a period; got {period}.")
+        raise InputError(
+            f"an odd multisine needs an even number of samples in a period; got {period}."
+        )
     harmonics = np.arange(1, (period - 1) // 2 + 1)
     if odd:
         harmonics = harmonics[::2]
@@ -77,11 +87,14 @@ def multisine(
     if band is not None:
         low, high = _band(band, sampling_time)
         slack = 1e-9  # of a harmonic: a limit that is meant to lie on one does
-        harmonics = harmonics[(harmonics >= low / resolution - slack) & (harmonics <= high / resolution + slack)]
+        harmonics = harmonics[
+            (harmonics >= low / resolution - slack) & (harmonics <= high / resolution + slack)
+        ]
     if not harmonics.size:
         raise InputError(
-            f"`band` {band} Hz holds no {'odd ' if odd else ''}harmonic: they are {resolution:g} Hz apart, "
-            "and below half the sampling frequency; widen it or take more samples."
+            f"`band` {band} Hz holds no {'odd ' if odd else ''}harmonic: they are "
+            f"{resolution:g} Hz apart, and below half the sampling frequency; widen it or take "
+            "more samples."
         )
     i = np.arange(1, len(harmonics) + 1)
     spectrum = np.zeros(period // 2 + 1, dtype=complex)
@@ -93,24 +106,31 @@ def multisine(
 
 
 def prbs(samples: int, *, amplitude: float, hold: int = 1, bits: int | None = None) -> Vector:
-    """Maximum-length pseudo-random binary sequence ±amplitude, each bit held for `hold` samples.
+    """Return a maximum-length pseudo-random binary sequence ±amplitude, `hold` samples a bit.
 
     Args:
         samples: N.
         hold: samples a bit: the sequence is flat up to about 0.4/(hold · Ts) Hz.
-        bits: of the shift register, whose period is (2^bits − 1) · hold samples; None for the shortest that
-            does not repeat within N.
+        bits: of the shift register, whose period is (2^bits − 1) · hold samples; None for the
+            shortest that does not repeat within N.
 
     Raises:
         InputError: numbers out of range, more samples than the longest register gives.
     """
-    amplitude, samples, hold = _amplitude(amplitude), check_count(samples, "samples"), check_count(hold, "hold")
+    amplitude, samples, hold = (
+        _amplitude(amplitude),
+        check_count(samples, "samples"),
+        check_count(hold, "hold"),
+    )
     length = -(-samples // hold)
     if bits is None:
         bits = max(2, math.ceil(math.log2(length + 1)))
     check_count(bits, "bits", 2)
     if bits > _MOST_BITS:
-        raise InputError(f"a register of {bits} bits is too long; at most {_MOST_BITS}. Use fewer samples or a hold.")
+        raise InputError(
+            f"a register of {bits} bits is too long; at most {_MOST_BITS}. Use fewer samples "
+            "or a hold."
+        )
     sequence = scipy.signal.max_len_seq(bits)[0]
     return amplitude * _held(np.resize(sequence, length), hold, samples)
 
@@ -123,7 +143,9 @@ def swept_sine(
     sampling_time: float = 1.0,
     logarithmic: bool = False,
 ) -> Vector:
-    """A sine whose frequency runs through `band` (Hz, from first to second) once in N samples, from zero on.
+    """Return a sine whose frequency sweeps through `band` (Hz) once in N samples, from zero on.
+
+    It sweeps from the first frequency to the second.
 
     Raises:
         InputError: numbers out of range, a frequency above half the sampling frequency.
@@ -148,25 +170,33 @@ def swept_square(
     sampling_time: float = 1.0,
     logarithmic: bool = False,
 ) -> Vector:
-    """The sign of `swept_sine`, ±amplitude (the positive level where the sine is zero)."""
-    wave = swept_sine(samples, amplitude=1.0, band=band, sampling_time=sampling_time, logarithmic=logarithmic)
+    """Return the sign of `swept_sine`, ±amplitude (the positive level where the sine is zero)."""
+    wave = swept_sine(
+        samples, amplitude=1.0, band=band, sampling_time=sampling_time, logarithmic=logarithmic
+    )
     return _amplitude(amplitude) * np.where(wave >= 0, 1.0, -1.0)
 
 
 def square(samples: int, *, amplitude: float, period: int) -> Vector:
-    """+amplitude for half a period, −amplitude for the other; `period` is an even number of samples.
+    """Return +amplitude for half a period, −amplitude for the other.
+
+    `period` is an even number of samples.
 
     Raises:
         InputError: numbers out of range, an odd period.
     """
     period = check_count(period, "period", 2)
     if period % 2:
-        raise InputError(f"`period` must be an even number of samples, half for each level; got {period}.")
+        raise InputError(
+            f"`period` must be an even number of samples, half for each level; got {period}."
+        )
     return binary_pattern(samples, [1, 0], amplitude=amplitude, hold=period // 2)
 
 
-def binary_pattern(samples: int, pattern: Sequence[int] | np.ndarray, *, amplitude: float, hold: int = 1) -> Vector:
-    """A pattern of 0 and 1 as ∓amplitude, each held for `hold` samples, repeated until there are N.
+def binary_pattern(
+    samples: int, pattern: Sequence[int] | np.ndarray, *, amplitude: float, hold: int = 1
+) -> Vector:
+    """Return a pattern of 0 and 1 as ∓amplitude, each for `hold` samples, repeated to N samples.
 
     Raises:
         InputError: numbers out of range, a pattern that is empty or holds anything but 0 and 1.
@@ -175,48 +205,72 @@ def binary_pattern(samples: int, pattern: Sequence[int] | np.ndarray, *, amplitu
         >>> binary_pattern(5, [1, 0, 0], amplitude=2.0)
         array([ 2., -2., -2.,  2., -2.])
     """
-    amplitude, samples, hold = _amplitude(amplitude), check_count(samples, "samples"), check_count(hold, "hold")
+    amplitude, samples, hold = (
+        _amplitude(amplitude),
+        check_count(samples, "samples"),
+        check_count(hold, "hold"),
+    )
     levels = np.asarray(pattern)
-    if levels.ndim != 1 or not levels.size or levels.dtype.kind not in "biuf" or not np.isin(levels, (0, 1)).all():
+    if (
+        levels.ndim != 1
+        or not levels.size
+        or levels.dtype.kind not in "biuf"
+        or not np.isin(levels, (0, 1)).all()
+    ):
         raise InputError(f"`pattern` must be a sequence of 0 and 1; got {pattern!r}.")
     return amplitude * _held(np.resize(levels, -(-samples // hold)), hold, samples)
 
 
-def white_gaussian(samples: int, *, amplitude: float, seed: int, deviation: float | None = None) -> Vector:
-    """Independent normal samples of standard deviation `deviation` (amplitude/3 by default), clipped to ±amplitude.
+def white_gaussian(
+    samples: int, *, amplitude: float, seed: int, deviation: float | None = None
+) -> Vector:
+    """Return independent normal samples of size `deviation`, clipped to ±amplitude.
+
+    `deviation` is their standard deviation, amplitude/3 by default.
 
     Raises:
         InputError: numbers out of range.
     """
     amplitude, rng = _amplitude(amplitude), _generator(seed)
-    deviation = amplitude / 3 if deviation is None else check_number(deviation, "deviation", positive=True)
-    return np.clip(rng.normal(0.0, deviation, check_count(samples, "samples")), -amplitude, amplitude)
+    deviation = (
+        amplitude / 3 if deviation is None else check_number(deviation, "deviation", positive=True)
+    )
+    return np.clip(
+        rng.normal(0.0, deviation, check_count(samples, "samples")), -amplitude, amplitude
+    )
 
 
 def white_uniform(samples: int, *, amplitude: float, seed: int) -> Vector:
-    """Independent samples, uniform on [−amplitude, amplitude].
+    """Return independent samples, uniform on [−amplitude, amplitude].
 
     Raises:
         InputError: numbers out of range.
     """
-    return _amplitude(amplitude) * _generator(seed).uniform(-1.0, 1.0, check_count(samples, "samples"))
+    return _amplitude(amplitude) * _generator(seed).uniform(
+        -1.0, 1.0, check_count(samples, "samples")
+    )
 
 
 def white_binary(samples: int, *, amplitude: float, seed: int, hold: int = 1) -> Vector:
-    """Independent ±amplitude with equal chances, each held for `hold` samples.
+    """Return independent ±amplitude with equal chances, each held for `hold` samples.
 
     Raises:
         InputError: numbers out of range.
     """
-    amplitude, samples, hold = _amplitude(amplitude), check_count(samples, "samples"), check_count(hold, "hold")
+    amplitude, samples, hold = (
+        _amplitude(amplitude),
+        check_count(samples, "samples"),
+        check_count(hold, "hold"),
+    )
     return amplitude * _held(_generator(seed).integers(0, 2, -(-samples // hold)), hold, samples)
 
 
 def sign_symmetric(u: Vector) -> Vector:
-    """u followed by −u, (2N,): the paper's symmetric data (Sect. 5.1 and 5.2).
+    """Return u followed by −u, (2N,): the paper's symmetric data (Sect. 5.1 and 5.2).
 
-    On a static model with odd physics it makes every even unmodelled term orthogonal exactly (`cond:special_PE`);
-    with lags it does so up to the rows that reach across the seam, and up to the memory of the outputs.
+    On a static model with odd physics it makes every even unmodelled term orthogonal exactly
+    (`cond:special_PE`); with lags it does so up to the rows that reach across the seam, and up to
+    the memory of the outputs.
 
     Raises:
         InputError: a signal that is empty or not finite.
@@ -226,45 +280,57 @@ def sign_symmetric(u: Vector) -> Vector:
 
 
 def limit_rate(u: Vector, largest_step: float, start: float | None = None) -> Vector:
-    """The signal that follows u with steps of at most `largest_step` a sample, (N,): what a slow actuator does.
+    """Return u with steps limited to `largest_step` a sample, (N,), as by a slow actuator.
 
-    `v_k = v_{k−1} + clip(u_k − v_{k−1}, ±largest_step)`; it stays within the range of u and `start`.
+    `v_k = v_{k−1} + clip(u_k − v_{k−1}, ±largest_step)`; it stays within the range of u and
+    `start`.
 
     Args:
         u: the wanted signal (N,).
         largest_step: in the unit of u, per sample (rate limit times the sampling time).
-        start: the value before the first sample; None for `u[0]`. Symmetries of u survive only up to the
-            run-in, so limit the rate of a signal before `sign_symmetric`, not after, where the seam may jump.
+        start: the value before the first sample; None for `u[0]`. Symmetries of u survive only up
+            to the run-in, so limit the rate of a signal before `sign_symmetric`, not after, where
+            the seam may jump.
 
     Raises:
         InputError: a signal that is not finite, a step that is not positive.
     """
     u, step = _signal(u), check_number(largest_step, "largest_step", positive=True)
-    if start is not None and not (isinstance(start, int | float | np.number) and math.isfinite(start)):
+    if start is not None and not (
+        isinstance(start, int | float | np.number) and math.isfinite(start)
+    ):
         raise InputError(f"`start` must be a finite number; got {start!r}.")
     value = float(u[0] if start is None else start)
     limited = np.empty(len(u))
     for k, wanted in enumerate(u.tolist()):
-        value = wanted if abs(wanted - value) <= step else value + math.copysign(step, wanted - value)
+        value = (
+            wanted if abs(wanted - value) <= step else value + math.copysign(step, wanted - value)
+        )
         limited[k] = value
     return limited
 
 
-def space_filling(samples: int, order: int, *, amplitude: float, seed: int, spread: float = 1.0) -> Vector:
-    """A sequence whose vectors of `order` successive samples fill the box [−amplitude, amplitude]^order evenly.
+def space_filling(
+    samples: int, order: int, *, amplitude: float, seed: int, spread: float = 1.0
+) -> Vector:
+    """Return a sequence whose vectors of `order` successive samples fill their box evenly.
 
-    A de Bruijn sequence (a random Eulerian circuit of the graph whose nodes are order − 1 symbols) over
-    `m = ⌊(N − order + 1)^(1/order)⌋` levels meets each of the m^order cells of the box exactly once; within its
-    level the successive visits take the van der Corput numbers. Use it where the regressor is
-    `u[k-nk] … u[k-nk-nb+1]`, with order = nb: nk is only a delay.
+    The box is [−amplitude, amplitude]^order.
+
+    A de Bruijn sequence (a random Eulerian circuit of the graph whose nodes are order − 1 symbols)
+    over `m = ⌊(N − order + 1)^(1/order)⌋` levels meets each of the m^order cells of the box exactly
+    once; within its level the successive visits take the van der Corput numbers. Use it where the
+    regressor is `u[k-nk] … u[k-nk-nb+1]`, with order = nb: nk is only a delay.
 
     Args:
-        samples: N, at least 2^order + order − 1; what is left after one circuit runs through it again.
-        order: lags to fill, 1 to 20. What it gains over white noise shrinks with every lag: the fill distance is 0.63
-            of the white median at 1000 samples of 2 lags, 0.72 at 1500 of 3, 0.84 at 4000 of 5.
+        samples: N, at least 2^order + order − 1; what is left after one circuit runs through it
+            again.
+        order: lags to fill, 1 to 20. What it gains over white noise shrinks with every lag: the
+            fill distance is 0.63 of the white median at 1000 samples of 2 lags, 0.72 at 1500 of 3,
+            0.84 at 4000 of 5.
         seed: of the circuit.
-        spread: share of a level's width that is used; 1 for all, the most uniform; 0 for the m levels alone,
-            the smallest fill distance and, over one circuit, exact symmetry.
+        spread: share of a level's width that is used; 1 for all, the most uniform; 0 for the m
+            levels alone, the smallest fill distance and, over one circuit, exact symmetry.
 
     Raises:
         InputError: numbers out of range, too few samples to visit 2 levels in every lag.
@@ -273,26 +339,37 @@ def space_filling(samples: int, order: int, *, amplitude: float, seed: int, spre
     order, spread = check_count(order, "order"), check_number(spread, "spread")
     rng = _generator(seed)
     if order > _MOST_ORDER or spread > 1:
-        raise InputError(f"`order` must be at most {_MOST_ORDER} and `spread` at most 1; got {order!r} and {spread!r}.")
+        raise InputError(
+            f"`order` must be at most {_MOST_ORDER} and `spread` at most 1; got {order!r} and "
+            f"{spread!r}."
+        )
     windows = samples - order + 1
     if windows < 2**order:
         raise InputError(
-            f"{samples} samples cannot fill {order} lags; give at least {2**order + order - 1}, or white_uniform."
+            f"{samples} samples cannot fill {order} lags; give at least "
+            f"{2**order + order - 1}, or white_uniform."
         )
     levels = round(windows ** (1.0 / order))
     levels -= levels**order > windows
     circuit = _de_bruijn(levels, order, rng)
     symbols = np.concatenate([circuit[len(circuit) - order + 1 :], np.resize(circuit, windows)])
     offset = np.empty(samples)
-    for visits in np.split(np.argsort(symbols, kind="stable"), np.cumsum(np.bincount(symbols))[:-1]):
+    for visits in np.split(
+        np.argsort(symbols, kind="stable"), np.cumsum(np.bincount(symbols))[:-1]
+    ):
         offset[visits] = _van_der_corput(len(visits)) + 0.5 / len(visits) - 0.5
-    return np.clip((2.0 * (symbols + 0.5 + spread * offset) - levels) / levels, -1.0, 1.0) * amplitude
+    return (
+        np.clip((2.0 * (symbols + 0.5 + spread * offset) - levels) / levels, -1.0, 1.0) * amplitude
+    )
 
 
 def fill_distance(u: Vector, order: int, *, amplitude: float) -> float:
-    """How far a point of the box [−amplitude, amplitude]^order can be from all lag vectors of u, in units of amplitude.
+    """Return the largest distance of a point of the box from all lag vectors of u, over amplitude.
 
-    Euclidean, over 4096 points of a Sobol sequence: a lower bound of the true one, the same on every call.
+    The box is [−amplitude, amplitude]^order.
+
+    Euclidean, over 4096 points of a Sobol sequence: a lower bound of the true one, the same on
+    every call.
 
     Raises:
         InputError: numbers out of range, fewer samples than `order`.
@@ -306,7 +383,7 @@ def fill_distance(u: Vector, order: int, *, amplitude: float) -> float:
 
 
 def lag_vectors(u: Vector, order: int) -> Matrix:
-    """Rows `u[k], u[k-1], …, u[k-order+1]`, (N − order + 1, order).
+    """Return rows `u[k], u[k-1], …, u[k-order+1]`, (N − order + 1, order).
 
     Raises:
         InputError: a signal that is not finite or shorter than `order`.
@@ -318,10 +395,11 @@ def lag_vectors(u: Vector, order: int) -> Matrix:
 
 
 def _de_bruijn(levels: int, order: int, rng: np.random.Generator) -> np.ndarray:
-    """A cyclic sequence of `levels**order` symbols in which every word of `order` symbols stands once.
+    """Return a cyclic sequence of `levels**order` symbols that holds every word of `order` once.
 
-    Hierholzer's algorithm on the graph of words of order − 1 symbols. The branches are shuffled, so that a part of
-    the sequence is even too: the usual lexicographic sequence spends its first part on the lowest levels.
+    Hierholzer's algorithm on the graph of words of order − 1 symbols. The branches are shuffled, so
+    that a part of the sequence is even too: the usual lexicographic sequence spends its first part
+    on the lowest levels.
     """
     nodes = levels ** (order - 1)
     branches = rng.permuted(np.tile(np.arange(levels), (nodes, 1)), axis=1).tolist()
@@ -339,14 +417,14 @@ def _de_bruijn(levels: int, order: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def _van_der_corput(count: int) -> Vector:
-    """The first `count` radical inverses in base 2, spread to the multiples of 1/count in [0, 1)."""
+    """Return the first `count` radical inverses in base 2, as multiples of 1/count in [0, 1)."""
     from scipy.stats import qmc
 
     return np.argsort(np.argsort(qmc.Halton(1, scramble=False).random(count)[:, 0])) / count
 
 
 def _held(bits: Any, hold: int, samples: int) -> Vector:
-    """0 as -1, 1 as 1."""
+    """Return the samples of held bits, 0 as -1 and 1 as 1."""
     return np.repeat(2.0 * bits - 1.0, hold)[:samples]
 
 
@@ -361,19 +439,33 @@ def _generator(seed: Any) -> np.random.Generator:
 def _signal(u: Any) -> Vector:
     column = as_signal(u, "u")
     if column.shape[1] != 1 or not len(column):
-        raise InputError(f"`u` must be one channel of at least one sample, (N,); got shape {np.shape(u)}.")
+        raise InputError(
+            f"`u` must be one channel of at least one sample, (N,); got shape {np.shape(u)}."
+        )
     return column[:, 0]
 
 
 def _band(band: Any, sampling_time: float, *, falling: bool = False) -> tuple[float, float]:
-    """Two frequencies, Hz, of 0 to Nyquist's; the second larger, or at least another one where `falling` is allowed."""
+    """Return two frequencies, Hz, of 0 to Nyquist's.
+
+    The second larger, or at least another one where `falling` is allowed.
+    """
     highest = 0.5 / sampling_time
-    numbers = isinstance(band, Sequence | np.ndarray) and not isinstance(band, str) and len(band) == 2
-    if not numbers or not all(isinstance(f, int | float | np.number) and math.isfinite(f) for f in band):
+    numbers = (
+        isinstance(band, Sequence | np.ndarray) and not isinstance(band, str) and len(band) == 2
+    )
+    if not numbers or not all(
+        isinstance(f, int | float | np.number) and math.isfinite(f) for f in band
+    ):
         raise InputError(f"`band` must be two frequencies in Hz; got {band!r}.")
     low, high = float(band[0]), float(band[1])
     if min(low, high) < 0 or max(low, high) > highest * (1 + 1e-12):
-        raise InputError(f"`band` must lie between 0 and {highest:g} Hz, half the sampling frequency; got {band!r}.")
+        raise InputError(
+            f"`band` must lie between 0 and {highest:g} Hz, half the sampling frequency; got "
+            f"{band!r}."
+        )
     if low == high if falling else low > high:
-        raise InputError(f"`band` must run from the lower to the higher of two frequencies; got {band!r}.")
+        raise InputError(
+            f"`band` must run from the lower to the higher of two frequencies; got {band!r}."
+        )
     return low, high

@@ -1,7 +1,7 @@
-"""Suspected unmodelled terms δ(x): friction, drag, hardening and the like, as expressions of raw lags.
+"""Suspected unmodelled terms δ(x): friction, drag, hardening, as expressions of raw lags.
 
-They are the "suspected unmodeled terms" of the paper's remark after `cond:special_PE`: what the physics
-leaves out by intention, known in form though not in size.
+They are the "suspected unmodeled terms" of the paper's remark after `cond:special_PE`: what the
+physics leaves out by intention, known in form though not in size.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from orthaug.physics.problem import Problem
 
 
 class _Kind(NamedTuple):
-    """How a kind writes its expression: `text(x, w)` of the channel expression x and the width w."""
+    """Expression of a kind: `text(x, w)` of the channel expression x and the width w."""
 
     text: Callable[[str, str], str]
     width: bool = False
@@ -46,27 +46,39 @@ _KINDS = {
 }
 KINDS = tuple(_KINDS)
 WIDTHS = tuple(kind for kind, entry in _KINDS.items() if entry.width)  # the kinds that need a width
-ODD_JUMPS = ("coulomb", "stribeck", "stribeck_gauss")  # the kinds that jump where their argument changes sign
+ODD_JUMPS = (
+    "coulomb",
+    "stribeck",
+    "stribeck_gauss",
+)  # the kinds that jump where their argument changes sign
 _VELOCITY = ("coulomb", "stribeck", "quadratic_drag", "cubic")
 _POSITION = ("cubic", "dead_zone")
-_SINGLE = (*_POSITION, "saturation", "coulomb")  # of an output read at one lag only, which may be a velocity
+_SINGLE = (
+    *_POSITION,
+    "saturation",
+    "coulomb",
+)  # of an output read at one lag only, which may be a velocity
 _CLEARLY = 0.05  # of the largest value
-_BELOW = 0.05  # of the largest value: what is only so far below 0 counts as positive, for it is noise
+# Of the largest value: what is only so far below 0 counts as positive, for it is noise
+_BELOW = 0.05
 _MULTIPLIED = 6  # lags at most, of which products are tried
 _INPUT = ("cubic", "dead_zone", "saturation")
 
 
 @dataclass(frozen=True)
 class Suspect:
-    """A suspected term `coefficient * expression` of one output; make one of a known kind with `of`.
+    """A suspected term `coefficient * expression` of one output.
 
-    `expression` is in the language of `orthaug.data.expressions` and may use the names in `constants` (kept as sorted
-    pairs), and `Ts` for the sampling time. `coefficient` is a guess of its size, in the output's unit per unit of the
-    expression, None where there is none. `output` may be left out where there is only one. `on` is what a known kind
-    acts on.
+    Make one of a known kind with `of`.
+
+    `expression` is in the language of `orthaug.data.expressions` and may use the names in
+    `constants` (kept as sorted pairs), and `Ts` for the sampling time. `coefficient` is a guess of
+    its size, in the output's unit per unit of the expression, None where there is none. `output`
+    may be left out where there is only one. `on` is what a known kind acts on.
 
     Raises:
-        InputError: an expression that is not arithmetic on lagged channels, a name or a number that is none.
+        InputError: an expression that is not arithmetic on lagged channels, a name or a number that
+            is none.
 
     Examples:
         >>> Suspect("drag", "v[k-1]*abs(v[k-1])", coefficient=-0.1).lags
@@ -85,7 +97,10 @@ class Suspect:
     def __post_init__(self) -> None:
         check_name(self.name)
         if self.output is not None and not isinstance(self.output, str):
-            raise InputError(f"suspect '{self.name}': `output` must be the name of a channel; got {self.output!r}.")
+            raise InputError(
+                f"suspect '{self.name}': `output` must be the name of a channel; got "
+                f"{self.output!r}."
+            )
         constants = _checked_constants(dict(self.constants), self.name)
         check_coefficient(self.name, self.coefficient)
         object.__setattr__(self, "constants", constants)
@@ -103,12 +118,12 @@ class Suspect:
         name: str | None = None,
         constants: Mapping[str, float] | None = None,
     ) -> Suspect:
-        """A suspect of a known kind, applied to the channel expression x = `on`.
+        """Return a suspect of a known kind, applied to the channel expression x = `on`.
 
         | kind | δ | width |
         |---|---|---|
         | `coulomb` | sign(x) | |
-        | `stribeck` | sign(x) exp(−abs(x)/width), the paper's decay from static to Coulomb friction | v_S |
+        | `stribeck` | sign(x) exp(−abs(x)/width), the paper's decay to Coulomb friction | v_S |
         | `stribeck_gauss` | sign(x) exp(−(x/width)²) | v_S |
         | `quadratic_drag` | x abs(x) | |
         | `cubic` | x³ | |
@@ -126,8 +141,8 @@ class Suspect:
             name: default the kind with its arguments, such as `coulomb(v[k-1])`.
 
         Raises:
-            InputError: an unknown kind, an argument that is missing, that the kind does not take, or that
-                does not parse.
+            InputError: an unknown kind, an argument that is missing, that the kind does not take,
+                or that does not parse.
 
         Examples:
             >>> Suspect.of("dead_zone", on="u[k-1]", width=0.5).expression
@@ -145,10 +160,12 @@ class Suspect:
             raise InputError(f"suspect '{self.name}': {error}") from None
 
     def sampled(self, sampling_time: float) -> Suspect:
-        """The suspect with this value [s] of `Ts`, where its expression reads that without declaring it."""
+        """Return the suspect with this value [s] of `Ts`, if its expression reads it undeclared."""
         if not self.parsed.unsampled:
             return self
-        return replace(self, constants=(*dict(self.constants).items(), (SAMPLING_TIME, float(sampling_time))))
+        return replace(
+            self, constants=(*dict(self.constants).items(), (SAMPLING_TIME, float(sampling_time)))
+        )
 
     @property
     def lags(self) -> tuple[Lag, ...]:
@@ -156,26 +173,30 @@ class Suspect:
         return self.parsed.lags
 
     def values(self, x: Matrix, layout: Layout, outputs: Sequence[str]) -> Matrix:
-        """δ(x) (N, ny) for a coefficient of 1: the expression in its output's column, zero in the others.
+        """Return δ(x) (N, ny) for a coefficient of 1: the expression in its output's column.
+
+        Other columns are zero.
 
         Args:
             x: regressors (N, nx) in the order of `layout`.
             outputs: names of the ny outputs.
 
         Raises:
-            InputError: lags that the layout lacks, an output that is missing or unknown, a value that is not finite.
+            InputError: lags that the layout lacks, an output that is missing or unknown, a value
+                that is not finite.
         """
         values, column = np.zeros((len(x), len(outputs))), self.form(x, layout)
         bad = np.flatnonzero(~np.isfinite(column))
         if bad.size:
             raise InputError(
-                f"suspect '{self.name}' = {self.expression} is not finite at row {bad[0]} of the regressor."
+                f"suspect '{self.name}' = {self.expression} is not finite at row {bad[0]} of "
+                "the regressor."
             )
         values[:, self.column_of(outputs)] = column
         return values
 
     def form(self, x: Matrix, layout: Layout) -> Vector:
-        """The expression on rows of the regressor (N,), also where it is not finite."""
+        """Return the expression on rows of the regressor (N,), also where it is not finite."""
         with np.errstate(all="ignore"):
             return _evaluate(self.parsed, x, layout, f"suspect '{self.name}'")
 
@@ -187,7 +208,9 @@ class Suspect:
             return 0
         if self.output not in outputs:
             hint = nearest(self.output, outputs)
-            raise InputError(f"suspect '{self.name}': unknown output '{self.output}'{hint}; known are {known}.")
+            raise InputError(
+                f"suspect '{self.name}': unknown output '{self.output}'{hint}; known are {known}."
+            )
         return list(outputs).index(self.output)
 
 
@@ -200,13 +223,15 @@ def check_name(name: Any) -> None:
 def check_coefficient(suspect: str, coefficient: Any) -> None:
     """Raise InputError for a coefficient that is no number."""
     if coefficient is not None and not is_number(coefficient):
-        raise InputError(f"suspect '{suspect}': `coefficient` must be a finite number; got {coefficient!r}.")
+        raise InputError(
+            f"suspect '{suspect}': `coefficient` must be a finite number; got {coefficient!r}."
+        )
 
 
 def written(
     kind: str, on: str | None, width: float | None, read: Callable[[str], Any], example: str
 ) -> tuple[str, str, str | None]:
-    """Expression and label of a known kind, and what it acts on in plain spaces.
+    """Return expression and label of a known kind, and its variable in plain spaces.
 
     Args:
         read: raises for what is no expression.
@@ -216,16 +241,23 @@ def written(
         InputError: an unknown kind, an argument that is missing, or that the kind does not take.
     """
     if kind not in _KINDS:
-        raise InputError(f"unknown kind of suspect '{kind}'{nearest(str(kind), KINDS)}; known are {', '.join(KINDS)}.")
+        raise InputError(
+            f"unknown kind of suspect '{kind}'{nearest(str(kind), KINDS)}; known are "
+            f"{', '.join(KINDS)}."
+        )
     if kind == "offset" and on is not None:
         raise InputError(f"an offset is the same everywhere and takes no `on`; got {on!r}.")
     if kind != "offset":
         if on is None:
-            raise InputError(f"a suspect of kind {kind} needs `on`, an expression such as {example}.")
+            raise InputError(
+                f"a suspect of kind {kind} needs `on`, an expression such as {example}."
+            )
         read(on)  # alone, so that a stray parenthesis cannot change what the kind wraps around it
         on = " ".join(on.split())
     if _KINDS[kind].width and width is None:
-        raise InputError(f"a suspect of kind {kind} needs `width`, in the unit of {on}; data_width suggests one.")
+        raise InputError(
+            f"a suspect of kind {kind} needs `width`, in the unit of {on}; data_width suggests one."
+        )
     if width is not None and not _KINDS[kind].width:
         raise InputError(f"a suspect of kind {kind} takes no `width`; got {width!r}.")
     w = "" if width is None else repr(check_number(width, "width", positive=True))
@@ -237,7 +269,9 @@ def written(
 def suspect_columns(
     suspects: Sequence[Suspect], x: Matrix, layout: Layout, outputs: Sequence[str]
 ) -> Float[np.ndarray, "ns N ny"]:
-    """δ(x) of every suspect for a coefficient of 1, (ns, N, ny), in each output's unit per unit of coefficient.
+    """Return δ(x) of every suspect for a coefficient of 1, (ns, N, ny).
+
+    The unit is that of the output per unit of the coefficient.
 
     Raises:
         InputError: two suspects of one name; as `Suspect.values`.
@@ -247,26 +281,31 @@ def suspect_columns(
     return np.stack(columns) if columns else np.zeros((0, len(x), len(outputs)))
 
 
-def data_width(on: str, x: Matrix, layout: Layout, constants: Mapping[str, float] | None = None) -> float:
-    """A width from the data's own scale: the median of |x| where x is not zero, to six digits, in the unit of `on`.
+def data_width(
+    on: str, x: Matrix, layout: Layout, constants: Mapping[str, float] | None = None
+) -> float:
+    """Return a width from the data: the median of nonzero |x|, to six digits, in the unit of `on`.
 
-    Half of the moving samples then lie inside a dead zone, a saturation or a Stribeck peak, so that the
-    data show both sides of it.
+    Half of the moving samples then lie inside a dead zone, a saturation or a Stribeck peak, so that
+    the data show both sides of it.
 
     Raises:
-        InputError: an expression that does not parse, that is not finite, or that is zero on all rows.
+        InputError: an expression that does not parse, that is not finite, or that is zero on all
+            rows.
     """
     with np.errstate(all="ignore"):
         size = np.abs(_evaluate(parse(on, constants), x, layout, f"'{on}'"))
     if not np.all(np.isfinite(size)):
-        raise InputError(f"'{on}' is not finite at row {np.flatnonzero(~np.isfinite(size))[0]} of the regressor.")
+        raise InputError(
+            f"'{on}' is not finite at row {np.flatnonzero(~np.isfinite(size))[0]} of the regressor."
+        )
     if not np.any(size > 0):
         raise InputError(f"'{on}' is zero on all rows; the data give no width. State one.")
     return float(f"{np.median(size[size > 0]):.6g}")
 
 
 def usual_suspects(problem: Problem) -> tuple[Suspect, ...]:
-    """What is often missing: friction, drag, hardening, dead zone, saturation, an offset, the root of a level."""
+    """Return the usual suspects: friction, drag, hardening, dead zone, saturation, offset, root."""
     layout, outputs = problem.layout, problem.outputs
     pairs: list[tuple[str, str]] = []
     for channel in dict.fromkeys(lag.channel for lag in layout):
@@ -287,53 +326,77 @@ def usual_suspects(problem: Problem) -> tuple[Suspect, ...]:
         label = f" in {output}" if own else ""
         for kind, on in pairs:
             width = data_width(on, problem.rows.x, layout) if kind in WIDTHS else None
-            suspects.append(Suspect.of(kind, on, width=width, output=output, name=f"{kind} of {on}{label}"))
+            suspects.append(
+                Suspect.of(kind, on, width=width, output=output, name=f"{kind} of {on}{label}")
+            )
         suspects.append(Suspect.of("offset", output=output, name=f"offset{label}"))
     return tuple(suspects)
 
 
 def saturations(suspects: Sequence[Suspect]) -> list[Suspect]:
-    """What is left of the channel beside each dead zone: data of a physics with that channel cannot tell the two."""
+    """Return a saturation for each dead zone, the rest of its channel.
+
+    Data of a physics with that channel cannot distinguish the two.
+    """
     zones = [suspect for suspect in suspects if suspect.name.startswith("dead_zone")]
     return [
-        replace(s, name=s.name.replace("dead_zone", "saturation"), expression=f"{s.on} - ({s.expression})")
+        replace(
+            s,
+            name=s.name.replace("dead_zone", "saturation"),
+            expression=f"{s.on} - ({s.expression})",
+        )
         for s in zones
     ]
 
 
 def changes_sign(values: Vector) -> bool:
-    """Whether values (N,) lie clearly on both sides of zero; otherwise what jumps there is as good as a constant."""
+    """Return whether values (N,) lie clearly on both sides of zero.
+
+    Otherwise what jumps there is as good as a constant.
+    """
     edge = _CLEARLY * np.abs(values).max(initial=0.0)
     return bool(np.min(values, initial=0.0) < -edge and np.max(values, initial=0.0) > edge)
 
 
 def is_level(values: Vector) -> bool:
-    """Whether values (N,) are positive but for noise, so that a root of them may be missing."""
+    """Return whether values (N,) are positive but for noise, so that their root may be missing."""
     return bool(np.min(values) >= -_BELOW * np.max(values))
 
 
 def usual_terms(problem: Problem) -> tuple[Suspect, ...]:
-    """Products of two lags that the physics or the learner reads, for what no usual suspect explains."""
+    """Return products of two lags of physics or learner, for effects beyond the usual suspects."""
     lags, outputs = problem.used[:_MULTIPLIED], problem.outputs
     pairs = [(one, other) for i, one in enumerate(lags) for other in lags[i:]]
     texts = [f"{one}**2" if one == other else f"{one}*{other}" for one, other in pairs]
     only = len(outputs) == 1
-    return tuple(Suspect(text if only else f"{text} in {output}", text, output) for output in outputs for text in texts)
+    return tuple(
+        Suspect(text if only else f"{text} in {output}", text, output)
+        for output in outputs
+        for text in texts
+    )
 
 
 def _evaluate(expression: Expression, x: Matrix, layout: Layout, what: str) -> np.ndarray:
     missing = [str(lag) for lag in expression.lags if lag not in layout]
     if missing:
         held = ", ".join(map(str, layout))
-        raise InputError(f"{what} reads {', '.join(missing)}, which the regressor does not hold; it holds {held}.")
+        raise InputError(
+            f"{what} reads {', '.join(missing)}, which the regressor does not hold; it holds "
+            f"{held}."
+        )
     values = expression.evaluate({lag: x[:, j] for j, lag in enumerate(layout)}, np)
     return np.broadcast_to(np.asarray(values, dtype=float), (len(x),))
 
 
-def _checked_constants(constants: Mapping[str, float], suspect: str) -> tuple[tuple[str, float], ...]:
+def _checked_constants(
+    constants: Mapping[str, float], suspect: str
+) -> tuple[tuple[str, float], ...]:
     for name, value in constants.items():
         if not isinstance(name, str) or not is_name(name):
             raise InputError(f"suspect '{suspect}': {name!r} cannot name a constant.")
         if not is_number(value):
-            raise InputError(f"suspect '{suspect}': the constant '{name}' must be a finite number; got {value!r}.")
+            raise InputError(
+                f"suspect '{suspect}': the constant '{name}' must be a finite number; got "
+                f"{value!r}."
+            )
     return tuple(sorted((name, float(value)) for name, value in constants.items()))

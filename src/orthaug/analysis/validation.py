@@ -1,4 +1,4 @@
-"""Does the learner earn its place? Free runs of the model and of physics alone on data that were not fitted."""
+"""Validation of a learner: free runs of the model and of physics alone on unfitted data."""
 
 from __future__ import annotations
 
@@ -17,24 +17,38 @@ from orthaug._base.parallel import Threads
 from orthaug.data.record import Record
 from orthaug.data.regressors import Layout
 from orthaug.fitting.estimates import Estimate
-from orthaug.fitting.held_out import HeldOut, Pieces, Ratio, blocked, mean_square, squared_errors
+from orthaug.fitting.held_out import (
+    HeldOutErrors,
+    Pieces,
+    Ratio,
+    blocked,
+    mean_square,
+    squared_errors,
+)
 from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.models.model import Model
 from orthaug.models.motion_model import MotionModel
 from orthaug.models.response import Response
 
-_BEYOND, _FAR = 0.01, 0.1  # of the training range: an excursion that is told, and one that counts on any row
+_BEYOND, _FAR = (
+    0.01,
+    0.1,
+)  # of the training range: an excursion that is reported, and one that counts on any row
 _OFTEN = 0.01  # of the rows: a smaller excursion counts from there on
 _MUCH = 0.1  # of a part's rows outside: what is wrong there may be that
-_LIKELY = 0.9  # ratio of errors below which an interval that holds 1 leaves undecided what is not shown
+# Ratio of errors below which an interval that holds 1 leaves undecided what is not shown
+_LIKELY = 0.9
 
 
 @dataclass(frozen=True)
 class Trial:
-    """Free-run errors on one piece of data that was not fitted, in standard deviations; inf where a run diverges.
+    """Free-run errors on one piece of data that was not fitted, in standard deviations.
 
-    `block` is true for a block of cross-validation, and false for a part of its own. `pieces` holds the squared errors
-    along the runs, of physics alone and of the model, for the uncertainty of their ratio.
+    Inf where a run diverges.
+
+    `block` is true for a block of cross-validation, and false for a part of its own. `pieces` holds
+    the squared errors along the runs, of physics alone and of the model, for the uncertainty of
+    their ratio.
     """
 
     where: str
@@ -46,7 +60,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class Extrapolation:
-    """How far a part leaves the training data in one entry of the regressor."""
+    """Distance of a part beyond the training data in one entry of the regressor."""
 
     part: str
     lag: str
@@ -58,8 +72,9 @@ class Extrapolation:
     def __str__(self) -> str:
         low, high = self.training
         return (
-            f"In {self.lag}, {self.part} leaves the training range of {low:.4g} to {high:.4g}: it goes from "
-            f"{self.reach[0]:.4g} to {self.reach[1]:.4g}, outside on {percent(self.share)} of its rows"
+            f"In {self.lag}, {self.part} leaves the training range of {low:.4g} to {high:.4g}: "
+            f"it goes from {self.reach[0]:.4g} to {self.reach[1]:.4g}, outside on "
+            f"{percent(self.share)} of its rows"
         )
 
 
@@ -67,7 +82,8 @@ class Extrapolation:
 class Verdict:
     """`code` is helps, no_help or hurts; `summary` says why. `trials` are the errors it rests on.
 
-    `ratio` is the error with the learner over that of physics alone where that decided; None without errors along runs.
+    `ratio` is the error with the learner over that of physics alone where that decided; None
+    without errors along runs.
     """
 
     code: str
@@ -78,7 +94,7 @@ class Verdict:
 
     @property
     def text(self) -> str:
-        """Why, and where the training range is left."""
+        """Reason for the verdict, and channels outside the training range."""
         return " ".join([self.summary, *(f"{e}." for e in self.extrapolation)])
 
     @property
@@ -95,7 +111,11 @@ def free_run_error(
     *,
     response: Response | None = None,
 ) -> float:
-    """RMS of the free run's error, each output in its `unit`, by default its own deviation; inf where it diverges.
+    """Return the RMS of the free run's error, each output in its `unit`.
+
+    By default that is its own deviation.
+
+    Inf where it diverges.
 
     `response` is the model's free run of the record, if it is there already.
     """
@@ -118,7 +138,10 @@ def trial_on(
     alone_response: Response | None = None,
     response: Response | None = None,
 ) -> Trial:
-    """Both models' free runs on a record that was not fitted; their responses, if they are there already."""
+    """Return both models' free runs on a record that was not fitted.
+
+    Their responses, if they are there already.
+    """
     alone_response = alone.simulate(record) if alone_response is None else alone_response
     response = model.simulate(record) if response is None else response
     error = free_run_error(alone, record, skip, response=alone_response)
@@ -127,8 +150,8 @@ def trial_on(
     return Trial(where, error, own, pieces=(pieces[0], pieces[1]))
 
 
-def trials_of(held_out: HeldOut) -> list[Trial]:
-    """The errors by which a run was chosen, as trials."""
+def trials_of(held_out: HeldOutErrors) -> list[Trial]:
+    """Return the errors by which a run was chosen, as trials."""
     chosen, trials = held_out.runs[held_out.chosen], []
     for label in dict.fromkeys(held_out.labels):
         own = [i for i, other in enumerate(held_out.labels) if other == label]
@@ -137,9 +160,11 @@ def trials_of(held_out: HeldOut) -> list[Trial]:
 
 
 def _trial(label: str, alone: Pieces, model: Pieces) -> Trial:
-    """Of squared errors in deviations of the training output."""
+    """Return a trial of squared errors, in deviations of the training output."""
     block = label.startswith("block ")
-    return Trial(label, math.sqrt(mean_square(alone)), math.sqrt(mean_square(model)), block, (alone, model))
+    return Trial(
+        label, math.sqrt(mean_square(alone)), math.sqrt(mean_square(model)), block, (alone, model)
+    )
 
 
 def cross_validate(
@@ -150,7 +175,7 @@ def cross_validate(
     start: int,
     runner: Any = Threads(),  # noqa: B008  (it holds nothing)
 ) -> list[list[Pieces]]:
-    """Squared free-run errors of every way of fitting on every held-out block, in training deviations.
+    """Return squared free-run errors of every fit on every held-out block, in training deviations.
 
     Args:
         fits: each fits a training record; a failed training counts as runs that diverge.
@@ -169,29 +194,35 @@ def cross_validate(
     return list(runner.map(_on_block, (tuple(fits), unit), folds))
 
 
-def _on_block(given: Any, pair: tuple[Record, Record], tell: Callable[..., None]) -> list[Pieces]:
-    """Errors on a block of every way of fitting the rest."""
+def _on_block(given: Any, pair: tuple[Record, Record], report: Callable[..., None]) -> list[Pieces]:
+    """Return the errors on a block of every fit of the rest."""
     (fits, unit), (training, held), errors = given, pair, []
     for fit in fits:
-        tell()
+        report()
         found: Pieces = [None] * len(held.experiments)
         with suppress(InputError):  # the block took away what the physics needs
             trained = fit(training)
-            found = squared_errors(trained.model.simulate(held), unit) if trained.status.ok else found
+            found = (
+                squared_errors(trained.model.simulate(held), unit) if trained.status.ok else found
+            )
         errors.append(found)
     return errors
 
 
 def block_trials(errors: Sequence[Sequence[Pieces]], fit: int) -> list[Trial]:
-    """Trials of one way of fitting against the first one, from `cross_validate`."""
-    return [_trial(f"block {i + 1} of {len(errors)}", block[0], block[fit]) for i, block in enumerate(errors)]
+    """Return the trials of one fit against the first one, from `cross_validate`."""
+    return [
+        _trial(f"block {i + 1} of {len(errors)}", block[0], block[fit])
+        for i, block in enumerate(errors)
+    ]
 
 
 def judge(trials: Sequence[Trial], extrapolation: Sequence[Extrapolation] = ()) -> Verdict | None:
-    """The verdict on trials of physics alone against the model; None without a trial.
+    """Return the verdict on trials of physics alone against the model; None without a trial.
 
-    All blocks together, and every part of its own, are judged by one rule (`Ratio.code`). The learner helps where each
-    of them says so; it hurts where one of them does, or where the model runs away and physics alone does not.
+    All blocks together, and every part of its own, are judged by one rule (`Ratio.code`). The
+    learner helps where each of them says so; it hurts where one of them does, or where the model
+    runs away and physics alone does not.
     """
     if not trials:
         return None
@@ -200,16 +231,22 @@ def judge(trials: Sequence[Trial], extrapolation: Sequence[Extrapolation] = ()) 
     groups += [(t.where, [t]) for t in trials if not t.block]
     sentences, codes, ratios = [], [], []
     for where, group in groups:
-        alone, model = (math.sqrt(sum(getattr(t, k) ** 2 for t in group) / len(group)) for k in ("alone", "model"))
+        alone, model = (
+            math.sqrt(sum(getattr(t, k) ** 2 for t in group) / len(group))
+            for k in ("alone", "model")
+        )
         ran_away = any(math.isinf(t.model) and not math.isinf(t.alone) for t in group)
         ratio = _ratio(group, alone, model)
         sure = f" ({ratio})" if str(ratio) and ratio.low < ratio.high else ""
-        told = _told(alone, model) + sure
+        sentence = _comparison(alone, model) + sure
         if len(group) > 1:
-            told = f"In {where} ({len(group)} blocks, {sum(t.model < t.alone for t in group)} of them better): {told}"
+            sentence = (
+                f"In {where} ({len(group)} blocks, {sum(t.model < t.alone for t in group)} of "
+                f"them better): {sentence}"
+            )
         else:
-            told = f"On {where}: {told}"
-        sentences.append(told)
+            sentence = f"On {where}: {sentence}"
+        sentences.append(sentence)
         codes.append("hurts" if ran_away else ratio.code)
         ratios.append(ratio)
     worst = next(code for code in ("hurts", "no_help", "helps") if code in codes)
@@ -219,40 +256,55 @@ def judge(trials: Sequence[Trial], extrapolation: Sequence[Extrapolation] = ()) 
     likely = ratio.value < _LIKELY and ratio.high > 1
     opening = {
         "helps": "The learner helps",
-        "no_help": "It is undecided whether the learner helps" if likely else "The learner does not help",
+        "no_help": "It is undecided whether the learner helps"
+        if likely
+        else "The learner does not help",
         "hurts": "The learner hurts in extrapolation" if beyond else "The learner hurts",
     }[worst]
-    reasons = sentences if worst == "helps" else [s for s, c in zip(sentences, codes, strict=True) if c != "helps"]
+    reasons = (
+        sentences
+        if worst == "helps"
+        else [s for s, c in zip(sentences, codes, strict=True) if c != "helps"]
+    )
     text = ". ".join([opening, *reasons]) + "."
     return Verdict(worst, text, tuple(trials), tuple(extrapolation), ratio)
 
 
 def _ratio(group: Sequence[Trial], alone: float, model: float) -> Ratio:
-    """Of a group's errors, with its interval where errors along the runs are there."""
+    """Return the ratio of a group's errors, with its interval where errors along runs are known."""
     pieces = [t.pieces for t in group]
     if any(piece is None for piece in pieces):
         return Ratio.exactly(model, alone)
     both = [piece for piece in pieces if piece is not None]
-    return Ratio.of([run for _, model in both for run in model], [run for alone, _ in both for run in alone])
+    return Ratio.of(
+        [run for _, model in both for run in model], [run for alone, _ in both for run in alone]
+    )
 
 
-def _told(alone: float, model: float) -> str:
-    """Both errors in words."""
+def _comparison(alone: float, model: float) -> str:
+    """Return both errors in words."""
     errors = {"with the learner": model, "with physics alone": alone}
     if not any(map(math.isinf, errors.values())):
         return f"free-run NRMSE {model:.4g} with the learner, {alone:.4g} with physics alone"
-    told = (f"diverges {who}" if math.isinf(e) else f"has an NRMSE of {e:.4g} {who}" for who, e in errors.items())
-    return f"the free run {' and '.join(told)}"
+    clauses = (
+        f"diverges {who}" if math.isinf(e) else f"has an NRMSE of {e:.4g} {who}"
+        for who, e in errors.items()
+    )
+    return f"the free run {' and '.join(clauses)}"
 
 
 def extrapolation(part: str, x: Matrix, training: Matrix, layout: Layout) -> list[Extrapolation]:
-    """Entries of the regressor in which a part leaves the range of the training data; one lag a channel.
+    """Return entries of the regressor in which a part leaves the range of the training data.
 
-    Not told is what noise does to extreme values: excursions by less than a hundredth of the range, or on few rows.
+    There is one lag for each channel.
+
+    Effects of noise on extreme values are not reported: excursions by less than a hundredth of the
+    range, or on few rows.
 
     Args:
         part: its name.
-        x: its regressors (N, nx), in the order of the layout; `training` those of the training data.
+        x: its regressors (N, nx), in the order of the layout; `training` those of the training
+            data.
     """
     leaving: dict[str, Extrapolation] = {}
     for j, lag in enumerate(layout):
@@ -262,16 +314,22 @@ def extrapolation(part: str, x: Matrix, training: Matrix, layout: Layout) -> lis
         excess = max(low - reach[0], reach[1] - high)
         often = excess > _BEYOND * (high - low) and beyond.mean() >= _OFTEN
         if (often or excess > _FAR * (high - low)) and lag.channel not in leaving:
-            leaving[lag.channel] = Extrapolation(part, str(lag), (low, high), reach, float(beyond.mean()))
+            leaving[lag.channel] = Extrapolation(
+                part, str(lag), (low, high), reach, float(beyond.mean())
+            )
     return list(leaving.values())
 
 
 def dominance(fit: Estimate, *, one_step: Response | None = None) -> float | None:
-    """‖F̃‖ / ‖Φθ̂‖ over the training rows, the learner's part against the physics'; None where the physics gives 0.
+    """Return ‖F̃‖ / ‖Φθ̂‖ over the training rows, the learner's part against the physics'.
+
+    None where the physics gives 0.
 
     `one_step` is the prediction of these rows, if it is there already.
     """
-    parts = (fit.model.components(fit.problem.record) if one_step is None else one_step).trajectories
+    parts = (
+        fit.model.components(fit.problem.record) if one_step is None else one_step
+    ).trajectories
     learner = math.sqrt(sum(float(np.nansum(t.learner**2)) for t in parts))
     physics = math.sqrt(sum(float(np.nansum(t.baseline**2)) for t in parts))
     return learner / physics if physics > 0 else None
@@ -284,18 +342,18 @@ def verdict(
     *,
     skip: int = 0,
 ) -> Verdict:
-    """Whether the learner helps: free runs of a fit and of physics alone on records that neither was fitted to.
+    """Return whether the learner helps, by free runs of a fit and of physics alone on new records.
 
     Args:
         fit: with a learner.
         alone: the same physics without, `estimate(…, learner=None)`, trained on the same record.
-        tests: a record, or several by name. A free run starts from the measured outputs before its first row, that
-            of a motion from the state by which it follows its first rows.
+        tests: a record, or several by name. A free run starts from the measured outputs before its
+            first row, that of a motion from the state by which it follows its first rows.
         skip: leading samples of each experiment that are not scored.
 
     Returns:
-        `code` is helps, no_help or hurts; `text` says why, with the errors of both and where the training range is
-        left; `trials` are the errors.
+        `code` is helps, no_help or hurts; `text` says why, with the errors of both and where the
+        training range is left; `trials` are the errors.
 
     Raises:
         InputError: a record without outputs or with other channels; an estimate that is not usable.

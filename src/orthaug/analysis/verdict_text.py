@@ -1,4 +1,4 @@
-"""The verdict on a residual: what it holds, its words, and the warnings that intervals of θ must carry."""
+"""Verdict on a residual: its content, its words, and the warnings for intervals of θ."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from orthaug.fitting.estimates import Estimate
 from orthaug.models.response import Response
 
 SHARE = 0.01  # of the residual's variance: what a regressor explains of it counts from there
-_SLOW = 0.9  # of a free run's variance: what its own past tells from there on is a drift rather than noise
-_TOLD = 5  # findings that a text lists at most
+_SLOW = 0.9  # of a free run's variance: a share by its own past from there on is a drift
+_LISTED = 5  # findings that a text lists at most
 _TOO_FAST = 0.05  # noise variance / smallest variance among the lagged outputs
 
 _BIASED = Warning(
@@ -28,23 +28,30 @@ _BIASED = Warning(
 )
 _INCONSISTENT = Warning(
     "coloured_residual",
-    "the one-step residual is coloured: what disturbs one row is in the lagged outputs of the next, which biases the "
-    'one-step θ, and its intervals do not cover that bias. Training on the free run (focus = "simulation") has none.',
+    "the one-step residual is coloured: a disturbance of one row is in the lagged outputs of the "
+    "next. That biases the one-step θ, and its intervals do not cover that bias. Training on the "
+    'free run (focus = "simulation") has none.',
 )
-_OFF = "The errors are coloured by enough to make the one-step θ inconsistent (warning `inconsistent`)."
-_COLOUR = 0.1  # of the residual's variance that its own past tells: from there on that bias may matter
+_OFF = (
+    "The errors are coloured by enough to make the one-step θ inconsistent (warning "
+    "`inconsistent`)."
+)
+_COLOUR = 0.1  # of the residual's variance by its own past: from there on that bias may matter
 
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
-    """`verdict` is white, equation_noise, sensor_noise or unmodelled; `text` says why and what to do.
+    """`verdict` is white, equation_noise, sensor_noise or unmodelled.
 
-    `one_step` and `free_run` are the tests of the two residuals per output. `ratio` is the free run's RMS error against
-    the one-step error, `noise_in_lags` the share of noise in the least excited direction of the lagged outputs.
-    `predictable` is what could be predicted of the error that was minimised, per output. `changes` are predicted to
-    lower it, the first of them by most; there is none where it is noise. `steps` are the steps of those outputs whose
-    one-step error is no larger, None where there are none. `missing` is the test of terms that the
-    equations of a motion could lack; None for other models.
+    `text` says why and what to do.
+
+    `one_step` and `free_run` are the tests of the two residuals per output. `ratio` is the free
+    run's RMS error against the one-step error, `noise_in_lags` the share of noise in the least
+    excited direction of the lagged outputs. `predictable` is what could be predicted of the error
+    that was minimised, per output. `changes` are predicted to lower it, the first of them by most;
+    there is none where it is noise. `steps` are the steps of those outputs whose one-step error is
+    no larger, None where there are none. `missing` is the test of terms that the equations of a
+    motion could lack; None for other models.
     """
 
     verdict: str
@@ -65,7 +72,7 @@ class Diagnosis:
 
 @dataclass(frozen=True, eq=False)
 class Finding:
-    """What was found out about a fit's residuals. `ratio` and `noise` are those of `Diagnosis`."""
+    """Findings on a fit's residuals. `ratio` and `noise` are those of `Diagnosis`."""
 
     fit: Estimate
     simulated: bool
@@ -84,28 +91,38 @@ class Finding:
     steps: Mapping[str, float] = field(default_factory=dict)
     """Steps of the outputs whose one-step error has their size."""
     inconsistent: Warning | None = None
-    """That coloured errors move the one-step θ, by how many standard errors, and what the remedies give."""
+    """That coloured errors move the one-step θ, by how many standard errors, and what the remedies
+    give.
+    """
 
     @property
     def lacks(self) -> bool:
-        """Whether a change of the model itself is worth making."""
+        """True if a change of the model itself is worth making."""
         return any(change.kind != "criterion" for change in self.changes)
 
     @property
     def own(self) -> tuple[ResidualTest, ...]:
         """The tests of the error that was minimised."""
-        return self.free_tests if self.fit.criterion.simulates and self.free_tests is not None else self.tests
+        return (
+            self.free_tests
+            if self.fit.criterion.simulates and self.free_tests is not None
+            else self.tests
+        )
 
     @property
     def drifts(self) -> bool:
-        """Whether a free run's error is slow, and white noise in the equation does not explain that."""
+        """True if a free run's error is slow, and white equation noise does not explain it."""
         slow = any(one.own_past > _SLOW for one in self.predictable)
         return self.simulated and slow and not self.white and not self.sensor
 
     def follows(self, share: float = SHARE) -> tuple[str, ...]:
-        """What the error that was minimised still follows: surely, and by more than a share of its variance."""
+        """Return inputs that the error surely follows, by more than a share of its variance."""
         inputs = (name for test in self.own for name in test.follows(float(np.sqrt(share))))
-        return tuple(dict.fromkeys([*inputs, *(name for test in self.own for name in test.curved_over(share))]))
+        return tuple(
+            dict.fromkeys(
+                [*inputs, *(name for test in self.own for name in test.curved_over(share))]
+            )
+        )
 
     @property
     def what(self) -> str:
@@ -114,36 +131,58 @@ class Finding:
 
 
 def words(verdict: str, seen: Finding) -> tuple[str, tuple[Warning, ...]]:
-    """The text of a verdict, and its warnings."""
+    """Return the text of a verdict, and its warnings."""
     text, warnings = {
         "white": _white,
         "equation_noise": _equation_noise,
         "sensor_noise": _sensor_noise,
         "unmodelled": _unmodelled,
     }[verdict](seen)
-    if verdict == "unmodelled" and _inconsistent(seen) and (seen.lacks or seen.inconsistent is None):
-        warnings = (*warnings, _INCONSISTENT)  # where the physics lacks something, a model of the colour tells no θ
+    if (
+        verdict == "unmodelled"
+        and _inconsistent(seen)
+        and (seen.lacks or seen.inconsistent is None)
+    ):
+        warnings = (
+            *warnings,
+            _INCONSISTENT,
+        )  # where the physics lacks something, a model of the colour gives no θ
     elif verdict != "sensor_noise" and seen.inconsistent is not None:
         return f"{text} {_OFF}", (*warnings, seen.inconsistent)
     plain = seen.fit.std is not None and seen.fit.plain_covariance is None
     if plain and not warnings and not (seen.free_white if seen.simulated else seen.white):
-        warnings = (_coloured("errors of the free run are" if seen.simulated else "one-step residual is"),)
+        warnings = (
+            _coloured("errors of the free run are" if seen.simulated else "one-step residual is"),
+        )
     return text, warnings
 
 
 def _inconsistent(seen: Finding) -> bool:
-    """Whether a coloured disturbance enters one-step θ through lagged outputs."""
-    if seen.simulated or seen.white or seen.steps or not seen.fit.model.form.states or seen.fit.std is None:
+    """Return whether a coloured disturbance enters one-step θ through lagged outputs."""
+    if (
+        seen.simulated
+        or seen.white
+        or seen.steps
+        or not seen.fit.model.form.states
+        or seen.fit.std is None
+    ):
         return False
     return any(one.own_past > _COLOUR for one in seen.predictable)
 
 
 def _white(seen: Finding) -> tuple[str, tuple[Warning, ...]]:
     if seen.complete and seen.inconsistent is not None:
-        return "The one-step residual is hardly coloured, by enough to move θ.", ()
+        return "The one-step residual is slightly coloured, but enough to move θ.", ()
     if seen.complete:
-        told = "the intervals hold" if seen.fit.model.form.bound is None else "it is noise as far as it shows"
-        return f"The one-step residual is white: {told}, and no criterion is better than this one.", ()
+        so = (
+            "the intervals hold"
+            if seen.fit.model.form.bound is None
+            else "the tests find only noise"
+        )
+        return (
+            f"The one-step residual is white: {so}, and no criterion is better than this one.",
+            (),
+        )
     return _small(seen), ()
 
 
@@ -155,78 +194,99 @@ def _equation_noise(seen: Finding) -> tuple[str, tuple[Warning, ...]]:
         asked = " The one-step criterion is the more precise one here."
         asked += f" {_sentence(seen.changes[0])}" if seen.changes else ""
     if seen.inconsistent is not None:
-        return "The one-step residual is nearly white, the free run's is not: the noise enters the equation.", ()
-    return f"The one-step residual is white, the free run's is not: the noise enters the equation.{asked}", ()
+        return (
+            "The one-step residual is nearly white, the free run's is not: the noise enters "
+            "the equation.",
+            (),
+        )
+    return (
+        "The one-step residual is white, the free run's is not: the noise enters the "
+        f"equation.{asked}",
+        (),
+    )
 
 
 def _sensor_noise(seen: Finding) -> tuple[str, tuple[Warning, ...]]:
     colour = max((t.largest_acf or 0.0) for t in seen.tests)
-    closer = "as close" if seen.ratio is None or seen.ratio > 0.95 else f"{1 / seen.ratio:.1f} times closer"
+    closer = (
+        "as close"
+        if seen.ratio is None or seen.ratio > 0.95
+        else f"{1 / seen.ratio:.1f} times closer"
+    )
     own = "the free run is" if seen.simulated else "the physics trained on the free run comes"
-    how = f"its largest autocorrelation is {colour:.2f} in size, and {own} {closer} without measured lags"
+    how = (
+        f"its largest autocorrelation is {colour:.2f} in size, and {own} {closer} without "
+        "measured lags"
+    )
     text = f"The one-step residual is coloured: {how}. That is noise on the measured output"
     if seen.simulated:
         more = f" {_sentence(seen.changes[0])}" if seen.changes else ""
-        return f"{text}, which the simulation criterion suits.{more}", ()
+        return f"{text}: the simulation criterion is the right one.{more}", ()
     text += '. One-step estimates of θ are then inconsistent, those of focus = "simulation" are not'
     if seen.changes and seen.changes[0].kind == "criterion":
         fall = seen.changes[0].fall
         text += (
-            f"; the error of the free run is predicted to fall by {percent(fall)} with it"
+            f"; that focus is predicted to lower the error of the free run by {percent(fall)}"
             if seen.changes[0].gains
-            else "; the error of the free run is not predicted to fall with it"
+            else "; that focus is not predicted to lower the error of the free run"
         )
     if seen.noise is not None and seen.noise > _TOO_FAST:
         text += (
-            f". The noise is {100 * seen.noise:.0f} % of what tells the lagged outputs apart: the sampling is too fast "
-            "for one-step estimation"
+            f". The noise is {100 * seen.noise:.0f} % of the least variance among the lagged "
+            "outputs: the sampling is too fast for one-step estimation"
         )
     steps = f" {_quantised(seen)}" if seen.steps else ""
     return f"{text}.{steps}", (_BIASED,) if seen.fit.std is not None else ()
 
 
 def _unmodelled(seen: Finding) -> tuple[str, tuple[Warning, ...]]:
-    told = [f"its largest autocorrelation is {max((t.largest_acf or 0.0) for t in seen.own):.2f} in size"]
+    findings = [
+        f"its largest autocorrelation is {max((t.largest_acf or 0.0) for t in seen.own):.2f} "
+        "in size"
+    ]
     for test in seen.own:
-        told += [f"the residual of {test.name} still follows {name}" for name in test.follows()]
-        told += [f"the residual of {test.name} is curved over {name}" for name in test.curved_over(SHARE)]
-    told = [*told[:_TOLD], *(["and more"] if len(told) > _TOLD else [])]
-    opening = f"The {seen.what}, {_size(seen)}, is not noise alone: {'; '.join(told)}."
+        findings += [f"the residual of {test.name} still follows {name}" for name in test.follows()]
+        findings += [
+            f"the residual of {test.name} is curved over {name}" for name in test.curved_over(SHARE)
+        ]
+    findings = [*findings[:_LISTED], *(["and more"] if len(findings) > _LISTED else [])]
+    opening = f"The {seen.what}, {_size(seen)}, is not noise alone: {'; '.join(findings)}."
     advice = "" if seen.steps and not seen.changes else _advice(seen, _cause(seen))
     return " ".join(part for part in (opening, _shares(seen), _quantised(seen), advice) if part), ()
 
 
 def _quantised(seen: Finding) -> str:
-    """That the steps of an output colour the residual one step ahead, and what to do."""
+    """Return sentences on an output's quantisation that colours the one-step residual."""
     if not seen.steps:
         return ""
     units = {c.name: f" {c.unit}".rstrip() for c in seen.fit.problem.record.outputs}
-    each = {test.name: f"{test.name} is measured in steps of {seen.steps[test.name]:.3g}{units[test.name]}, and the "
-            f"one-step residual ({test.rms:.2g}{units[test.name]}) is no larger"
+    each = {test.name: f"{test.name} is measured in steps of {seen.steps[test.name]:.3g}{units[test.name]}, "
+        f"and the one-step residual ({test.rms:.2g}{units[test.name]}) is no larger"
             for test in seen.tests if test.name in seen.steps}  # fmt: skip
     trained = "" if seen.simulated else 'training on the free run (focus = "simulation"), '
     return (
-        f"{'; '.join(each.values())}: such steps colour it as noise on the output does, and bias one-step estimates of "
-        f"θ. Against that help {trained}fewer samples (`decimate` of data.prepare), or a finer measurement."
+        f"{'; '.join(each.values())}: such steps colour it as noise on the output does, and "
+        f"bias one-step estimates of θ. Remedies: {trained}fewer samples (`decimate` of "
+        "data.prepare), or a finer measurement."
     )
 
 
 def _cause(seen: Finding) -> str:
-    """What may stand behind a residual that none of the changes that were tried lowers, and what to do."""
+    """Return likely causes of a residual that none of the tried changes lowers, and remedies."""
     followed = [name for test in seen.own for name in (*test.follows(), *test.curved_over(SHARE))]
     if followed:
         return (
-            f"what it follows ({_joined(followed[:_TOLD])}) has a form that was not tried, or comes with dynamics that "
-            "the lags do not hold; suspects of your own (`[[suspects]]`) test a form"
+            f"the effect of {_joined(followed[:_LISTED])} has a form that was not tried, or "
+            "dynamics beyond the lags; test a form by your own `[[suspects]]`"
         )
     if seen.drifts:
         return (
-            "the error drifts, which neither white noise in the equation nor noise on the sensor explains; a "
-            "disturbance that was not recorded, or slow dynamics that the physics lacks, would: record it as an input"
+            "the error drifts, which no white noise explains. An unrecorded disturbance would, or "
+            "slow dynamics that the physics lacks: record the disturbance as an input"
         )
     return (
-        "its colour is that of a disturbance or of noise on the output that neither criterion describes; its own past "
-        "predicts it, an input that was not recorded might"
+        "its colour is that of a disturbance or of sensor noise that neither criterion describes. "
+        "Its own past predicts it; an unrecorded input might, too"
     )
 
 
@@ -235,45 +295,59 @@ def _joined(names: Sequence[str]) -> str:
 
 
 def _small(seen: Finding) -> str:
-    """What is said where the tests reject, but hardly anything could be predicted."""
+    """Return sentences on a residual that the tests reject but hardly anything predicts."""
     colour = " Its colour is that of the noise." if seen.simulated and not seen.white else ""
     followed = seen.follows()
     shown = (
-        f"noise for the most part, but still follows {_joined(followed)}" if followed else "noise as far as it shows"
+        f"mostly noise, but still follows {_joined(followed)}" if followed else "noise by all tests"
     )
-    advice = _advice(seen, "what it follows is a small effect" if followed else "it is the noise floor")
+    advice = _advice(
+        seen, "what it follows is a small effect" if followed else "it is the noise floor"
+    )
     return f"The {seen.what}, {_size(seen)}, is {shown}. {_shares(seen)}{colour} {advice}"
 
 
 def _size(seen: Finding) -> str:
-    share = max((t.rms or 0.0) / d for t, d in zip(seen.own, seen.fit.problem.deviation, strict=True))
+    share = max(
+        (t.rms or 0.0) / d for t, d in zip(seen.own, seen.fit.problem.deviation, strict=True)
+    )
     return f"{percent(share)} of the output's deviation"
 
 
 def _shares(seen: Finding) -> str:
-    """How much could be predicted, of the output of which most could; of equal ones that which follows something."""
+    """Return the predictable shares, of the output with the largest one.
+
+    Among equal ones it is the one that follows something.
+    """
     if not seen.predictable:
         return ""
-    told = {test.name for test in seen.own if test.follows() or test.curved_over(SHARE)}
-    one = max(seen.predictable, key=lambda entry: (entry.largest(), entry.name in told))
+    named = {test.name for test in seen.own if test.follows() or test.curved_over(SHARE)}
+    one = max(seen.predictable, key=lambda entry: (entry.largest(), entry.name in named))
     of = f" of {one.name}" if len(seen.predictable) > 1 else ""
     unit = next((c.unit for c in seen.fit.problem.record.outputs if c.name == one.name), "")
     size = float(np.sqrt(one.largest())) * one.rms
     past, driven, curved = (percent(share) for share in (one.own_past, one.inputs, one.functions))
     return (
-        f"Of its variance{of} {past} could be predicted from its own past, {driven} from the inputs, {curved} from "
-        f"functions of the regressors: {size:.2g}{f' {unit}' if unit else ''} at most."
+        f"The predictable share of its variance{of} is {past} from its own past, {driven} from "
+        f"the inputs, {curved} from functions of the regressors: "
+        f"{size:.2g}{f' {unit}' if unit else ''} at most."
     )
 
 
 def _advice(seen: Finding, otherwise: str) -> str:
-    """The change that is predicted to help most; or that none of them is, and what follows."""
+    """Return the change that is predicted to help most.
+
+    Where none helps, say so, and what follows.
+    """
     if seen.changes:
         return _sentence(seen.changes[0])
     if not seen.predictable:
-        return "Options that were not tried are more lags, other learner inputs or neurons."
+        return "Try more lags, other learner inputs or more neurons."
     limit = 100 * fall_of(WORTH)
-    return f"No further lag, offset or learner is predicted to lower it by {percent(limit / 100)}: {otherwise}."
+    return (
+        "No further lag, offset or learner is predicted to lower it by "
+        f"{percent(limit / 100)}: {otherwise}."
+    )
 
 
 def _sentence(change: Change) -> str:
@@ -282,5 +356,8 @@ def _sentence(change: Change) -> str:
 
 
 def _coloured(what: str) -> Warning:
-    told = f"standard errors of θ are those of a white residual, but the {what} coloured: take them for a rough guide."
-    return Warning("coloured_residual", told)
+    text = (
+        f"standard errors of θ assume a white residual, but the {what} coloured: they are "
+        "only a rough guide."
+    )
+    return Warning("coloured_residual", text)

@@ -1,4 +1,4 @@
-"""States and inputs that a run visits, each with its row in the record, and the place where a quantity is largest."""
+"""States and inputs along a run, with their rows in the record, and the place of a maximum."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ MOST_STEPS = 20_000  # rows that a check looks at, spread evenly
 
 
 @dataclass(frozen=True)
-class Place:
-    """A point by its entries, and where it stands: experiment, row in it, and both in words.
+class RunPoint:
+    """A point by its entries and its place: experiment, row in it, and both in words.
 
     `experiment` and `row` are None for a point that no run has visited.
     """
@@ -34,69 +34,87 @@ class Place:
     regressor: dict[str, float]
 
     def __str__(self) -> str:
-        return f"{self.where} ({', '.join(f'{name} = {value:.4g}' for name, value in self.regressor.items())})"
+        return (
+            f"{self.where} "
+            f"({', '.join(f'{name} = {value:.4g}' for name, value in self.regressor.items())})"
+        )
 
 
 @dataclass(frozen=True, eq=False)
-class Where:
+class RowIndex:
     """The experiment and the row (m,) of each of m points; -1 for those that no run has visited."""
 
     experiment: Int[np.ndarray, "m"]
     row: Int[np.ndarray, "m"]
 
     @classmethod
-    def of(cls, lengths: Sequence[int], first: int) -> Where:
-        """So many rows of each experiment, from the row `first` on."""
+    def of(cls, lengths: Sequence[int], first: int) -> RowIndex:
+        """Return `count` rows of each experiment, from the row `first` on."""
         experiment = [np.full(length, i) for i, length in enumerate(lengths)]
-        return cls(np.concatenate(experiment), np.concatenate([np.arange(length) + first for length in lengths]))
+        return cls(
+            np.concatenate(experiment),
+            np.concatenate([np.arange(length) + first for length in lengths]),
+        )
 
     def __len__(self) -> int:
         return len(self.row)
 
-    def take(self, which: Any) -> Where:
-        """Those at the indices `which`, or where a mask is true."""
-        return Where(self.experiment[which], self.row[which])
+    def take(self, which: Any) -> RowIndex:
+        """Return those at the indices `which`, or where a mask is true."""
+        return RowIndex(self.experiment[which], self.row[which])
 
-    def and_nowhere(self, count: int) -> Where:
-        """With `count` points more that no run has visited."""
-        return Where(*(np.concatenate([known, np.full(count, -1)]) for known in (self.experiment, self.row)))
+    def and_nowhere(self, count: int) -> RowIndex:
+        """Return the rows with `count` further points that no run has visited."""
+        return RowIndex(
+            *(np.concatenate([known, np.full(count, -1)]) for known in (self.experiment, self.row))
+        )
 
     def worst(
         self, record: Record, values: Vector, entries: Callable[[int], dict[str, float]]
-    ) -> tuple[float | None, Place | None]:
-        """The largest of the values (m,) and its place, with the entries of that point; None where none is finite."""
+    ) -> tuple[float | None, RunPoint | None]:
+        """Return the largest of the values (m,) and its place, with the entries of that point.
+
+        None where none is finite.
+        """
         values = np.where(np.isfinite(values), values, -1.0)
         if values.max(initial=-1.0) < 0:
             return None, None
         i = int(np.argmax(values))
         experiment, row, size = int(self.experiment[i]), int(self.row[i]), float(values[i])
         if experiment < 0:
-            return size, Place(None, None, "a point off the trajectory", entries(i))
+            return size, RunPoint(None, None, "a point off the trajectory", entries(i))
         where = f"experiment {experiment}, {record.experiments[experiment].where(row)}"
-        return size, Place(experiment, row, where, entries(i))
+        return size, RunPoint(experiment, row, where, entries(i))
 
 
 @dataclass(frozen=True, eq=False)
-class Visited:
-    """Points of a run: states (m, n0) and the inputs (m, nu) of a step from there, and where they stand."""
+class RunPoints:
+    """Points of a run: states (m, n0), inputs (m, nu) of a step from there, and their places."""
 
     states: Matrix
     inputs: Matrix
-    where: Where
+    where: RowIndex
 
     def __len__(self) -> int:
         return len(self.states)
 
-    def take(self, which: Any) -> Visited:
-        """Those at the indices `which`, or where a mask is true."""
-        return replace(self, states=self.states[which], inputs=self.inputs[which], where=self.where.take(which))
+    def take(self, which: Any) -> RunPoints:
+        """Return those at the indices `which`, or where a mask is true."""
+        return replace(
+            self, states=self.states[which], inputs=self.inputs[which], where=self.where.take(which)
+        )
 
-    def with_box(self, of: Visited, count: int) -> Visited:
-        """With `count` points more, uniform in the box that others span; the same ones on every call."""
+    def with_box(self, of: RunPoints, count: int) -> RunPoints:
+        """Return the points and `count` more, uniform in the box that other points span.
+
+        The same ones on every call.
+        """
         if not count:
             return self
         spanned = np.hstack([of.states, of.inputs])
-        more = np.random.default_rng(0).uniform(spanned.min(axis=0), spanned.max(axis=0), (count, spanned.shape[1]))
+        more = np.random.default_rng(0).uniform(
+            spanned.min(axis=0), spanned.max(axis=0), (count, spanned.shape[1])
+        )
         states, inputs = np.split(more, [self.states.shape[1]], axis=1)
         where = self.where.and_nowhere(count)
         return replace(
@@ -106,27 +124,32 @@ class Visited:
             where=where,
         )
 
-    def worst(self, record: Record, values: Vector, describe: Describe) -> tuple[float | None, Place | None]:
-        """The largest of the values (m,) and its place in words of the dynamics; None where no value is finite."""
+    def worst(
+        self, record: Record, values: Vector, describe: Describe
+    ) -> tuple[float | None, RunPoint | None]:
+        """Return the largest of the values (m,) and its place in words of the dynamics.
+
+        None where no value is finite.
+        """
         return self.where.worst(record, values, lambda i: describe(self.states[i], self.inputs[i]))
 
 
 @dataclass(frozen=True, eq=False)
-class Visits:
+class RunSample:
     """At most so many `points` of a run of `steps` steps, and where it `diverged`.
 
-    `unit` (n0,) is what counts as one in each entry of the state: the deviation of the measured output it stands for,
-    or else its own over the points.
+    `unit` (n0,) is what counts as one in each entry of the state: the deviation of the measured
+    output it is a lag of, or else its own over the points.
     """
 
-    points: Visited
+    points: RunPoints
     steps: int
     unit: Vector
     diverged: tuple[str, ...] = ()
 
 
 def usable(model: Model | MotionModel, record: Record) -> Record:
-    """The record's channels in the model's order.
+    """Return the record's channels in the model's order.
 
     Raises:
         InputError: other channels, or too few rows in an experiment.
@@ -137,13 +160,15 @@ def usable(model: Model | MotionModel, record: Record) -> Record:
     return record
 
 
-def visited_by(model: Model, record: Record, free_run: Response, most: int) -> Visits:
-    """States of a free run from measured outputs, up to where it diverged."""
+def visited_by(model: Model, record: Record, free_run: Response, most: int) -> RunSample:
+    """Return states of a free run from measured outputs, up to where it diverged."""
     form: Dynamics = model.form
     record, start, runs = usable(model, record), form.first_row, free_run.trajectories
     ends = [t.diverged[0] + 1 if t.diverged else len(t.model) for t in runs]
 
-    def states(i: int, experiment: Experiment, inputs: Matrix, rows: Int[np.ndarray, "r"]) -> Matrix:
+    def states(
+        i: int, experiment: Experiment, inputs: Matrix, rows: Int[np.ndarray, "r"]
+    ) -> Matrix:
         outputs = np.concatenate([experiment.outputs[:start], runs[i].model[start:]])
         return form.states_at(model.numbers, outputs, inputs, rows)
 
@@ -156,8 +181,8 @@ def visited_by(model: Model, record: Record, free_run: Response, most: int) -> V
     return replace(found, diverged=tuple(diverged))
 
 
-def measured_by(model: Model, record: Record, most: int) -> Visits:
-    """States as the measured outputs give them."""
+def measured_by(model: Model, record: Record, most: int) -> RunSample:
+    """Return states as the measured outputs give them."""
     form: Dynamics = model.form
     record = usable(model, record)
     ends = [len(e) for e in record.experiments]
@@ -170,9 +195,9 @@ def _visits(
     ends: Sequence[int],
     most: int,
     states: Callable[[int, Experiment, Any, Any], Matrix],
-) -> Visits:
-    """Points spread evenly over all experiments, up to the end of each."""
-    every = Where.of([end - form.first_row for end in ends], form.first_row)
+) -> RunSample:
+    """Return points spread evenly over all experiments, up to the end of each."""
+    every = RowIndex.of([end - form.first_row for end in ends], form.first_row)
     some = every.take(evenly(len(every), most))
     pieces = []
     for i, experiment in enumerate(record.experiments):
@@ -180,12 +205,19 @@ def _visits(
         inputs = form.inputs(experiment, record)
         pieces.append((states(i, experiment, inputs, rows), inputs[rows - form.first_row]))
     visited, inputs = (np.concatenate(piece) for piece in zip(*pieces, strict=True))
-    points = Visited(visited, inputs, some)
-    return Visits(points, len(every), _units(form, points, np.concatenate([e.outputs for e in record.experiments])))
+    points = RunPoints(visited, inputs, some)
+    return RunSample(
+        points,
+        len(every),
+        _units(form, points, np.concatenate([e.outputs for e in record.experiments])),
+    )
 
 
-def _units(form: Dynamics, points: Visited, outputs: Matrix) -> Vector:
-    """One over what an entry costs in deviations of the outputs; its own deviation where it is free."""
+def _units(form: Dynamics, points: RunPoints, outputs: Matrix) -> Vector:
+    """Return one over what an entry costs in deviations of the outputs.
+
+    Its own deviation where it is free.
+    """
     if not len(points):
         return np.ones(form.states)  # of what may be too long for a matrix
     per_output = positive(outputs.std(axis=0))
@@ -194,10 +226,12 @@ def _units(form: Dynamics, points: Visited, outputs: Matrix) -> Vector:
 
 
 def evenly(count: int, most: int) -> Int[np.ndarray, "m"]:
-    """At most `most` of `count` indices, spread evenly."""
-    return np.arange(count) if count <= most else np.linspace(0, count - 1, most).round().astype(int)
+    """Return at most `most` of `count` indices, spread evenly."""
+    return (
+        np.arange(count) if count <= most else np.linspace(0, count - 1, most).round().astype(int)
+    )
 
 
 def positive(scale: Vector) -> Vector:
-    """The scale, 1 where it is 0 or not finite."""
+    """Return the scale, 1 where it is 0 or not finite."""
     return np.where(np.isfinite(scale) & (scale > 0), scale, 1.0)

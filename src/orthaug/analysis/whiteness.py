@@ -1,4 +1,4 @@
-"""Is a signal white, and normal? Correlations, Ljung-Box, Jarque-Bera, the autoregression that stands for its colour.
+"""Whiteness and normality: correlations, Ljung-Box, Jarque-Bera, whitening autoregression.
 
 Signals are those of one or several experiments: no product crosses the boundary of one.
 """
@@ -15,27 +15,35 @@ import scipy.special
 from orthaug._base.checks import Vector
 from orthaug.fitting.colour import burg
 
-Pieces = Sequence[Vector] | Vector  # a signal in one piece per experiment; a plain vector is one experiment
+Pieces = (
+    Sequence[Vector] | Vector
+)  # a signal in one piece per experiment; a plain vector is one experiment
 
-CONSTANT = 64 * np.finfo(float).eps  # rounding of the mean: a smaller deviation, against the largest value, is none
+CONSTANT = (
+    64 * np.finfo(float).eps
+)  # rounding of the mean: a smaller deviation, against the largest value, is none
 LARGEST = 1e150  # squares of larger values overflow: a model that left all bounds has no statistics
-_FEW_LAGS = 100  # their products take half as long as the transforms at 10⁶ rows, twice as long at 10⁴
-ROWS_PER_LAG = 20  # with fewer, Ljung-Box rejects too often (3 % instead of 1 % at 4) and AIC overfits
+# Their products take half as long as the transforms at 10⁶ rows, twice as long at 10⁴
+_FEW_LAGS = 100
+# With fewer, Ljung-Box rejects too often (3 % instead of 1 % at 4) and AIC overfits
+ROWS_PER_LAG = 20
 
 
 def autocorrelation(signal: Pieces, lags: int = 25) -> Vector | None:
-    """r_e(τ) = Σ e_k e_{k−τ} / Σ e_k², e less its mean, for τ = 0…lags, (lags + 1,).
+    """Return r_e(τ) = Σ e_k e_{k−τ} / Σ e_k², e less its mean, for τ = 0…lags, (lags + 1,).
 
-    The mean is that of all experiments. Lags as long as the longest experiment are cut; None for a constant signal.
+    The mean is that of all experiments. Lags as long as the longest experiment are cut; None for a
+    constant signal.
     """
     values = cross_correlation(signal, signal, lags)
     return None if values is None else values[len(values) // 2 :]
 
 
 def cross_correlation(residual: Pieces, inputs: Pieces, lags: int = 25) -> Vector | None:
-    """r_eu(τ) = Σ e_k u_{k−τ} / √(Σ e_k² Σ u_k²), means removed, for τ = −lags…lags, (2 lags + 1,).
+    """Return r_eu(τ) = Σ e_k u_{k−τ} / √(Σ e_k² Σ u_k²), means removed, |τ| ≤ lags, (2 lags + 1,).
 
-    At τ ≥ 0 the residual follows the input. Lags are cut as in `autocorrelation`; None where one signal is constant.
+    At τ ≥ 0 the residual follows the input. Lags are cut as in `autocorrelation`; None where one
+    signal is constant.
     """
     e, u = standardised(residual), standardised(inputs)
     if e is None or u is None:
@@ -45,25 +53,32 @@ def cross_correlation(residual: Pieces, inputs: Pieces, lags: int = 25) -> Vecto
 
 
 def _products(x: Vector, y: Vector, reach: int) -> Vector:
-    """Σ x_k y_{k−τ} for τ = −reach…reach: a product each, or all of them by two transforms."""
+    """Return Σ x_k y_{k−τ} for τ = −reach…reach: a product each, or all by two transforms."""
     if reach <= _FEW_LAGS or not len(x):
         own = max(min(reach, len(x) - 1), 0)
         lags = range(-own, own + 1)
-        found = [x[max(t, 0) : len(x) + min(t, 0)] @ y[max(-t, 0) : len(y) - max(t, 0)] for t in lags]
+        found = [
+            x[max(t, 0) : len(x) + min(t, 0)] @ y[max(-t, 0) : len(y) - max(t, 0)] for t in lags
+        ]
         return np.pad(found, reach - own)
-    size = 1 << (len(x) + reach).bit_length()  # zeros behind the record, so that it does not meet its start
+    size = (
+        1 << (len(x) + reach).bit_length()
+    )  # zeros behind the record, so that it does not meet its start
     products = np.fft.irfft(np.fft.rfft(x, size) * np.fft.rfft(y, size).conj(), size)
     return np.concatenate([products[size - reach :], products[: reach + 1]])
 
 
 def pieces_of(signal: Pieces) -> list[Vector]:
-    """One array per experiment."""
+    """Return one array per experiment."""
     parts = [signal] if isinstance(signal, np.ndarray) and signal.ndim == 1 else signal
     return [np.asarray(one, dtype=float) for one in parts]
 
 
 def standardised(signal: Pieces) -> list[Vector] | None:
-    """Less the mean of all samples, with a sum of squares of 1; None for a signal that is constant or not finite."""
+    """Return the signal less the mean of all samples, with a sum of squares of 1.
+
+    None for a signal that is constant or not finite.
+    """
     parts = pieces_of(signal)
     whole = np.concatenate(parts) if len(parts) else np.zeros(0)
     size = np.abs(whole).max(initial=0.0)
@@ -75,13 +90,13 @@ def standardised(signal: Pieces) -> list[Vector] | None:
 
 
 def cut(whole: Any, like: Sequence[Vector]) -> list[Any]:
-    """A signal in experiments as long as those of another."""
+    """Return a signal in experiments as long as those of another."""
     return np.split(whole, np.cumsum([len(one) for one in like])[:-1])
 
 
 @dataclass(frozen=True)
 class LjungBox:
-    """Statistic Q, degrees of freedom, and the probability of a larger Q where the residual is white."""
+    """Statistic Q, degrees of freedom, and the probability of a larger Q for a white residual."""
 
     statistic: float
     freedom: int
@@ -90,7 +105,10 @@ class LjungBox:
 
 @dataclass(frozen=True)
 class Normality:
-    """Jarque-Bera statistic (χ² with 2 degrees of freedom) and p-value; skewness and excess kurtosis."""
+    """Jarque-Bera statistic (χ² with 2 degrees of freedom) and p-value.
+
+    Skewness and excess kurtosis.
+    """
 
     statistic: float
     p: float
@@ -99,10 +117,13 @@ class Normality:
 
 
 def ljung_box(signal: Pieces, lags: int = 25, fitted: int = 0) -> LjungBox | None:
-    """Whiteness: `Q = N (N + 2) Σ_τ r_e(τ)² / n_τ` ~ χ²(lags − fitted), τ = 1…lags (Ljung and Box 1978).
+    """Return the whiteness test `Q = N (N + 2) Σ_τ r_e(τ)² / n_τ` ~ χ²(lags − fitted).
 
-    n_τ is the number of pairs of samples τ apart within experiments; for one experiment N − τ. At most a lag for every
-    20 rows; None for a residual that is constant, not finite, or shorter than that.
+    τ = 1…lags (Ljung and Box 1978).
+
+    n_τ is the number of pairs of samples τ apart within experiments; for one experiment N − τ. At
+    most a lag for every 20 rows; None for a residual that is constant, not finite, or shorter than
+    that.
     """
     lengths = np.array([len(one) for one in pieces_of(signal)])
     n = int(lengths.sum())
@@ -114,16 +135,22 @@ def ljung_box(signal: Pieces, lags: int = 25, fitted: int = 0) -> LjungBox | Non
 
 
 def ljung_box_of(acf: Vector, pairs: Vector, n: int, fitted: int = 0) -> LjungBox:
-    """The same from `acf` (M + 1,) of n samples, of which n_τ = `pairs` (M,) are τ apart."""
+    """Return the whiteness test from `acf` (M + 1,) of n samples.
+
+    Of these n_τ = `pairs` (M,) are τ apart.
+    """
     statistic = float(n * (n + 2.0) * np.sum(acf[1:] ** 2 / pairs))
     freedom = max(len(pairs) - fitted, 1)
     return LjungBox(statistic, freedom, float(scipy.special.chdtrc(freedom, statistic)))
 
 
 def normality(signal: Pieces) -> Normality | None:
-    """Jarque-Bera, `N/6 (S² + K²/4)` ~ χ²(2), of skewness S and excess kurtosis K (population moments).
+    """Return the Jarque-Bera test, `N/6 (S² + K²/4)` ~ χ²(2), of skewness S and excess kurtosis K.
 
-    For independent samples. The distribution is approached slowly: below some 2000 rows the p-value is rough.
+    S and K are of population moments.
+
+    It assumes independent samples. The distribution is approached slowly: below some 2000 rows the
+    p-value is rough.
     """
     e = standardised(signal)
     if e is None:
@@ -135,7 +162,9 @@ def normality(signal: Pieces) -> Normality | None:
 
 
 def whitening(signal: Pieces, largest: int = 25) -> Vector | None:
-    """The coefficients (1, a_1, …, a_p) of `A(q) e_k = ε_k`, ε white, of a signal less its mean, by Burg.
+    """Return the coefficients (1, a_1, …, a_p) of the whitening `A(q) e_k = ε_k`, by Burg.
+
+    e is the signal less its mean, ε is white.
 
     None for a signal that is constant or not finite.
     """

@@ -1,39 +1,383 @@
-"""Advice that was tried: changes of a spec, each refitted, and what it does to the free run where nothing was fitted.
+"""Tested advice: changes of a spec, each refitted and judged by its free run on data not fitted.
 
-The model as it is and every change of it are fitted to the same rows and run over the same others: the validation part,
-or the last third of the training rows as one long run. A change is advised where it lowers the error there surely, by
-the rule that all models are compared by (`Ratio`). A few changes are tried, the same on every machine; the rest is
-counted.
+The present model and every change of it are fitted to the same rows and run over the same others:
+the validation part, or the last third of the training rows as one long run. A change is advised
+where it lowers the error there significantly, by the rule that compares all models (`Ratio`). A few
+changes are tried, the same on every machine; the others are only counted.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from orthaug._base.errors import InputError
 from orthaug._base.lines import counted
 from orthaug._base.progress import LOG
-from orthaug.commands.job import ALONE, Job, Variant
-from orthaug.commands.proposals import Proposal, proposals
+from orthaug.analysis.suspects import Suspect
+from orthaug.commands.job import PHYSICS_ONLY, Job, Variant
 from orthaug.commands.spec import spec_model
+from orthaug.data.expressions import SAMPLING_TIME
 from orthaug.data.record import Record
 from orthaug.fitting.held_out import Pieces, Ratio, blocked, mean_square, squared_errors
-from orthaug.reports.findings import AdviceResult, AdviceTrialsResult
+from orthaug.fitting.kinds import CRITERIA
+from orthaug.physics.motion import HOLDS
+from orthaug.reports.findings import AdviceResult, AdviceTrialsResult, ChangeResult, SuspectResult
 from orthaug.reports.result import FitResult
 
+_SHAPES = {
+    "linear": "{}",
+    "jump": "sign({})",
+    "absolute": "abs({})",
+    "square": "{}**2",
+    "cube": "{}**3",
+}
+_TERMS = 3  # suspected terms that are proposed
+_LITTLE = 0.05  # of what was learned or left: what explains less is not proposed
+_ROWS = 20_000  # of the residual that are looked at
+_SPANNED = 1e-9  # of a term's squares: what is left of it beside the physics where it is physics
+_WIDER = 2  # times the neurons
+_ZONE = "dead_zone"
+
+
+@dataclass(frozen=True, eq=False)
+class Proposal:
+    """A change of a spec: `words` that go on from "with", and the new values by their keys."""
+
+    words: str
+    change: dict[str, Any]
+    learns: bool = False
+    """Whether the change is about a learner: a fit of physics alone would not show its effect."""
+    refocuses: bool = False
+    positive: str | None = None
+    """A parameter that has to be positive, such as the size of a dead zone."""
+
+    def accepts(self, fit: Any) -> bool:
+        """Return whether the result of a changed spec agrees with the words of the proposal."""
+        if self.positive is None:
+            return True
+        return bool(fit.parameters.loc[self.positive, "value"] > 0)
+
+
+def proposals(job: Job, result: FitResult, fit: Any) -> list[Proposal]:
+    """Return what the findings of a fit suggest, the likeliest first, each once."""
+    if (
+        result.residuals is not None
+        and result.residuals.verdict == "white"
+        and not result.residuals.changes
+    ):
+        return _once(list(_suspected_terms(job, result, fit)) if _biased(result) else [])
+    found = [
+        *_missing_terms(job, result),
+        *_suspected_terms(job, result, fit),
+        *_predicted_changes(job, result, fit),
+        *_learner_for_equation(job, result, fit),
+        *_holds(job, result),
+    ]
+    return _once(sorted(found, key=lambda proposal: proposal.learns))  # a learner takes longest
+
+
+def _once(found: list[Proposal]) -> list[Proposal]:
+    return list({proposal.words: proposal for proposal in reversed(found)}.values())[::-1]
+
+
+def _biased(result: FitResult) -> bool:
+    return any(
+        row.bias is not None for row in (*result.parameters, *(result.physical_parameters or ()))
+    )
+
+
+def _missing_terms(job: Job, result: FitResult) -> Iterator[Proposal]:
+    """Yield the terms that the free run of a motion lacks."""
+    test = result.residuals.missing if result.residuals is not None else None
+    if test is None or result.residuals is None or result.residuals.verdict != "unmodelled":
+        return
+    for term in test.terms[:_TERMS]:
+        text = "1" if term.variable is None else _SHAPES[term.shape].format(term.variable)
+        words = "a constant" if term.variable is None else ""
+        yield from _term(job, text, term.equation, term.coefficient, words)
+
+
+def _suspected_terms(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal]:
+    """Yield the suspects that explain most of the learned part, or of the physics' residual."""
+    plain = job.spec.motion is None and fit.model.form.bound is None and len(fit.theta) > 0
+    left = _residual_columns(fit) if plain else None
+    found = []
+    for entry in result.bias or ():
+        share, size = entry.explained, entry.coefficient_found
+        if entry.residual is not None:
+            share, size = entry.residual.share, entry.residual.coefficient
+        elif left is not None:
+            share, size = _residual_share(fit, entry, *left)
+        positive = entry.name.startswith(_ZONE)
+        if (share or 0.0) > _LITTLE and not (
+            positive and (size or 0.0) < 0
+        ):  # that would be no dead zone
+            found.append((share or 0.0, entry, size, positive))
+    for _, entry, size, positive in sorted(found, key=lambda one: -one[0])[:_TERMS]:
+        where = entry.output if job.spec.motion is None else entry.equation
+        yield from _term(
+            job, entry.expression, where, size or entry.coefficient, "", positive=positive
+        )
+
+
+def _residual_columns(fit: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return an orthonormal basis of the physics (N ny, nθ) and the residual beside it (N ny,).
+
+    Both are scaled by the deviations of the outputs; the residual is the one-step one.
+    """
+    problem = fit.problem
+    x, unit = problem.rows.x[:: _every(fit)], problem.deviation
+    phi = np.asarray(problem.baseline.phi(x, problem.layout, problem.outputs, np)) / unit[:, None]
+    basis = np.linalg.qr(phi.reshape(-1, phi.shape[2]))[0]
+    runs = fit.model.predict(problem.record).trajectories
+    error = (
+        np.concatenate([(run.measured - run.model)[problem.rows.start :] for run in runs])[
+            :: _every(fit)
+        ]
+        / unit
+    )
+    return basis, error.ravel() - basis @ (basis.T @ error.ravel())
+
+
+def _every(fit: Any) -> int:
+    """Return the stride of the rows that are looked at."""
+    return 1 + len(fit.problem.rows.x) // _ROWS
+
+
+def _residual_share(
+    fit: Any, entry: SuspectResult, basis: np.ndarray, error: np.ndarray
+) -> tuple[float, float]:
+    """Return the share of the one-step residual that a suspect explains, and its coefficient.
+
+    Both are beside the physics: the part of the suspect that the physics spans is removed.
+    """
+    problem = fit.problem
+    constants = {SAMPLING_TIME: problem.record.sampling_time} | dict(problem.baseline.constants)
+    suspect = Suspect(entry.name, entry.expression, entry.output, constants=constants)
+    column = (
+        suspect.values(problem.rows.x[:: _every(fit)], problem.layout, problem.outputs)
+        / problem.deviation
+    )
+    rest = column.ravel() - basis @ (basis.T @ column.ravel())
+    along, size = float(rest @ error), float(rest @ rest)
+    if not size > _SPANNED * float(column.ravel() @ column.ravel()):
+        return 0.0, 0.0
+    return along**2 / size / max(float(error @ error), np.finfo(float).tiny), along / size
+
+
+def _term(
+    job: Job,
+    expression: str,
+    equation: str | None,
+    size: float | None,
+    words: str,
+    *,
+    positive: bool = False,
+) -> Iterator[Proposal]:
+    """Yield the proposal to add a term, with its coefficient as a new parameter.
+
+    Yields nothing where the spec has the term already.
+    """
+    spec, declared = job.spec, job.declaration
+    name, initial = _new_name(job), float(size or 0.0)
+    if spec.motion is not None:
+        equation = _equation(job, equation)
+        if equation is None:
+            return
+        places = declared["motion"]["states"]
+        key = "next" if spec.motion.integrator == "discrete" else "derivative"
+        own = str(places[equation][key])
+        if f"*{_squeezed(expression)}" in _squeezed(own):
+            return
+        change: dict[str, Any] = {
+            f"motion.states.{equation}.{key}": f"{own} + {name}*({expression})",
+            f"motion.parameters.{name}": {"initial": initial},
+        }
+        where = f"in the equation of {equation}"
+    else:
+        terms = declared["baseline"]["terms"]
+        several = len(spec.data.outputs) > 1
+        if any(
+            _same(str(term["regressor"]), expression, term.get("output"), equation)
+            for term in terms
+        ):
+            return
+        own_output = {"output": equation} if several and equation is not None else {}
+        change = {
+            "baseline.terms": [*terms, {"parameter": name, "regressor": expression, **own_output}]
+        }
+        if spec.physics is not None:
+            change[f"physics.parameters.{name}"] = {"initial": initial or 1.0}
+            change[f"physics.theta.{name}"] = name
+        where = f"in the physics{f' of {equation}' if several and equation is not None else ''}"
+    what = words or f"the term {expression}"
+    yield Proposal(f"{what} {where}", change, positive=name if positive else None)
+
+
+def _equation(job: Job, equation: str | None) -> str | None:
+    """Return the state whose equation a term is added to; None for a term of an output."""
+    from orthaug.analysis.motion_suspects import equations_of, usual_places
+
+    motion = job.problem.motion
+    if equation is None:
+        places = usual_places(motion)
+        equation = equations_of(motion)[places[0]] if len(places) == 1 else None
+    return equation if equation in motion.names_of_states else None
+
+
+def _new_name(job: Job) -> str:
+    """Return a name for a parameter that the spec does not use."""
+    spec, number = job.spec, 1
+    taken = set(spec.data.inputs) | set(spec.data.outputs)
+    if spec.motion is not None:
+        taken |= {
+            *spec.motion.states,
+            *spec.motion.parameters,
+            *spec.motion.define,
+            *spec.motion.constants,
+        }
+    elif spec.baseline is not None:
+        taken |= {term.parameter for term in spec.baseline.terms} | set(spec.baseline.constants)
+        taken |= set(spec.physics.parameters) if spec.physics is not None else set()
+    while (name := f"size{number if number > 1 else ''}") in taken:
+        number += 1
+    return name
+
+
+def _squeezed(text: str) -> str:
+    return "".join(text.split())
+
+
+def _same(one: str, other: str, output: str | None, equation: str | None) -> bool:
+    return _squeezed(one) == _squeezed(other) and (
+        output is None or equation is None or output == equation
+    )
+
+
+def _predicted_changes(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal]:
+    """Yield the changes of lagged physics for which its residual predicts a gain."""
+    for change in result.residuals.changes if result.residuals is not None else ():
+        if change.kind in ("input_lag", "output_lag", "offset"):
+            yield from _term(job, change.what, change.output, None, _lag_words(change))
+        elif change.kind == "learner":
+            yield from _learner(job, result, fit)
+        elif (
+            change.kind == "criterion"
+            and not _has_compared_criteria(result)
+            and change.what != CRITERIA.kind_of(fit.criterion)
+        ):
+            yield Proposal(
+                f'focus = "{change.what}"', {"training.focus": change.what}, refocuses=True
+            )
+
+
+def _has_compared_criteria(result: FitResult) -> bool:
+    """Return whether the fit itself has already tried both criteria."""
+    return result.focus is not None and bool(result.focus.candidates)
+
+
+def _lag_words(change: ChangeResult) -> str:
+    return "an offset" if change.kind == "offset" else f"the further lag {change.what}"
+
+
+def _learner(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal]:
+    """Yield a learner where none was tried, one that sees more, one of more neurons."""
+    from orthaug.physics.shared import seen
+
+    spec, problem, bound = job.spec, job.problem, fit.model.form.bound
+    if spec.motion is not None:
+        return
+    if spec.declared_learner() is None:
+        yield Proposal("a learner", {"learner": {"kind": "mlp"}}, learns=True)
+        return
+    if bound is None:  # it was tried, and physics alone was better
+        return
+    visible = seen(problem.features, problem.layout, problem.rows.x, lambda rows: rows)
+    hidden = [str(lag) for lag, one in zip(problem.layout, visible, strict=True) if not one]
+    now = spec.learner_inputs()
+    if hidden and now is not None:
+        yield Proposal(
+            f"a learner that also sees {', '.join(hidden)}",
+            {"learner.inputs": [*now, *hidden]},
+            learns=True,
+        )
+    wild = any(warning.code == "wild_rows" for warning in result.warnings)
+    widths = getattr(bound.learner, "hidden", None)
+    if not hidden and widths and not wild:
+        wider = [_WIDER * width for width in widths]
+        yield Proposal(
+            f"a learner of {' and '.join(map(str, wider))} neurons",
+            {"learner.hidden": wider},
+            learns=True,
+        )
+
+
+def _learner_for_equation(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal]:
+    """Yield proposals of a learner in the equation of a motion that lacks something.
+
+    Where there is one already, it is given the signals that the missing part depends on.
+    """
+    test = result.residuals.missing if result.residuals is not None else None
+    if job.spec.motion is None or test is None or not test.terms or result.residuals is None:
+        return
+    best = test.terms[0]
+    if result.residuals.verdict != "unmodelled" or best.variable is None:
+        return
+    if job.spec.declared_learner() is None:
+        change = {
+            f"motion.states.{best.equation}.learned": True,
+            "learner": {"inputs": [best.variable]},
+        }
+        words = f"a learner that sees {best.variable} in the equation of {best.equation}"
+        yield Proposal(words, change, learns=True)
+        return
+    now = job.spec.learner_inputs()
+    learned = {job.problem.motion.names_of_states[i] for i in job.problem.motion.learned[0]}
+    if (
+        fit.model.form.bound is None
+        or now is None
+        or best.equation not in learned
+        or _reads(now, best.variable)
+    ):
+        return
+    change = {"learner.inputs": [*now, best.variable]}
+    yield Proposal(f"a learner that also sees {best.variable}", change, learns=True)
+
+
+def _reads(inputs: tuple[str, ...], variable: str) -> bool:
+    return any(_squeezed(text) == variable for text in inputs)
+
+
+def _holds(job: Job, result: FitResult) -> Iterator[Proposal]:
+    """Yield the holds of the inputs that a motion does not use yet."""
+    motion = job.spec.motion
+    if motion is None or not job.spec.data.inputs or motion.integrator == "discrete":
+        return
+    if result.residuals is None or result.residuals.verdict != "unmodelled":
+        return
+    for hold in HOLDS:
+        if hold != motion.hold:
+            yield Proposal(f'hold = "{hold}"', {"motion.hold": hold})
+
+
 _PIECES = 3  # of the training rows, the last of which is held out where there is no validation part
-_MOST, _MOST_OF_A_MOTION = 3, 2  # changes that are tried: together they take about as long as the fit
-_SAME = 1e-6  # relative: two terms of one error span the same beside the physics, as a dead zone and a limit
+_MOST, _MOST_OF_A_MOTION = (
+    3,
+    2,
+)  # changes that are tried: together they take about as long as the fit
+_SAME = 1e-6  # relative: two terms of one error span the same, as a dead zone and a limit
 _LISTED = 3  # changes without gain that the text names
 
 
 @dataclass(frozen=True, eq=False)
-class HeldOutRows:
-    """The rows that models are fitted to, and those that they run over."""
+class ValidationRows:
+    """The rows that models are fitted to, and those on which their free runs are judged."""
 
     training: Record
     held: Record
@@ -42,21 +386,27 @@ class HeldOutRows:
     which: str
 
     @classmethod
-    def of(cls, job: Job) -> HeldOutRows:
+    def of(cls, job: Job) -> ValidationRows:
         """Return the validation part of a job, or the last third of its training rows.
 
         Raises:
             InputError: too few rows.
         """
         if job.validation is not None:
-            return cls(job.train.record, job.validation.record, job.validation.skips, "the validation part", "")
+            return cls(
+                job.train.record,
+                job.validation.record,
+                job.validation.skips,
+                "the validation part",
+                "",
+            )
         training, held = blocked(job.train.record, _PIECES, job.first_row)[-1]
         return cls(training, held, 0, "rows held out", " (the last third of the training data)")
 
 
 @dataclass(frozen=True, eq=False)
-class Tried:
-    """A proposal with the errors of its free run; `pieces` is None where it could not be fitted."""
+class ProposalErrors:
+    """A proposal with the errors of its free run; `pieces` is None where its fit failed."""
 
     proposal: Proposal
     pieces: Pieces | None
@@ -73,23 +423,30 @@ class Trials:
     """Fits of changed specs."""
 
     job: Job
-    rows: HeldOutRows
+    rows: ValidationRows
     variant: Variant
     unit: Any
     substeps: int | None = None
-    """Of a motion that is integrated."""
+    """Substeps of a motion that is integrated."""
 
     def changed(self, change: dict[str, Any]) -> Job:
-        """Return the job of a changed spec, with the substeps of the fit: looking for them would cost most.
+        """Return the job of a changed spec, with the substeps of the fit: a search would cost most.
 
         Raises:
             InputError: the change is not possible; ValueError likewise.
         """
         fixed = {} if self.substeps is None else {"motion.substeps": self.substeps}
-        return self.job.changed(spec_model().model_validate(changed(self.job.declaration, change | fixed)))
+        return self.job.changed(
+            spec_model().model_validate(changed(self.job.declaration, change | fixed))
+        )
 
-    def run(self, job: Job, variant: Variant, accepts: Callable[[Any], bool] = lambda fit: True) -> Pieces | None:
-        """Squared errors of the free run of a job's model; None where there is none, or it is not accepted."""
+    def run(
+        self, job: Job, variant: Variant, accepts: Callable[[Any], bool] = lambda fit: True
+    ) -> Pieces | None:
+        """Return the squared errors of the free run of a job's model.
+
+        None where training failed, or the fit is not accepted.
+        """
         try:
             fit = job.fold_fit(variant)(self.rows.training)
             if not fit.status.ok or not accepts(fit):
@@ -99,21 +456,21 @@ class Trials:
             LOG.info("a change was not tried: %s", error)
             return None
 
-    def of(self, proposal: Proposal, *, physics_only: bool) -> Tried:
-        """The trial of a proposal."""
+    def of(self, proposal: Proposal, *, physics_only: bool) -> ProposalErrors:
+        """Return the trial of a proposal."""
         try:
             job = self.changed(proposal.change)
         except (InputError, ValueError) as error:
             LOG.info("%s was not tried: %s", proposal.words, error)
-            return Tried(proposal, None)
+            return ProposalErrors(proposal, None)
         criterion = job.spec.declared_criterion() if proposal.refocuses else self.variant.criterion
-        kind = ALONE if physics_only else None if proposal.learns else self.variant.kind
+        kind = PHYSICS_ONLY if physics_only else None if proposal.learns else self.variant.kind
         pieces = self.run(job, Variant(kind, criterion=criterion), proposal.accepts)
-        return Tried(proposal, pieces, physics_only)
+        return ProposalErrors(proposal, pieces, physics_only)
 
 
 def changed(declaration: dict[str, Any], change: dict[str, Any]) -> dict[str, Any]:
-    """Return a declaration with the values of a change at their keys, dots between the parts of a key."""
+    """Return a declaration with the values of a change; dots in a key separate its levels."""
     found = deepcopy(declaration)
     for key, value in change.items():
         *path, last = key.split(".")
@@ -126,8 +483,10 @@ def changed(declaration: dict[str, Any], change: dict[str, Any]) -> dict[str, An
     return found
 
 
-def advise(job: Job, fit: Any, result: FitResult) -> tuple[list[AdviceResult], AdviceTrialsResult] | None:
-    """Return the changes that better the free run where nothing was fitted, and an account of all trials.
+def advise(
+    job: Job, fit: Any, result: FitResult
+) -> tuple[list[AdviceResult], AdviceTrialsResult] | None:
+    """Return the changes that lower the free run's validation error, and a count of all trials.
 
     None where nothing is proposed, or nothing can be tried.
     """
@@ -135,11 +494,11 @@ def advise(job: Job, fit: Any, result: FitResult) -> tuple[list[AdviceResult], A
     if not found or job.train.source is not None or job.spec.engine.kind not in ("auto", "memory"):
         return None
     try:
-        rows = HeldOutRows.of(job)
+        rows = ValidationRows.of(job)
     except InputError:
         return None
     learns = fit.model.form.bound is not None
-    variant = Variant(None if learns else ALONE, criterion=fit.criterion)
+    variant = Variant(None if learns else PHYSICS_ONLY, criterion=fit.criterion)
     motion = result.motion
     substeps = None if motion is None or motion.integrator == "discrete" else motion.substeps
     trials = Trials(job, rows, variant, fit.problem.deviation, substeps)
@@ -152,38 +511,60 @@ def advise(job: Job, fit: Any, result: FitResult) -> tuple[list[AdviceResult], A
 
 
 def _concluded(
-    base: Pieces, tried: Sequence[Tried], rows: HeldOutRows, left: int, learns: bool
+    base: Pieces, tried: Sequence[ProposalErrors], rows: ValidationRows, left: int, learns: bool
 ) -> tuple[list[AdviceResult], AdviceTrialsResult]:
     before = math.sqrt(mean_square(base))
-    helps = [one for one in tried if one.pieces is not None and _ratio(one.pieces, base).code == "helps"]
-    better: list[Tried] = []
+    helps = [
+        one for one in tried if one.pieces is not None and _ratio(one.pieces, base).code == "helps"
+    ]
+    better: list[ProposalErrors] = []
     for one in sorted(helps, key=lambda one: one.error):
         if not any(math.isclose(one.error, other.error, rel_tol=_SAME) for other in better):
             better.append(one)
     advice = [
-        AdviceResult(change=one.proposal.change, text=_advice_text(one, before, rows), before=before, after=one.error)
+        AdviceResult(
+            change=one.proposal.change,
+            text=_advice_text(one, before, rows),
+            before=before,
+            after=one.error,
+        )
         for one in better
     ]
     worse = [one for one in tried if one not in helps]
-    text = f"Tried by a refit of {'physics and learner' if learns else 'the physics'} and a free run over {rows.where}"
-    text += f"{rows.which}: {counted(len(tried), 'change')} of the spec, {_which(len(helps), len(tried))}."
+    text = (
+        f"Tried by a refit of {'physics and learner' if learns else 'the physics'} and a free "
+        f"run over {rows.where}"
+    )
+    text += (
+        f"{rows.which}: {counted(len(tried), 'change')} of the spec, "
+        f"{_which(len(helps), len(tried))}."
+    )
     if worse:
         named = "; ".join(f"{one.proposal.words} ({_after(one)})" for one in worse[:_LISTED])
         more = f" and {len(worse) - _LISTED} more" if len(worse) > _LISTED else ""
         text += f" No gain from {_error(before)}: {named}{more}."
     if left:
-        text += f" {counted(left, 'change')} {'was' if left == 1 else 'were'} not tried, to spare time."
+        text += (
+            f" {counted(left, 'change')} {'was' if left == 1 else 'were'} not tried, to spare time."
+        )
     return advice, AdviceTrialsResult(text=text, tried=len(tried), not_tried=left)
 
 
 def _which(better: int, tried: int) -> str:
     if tried == 1:
-        return "which betters it" if better else "which does not better it"
-    return f"of which {'none betters' if not better else 'one betters' if better == 1 else f'{better} better'} it"
+        return "which betters it" if better else "which does not improve it"
+    return (
+        "of which "
+        f"{'none betters' if not better else 'one betters' if better == 1 else f'{better} better'} "
+        "it"
+    )
 
 
 def _ratio(pieces: Pieces, base: Pieces) -> Ratio:
-    """Errors against those of the model as it is, on the rows that both have: more lags begin later."""
+    """Return the ratio of errors to those of the present model, on the rows that both predict.
+
+    With more lags the predictions begin later.
+    """
     cut = [
         (a, b) if a is None or b is None else (a[-min(len(a), len(b)) :], b[-min(len(a), len(b)) :])
         for a, b in zip(pieces, base, strict=True)
@@ -191,16 +572,27 @@ def _ratio(pieces: Pieces, base: Pieces) -> Ratio:
     return Ratio.of([a for a, _ in cut], [b for _, b in cut])
 
 
-def _advice_text(one: Tried, before: float, rows: HeldOutRows) -> str:
+def _advice_text(one: ProposalErrors, before: float, rows: ValidationRows) -> str:
     alone = " of physics alone" if one.physics_only else ""
     text = f"With {one.proposal.words} the free run{alone} on {rows.where}"
     if math.isinf(before):
-        return f"{text} no longer diverges: its error is {_error(one.error)} of the output's deviation."
-    return f"{text} improves from {_error(before)} to {_error(one.error)} of the output's deviation."
+        return (
+            f"{text} no longer diverges: its error is {_error(one.error)} of the output's "
+            "deviation."
+        )
+    return (
+        f"{text} improves from {_error(before)} to {_error(one.error)} of the output's deviation."
+    )
 
 
-def _after(one: Tried) -> str:
-    return "no fit" if one.pieces is None else "diverges" if math.isinf(one.error) else _error(one.error)
+def _after(one: ProposalErrors) -> str:
+    return (
+        "no fit"
+        if one.pieces is None
+        else "diverges"
+        if math.isinf(one.error)
+        else _error(one.error)
+    )
 
 
 def _error(value: float) -> str:

@@ -1,4 +1,4 @@
-"""Analyses behind a finished training: where one fails the result stands, and a warning says which."""
+"""Analyses after training: where one fails the fit is kept, and a warning names the analysis."""
 
 from __future__ import annotations
 
@@ -12,13 +12,19 @@ from orthaug._base.progress import LOG
 
 T = TypeVar("T")
 _NUMERICAL = (ArithmeticError, np.linalg.LinAlgError)
-DEFECTS: tuple[type[BaseException], ...] = (AttributeError, IndexError, KeyError, TypeError, ValueError)
+DEFECTS: tuple[type[BaseException], ...] = (
+    AttributeError,
+    IndexError,
+    KeyError,
+    TypeError,
+    ValueError,
+)
 
 
 def attempt(what: str, analysis: Callable[[], T], warnings: list[Any], otherwise: T) -> T:
-    """What an analysis finds, or `otherwise` with one more warning where it fails.
+    """Return the result of an analysis, or `otherwise` with one more warning where it fails.
 
-    A training may have taken hours: a defect of an analysis does not take it away, and is logged.
+    Training may have taken hours: a defect of an analysis does not discard it, and is logged.
 
     Args:
         what: the analysis in words, to begin a sentence with.
@@ -27,20 +33,28 @@ def attempt(what: str, analysis: Callable[[], T], warnings: list[Any], otherwise
     try:
         return analysis()
     except _NUMERICAL as error:
-        told = f"{what} failed numerically ({str(error).rstrip('.')}): the result stands without it."
+        text = (
+            f"{what} failed numerically ({str(error).rstrip('.')}): the result is given without it."
+        )
     except InputError:
         raise
     except DEFECTS as error:
         LOG.info("%s failed", what, exc_info=True)
-        told = f"{what} failed by a defect of orthaug ({type(error).__name__}: {error}): the result stands without it."
-    warnings.append(Warning("analysis_failed", told))
+        text = (
+            f"{what} failed by a defect of orthaug ({type(error).__name__}: {error}): the "
+            "result is given without it."
+        )
+    warnings.append(Warning("analysis_failed", text))
     return otherwise
 
 
 def attempt_warned(
     what: str, analysis: Callable[[], T | None], warnings: list[Any], without: Warning | None = None
 ) -> T | None:
-    """As `attempt`, with the warnings that the finding has, or `without` where there is none; None where it fails."""
+    """Return the result of an analysis, or `without`; its own warnings are added too.
+
+    None where it fails.
+    """
 
     def found() -> T | None:
         finding: Any = analysis()

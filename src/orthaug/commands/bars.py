@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from html import escape
 from typing import TYPE_CHECKING, Any
 
-from orthaug._base.progress import SILENT, Enough, Plan, Progress, Tell
+from orthaug._base.progress import SILENT, Plan, Progress, ProgressCallback, StopTraining
 from orthaug.commands import streams
 from orthaug.commands.signals import WATCH
 from orthaug.commands.streams import say
@@ -23,38 +23,52 @@ if TYPE_CHECKING:
     from rich.progress import Progress as Bar
     from rich.progress import ProgressColumn
 
-TOLD_AS = "ORTHAUG_PROGRESS"
-"""Variable of the environment; where it is `json`, training tells of itself by lines of JSON on standard error."""
+PROGRESS_VARIABLE = "ORTHAUG_PROGRESS"
+"""Environment variable: with the value `json`, progress is written as JSON to standard error.
+"""
 ENOUGH = threading.Event()
-"""Of the process: once it is set, training ends with what it has reached, as a result with the warning `stopped`."""
+"""Event of the process: it ends training with the result so far and the warning `stopped`.
+"""
 ENOUGH_LINE = b"enough\n"
 """What sets it, on the standard input of a child of the page."""
+GO_ON = "The runs that are done are kept: the same command goes on from there"
+"""What an interrupted `reproduce` says last."""
 _OFTEN = 0.02  # s between such lines
-_MANY = 1_000_000  # rows from which the rate is told
-_LONG = 5.0  # s of a search that are told beforehand
-_SEEN = 3  # models after which the time of the rest is told: the first ones compile
+_MANY = 1_000_000  # rows from which the rate is shown
+_LONG = 5.0  # s of a search from which its duration is announced
+_SEEN = 3  # models after which the remaining time is shown: the first ones compile
 
 
 def on_terminal() -> bool:
-    """Whether a person sees standard error. FORCE_COLOR, which build servers set, does not make it one."""
+    """Return whether standard error is a terminal.
+
+    FORCE_COLOR, which build servers set, does not make it one.
+    """
     return sys.stderr is not None and sys.stderr.isatty()
 
 
 def drawn_bar(*columns: ProgressColumn, transient: bool = True) -> Bar:
-    """A bar with its description and these columns, drawn on a terminal only. NO_COLOR is heeded."""
+    """Return a bar with its description and these columns, drawn on a terminal only.
+
+    NO_COLOR has effect.
+    """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn
 
     shown = (TextColumn("{task.description}"), BarColumn(), *columns)
-    return Progress(*shown, console=Console(stderr=True), transient=transient, disable=not on_terminal())
+    return Progress(
+        *shown, console=Console(stderr=True), transient=transient, disable=not on_terminal()
+    )
 
 
 @contextmanager
-def training_bar(runs: int, iterations: int, wanted: bool = True, rows: int = 0) -> Iterator[Progress]:
-    """A progress bar on standard error where that is a terminal; Ctrl-C says what it stopped.
+def training_bar(
+    runs: int, iterations: int, wanted: bool = True, rows: int = 0
+) -> Iterator[Progress]:
+    """Show a progress bar on standard error where that is a terminal; report what Ctrl-C stopped.
 
     Args:
-        rows: of the training data. Where there are many, it says how many are gone through in a second.
+        rows: of the training data. Where there are many, the rate in rows/s is shown.
     """
     if not wanted:
         yield SILENT
@@ -65,28 +79,30 @@ def training_bar(runs: int, iterations: int, wanted: bool = True, rows: int = 0)
     with (
         _deferred_interrupt() as interrupted,
         drawn_bar(TimeElapsedColumn(), TimeRemainingColumn()) as bar,
-        WATCH.telling(lambda: reached, bar.stop),
+        WATCH.reporting(lambda: reached, bar.stop),
     ):
         task = bar.add_task("compiling", total=runs * iterations)
         done: dict[int, int] = {}
         line = _Lines(runs, iterations)
 
-        def tell(run: int, iteration: int, loss: float) -> None:
+        def show(run: int, iteration: int, loss: float) -> None:
             nonlocal reached
             done[run] = iteration
             reached = f"run {run + 1} of {runs}, iteration {iteration}, loss {loss:.3g}"
             passes = sum(done.values())
             rate = rows * passes / max(time.monotonic() - began, 1e-3)
-            told = f"{reached}, {rate / 1e6:.3g} million rows/s" if rows >= _MANY else reached
-            bar.update(task, completed=passes, description=told)
+            description = (
+                f"{reached}, {rate / 1e6:.3g} million rows/s" if rows >= _MANY else reached
+            )
+            bar.update(task, completed=passes, description=description)
             line(run, iteration, loss, passes)
             if interrupted.is_set():
                 raise KeyboardInterrupt(reached)
             if ENOUGH.is_set():
-                raise Enough
+                raise StopTraining
 
         try:
-            yield Progress(tell, plan=line.planned)
+            yield Progress(show, plan=line.planned)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(reached) from None
         if interrupted.is_set():
@@ -94,70 +110,87 @@ def training_bar(runs: int, iterations: int, wanted: bool = True, rows: int = 0)
 
 
 class _Lines:
-    """Writes a line of JSON now and then, for a program that follows this one; nothing unless it is asked for."""
+    """A writer of progress as lines of JSON, for a program that follows this one.
+
+    It writes only if the environment asks for it.
+    """
 
     def __init__(self, runs: int, iterations: int) -> None:
         self.runs, self.iterations = runs, iterations
-        self._wanted, self._last = os.environ.get(TOLD_AS) == "json", -_OFTEN
+        self._wanted, self._last = os.environ.get(PROGRESS_VARIABLE) == "json", -_OFTEN
         self._first, self._plan = 0, ()
 
     def planned(self, first: int, plan: Plan) -> None:
-        """The runs from this number on are these."""
+        """Set the runs that follow from this number on."""
         self._first, self._plan = first, tuple(plan)
 
     def __call__(self, run: int, iteration: int, loss: float, passes: int) -> None:
         if not self._wanted or time.monotonic() - self._last < _OFTEN:
             return
         self._last = time.monotonic()
-        told = {"run": run + 1, "runs": self.runs, "iteration": iteration, "iterations": self.iterations}
+        fields = {
+            "run": run + 1,
+            "runs": self.runs,
+            "iteration": iteration,
+            "iterations": self.iterations,
+        }
         share = min(1.0, passes / max(self.runs * self.iterations, 1))
         own = run - self._first  # one that is made again has a number after those that are planned
         known = self._plan[own] if 0 <= own < len(self._plan) else {}
-        streams.say(json.dumps({**told, "loss": loss if math.isfinite(loss) else None, "done": share, **known}))
+        streams.say(
+            json.dumps(
+                {**fields, "loss": loss if math.isfinite(loss) else None, "done": share, **known}
+            )
+        )
 
 
 @contextmanager
 def study_bars() -> Iterator[Callable[[str, int, int], None]]:
-    """A bar per study on standard error where that is a terminal; Ctrl-C stops after the run at hand."""
+    """Show a bar per study on standard error where that is a terminal.
+
+    Ctrl-C stops after the run at hand.
+    """
     from rich.progress import MofNCompleteColumn, TimeElapsedColumn
 
     reached = "the start of the studies"
     with (
         _deferred_interrupt() as interrupted,
         drawn_bar(MofNCompleteColumn(), TimeElapsedColumn(), transient=False) as bar,
-        WATCH.telling(lambda: reached, bar.stop),
+        WATCH.reporting(lambda: reached, bar.stop, GO_ON),
     ):
         tasks: dict[str, Any] = {}
 
-        def tell(title: str, done: int, total: int) -> None:
+        def show(title: str, done: int, total: int) -> None:
             nonlocal reached
-            reached = f"'{title}', {done} of {total} runs done and kept for the next time"
+            reached = f"'{title}', {done} of {total} runs done"
             if title not in tasks:
                 tasks[title] = bar.add_task(title, total=total)
             bar.update(tasks[title], completed=done)
             if interrupted.is_set():
-                raise KeyboardInterrupt(reached)
+                raise KeyboardInterrupt(reached, GO_ON)
 
-        yield tell
+        yield show
 
 
 @contextmanager
 def selection_bar(most: int) -> Iterator[Callable[[str, Any], None]]:
-    """A bar of the models that were judged, on standard error; Ctrl-C keeps what there is, a second one ends at once.
+    """Show a bar of the models judged so far, on standard error.
 
-    Once terms have been judged for a while, it says what the rest takes at most, also where there is no terminal.
+    Ctrl-C keeps the models judged so far, a second one ends at once.
+
+    After some terms it announces the longest remaining time, also without a terminal.
     """
     from rich.progress import MofNCompleteColumn, TimeElapsedColumn, TimeRemainingColumn
 
     with (
         _asked_to_stop() as asked,
         drawn_bar(MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn()) as bar,
-        WATCH.telling(lambda: "the selection of a structure", bar.stop),
+        WATCH.reporting(lambda: "the selection of a structure", bar.stop),
     ):
         tasks: dict[str, Any] = {}
         judged: dict[str, list[float]] = {}
 
-        def tell(stage: str, rung: Any) -> None:
+        def show(stage: str, rung: Any) -> None:
             done = judged.setdefault(stage, [])
             done.append(rung.seconds)
             if stage not in tasks:
@@ -165,16 +198,19 @@ def selection_bar(most: int) -> Iterator[Callable[[str, Any], None]]:
             bar.update(tasks[stage], advance=1)
             whole = done[-1] * most
             if stage == "terms" and len(done) == _SEEN and whole > _LONG and not on_terminal():
-                say(f"note: a model takes {done[-1]:.1f} s; at most {most} are judged, {whole:.0f} s.")
+                say(
+                    f"note: a model takes {done[-1]:.1f} s; at most {most} are judged, "
+                    f"{whole:.0f} s."
+                )
             if asked.is_set():
                 raise KeyboardInterrupt
 
-        yield tell
+        yield show
 
 
 @contextmanager
 def _asked_to_stop() -> Iterator[threading.Event]:
-    """An event that the first Ctrl-C sets."""
+    """Yield an event that the first Ctrl-C sets."""
     if WATCH.active:
         with WATCH.asking() as event:
             yield event
@@ -185,7 +221,9 @@ def _asked_to_stop() -> Iterator[threading.Event]:
 
 @contextmanager
 def _deferred_interrupt() -> Iterator[threading.Event]:
-    """Ctrl-C sets the event, so that it never lands inside compiled code; a second one interrupts at once.
+    """Let Ctrl-C set the event, so that it never interrupts compiled code.
+
+    A second one interrupts at once.
 
     Where a thread watches for signals, it ends the program itself.
     """
@@ -207,8 +245,8 @@ def _deferred_interrupt() -> Iterator[threading.Event]:
 
 
 @contextmanager
-def shown_progress() -> Iterator[Tell]:
-    """Progress of a fit from Python: a bar on a terminal, a line in a notebook, nothing elsewhere."""
+def shown_progress() -> Iterator[ProgressCallback]:
+    """Show the progress of a fit from Python: on a terminal a bar, in a notebook a line."""
     display = _display()
     if display is not None:
         yield from _in_notebook(display)
@@ -219,39 +257,46 @@ def shown_progress() -> Iterator[Tell]:
 
 
 def _display() -> Any:
-    """IPython's `display` in a notebook, which has loaded it; None elsewhere."""
+    """Return IPython's `display` in a notebook, which has loaded it; None elsewhere."""
     ipython, shown = sys.modules.get("IPython"), sys.modules.get("IPython.display")
     if ipython is None or shown is None:
         return None
     return shown.display if type(ipython.get_ipython()).__name__ == "ZMQInteractiveShell" else None
 
 
-def _in_notebook(display: Any) -> Iterator[Tell]:
+def _in_notebook(display: Any) -> Iterator[ProgressCallback]:
     lock, began = threading.Lock(), time.monotonic()
     runs: dict[int, tuple[int, float]] = {}
-    handle: Any = display({"text/html": _line("compiling", ended=False), "text/plain": ""}, raw=True, display_id=True)
+    handle: Any = display(
+        {"text/html": _line("compiling", ended=False), "text/plain": ""}, raw=True, display_id=True
+    )
 
-    def show(words: str, *, ended: bool) -> None:
+    def draw(words: str, *, ended: bool) -> None:
         handle.update({"text/html": _line(words, ended=ended), "text/plain": words}, raw=True)
 
-    def tell(run: int, iteration: int, loss: float) -> None:
+    def show(run: int, iteration: int, loss: float) -> None:
         with lock:
             runs[run] = (iteration, loss)
-            show(_words(run, iteration, loss), ended=False)
+            draw(_words(run, iteration, loss), ended=False)
 
     try:
-        yield tell
+        yield show
     finally:
         steps = sum(iteration for iteration, _ in runs.values())
-        show(f"{len(runs) or 1} runs, {steps} iterations, {time.monotonic() - began:.1f} s", ended=True)
+        draw(
+            f"{len(runs) or 1} runs, {steps} iterations, {time.monotonic() - began:.1f} s",
+            ended=True,
+        )
 
 
-def _on_terminal() -> Iterator[Tell]:
+def _on_terminal() -> Iterator[ProgressCallback]:
     from rich.progress import TimeElapsedColumn
 
     with drawn_bar(TimeElapsedColumn()) as shown:
         task = shown.add_task("compiling", total=None)
-        yield lambda run, iteration, loss: shown.update(task, description=_words(run, iteration, loss))
+        yield lambda run, iteration, loss: shown.update(
+            task, description=_words(run, iteration, loss)
+        )
 
 
 def _words(run: int, iteration: int, loss: float) -> str:
@@ -259,6 +304,10 @@ def _words(run: int, iteration: int, loss: float) -> str:
 
 
 def _line(words: str, *, ended: bool) -> str:
-    """A bar that moves as long as it is not known how long it takes."""
-    moving = "" if ended else '<progress aria-label="training" style="vertical-align:middle"></progress> '
+    """Return a bar that moves while the total is unknown."""
+    moving = (
+        ""
+        if ended
+        else '<progress aria-label="training" style="vertical-align:middle"></progress> '
+    )
     return f"<div>{moving}{escape(words)}</div>"

@@ -1,4 +1,7 @@
-"""The command line: arguments in, text out. Results go to standard output, progress and errors to standard error."""
+"""The command line: arguments in, text out.
+
+Results go to standard output, progress and errors to standard error.
+"""
 
 from __future__ import annotations
 
@@ -15,23 +18,24 @@ import typer
 from orthaug._base.checks import check_choice
 from orthaug._base.errors import TrainingError
 from orthaug.commands import streams
-from orthaug.commands.bars import on_terminal, study_bars, training_bar
+from orthaug.commands.bars import GO_ON, on_terminal, study_bars, training_bar
 from orthaug.commands.program import (
     AsJson,
     Force,
+    ListOptionCommand,
     OutFolder,
     SpecPath,
-    TakesLists,
     app,
     arguments,
     main,
     other_writes,
     prepare_jax,
-    tell,
+    print_result,
 )
+from orthaug.commands.signals import WATCH
 
 __all__ = ["main"]
-_LARGE = 20e6  # bytes of a data file from which on `init` tells what it is at
+_LARGE = 20e6  # bytes of a data file from which on `init` reports its stage
 
 
 @app.command()
@@ -54,7 +58,9 @@ def demo(out: OutFolder = None, force: Force = False) -> None:
 def check(
     spec: SpecPath,
     as_json: AsJson = False,
-    figure: Annotated[Path | None, typer.Option("--figure", metavar="PNG", help="Heat map of the biases.")] = None,
+    figure: Annotated[
+        Path | None, typer.Option("--figure", metavar="PNG", help="Heat map of the biases.")
+    ] = None,
     force: Force = False,
 ) -> None:
     """Report excitation and identifiability; trains nothing."""
@@ -67,7 +73,7 @@ def check(
     if job.spec.motion is not None:  # its runs are computed
         prepare_jax()
     result = kind_of(job).checked(job)
-    tell(result, check_text(result), as_json)
+    print_result(result, check_text(result), as_json)
     if figure is not None and result.bias:
         from orthaug.reports.finding_plots import bias_figure
 
@@ -81,12 +87,14 @@ def check(
 def fit(
     spec: SpecPath,
     out: OutFolder = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on from where an earlier fit was ended.")] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on from where an earlier fit was ended.")
+    ] = False,
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
     """Fit a spec, print a summary and write the result folder."""
-    from orthaug.commands.fit import fit_job, keeping, write_result
+    from orthaug.commands.fit import fit_job, keep_states, write_result
     from orthaug.commands.folder import check_folder, check_inputs_kept
     from orthaug.commands.kinds import open_job
     from orthaug.reports.text import fit_text
@@ -97,17 +105,18 @@ def fit(
     check_inputs_kept(job, folder)
     prepare_jax()
     asked = arguments("fit", spec, out=out, resume=resume, json=as_json, force=force)
-    job = replace(keeping(job, folder, resume=resume), arguments=asked)
+    job = replace(keep_states(job, folder, resume=resume), arguments=asked)
     learns, rows = job.spec.declared_learner() is not None, getattr(job.problem, "count", 0)
     with training_bar(job.run_count, job.iterations, learns, rows) as progress:
         fitted = fit_job(job, progress)
     if other_writes():
         return
     write_result(fitted, folder, force=force)
-    tell(fitted.result, fit_text(fitted.fit, fitted.result), as_json, folder)
+    print_result(fitted.result, fit_text(fitted.fit, fitted.result), as_json, folder)
     if not fitted.fit.status.ok:
         raise TrainingError(
-            f"{fitted.result.status.message.removesuffix('.')}. The account is in {folder / 'result.json'}."
+            f"{fitted.result.status.message.removesuffix('.')}. The account is in "
+            f"{folder / 'result.json'}."
         )
 
 
@@ -116,12 +125,13 @@ def compare(
     spec: SpecPath,
     out: OutFolder = None,
     model: Annotated[
-        list[Path] | None, typer.Option("--model", metavar="MODEL", help="A saved model to put beside; any number.")
+        list[Path] | None,
+        typer.Option("--model", metavar="MODEL", help="A saved model to put beside; any number."),
     ] = None,
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
-    """Physics alone and every structure, one table."""
+    """Compare physics alone and every structure in one table."""
     from orthaug.commands.folder import check_folder, check_inputs_kept
     from orthaug.commands.kinds import open_job
     from orthaug.reports.text import compare_text
@@ -140,7 +150,9 @@ def compare(
     if other_writes():
         return
     comparing.write(comparison, folder, force=force)
-    tell(comparison.result, compare_text(comparison.result, comparison.verdicts), as_json, folder)
+    print_result(
+        comparison.result, compare_text(comparison.result, comparison.verdicts), as_json, folder
+    )
 
 
 @app.command()
@@ -152,7 +164,7 @@ def design(
 ) -> None:
     """Design an input that biases the parameters least.
 
-    Within limits, against suspected terms and noise: [design] of the spec.
+    [design] of the spec has the limits, suspected terms and noise.
     """
     from orthaug.commands import design as designing
     from orthaug.commands.folder import check_file
@@ -167,14 +179,16 @@ def design(
     for line in designing.notes(job):
         streams.say(line)
     result = DesignResult.of(designed)
-    tell(result, design_text(result), as_json, out)
+    print_result(result, design_text(result), as_json, out)
 
 
 @app.command()
-def select(spec: SpecPath, out: OutFolder = None, as_json: AsJson = False, force: Force = False) -> None:
+def select(
+    spec: SpecPath, out: OutFolder = None, as_json: AsJson = False, force: Force = False
+) -> None:
     """Choose orders, delay and terms, and write a spec with them.
 
-    Or a network's width and inputs: [selection] of the spec.
+    It can also choose a network's width and inputs: [selection] of the spec.
     """
     from orthaug.commands.bars import selection_bar
     from orthaug.commands.folder import check_folder, check_inputs_kept
@@ -186,22 +200,29 @@ def select(spec: SpecPath, out: OutFolder = None, as_json: AsJson = False, force
     job, given = open_select(spec)
     check_inputs_kept(job, folder)
     prepare_jax()
-    with selection_bar(steps_at_most(given.selection.terms)) as told:
-        selected = select_for(job, given, folder, told)
+    with selection_bar(steps_at_most(given.selection.terms)) as report_model:
+        selected = select_for(job, given, folder, report_model)
     write_selected(selected, folder, force=force)
     place = f"{folder}; next: orthaug fit {folder / 'spec.toml'}"
-    tell(selected.result, selection_text(selected.result), as_json, place)
+    print_result(selected.result, selection_text(selected.result), as_json, place)
 
 
-@app.command(cls=TakesLists)
+@app.command(cls=ListOptionCommand)
 def init(
     data: Annotated[Path, typer.Argument(metavar="DATA", help="Data file.")],
-    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="The spec to write.")] = Path("spec.toml"),
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="The spec to write.")] = Path(
+        "spec.toml"
+    ),
     inputs: Annotated[
-        list[str] | None, typer.Option("--inputs", metavar="A B", help="Columns of the inputs; A,B as well.")
+        list[str] | None,
+        typer.Option("--inputs", metavar="A B", help="Columns of the inputs; A,B as well."),
     ] = None,
-    outputs: Annotated[list[str] | None, typer.Option("--outputs", metavar="Y", help="Columns of the outputs.")] = None,
-    sampling_time: Annotated[float | None, typer.Option("--sampling-time", metavar="S", help="Between rows.")] = None,
+    outputs: Annotated[
+        list[str] | None, typer.Option("--outputs", metavar="Y", help="Columns of the outputs.")
+    ] = None,
+    sampling_time: Annotated[
+        float | None, typer.Option("--sampling-time", metavar="S", help="Between rows.")
+    ] = None,
     force: Force = False,
 ) -> None:
     """Look at a data file, and write a first spec that runs.
@@ -217,8 +238,8 @@ def init(
     if sampling_time is not None:
         check_step(sampling_time)
     large = data.is_file() and data.stat().st_size > _LARGE
-    told = streams.say if large and on_terminal() else _unsaid
-    told(f"reading {data.name}")
+    report_stage = streams.say if large and on_terminal() else _silent
+    report_stage(f"reading {data.name}")
     found = look(data)
     roles = assign(found, inputs, outputs, sampling_time)
     if roles is None:
@@ -228,26 +249,37 @@ def init(
         streams.say("columns: " + ", ".join(column.header for column in found.signals))
         if inputs is None:
             check = partial(assign, found, outputs=outputs, sampling_time=sampling_time)
-            inputs = [_asked("inputs, separated by commas (none: press enter)", check)]
+            inputs = [_ask("inputs, separated by commas (none: press enter)", check)]
         if outputs is None:
-            outputs = [_asked("outputs", partial(assign, found, inputs), default=None)]
+            outputs = [_ask("outputs", partial(assign, found, inputs), default=None)]
         roles = assign(found, inputs, outputs, sampling_time)
-    if roles is not None and sampling_time is None and found.clock.step is None and sys.stdin.isatty():
-        roles = replace(roles, sampling_time=check_step(typer.prompt("seconds between rows", type=float, default=1.0)))
+    if (
+        roles is not None
+        and sampling_time is None
+        and found.clock.step is None
+        and sys.stdin.isatty()
+    ):
+        roles = replace(
+            roles,
+            sampling_time=check_step(typer.prompt("seconds between rows", type=float, default=1.0)),
+        )
     assert roles is not None  # both are given
-    told("looking at signals, delays and orders")
+    report_stage("looking at signals, delays and orders")
     spec = draft(found, roles, out)
-    told("opening the spec as a fit would")
+    report_stage("opening the spec as a fit would")
     write_spec(spec, out, force=force)
     streams.echo(f"{spec.account}\n\nwritten to {out}; next: orthaug fit {out}")
 
 
-def _unsaid(line: str) -> None:
-    """Nobody waits long enough to be told."""
+def _silent(line: str) -> None:
+    """Show nothing: the file is read too quickly for a message."""
 
 
-def _asked(text: str, check: Callable[[str], Any], default: str | None = "") -> str:
-    """An answer that `check` accepts; what is wrong with another one is said, and it is asked again."""
+def _ask(text: str, check: Callable[[str], Any], default: str | None = "") -> str:
+    """Return an answer that `check` accepts.
+
+    Another answer is refused with the reason, and the question is repeated.
+    """
     from orthaug._base.errors import InputError
 
     while True:
@@ -265,10 +297,14 @@ def page(
     spec: Annotated[
         Path | None, typer.Argument(metavar="[SPEC]", help="Spec to begin with; it is not written.")
     ] = None,
-    port: Annotated[int | None, typer.Option("--port", metavar="N", help="A free one without it.")] = None,
-    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open it in the browser.")] = True,
+    port: Annotated[
+        int | None, typer.Option("--port", metavar="N", help="A free one without it.")
+    ] = None,
+    browser: Annotated[
+        bool, typer.Option("--browser/--no-browser", help="Open it in the browser.")
+    ] = True,
 ) -> None:
-    """A page on this machine to do all of this in a browser.
+    """Open a page on this machine to do all of this in a browser.
 
     Look at data, write physics, train, compare and export.
     """
@@ -283,12 +319,12 @@ def schema(
         str,
         typer.Argument(
             metavar="[WHAT]",
-            help="fit, check, compare, split, design, select, explain, linearize or track: what the command writes; "
-            "spec: a spec file; keys: every key of a spec, in words.",
+            help="fit, check, compare, split, design, select, explain, linearize or track: what "
+            "the command writes; spec: a spec file; keys: every key of a spec, in words.",
         ),
     ] = "fit",
 ) -> None:
-    """The JSON schema of a result or a spec; keys: in words."""
+    """Print the JSON schema of a result or a spec; keys: in words."""
     from orthaug.commands.schema import RESULTS, keys_of_a_spec, schema_of, schema_of_a_spec
 
     if check_choice(command, (*RESULTS, "spec", "keys"), "WHAT") == "keys":
@@ -300,20 +336,30 @@ def schema(
 
 @app.command()
 def reproduce(
-    name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="One study; all without it.")] = None,
+    name: Annotated[
+        str | None, typer.Argument(metavar="[NAME]", help="One study; all without it.")
+    ] = None,
     out: OutFolder = None,
     pipeline: Annotated[
-        str, typer.Option("--pipeline", metavar="ours|paper|scripts", help="Who trains; scripts: as published.")
+        str,
+        typer.Option(
+            "--pipeline", metavar="ours|paper|scripts", help="Who trains; scripts: as published."
+        ),
     ] = "ours",
-    small: Annotated[bool, typer.Option("--small", help="The reduced size that the tests run.")] = False,
+    small: Annotated[
+        bool, typer.Option("--small", help="The reduced size that the tests run.")
+    ] = False,
     scheduler: Annotated[
-        str | None, typer.Option("--scheduler", metavar="ADDRESS", help="A Dask cluster whose workers make the runs.")
+        str | None,
+        typer.Option(
+            "--scheduler", metavar="ADDRESS", help="A Dask cluster whose workers make the runs."
+        ),
     ] = None,
     force: Force = False,
 ) -> None:
-    """The paper's figures and tables beside the published ones.
+    """Compute the paper's figures and tables again.
 
-    Goes on where it was interrupted.
+    An interrupted run continues where it stopped.
     """
     from orthaug.studies import reproduction
 
@@ -328,9 +374,12 @@ def reproduce(
 
         client = connected(scheduler, None)
     with study_bars() as progress:
-        reproduced = reproduction.reproduce(entries, pipeline=pipeline, small=small, progress=progress, client=client)
-    reproduction.write(reproduced, folder, pipeline, force=force)
+        reproduced = reproduction.reproduce(
+            entries, pipeline=pipeline, small=small, progress=progress, client=client
+        )
+    with WATCH.reporting(lambda: "the writing of the page", then=GO_ON):
+        reproduction.write(reproduced, folder, pipeline, force=force)
     streams.echo(f"{reproduction.text(reproduced)}\n\nwritten to {folder}/index.html")
 
 
-from orthaug.commands import model_cli  # noqa: E402, F401  (its commands stand behind these)
+from orthaug.commands import model_cli  # noqa: E402, F401  (its commands come after these)

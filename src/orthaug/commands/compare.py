@@ -13,9 +13,16 @@ from orthaug._base.errors import InputError
 from orthaug._base.folders import whole_folder
 from orthaug._base.progress import SILENT, Progress
 from orthaug.analysis.validation import Verdict, dominance
-from orthaug.commands.doubts import doubted
-from orthaug.commands.fit import Fitted, cross_validated, fit_variant, judge_fit, score_part, wanted_blocks
-from orthaug.commands.job import ALONE, Job, Variant, origin_of
+from orthaug.commands.doubts import with_doubts
+from orthaug.commands.fit import (
+    FitReport,
+    cross_validated,
+    fit_variant,
+    judge_fit,
+    score_part,
+    wanted_blocks,
+)
+from orthaug.commands.job import PHYSICS_ONLY, Job, Variant, origin_of
 from orthaug.data.record import same_step
 from orthaug.fitting.criteria import Criterion, Prediction
 from orthaug.models import storage
@@ -27,29 +34,32 @@ from orthaug.reports.result import CompareResult, RowResult, parameter_rows
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """One entry per way of modelling: the fitted ones, and models that were saved earlier."""
+    """A comparison: one entry per model, fitted now or saved earlier."""
 
     job: Job
-    fitted: dict[str, Fitted]
+    fitted: dict[str, FitReport]
     verdicts: dict[str, Verdict]
     result: CompareResult
 
     def __repr__(self) -> str:
-        codes = {kind: self.verdicts[kind].code if kind in self.verdicts else "–" for kind in self.fitted}
+        codes = {
+            kind: self.verdicts[kind].code if kind in self.verdicts else "–" for kind in self.fitted
+        }
         return f"Comparison({', '.join(f'{kind}: {code}' for kind, code in codes.items())})"
 
     def summary(self) -> str:
-        """What `orthaug compare` prints."""
+        """Return what `orthaug compare` prints."""
         from orthaug.reports.text import compare_text
 
         return compare_text(self.result, self.verdicts)
 
 
 def compare(job: Job, saved: Sequence[Path] = (), progress: Progress = SILENT) -> Comparison:
-    """Fit every structure as the spec trains, score each on every part, and put saved models beside them.
+    """Fit every structure as the spec trains, and score each and every saved model on every part.
 
-    A structure that the spec does not allow (a baseline penalty with an initial value of 0) is left out with
-    the reason. With a validation part the row of the lowest error there is marked as chosen.
+    A structure that the spec does not allow (a baseline penalty with an initial value of 0) is left
+    out with the reason. With a validation part the row of the lowest error there is marked as
+    chosen.
     """
     models = {str(path): _matching(path, job) for path in saved}
     fitted, left_out = {}, {}
@@ -60,10 +70,16 @@ def compare(job: Job, saved: Sequence[Path] = (), progress: Progress = SILENT) -
         if refusal is not None:
             left_out[kind] = refusal
             continue
-        if decided is not None and kind == job.spec.structure.kind and decided.fit.model.form.bound is not None:
+        if (
+            decided is not None
+            and kind == job.spec.structure.kind
+            and decided.fit.model.form.bound is not None
+        ):
             fitted[kind] = decided
             continue
-        fitted[kind] = doubted(fit_variant(job, variant, progress.after(runs=number * job.run_count)))
+        fitted[kind] = with_doubts(
+            fit_variant(job, variant, progress.after(runs=number * job.run_count))
+        )
     verdicts = _verdicts(job, fitted)
     rows = [_row(kind, fit, verdicts.get(kind)) for kind, fit in fitted.items()]
     rows += [_saved_row(name, model, job) for name, model in models.items()]
@@ -78,35 +94,40 @@ def compare(job: Job, saved: Sequence[Path] = (), progress: Progress = SILENT) -
     return Comparison(job, fitted, verdicts, CompareResult.model_validate(content))
 
 
-def _criterion(job: Job, progress: Progress) -> tuple[Criterion, Fitted | None]:
-    """The criterion that every structure is trained by, and the fit that decided it where the data were to decide."""
+def _criterion(job: Job, progress: Progress) -> tuple[Criterion, FitReport | None]:
+    """Return the criterion that trains every structure, and the fit that chose it, if any."""
     declared = job.spec.declared_criterion()
     if not declared.automatic:
         return declared, None
-    kind = job.spec.structure.kind if job.spec.structure.kind in job.compared else ALONE
-    fitted = doubted(fit_variant(job, Variant(kind), progress))
+    kind = job.spec.structure.kind if job.spec.structure.kind in job.compared else PHYSICS_ONLY
+    fitted = with_doubts(fit_variant(job, Variant(kind), progress))
     return (fitted.fit.criterion if fitted.fit.status.ok else Prediction()), fitted
 
 
-def _verdicts(job: Job, fitted: dict[str, Fitted]) -> dict[str, Verdict]:
-    """Whether the learner earns its place in each structure, by blocked cross-validation and the held-out parts."""
-    alone = fitted[ALONE].fit
-    kinds = [kind for kind, tried in fitted.items() if kind != ALONE and tried.fit.status.ok]
+def _verdicts(job: Job, fitted: dict[str, FitReport]) -> dict[str, Verdict]:
+    """Return whether each structure's learner helps, by cross-validation and held-out parts."""
+    alone = fitted[PHYSICS_ONLY].fit
+    kinds = [kind for kind, tried in fitted.items() if kind != PHYSICS_ONLY and tried.fit.status.ok]
     if not kinds or not alone.status.ok:
         return {}
     criterion = alone.criterion
-    blocks, flown = wanted_blocks(job), criterion.simulates
-    if flown or not blocks:  # free runs were chosen by the same trials
+    blocks, simulates = wanted_blocks(job), criterion.simulates
+    if simulates or not blocks:  # free runs were chosen by the same trials
         trials = [None] * len(kinds)
     else:
-        trials = cross_validated(job, blocks, [Variant(kind, criterion=criterion) for kind in kinds])
-    ran = fitted[ALONE].responses
-    verdicts = {k: judge_fit(fitted[k], lambda: alone, own, ran) for k, own in zip(kinds, trials, strict=True)}
+        trials = cross_validated(
+            job, blocks, [Variant(kind, criterion=criterion) for kind in kinds]
+        )
+    ran = fitted[PHYSICS_ONLY].responses
+    verdicts = {
+        k: judge_fit(fitted[k], lambda: alone, own, ran)
+        for k, own in zip(kinds, trials, strict=True)
+    }
     return {kind: verdict for kind, verdict in verdicts.items() if verdict is not None}
 
 
 def write(comparison: Comparison, folder: Path, *, force: bool = False) -> None:
-    """result.json, models/, figures/ and report.html, whole or not at all."""
+    """Write result.json, models/, figures/ and report.html, whole or not at all."""
     with whole_folder(folder, force=force) as partial:
         (partial / "result.json").write_text(comparison.result.to_json() + "\n", encoding="utf-8")
         for kind, fitted in comparison.fitted.items():
@@ -121,7 +142,7 @@ def write(comparison: Comparison, folder: Path, *, force: bool = False) -> None:
 
 
 def compare_report(comparison: Comparison) -> str:
-    """The page of a comparison."""
+    """Return the page of a comparison."""
     from orthaug.reports.page import compare_page
     from orthaug.reports.page_compare import ComparePage
 
@@ -130,11 +151,13 @@ def compare_report(comparison: Comparison) -> str:
         for name, fitted in comparison.fitted.items()
         if fitted.responses
     }
-    return compare_page(ComparePage(origin_of(comparison.job, "compare"), comparison.result, responses))
+    return compare_page(
+        ComparePage(origin_of(comparison.job, "compare"), comparison.result, responses)
+    )
 
 
 def _matching(path: Path, job: Job) -> Model | MotionModel:
-    """A saved model that the job's data fit."""
+    """Return a saved model that fits the job's data."""
     model = storage.load(path)
     record = job.problem.record
     lacking = [c.name for c in model.inputs if c.name not in [own.name for own in record.inputs]]
@@ -143,17 +166,19 @@ def _matching(path: Path, job: Job) -> Model | MotionModel:
         raise InputError(f"{path}: uses the input {', '.join(lacking)}; the spec has {known}.")
     if not same_step(model.sampling_time, record.sampling_time):
         raise InputError(
-            f"{path}: sampled every {model.sampling_time:g} s, the spec's data every {record.sampling_time:g} s."
+            f"{path}: sampled every {model.sampling_time:g} s, the spec's data every "
+            f"{record.sampling_time:g} s."
         )
     wanted = [c.name for c in record.outputs]
     if [c.name for c in model.outputs] != wanted:
         raise InputError(
-            f"{path}: its outputs are {', '.join(c.name for c in model.outputs)}; expected {', '.join(wanted)}."
+            f"{path}: its outputs are {', '.join(c.name for c in model.outputs)}; expected "
+            f"{', '.join(wanted)}."
         )
     return model
 
 
-def _row(kind: str, fitted: Fitted, verdict: Verdict | None) -> RowResult:
+def _row(kind: str, fitted: FitReport, verdict: Verdict | None) -> RowResult:
     result, fit = fitted.result, fitted.fit
     own = {key: getattr(result, key) for key in ("parameters", "orthogonality_defect", "residuals")}
     own |= {"status": result.status.code, "seconds": result.status.seconds, "validation": verdict}
@@ -164,19 +189,26 @@ def _row(kind: str, fitted: Fitted, verdict: Verdict | None) -> RowResult:
 def _saved_row(name: str, model: Model | MotionModel, job: Job) -> RowResult:
     warnings: list[Any] = []
     scores = {part.name: score_part(model, part, warnings)[0] for part in job.parts}
-    return _row_of(name, model, scores, warnings, status="saved", parameters=parameter_rows(*model.estimated))
+    return _row_of(
+        name, model, scores, warnings, status="saved", parameters=parameter_rows(*model.estimated)
+    )
 
 
-def _row_of(name: str, model: Model | MotionModel, scores: Any, warnings: Sequence[Any], **told: Any) -> RowResult:
-    """A row; null for what is not `told`."""
+def _row_of(
+    name: str, model: Model | MotionModel, scores: Any, warnings: Sequence[Any], **content: Any
+) -> RowResult:
+    """Return a row of the table; keys that `content` lacks are null."""
     own = {"name": name, "weights": model.form.bound.size if model.form.bound else 0}
     return RowResult.model_validate(
-        dict.fromkeys(RowResult.model_fields) | own | {"scores": scores, "warnings": warnings} | told
+        dict.fromkeys(RowResult.model_fields)
+        | own
+        | {"scores": scores, "warnings": warnings}
+        | content
     )
 
 
 def _chosen(rows: Sequence[RowResult], simulates: bool) -> str | None:
-    """The row of the lowest error on the validation part, of the free run or one step ahead as training looks at it.
+    """Return the row with the lowest error on the validation part, by the criterion of training.
 
     Physics alone wins where the verdict is that the learner of that row does not help.
     """
@@ -188,4 +220,8 @@ def _chosen(rows: Sequence[RowResult], simulates: bool) -> str | None:
             errors[row.name] = float(np.mean(np.square(np.array(score.nrmse, dtype=float))))
     best = min(errors, key=errors.__getitem__) if errors else None
     verdict = next((row.validation for row in rows if row.name == best), None)
-    return ALONE if verdict is not None and verdict.verdict != "helps" and ALONE in errors else best
+    return (
+        PHYSICS_ONLY
+        if verdict is not None and verdict.verdict != "helps" and PHYSICS_ONLY in errors
+        else best
+    )

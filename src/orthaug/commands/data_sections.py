@@ -1,4 +1,4 @@
-"""The sections [data], [engine] and [motion] of a spec: channels, files, who sums over rows, equations of motion."""
+"""The sections [data], [engine] and [motion] of a spec."""
 
 from __future__ import annotations
 
@@ -12,7 +12,15 @@ from pydantic import Field, model_validator
 from orthaug._base.checks import check_label
 from orthaug._base.errors import InputError
 from orthaug._base.memory import available
-from orthaug.commands.sections import Count, Finite, KindSection, PhysicalSection, Positive, Section, with_kinds
+from orthaug.commands.sections import (
+    Count,
+    Finite,
+    KindSection,
+    PhysicalSection,
+    Positive,
+    Section,
+    with_kinds,
+)
 from orthaug.data.preparation import STEPS
 from orthaug.data.record import LONGEST_STEP
 from orthaug.physics.motion import HOLDS, INTEGRATORS, MOST_SUBSTEPS, Motion, Output, State
@@ -47,7 +55,7 @@ class ChannelSection(Section):
 
 
 class PrepareSection(KindSection):
-    """A step that every part of the data goes through."""
+    """A step of preparation that every part of the data goes through."""
 
     registries = {"step": STEPS}
     step: str
@@ -75,7 +83,7 @@ class Data(Section):
 
     @property
     def step(self) -> float | None:
-        """Seconds between the rows that are kept of the training data; None where the data tell."""
+        """Seconds between the rows kept for training; None where the data determine it."""
         if self.time or any(section.step in ("decimate", "resample") for section in self.prepare):
             return None
         return (self.sampling_time or 1.0) * self.train.every
@@ -90,25 +98,32 @@ class Data(Section):
         for name in self.tests:
             check_label(name, "the name of a test")
             if name in ("train", "validation"):
-                raise ValueError(f"`tests.{name}` has the name of another part of the data; expected another name")
+                raise ValueError(
+                    f"`tests.{name}` has the name of another part of the data; expected "
+                    "another name"
+                )
         return self
 
     def _no_channel(self, name: str) -> str:
-        """What is wrong with a section of `channels` for no channel: it, or the name that it should have met."""
+        """Return a message on a section of `channels` that names no channel."""
         known = (*self.inputs, *self.outputs)
         open_names = [other for other in known if other not in self.channels]
         close = difflib.get_close_matches(name, open_names, n=1)
         if not close:
-            return f"`channels.{name}` is neither an input nor an output; expected one of {', '.join(known)}"
+            return (
+                f"`channels.{name}` is neither an input nor an output; expected one of "
+                f"{', '.join(known)}"
+            )
         kind = "inputs" if close[0] in self.inputs else "outputs"
         return (
-            f"`channels.{name}` is neither an input nor an output, and `{kind}` has '{close[0]}', of which `channels` "
-            "knows nothing; expected the same name in both, so one of them is misspelt"
+            f"`channels.{name}` is neither an input nor an output, and `{kind}` has "
+            f"'{close[0]}', of which `channels` knows nothing; expected the same name in both, "
+            "so one of them is misspelt"
         )
 
 
 class EngineSection(Section):
-    """Who sums over the rows."""
+    """The engine that sums over the rows."""
 
     kind: Literal["auto", "memory", "stream", "devices", "dask"] = "auto"
     scheduler: str | None = None
@@ -118,19 +133,19 @@ class EngineSection(Section):
     checkpoint: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 10.0
 
     def chosen(self, files: Sequence[Path]) -> str:
-        """The kind; "auto" streams Parquet files that are too large for memory."""
+        """Return the kind of engine; "auto" streams Parquet files that are too large for memory."""
         if self.kind != "auto":
             return self.kind
         parquet = all(file.suffix.lower() == _PARQUET for file in files)
         try:
             size = sum(file.stat().st_size for file in files)
-        except OSError:  # reading them will tell
+        except OSError:  # reading them will report it
             return "memory"
         return "stream" if parquet and _COPIES * size > _SHARE * available() else "memory"
 
 
 def engine_of(section: EngineSection, kind: str) -> Engine:
-    """The engine of a kind.
+    """Return the engine of a kind.
 
     Raises:
         InputError: one that is not installed, or cannot be reached.
@@ -145,7 +160,10 @@ def engine_of(section: EngineSection, kind: str) -> Engine:
 
         hosts.join()
         if hosts.several() and section.devices is not None:
-            raise InputError(f"`engine.devices`: found {section.devices}; over several hosts all devices are used.")
+            raise InputError(
+                f"`engine.devices`: found {section.devices}; over several hosts all devices "
+                "are used."
+            )
         return Devices(section.devices)
     from orthaug.models.rows import InMemory
     from orthaug.models.streaming import Stream
@@ -184,7 +202,7 @@ class MotionSection(Section):
 
     @model_validator(mode="after")
     def _check_equations(self) -> MotionSection:
-        """Each state has the equation that its integrator reads."""
+        """Check that each state has the equation that its integrator reads."""
         discrete = self.integrator == "discrete"
         own, other = ("next", "derivative") if discrete else ("derivative", "next")
         kind = "a discrete motion" if discrete else f'`integrator = "{self.integrator}"`'
@@ -198,17 +216,26 @@ class MotionSection(Section):
     @property
     def learns(self) -> bool:
         """Whether a learner is added to any equation or output."""
-        outputs = (output.learned for output in self.outputs.values() if not isinstance(output, str))
+        outputs = (
+            output.learned for output in self.outputs.values() if not isinstance(output, str)
+        )
         return any(state.learned for state in self.states.values()) or any(outputs)
 
     def declared(self, inputs: Sequence[str], outputs: Sequence[str]) -> Motion:
-        """The motion, its channels in the order of the data.
+        """Return the motion, with its channels in the order of the data.
 
         Raises:
-            InputError: names and expressions that cannot be, and what else `Motion.from_equations` refuses.
+            InputError: names and expressions that cannot be, and what else `Motion.from_equations`
+                refuses.
         """
-        given = {name: OutputSection(expression=o) if isinstance(o, str) else o for name, o in self.outputs.items()}
-        known = [*(name for name in outputs if name in given), *(name for name in given if name not in outputs)]
+        given = {
+            name: OutputSection(expression=o) if isinstance(o, str) else o
+            for name, o in self.outputs.items()
+        }
+        known = [
+            *(name for name in outputs if name in given),
+            *(name for name in given if name not in outputs),
+        ]
         states = []
         for name, state in self.states.items():
             equation = state.next if self.integrator == "discrete" else state.derivative

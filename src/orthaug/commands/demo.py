@@ -1,4 +1,7 @@
-"""The built-in example: the paper's mass-spring-damper, where two structures fit alike and only one keeps θ."""
+"""The built-in example: the paper's mass-spring-damper.
+
+Two structures fit it equally well, and only the orthogonal one keeps θ.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,7 @@ import numpy as np
 from orthaug._base.folders import whole_folder
 from orthaug._base.lines import fold
 from orthaug._base.progress import SILENT, Progress
-from orthaug.commands.fit import Fitted, fill_result, fit_job
+from orthaug.commands.fit import FitReport, fill_result, fit_job
 from orthaug.commands.kinds import open_job
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.estimation import estimate
@@ -59,13 +62,23 @@ regularization = "none"
 
 
 def run(folder: Path, progress: Progress = SILENT, *, force: bool = False) -> str:
-    """Generate the record, fit both structures, write data, spec and orthogonal fit; return the comparison."""
+    """Generate the record, fit both structures; write data, spec and orthogonal fit.
+
+    Return the comparison.
+    """
     example = mass_spring_damper()
     with whole_folder(folder, force=force) as partial:
         for name, record in (("train", example.train), ("test", example.test)):
             experiment = record.experiments[0]
             table = np.column_stack([experiment.inputs, experiment.outputs])
-            np.savetxt(partial / f"{name}.csv", table, fmt="%.17g", delimiter=",", header="force,position", comments="")
+            np.savetxt(
+                partial / f"{name}.csv",
+                table,
+                fmt="%.17g",
+                delimiter=",",
+                header="force,position",
+                comments="",
+            )
         (partial / "spec.toml").write_text(SPEC, encoding="utf-8")
         job = open_job(partial / "spec.toml")
         orthogonal = fit_job(job, progress)
@@ -85,7 +98,7 @@ def _additive(example: Example, seed: int, progress: Progress) -> Estimate:
     )
 
 
-def _comparison(example: Example, orthogonal: Fitted, additive: list[Estimate]) -> str:
+def _comparison(example: Example, orthogonal: FitReport, additive: list[Estimate]) -> str:
     fit = orthogonal.fit
     std = fit.std if fit.std is not None else np.zeros_like(fit.theta)
     thetas = np.array([a.theta for a in additive])
@@ -93,21 +106,37 @@ def _comparison(example: Example, orthogonal: Fitted, additive: list[Estimate]) 
         "The paper's mass-spring-damper: linear physics, friction left to a network of 16 neurons.",
         f"{RESTARTS} initialisations; the same data, the same network, the same training.",
         "",
-        f"{'':<24}{'true':>12}{'initial':>10}{'orthogonal ± std':>23}   {'additive, lowest … highest':>26}",
+        f"{'':<24}{'true':>12}{'initial':>10}{'orthogonal ± std':>23}   "
+        f"{'additive, lowest … highest':>26}",
     ]
     for i, parameter in enumerate(fit.problem.baseline.parameters):
         spread = f"{thetas[:, i].min():.5g} … {thetas[:, i].max():.5g}"
         value = f"{fit.theta[i]:.6g} ± {std[i]:.2g}"
         lines.append(
-            f"{parameter.name:<24}{example.theta[i]:>12.6g}{parameter.initial:>10.4g}{value:>23}   {spread:>26}"
+            f"{parameter.name:<24}{example.theta[i]:>12.6g}{parameter.initial:>10.4g}{value:>23}   "
+            f"{spread:>26}"
         )
     errors = [np.linalg.norm((t - example.theta) / example.theta) for t in thetas]
     error = np.linalg.norm((fit.theta - example.theta) / example.theta)
-    lines.append(f"{'relative error of θ':<46}{error:>23.4g}   {f'{min(errors):.4g} … {max(errors):.4g}':>26}")
-    for label, verb in (("test RMSE, one step [m]", "predict"), ("test RMSE, free run [m]", "simulate")):
+    lines.append(
+        f"{'relative error of θ':<46}{error:>23.4g}   "
+        f"{f'{min(errors):.4g} … {max(errors):.4g}':>26}"
+    )
+    for label, verb in (
+        ("test RMSE, one step [m]", "predict"),
+        ("test RMSE, free run [m]", "simulate"),
+    ):
         ours = getattr(fit.model, verb)(example.test).scores().rmse[0]
         theirs = [getattr(a.model, verb)(example.test).scores().rmse[0] for a in additive]
         lines.append(f"{label:<46}{ours:>23.3g}   {f'{min(theirs):.3g} … {max(theirs):.3g}':>26}")
-    lines += ["", f"Both predict equally well; only the orthogonal structure keeps θ (‖QᵀF̃‖/‖F‖ = {fit.defect:.0e})."]
-    lines += [f"warning: {warning.text}" for warning in orthogonal.result.warnings if warning.code == "biased"]
+    lines += [
+        "",
+        "Both predict equally well; only the orthogonal structure keeps θ (‖QᵀF̃‖/‖F‖ = "
+        f"{fit.defect:.0e}).",
+    ]
+    lines += [
+        f"warning: {warning.text}"
+        for warning in orthogonal.result.warnings
+        if warning.code == "biased"
+    ]
     return "\n".join(fold(lines))

@@ -17,24 +17,29 @@ from orthaug.commands.suspects import declared
 
 
 def design_for(job: Job) -> Design:
-    """The input that the spec's `[design]` asks for.
+    """Return the input that the spec's `[design]` asks for.
 
-    θ is the spec's initial value, or least squares on the training data where none is given; the noise, where the spec
-    states none, is what physics alone leaves of these data. The parameters of a motion are those of physics alone.
-    Inputs beside the one that is designed are as they were recorded.
+    θ is the spec's initial value, or least squares on the training data where none is given; the
+    noise, where the spec states none, is what physics alone leaves of these data. The parameters of
+    a motion are those of physics alone. Inputs beside the one that is designed are as they were
+    recorded.
 
     Raises:
-        InputError: no `[design]` section, limits that cannot be met, suspects without a coefficient.
+        InputError: no `[design]` section, limits that cannot be met, suspects without a
+            coefficient.
     """
     section = job.spec.design
     if section is None:
         raise InputError(
-            f"{job.path}: the section [design] is missing; it needs `samples` and limits, such as `amplitude`."
+            f"{job.path}: the section [design] is missing; it needs `samples` and limits, such "
+            "as `amplitude`."
         )
     limits = ("samples", "amplitude", "minimum", "maximum", "rate", "condition", "seed")
     asked = {name: getattr(section, name) for name in limits}
     try:
-        asked["channel"] = _input(section.input, [channel.name for channel in job.problem.record.inputs])
+        asked["channel"] = _input(
+            section.input, [channel.name for channel in job.problem.record.inputs]
+        )
         asked["known_inputs"] = _others(job, asked["channel"], section.samples)
         asked["sampling_time"] = job.problem.record.sampling_time
         if isinstance(job, MotionJob):
@@ -70,11 +75,17 @@ def _of_motion(job: MotionJob, asked: dict[str, Any], noise: float | None) -> De
     solver: Any = spec.declared_solver()
     task = task.prepared(solver, job.structure)
     if task.physics is None:
-        raise InputError("physics alone has no finite free run from its initial values; give others.")
+        raise InputError(
+            "physics alone has no finite free run from its initial values; give others."
+        )
     left: Any = noise
     if noise is None:
-        left = tuple(np.sqrt(np.sum(task.physics.end.flown.errors**2, axis=(0, 1, 3)) / task.plan.segments.count))
-    p = motion.coordinates.physical(task.physics.end.flown.theta)
+        left = tuple(
+            np.sqrt(
+                np.sum(task.physics.end.point.errors**2, axis=(0, 1, 3)) / task.plan.segments.count
+            )
+        )
+    p = motion.coordinates.physical(task.physics.end.point.theta)
     own = {"parameters": p, "noise": left, "substeps": task.plan.dynamics.substeps}
     return design_motion_input(motion, suspects=job.suspects, **own, **asked)
 
@@ -86,27 +97,42 @@ def _input(name: str | None, known: list[str]) -> str:
 
 
 def _others(job: Job, chosen: str, samples: int) -> dict[str, np.ndarray]:
-    """The other inputs as the longest experiment of the training data has them, repeated where it ends."""
+    """Return the other inputs, as in the longest experiment of the training data.
+
+    They are repeated where that ends.
+    """
     record = job.problem.record
     longest = max(record.experiments, key=len).inputs
     named = zip((channel.name for channel in record.inputs), longest.T, strict=True)
-    return {name: np.resize(values, min(samples, MOST_SAMPLES)) for name, values in named if name != chosen}
+    return {
+        name: np.resize(values, min(samples, MOST_SAMPLES))
+        for name, values in named
+        if name != chosen
+    }
 
 
 def notes(job: Job) -> list[str]:
-    """What stands in the inputs that are not designed."""
+    """Return notes on the inputs that are not designed."""
     assert job.spec.design is not None
     others = [c.name for c in job.problem.record.inputs if c.name != job.spec.design.input]
-    return [f"note: {', '.join(others)}: as recorded in the training data."] if others and job.spec.design.input else []
+    return (
+        [f"note: {', '.join(others)}: as recorded in the training data."]
+        if others and job.spec.design.input
+        else []
+    )
 
 
 def write(job: Job, design: Design, out: Path, *, force: bool = False) -> None:
-    """The signal as CSV, `time` and every input, whole or not at all."""
+    """Write the signal as CSV, `time` and every input, whole or not at all."""
     assert job.spec.design is not None
     names = [channel.name for channel in job.problem.record.inputs]
     chosen, count = job.spec.design.input or names[0], len(design.signal)
     others = _others(job, chosen, count) | {chosen: design.signal}
-    columns = {"time": np.arange(count) * job.problem.record.sampling_time} | {name: others[name] for name in names}
+    columns = {"time": np.arange(count) * job.problem.record.sampling_time} | {
+        name: others[name] for name in names
+    }
     table = np.column_stack(list(columns.values()))
     with whole_file(out, force=force) as partial:
-        np.savetxt(partial, table, fmt="%.17g", delimiter=",", header=",".join(columns), comments="")
+        np.savetxt(
+            partial, table, fmt="%.17g", delimiter=",", header=",".join(columns), comments=""
+        )

@@ -1,6 +1,6 @@
-"""What intervals of a fit do not count: structure that noise does not explain, and a state that the model lacks.
+"""Causes of error that the intervals of a fit do not count: missing structure or a missing state.
 
-It is asked of every fit, of lagged physics and of motions, whether a learner stayed, fell back or was never declared.
+Every fit is tested, for either kind of physics, with a learner or without one.
 """
 
 from __future__ import annotations
@@ -27,38 +27,54 @@ _DETERMINED = re.compile(
 )
 
 
-def doubted(fitted: Any) -> Any:
-    """Return a `Fitted` with the warnings `unexplained` and `hidden_state`, and intervals that say what they count."""
+def with_doubts(fitted: Any) -> Any:
+    """Return a fit with the warnings `unexplained` and `hidden_state`, and its intervals marked.
+
+    The marks say what the intervals count.
+    """
     from orthaug.analysis.hidden_state import structure_test
 
     fit, result = fitted.fit, fitted.result
     if not fit.status.ok:
         return fitted
     failed: list[Any] = []
-    test = attempt("the search for a hidden state", lambda: structure_test(fit.model, fit.problem.record), failed, None)
+    test = attempt(
+        "the search for a hidden state",
+        lambda: structure_test(fit.model, fit.problem.record),
+        failed,
+        None,
+    )
     unmodelled = result.residuals is not None and result.residuals.verdict == "unmodelled"
     known = {warning.code for warning in result.warnings}
     warnings = [WarningResult.model_validate(warning) for warning in failed]
     if (unmodelled or (test is not None and test.found)) and "unexplained" not in known:
-        warnings.append(WarningResult(code="unexplained", text=_unexplained(test, bool(result.residuals))))
+        warnings.append(
+            WarningResult(code="unexplained", text=_unexplained(test, bool(result.residuals)))
+        )
     if test is not None and test.has_memory:
         warnings.append(WarningResult(code="hidden_state", text=_hidden_state(fit, test)))
     found: dict[str, Any] = {"warnings": [*result.warnings, *warnings]}
     if test is not None and test.found:
         found["unexplained"] = _structure(fit, test)
     if any(warning.code == "unexplained" for warning in found["warnings"]):
-        found |= {name: _noise_only(getattr(result, name)) for name in ("parameters", "physical_parameters")}
+        found |= {
+            name: _noise_only(getattr(result, name))
+            for name in ("parameters", "physical_parameters")
+        }
     reason = _reason(result, test, unmodelled)
     if result.shared is not None and reason:
-        found["shared"] = _withdrawn(result.shared, reason)
+        found["shared"] = _withdraw(result.shared, reason)
     return replace(fitted, result=FitResult.model_validate({**dict(result), **found}))
 
 
 def _noise_only(rows: list[ParameterResult] | None) -> list[ParameterResult] | None:
-    """Mark the intervals as those of noise alone."""
+    """Return the parameters with their intervals marked as those of noise alone."""
     if rows is None:
         return None
-    return [row.model_copy(update={"ci95_counts": "noise only"}) if row.ci95 is not None else row for row in rows]
+    return [
+        row.model_copy(update={"ci95_counts": "noise only"}) if row.ci95 is not None else row
+        for row in rows
+    ]
 
 
 def _unexplained(test: StructureTest | None, judged: bool) -> str:
@@ -66,43 +82,58 @@ def _unexplained(test: StructureTest | None, judged: bool) -> str:
         what = "the residual holds more than noise"
         what += " (its verdict is `unmodelled`)" if judged else ""
     else:
-        best = max((one for one in (test.static, test.memory) if one is not None), key=lambda one: one.share)
+        best = max(
+            (one for one in (test.static, test.memory) if one is not None),
+            key=lambda one: one.share,
+        )
         name = f"a further lag of {best.on}" if test.is_a_lag(best) else best.name
         what = (
-            f"the model leaves more than noise: {name} in {best.equation} predicts {percent(best.share)} of the "
-            "free run's error, beside the colour of its noise, on rows that it was not fitted to"
+            f"the model leaves more than noise: {name} in {best.equation} predicts "
+            f"{percent(best.share)} of the free run's error on rows not fitted, beside the "
+            "colour of its noise"
         )
     return (
-        f"{what}. The 95 % intervals count noise only; what is missing may have moved the parameters by more. "
-        "`[[suspects]]` and `orthaug explain` look for its terms; write them into the physics, or let the learner see "
-        "what they depend on."
+        f"{what}. The 95 % intervals count noise only; what is missing may have moved the "
+        "parameters by more. `[[suspects]]` and `orthaug explain` look for its terms; write "
+        "them into the physics, or let the learner see what they depend on."
     )
 
 
 def _hidden_state(fit: Any, test: StructureTest) -> str:
     assert test.memory is not None
     best = test.memory
-    others = [one.name for one in test.families if one.sure and one is not best and one.share > 0.8 * best.share]
+    others = [
+        one.name
+        for one in test.families
+        if one.sure and one is not best and one.share > 0.8 * best.share
+    ]
     beside = f" ({', '.join(others[: _LISTED - 1])} nearly as much)" if others else ""
     remedy = "write the state out as a state of the motion with its own equation"
     if fit.lagged:
-        remedy = "add lags of outputs and inputs to the physics, or write the system as a motion with that state"
+        remedy = (
+            "add lags of outputs and inputs to the physics, or write the system as a motion "
+            "with that state"
+        )
     remedy += "; or let the learner see lags or a filtered copy of that signal"
     return (
-        f"a state is missing: {best.name} in {best.equation} predicts {percent(best.share)} of the free run's error "
-        f"on rows that it was not fitted to, which no function of the model's own states does{beside}."
-        f"{_moved(fit, best)} Do this: {remedy}."
+        f"a state is missing: {best.name} in {best.equation} predicts {percent(best.share)} of "
+        f"the free run's error on rows not fitted{beside}. No function of the model's own "
+        f"states does so.{_movement_text(fit, best)} Do this: {remedy}."
     )
 
 
-def _moved(fit: Any, best: FamilyTest) -> str:
-    """Return by how much the parameters move with a term, in words."""
+def _movement_text(fit: Any, best: FamilyTest) -> str:
+    """Return a sentence on how much a term moves the parameters."""
     values = _values_with(fit, best)
     if not values:
         return ""
     now = _now(fit)
-    moves = sorted(values, key=lambda name: -abs(values[name] - now[name]) / max(abs(now[name]), 1e-300))
-    listed = ", ".join(f"{name} {values[name]:.4g} instead of {now[name]:.4g}" for name in moves[:_LISTED])
+    moves = sorted(
+        values, key=lambda name: -abs(values[name] - now[name]) / max(abs(now[name]), 1e-300)
+    )
+    listed = ", ".join(
+        f"{name} {values[name]:.4g} instead of {now[name]:.4g}" for name in moves[:_LISTED]
+    )
     return f" With it the fit gives {listed}."
 
 
@@ -112,13 +143,15 @@ def _now(fit: Any) -> dict[str, float]:
 
 
 def _values_with(fit: Any, best: FamilyTest) -> dict[str, float]:
-    """Return the parameters with a term fitted beside them."""
+    """Return the parameters of a fit with an additional term."""
     names = list(_now(fit))
     moved: Vector = np.asarray(fit.theta) + np.array(best.moves)
     if len(best.moves) != len(names):
         return {}
     values = moved if fit.lagged else fit.problem.motion.coordinates.physical(moved)
-    return {name: float(value) for name, value in zip(names, values, strict=True) if np.isfinite(value)}
+    return {
+        name: float(value) for name, value in zip(names, values, strict=True) if np.isfinite(value)
+    }
 
 
 def _structure(fit: Any, test: StructureTest) -> StructureResult:
@@ -133,15 +166,29 @@ def _structure(fit: Any, test: StructureTest) -> StructureResult:
 def memory_result(one: FamilyTest, parameters: dict[str, float] | None = None) -> MemoryResult:
     """Return a family of terms as results list it."""
     scale = None if one.term is None else one.term.scale
-    own = {"name": one.name, "kind": one.kind, "on": one.on, "scale": scale, "equation": one.equation}
-    return MemoryResult.model_validate({**own, "share": one.share, "p": one.p, "parameters": parameters or None})
+    own = {
+        "name": one.name,
+        "kind": one.kind,
+        "on": one.on,
+        "scale": scale,
+        "equation": one.equation,
+    }
+    return MemoryResult.model_validate(
+        {**own, "share": one.share, "p": one.p, "parameters": parameters or None}
+    )
 
 
 def _reason(result: FitResult, test: StructureTest | None, unmodelled: bool) -> str:
-    """Return why no parameter counts as determined by the fit; nothing where it does."""
+    """Return the reason why the fit determines no parameter; empty where it determines some."""
     if test is not None and test.found:
-        best = max((one for one in (test.static, test.memory) if one is not None), key=lambda one: one.share)
-        return f"what the model leaves is no function of what the learner sees ({best.name} predicts it)"
+        best = max(
+            (one for one in (test.static, test.memory) if one is not None),
+            key=lambda one: one.share,
+        )
+        return (
+            f"what the model leaves is no function of what the learner sees ({best.name} "
+            "predicts it)"
+        )
     if unmodelled:
         return "the residual holds more than noise"
     stopped = {"not_converged", "stopped"} & {warning.code for warning in result.warnings}
@@ -150,14 +197,20 @@ def _reason(result: FitResult, test: StructureTest | None, unmodelled: bool) -> 
     return ""
 
 
-def _withdrawn(shared: SharedResult, reason: str) -> SharedResult:
-    """Return what the learner could imitate, without the parameters that the fit would otherwise determine."""
+def _withdraw(shared: SharedResult, reason: str) -> SharedResult:
+    """Return what the learner could imitate, with no parameter determined by the fit."""
     lost = [*shared.determined, *(shared.physical or [])]
     if not lost:
         return shared
     text = _DETERMINED.sub("", shared.text).rstrip(".")
     named = ", ".join(lost)
-    text = f"{text}. {named} would be determined by the fit beside such a learner, but not here: {reason}."
+    text = f"{text}. The fit would determine {named} beside such a learner, but not here: {reason}."
     physical = None if shared.physical is None else []
-    update = {"text": text, "determined": [], "physical": physical, "withdrawn": lost, "doubt": reason}
+    update = {
+        "text": text,
+        "determined": [],
+        "physical": physical,
+        "withdrawn": lost,
+        "doubt": reason,
+    }
     return shared.model_copy(update=update)

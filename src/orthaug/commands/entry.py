@@ -1,6 +1,6 @@
-"""Where the program starts: signals first, then streams and surroundings, and only then the command line.
+"""Entry point of the program: signals first, then streams and environment, then the command line.
 
-The user's switches for libraries that orthaug uses within itself do not reach them.
+Environment variables of the user for libraries inside orthaug have no effect on them.
 """
 
 from __future__ import annotations
@@ -11,13 +11,23 @@ import sys
 
 from orthaug.commands.signals import WATCH
 
-_OF_JAX = ("JAX_PLATFORMS", "JAX_ENABLE_X64", "JAX_COMPILATION_CACHE_DIR", "JAX_DISABLE_JIT")  # the others are dropped
-_LEAST_MEMORY, _MEMORY_PER_CORE = 3.0 * 2**30, 0.15 * 2**30  # bytes of addresses that JAX and BLAS take for themselves
+_OF_JAX = (
+    "JAX_PLATFORMS",
+    "JAX_ENABLE_X64",
+    "JAX_COMPILATION_CACHE_DIR",
+    "JAX_DISABLE_JIT",
+)  # the others are dropped
+_LEAST_MEMORY, _MEMORY_PER_CORE = (
+    3.0 * 2**30,
+    0.15 * 2**30,
+)  # bytes of addresses that JAX and BLAS take for themselves
 
 
 def main() -> None:
     """Entry point of the program."""
-    gc.set_threshold(100_000, 50, 100)  # what imports and traces leave is no garbage: looking for it costs a tenth
+    gc.set_threshold(
+        100_000, 50, 100
+    )  # what imports and traces leave is no garbage: looking for it costs a tenth
     _open_streams()
     WATCH.start()
     from orthaug.commands import streams
@@ -37,7 +47,10 @@ def main() -> None:
 
 
 def _open_streams() -> None:
-    """Open standard streams that are closed, so that no file takes their number. Writing to a closed output fails."""
+    """Open standard streams that are closed, so that no file takes their number.
+
+    Writing to a closed output fails.
+    """
     for number, way in ((0, os.O_RDONLY), (1, os.O_RDONLY), (2, os.O_WRONLY)):
         try:
             os.fstat(number)
@@ -46,7 +59,7 @@ def _open_streams() -> None:
 
 
 def _complaint() -> str | None:
-    """What keeps every command from running, in words."""
+    """Return a message on the cause that keeps every command from running; None without one."""
     from orthaug._base.memory import in_words, limit
 
     try:
@@ -56,14 +69,14 @@ def _complaint() -> str | None:
     needed = _LEAST_MEMORY + _MEMORY_PER_CORE * (os.cpu_count() or 1)
     if limit() < needed and not {"--help", "--version"} & set(sys.argv):
         return (
-            f"the limit on memory (ulimit -v) is {in_words(limit())}; with its libraries orthaug takes "
-            f"{in_words(needed)} of addresses on this machine. Raise the limit."
+            f"the memory limit (ulimit -v) is {in_words(limit())}; with its libraries orthaug "
+            f"needs {in_words(needed)} of address space on this machine. Raise the limit."
         )
     return None
 
 
 def _settle() -> None:
-    """Surroundings in which libraries neither fail nor talk: their warnings are no lines for users."""
+    """Prepare the environment so that libraries neither fail nor print warnings of their own."""
     import logging
     import warnings
 

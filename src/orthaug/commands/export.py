@@ -11,7 +11,7 @@ from orthaug.export import exporting
 
 
 def check(model: Path, to: str, out: Path, name: str, *, force: bool = False) -> None:
-    """Raise InputError where there is no such target or place, or where the code would take the model's place."""
+    """Raise InputError for an unknown target or place, or one that would replace the model."""
     exporting.check_export(to, out, name, force=force)
     try:
         inside = model.exists() and model.resolve().is_relative_to(out.resolve())
@@ -22,7 +22,7 @@ def check(model: Path, to: str, out: Path, name: str, *, force: bool = False) ->
 
 
 def run(model: Path, to: str, out: Path, name: str, *, force: bool = False) -> tuple[str, ...]:
-    """Load the model and write the folder; what to know of the code.
+    """Load the model and write the folder; return notes on the code.
 
     Raises:
         InputError: no model there, or one that has no code.
@@ -35,5 +35,12 @@ def run(model: Path, to: str, out: Path, name: str, *, force: bool = False) -> t
     except InputError as error:
         own = str(error).startswith(str(out))
         raise InputError(str(error) if own else f"{model}: {error}") from None
-    what = "The code stands for data after these steps: a delay by `shift`, say, is not in it."
-    return prepared_notes(loaded, what=what) if any(done.step not in MENDING for done in loaded.prepared) else ()
+    what = (
+        "The code expects data after these steps: it does not contain a delay by `shift`, for "
+        "example."
+    )
+    return (
+        prepared_notes(loaded, what=what)
+        if any(done.step not in MENDING for done in loaded.prepared)
+        else ()
+    )

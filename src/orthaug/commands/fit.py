@@ -1,4 +1,4 @@
-"""What `orthaug fit` does: train a job, score and judge it, and write the folder that holds the result."""
+"""Fit of a spec: train a job, score and judge it, and write the folder with the result."""
 
 from __future__ import annotations
 
@@ -16,9 +16,10 @@ from orthaug._base.parallel import one_blas_thread
 from orthaug._base.progress import SILENT, Progress
 from orthaug._base.views import MAKERS
 from orthaug.commands.attempt import attempt
-from orthaug.commands.doubts import doubted
+from orthaug.commands.chosen_rows import after_choice
+from orthaug.commands.doubts import with_doubts
 from orthaug.commands.folder import PHYSICS
-from orthaug.commands.job import ALONE, AS_DECLARED, DEFAULT_BLOCKS, Job, Variant, origin_of
+from orthaug.commands.job import AS_DECLARED, DEFAULT_BLOCKS, PHYSICS_ONLY, Job, Variant, origin_of
 from orthaug.commands.kinds import kind_of
 from orthaug.commands.parts import Part
 from orthaug.commands.scales import describe_scales
@@ -33,29 +34,29 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class Fitted:
+class FitReport:
     """A fit with the content of result.json: parameters, scores on every part, findings."""
 
     job: Job
     fit: Any
-    """`Estimate`, or `MotionEstimate` of a motion."""
+    """The fit: `Estimate`, or `MotionEstimate` for a motion."""
     result: FitResult
     responses: Mapping[str, tuple[Response, Response]]
     """One-step prediction and free run of every part, by its name; none where training failed."""
     alone: Mapping[str, tuple[Response, Response]] = field(default_factory=dict)
-    """The same of physics alone, where that was fitted, too."""
+    """The responses of physics alone, where that was fitted too."""
 
     def __repr__(self) -> str:
         return f"Fitted({self.job.path.name}: {self.fit!r})"
 
     def summary(self) -> str:
-        """What `orthaug fit` prints."""
+        """Return what `orthaug fit` prints."""
         from orthaug.reports.text import fit_text
 
         return fit_text(self.fit, self.result) or self.fit.status.message
 
     def report(self, path: Any = None) -> Any:
-        """The page that `orthaug fit` writes; see `Estimate.report`."""
+        """Return the page that `orthaug fit` writes; see `Estimate.report`."""
         return MAKERS["report"](self, path, None)
 
     @property
@@ -70,58 +71,85 @@ class Fitted:
 
 
 @one_blas_thread()
-def fit_job(job: Job, progress: Progress = SILENT) -> Fitted:
-    """Train as the spec says, score every part, ask whether the learner earns its place, and try what may better it."""
-    return advised(doubted(judged(fit_variant(job, AS_DECLARED, progress))))
+def fit_job(job: Job, progress: Progress = SILENT) -> FitReport:
+    """Train as the spec says, score every part, judge the learner, and try improvements."""
+    return with_advice(with_doubts(with_verdict(fit_variant(job, AS_DECLARED, progress))))
 
 
-def advised(fitted: Fitted) -> Fitted:
+def with_advice(fitted: FitReport) -> FitReport:
     """Return a fit with the changes of its spec that were tried."""
     from orthaug.commands.advice import advise
 
-    if not fitted.fit.status.ok or _stopped(fitted.fit):
+    if not fitted.fit.status.ok or _was_stopped(fitted.fit):
         return fitted
     failed: list[Any] = []
-    found = attempt("the trial of advice", lambda: advise(fitted.job, fitted.fit, fitted.result), failed, None)
-    warnings = [*fitted.result.warnings, *(WarningResult.model_validate(warning) for warning in failed)]
-    told = {"warnings": warnings} if found is None else {"advice": found[0], "advice_trials": found[1]}
-    return replace(fitted, result=FitResult.model_validate({**dict(fitted.result), **told}))
+    found = attempt(
+        "the trial of advice", lambda: advise(fitted.job, fitted.fit, fitted.result), failed, None
+    )
+    warnings = [
+        *fitted.result.warnings,
+        *(WarningResult.model_validate(warning) for warning in failed),
+    ]
+    trials = (
+        {"warnings": warnings} if found is None else {"advice": found[0], "advice_trials": found[1]}
+    )
+    return replace(fitted, result=FitResult.model_validate({**dict(fitted.result), **trials}))
 
 
-def judged(fitted: Fitted) -> Fitted:
-    """With whether the learner earns its place."""
+def with_verdict(fitted: FitReport) -> FitReport:
+    """Return a fit with the verdict on its learner."""
     job, fit, warnings = fitted.job, fitted.fit, list(fitted.result.warnings)
     if not fit.status.ok or (fit.model.form.bound is None and fit.held_out is None):
         return fitted
     failed: list[Any] = []
     physics = cache(partial(_physics_alone, fitted))
     alone = fitted.alone or None
-    verdict = attempt("the judgement of the learner", lambda: judge_fit(fitted, physics, alone=alone), failed, None)
+    verdict = attempt(
+        "the judgement of the learner",
+        lambda: judge_fit(fitted, physics, alone=alone),
+        failed,
+        None,
+    )
     warnings += failed
     asked = fit.model.form.bound is not None and job.spec.validation.blocks != 0
     if verdict is None and asked and not failed:
         short = "the training data have too few rows for cross-validation in so many blocks"
-        why = "training was stopped too early for cross-validation" if _stopped(fit) else short
-        told = f"whether the learner helps is not judged: no part is held out, and {why}."
-        warnings.append(WarningResult(code="not_judged", text=told))
+        why = "training was stopped too early for cross-validation" if _was_stopped(fit) else short
+        text = f"whether the learner helps is not judged: no part is held out, and {why}."
+        warnings.append(WarningResult(code="not_judged", text=text))
     if verdict is not None and fit.model.form.bound is not None:
-        told = (*verdict.warnings, *_unexplained(fitted, None if verdict.code == "helps" else physics))
-        warnings += [WarningResult.model_validate(warning) for warning in told]
-    result = FitResult.model_validate({**dict(fitted.result), "validation": verdict, "warnings": warnings})
+        text = (
+            *verdict.warnings,
+            *_unexplained(fitted, None if verdict.code == "helps" else physics),
+        )
+        warnings += [WarningResult.model_validate(warning) for warning in text]
+    result = FitResult.model_validate(
+        {**dict(fitted.result), "validation": verdict, "warnings": warnings}
+    )
     return replace(fitted, result=result)
 
 
-def _physics_alone(fitted: Fitted) -> Any:
-    """The fit of physics alone that the learner had to beat: the one that was made, or one by the same criterion."""
+def _physics_alone(fitted: FitReport) -> Any:
+    """Return the fit of physics alone that the learner is compared to.
+
+    It is the one that was made already, or one by the same criterion.
+    """
     made = fitted.fit.physics_alone
-    return made if made is not None else fitted.job.run(Variant(ALONE, criterion=fitted.fit.criterion))
+    return (
+        made
+        if made is not None
+        else fitted.job.run(Variant(PHYSICS_ONLY, criterion=fitted.fit.criterion))
+    )
 
 
-def _unexplained(fitted: Fitted, physics: Callable[[], Any] | None) -> list[Warning]:
-    """That a learner may have taken from parameters that it could imitate, where no cause tells by how much.
+def _unexplained(fitted: FitReport, physics: Callable[[], Any] | None) -> list[Warning]:
+    """Return a warning where the learner may have taken an unknown share of a parameter.
+
+    It could imitate these parameters, and no suspect explains what it found.
 
     Args:
-        physics: the fit without the learner, where that does not help: it may still take up what physics alone leaves.
+        physics: the fit without the learner, where that does not help: it may still take up what
+            physics alone leaves.
     """
     from orthaug.analysis.diagnosis import diagnose
 
@@ -130,24 +158,32 @@ def _unexplained(fitted: Fitted, physics: Callable[[], Any] | None) -> list[Warn
     shared = [row.name for row in rows if row.shared]
     if not shared or any(row.bias for row in rows):
         return []
-    told, failed = "no suspect explains half of what the learner found", []
+    text, failed = "no suspect explains half of what the learner found", []
     if physics is not None:
         if not result.residuals or result.residuals.verdict == "unmodelled":
             return []
         own = physics()
-        alone = own.status.ok and attempt("the residual of physics alone", lambda: diagnose(own), failed, None)
+        alone = own.status.ok and attempt(
+            "the residual of physics alone", lambda: diagnose(own), failed, None
+        )
         if not alone or alone.verdict != "unmodelled":
             return failed
-        told = "physics alone leaves more than noise, which the learner takes up without better free runs"
-    told += (
-        f": a part of that may belong to {', '.join(shared)}, and no interval counts it. `orthaug explain` looks for "
-        "its terms, [[suspects]] declares them; another measure, or a learner that sees less, may tell them apart."
+        text = (
+            "physics alone leaves more than noise, which the learner takes up without better "
+            "free runs"
+        )
+    text += (
+        f": a part of that may belong to {', '.join(shared)}, and no interval counts it. "
+        "`orthaug explain` looks for its terms, [[suspects]] declares them; another measure, "
+        "or a learner that sees less, may separate them."
     )
-    return [Warning("unexplained", told)]
+    return [Warning("unexplained", text)]
 
 
-def keeping(job: Job, folder: Path, *, resume: bool = False) -> Job:
-    """The job with the states of its training kept beside the result folder; with `resume` it goes on from them.
+def keep_states(job: Job, folder: Path, *, resume: bool = False) -> Job:
+    """Return the job, with its states of training kept beside the result folder.
+
+    With `resume` training continues from them.
 
     Raises:
         InputError: states of another fit; hosts that do not run the same one.
@@ -158,28 +194,37 @@ def keeping(job: Job, folder: Path, *, resume: bool = False) -> Job:
     if job.spec.engine.kind == "devices" and hosts.several():
         hosts.check_alike(job.fingerprint)
         if resume:
-            raise InputError("--resume: a fit over several hosts keeps no states to go on from; leave it out.")
+            raise InputError(
+                "--resume: a fit over several hosts keeps no states to continue from; leave it out."
+            )
         return job
     place = folder.with_name(f"{folder.name}.training")
     kept = Checkpoints(place, job.fingerprint, job.spec.engine.checkpoint)
     return replace(job, checkpoints=kept.opened(resume=resume))
 
 
-def fit_variant(job: Job, variant: Variant, progress: Progress = SILENT) -> Fitted:
-    """Train a variant of a job and score every part; `judge_fit` asks whether the learner helps."""
+def fit_variant(job: Job, variant: Variant, progress: Progress = SILENT) -> FitReport:
+    """Train a variant of a job and score every part; `judge_fit` judges the learner."""
     progress.planned(job.planned(variant))
-    return told_of(job, job.run(variant, progress))
+    return report_of(job, job.run(variant, progress))
 
 
-def told_of(job: Job, fit: Any) -> Fitted:
-    """Scores of a fit on every part of its job, and all that results tell of it but the verdict on the learner."""
+def report_of(job: Job, fit: Any) -> FitReport:
+    """Score a fit on every part of its job, and fill its result up to the verdict."""
+    fit, intervals = after_choice(job, fit)
     warnings: list[Any] = [*job.warnings, *fit.warnings]
     if job.checkpoints is not None and job.checkpoints.lost:
-        warnings.append(Warning("checkpoint_lost", f"the last state of training was not kept: {job.checkpoints.lost}."))
+        warnings.append(
+            Warning(
+                "checkpoint_lost",
+                f"the last state of training was not kept: {job.checkpoints.lost}.",
+            )
+        )
     if job.checkpoints is not None and job.checkpoints.spoilt:
         text = (
-            f"a kept state of training is damaged ({job.checkpoints.folder.name}/{job.checkpoints.spoilt[0]}), so "
-            "training began anew there; the result is that of a whole training."
+            "a kept state of training is damaged "
+            f"({job.checkpoints.folder.name}/{job.checkpoints.spoilt[0]}), so that run began "
+            "anew; the result is complete."
         )
         warnings.append(Warning("checkpoint_spoilt", text))
     scores, responses = {}, {}
@@ -190,12 +235,18 @@ def told_of(job: Job, fit: Any) -> Fitted:
     if physics is not None and physics.status.ok:
         ran = {part.name: score_part(physics.model, part, []) for part in job.parts}
         alone = {name: scored for name, (scored, _) in ran.items()}
-    if fit.status.ok and job.spec.training.chosen_focus() == "prediction" and fit.model.form.bound is not None:
-        warnings += _one_step_only(scores, alone, [part.name for part in job.parts if part not in job.tests])
-    fit, told = kind_of(job).content(job, fit, responses, warnings)
-    if fit.status.ok and told["residuals"] is not None:
-        fit = _for_observers(fit, told["residuals"].verdict, warnings)
-    content = told | {
+    if (
+        fit.status.ok
+        and job.spec.training.chosen_focus() == "prediction"
+        and fit.model.form.bound is not None
+    ):
+        warnings += _one_step_only(
+            scores, alone, [part.name for part in job.parts if part not in job.tests]
+        )
+    fit, fields = kind_of(job).content(job, fit, responses, warnings)
+    if fit.status.ok and fields["residuals"] is not None:
+        fit = _for_observers(fit, fields["residuals"].verdict, warnings)
+    content = fields | {
         "spec": job.declaration,
         "data": job.data,
         "status": _status(fit, warnings),
@@ -208,19 +259,27 @@ def told_of(job: Job, fit: Any) -> Fitted:
         "focus": fit.focus,
         "physics_alone": {"scores": alone} if alone else None,
         "validation": None,
+        "intervals": intervals,
         "warnings": warnings,
     }
     terms = learned_terms(fit.model) if fit.status.ok else ()
     if terms:
         written = {writing: equation(fit.model, writing) for writing in ("text", "latex")}
         content |= {"terms": terms, "equation": written}
-    return Fitted(
-        job, fit, FitResult.model_validate(content), responses, {name: both for name, (_, both) in ran.items()}
+    return FitReport(
+        job,
+        fit,
+        FitResult.model_validate(content),
+        responses,
+        {name: both for name, (_, both) in ran.items()},
     )
 
 
 def _status(fit: Any, warnings: Sequence[Any]) -> Any:
-    """How training ended; of a model that does not run freely its message begins with that."""
+    """Return how training ended.
+
+    For a model whose free run diverges, the message begins with that.
+    """
     first = next((warning.text for warning in warnings if warning.code == "one_step_only"), "")
     last = "" if fit.status.ok else describe_scales(fit.problem.record)
     if not (first or last):
@@ -234,25 +293,42 @@ def _status(fit: Any, warnings: Sequence[Any]) -> Any:
 def _one_step_only(
     scores: Mapping[str, PartScores], alone: Mapping[str, PartScores], parts: Sequence[str]
 ) -> list[Warning]:
-    """That a model trained one step ahead by hand is of no use in free run: it diverges, or physics alone is better."""
+    """Return a warning where a model trained one step ahead is of no use in free run.
+
+    It diverges there, or physics alone is better; the user chose the criterion.
+    """
     diverges = any(scores[part].simulation.nrmse is None for part in parts)
     worse = [
-        bool(np.all(np.asarray(scores[part].simulation.nrmse) > np.asarray(alone[part].simulation.nrmse)))
+        bool(
+            np.all(
+                np.asarray(scores[part].simulation.nrmse) > np.asarray(alone[part].simulation.nrmse)
+            )
+        )
         for part in parts
-        if part in alone and scores[part].simulation.nrmse is not None and alone[part].simulation.nrmse is not None
+        if part in alone
+        and scores[part].simulation.nrmse is not None
+        and alone[part].simulation.nrmse is not None
     ]
     if not diverges and not (worse and all(worse)):
         return []
-    why = "its free run diverges" if diverges else "physics alone follows the outputs better in free run"
+    why = (
+        "its free run diverges"
+        if diverges
+        else "physics alone follows the outputs better in free run"
+    )
     text = (
-        f'the model is for one-step prediction only: {why}. `focus = "auto"`, the default, trains the free run, too, '
+        f'the model is for one-step prediction only: {why}. `focus = "auto"`, the default, '
+        "trains the free run, too, "
         "where one step ahead is not enough."
     )
     return [Warning("one_step_only", text)]
 
 
 def _for_observers(fit: Any, verdict: str, warnings: list[Any]) -> Any:
-    """The fit whose model keeps what an observer of it asks for: the verdict on the residual, and two noises."""
+    """Return the fit with a model that keeps what observers need.
+
+    These are the verdict on the residual, and the two noises.
+    """
     from orthaug.analysis.observer_noise import to_keep
 
     kept = replace(fit.model.statistics, verdict=verdict)
@@ -263,19 +339,19 @@ def _for_observers(fit: Any, verdict: str, warnings: list[Any]) -> Any:
 
 
 def judge_fit(
-    fitted: Fitted,
+    fitted: FitReport,
     physics: Callable[[], Any],
     blocks: Sequence[Trial] | None = None,
     alone: Mapping[str, tuple[Response, Response]] | None = None,
 ) -> Verdict | None:
-    """Whether the learner earns its place: free runs against physics alone on what was not fitted.
+    """Return whether the learner is useful: its free run against physics alone on data not fitted.
 
-    Where the fit fell back to physics alone, that is judged by which it did.
+    Where the fit fell back to physics alone, the trials behind that choice decide.
 
     Args:
         physics: gives the fit of physics alone, where a part is held out.
-        blocks: trials of blocked cross-validation; None for those by which the fit was chosen, or to make them, where
-            there is no validation or test part or where the spec asks for them.
+        blocks: trials of blocked cross-validation; None for those by which the fit was chosen, or
+            to make them, where there is no validation or test part or where the spec asks for them.
         alone: the responses of physics alone by part, where they are there already.
     """
     from orthaug.analysis.validation import extrapolation, judge, trial_on, trials_of
@@ -292,7 +368,7 @@ def judge_fit(
         else:
             blocks = (
                 cross_validated(job, wanted, [Variant(criterion=fitted.fit.criterion)])[0]
-                if wanted and not _stopped(fitted.fit)
+                if wanted and not _was_stopped(fitted.fit)
                 else ()
             )
     trials, beyond = list(blocks), []
@@ -300,28 +376,41 @@ def judge_fit(
         ran = None if alone is None else alone[part.name][1]
         response = fitted.responses[part.name][1]
         trials.append(
-            trial_on(part.name, part.record, part.skips, physics().model, model, alone_response=ran, response=response)
+            trial_on(
+                part.name,
+                part.record,
+                part.skips,
+                physics().model,
+                model,
+                alone_response=ran,
+                response=response,
+            )
         )
-        beyond += extrapolation(part.name, job.reach(model, part.record)[0], *job.reach(model, job.train.record))
+        beyond += extrapolation(
+            part.name, job.reach(model, part.record)[0], *job.reach(model, job.train.record)
+        )
     return judge(trials, beyond)
 
 
-def _stopped(fit: Any) -> bool:
-    """Whether training was asked to end with what it had: then nobody waits for cross-validation either."""
+def _was_stopped(fit: Any) -> bool:
+    """Return whether training was asked to end early: then cross-validation is omitted too."""
     return any(warning.code == "stopped" for warning in fit.warnings)
 
 
 def wanted_blocks(job: Job) -> int:
-    """Blocks of cross-validation for a verdict: none where parts are held out, unless the spec asks for them."""
+    """Return the number of blocks of cross-validation: by default none beside held-out parts."""
     asked = job.spec.validation.blocks
     return (0 if job.parts[1:] else DEFAULT_BLOCKS) if asked is None else asked
 
 
 def cross_validated(job: Job, blocks: int, variants: Sequence[Variant]) -> list[list[Trial]]:
-    """Trials of every variant on every block; none where the record is too short for that."""
+    """Return the trials of every variant on every block; none where the record is too short."""
     from orthaug.analysis.validation import block_trials, cross_validate
 
-    fits = [job.fold_fit(variant) for variant in (Variant(ALONE, criterion=variants[0].criterion), *variants)]
+    fits = [
+        job.fold_fit(variant)
+        for variant in (Variant(PHYSICS_ONLY, criterion=variants[0].criterion), *variants)
+    ]
     try:
         options: dict[str, Any] = {"start": job.first_row, "runner": job.runner}
         errors = cross_validate(job.train.record, fits, blocks=blocks, **options)
@@ -330,11 +419,16 @@ def cross_validated(job: Job, blocks: int, variants: Sequence[Variant]) -> list[
     return [block_trials(errors, 1 + j) for j in range(len(variants))]
 
 
-def score_part(model: Any, part: Part, warnings: list[Any]) -> tuple[PartScores, tuple[Response, Response]]:
-    """Scores of a part, and the responses they come from. For a score that does not exist a warning is added."""
+def score_part(
+    model: Any, part: Part, warnings: list[Any]
+) -> tuple[PartScores, tuple[Response, Response]]:
+    """Return the scores of a part, and the responses that they come from.
+
+    A missing score adds a warning.
+    """
     responses = model.predict(part.record), model.simulate(part.record)
     if part.source is not None:
-        return _scored_along(model, part, warnings), responses
+        return _score_along(model, part, warnings), responses
     scores = {}
     for kind, response in zip(("prediction", "simulation"), responses, strict=True):
         runaway = next((t.diverged for t in response.trajectories if t.diverged), None)
@@ -342,44 +436,62 @@ def score_part(model: Any, part: Part, warnings: list[Any]) -> tuple[PartScores,
         scores[kind] = ScoreResult() if runaway is not None else scored
         if runaway is not None:
             step, output = runaway
-            told = f"{part.name}: the free run diverged in output '{output}' at step {step}; no simulation scores."
-            warnings.append(Warning("free_run_diverged", told))
+            text = (
+                f"{part.name}: the free run diverged in output '{output}' at step {step}; no "
+                "simulation scores."
+            )
+            warnings.append(Warning("free_run_diverged", text))
         elif np.isnan(scored.rmse).any():
-            warnings.append(Warning("not_finite", f"{part.name}: the {kind} is not finite on some rows; no scores."))
+            warnings.append(
+                Warning(
+                    "not_finite", f"{part.name}: the {kind} is not finite on some rows; no scores."
+                )
+            )
         elif np.isnan(scored.nrmse).any():
-            told = f"{part.name}: an output is constant over the scored samples; no NRMSE and FIT of its {kind}."
-            warnings.append(Warning("constant_output", told))
+            text = (
+                f"{part.name}: an output is constant over the scored samples; no NRMSE and FIT "
+                f"of its {kind}."
+            )
+            warnings.append(Warning("constant_output", text))
     return PartScores.model_validate(scores), responses
 
 
-def _scored_along(model: Any, part: Part, warnings: list[Any]) -> PartScores:
-    """Scores of all rows of a part of which only a witness is in memory, and tests of the residual of all of them."""
+def _score_along(model: Any, part: Part, warnings: list[Any]) -> PartScores:
+    """Return scores and residual tests over all rows of a part that is kept as a subsample."""
     from orthaug.analysis.residuals import RunningResidual
     from orthaug.data.sources import rows_of
     from orthaug.models.long_runs import scores_along
 
     assert part.source is not None
-    whole = len(part.record) == rows_of(part.source)  # whose tests are those of the result
+    whole = len(part.record) == rows_of(part.source)  # its tests are those of the result
     residual = RunningResidual([c.name for c in model.outputs], [c.name for c in model.inputs])
     found = scores_along(model, part.source, part.skip, None if whole else residual.watch)
     if found.diverged is not None:
         file, row, output = found.diverged
-        told = f"{part.name}: the free run diverged in output '{output}' at row {row} of {file}; no simulation scores."
-        warnings.append(Warning("free_run_diverged", told))
+        text = (
+            f"{part.name}: the free run diverged in output '{output}' at row {row} of {file}; "
+            "no simulation scores."
+        )
+        warnings.append(Warning("free_run_diverged", text))
     simulation = ScoreResult() if found.diverged is not None else found.simulation
     tests = residual.tests() or None
-    return PartScores.model_validate({"prediction": found.prediction, "simulation": simulation, "residual": tests})
+    return PartScores.model_validate(
+        {"prediction": found.prediction, "simulation": simulation, "residual": tests}
+    )
 
 
-def write_result(fitted: Fitted, folder: Path, *, force: bool = False) -> None:
-    """result.json, model/ and figures/, whole or not at all; without a model where training failed."""
+def write_result(fitted: FitReport, folder: Path, *, force: bool = False) -> None:
+    """Write result.json, model/ and figures/, whole or not at all.
+
+    Without a model where training failed.
+    """
     with whole_folder(folder, force=force) as partial:
         fill_result(fitted, partial)
     if fitted.job.checkpoints is not None:
         fitted.job.checkpoints.discard()
 
 
-def fill_result(fitted: Fitted, folder: Path) -> None:
+def fill_result(fitted: FitReport, folder: Path) -> None:
     """Write the files of a result into an existing folder."""
     from orthaug.models import storage
 
@@ -389,7 +501,11 @@ def fill_result(fitted: Fitted, folder: Path) -> None:
     (folder / "model").mkdir()
     storage.write(fitted.fit.model, folder / "model")
     physics = fitted.fit.physics_alone
-    if physics is None and fitted.fit.model.form.bound is None and fitted.job.spec.declared_learner() is not None:
+    if (
+        physics is None
+        and fitted.fit.model.form.bound is None
+        and fitted.job.spec.declared_learner() is not None
+    ):
         physics = fitted.fit  # the learner was left out
     if physics is not None and physics.status.ok:
         (folder / PHYSICS).mkdir()
@@ -399,7 +515,7 @@ def fill_result(fitted: Fitted, folder: Path) -> None:
     (folder / "report.html").write_text(fit_report(fitted), encoding="utf-8")
 
 
-def _draw(fitted: Fitted, folder: Path) -> None:
+def _draw(fitted: FitReport, folder: Path) -> None:
     from orthaug.reports import plots
 
     drawn = kind_of(fitted.job).figures(fitted.job, fitted.fit, fitted.result, fitted.responses)
@@ -407,8 +523,11 @@ def _draw(fitted: Fitted, folder: Path) -> None:
         plots.save(figure, folder / f"{name}.png")
 
 
-def fit_report(fitted: Fitted, origin: Origin | None = None) -> str:
-    """The page of a fit that has a model; `origin` is where it comes from, None for its spec."""
+def fit_report(fitted: FitReport, origin: Origin | None = None) -> str:
+    """Return the page of a fit that has a model.
+
+    `origin` is None for the origin given by its spec.
+    """
     from orthaug.reports.learned_part import learned_of
     from orthaug.reports.page import fit_page
     from orthaug.reports.page_fit import FitPage
@@ -416,4 +535,6 @@ def fit_report(fitted: Fitted, origin: Origin | None = None) -> str:
     job, fit, responses = fitted.job, fitted.fit, fitted.responses
     alone = {} if fit.model.form.bound is None else kind_of(job).physics_alone(job, fit, responses)
     learned = learned_of(fit, job.train.record)
-    return fit_page(FitPage(origin or origin_of(job, "fit"), fitted.result, responses, alone, learned))
+    return fit_page(
+        FitPage(origin or origin_of(job, "fit"), fitted.result, responses, alone, learned)
+    )

@@ -22,7 +22,9 @@ PHYSICS = "model-physics"
 
 
 def chosen_model(model: Path, which: str) -> Path:
-    """Return the folder of the model that a command runs: the fitted one, or `physics`, the one without a learner.
+    """Return the folder of the model that a command runs.
+
+    It is the fitted one, or `physics`: the one without a learner.
 
     Raises:
         InputError: neither of these, or a fit that has no physics alone beside its model.
@@ -33,13 +35,17 @@ def chosen_model(model: Path, which: str) -> Path:
     whole = model.parent if model.name == "model" else model
     if not (whole / PHYSICS).is_dir():
         raise InputError(
-            f"{whole}: holds no {PHYSICS}; expected a result of `orthaug fit` with a learner, or no --model physics."
+            f"{whole}: holds no {PHYSICS}; expected a result of `orthaug fit` with a learner, "
+            "or no --model physics."
         )
     return whole / PHYSICS
 
 
 def results_beside(model: Path) -> Iterator[Any]:
-    """What is read from result.json in the folder of a model, or the one above; for the caller to check."""
+    """Yield what is read from result.json in the folder of a model, or the one above.
+
+    The caller has to check its content.
+    """
     for folder in (model, model.parent):
         with suppress(OSError, ValueError, RecursionError):
             yield json.loads((folder / "result.json").read_text(encoding="utf-8"))
@@ -53,7 +59,7 @@ def check_folder(folder: Path, *, force: bool = False) -> None:
 
 
 def check_inputs_kept(job: Job, folder: Path, models: Iterable[Path] = ()) -> None:
-    """Raise InputError where the result would take the place of a file or model that the job reads."""
+    """Raise InputError where the result would replace a file or model that the job reads."""
     for file in (*job.files, *models):
         if file.resolve().is_relative_to(folder.resolve()):
             what = file.name if file in job.files else f"the model {file}"
@@ -61,7 +67,7 @@ def check_inputs_kept(job: Job, folder: Path, models: Iterable[Path] = ()) -> No
 
 
 def check_kept(folder: Path, *read: Path) -> None:
-    """Raise InputError where a result folder would take the place of what is read."""
+    """Raise InputError where a result folder would replace what is read."""
     for path in read:
         try:
             inside = path.exists() and path.resolve().is_relative_to(folder.resolve())
@@ -72,7 +78,7 @@ def check_kept(folder: Path, *read: Path) -> None:
 
 
 def check_file(out: Path | None, *read: Path, force: bool = False) -> None:
-    """Raise InputError early where a file could not be written, is there, or is one of those that are read."""
+    """Raise InputError early where a file cannot be written, exists, or is one of those read."""
     if out is None:
         return
     try:
@@ -86,14 +92,14 @@ def check_file(out: Path | None, *read: Path, force: bool = False) -> None:
 
 
 def check_figure(out: Path | None, *read: Path, force: bool = False) -> None:
-    """`check_file` of a figure, whose ending says in which format it is drawn."""
+    """Check the file of a figure as `check_file` does, and that its ending is a known format."""
     if out is not None and out.suffix.lower() not in (".png", ".pdf", ".svg"):
         raise InputError(f"{out}: found the ending '{out.suffix}'; expected .png, .pdf or .svg.")
     check_file(out, *read, force=force)
 
 
 def save_figure(figure: Figure, out: Path, *, force: bool = False) -> None:
-    """The figure in the format of its ending, whole or not at all."""
+    """Write the figure in the format of its ending, whole or not at all."""
     from orthaug.reports.drawing import save
 
     with whole_file(out, force=force) as partial:
@@ -101,7 +107,7 @@ def save_figure(figure: Figure, out: Path, *, force: bool = False) -> None:
 
 
 def relative(file: Path, folder: Path) -> str:
-    """A file as a spec in the folder names it."""
+    """Return a file as a spec in the folder names it."""
     try:
         return Path(os.path.relpath(file.resolve(), folder.resolve())).as_posix()
     except ValueError:  # on another drive

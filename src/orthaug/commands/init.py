@@ -1,4 +1,4 @@
-"""A first spec for a data file: what `orthaug init` tells of it, and writes."""
+"""A first spec for a data file: `orthaug init` describes the file, and writes the spec."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import tomlkit
 
 from orthaug._base.errors import InputError, MissingSampleError
 from orthaug._base.folders import whole_file
 from orthaug._base.lines import counted, percent
-from orthaug.commands.first_spec import FILLED, Roles, channel_names, lacking, spec_text, steps_of, time_of
+from orthaug.commands.folder import relative
 from orthaug.data.columns import Column
 from orthaug.data.headers import is_time
 from orthaug.data.preparation import STEPS
@@ -22,6 +23,200 @@ from orthaug.data.survey import Survey, survey
 from orthaug.data.wild import data_warnings
 from orthaug.selection.first_orders import LOOKED_AT, FirstModel, first_model
 
+FILLED = 3
+"""Rows of a gap that the spec's step `fill` reconstructs at most."""
+_CLEARLY = "first significant at lag {}; from here on it runs clearly better on rows held out"
+
+
+@dataclass(frozen=True, eq=False)
+class Roles:
+    """The columns that are inputs and outputs, and the sampling time [s] that the user gave."""
+
+    inputs: tuple[Column, ...]
+    outputs: tuple[Column, ...]
+    sampling_time: float | None = None
+
+
+def channel_names(columns: Sequence[Column]) -> list[str]:
+    """Return what the channels of these columns are called."""
+    return [column.name for column in columns]
+
+
+def time_of(found: Survey, roles: Roles) -> str | None:
+    """Return the column of instants, where its times are to be used.
+
+    That is where its steps are uneven, or where every part has it.
+    """
+    clock = found.clock
+    used = clock.column is not None and clock.instants and not roles.sampling_time
+    return (
+        clock.column.header if used and clock.column and (clock.steady or not clock.even) else None
+    )
+
+
+def steps_of(found: Survey, roles: Roles) -> list[tuple[str, dict[str, Any]]]:
+    """Return the preparation that the data need.
+
+    Spikes of outputs are replaced, and uneven instants resampled onto a grid.
+    """
+    steps: list[tuple[str, dict[str, Any]]] = []
+    if any(column.spikes for column in roles.outputs):
+        threshold = min(column.threshold for column in roles.outputs)
+        steps += [
+            ("outliers", {"threshold": threshold}),
+            ("fill", {"most": FILLED, "method": "pchip"}),
+        ]
+    if time_of(found, roles) and not found.clock.even:
+        steps.append(("resample", {"sampling_time": found.clock.step}))
+    return steps
+
+
+def step_of(found: Survey, roles: Roles) -> float:
+    """Return the seconds between rows: as given, as in the file, or 1."""
+    return roles.sampling_time or found.clock.step or 1.0
+
+
+def lacking(rows: int) -> str:
+    """Return the number of rows that lack a value, in words."""
+    return f"{counted(rows, 'row')} lack{'s' if rows == 1 else ''} a value"
+
+
+def spec_text(
+    found: Survey,
+    roles: Roles,
+    out: Path,
+    rows: int,
+    cut: int,
+    gaps: str,
+    named: tuple[list[str], list[str]],
+    model: FirstModel,
+) -> str:
+    """Return the spec with comments; `gaps` says which rows will be left out, "" for none."""
+    document = tomlkit.document()
+    document.add(
+        tomlkit.comment(
+            f"Written by orthaug init from {found.path.name}. Run: orthaug fit {out.name}"
+        )
+    )
+    document.add(
+        tomlkit.comment("Every key: orthaug schema keys. This is a first draft to be improved.")
+    )
+    document.add("data", _data(found, roles, out, rows, cut, gaps, named))
+    document.add(tomlkit.nl())
+    document.add(
+        tomlkit.comment(
+            "The physics: linear difference equations, to be replaced by what you know "
+            "([motion]: equations of motion)."
+        )
+    )
+    document.add("baseline", _baseline(named, model))
+    learner = tomlkit.table()
+    learner.add("kind", "mlp")
+    learner.add("hidden", [8])
+    learner["hidden"].comment(
+        "sees the lags that the physics reads; [lags] gives it more, `inputs` fewer"
+    )
+    document.add("learner", learner)
+    training = tomlkit.table()
+    training.add("restarts", 3)
+    document.add("training", training)
+    return tomlkit.dumps(document)
+
+
+def _data(
+    found: Survey,
+    roles: Roles,
+    out: Path,
+    rows: int,
+    cut: int,
+    gaps: str,
+    named: tuple[list[str], list[str]],
+) -> Any:
+    file, clock = relative(found.path, out.resolve().parent), found.clock
+    data = tomlkit.table()
+    time = time_of(found, roles)
+    if time is not None:
+        data.add("time", time)
+        data["time"].comment(f"{'every' if clock.even else 'mostly every'} {clock.step:g} s")
+    else:
+        data.add("sampling_time", step_of(found, roles))
+        unknown = clock.step is None and not roles.sampling_time
+        data["sampling_time"].comment("s; no column gives it: change it" if unknown else "s")
+    for key, names in zip(("inputs", "outputs"), named, strict=True):
+        data.add(key, names)
+    uneven = time is not None and not clock.even
+    if gaps or uneven:
+        data.add("missing", "skip")
+        data["missing"].comment(gaps or "nothing is interpolated across gaps")
+    for name, part in (("train", [0, cut]), ("tests", [cut, rows])):
+        if part[0] == part[1]:
+            continue
+        entry = tomlkit.inline_table()
+        entry.update({"files": [file], "rows": part})
+        if name == "train":
+            data.add("train", entry)
+        else:
+            data.add(tomlkit.key(["tests", "last"]), entry)
+    channels = tomlkit.table(is_super_table=True)
+    for column in (*roles.inputs, *roles.outputs):
+        entry = tomlkit.inline_table()
+        entry.update({"column": column.header} if column.header != column.name else {})
+        entry.update({"unit": column.unit} if column.unit else {})
+        if entry:
+            channels.add(tomlkit.key(column.name), entry)
+    if len(channels):
+        data.add("channels", channels)
+    steps = tomlkit.aot()
+    for kind, keys in steps_of(found, roles):
+        step = tomlkit.table()
+        step.update({"step": kind, **keys})
+        steps.append(step)
+    if len(steps):
+        data.add("prepare", steps)
+    return data
+
+
+def _baseline(named: tuple[list[str], list[str]], model: FirstModel) -> Any:
+    inputs, outputs = named
+    terms, orders = [], model.orders
+    comments = {}
+    for name, nk, seen in zip(inputs, orders.nk, model.delays, strict=True):
+        if seen != nk:
+            why = (
+                "no lag of it is significant, so this is a guess"
+                if seen is None
+                else _CLEARLY.format(seen)
+            )
+            comments[f"{name}[k-{nk}]" if nk else f"{name}[k]"] = why
+    for output in outputs:
+        own = f"_{output}" if len(outputs) > 1 else ""
+        found = [(f"a{i}{own}", f"{output}[k-{i}]") for i in range(1, orders.na + 1)]
+        for name, nb, nk in zip(inputs, orders.nb, orders.nk, strict=True):
+            by = f"_{name}" if len(inputs) > 1 else ""
+            found += [
+                (f"b{lag}{by}{own}", f"{name}[k-{lag}]" if lag else f"{name}[k]")
+                for lag in range(nk, nk + nb)
+            ]
+        found += [(f"offset{own}", "1")] if model.offset else []
+        for parameter, regressor in found:
+            term = tomlkit.table()
+            term.add(
+                "parameter", f"{parameter}_" if parameter in (*inputs, *outputs) else parameter
+            )
+            term.add("regressor", regressor)
+            if regressor in comments:
+                term["regressor"].comment(comments[regressor])
+            if own:
+                term.add("output", output)
+            terms.append(term)
+    array = tomlkit.aot()
+    for term in terms:
+        array.append(term)
+    baseline = tomlkit.table(is_super_table=True)
+    baseline.add("terms", array)
+    return baseline
+
+
 Names = str | Sequence[str]  # columns, several in a text separated by commas
 TRAINED = 0.75  # share of the rows; the rest is a test
 _TESTED = 30  # rows of a test at least
@@ -30,14 +225,14 @@ _LISTED = 12  # columns in a message
 
 @dataclass(frozen=True, eq=False)
 class Draft:
-    """A spec as text, with the account of what was seen."""
+    """A spec as text, with a description of the file."""
 
     spec: str
     account: str
 
 
 def look(path: Path) -> Survey:
-    """The columns of a file.
+    """Return the columns of a file.
 
     Raises:
         InputError: a file that cannot be read or holds no numbers.
@@ -48,7 +243,9 @@ def look(path: Path) -> Survey:
 def assign(
     found: Survey, inputs: Names | None, outputs: Names | None, sampling_time: float | None = None
 ) -> Roles | None:
-    """Columns by their names; where nothing is given by what the names say; None if that is open.
+    """Return the columns by name; where none are given, by the meaning of their names.
+
+    None where the names leave that open.
 
     Raises:
         InputError: columns that are not there, twice, constant or the time.
@@ -57,22 +254,35 @@ def assign(
         known = found.roles()
         return None if known is None else Roles(tuple(known[0]), tuple(known[1]), sampling_time)
     named = {"input": inputs, "output": outputs}
-    chosen = [None if n is None else columns_of(found, n, kind, sampling_time) for kind, n in named.items()]
+    chosen = [
+        None if n is None else columns_of(found, n, kind, sampling_time)
+        for kind, n in named.items()
+    ]
     if outputs is not None and not chosen[1]:
-        raise InputError(f"{found.path}: no output is named; give --outputs, a column or several separated by commas.")
+        raise InputError(
+            f"{found.path}: no output is named; give --outputs, a column or several separated "
+            "by commas."
+        )
     both = [column for group in chosen for column in group or ()]
     for column in both:
         if both.count(column) > 1:
-            raise InputError(f"{found.path}: column '{column.header}' is named twice among inputs and outputs.")
+            raise InputError(
+                f"{found.path}: column '{column.header}' is named twice among inputs and outputs."
+            )
     if chosen[0] is None or chosen[1] is None:
         return None
     if not found.same_lengths(both):
         listing = ", ".join(f"'{c.header}' {c.filled}" for c in both)
-        raise InputError(f"{found.path}: the columns have unequal lengths: {listing} rows. Name those of one run.")
+        raise InputError(
+            f"{found.path}: the columns have unequal lengths: {listing} rows. Name those of "
+            "one run."
+        )
     return Roles(tuple(chosen[0]), tuple(chosen[1]), sampling_time)
 
 
-def columns_of(found: Survey, names: Names, kind: str, sampling_time: float | None = None) -> list[Column]:
+def columns_of(
+    found: Survey, names: Names, kind: str, sampling_time: float | None = None
+) -> list[Column]:
     """Return the columns of these names; a text may hold several, separated by commas.
 
     Args:
@@ -93,68 +303,91 @@ def columns_of(found: Survey, names: Names, kind: str, sampling_time: float | No
 
 
 def _check_no_time(found: Survey, column: Column, kind: str, sampling_time: float | None) -> None:
-    """Raise InputError for the time as a channel; an input may rise as evenly where the time is known otherwise."""
+    """Raise InputError where the time is named as a channel.
+
+    An input may rise as evenly where the time is known otherwise.
+    """
     place, refused = f"{found.path}: column '{column.header}'", found.looks_like_time(column)
     if column is found.clock.column and found.clock.by_name:
         raise InputError(f"{place} is the time; it is no channel.")
     if column is found.clock.column and (kind == "output" or sampling_time is None):
-        remedy = "it is no output" if kind == "output" else "if it is an input, give --sampling-time, the step in s"
-        raise InputError(f"{place} rises by {found.clock.step:g} s in each row, as time does; {remedy}.")
+        remedy = (
+            "it is no output"
+            if kind == "output"
+            else "if it is an input, give --sampling-time, the step in s"
+        )
+        raise InputError(
+            f"{place} rises by {found.clock.step:g} s in each row, as time does; {remedy}."
+        )
     if refused is not None and (kind == "output" or is_time(column.header)):
-        raise InputError(f"{place} {refused.reason}; it is no {'channel' if is_time(column.header) else 'output'}.")
+        raise InputError(
+            f"{place} {refused.reason}; it is no "
+            f"{'channel' if is_time(column.header) else 'output'}."
+        )
 
 
 def question(found: Survey, inputs: Names | None = None, outputs: Names | None = None) -> str:
-    """What to give where the columns do not say what they are; `inputs` and `outputs` are what was given.
+    """Return what the user has to give where the columns do not show their roles.
+
+    `inputs` and `outputs` are what was given.
 
     Raises:
         InputError: no column could be a channel, or none is left for an output.
     """
     kinds = {"input": inputs, "output": outputs}
-    given = {id(c): c for kind, names in kinds.items() for c in columns_of(found, names or "", kind)}
+    given = {
+        id(c): c for kind, names in kinds.items() for c in columns_of(found, names or "", kind)
+    }
     free = [c for c in found.signals if id(c) not in given]
     if not found.signals or (outputs is None and not free):
-        raise InputError(f"{found.path}: {_nothing_left(found, _joined(inputs))}")
+        raise InputError(f"{found.path}: {_no_output_reason(found, _join(inputs))}")
     some = _listed([c.header for c in found.signals])
     output = free.pop() if outputs is None else None
     rows = next((c.filled for c in (output, *given.values()) if c is not None), 0)
     alike = [c.header for c in free if c.filled == rows] or [c.header for c in free]
     named = ",".join(alike[:_LISTED]) if outputs is not None else alike[0] if alike else ""
-    into = named if inputs is None else _joined(inputs)
-    proposed = f'--inputs "{into}" --outputs "{_joined(outputs) if output is None else output.header}"'
-    said = "the names of the columns do not tell inputs from outputs"
+    into = named if inputs is None else _join(inputs)
+    proposed = (
+        f'--inputs "{into}" --outputs "{_join(outputs) if output is None else output.header}"'
+    )
+    said = "the names of the columns do not show which are inputs and which outputs"
     if inputs is not None or outputs is not None:
         said = f"only {'inputs' if outputs is None else 'outputs'} are named"
     none = ' (--inputs "" for none)' if inputs is None and named else ""
     others = left_out(found, [*found.signals])
     return (
-        f"{found.path}: {said}: {some}. Say both, separated by commas, such as {proposed}{none}; columns that are not "
-        f"named are left out." + (f" No channels: {others}." if others else "")
+        f"{found.path}: {said}: {some}. Say both, separated by commas, such as "
+        f"{proposed}{none}; columns that are not named are left out."
+        + (f" No channels: {others}." if others else "")
     )
 
 
-def _joined(names: Names | None) -> str | None:
-    """Names as a person would write them."""
+def _join(names: Names | None) -> str | None:
+    """Return the names as a person would write them."""
     return names if names is None or isinstance(names, str) else ",".join(names)
 
 
-def _nothing_left(found: Survey, inputs: str | None) -> str:
-    """Why there is no output to name."""
+def _no_output_reason(found: Survey, inputs: str | None) -> str:
+    """Return the reason why no column is left for an output."""
     rows = counted(max(column.filled for column in found.columns), "row")
     others = left_out(found, [*found.signals])
     if not found.signals:
         return (
-            f"no column could be a channel, {rows}: {others}. A first model needs an output that varies, over some "
-            "dozens of rows."
+            f"no column can be a channel, {rows}: {others}. A first model needs an output that "
+            "varies over some dozens of rows."
         )
-    text = f"every column that could be a channel is an input already ({inputs}), and none is left for an output"
+    text = (
+        f"every possible channel is already an input ({inputs}), so no column is left for an output"
+    )
     return f"{text}; left out: {others}." if others else f"{text}."
 
 
 def left_out(found: Survey, used: Sequence[Column]) -> str:
-    """The columns that are not used, and why, in a list; the time is none of them."""
+    """Return a list of the unused columns, except the time, with the reasons."""
     apart = {id(c) for c in (*used, found.clock.column)}
-    return _listed([f"{c.header} ({found.why_not(c)})" for c in found.columns if id(c) not in apart])
+    return _listed(
+        [f"{c.header} ({found.why_not(c)})" for c in found.columns if id(c) not in apart]
+    )
 
 
 def _listed(columns: Sequence[str]) -> str:
@@ -163,7 +396,7 @@ def _listed(columns: Sequence[str]) -> str:
 
 
 def draft(found: Survey, roles: Roles, out: Path) -> Draft:
-    """A spec for a file that runs, for the place `out`, and the account.
+    """Return a spec that runs on a file, for the place `out`, and a description of the file.
 
     Raises:
         InputError: too few rows, or channels without a row where all have a value.
@@ -176,11 +409,15 @@ def draft(found: Survey, roles: Roles, out: Path) -> Draft:
     model = first_model(record)
     if model is None:
         raise InputError(
-            f"{found.path}: {len(record)} usable rows are too few for a first model of these channels, or the inputs "
-            "are combinations of each other. Give more rows, or fewer inputs."
+            f"{found.path}: {len(record)} usable rows are too few for a first model of these "
+            "channels, or the inputs are combinations of each other. Give more rows, or fewer "
+            "inputs."
         )
     named = (channel_names(roles.inputs), channel_names(roles.outputs))
-    wild = f"{counted(lost, 'training row')} in longer runs of wild samples {'is' if lost == 1 else 'are'} left out"
+    wild = (
+        f"{counted(lost, 'training row')} in longer runs of wild samples "
+        f"{'is' if lost == 1 else 'are'} left out"
+    )
     gaps = lacking(missing) if missing else wild if lost else ""
     text = spec_text(found, roles, out, rows, cut, gaps, named, model)
     return Draft(
@@ -199,7 +436,7 @@ def draft(found: Survey, roles: Roles, out: Path) -> Draft:
 
 
 def write_spec(found: Draft, out: Path, *, force: bool = False) -> None:
-    """The spec, once it has been opened with its data as `orthaug fit` would."""
+    """Write the spec, after opening it with its data as `orthaug fit` does."""
     from orthaug.commands.kinds import open_job
 
     with whole_file(out, force=force) as partial:
@@ -208,12 +445,14 @@ def write_spec(found: Draft, out: Path, *, force: bool = False) -> None:
             try:
                 open_job(partial)
             except InputError as error:
-                told = str(error).removeprefix(f"{partial}: ")
-                raise InputError(f"{out}: a spec for these columns would be refused: {told}") from None
+                reason = str(error).removeprefix(f"{partial}: ")
+                raise InputError(
+                    f"{out}: a spec for these columns would be refused: {reason}"
+                ) from None
 
 
 def _extent(roles: Roles) -> tuple[int, int]:
-    """Rows up to the last value of any channel, and how many of them lack one."""
+    """Return the number of rows up to the last value of any channel, and of those that lack one."""
     columns = [*roles.inputs, *roles.outputs]
     rows = max(column.filled for column in columns)
     there = np.ones(rows, dtype=bool)
@@ -225,16 +464,24 @@ def _extent(roles: Roles) -> tuple[int, int]:
 
 
 def _record(found: Survey, roles: Roles, cut: int, missing: int) -> tuple[Record, int]:
-    """The training rows, and how many are left out because a sample is missing."""
-    inputs, outputs = ([Channel(c.name, c.unit, c.header) for c in group] for group in (roles.inputs, roles.outputs))
-    options: dict[str, Any] = {"rows": (0, cut), "missing": "skip" if missing or not found.clock.even else "error"}
+    """Return the training rows, and how many are left out because a sample is missing."""
+    inputs, outputs = (
+        [Channel(c.name, c.unit, c.header) for c in group]
+        for group in (roles.inputs, roles.outputs)
+    )
+    options: dict[str, Any] = {
+        "rows": (0, cut),
+        "missing": "skip" if missing or not found.clock.even else "error",
+    }
     options["prepare"] = [STEPS.declare(kind, keys) for kind, keys in steps_of(found, roles)]
     if not found.clock.even:
         options["time"] = time_of(found, roles)
     try:
         record = read_record(found.path, inputs=inputs, outputs=outputs, **options)
     except MissingSampleError:  # more samples in a row were wild than a gap is filled over
-        record = read_record(found.path, inputs=inputs, outputs=outputs, **{**options, "missing": "skip"})
+        record = read_record(
+            found.path, inputs=inputs, outputs=outputs, **{**options, "missing": "skip"}
+        )
     return record, record.missing
 
 
@@ -248,12 +495,15 @@ def _account(
     wild: str,
     notes: Sequence[str] = (),
 ) -> str:
-    """What was seen, a line each."""
+    """Return the description of the file, a line for each finding."""
     step = f"{roles.sampling_time:g} s, as given" if roles.sampling_time else str(found.clock)
     if roles.sampling_time is None and found.clock.step is None:
-        step += "; 1 s is written: change it"
-    told = f"; {found.note}" if found.note else ""
-    lines = [f"{found.path.name}: {rows} rows, {len(found.columns)} columns{told}", f"sampling time: {step}"]
+        step += "; the spec has 1 s: change it"
+    horizon = f"; {found.note}" if found.note else ""
+    lines = [
+        f"{found.path.name}: {rows} rows, {len(found.columns)} columns{horizon}",
+        f"sampling time: {step}",
+    ]
     for kind, columns in (("input", roles.inputs), ("output", roles.outputs)):
         lines += [f"{kind:<7}{as_seen(column, spikes=kind == 'output')}" for column in columns]
     used = {id(c) for c in (*roles.inputs, *roles.outputs, found.clock.column)}
@@ -267,19 +517,34 @@ def _account(
         filled = any(kind == "fill" for kind, _ in steps_of(found, roles))
         lines.append(f"{lacking(missing)} and will be left out, with all windows that touch them")
         if filled:
-            lines[-1] = f"{lacking(missing)}: gaps of up to {FILLED} rows are filled, longer ones left out"
+            lines[-1] = (
+                f"{lacking(missing)}: gaps of up to {FILLED} rows are filled, longer ones left out"
+            )
     lines += [wild] if wild else []
     lines += notes
-    for name, late, seen in zip(channel_names(roles.inputs), model.orders.nk, model.delays, strict=True):
+    for name, late, seen in zip(
+        channel_names(roles.inputs), model.orders.nk, model.delays, strict=True
+    ):
         if seen is not None and seen != late:
-            lines.append(f"the spec takes {name} from lag {late} on, which runs clearly better on rows held out")
+            lines.append(
+                f"the spec takes {name} from lag {late} on, which runs clearly better on rows "
+                "held out"
+            )
     size, errors = model.orders, ", ".join(percent(error, 3) for error in model.free_run)
-    told = "one step ahead" if not roles.inputs else "in free run"
-    lines.append(f"first physics: linear, {size}{', with a constant' if model.offset else ''}; {told} its error")
+    horizon = "one step ahead" if not roles.inputs else "in free run"
+    lines.append(
+        f"first physics: linear, {size}{', with a constant' if model.offset else ''}; {horizon} "
+        "its error"
+    )
     lines[-1] += f" on rows held out is {errors} of the output's standard deviation"
     if cut - missing > LOOKED_AT:
-        lines.append(f"delays and orders are found on {LOOKED_AT} of these rows, in windows spread over them")
-    lines.append("test: " + (f"rows {cut} to {rows}" if cut < rows else "none, for there are few rows"))
+        lines.append(
+            f"delays and orders are estimated from {LOOKED_AT} of these rows, in windows "
+            "spread over them"
+        )
+    lines.append(
+        "test: " + (f"rows {cut} to {rows}" if cut < rows else "none, because there are few rows")
+    )
     return "\n".join(lines)
 
 
@@ -292,21 +557,31 @@ def _delay(delay: int | None) -> str:
 def _order(order: int) -> str:
     from orthaug.selection.first_orders import PERSISTENCE
 
-    return f"up to order {order}" + (" or more" if order >= PERSISTENCE else ": few lags can be told apart")
+    return f"up to order {order}" + (
+        " or more" if order >= PERSISTENCE else ": few lags can be distinguished"
+    )
 
 
 def as_seen(column: Column, *, spikes: bool) -> str:
-    """A channel in words: range, and what is odd about it."""
+    """Return a channel in words: its range, and what is unusual about it."""
     low, high = float(column.finite.min()), float(column.finite.max())
-    text = f"{column.name}" + (f" = column '{column.header}'" if column.header != column.name else "")
+    text = f"{column.name}" + (
+        f" = column '{column.header}'" if column.header != column.name else ""
+    )
     text += f": {low:.4g} to {high:.4g} {column.unit}".rstrip()
     if column.missing:
         text += f"; {counted(column.missing, 'cell')} missing"
     if spikes and column.spikes:
-        text += f"; {counted(column.spikes, 'sample')} far from all neighbours, which the spec replaces"
+        text += (
+            f"; {counted(column.spikes, 'sample')} far from all neighbours, which the spec replaces"
+        )
     for value, count in column.limits:
         text += f"; {counted(count, 'row')} at {value:.4g}, perhaps a limit of sensor or actuator"
     if column.quantum is not None:
-        moves = f", while it moves by {column.movement:.2g} from row to row" if column.quantum > column.movement else ""
+        moves = (
+            f", while it moves by {column.movement:.2g} from row to row"
+            if column.quantum > column.movement
+            else ""
+        )
         text += f"; in steps of {column.quantum:.3g}{moves}"
     return text

@@ -1,4 +1,4 @@
-"""A job: a spec with its data read and checked, and how it is trained, as declared or as a variant of that."""
+"""A job: a spec with its data read and checked, trained as declared or as a variant."""
 
 from __future__ import annotations
 
@@ -31,35 +31,35 @@ if TYPE_CHECKING:
     from orthaug.reports.page_fit import Origin
 
 DEFAULT_BLOCKS = 4
-ALONE = "physics alone"
+PHYSICS_ONLY = "physics alone"
 _TOLD = ("jax", "numpy", "scipy")  # packages whose versions move numbers
 
 
 @dataclass(frozen=True, eq=False)
 class Variant:
-    """A variant of a job: another structure or physics alone, perhaps on a fold of the training data.
+    """A variant of a job: another structure or physics alone, perhaps on a fold of the data.
 
     A fit on a fold has one start, few iterations, and nothing to choose from.
     """
 
     kind: str | None = None
-    """Of the structure, or `ALONE`; None for the structure that the spec declares."""
+    """The kind of structure, or `PHYSICS_ONLY`; None for the structure that the spec declares."""
     fold: Record | None = None
     criterion: Criterion | None = None
     """None for the criterion that the spec declares."""
 
     @property
     def alone(self) -> bool:
-        """Whether there is no learner."""
-        return self.kind == ALONE
+        """Whether the variant has no learner."""
+        return self.kind == PHYSICS_ONLY
 
     @property
     def structure_kind(self) -> str | None:
-        """Of the structure; "orthogonal" for physics alone."""
+        """Kind of the structure; "orthogonal" for physics alone."""
         return "orthogonal" if self.alone else self.kind
 
     def on(self, fold: Record) -> Variant:
-        """The same on a fold."""
+        """Return the variant on a fold."""
         return replace(self, fold=fold)
 
 
@@ -77,9 +77,9 @@ class Job(ABC):
     tests: tuple[Part, ...]
     problem: Any
     checkpoints: Checkpoints | None = None
-    """Where the states of training are kept."""
+    """The folder in which the states of training are kept."""
     arguments: tuple[str, ...] = ()
-    """Of the command that asked for it; none from Python."""
+    """The arguments of the command that made the job; none from Python."""
 
     def __repr__(self) -> str:
         parts = ", ".join(f"{part.name} {len(part.record)} rows" for part in self.parts)
@@ -98,23 +98,23 @@ class Job(ABC):
     @property
     @abstractmethod
     def compared(self) -> tuple[str, ...]:
-        """What `orthaug compare` fits: kinds of variants, physics alone first."""
+        """Kinds of variants that `orthaug compare` fits, physics alone first."""
 
     @abstractmethod
     def refusal(self, variant: Variant) -> str | None:
-        """Why a variant cannot be fitted; None where it can."""
+        """Return the reason why a variant cannot be fitted; None where it can."""
 
     @abstractmethod
     def run(self, variant: Variant = AS_DECLARED, progress: Progress = SILENT) -> Any:
         """Train as the spec says, or a variant of that."""
 
     def fold_fit(self, variant: Variant) -> Callable[[Record], Any]:
-        """What trains a variant on a fold."""
+        """Return a function that trains a variant on a fold."""
         return lambda fold: self.run(variant.on(fold))
 
     @abstractmethod
     def changed(self, spec: Spec) -> Job:
-        """Return the job of another spec on the data of this one, to be fitted to folds of them.
+        """Return the job of another spec on the same data, to be fitted to folds of them.
 
         Raises:
             InputError: what the spec declares cannot be fitted to the training data.
@@ -122,16 +122,16 @@ class Job(ABC):
 
     @property
     def runner(self) -> Any:
-        """Who makes independent runs of this job."""
+        """Runner of the independent runs of this job."""
         return Threads()
 
     @abstractmethod
     def reach(self, model: Any, record: Record) -> tuple[np.ndarray, Layout]:
-        """Where a model is on a record: points (M, n), and what their entries are called."""
+        """Return the points (M, n) at which a model is evaluated on a record, and their names."""
 
     @property
     def warnings(self) -> tuple[Warning, ...]:
-        """What was done to the data, and which samples of the training data are no measurements."""
+        """Warnings on what was done to the data, and which training samples are no measurements."""
         return (*(warning for part in self.parts for warning in part.warnings), *self._of_samples)
 
     @cached_property
@@ -141,12 +141,15 @@ class Job(ABC):
         return tuple(data_warnings(self.train.record, self.without))
 
     def without(self, samples: Any) -> str:
-        """Return what a fit without these samples of the training data gives, in a sentence; "" where that is dear."""
+        """Return a sentence on the result of a fit without these samples of the training data.
+
+        It is "" where such a fit is expensive.
+        """
         return ""
 
     @property
     def run_count(self) -> int:
-        """How many runs a fit makes: restarts times regularizations."""
+        """Number of runs in a fit: restarts times regularizations."""
         return self.spec.runs(linear=self.linear)
 
     @property
@@ -155,27 +158,39 @@ class Job(ABC):
         return False
 
     def planned(self, variant: Variant) -> Plan:
-        """What is known of each run of a variant; nothing where fits to new weights of the outputs follow."""
+        """Return the known settings of each run of a variant.
+
+        Empty where fits to new weights of the outputs follow.
+        """
         spec = self.spec
         if spec.training.output_weights == "covariance":
             return ()
         if variant.alone or spec.declared_learner() is None:
-            return ({"structure": ALONE},)
+            return ({"structure": PHYSICS_ONLY},)
         kind, validated = variant.kind or spec.structure.kind, spec.data.validation is not None
         choices = spec.regularizations(linear=self.linear, validated=validated, kind=kind)
         starts = range(1, spec.training.restarts + 1)
-        return tuple({"structure": kind, "start": i, "regularization": choice} for choice in choices for i in starts)
+        return tuple(
+            {"structure": kind, "start": i, "regularization": choice}
+            for choice in choices
+            for i in starts
+        )
 
     @property
     def iterations(self) -> int:
-        """Steps of a run at most."""
-        flown = self.spec.declared_criterion().flown
-        return self.spec.declared_solver().iterations + (flown.start_iterations if flown else 0)
+        """Maximum number of steps in a run."""
+        free_run = self.spec.declared_criterion().free_run
+        return self.spec.declared_solver().iterations + (
+            free_run.start_iterations if free_run else 0
+        )
 
     @property
     def files(self) -> tuple[Path, ...]:
         """Every file that the job reads."""
-        return (self.path, *(self.path.parent / entry.file for part in self.parts for entry in part.files))
+        return (
+            self.path,
+            *(self.path.parent / entry.file for part in self.parts for entry in part.files),
+        )
 
     @property
     def parts(self) -> tuple[Part, ...]:
@@ -189,7 +204,7 @@ class Job(ABC):
 
     @property
     def fingerprint(self) -> str:
-        """Of everything that training depends on: the spec, its files, the program."""
+        """Fingerprint of everything that training depends on: the spec, its files, the program."""
         content = {"spec": self.declaration, "data": self.data.model_dump(), "orthaug": __version__}
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
@@ -199,27 +214,37 @@ class Job(ABC):
         return DataResult(
             train=list(self.train.files),
             validation=list(self.validation.files) if self.validation else None,
-            tests={part.name.removeprefix("tests."): list(part.files) for part in self.tests} or None,
-            prepare=[PreparedResult.model_validate(done) for done in self.train.record.prepared] or None,
+            tests={part.name.removeprefix("tests."): list(part.files) for part in self.tests}
+            or None,
+            prepare=[PreparedResult.model_validate(done) for done in self.train.record.prepared]
+            or None,
         )
 
     def training_options(self, variant: Variant) -> dict[str, Any]:
-        """What a variant is trained with, whatever the physics is."""
+        """Return the options of training of a variant, for either kind of physics."""
         from orthaug.fitting.training import FOLD_ITERATIONS
 
         fold, spec, training = variant.fold, self.spec, self.spec.training
-        solver, choices, blocks = spec.declared_solver(), training.regularization, spec.validation.blocks
+        solver, choices, blocks = (
+            spec.declared_solver(),
+            training.regularization,
+            spec.validation.blocks,
+        )
         validated = self.validation is not None and fold is None
         return {
             "learner": None if variant.alone else spec.declared_learner(),
             "criterion": variant.criterion or spec.declared_criterion(),
             "solver": solver if fold is None else solver.at_most(FOLD_ITERATIONS),
-            "regularization": choices[0] if fold is not None and isinstance(choices, list) else choices,
+            "regularization": choices[0]
+            if fold is not None and isinstance(choices, list)
+            else choices,
             "restarts": training.restarts if fold is None else 1,
             "seed": training.seed,
             "blocks": 0 if fold is not None else DEFAULT_BLOCKS if blocks is None else blocks,
             "fallback": training.fallback,
-            "validation": self.validation.scored(self.first_row) if validated and self.validation else None,
+            "validation": self.validation.scored(self.first_row)
+            if validated and self.validation
+            else None,
         }
 
 
@@ -227,24 +252,26 @@ _YEAR_10000 = 253_402_300_800  # s since 1970
 
 
 def date_of_results() -> datetime:
-    """Return the date of a result: that of SOURCE_DATE_EPOCH where it is set, now otherwise.
+    """Return the date of a result: SOURCE_DATE_EPOCH where it is set, now otherwise.
 
     Raises:
-        InputError: seconds that no date is made of.
+        InputError: seconds that are no date.
     """
     epoch = os.environ.get("SOURCE_DATE_EPOCH", "")
     if not epoch:
         return datetime.now(UTC)
-    if not (epoch.isascii() and epoch.isdecimal() and len(epoch) <= 12 and int(epoch) < _YEAR_10000):
+    if not (
+        epoch.isascii() and epoch.isdecimal() and len(epoch) <= 12 and int(epoch) < _YEAR_10000
+    ):
         raise InputError(
-            f"SOURCE_DATE_EPOCH: found {shown(epoch)}; expected whole seconds since 1970 up to the year 9999. Unset it "
-            "for the date of today."
+            f"SOURCE_DATE_EPOCH: found {shown(epoch)}; expected whole seconds since 1970 up to "
+            "the year 9999. Unset it for the date of today."
         )
     return datetime.fromtimestamp(int(epoch), UTC)
 
 
 def origin_of(job: Job, command: str) -> Origin:
-    """Where a result of a job comes from. SOURCE_DATE_EPOCH, where it is set, is the date."""
+    """Return the origin of a job's result. SOURCE_DATE_EPOCH, where it is set, is the date."""
     import importlib.metadata
     import platform
     import shlex
@@ -266,7 +293,10 @@ def origin_of(job: Job, command: str) -> Origin:
 
 
 def _toml(job: Job) -> str:
-    """The spec as it was written; where its file is another one by now, what was read of it."""
+    """Return the spec as it was written.
+
+    Where its file has changed since, it is the content that was read.
+    """
     import tomlkit
 
     try:
@@ -279,7 +309,7 @@ def _toml(job: Job) -> str:
 
 
 def _without_none(content: Any) -> Any:
-    """TOML has no null."""
+    """Return the content without keys that are None: TOML has no null."""
     if isinstance(content, dict):
         return {key: _without_none(value) for key, value in content.items() if value is not None}
     return [_without_none(value) for value in content] if isinstance(content, list) else content

@@ -1,4 +1,4 @@
-"""The kinds of jobs: which one a spec opens, and what tells of it, a module for lagged physics and one for motions."""
+"""The kinds of jobs: lagged physics and motions, a module for each, and which one a spec opens."""
 
 from __future__ import annotations
 
@@ -21,32 +21,46 @@ if TYPE_CHECKING:
 
 @runtime_checkable
 class Kind(Protocol):
-    """What a module of a kind has."""
+    """Interface of the module of a kind of job."""
 
     def checked(self, job: Any) -> CheckResult:
-        """What can be said before training: excitation, identifiability, what may bias; nothing is kept."""
+        """Return the findings before training: excitation, identifiability, possible biases.
+
+        Nothing is stored.
+        """
         ...
 
     def refused(self, job: Any, result: CheckResult) -> InputError | None:
-        """Why the job cannot be fitted, after the report; None where it can."""
+        """Return the reason why the job cannot be fitted, after the report; None where it can."""
         ...
 
     def content(
-        self, job: Any, fit: Any, responses: Mapping[str, tuple[Response, Response]], warnings: list[Any]
+        self,
+        job: Any,
+        fit: Any,
+        responses: Mapping[str, tuple[Response, Response]],
+        warnings: list[Any],
     ) -> tuple[Any, dict[str, Any]]:
-        """The fit as it is handed over, and what results tell of it beside what all kinds do; warnings are added."""
+        """Return the fit as it is handed over, and the content of its result; warnings are added.
+
+        The content has the keys that differ between the kinds.
+        """
         ...
 
     def figures(
-        self, job: Any, fit: Any, result: FitResult, responses: Mapping[str, tuple[Response, Response]]
+        self,
+        job: Any,
+        fit: Any,
+        result: FitResult,
+        responses: Mapping[str, tuple[Response, Response]],
     ) -> dict[str, Figure]:
-        """The figures of a result by their names."""
+        """Return the figures of a result by their names."""
         ...
 
     def physics_alone(
         self, job: Any, fit: Any, responses: Mapping[str, tuple[Response, Response]]
     ) -> Mapping[str, Response]:
-        """The free run of every part by the physics without the learner that there is."""
+        """Return the free run of every part by the model's physics without its learner."""
         ...
 
 
@@ -54,7 +68,7 @@ _KINDS: dict[type[Job], Kind] = {LaggedJob: lagged_kind, MotionJob: motion_kind}
 
 
 def kind_of(job: Job) -> Kind:
-    """What tells of a job."""
+    """Return the module for the kind of a job."""
     return _KINDS[type(job)]
 
 

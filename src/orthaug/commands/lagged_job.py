@@ -13,7 +13,7 @@ import numpy as np
 from orthaug._base.errors import InputError, KeyedError, Warning
 from orthaug._base.progress import SILENT, Progress
 from orthaug.commands.data_sections import engine_of
-from orthaug.commands.job import ALONE, AS_DECLARED, Job, Variant
+from orthaug.commands.job import AS_DECLARED, PHYSICS_ONLY, Job, Variant
 from orthaug.commands.parts import load_parts
 from orthaug.commands.spec import Spec
 from orthaug.commands.suspects import check_suspects
@@ -25,7 +25,7 @@ from orthaug.fitting.independent_terms import independent_terms
 from orthaug.fitting.kinds import STRUCTURES
 from orthaug.fitting.rules import check_cost, check_scored
 from orthaug.inference.kinds import MeasurePlace
-from orthaug.inference.measures import Measure, Weighed, weigh_problem
+from orthaug.inference.measures import Measure, WeighedPhysics, weigh_problem
 from orthaug.physics.parameters import PhysicsMap, with_initial
 from orthaug.physics.problem import Problem, check_defined, pose, regressor_of
 from orthaug.physics.streamed import pose_streamed
@@ -41,12 +41,12 @@ class LaggedJob(Job):
     """A job with a baseline."""
 
     problem: Problem
-    weighed: Weighed
+    weighed: WeighedPhysics
     physics: PhysicsMap | None
     engine: Engine
-    """Who sums over the rows."""
+    """The engine that sums over the rows."""
     left_out: tuple[Warning, ...] = ()
-    """What is told of terms that the learner was declared with, and that say nothing of their own."""
+    """Warnings on terms of the learner that are left out, as they add nothing of their own."""
 
     @property
     def warnings(self) -> tuple[Warning, ...]:
@@ -71,7 +71,9 @@ class LaggedJob(Job):
 
     @property
     def compared(self) -> tuple[str, ...]:
-        return (ALONE,) if self.spec.declared_learner() is None else (ALONE, *STRUCTURES)
+        return (
+            (PHYSICS_ONLY,) if self.spec.declared_learner() is None else (PHYSICS_ONLY, *STRUCTURES)
+        )
 
     @property
     def used(self) -> tuple[Lag, ...]:
@@ -86,14 +88,18 @@ class LaggedJob(Job):
     def refusal(self, variant: Variant) -> str | None:
         baseline = self.problem.baseline
         try:
-            self.spec.declared_structure(variant.structure_kind).penalty(baseline.names, baseline.initial, 1.0)
+            self.spec.declared_structure(variant.structure_kind).penalty(
+                baseline.names, baseline.initial, 1.0
+            )
         except InputError as error:
             return str(error)
         return None
 
     def reach(self, model: Model, record: Record) -> tuple[np.ndarray, Layout]:
         own = record is self.train.record
-        return self.problem.rows.x if own else lag_rows(record, self.problem.layout), self.problem.layout
+        return self.problem.rows.x if own else lag_rows(
+            record, self.problem.layout
+        ), self.problem.layout
 
     @property
     def runner(self) -> Engine:
@@ -102,9 +108,14 @@ class LaggedJob(Job):
         return runs_on(self.engine)
 
     def fold_fit(self, variant: Variant) -> Callable[[Record], Estimate]:
-        """As there; it can be sent to another process. A fold is small: its rows are in memory."""
+        """Return a function that trains a variant on a fold, and can be sent to another process.
+
+        A fold is small: its rows are in memory.
+        """
         spec, options = self.spec, self.training_options(variant.on(self.train.record))
-        options["structure"] = spec.declared_structure(variant.structure_kind)  # predictions score it: no measure tells
+        options["structure"] = spec.declared_structure(
+            variant.structure_kind
+        )  # scored by predictions, on which the measure has no effect
         weights, lags, learner_inputs = spec.training.output_weights, None, None
         if not variant.alone and spec.declared_learner() is not None:
             lags, learner_inputs = spec.lag_orders(), spec.learner_inputs()
@@ -112,11 +123,16 @@ class LaggedJob(Job):
         return partial(_fitted_to, posed=posed, weights=weights, options=options)
 
     def changed(self, spec: Spec) -> LaggedJob:
-        physics, baseline = spec.physics_map(self.train.record.sampling_time), spec.declared_baseline()
+        physics, baseline = (
+            spec.physics_map(self.train.record.sampling_time),
+            spec.declared_baseline(),
+        )
         baseline = baseline if physics is None else with_initial(physics, baseline)
         lags = spec.lag_orders() if spec.declared_learner() is not None else None
         weights = spec.training.output_weights
-        problem = pose(self.train.record, baseline, lags, spec.learner_inputs(), output_weights=weights)
+        problem = pose(
+            self.train.record, baseline, lags, spec.learner_inputs(), output_weights=weights
+        )
         return replace(self, spec=spec, problem=problem, physics=physics, checkpoints=None)
 
     def run(self, variant: Variant = AS_DECLARED, progress: Progress = SILENT) -> Estimate:
@@ -124,8 +140,13 @@ class LaggedJob(Job):
 
         if variant.fold is not None:
             return self.fold_fit(variant)(variant.fold)
-        structure = self.spec.declared_structure(variant.structure_kind, None if variant.alone else self.measure)
-        options = self.training_options(variant) | {"engine": self.engine, "checkpoints": self.checkpoints}
+        structure = self.spec.declared_structure(
+            variant.structure_kind, None if variant.alone else self.measure
+        )
+        options = self.training_options(variant) | {
+            "engine": self.engine,
+            "checkpoints": self.checkpoints,
+        }
         options["ensemble"] = self.spec.training.ensemble and options["learner"] is not None
         problem = self.problem.physics_alone() if variant.alone else self.problem
         return fit(problem, structure=structure, progress=progress, **options)
@@ -161,19 +182,31 @@ def open_lagged(path: Path, spec: Spec, *, require_full_rank: bool = True) -> La
     train, validation, tests = parts or load_parts(path, spec)
     lags = spec.lag_orders() if spec.declared_learner() is not None else None
     try:
-        layout, _ = regressor_of(baseline, lags, learner_inputs, tuple(spec.data.outputs), tuple(spec.data.inputs))
+        layout, _ = regressor_of(
+            baseline, lags, learner_inputs, tuple(spec.data.outputs), tuple(spec.data.inputs)
+        )
         first = largest_lag(layout)
-        train, tests = train.without_short(first), tuple(part.without_short(first) for part in tests)
+        train, tests = (
+            train.without_short(first),
+            tuple(part.without_short(first) for part in tests),
+        )
         validation = validation.without_short(first) if validation else None
-        options = {"output_weights": spec.training.output_weights, "require_full_rank": require_full_rank}
+        options = {
+            "output_weights": spec.training.output_weights,
+            "require_full_rank": require_full_rank,
+        }
         kind = spec.engine_kind([path.parent / entry.file for entry in train.files])
         engine = engine_of(spec.engine, kind)
-        several = spec.runs(linear=baseline.linear) > 1 and train.source is None  # on a cluster they are its tasks
+        several = (
+            spec.runs(linear=baseline.linear) > 1 and train.source is None
+        )  # on a cluster they are its tasks
         if kind in ("memory", "devices") or spec.brought or (kind == "dask" and several):
             problem = pose(train.record, baseline, lags, learner_inputs, **options)
         else:
             source = train.source or RecordSource(train.record, first, spec.engine.partition_rows)
-            problem = pose_streamed(source, train.record, engine.passes, baseline, lags, learner_inputs, **options)
+            problem = pose_streamed(
+                source, train.record, engine.passes, baseline, lags, learner_inputs, **options
+            )
         learner, left_out = spec.declared_learner(), ()
         if learner is not None and problem.excitation.full_rank:
             problem, _, left_out = independent_terms(problem, learner)
@@ -182,7 +215,13 @@ def open_lagged(path: Path, spec: Spec, *, require_full_rank: bool = True) -> La
         _check_cost(spec, problem, engine)
         weighed = weigh_problem(measure_of(spec, problem, path.parent), problem)
         _check_measure(weighed, problem)
-        named: dict[str, Any] = {"path": path, "spec": spec, "train": train, "validation": validation, "tests": tests}
+        named: dict[str, Any] = {
+            "path": path,
+            "spec": spec,
+            "train": train,
+            "validation": validation,
+            "tests": tests,
+        }
         named |= {"problem": problem, "weighed": weighed, "engine": engine}
         job = LaggedJob(**named, physics=physics, left_out=left_out)
         check_suspects(spec.suspects, problem)
@@ -196,7 +235,7 @@ def open_lagged(path: Path, spec: Spec, *, require_full_rank: bool = True) -> La
 
 
 def _check_scored(spec: Spec, problem: Problem) -> None:
-    """`check_scored` in the words of the spec."""
+    """Check that the parts can be scored, as `check_scored`; errors use the words of the spec."""
     longest = max(len(e) for e in problem.record.experiments) - problem.rows.start
     try:
         check_scored(spec.declared_criterion(), longest)
@@ -205,22 +244,32 @@ def _check_scored(spec: Spec, problem: Problem) -> None:
 
 
 def _check_cost(spec: Spec, problem: Problem, engine: Engine) -> None:
-    """`check_cost` before JAX is loaded."""
-    sizes = {"rows": problem.count, "features": len(problem.features.entries), "outputs": len(problem.outputs)}
+    """Check the cost of training, as `check_cost`, before JAX is loaded."""
+    sizes = {
+        "rows": problem.count,
+        "features": len(problem.features.entries),
+        "outputs": len(problem.outputs),
+    }
     runs = spec.runs(linear=problem.baseline.linear)
-    options: dict[str, Any] = {"held": len(problem.rows), "iterations": spec.declared_solver().iterations, "runs": runs}
+    options: dict[str, Any] = {
+        "held": len(problem.rows),
+        "iterations": spec.declared_solver().iterations,
+        "runs": runs,
+    }
     check_cost(spec.declared_learner(), **sizes, **options, room=engine.room())
 
 
 def measure_of(spec: Spec, problem: Problem, folder: Path) -> Measure:
-    """The measure that a spec declares for its problem."""
+    """Return the measure that a spec declares for its problem."""
     lags = [str(lag) for lag in problem.used]
     return spec.declared_measure(MeasurePlace(folder, lags, problem.record, problem.rows.start))
 
 
-def _check_measure(weighed: Weighed, problem: Problem) -> None:
-    """Raise InputError for a measure under which the physics is rank-deficient, where on the data it is not."""
+def _check_measure(weighed: WeighedPhysics, problem: Problem) -> None:
+    """Raise InputError where physics is rank-deficient under the measure but not on the data."""
     if problem.excitation.full_rank and not weighed.excitation.full_rank:
         groups = "; ".join(", ".join(group) for group in weighed.excitation.collinear)
         name = weighed.measure.name
-        raise InputError(f"under the {name} measure the physics cannot tell {groups} apart; widen or move it.")
+        raise InputError(
+            f"under the {name} measure the physics cannot distinguish {groups}; widen or move it."
+        )

@@ -1,4 +1,4 @@
-"""What is told of jobs whose physics is linear in θ on lagged signals."""
+"""Results of jobs whose physics is linear in θ on lagged signals."""
 
 from __future__ import annotations
 
@@ -11,16 +11,23 @@ import numpy as np
 from orthaug._base.errors import InputError, Warning
 from orthaug.analysis.closed_loop import closed_loop
 from orthaug.analysis.imitation import Imitation, imitation
-from orthaug.analysis.measure_bias import Ground, bias_under
+from orthaug.analysis.measure_bias import MeasureLinearization, bias_under
 from orthaug.commands.attempt import attempt, attempt_warned
 from orthaug.commands.lagged_job import LaggedJob
 from orthaug.commands.suspects import declared
 from orthaug.fitting.elimination import directions
 from orthaug.inference.measures import weigh_problem
 from orthaug.inference.nearly_shared import shared_warnings
+from orthaug.physics import ill_conditioned
 from orthaug.physics.baseline import derived_units
 from orthaug.physics.excitation import identifiability, require_rank
-from orthaug.reports.result import CheckResult, FitResult, ParameterResult, parameter_rows, physical_rows
+from orthaug.reports.result import (
+    CheckResult,
+    FitResult,
+    ParameterResult,
+    parameter_rows,
+    physical_rows,
+)
 
 if TYPE_CHECKING:
     from orthaug.analysis.budget import Budget
@@ -30,13 +37,13 @@ if TYPE_CHECKING:
 
 _NOT_ANALYSED = Warning(
     "residual_not_analysed",
-    "the residual is not analysed: there are too few rows for that, or it is rounding only.",
+    "the residual is not analysed: there are too few rows, or it is rounding error only.",
 )
 _UNKNOWN = ("physical_parameters", "physical_consistency", "sensitivities", "bias")
 
 
 def checked(job: LaggedJob) -> CheckResult:
-    """Excitation on the data, identifiability of the physics, and what each suspect would do to θ."""
+    """Return excitation of the data, identifiability of the physics, and bias by suspects."""
     problem = job.problem
     return CheckResult.model_validate(
         {
@@ -45,16 +52,23 @@ def checked(job: LaggedJob) -> CheckResult:
             "regressor": [str(lag) for lag in problem.layout],
             "rows": problem.count,
             "excitation": problem.excitation,
-            "identifiability": identifiability(problem.baseline, problem.layout, problem.outputs, problem.rows.x),
+            "identifiability": identifiability(
+                problem.baseline, problem.layout, problem.outputs, problem.rows.x
+            ),
             "shared": _shared_of(job),
             "bias": _bias_of(job) if problem.excitation.full_rank else None,
-            "warnings": [*job.warnings, *_said_of_shared(job), *closed_loop(job.train.record)],
+            "warnings": [
+                *job.warnings,
+                *ill_conditioned.of_physics(problem),
+                *_shared_warnings(job),
+                *closed_loop(job.train.record),
+            ],
         }
     )
 
 
 def refused(job: LaggedJob, result: CheckResult) -> InputError | None:
-    """Why the job cannot be fitted, after the report."""
+    """Return the reason why the job cannot be fitted, after the report; None where it can."""
     try:
         require_rank(job.problem.excitation, job.problem.samples)
     except InputError as error:
@@ -63,19 +77,29 @@ def refused(job: LaggedJob, result: CheckResult) -> InputError | None:
 
 
 def content(
-    job: LaggedJob, fit: Estimate, responses: Mapping[str, tuple[Response, Response]], warnings: list[Any]
+    job: LaggedJob,
+    fit: Estimate,
+    responses: Mapping[str, tuple[Response, Response]],
+    warnings: list[Any],
 ) -> tuple[Estimate, dict[str, Any]]:
-    """The fit with the standard errors that its residual asks for, and what results tell of it; warnings are added."""
+    """Return the fit and the content of its result; warnings are added.
+
+    The standard errors are the ones that its residual calls for.
+    """
     from orthaug.analysis.robustness import robust_where_asked
 
-    told: dict[str, Any] = dict.fromkeys((*_UNKNOWN, "residuals", "missing_lags", "stability"))
+    fields: dict[str, Any] = dict.fromkeys((*_UNKNOWN, "residuals", "missing_lags", "stability"))
     if fit.status.ok:
         one_step, free_run = responses[job.train.name]
         plain = fit
-        fit = attempt("the robust covariance", lambda: robust_where_asked(plain, one_step), warnings, plain)
-        told |= _physical_content(job, fit, warnings)
-        told["bias"] = attempt("the bias by suspects", partial(_bias_of, job, fit), warnings, None)
-        told |= _analysed(fit, one_step, free_run, warnings)
+        fit = attempt(
+            "the robust covariance", lambda: robust_where_asked(plain, one_step), warnings, plain
+        )
+        fields |= _physical_content(job, fit, warnings)
+        fields["bias"] = attempt(
+            "the bias by suspects", partial(_bias_of, job, fit), warnings, None
+        )
+        fields |= _analysed(fit, one_step, free_run, warnings)
     shared = _shared_of(job, fit, others=False)
     rows = parameter_rows(
         fit.problem.baseline.parameters,
@@ -85,33 +109,53 @@ def content(
         fit.one_step_theta,
         None if fit.plain_covariance is None else np.sqrt(np.diag(fit.plain_covariance)),
     )
-    units = derived_units(fit.problem.baseline, fit.problem.record.outputs, fit.problem.record.inputs)
-    rows = [row if row.unit else row.model_copy(update={"derived_unit": units.get(row.name)}) for row in rows]
-    told |= {
-        "standard_errors": None if fit.std is None else "plain" if fit.plain_covariance is None else "robust",
+    units = derived_units(
+        fit.problem.baseline, fit.problem.record.outputs, fit.problem.record.inputs
+    )
+    rows = [
+        row if row.unit else row.model_copy(update={"derived_unit": units.get(row.name)})
+        for row in rows
+    ]
+    fields |= {
+        "standard_errors": None
+        if fit.std is None
+        else "plain"
+        if fit.plain_covariance is None
+        else "robust",
         "standard_errors_by": None if fit.std_kind == "plain" else fit.std_kind,
         "measure_detail": fit.measure,
         "excitation": fit.excitation,
         "shared": shared,
     }
-    warnings += _said_of_shared(job, fit) if fit.status.ok else ()
+    warnings += _shared_warnings(job, fit) if fit.status.ok else ()
     budget = None
     if fit.status.ok:
-        budget = attempt("the bias that the learner implies", partial(_budget_of, job, fit), warnings, None)
+        budget = attempt(
+            "the bias that the learner implies", partial(_budget_of, job, fit), warnings, None
+        )
     warnings += budget.warnings if budget else ()
-    if fit.model.structure != "orthogonal" or fit.model.form.bound is None:  # a variant of what the spec declares
+    if (
+        fit.model.structure != "orthogonal" or fit.model.form.bound is None
+    ):  # a variant, not the declared structure
         shared = None
-    told["parameters"] = _with_biases(rows, shared.determined if shared else None, budget, fit.at_bound)
-    if told["physical_parameters"] is not None:
+    fields["parameters"] = _with_biases(
+        rows, shared.determined if shared else None, budget, fit.at_bound
+    )
+    if fields["physical_parameters"] is not None:
         physical = shared.physical if shared else None
-        told["physical_parameters"] = _with_biases(told["physical_parameters"], physical, budget)
-    return fit, told
+        fields["physical_parameters"] = _with_biases(
+            fields["physical_parameters"], physical, budget
+        )
+    return fit, fields
 
 
 def figures(
-    job: LaggedJob, fit: Estimate, result: FitResult, responses: Mapping[str, tuple[Response, Response]]
+    job: LaggedJob,
+    fit: Estimate,
+    result: FitResult,
+    responses: Mapping[str, tuple[Response, Response]],
 ) -> dict[str, Figure]:
-    """The figures of a result by their names."""
+    """Return the figures of a result by their names."""
     from orthaug.reports import finding_plots, plots
 
     last, structure = job.parts[-1].name, fit.model.structure
@@ -124,7 +168,10 @@ def figures(
     }
     if result.residuals is not None:
         units = {channel.name: channel.unit for channel in (*fit.model.inputs, *fit.model.outputs)}
-        for kind, tests in (("one-step", result.residuals.one_step), ("free-run", result.residuals.free_run)):
+        for kind, tests in (
+            ("one-step", result.residuals.one_step),
+            ("free-run", result.residuals.free_run),
+        ):
             if tests is not None:
                 title = f"{kind} residual on the training data, {structure}"
                 figure = finding_plots.residual_analysis_figure(tests, title, units)
@@ -132,25 +179,34 @@ def figures(
     if result.bias:
         drawn["bias"] = finding_plots.bias_figure(result.bias)
     if fit.model.form.bound is not None:
-        drawn["components"] = plots.components_figure(one_step, f"parts of the one-step prediction, {where}")
+        drawn["components"] = plots.components_figure(
+            one_step, f"parts of the one-step prediction, {where}"
+        )
     return drawn
 
 
 def physics_alone(
     job: LaggedJob, fit: Estimate, responses: Mapping[str, tuple[Response, Response]]
 ) -> Mapping[str, Response]:
-    """The free run of every part by the physics without the learner."""
+    """Return the free run of every part by the model's physics without its learner."""
     alone = fit.model.alone
     return {part.name: alone.simulate(part.record) for part in job.parts}
 
 
 def _physical_content(job: LaggedJob, fit: Estimate, warnings: list[Any]) -> dict[str, Any]:
-    """The physical parameters of θ̂ and what belongs to them, where the spec has a map; warnings are added."""
+    """Return the physical parameters of θ̂ and their findings, where the spec has a map.
+
+    Warnings are added.
+    """
     if job.physics is None:
         return {}
     physical, profiles, slopes = fit.physical(job.physics), None, None
     warnings += physical.warnings
-    if job.spec.physics is not None and job.spec.physics.profile and physical.covariance is not None:
+    if (
+        job.spec.physics is not None
+        and job.spec.physics.profile
+        and physical.covariance is not None
+    ):
         profiles = {name: fit.physical_profile(job.physics, name) for name in physical.names}
     if physical.sensitivities is not None:  # ∂ln p / ∂ln θ by name
         slopes = {
@@ -164,8 +220,10 @@ def _physical_content(job: LaggedJob, fit: Estimate, warnings: list[Any]) -> dic
     }
 
 
-def _analysed(fit: Estimate, one_step: Response, free_run: Response, warnings: list[Any]) -> dict[str, Any]:
-    """What the residuals and the free run's sensitivity say; warnings are added."""
+def _analysed(
+    fit: Estimate, one_step: Response, free_run: Response, warnings: list[Any]
+) -> dict[str, Any]:
+    """Return the findings on the residuals and the free run's sensitivity; warnings are added."""
     from orthaug.analysis.diagnosis import diagnose
     from orthaug.analysis.free_run_stability import stability
     from orthaug.analysis.missing_lags import missing_lags
@@ -184,29 +242,35 @@ def _analysed(fit: Estimate, one_step: Response, free_run: Response, warnings: l
             warnings,
             _NOT_ANALYSED,
         ),
-        "missing_lags": attempt_warned("the search for missing lags", lambda: missing_lags(fit, one_step), warnings),
+        "missing_lags": attempt_warned(
+            "the search for missing lags", lambda: missing_lags(fit, one_step), warnings
+        ),
     }
 
 
 def _bias_of(job: LaggedJob, fit: Estimate | None = None) -> list[dict[str, Any]]:
-    """The table of suspects under the spec's measure; after a fit with its θ and what its learner explains.
+    """Return the table of suspects under the spec's measure.
 
-    Whether a measure can remove a bias is asked before a fit: then it is answered for the usual suspects, too.
+    After a fit it uses θ and what the learner explains.
+
+    Before a fit it includes the usual suspects, since it shows which measure removes a bias.
     """
     if not job.problem.baseline.names:
         return []
-    ground = _ground(job, fit)
-    return bias_under(ground, declared(job.spec.suspects, ground.problem), certify_usual=fit is None)
+    linearization = _linearization(job, fit)
+    return bias_under(
+        linearization, declared(job.spec.suspects, linearization.problem), certify_usual=fit is None
+    )
 
 
 def _budget_of(job: LaggedJob, fit: Estimate) -> Budget | None:
-    """The bias that what the learner found implies, under the spec's measure."""
+    """Return the bias that what the learner found implies, under the spec's measure."""
     from orthaug.analysis.budget import budget_on
 
     if fit.model.structure != "orthogonal" or fit.model.form.bound is None:
         return None
-    ground = _ground(job, fit)
-    return budget_on(ground, fit, declared(job.spec.suspects, ground.problem))
+    linearization = _linearization(job, fit)
+    return budget_on(linearization, fit, declared(job.spec.suspects, linearization.problem))
 
 
 def _with_biases(
@@ -215,40 +279,59 @@ def _with_biases(
     budget: Budget | None,
     held: Collection[str] = (),
 ) -> list[ParameterResult]:
-    """Parameters with whether the learner could imitate them, and what biases them; not of those `held` at a bound."""
-    shared = [None if determined is None or row.name in held else row.name not in determined for row in rows]
+    """Return the parameters, with whether the learner could imitate them and what biases them.
+
+    Those `held` at a bound have none.
+    """
+    shared = [
+        None if determined is None or row.name in held else row.name not in determined
+        for row in rows
+    ]
     biases = [budget.of(row.name) if budget and row.name not in held else None for row in rows]
-    return [row.told(imitated, bias) for row, imitated, bias in zip(rows, shared, biases, strict=True)]
+    return [
+        row.with_bias(imitated, bias)
+        for row, imitated, bias in zip(rows, shared, biases, strict=True)
+    ]
 
 
-def _ground(job: LaggedJob, fit: Estimate | None) -> Ground:
+def _linearization(job: LaggedJob, fit: Estimate | None) -> MeasureLinearization:
     problem, weighed, structure = job.problem, job.weighed, job.spec.declared_structure()
     if fit is None:
         along = directions(structure, problem) if job.spec.declared_learner() is not None else None
-        return Ground(weighed, problem, problem.least_squares, job.physics, None, along)
+        return MeasureLinearization(
+            weighed, problem, problem.least_squares, job.physics, None, along
+        )
     if fit.problem.weight.kind != problem.weight.kind:  # weighed by the errors that the fit left
         problem = fit.problem
         weighed = weigh_problem(job.measure, problem)
     learned = None if fit.model.form.bound is None else fit.model.learner_at(weighed.points.x)
-    return Ground(weighed, problem, fit.theta, job.physics, learned, fit.model.shared)
+    return MeasureLinearization(weighed, problem, fit.theta, job.physics, learned, fit.model.shared)
 
 
-def _said_of_shared(job: LaggedJob, fit: Estimate | None = None) -> list[Warning]:
-    """What the rows say of directions that the names call determined beside the learner."""
+def _shared_warnings(job: LaggedJob, fit: Estimate | None = None) -> list[Warning]:
+    """Return warnings on directions that are determined in name, but not beside the learner."""
     structure, problem = job.spec.declared_structure(), fit.problem if fit else job.problem
     if job.spec.declared_learner() is None or not structure.projects or structure.shared == "all":
         return []
-    if not problem.baseline.names or not problem.features.entries or (fit and fit.model.form.bound is None):
+    if (
+        not problem.baseline.names
+        or not problem.features.entries
+        or (fit and fit.model.form.bound is None)
+    ):
         return []
     return shared_warnings(problem.shared, [str(entry) for entry in problem.features.entries])
 
 
-def _shared_of(job: LaggedJob, fit: Estimate | None = None, *, others: bool = True) -> Imitation | None:
-    """Before training already; None without a learner, or where the structure splits nothing along chosen directions.
+def _shared_of(
+    job: LaggedJob, fit: Estimate | None = None, *, others: bool = True
+) -> Imitation | None:
+    """Return what the learner could imitate, before training.
+
+    None without a learner, or where the structure splits nothing along chosen directions.
 
     Args:
         fit: of the job's problem; None for the problem as it was posed.
-        others: tell what other learner inputs would make of it.
+        others: compute the effect of other learner inputs too.
     """
     structure = job.spec.declared_structure()
     if job.spec.declared_learner() is None or not structure.projects or structure.shared == "all":

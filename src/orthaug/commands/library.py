@@ -1,6 +1,6 @@
-"""What users of Python call: specs opened, fitted and compared, and the page of a fit.
+"""The interface for users of Python: open, fit and compare specs, and write the page of a fit.
 
-For a fit without a spec a job is made of what the fit knows.
+For a fit without a spec a job is built from the fit.
 """
 
 from __future__ import annotations
@@ -15,15 +15,22 @@ from typing import TYPE_CHECKING, Any
 from orthaug._base.checks import check_type
 from orthaug._base.errors import InputError, TrainingError
 from orthaug._base.folders import check_new_file, whole_file
-from orthaug.commands.doubts import doubted
-from orthaug.commands.fit import Fitted, fit_job, fit_report, judged, told_of, write_result
+from orthaug.commands.doubts import with_doubts
+from orthaug.commands.fit import (
+    FitReport,
+    fit_job,
+    fit_report,
+    report_of,
+    with_verdict,
+    write_result,
+)
 from orthaug.commands.folder import check_folder, check_inputs_kept
 from orthaug.commands.job import Job, origin_of
 from orthaug.commands.kinds import open_job
 from orthaug.commands.lagged_job import LaggedJob
 from orthaug.commands.motion_job import MotionJob
 from orthaug.commands.parts import Part
-from orthaug.commands.spec import TrainingSection, ValidationSection
+from orthaug.commands.spec import SelectionSection, TrainingSection, ValidationSection
 from orthaug.data.record import Record
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.kinds import STRUCTURES
@@ -46,8 +53,8 @@ def load_spec(path: str | os.PathLike) -> Job:
         path: of the spec, a TOML file; paths in it start at its folder.
 
     Returns:
-        What `fit_spec` and `compare` take. `train.record`, `validation` and `tests` are its data, `problem` the rows
-        with the physics, `spec` the declarations.
+        What `fit_spec` and `compare` take. `train.record`, `validation` and `tests` are its data,
+        `problem` the rows with the physics, `spec` the declarations.
 
     Raises:
         InputError: anything wrong with spec, files or physics; one line that names it.
@@ -56,29 +63,31 @@ def load_spec(path: str | os.PathLike) -> Job:
     return open_job(Path(path))
 
 
-def fit_spec(spec: Spec, out: str | os.PathLike | None = None) -> Fitted:
-    """What `orthaug fit` does: train, score every part, and ask whether the learner earns its place.
+def fit_spec(spec: Spec, out: str | os.PathLike | None = None) -> FitReport:
+    """Train the job of a spec, score every part and judge the learner, as `orthaug fit` does.
 
     Args:
         spec: a spec file, or what `load_spec` returned.
         out: folder to write result, model, figures and report into; None to write nothing.
 
     Returns:
-        `fit`, the `Estimate`; `result`, the content of result.json; `summary()`, what the command prints. Where
-        training failed numerically `fit.status` says so, and there are no scores.
+        `fit`, the `Estimate`; `result`, the content of result.json; `summary()`, what the command
+        prints. Where training failed numerically `fit.status` says so, and there are no scores.
 
     Raises:
         InputError: as `load_spec`; a folder that cannot be written or holds something else.
     """
-    job, folder = _opened(spec, out)
+    job, folder = _open(spec, out)
     fitted = fit_job(job)
     if folder is not None:
         write_result(fitted, folder)
     return fitted
 
 
-def compare(spec: Spec, models: Sequence[str | os.PathLike] = (), out: str | os.PathLike | None = None) -> Comparison:
-    """What `orthaug compare` does: physics alone and every structure on the same data and seeds.
+def compare(
+    spec: Spec, models: Sequence[str | os.PathLike] = (), out: str | os.PathLike | None = None
+) -> Comparison:
+    """Compare physics alone and every structure on the same data and seeds, as `orthaug compare`.
 
     Args:
         spec: a spec file, or what `load_spec` returned.
@@ -86,8 +95,8 @@ def compare(spec: Spec, models: Sequence[str | os.PathLike] = (), out: str | os.
         out: folder to write result, models and figure into; None to write nothing.
 
     Returns:
-        `fitted`, one `Fitted` by the name of the structure; `verdicts`, whether the learner helps in each; `result`,
-        the content of result.json; `summary()`, what the command prints.
+        `fitted`, one `FitReport` by the name of the structure; `verdicts`, whether the learner
+        helps in each; `result`, the content of result.json; `summary()`, what the command prints.
 
     Raises:
         InputError: as `fit_spec`; a model that does not fit the data.
@@ -96,7 +105,7 @@ def compare(spec: Spec, models: Sequence[str | os.PathLike] = (), out: str | os.
         raise InputError("`models` must be a list of folders, such as ['orthaug-out/spec'].")
     for model in models:
         check_type(model, str | os.PathLike, "models", "a list of folders")
-    job, folder = _opened(spec, out)
+    job, folder = _open(spec, out)
     from orthaug.commands import compare as comparing
 
     comparison = comparing.compare(job, [Path(model) for model in models])
@@ -105,8 +114,8 @@ def compare(spec: Spec, models: Sequence[str | os.PathLike] = (), out: str | os.
     return comparison
 
 
-def _opened(spec: Spec, out: str | os.PathLike | None) -> tuple[Job, Path | None]:
-    """The job, and the folder to write, checked."""
+def _open(spec: Spec, out: str | os.PathLike | None) -> tuple[Job, Path | None]:
+    """Return the job, and the folder to write, checked."""
     check_type(spec, Spec, "spec", "the name of a spec file, or what load_spec returns")
     check_type(out, str | os.PathLike | None, "out", "the name of a folder, or None")
     folder = None if out is None else Path(out)
@@ -120,7 +129,10 @@ def _opened(spec: Spec, out: str | os.PathLike | None) -> tuple[Job, Path | None
 
 @dataclass(frozen=True)
 class Page:
-    """A page of a fit: `html` is all of it; `path` the file that has it, or None. A notebook shows it."""
+    """A page of a fit: `html` is all of it; `path` the file that has it, or None.
+
+    A notebook displays it.
+    """
 
     html: str = field(repr=False)
     path: Path | None = None
@@ -132,8 +144,8 @@ class Page:
 
 
 @dataclass(frozen=True)
-class Known:
-    """What a fit tells in the place of a spec."""
+class FitFacts:
+    """The declarations of a fit, where there is no spec."""
 
     fit: Any
     suspects: tuple[()] = ()
@@ -141,28 +153,29 @@ class Known:
     motion: None = None
     training: TrainingSection = field(default_factory=lambda: TrainingSection(fallback=False))
     validation: ValidationSection = field(default_factory=lambda: ValidationSection(blocks=0))
+    selection: SelectionSection = field(default_factory=SelectionSection)
 
     def declared_learner(self) -> Any:
-        """The learner; None without one."""
+        """Return the learner; None without one."""
         bound = self.fit.model.form.bound
         return None if bound is None else bound.learner
 
     def declared_structure(self, kind: str | None = None, measure: Any = None) -> Any:
-        """The kind of structure that was fitted."""
+        """Return the kind of structure that was fitted."""
         return STRUCTURES[kind or self.fit.model.structure]()
 
     def declared_criterion(self) -> Any:
-        """What was fitted."""
+        """Return the criterion that was fitted."""
         return self.fit.criterion
 
     def declared_solver(self) -> Any:
-        """The default: physics alone needs no other."""
+        """Return the default solver: physics alone needs no other."""
         from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 
         return LevenbergMarquardt()
 
     def model_dump(self, **_: Any) -> dict[str, Any]:
-        """What a title is made of."""
+        """Return the declarations that a title is made of."""
         record = self.fit.problem.record
         return {
             "data": {
@@ -173,21 +186,29 @@ class Known:
 
 
 def page_of(
-    fit: Estimate | MotionEstimate, path: str | os.PathLike | None = None, tests: Mapping[str, Record] | None = None
+    fit: Estimate | MotionEstimate,
+    path: str | os.PathLike | None = None,
+    tests: Mapping[str, Record] | None = None,
 ) -> Page:
-    """What `fit.report` returns: parameters, free runs, what was learned, residuals, stability.
+    """Return the page of a fit: parameters, free runs, learned part, residuals, stability.
 
     Raises:
-        TrainingError: a fit without a usable model. InputError: a path that cannot be written, records that do not fit.
+        TrainingError: a fit without a usable model.
+        InputError: a path that cannot be written, records that do not fit.
     """
     place = _checked(fit, path)
     job = job_of(fit, {} if tests is None else tests)
-    made = replace(origin_of(job, "fit"), name="spec", command=f"{NAME} in Python", toml=_account(fit))
-    return _written(fit_report(doubted(judged(told_of(job, fit))), made), place)
+    made = replace(
+        origin_of(job, "fit"), name="spec", command=f"{NAME} in Python", toml=_account(fit)
+    )
+    return _written(fit_report(with_doubts(with_verdict(report_of(job, fit))), made), place)
 
 
-def page_of_spec(fitted: Fitted, path: str | os.PathLike | None, tests: None = None) -> Page:
-    """The page of what `fit_spec` returned, as the command line writes it; errors as `page_of`."""
+def page_of_spec(fitted: FitReport, path: str | os.PathLike | None, tests: None = None) -> Page:
+    """Return the page of a report by `fit_spec`, as the command line writes it.
+
+    Errors as `page_of`.
+    """
     place = _checked(fitted.fit, path)
     return _written(fit_report(fitted), place)
 
@@ -211,25 +232,41 @@ def _written(text: str, path: Path | None) -> Page:
 
 
 def _account(fit: Estimate | MotionEstimate) -> str:
-    """What stands in the place of the spec."""
+    """Return the text in the place of the spec."""
     physics = fit.problem.motion if isinstance(fit, MotionEstimate) else fit.problem.baseline
     bound = fit.model.form.bound
-    told = (fit.problem.record, physics, f"learner: {'none' if bound is None else bound.learner}")
-    lines = ("Fitted in Python by orthaug.estimate; there is no spec.", *map(str, told))
+    declared = (
+        fit.problem.record,
+        physics,
+        f"learner: {'none' if bound is None else bound.learner}",
+    )
+    lines = ("Fitted in Python by orthaug.estimate; there is no spec.", *map(str, declared))
     return "".join(f"# {line}\n" for text in lines for line in text.splitlines())
 
 
 def job_of(fit: Any, tests: Mapping[str, Record]) -> Job:
-    """The job whose result the fit is, as far as the fit knows it."""
-    if not isinstance(tests, Mapping) or not all(isinstance(record, Record) for record in tests.values()):
+    """Return the job of a fit, with as much as the fit knows of it."""
+    if not isinstance(tests, Mapping) or not all(
+        isinstance(record, Record) for record in tests.values()
+    ):
         raise InputError("`tests` must be records by their names, such as {'steps': record}.")
     problem = fit.problem
-    named: dict[str, Any] = {"path": Path(NAME), "spec": Known(fit), "validation": None, "problem": problem}
+    named: dict[str, Any] = {
+        "path": Path(NAME),
+        "spec": FitFacts(fit),
+        "validation": None,
+        "problem": problem,
+    }
     named["train"] = Part("train", problem.record, 0, ())
     named["tests"] = tuple(
-        Part(f"tests.{name}", fit.model.fitting(record, need_outputs=True), 0, ()) for name, record in tests.items()
+        Part(f"tests.{name}", fit.model.fitting(record, need_outputs=True), 0, ())
+        for name, record in tests.items()
     )
-    measure = Training() if fit.model.measure == "training" else getattr(fit.measure, "measure", None) or Training()
+    measure = (
+        Training()
+        if fit.model.measure == "training"
+        else getattr(fit.measure, "measure", None) or Training()
+    )
     if isinstance(fit, MotionEstimate):
         return MotionJob(measure=measure, engine=InMemory(), **named)
     weighed = weigh_problem(measure, problem)

@@ -9,7 +9,7 @@ from orthaug._base.errors import InputError
 from orthaug._base.folders import check_replaceable, whole_file, whole_folder
 from orthaug.commands.folder import check_figure, check_file, save_figure
 from orthaug.commands.parts import load_parts
-from orthaug.commands.run import Reading, open_run
+from orthaug.commands.run import ReadOptions, open_run
 from orthaug.commands.spec import load_spec
 from orthaug.data.record import Record
 
@@ -22,7 +22,7 @@ _FIGURES = (".png", ".pdf", ".svg")
 
 
 def check_place(out: Path | None, *read: Path, force: bool = False) -> None:
-    """Raise InputError early where the folder or file could not be written, or would replace what is read."""
+    """Raise InputError early where the output cannot be written, or would replace an input."""
     if out is None:
         return
     suffix = out.suffix.lower()
@@ -34,7 +34,9 @@ def check_place(out: Path | None, *read: Path, force: bool = False) -> None:
     elif suffix == ".json":
         check_file(out, *read, force=force)
     elif suffix in (".txt", ".csv", ".toml", ".html"):
-        raise InputError(f"{out}: found the ending '{out.suffix}'; give a folder, or .json, .png, .pdf or .svg.")
+        raise InputError(
+            f"{out}: found the ending '{out.suffix}'; give a folder, or .json, .png, .pdf or .svg."
+        )
     else:
         check_replaceable(out, force=force)
         for file in read:
@@ -43,7 +45,7 @@ def check_place(out: Path | None, *read: Path, force: bool = False) -> None:
 
 
 def open_linear(model: Path, data: Path | None) -> tuple[Model | MotionModel, Record | None]:
-    """The model, and the record of a data file, or of the training data of a spec.
+    """Return the model, and the record of a data file or of the training data of a spec.
 
     Raises:
         InputError: no model, no file, missing columns.
@@ -53,7 +55,7 @@ def open_linear(model: Path, data: Path | None) -> tuple[Model | MotionModel, Re
 
         return load(model), None
     if data.suffix.lower() != ".toml":
-        opened = open_run(model, data, need_outputs=True, reading=Reading(prepare=True))
+        opened = open_run(model, data, need_outputs=True, reading=ReadOptions(prepare=True))
         return opened.model, opened.record
     from orthaug.models.storage import load
 
@@ -66,7 +68,9 @@ def open_linear(model: Path, data: Path | None) -> tuple[Model | MotionModel, Re
 
 
 def write(found: Linearization, out: Path, *, force: bool = False) -> None:
-    """A folder with result.json, linear.txt and figures/; or one file, by its ending JSON or the frequency response.
+    """Write a folder with result.json, linear.txt and figures/.
+
+    Or write one file, by its ending JSON or the frequency response.
 
     Whole or not at all.
     """
@@ -83,7 +87,10 @@ def write(found: Linearization, out: Path, *, force: bool = False) -> None:
 
     if suffix in _FIGURES:
         if not found[0].inputs:
-            raise InputError("the model has no inputs, so that it has no frequency response to draw; give a folder.")
+            raise InputError(
+                "the model has no inputs, so that it has no frequency response to draw; give a "
+                "folder."
+            )
         save_figure(bode_figure(found), out, force=force)
         return
     with whole_folder(out, force=force) as partial:
@@ -95,8 +102,8 @@ def write(found: Linearization, out: Path, *, force: bool = False) -> None:
         save(poles_figure(found), partial / "figures" / "poles.png")
 
 
-def told(found: Linearization, *, as_json: bool) -> str:
-    """What the command prints."""
+def output_text(found: Linearization, *, as_json: bool) -> str:
+    """Return the text that the command prints."""
     from orthaug.reports.linear import LinearizeResult
     from orthaug.reports.linear_text import linear_text
 

@@ -26,11 +26,11 @@ from orthaug.commands.program import (
     Which,
     app,
     prepare_jax,
-    tell,
+    print_result,
 )
 
 if TYPE_CHECKING:
-    from orthaug.commands.run import ModelOnData, Reading
+    from orthaug.commands.run import ModelOnData, ReadOptions
     from orthaug.models.response import Response
 
 
@@ -48,12 +48,12 @@ def simulate(
     which: Which = "fitted",
     force: Force = False,
 ) -> None:
-    """Free run of a saved model on a data file."""
+    """Simulate a saved model in free run on a data file."""
     from orthaug.commands import run
     from orthaug.commands.folder import check_file, chosen_model
 
     model = chosen_model(model, which)
-    reading = run.Reading.of(missing, rows, every, column or (), prepare)
+    reading = run.ReadOptions.of(missing, rows, every, column or (), prepare)
     if initial is None and _written_long(model, data, reading, out, force, free=True):
         return
     opened = run.open_run(model, data, reading=reading)
@@ -72,7 +72,10 @@ def predict(
     out: OutFile = None,
     initial: Initial = None,
     observer: Annotated[
-        bool, typer.Option("--observer", help="From an estimated state, with 95 % bands; outputs may be missing.")
+        bool,
+        typer.Option(
+            "--observer", help="From an estimated state, with 95 % bands; outputs may be missing."
+        ),
     ] = False,
     missing: Missing = "error",
     rows: Rows = None,
@@ -82,12 +85,12 @@ def predict(
     which: Which = "fitted",
     force: Force = False,
 ) -> None:
-    """H-step-ahead prediction of a saved model."""
+    """Predict a data file with a saved model, some steps ahead."""
     from orthaug.commands import run
     from orthaug.commands.folder import check_file, chosen_model
 
     model = chosen_model(model, which)
-    reading = run.Reading.of(missing, rows, every, column or (), prepare)
+    reading = run.ReadOptions.of(missing, rows, every, column or (), prepare)
     plain = horizon == 1 and initial is None and not observer
     if plain and _written_long(model, data, reading, out, force, free=False):
         return
@@ -95,62 +98,83 @@ def predict(
     check_file(out, model, data, Path(initial or data), force=force)
     prepare_jax()
     if observer:
-        response, told = run.observed(opened, horizon)
+        response, notes = run.observed(opened, horizon)
     else:
-        response, told = opened.model.predict(opened.record, horizon=horizon), []
-    _write_response(response, opened, out, force, [*opened.notes, *told])
+        response, notes = opened.model.predict(opened.record, horizon=horizon), []
+    _write_response(response, opened, out, force, [*opened.notes, *notes])
 
 
 @app.command()
 def split(
     model: ModelPath,
-    data: Annotated[list[Path], typer.Argument(metavar="DATA…", help="The files that the model was trained on.")],
+    data: Annotated[
+        list[Path], typer.Argument(metavar="DATA…", help="The files that the model was trained on.")
+    ],
     measure: Annotated[
-        str, typer.Option("--measure", metavar="KIND", help="As `kind` in the spec's [structure.measure].")
+        str,
+        typer.Option(
+            "--measure", metavar="KIND", help="As `kind` in the spec's [structure.measure]."
+        ),
     ] = "training",
-    rows: Annotated[str | None, typer.Option("--rows", metavar="A:B", help="Rows of each file, half-open.")] = None,
-    box: Annotated[
-        list[str] | None, typer.Option("--box", metavar="LAG=LOW:HIGH", help="Limits of the uniform measure.")
+    rows: Annotated[
+        str | None, typer.Option("--rows", metavar="A:B", help="Rows of each file, half-open.")
     ] = None,
-    samples: Annotated[str | None, typer.Option("--samples", metavar="FILE", help="Points, a column per lag.")] = None,
+    box: Annotated[
+        list[str] | None,
+        typer.Option("--box", metavar="LAG=LOW:HIGH", help="Limits of the uniform measure."),
+    ] = None,
+    samples: Annotated[
+        str | None, typer.Option("--samples", metavar="FILE", help="Points, a column per lag.")
+    ] = None,
     weights: Annotated[
-        str | None, typer.Option("--weights", metavar="FILE", help="A column `weight`, a row per row of DATA.")
+        str | None,
+        typer.Option("--weights", metavar="FILE", help="A column `weight`, a row per row of DATA."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Parameters of a saved model under another measure.
+    """Split the parameters of a saved model by another measure.
 
-    Without training again.
+    The model is not trained again.
     """
     from orthaug.commands import split as splitting
     from orthaug.commands.run import read_rows
     from orthaug.reports.text import split_text
 
     opened = splitting.open_training(model, data, read_rows(rows))
-    given = {"box": box or [], "samples": [samples] if samples else [], "weights": [weights] if weights else []}
+    given = {
+        "box": box or [],
+        "samples": [samples] if samples else [],
+        "weights": [weights] if weights else [],
+    }
     chosen = splitting.read_measure(measure, given, opened)
     prepare_jax()
     for line in opened.notes:
         streams.say(line)
     result = splitting.split_model(opened, chosen)
-    tell(result, split_text(result), as_json)
+    print_result(result, split_text(result), as_json)
 
 
 @app.command()
 def explain(
     model: ModelPath,
-    data: Annotated[list[Path], typer.Argument(metavar="DATA…", help="Best the files that the model was trained on.")],
-    degree: Annotated[int, typer.Option("--degree", metavar="D", help="Of products of what the learner sees.")] = 3,
+    data: Annotated[
+        list[Path],
+        typer.Argument(metavar="DATA…", help="Best the files that the model was trained on."),
+    ],
+    degree: Annotated[
+        int, typer.Option("--degree", metavar="D", help="Of products of what the learner sees.")
+    ] = 3,
     functions: Annotated[
-        list[str] | None, typer.Option("--function", metavar="NAME", help="In products, such as abs; any number.")
+        list[str] | None,
+        typer.Option("--function", metavar="NAME", help="In products, such as abs; any number."),
     ] = None,
     most: Annotated[int, typer.Option("--terms", metavar="N", help="Terms at most.")] = 6,
     rows: Rows = None,
     as_json: AsJson = False,
 ) -> None:
-    """Which terms the learner of a saved model has found.
+    """Explain which terms the learner of a saved model has found.
 
-    And what to write into the physics.
+    And print what to write into the physics.
     """
     check_count(degree, "--degree", of="factors")
     check_count(most, "--terms", of="terms")
@@ -164,19 +188,24 @@ def explain(
     result = explain_model(opened, degree=degree, functions=functions or (), most=most)
     for line in explain_notes(model) if result.spec else ():
         streams.say(line)
-    tell(result, explain_text(result), as_json)
+    print_result(result, explain_text(result), as_json)
 
 
 @app.command()
 def export(
     model: ModelPath,
-    to: Annotated[str, typer.Option("--to", metavar="TARGET", help="c, casadi, control, fmu, numpy, onnx or latex.")],
+    to: Annotated[
+        str,
+        typer.Option(
+            "--to", metavar="TARGET", help="c, casadi, control, fmu, numpy, onnx or latex."
+        ),
+    ],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the code.")],
     name: Annotated[str, typer.Option("--name", help="Of files and functions.")] = "model",
     which: Which = "fitted",
     force: Force = False,
 ) -> None:
-    """A saved model as code that needs no orthaug."""
+    """Export a saved model as code that needs no orthaug."""
     from orthaug.commands import export as exporting
     from orthaug.commands.folder import chosen_model
 
@@ -192,23 +221,31 @@ def export(
 def linearize(
     model: ModelPath,
     at: Annotated[
-        str | None, typer.Option("--at", metavar="'NAME=VALUE, …'", help="Held inputs; outputs or states to fix.")
+        str | None,
+        typer.Option(
+            "--at", metavar="'NAME=VALUE, …'", help="Held inputs; outputs or states to fix."
+        ),
     ] = None,
     data: Annotated[
-        Path | None, typer.Option("--data", metavar="DATA|SPEC", help="Measured data to compare with.")
+        Path | None,
+        typer.Option("--data", metavar="DATA|SPEC", help="Measured data to compare with."),
     ] = None,
     continuous: Annotated[
-        str, typer.Option("--continuous", metavar="zoh|tustin", help="How to convert to continuous time.")
+        str,
+        typer.Option(
+            "--continuous", metavar="zoh|tustin", help="How to convert to continuous time."
+        ),
     ] = "zoh",
     out: Annotated[
-        Path | None, typer.Option("--out", metavar="DIR|FILE", help="Folder; or a .json, .png, .pdf or .svg.")
+        Path | None,
+        typer.Option("--out", metavar="DIR|FILE", help="Folder; or a .json, .png, .pdf or .svg."),
     ] = None,
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
-    """Operating points of a saved model; its poles and gains.
+    """Linearize a saved model: operating points, poles and gains.
 
-    With intervals, and the frequency response.
+    All with intervals, and the frequency response.
     """
     from orthaug.commands import linearize as linearizing
     from orthaug.commands.run import prepared_notes
@@ -216,14 +253,16 @@ def linearize(
     linearizing.check_place(out, model, *([data] if data else []), force=force)
     opened, record = linearizing.open_linear(model, data)
     prepare_jax()
-    for line in prepared_notes(opened, what="Operating points are those of data after these steps."):
+    for line in prepared_notes(
+        opened, what="Operating points are those of data after these steps."
+    ):
         streams.say(line)
     from orthaug.analysis.linearization import linearize as linearized
 
     found = linearized(opened, at, record, continuous=continuous)
     if out is not None:
         linearizing.write(found, out, force=force)
-    streams.echo(linearizing.told(found, as_json=as_json))
+    streams.echo(linearizing.output_text(found, as_json=as_json))
     if out is not None and not as_json:
         streams.echo(f"\nwritten to {out}")
 
@@ -232,29 +271,40 @@ def linearize(
 def track(
     model: ModelPath,
     data: Annotated[
-        list[Path] | None, typer.Option("--data", metavar="FILE", help="New data; any number, a gap between them.")
+        list[Path] | None,
+        typer.Option("--data", metavar="FILE", help="New data; any number, a gap between them."),
     ] = None,
     training: Annotated[
-        list[Path] | None, typer.Option("--training", metavar="FILE", help="The files that the model was trained on.")
+        list[Path] | None,
+        typer.Option("--training", metavar="FILE", help="The files that the model was trained on."),
     ] = None,
-    rows: Annotated[str | None, typer.Option("--rows", metavar="A:B", help="Rows of each training file.")] = None,
+    rows: Annotated[
+        str | None, typer.Option("--rows", metavar="A:B", help="Rows of each training file.")
+    ] = None,
     forgetting: Annotated[
-        float | None, typer.Option("--forgetting", metavar="λ", help="Weight of a row against the next one.")
+        float | None,
+        typer.Option("--forgetting", metavar="λ", help="Weight of a row against the next one."),
     ] = None,
-    memory: Annotated[float | None, typer.Option("--memory", metavar="S", help="The same in seconds.")] = None,
+    memory: Annotated[
+        float | None, typer.Option("--memory", metavar="S", help="The same in seconds.")
+    ] = None,
     state: Annotated[
-        Path | None, typer.Option("--state", metavar="DIR", help="Result of an earlier run, to go on from.")
+        Path | None,
+        typer.Option("--state", metavar="DIR", help="Result of an earlier run, to go on from."),
     ] = None,
     follows: Annotated[
-        bool, typer.Option("--follows", help="The new data follow on the state's last row without a gap.")
+        bool,
+        typer.Option(
+            "--follows", help="The new data follow on the state's last row without a gap."
+        ),
     ] = False,
     out: OutFolder = None,
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
-    """Parameters of a saved model over new data, with an alarm.
+    """Track the parameters of a saved model over new data.
 
-    By recursive least squares with forgetting.
+    It uses recursive least squares with forgetting.
     """
     from orthaug.commands import track as tracking
     from orthaug.commands.folder import check_folder, check_kept
@@ -268,14 +318,21 @@ def track(
     prepare_jax()
     for line in prepared_notes(opened.model, opened.record):
         streams.say(line)
-    tracked = tracking.track(opened, forgetting=forgetting, memory=memory, state=state, follows=follows)
+    tracked = tracking.track(
+        opened, forgetting=forgetting, memory=memory, state=state, follows=follows
+    )
     text = track_text(tracked.result)
     tracking.write_tracked(tracked, folder, text, force=force)
-    tell(tracked.result, text, as_json, folder)
+    print_result(tracked.result, text, as_json, folder)
 
 
-def _written_long(model: Path, data: Path, reading: Reading, out: Path | None, force: bool, *, free: bool) -> bool:
-    """Whether the file is one that is not read at once; then its table is written piece by piece."""
+def _written_long(
+    model: Path, data: Path, reading: ReadOptions, out: Path | None, force: bool, *, free: bool
+) -> bool:
+    """Return whether the file is one that is read piece by piece.
+
+    Its table is then written piece by piece.
+    """
     from orthaug.commands import long_run
     from orthaug.commands.folder import check_file
     from orthaug.commands.run import prepared_notes
@@ -298,17 +355,21 @@ def _written_long(model: Path, data: Path, reading: Reading, out: Path | None, f
 
 
 def _write_response(
-    response: Response, opened: ModelOnData, out: Path | None, force: bool, notes: Sequence[str] = ()
+    response: Response,
+    opened: ModelOnData,
+    out: Path | None,
+    force: bool,
+    notes: Sequence[str] = (),
 ) -> None:
-    """The CSV and what is to say about it: scores go where the CSV does not."""
+    """Write the CSV, and print scores where the CSV does not go."""
     from orthaug.commands import run
     from orthaug.reports.text import response_text
 
     for line in (*notes, *(f"warning: {warning.text}" for warning in run.warnings(response))):
         streams.say(line)
     run.write_csv(response, opened, out, force=force)
-    told = response_text(response)
-    if told:
-        (streams.say if out is None else streams.echo)(told)
+    scores = response_text(response)
+    if scores:
+        (streams.say if out is None else streams.echo)(scores)
     if out is not None:
         streams.echo(f"written to {out}")

@@ -12,13 +12,19 @@ from orthaug._base.errors import InputError, KeyedError
 from orthaug._base.progress import SILENT, Progress
 from orthaug.analysis.motion_suspects import MotionSuspect
 from orthaug.commands.data_sections import engine_of
-from orthaug.commands.job import ALONE, AS_DECLARED, Job, Variant
+from orthaug.commands.job import AS_DECLARED, PHYSICS_ONLY, Job, Variant
 from orthaug.commands.parts import Part, load_parts
 from orthaug.commands.spec import Spec
 from orthaug.commands.suspects import declared_terms
 from orthaug.data.record import Record, check_channels
 from orthaug.data.regressors import Layout
-from orthaug.fitting.rules import check_cost, check_motion_choices, check_scored, check_solver, tried
+from orthaug.fitting.rules import (
+    check_cost,
+    check_motion_choices,
+    check_scored,
+    check_solver,
+    tried,
+)
 from orthaug.fitting.structures import Structure
 from orthaug.inference.kinds import MeasurePlace
 from orthaug.inference.measures import Measure, Support
@@ -41,7 +47,7 @@ class MotionJob(Job):
     problem: MotionProblem
     measure: Measure
     engine: Engine
-    """Who sums over the segments."""
+    """The engine that sums over the segments."""
     suspects: tuple[MotionSuspect, ...] = ()
 
     @property
@@ -54,7 +60,11 @@ class MotionJob(Job):
 
     @property
     def compared(self) -> tuple[str, ...]:
-        return (ALONE,) if self.spec.declared_learner() is None else (ALONE, WITH_LEARNER)
+        return (
+            (PHYSICS_ONLY,)
+            if self.spec.declared_learner() is None
+            else (PHYSICS_ONLY, WITH_LEARNER)
+        )
 
     def refusal(self, variant: Variant) -> str | None:
         return None
@@ -102,14 +112,25 @@ def open_motion(path: Path, spec: Spec) -> MotionJob:
         _check_choices(spec, motion)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    least = len(motion.states) + 1  # rows of a run that tell where it starts
-    train, validation, *tests = (p and p.without_short(0, least) for p in _parts(load_parts(path, spec)))
+    least = len(motion.states) + 1  # rows that determine the initial state of a run
+    train, validation, *tests = (
+        p and p.without_short(0, least) for p in _parts(load_parts(path, spec))
+    )
     assert train is not None
     try:
         inputs = spec.learner_inputs() if spec.declared_learner() is not None else None
         problem = pose_motion(train.record, motion, inputs, spec.training.output_weights)
-        named = {"path": path, "spec": spec, "train": train, "validation": validation, "tests": tuple(tests)}
-        own = {"measure": _measure_of(spec, problem, path.parent), "suspects": declared_terms(spec.suspects, problem)}
+        named = {
+            "path": path,
+            "spec": spec,
+            "train": train,
+            "validation": validation,
+            "tests": tuple(tests),
+        }
+        own = {
+            "measure": _measure_of(spec, problem, path.parent),
+            "suspects": declared_terms(spec.suspects, problem),
+        }
         kind = spec.engine_kind([path.parent / entry.file for entry in train.files])
         job = MotionJob(**named, problem=problem, engine=engine_of(spec.engine, kind), **own)
         for part in job.parts:
@@ -126,7 +147,7 @@ def _parts(loaded: tuple[Part, Part | None, tuple[Part, ...]]) -> list[Part | No
 
 
 def _check_choices(spec: Spec, motion: Motion) -> None:
-    """The rules between motion, learner, structure, criterion and solver, in the words of the spec."""
+    """Check that motion, learner, structure, criterion and solver go together."""
     try:
         learner, structure = spec.declared_learner(), spec.declared_structure()
         solver, criterion = spec.declared_solver(), spec.declared_criterion()
@@ -140,12 +161,12 @@ def _check_choices(spec: Spec, motion: Motion) -> None:
 
 
 def _place(error: KeyedError) -> str:
-    """The key of the spec that an error is about."""
+    """Return the key of the spec that an error is about."""
     return _SECTIONS.get(error.key, f"training.{error.key}")
 
 
 def _check_sizes(spec: Spec, problem: MotionProblem) -> None:
-    """Raise InputError where nothing would be scored, or training would not end."""
+    """Raise InputError where no row would be scored, or training would not end."""
     criterion = spec.declared_criterion()
     try:
         check_scored(criterion, max(len(e) for e in problem.record.experiments))
@@ -158,11 +179,16 @@ def _check_sizes(spec: Spec, problem: MotionProblem) -> None:
         "outputs": max(len(states) + len(outputs), 1),
     }
     runs = spec.runs(linear=False)
-    check_cost(spec.declared_learner(), **sizes, iterations=spec.declared_solver().iterations, runs=runs)
+    check_cost(
+        spec.declared_learner(), **sizes, iterations=spec.declared_solver().iterations, runs=runs
+    )
 
 
 def _measure_of(spec: Spec, problem: MotionProblem, folder: Path) -> Measure:
-    """The measure that a spec declares, tried on the guessed states: names and limits are wrong before any training."""
+    """Return the measure that a spec declares, tried on the guessed states.
+
+    So wrong names and limits are found before training.
+    """
     names = [str(lag) for lag in layout_of(problem.motion)]
     measure = spec.declared_measure(MeasurePlace(folder, names, problem.record, problem.first_row))
     rows = len(problem.record)  # a measure may weigh each of them

@@ -1,4 +1,4 @@
-"""What is told of jobs whose physics are equations of motion."""
+"""Results of jobs whose physics are equations of motion."""
 
 from __future__ import annotations
 
@@ -12,7 +12,13 @@ from orthaug.analysis.closed_loop import closed_loop
 from orthaug.commands.attempt import attempt, attempt_warned
 from orthaug.commands.motion_job import MotionJob
 from orthaug.commands.scales import describe_scales
-from orthaug.reports.result import CheckResult, FitResult, MeasureResult, ParameterResult, parameter_rows
+from orthaug.reports.result import (
+    CheckResult,
+    FitResult,
+    MeasureResult,
+    ParameterResult,
+    parameter_rows,
+)
 
 if TYPE_CHECKING:
     from orthaug.analysis.input_timing import Trial
@@ -22,50 +28,66 @@ if TYPE_CHECKING:
     from orthaug.reports.drawing import Figure
 
 _UNKNOWN = ("physical_parameters", "physical_consistency", "sensitivities", "bias", "missing_lags")
-_STIFF = 20  # substeps from which a motion is told to be stiff for its sampling
+_STIFF = 20  # substeps from which a motion is called stiff for its sampling
 _NOT_ANALYSED = Warning(
     "residual_not_analysed",
-    "the residual is not analysed: the free run ran away, has too few rows, or leaves rounding only.",
+    "the residual is not analysed: the free run diverged, has too few rows, or leaves rounding "
+    "error only.",
 )
 _NOT_RICH = Warning(
     "rich_inputs_run_away",
-    "physics alone runs away with rich inputs: what is told of identifiability is that of the record's own.",
+    "physics alone diverges under rich inputs, so identifiability is computed for the inputs "
+    "of the record.",
 )
 
 
 def checked(job: MotionJob) -> CheckResult:
-    """What the outputs tell apart, what the learner could imitate, substeps and holds."""
+    """Return identifiability, what the learner could imitate, substeps and holds."""
     from orthaug.analysis.absorbed import Waves
     from orthaug.analysis.imitation import imitation_before
     from orthaug.analysis.input_timing import dead_times, try_holds
-    from orthaug.analysis.motion_identifiability import identified
-    from orthaug.fitting.motion_course import MotionCourse
+    from orthaug.analysis.motion_identifiability import identified, ill_conditioned_alone
     from orthaug.fitting.motion_estimation import without_learner
+    from orthaug.fitting.segmented_motion import SegmentedMotion
     from orthaug.inference.motion_split import shared_of_motion
     from orthaug.inference.nearly_shared import shared_warnings
-    from orthaug.models.moving import Moving
+    from orthaug.models.moving import MotionDynamics
 
     problem, spec = job.problem, job.spec
     motion, criterion = problem.motion, spec.declared_criterion()
-    course = MotionCourse.of(without_learner(problem), None, criterion)
-    told = identified(course)
-    if told is None:
-        wild = "".join(f" {warning.text}" for warning in job.warnings if warning.code == "wild_samples")
+    segmented = SegmentedMotion.of(without_learner(problem), None, criterion)
+    identification = identified(segmented)
+    if identification is None:
+        wild = "".join(
+            f" {warning.text}" for warning in job.warnings if warning.code == "wild_samples"
+        )
         scales = describe_scales(problem.record)
         cause = f" {scales[0].upper()}{scales[1:]}" if scales else ""
-        remedy = f"it runs on a sample that is none.{wild}" if wild else f"give others.{cause}"
-        raise InputError(f"{job.path}: physics alone has no finite free run from its initial values; {remedy}")
+        remedy = f"it meets a wild sample.{wild}" if wild else f"give others.{cause}"
+        raise InputError(
+            f"{job.path}: physics alone has no finite free run from its initial values; {remedy}"
+        )
     shared, on_rows = None, []
     if spec.declared_learner() is not None and job.structure.shared != "all":
-        form = Moving(motion, problem.features, None, problem.record.sampling_time, problem.substeps)
-        shared = imitation_before(form, motion.coordinates.initial, told.states, told.inputs)
-        seen = shared_of_motion(form, motion.coordinates.initial, told.states, told.inputs)
+        form = MotionDynamics(
+            motion, problem.features, None, problem.record.sampling_time, problem.substeps
+        )
+        shared = imitation_before(
+            form, motion.coordinates.initial, identification.states, identification.inputs
+        )
+        seen = shared_of_motion(
+            form, motion.coordinates.initial, identification.states, identification.inputs
+        )
         on_rows = shared_warnings(seen, [str(entry) for entry in form.features])
-    posed, waves = (problem, Waves()) if spec.declared_learner() is not None else (without_learner(problem), None)
+    posed, waves = (
+        (problem, Waves())
+        if spec.declared_learner() is not None
+        else (without_learner(problem), None)
+    )
     trial = try_holds(posed, criterion, spec.declared_solver(), job.structure, waves)
     text, warnings = _about_steps(job, trial)
     warnings += [late.warning for late in dead_times(trial.task, spec.declared_solver())]
-    if told.by_any is None:
+    if identification.by_any is None:
         warnings.append(_NOT_RICH)
     return CheckResult.model_validate(
         {
@@ -73,10 +95,10 @@ def checked(job: MotionJob) -> CheckResult:
             "parameters": motion.names,
             "regressor": [*motion.names_of_states, *motion.inputs],
             "rows": len(problem.record),
-            "excitation": told.on_data,
-            "identifiability": told.by_any or told.on_data,
+            "excitation": identification.on_data,
+            "identifiability": identification.by_any or identification.on_data,
             "shared": shared,
-            "bias": _biases(job, trial) if told.on_data.full_rank else None,
+            "bias": _biases(job, trial) if identification.on_data.full_rank else None,
             "motion": {
                 "states": motion.names_of_states,
                 "integrator": motion.integrator,
@@ -87,32 +109,42 @@ def checked(job: MotionJob) -> CheckResult:
                 "best_hold": trial.best,
                 "text": text,
             },
-            "warnings": [*job.warnings, *on_rows, *warnings, *closed_loop(job.train.record)],
+            "warnings": [
+                *job.warnings,
+                *(ill_conditioned_alone(trial.task) if identification.on_data.full_rank else ()),
+                *on_rows,
+                *warnings,
+                *closed_loop(job.train.record),
+            ],
         }
     )
 
 
 def _biases(job: MotionJob, trial: Trial) -> list[dict[str, Any]] | None:
-    """What every suspect would do, about physics alone; of the usual ones those that do anything, where none is named.
+    """Return the bias that each suspect would cause, with physics alone.
+
+    Without suspects in the spec, the usual ones with an effect.
 
     None where physics alone has no run.
     """
-    from orthaug.analysis.motion_bias import ground_before
+    from orthaug.analysis.motion_bias import linearize_physics
 
-    ground = ground_before(trial.task, job.structure)
-    if ground is None:
+    linearization = linearize_physics(trial.task, job.structure)
+    if linearization is None:
         return None
-    table = ground.table(job.suspects or ground.usual())
+    table = linearization.table(job.suspects or linearization.usual())
     return [entry.as_dict() for entry in table if job.suspects or entry.size]
 
 
 def refused(job: MotionJob, result: CheckResult) -> InputError | None:
-    """Parameters that the outputs do not tell apart, after the report."""
+    """Return an error where the outputs do not identify the parameters, after the report."""
     found = result.excitation
     if found.rank == found.columns:
         return None
     groups = "; ".join(
-        f"{group[0]} changes no output" if len(group) == 1 else f"{', '.join(group)} cannot be told apart"
+        f"{group[0]} changes no output"
+        if len(group) == 1
+        else f"{', '.join(group)} cannot be distinguished"
         for group in found.collinear
     )
     lacking = found.columns - found.rank
@@ -121,7 +153,8 @@ def refused(job: MotionJob, result: CheckResult) -> InputError | None:
     if result.identifiability.identifiable:
         remedy += ", or use data that excite them separately"
     return RankError(
-        f"the outputs do not determine the parameters (rank {found.rank} of {found.columns}): {groups}; {remedy}."
+        f"the outputs do not determine the parameters (rank {found.rank} of {found.columns}): "
+        f"{groups}; {remedy}."
     )
 
 
@@ -131,7 +164,7 @@ def content(
     responses: Mapping[str, tuple[Response, Response]],
     warnings: list[Any],
 ) -> tuple[MotionEstimate, dict[str, Any]]:
-    """The fit, and what results tell of it; warnings are added."""
+    """Return the fit and the content of its result; warnings are added."""
     from orthaug.analysis.imitation import MotionImitation
     from orthaug.analysis.robustness import robust_free_run
     from orthaug.inference.nearly_shared import shared_warnings
@@ -140,24 +173,32 @@ def content(
     motion, form = job.problem.motion, fit.model.form
     count, gram = len(motion.names), fit.model.statistics.gram
     found: dict[str, Any] = dict.fromkeys(("budget", "coarse", "parts"))
-    told: dict[str, Any] = dict.fromkeys((*_UNKNOWN, "residuals", "stability", "shared", "measure_detail"))
+    fields: dict[str, Any] = dict.fromkeys(
+        (*_UNKNOWN, "residuals", "stability", "shared", "measure_detail")
+    )
     if fit.status.ok:
         plain = fit
         fit = attempt("the robust covariance", lambda: robust_free_run(plain), warnings, plain)
         found = _analysed(job, fit, responses[job.train.name][1], warnings)
         warnings += closed_loop(job.train.record)
-        told |= {name: found[name] for name in ("residuals", "stability", "bias")}
+        fields |= {name: found[name] for name in ("residuals", "stability", "bias")}
     budget, coarse, parts = found["budget"], found["coarse"], found["parts"] or ()
     if fit.status.ok and form.bound is not None:
         seen = [str(entry) for entry in form.features]
-        told["shared"] = MotionImitation.of(seen, fit.shared)
+        fields["shared"] = MotionImitation.of(seen, fit.shared)
         warnings += shared_warnings(fit.shared, seen)
-        told["measure_detail"] = MeasureResult.of_motion(fit.split_by)
-    return fit, told | {
+        fields["measure_detail"] = MeasureResult.of_motion(fit.split_by)
+    return fit, fields | {
         "parameters": _parameters(fit, budget),
-        "standard_errors": None if fit.std is None else "plain" if fit.plain_covariance is None else "robust",
+        "standard_errors": None
+        if fit.std is None
+        else "plain"
+        if fit.plain_covariance is None
+        else "robust",
         "standard_errors_by": None if fit.std_kind == "plain" else fit.std_kind,
-        "excitation": Excitation(0, count, None, ()) if gram is None else of_gram(gram[:count, :count], motion.names),
+        "excitation": Excitation(0, count, None, ())
+        if gram is None
+        else of_gram(gram[:count, :count], motion.names),
         "motion": {
             "states": motion.names_of_states,
             "integrator": motion.integrator,
@@ -170,45 +211,64 @@ def content(
     }
 
 
-def _analysed(job: MotionJob, fit: MotionEstimate, free_run: Response, warnings: list[Any]) -> dict[str, Any]:
-    """What is asked of a fit behind its training; None for an analysis that fails. Warnings are added."""
+def _analysed(
+    job: MotionJob, fit: MotionEstimate, free_run: Response, warnings: list[Any]
+) -> dict[str, Any]:
+    """Return the analyses of a fit; None for one that fails.
+
+    Warnings are added.
+    """
     from orthaug.analysis.learned_part import equation_parts
     from orthaug.analysis.motion_bias import suspected_bias
-    from orthaug.analysis.motion_budget import told_budget
+    from orthaug.analysis.motion_budget import declared_budget
     from orthaug.analysis.motion_diagnosis import diagnose_motion
     from orthaug.analysis.motion_modes import motion_stability
     from orthaug.analysis.motion_response import substep_bias
 
     def biases() -> Any:
         table = suspected_bias(fit, job.suspects) if job.suspects else []
-        budget = told_budget(fit, job.suspects, table)
+        budget = declared_budget(fit, job.suspects, table)
         warnings.extend(budget.warnings if budget else ())
         listed = {entry.suspect for entry in table}
-        usual = [cause for cause in (budget.causes if budget else ()) if cause.suspect not in listed]
+        usual = [
+            cause for cause in (budget.causes if budget else ()) if cause.suspect not in listed
+        ]
         return [entry.as_dict() for entry in (*table, *usual)] or None, budget
 
     points = job.reach(fit.model, job.train.record)[0]
     x, u = np.split(points, [fit.model.form.states], axis=1)
     found = {
         "residuals": attempt_warned(
-            "the analysis of the residual", lambda: diagnose_motion(fit, free_run), warnings, _NOT_ANALYSED
+            "the analysis of the residual",
+            lambda: diagnose_motion(fit, free_run),
+            warnings,
+            _NOT_ANALYSED,
         ),
         "stability": attempt_warned(
-            "the analysis of the modes", lambda: motion_stability(fit.model, x, u, record=job.train.record), warnings
+            "the analysis of the modes",
+            lambda: motion_stability(fit.model, x, u, record=job.train.record),
+            warnings,
         ),
         "parts": None,
     }
     if fit.model.form.bound is not None:
-        found["parts"] = attempt("the size of the learned part", lambda: equation_parts(fit, x, u), warnings, None)
-    found["coarse"] = attempt_warned("the analysis of the substeps", lambda: substep_bias(fit), warnings)
+        found["parts"] = attempt(
+            "the size of the learned part", lambda: equation_parts(fit, x, u), warnings, None
+        )
+    found["coarse"] = attempt_warned(
+        "the analysis of the substeps", lambda: substep_bias(fit), warnings
+    )
     table, budget = attempt("the bias by suspects", biases, warnings, (None, None))
     return found | {"bias": table, "budget": budget}
 
 
 def figures(
-    job: MotionJob, fit: MotionEstimate, result: FitResult, responses: Mapping[str, tuple[Response, Response]]
+    job: MotionJob,
+    fit: MotionEstimate,
+    result: FitResult,
+    responses: Mapping[str, tuple[Response, Response]],
 ) -> dict[str, Figure]:
-    """The figures of a result by their names."""
+    """Return the figures of a result by their names."""
     from orthaug.reports import finding_plots, plots
     from orthaug.reports.learned_part import learned_of
 
@@ -218,13 +278,17 @@ def figures(
     drawn = {
         "simulation": plots.output_figure(free, f"free run, {part.name}", learns=learns),
         "residual": plots.residual_figure(free, f"free-run residual, {part.name}"),
-        "states": plots.states_figure(fit.model, part.record, f"states of the free run, {part.name}"),
+        "states": plots.states_figure(
+            fit.model, part.record, f"states of the free run, {part.name}"
+        ),
     }
     if result.bias:
         drawn["bias"] = finding_plots.bias_figure(result.bias)
     drawn["prediction"] = plots.output_figure(one_step, f"one-step prediction, {part.name}")
     if learns:
-        drawn["components"] = plots.parts_figure(fit.model, part.record, f"physics and learner, {part.name}")
+        drawn["components"] = plots.parts_figure(
+            fit.model, part.record, f"physics and learner, {part.name}"
+        )
         part = learned_of(fit, job.train.record)
         assert part is not None
         title = f"learned beside the physics, by the {fit.model.measure} measure"
@@ -235,52 +299,67 @@ def figures(
 def physics_alone(
     job: MotionJob, fit: MotionEstimate, responses: Mapping[str, tuple[Response, Response]]
 ) -> Mapping[str, Response]:
-    """The free run of every part by the physics without the learner."""
+    """Return the free run of every part by the model's physics without its learner."""
     return {part: free.physics_alone for part, (_, free) in responses.items()}
 
 
 def _parameters(fit: MotionEstimate, budget: MotionBudget | None) -> list[ParameterResult]:
-    """The parameters with their intervals, whether the learner could imitate them, and what biases them."""
+    """Return the parameters with intervals, whether the learner could imitate them, and biases."""
     motion = fit.problem.motion
     values = fit.values if fit.status.ok else np.full(len(motion.names), np.nan)
     rows = parameter_rows(motion.parameters, values, fit.std, fit.interval, plain_std=fit.plain_std)
     learns = fit.model.form.bound is not None and fit.status.ok
-    told = [row.name not in fit.shared.untouched if learns else None for row in rows]
+    imitable = [row.name not in fit.shared.untouched if learns else None for row in rows]
     biases = [budget.of(row.name) if budget else None for row in rows]
-    return [row.told(shared, bias) for row, shared, bias in zip(rows, told, biases, strict=True)]
+    return [
+        row.with_bias(shared, bias)
+        for row, shared, bias in zip(rows, imitable, biases, strict=True)
+    ]
 
 
 def _about_steps(job: MotionJob, trial: Trial) -> tuple[str, list[Warning]]:
-    """What integrator and hold do to the outputs, in words; with what to be warned of."""
+    """Return a text on the errors of integrator and hold in the outputs, and warnings."""
     motion, problem, warnings = job.problem.motion, job.problem, []
     step = problem.record.sampling_time
     if motion.integrator == "discrete":
         return "The equations give the state one sample later: nothing is integrated.", warnings
     if trial.substeps is None:
-        told = "physics alone has no finite free run from its initial values, so substeps and holds were not tried."
-        return "", [Warning("physics_runs_away", told)]
-    told = [
-        f"The fastest mode of the initial physics is {problem.fastest:.3g} 1/s, sampled every {step:g} s; "
-        f"{trial.substeps} substep{'s' * (trial.substeps > 1)} of {motion.integrator} in a sample"
+        sentences = (
+            "physics alone has no finite free run from its initial values, so substeps and "
+            "holds were not tried."
+        )
+        return "", [Warning("physics_runs_away", sentences)]
+    sentences = [
+        f"The fastest mode of the initial physics is {problem.fastest:.3g} 1/s, sampled every "
+        f"{step:g} s; {trial.substeps} substep{'s' * (trial.substeps > 1)} of "
+        f"{motion.integrator} in a sample"
         + (
             " are as declared."
             if motion.substeps is not None
-            else ": twice as many move the outputs by less than 1 % of the residual."
+            else ": twice as many change the outputs by less than 1 % of the residual."
         )
     ]
     if trial.substeps >= _STIFF:
         text = (
-            f'the motion is stiff for its sampling: {trial.substeps} substeps; `integrator = "exact"` may need fewer.'
+            f"the motion is stiff for its sampling: {trial.substeps} substeps; "
+            '`integrator = "exact"` may need fewer.'
         )
         warnings.append(Warning("stiff", text))
     if len(trial.holds) > 1:
         shown = ", ".join(
-            f"{held.hold} {'no run' if held.residual is None else f'{held.residual:.4g}'}" for held in trial.holds
+            f"{held.hold} {'no run' if held.residual is None else f'{held.residual:.4g}'}"
+            for held in trial.holds
         )
-        told.append(f"Physics alone leaves, by the hold of its inputs, in deviations of the output: {shown}.")
+        sentences.append(
+            "Residual of physics alone for each hold of the inputs, in deviations of the "
+            f"output: {shown}."
+        )
         if trial.best is None:
-            told.append("None explains the data clearly better than the declared one.")
+            sentences.append("No hold explains the data clearly better than the declared one.")
         else:
-            text = f'the data are explained better by hold = "{trial.best}" than by the declared "{motion.hold}".'
+            text = (
+                f'the data are explained better by hold = "{trial.best}" than by the '
+                f'declared "{motion.hold}".'
+            )
             warnings.append(Warning("other_hold", text))
-    return " ".join(told), warnings
+    return " ".join(sentences), warnings

@@ -14,83 +14,91 @@ from orthaug._base.lines import counted
 from orthaug._base.memory import few_arenas
 from orthaug.commands.data_sections import PartSection
 from orthaug.commands.spec import Spec
-from orthaug.data.clock import DRIFT, thinned_twice, told_clock
+from orthaug.data.clock import DRIFT, read_clock, thinned_twice
 from orthaug.data.parquet_source import open_parquet
 from orthaug.data.preparation import warnings_of
 from orthaug.data.readers import read_record
 from orthaug.data.record import Record, same_step
 from orthaug.data.sources import Source, witness
-from orthaug.data.tables import KNOWN, PLAIN_TEXT
+from orthaug.data.tables import KNOWN, PLAIN_TEXT, guessed_encoding
 from orthaug.reports.result import FileResult
 
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """A part of the data: its record, and how many leading samples of each recording are not scored."""
+    """A part of the data: its record, and the leading samples of each recording not scored."""
 
     name: str
     record: Record
     skip: int
     files: tuple[FileResult, ...]
     warnings: tuple[Warning, ...] = ()
-    """Rows that were thinned out, or left out around missing samples."""
+    """Warnings on rows that were thinned out, or left out around missing samples."""
     source: Source | None = None
-    """All rows of the part, where its record is a witness of them only."""
+    """All rows of the part, where its record is only a subsample of them."""
 
     def without_short(self, first: int, least: int = 0) -> Part:
-        """Without stretches between missing samples that are too short for a row after the first `first`.
+        """Return the part without stretches between missing samples that are too short.
+
+        They have no row after the first `first`.
 
         Args:
-            least: rows of a stretch that has a use.
+            least: minimum rows of a useful stretch.
         """
         if not self.record.missing:
             return self
-        record, gaps = long_stretches(self.record, self.skips, first, least, f"data.{self.name}: ", self.skip)
-        told = Warning("missing_rows", f"{self.name}: {gaps}")
-        return replace(self, record=record, warnings=(*self.warnings, told))
+        record, gaps = long_stretches(
+            self.record, self.skips, first, least, f"data.{self.name}: ", self.skip
+        )
+        warning = Warning("missing_rows", f"{self.name}: {gaps}")
+        return replace(self, record=record, warnings=(*self.warnings, warning))
 
     @property
     def skips(self) -> tuple[int, ...]:
-        """How many leading samples of each experiment are not scored."""
-        return tuple(max(0, self.skip - experiment.offset) for experiment in self.record.experiments)
+        """Return how many leading samples of each experiment are not scored."""
+        return tuple(
+            max(0, self.skip - experiment.offset) for experiment in self.record.experiments
+        )
 
     def scored(self, start: int) -> Record:
-        """The record of the scored rows and their lags, where the first usable row is `start`."""
+        """Return the record of the scored rows and their lags; the first usable row is `start`."""
         kept = tuple(
-            e.rows(max(0, skip - start), None) for e, skip in zip(self.record.experiments, self.skips, strict=True)
+            e.rows(max(0, skip - start), None)
+            for e, skip in zip(self.record.experiments, self.skips, strict=True)
         )
         return replace(self.record, experiments=kept)
 
     def check_scorable(self, start: int, sampling_time: float, least: int = 0) -> None:
-        """Raise InputError where an experiment has no row to score or fewer than `least`, or another sampling time."""
+        """Raise InputError for an experiment with too few rows, or another sampling time."""
         if not same_step(self.record.sampling_time, sampling_time):
             raise InputError(
-                f"data.{self.name}: sampled every {self.record.sampling_time:g} s, the training data every "
-                f"{sampling_time:g} s; one model has one sampling time."
+                f"data.{self.name}: sampled every {self.record.sampling_time:g} s, the "
+                f"training data every {sampling_time:g} s; one model has one sampling time."
             )
         for experiment, skip in zip(self.record.experiments, self.skips, strict=True):
             first = max(start, skip)
             if len(experiment) < least:
                 raise InputError(
-                    f"{experiment.source}: data.{self.name} has {len(experiment)} rows, too few; at least {least} tell "
-                    "where a run of this motion starts."
+                    f"{experiment.source}: data.{self.name} has {len(experiment)} rows, too "
+                    f"few; at least {least} determine where a run of this motion starts."
                 )
             if len(experiment) <= first:
                 raise InputError(
-                    f"{experiment.source}: data.{self.name} has {len(experiment)} rows, too few; the first {first} are "
-                    f"lags or skipped, so at least {first + 1} are needed."
+                    f"{experiment.source}: data.{self.name} has {len(experiment)} rows, too "
+                    f"few; the first {first} are lags or skipped, so at least {first + 1} are "
+                    "needed."
                 )
 
 
 def long_stretches(
     record: Record, skips: Sequence[int], first: int, least: int = 0, what: str = "", skip: int = 0
 ) -> tuple[Record, str]:
-    """A record without stretches that are too short for a row after the first ones, and what was left out, in words.
+    """Return a record without stretches too short to predict a row, and a text on these.
 
     Args:
         skips: leading samples of each stretch that are not scored.
         least: rows of a stretch that has a use.
-        what: stands before what is wrong; `skip` is the largest of the skips as it was asked for.
+        what: prefix of the message; `skip` is the largest of the skips as given.
 
     Raises:
         InputError: no stretch is long enough.
@@ -102,12 +110,14 @@ def long_stretches(
         needed = f"the first {max(first, skip)} are lags or skipped"
         needed = f"at least {least} are needed" if most < least else needed
         raise InputError(
-            f"{record.experiments[0].source}: {what}the longest stretch between missing samples has "
-            f"{counted(most, 'row')}, too few: {needed}."
+            f"{record.experiments[0].source}: {what}the longest stretch between missing "
+            f"samples has {counted(most, 'row')}, too few: {needed}."
         )
     kept = replace(record, experiments=long)
     usable = sum(len(experiment) - first for experiment in long)
-    lost = "row has missing cells and is" if record.missing == 1 else "rows have missing cells and are"
+    lost = (
+        "row has missing cells and is" if record.missing == 1 else "rows have missing cells and are"
+    )
     return kept, (
         f"{record.missing} {lost} left out with all windows that touch them; "
         f"{counted(usable, 'usable row')} remain, in {len(long)} stretch{'es' * (len(long) > 1)}."
@@ -115,17 +125,25 @@ def long_stretches(
 
 
 def load_parts(path: Path, spec: Spec) -> tuple[Part, Part | None, tuple[Part, ...]]:
-    """Training, validation and test parts of the spec at `path`, as their files hold them."""
+    """Return training, validation and test parts of the spec at `path`, unprepared."""
     files = [path.parent / file for file in expanded(path, spec.data.train.files, "train")]
     stays = spec.engine_kind(files) in ("stream", "dask") and not spec.brought
     train = _load(path, spec, spec.data.train, "train", stays=stays)
-    validation = _load(path, spec, spec.data.validation, "validation") if spec.data.validation else None
-    tests = [_load(path, spec, part, f"tests.{name}", stays=stays) for name, part in spec.data.tests.items()]
+    validation = (
+        _load(path, spec, spec.data.validation, "validation") if spec.data.validation else None
+    )
+    tests = [
+        _load(path, spec, part, f"tests.{name}", stays=stays)
+        for name, part in spec.data.tests.items()
+    ]
     return train, validation, tuple(tests)
 
 
 def expanded(path: Path, entries: Sequence[str], name: str) -> list[str]:
-    """Files as the spec names them: a pattern such as `runs/*.parquet`, or a folder, stands for all in it, sorted."""
+    """Return the files that the spec names, sorted.
+
+    A pattern such as `runs/*.parquet`, or a folder, gives all files in it.
+    """
     found = []
     for entry in entries:
         if (path.parent / entry).is_dir():
@@ -140,24 +158,33 @@ def expanded(path: Path, entries: Sequence[str], name: str) -> list[str]:
             continue
         if not files:
             raise InputError(
-                f"{path}: 'data.{name}.files': no file fits '{entry}'; expected one of {', '.join(KNOWN)}."
+                f"{path}: 'data.{name}.files': no file matches '{entry}'; expected one of "
+                f"{', '.join(KNOWN)}."
             )
         found += sorted(file for file in files if Path(file).suffix)
     return found
 
 
 def _load(path: Path, spec: Spec, part: PartSection, name: str, *, stays: bool = False) -> Part:
-    """Read a part's files. Messages begin with the file at fault; once it is read, with its name in the spec.
+    """Return a part with its files read.
+
+    Messages begin with the file at fault, after reading by its name in the spec.
 
     Args:
-        stays: leave the rows of Parquet files where they are, and read a witness of them.
+        stays: leave the rows of Parquet files where they are, and read a subsample of them.
     """
-    unknown = [channel for channel in part.columns if channel not in (*spec.data.inputs, *spec.data.outputs)]
+    unknown = [
+        channel
+        for channel in part.columns
+        if channel not in (*spec.data.inputs, *spec.data.outputs)
+    ]
     if unknown:
-        raise InputError(f"{path}: 'data.{name}.columns': '{unknown[0]}' is neither an input nor an output.")
+        raise InputError(
+            f"{path}: 'data.{name}.columns': '{unknown[0]}' is neither an input nor an output."
+        )
     files = expanded(path, part.files, name)
     if stays and all(Path(file).suffix.lower() == ".parquet" for file in files):
-        return _left(path, spec, part, name, files)
+        return _open_in_files(path, spec, part, name, files)
     records, results = [], []
     used = _used_columns(spec, part.columns)
     for file in files:
@@ -171,18 +198,29 @@ def _load(path: Path, spec: Spec, part: PartSection, name: str, *, stays: bool =
             every=part.every,
             prepare=spec.data.steps,
         )
-        results.append(FileResult(file=file, sha256=file_digest(path.parent / file), rows=len(record)))
+        results.append(
+            FileResult(file=file, sha256=file_digest(path.parent / file), rows=len(record))
+        )
         records.append(record)
     record = Record.join(records)
     sources = (file for read, file in zip(records, files, strict=True) for _ in read.experiments)
-    told = tuple(replace(e, source=file) for e, file in zip(record.experiments, sources, strict=True))
-    record = replace(record, experiments=told)
+    renamed = tuple(
+        replace(e, source=file) for e, file in zip(record.experiments, sources, strict=True)
+    )
+    record = replace(record, experiments=renamed)
     warnings = ()
     if part.every > 1:
         given = spec.data.sampling_time
-        apart = f", so that rows are {part.every * given:g} s apart instead of {given:g} s" if given else ""
+        apart = (
+            f", so that rows are {part.every * given:g} s apart instead of {given:g} s"
+            if given
+            else ""
+        )
         kept = f"{name}: one row in {part.every} is kept without a filter{apart}"
-        warnings = (Warning("thinned", f"{kept}; content above the new Nyquist frequency folds back."),)
+        warnings = (
+            Warning("thinned", f"{kept}; content above the new Nyquist frequency folds back."),
+        )
+    warnings += _guessed_encoding(path, files, name)
     if spec.data.time is None:
         warnings += _other_step(path, spec, files, name, part.columns)
     if name == "train":
@@ -190,17 +228,19 @@ def _load(path: Path, spec: Spec, part: PartSection, name: str, *, stays: bool =
     return Part(name, record, part.skip, tuple(results), warnings)
 
 
-def _left(path: Path, spec: Spec, part: PartSection, name: str, files: Sequence[str]) -> Part:
-    """A part whose rows stay in its Parquet files."""
+def _open_in_files(
+    path: Path, spec: Spec, part: PartSection, name: str, files: Sequence[str]
+) -> Part:
+    """Return a part whose rows remain in its Parquet files."""
     if spec.data.prepare:
         raise InputError(
-            f"{path}: 'data.prepare' needs the rows in memory, and these stay in their files; prepare the files, or "
-            'set engine.kind = "memory".'
+            f"{path}: 'data.prepare' needs the rows in memory, and these stay in "
+            'their files; prepare the files, or set engine.kind = "memory".'
         )
     if part.rows is not None or part.every > 1:
         raise InputError(
-            f"{path}: 'data.{name}': `rows` and `every` need the rows in memory; write the files that way, or set "
-            'engine.kind = "memory".'
+            f"{path}: 'data.{name}': `rows` and `every` need the rows in memory; "
+            'write the files that way, or set engine.kind = "memory".'
         )
     few_arenas()
     places = [path.parent / file for file in files]
@@ -209,23 +249,30 @@ def _left(path: Path, spec: Spec, part: PartSection, name: str, files: Sequence[
     for partition in source.partitions:
         rows[partition.path] = rows.get(partition.path, 0) + partition.rows
     results = [
-        FileResult(file=file, sha256=file_digest(path.parent / file), rows=rows[str(path.parent / file)])
+        FileResult(
+            file=file, sha256=file_digest(path.parent / file), rows=rows[str(path.parent / file)]
+        )
         for file in files
     ]
     names = {str(path.parent / file): file for file in files}
     record = witness(source)
-    record = replace(record, experiments=tuple(replace(e, source=names[e.source]) for e in record.experiments))
+    record = replace(
+        record, experiments=tuple(replace(e, source=names[e.source]) for e in record.experiments)
+    )
     total, warnings = sum(rows.values()), ()
     if spec.data.time is None:
         warnings = _other_step(path, spec, files, name, part.columns)
     if len(record) < total:
-        told = f"{name}: findings and figures look at {len(record)} of {total} rows, in windows spread over them."
-        warnings += (Warning("witness", told),)
+        text = (
+            f"{name}: findings and figures use {len(record)} of {total} rows, in windows "
+            "spread over them."
+        )
+        warnings += (Warning("witness", text),)
     return Part(name, record, part.skip, tuple(results), warnings, source)
 
 
 def _options(spec: Spec, part: PartSection) -> dict[str, Any]:
-    """How the files of a part are read, wherever their rows are."""
+    """Return the options for reading the files of a part, in memory or not."""
     data = spec.data
     named = {key: getattr(data, key) for key in ("sampling_time", "time", "experiment", "missing")}
     channels = {"inputs": spec.channels(data.inputs), "outputs": spec.channels(data.outputs)}
@@ -233,24 +280,47 @@ def _options(spec: Spec, part: PartSection) -> dict[str, Any]:
 
 
 def _used_columns(spec: Spec, columns: Mapping[str, str]) -> set[str]:
-    """The columns of a part's files that are channels, or tell experiments apart."""
+    """Return the columns of a part's files that are channels, or that separate experiments."""
     channels = [*spec.channels(spec.data.inputs), *spec.channels(spec.data.outputs)]
     return {columns.get(c.name, c.file_column) for c in channels} | {spec.data.experiment or ""}
+
+
+def _guessed_encoding(path: Path, files: Sequence[str], name: str) -> tuple[Warning, ...]:
+    """Return a warning for the first file that is not UTF-8.
+
+    Apparent text in an old encoding may be damaged.
+    """
+    for file in files:
+        line = guessed_encoding(path.parent / file)
+        if line is not None:
+            text = (
+                f"{name}: line {line} of {file} is no UTF-8, so the file is read as "
+                "Windows-1252; save it as UTF-8."
+            )
+            return (Warning("encoding_guessed", text),)
+    return ()
 
 
 def _other_step(
     path: Path, spec: Spec, files: Sequence[str], name: str, columns: Mapping[str, str]
 ) -> tuple[Warning, ...]:
-    """A warning where a file tells another sampling time than the spec does."""
+    """Return a warning where the sampling time of a file differs from that of the spec."""
     used = _used_columns(spec, columns)
     step, given = spec.data.sampling_time or 1.0, spec.data.sampling_time is not None
     for file in files:
-        clock = told_clock(path.parent / file, used)
+        clock = read_clock(path.parent / file, used)
         if clock.column is None or clock.step is None or abs(clock.step - step) <= DRIFT * step:
             continue
-        said = f"`sampling_time` is {step:g} s" if given else "the spec says no sampling time, so 1 s is taken"
+        said = (
+            f"`sampling_time` is {step:g} s"
+            if given
+            else "the spec gives no sampling time, so 1 s is used"
+        )
         header = clock.column.header
         remedy = f'time = "{header}"' if clock.instants else f"sampling_time = {clock.step:g}"
-        text = f"{name}: {said}, but column '{header}' of {file} tells {clock.step:g} s; perhaps {remedy} is meant."
+        text = (
+            f"{name}: {said}, but column '{header}' of {file} gives {clock.step:g} s; perhaps "
+            f"{remedy} is meant."
+        )
         return (Warning("other_sampling_time", text),)
     return ()

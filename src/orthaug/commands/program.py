@@ -1,4 +1,4 @@
-"""The program around its commands: what arguments mean, and how errors become one line and an exit code."""
+"""The frame of the commands: meaning of arguments, and errors as one line and an exit code."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from orthaug._base.checks import check_choice
 from orthaug._base.errors import InputError, TrainingError
 from orthaug._base.folders import PARTIALS
 from orthaug.commands import streams
-from orthaug.commands.signals import WATCH
+from orthaug.commands.signals import WATCH, ending
 
 if TYPE_CHECKING:
     from orthaug.reports.fields import Content
@@ -27,8 +27,11 @@ class Interrupted(Exception):
     """Ctrl-C, with what it stopped; typer would turn a KeyboardInterrupt into a bare exit code."""
 
 
-class Unread(Exception):
-    """Nobody reads the output any more, as after `| head`; typer would turn a BrokenPipeError into exit code 1."""
+class OutputClosed(Exception):
+    """The reader of the output has closed it, as after `| head`.
+
+    Typer would turn a BrokenPipeError into exit code 1.
+    """
 
 
 class _Group(typer.core.TyperGroup):
@@ -39,27 +42,33 @@ class _Group(typer.core.TyperGroup):
             raise Interrupted(*interrupt.args) from None
         except OSError as error:
             if error.errno in _NO_READER and error.filename is None:
-                raise Unread from None
+                raise OutputClosed from None
             raise
 
 
-class TakesLists(typer.core.TyperCommand):
-    """A command each of whose repeatable options takes several values too: `--inputs a b`."""
+class ListOptionCommand(typer.core.TyperCommand):
+    """A command whose repeatable options take several values too: `--inputs a b`."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        valued = {name: option for option in self.params for name in option.opts if name.startswith("-")}
-        valued = {name: option for name, option in valued.items() if not getattr(option, "is_flag", False)}
+        valued = {
+            name: option for option in self.params for name in option.opts if name.startswith("-")
+        }
+        valued = {
+            name: option for name, option in valued.items() if not getattr(option, "is_flag", False)
+        }
         lists = {name for name, option in valued.items() if getattr(option, "multiple", False)}
         return super().parse_args(ctx, _repeated(args, lists, set(valued)))
 
 
 def _repeated(args: Sequence[str], lists: Set[str], valued: Set[str]) -> list[str]:
-    """Return arguments where an option of a list stands before each of its values.
+    """Return arguments with the option of a list repeated before each of its values.
 
-    One value is left to be the argument of the command where there would be none: a file that exists, or the last.
+    Where the command would have no argument, one value is left for it: a file that exists, or the
+    last.
 
     Examples:
-        >>> _repeated(["run.csv", "--inputs", "a", "b", "--out", "c"], {"--inputs"}, {"--inputs", "--out"})
+        >>> given = ["run.csv", "--inputs", "a", "b", "--out", "c"]
+        >>> _repeated(given, {"--inputs"}, {"--inputs", "--out"})
         ['run.csv', '--inputs', 'a', '--inputs', 'b', '--out', 'c']
     """
     found: list[list[str]] = []
@@ -86,43 +95,69 @@ def _repeated(args: Sequence[str], lists: Set[str], valued: Set[str]) -> list[st
 app = typer.Typer(
     name="orthaug",
     cls=_Group,
-    help="Fit physics together with a learned correction, so that the physics keeps all that physics can explain.",
+    help="Fit physics together with a learned correction, so that physics keeps what it can "
+    "explain.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
 _NO_READER = (errno.EPIPE, errno.EINVAL) if os.name == "nt" else (errno.EPIPE,)
 SpecPath = Annotated[Path, typer.Argument(metavar="SPEC", help="Spec file (TOML).")]
-ModelPath = Annotated[Path, typer.Argument(metavar="MODEL", help="Result folder of `fit`, or its model/.")]
-Which = Annotated[
-    str, typer.Option("--model", metavar="fitted|physics", help="The fitted model, or the physics without a learner.")
+ModelPath = Annotated[
+    Path, typer.Argument(metavar="MODEL", help="Result folder of `fit`, or its model/.")
 ]
-DataPath = Annotated[Path, typer.Argument(metavar="DATA", help="Data file with the model's channels.")]
+Which = Annotated[
+    str,
+    typer.Option(
+        "--model",
+        metavar="fitted|physics",
+        help="The fitted model, or the physics without a learner.",
+    ),
+]
+DataPath = Annotated[
+    Path, typer.Argument(metavar="DATA", help="Data file with the model's channels.")
+]
 OutFolder = Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Result folder.")]
-OutFile = Annotated[Path | None, typer.Option("--out", metavar="FILE", help="CSV file; standard output without it.")]
+OutFile = Annotated[
+    Path | None, typer.Option("--out", metavar="FILE", help="CSV file; standard output without it.")
+]
 Initial = Annotated[
     str | None,
-    typer.Option("--initial", metavar="measured|zero|INIT", help="Outputs before the first step; INIT is a CSV."),
+    typer.Option(
+        "--initial",
+        metavar="measured|zero|INIT",
+        help="Outputs before the first step; INIT is a CSV.",
+    ),
 ]
 Missing = Annotated[
-    str, typer.Option("--missing", metavar="error|skip", help="Rows with missing cells; skip leaves them out.")
+    str,
+    typer.Option(
+        "--missing", metavar="error|skip", help="Rows with missing cells; skip leaves them out."
+    ),
 ]
-Rows = Annotated[str | None, typer.Option("--rows", metavar="A:B", help="Rows of the file, half-open.")]
+Rows = Annotated[
+    str | None, typer.Option("--rows", metavar="A:B", help="Rows of the file, half-open.")
+]
 Every = Annotated[int, typer.Option("--every", metavar="N", help="Keep each N-th row.")]
 Columns = Annotated[
     list[str] | None,
-    typer.Option("--column", metavar="NAME=COLUMN", help="The file's column of a channel; any number."),
+    typer.Option(
+        "--column", metavar="NAME=COLUMN", help="The file's column of a channel; any number."
+    ),
 ]
 Prepare = Annotated[
     bool | None,
-    typer.Option("--prepare/--no-prepare", help="Prepare the rows as the training data were, by the model's steps."),
+    typer.Option(
+        "--prepare/--no-prepare",
+        help="Prepare the rows as the training data were, by the model's steps.",
+    ),
 ]
 Force = Annotated[bool, typer.Option("--force", help="Replace what is there, whoever wrote it.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of the summary.")]
 
 
 def main() -> None:
-    """Entry point: runs the command and turns errors into one line and an exit code."""
+    """Run the command and turn errors into one line and an exit code."""
     try:
         code = app(prog_name="orthaug", standalone_mode=False)
         sys.stdout.flush()
@@ -131,24 +166,32 @@ def main() -> None:
     except TrainingError as error:
         _fail(f"training failed: {error}", 1)
     except (Interrupted, KeyboardInterrupt) as interrupt:
-        _fail(f"interrupted{''.join(f' during {text}' for text in interrupt.args)}; nothing is written", 130)
-    except (Unread, BrokenPipeError):
+        during, then = (*map(str, interrupt.args), "", "")[:2]
+        _fail(ending("interrupted", during, then=then), 130)
+    except (OutputClosed, BrokenPipeError):
         streams.silence(sys.stdout)
         sys.exit(0)
     except OSError as error:
         streams.silence(sys.stdout)
         what = error.filename or "standard output"
-        _fail(f"error: {InputError(f'{what}: cannot be read or written ({error.strerror or error}).')}", 2)
+        _fail(
+            "error: "
+            f"{InputError(f'{what}: cannot be read or written ({error.strerror or error}).')}",
+            2,
+        )
     except Exception as error:
         text = _complaint(error)
         if text is None:
             raise
-        _fail(text if text.startswith("Usage") else f"error: {' '.join(text.split())}", getattr(error, "exit_code", 2))
+        _fail(
+            text if text.startswith("Usage") else f"error: {' '.join(text.split())}",
+            getattr(error, "exit_code", 2),
+        )
     sys.exit(code if isinstance(code, int) else 0)
 
 
 def _complaint(error: Exception) -> str | None:
-    """What to tell of an error that is not ours; None of one that should not be."""
+    """Return the message for an error of another library; None for one that is not caught."""
     from orthaug._base.jax import starts
 
     complaint = getattr(error, "format_message", None)  # typer's own, about arguments
@@ -172,18 +215,27 @@ def _version(show: bool) -> None:
 @app.callback()
 def options(
     verbose: Annotated[
-        int, typer.Option("--verbose", "-v", count=True, help="Tell what is done; twice for more.", show_default=False)
+        int,
+        typer.Option(
+            "--verbose",
+            "-v",
+            count=True,
+            help="Tell what is done; twice for more.",
+            show_default=False,
+        ),
     ] = 0,
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
-    """What stands before a command: -v, -vv or ORTHAUG_LOG ask for the log."""
+    """Set the options before a command: -v, -vv or ORTHAUG_LOG ask for the log."""
     level, levels = os.environ.get("ORTHAUG_LOG", "").lower(), ("info", "debug")
     if verbose or level:
         from orthaug._base.progress import show_log
 
-        show_log(levels[min(verbose, 2) - 1] if verbose else check_choice(level, levels, "ORTHAUG_LOG"))
+        show_log(
+            levels[min(verbose, 2) - 1] if verbose else check_choice(level, levels, "ORTHAUG_LOG")
+        )
 
 
 def _fail(message: str, code: int) -> None:
@@ -192,19 +244,19 @@ def _fail(message: str, code: int) -> None:
     sys.exit(code)
 
 
-def tell(result: Content, text: str, as_json: bool, place: object = None) -> None:
-    """A result on standard output, as JSON or in words; then what was written."""
+def print_result(result: Content, text: str, as_json: bool, place: object = None) -> None:
+    """Print a result on standard output, as JSON or in words; then the place that was written."""
     written = f"\n\nwritten to {place}" if place is not None else ""
     if place in PARTIALS.overtaken:
         streams.say(
-            f"warning: {place}: another run wrote a result here while this one ran, and this one has replaced it; run "
-            "it again with another --out to have both."
+            f"warning: {place}: another run wrote a result here meanwhile, and this one has "
+            "replaced it; run again with another --out to have both."
         )
     streams.echo(result.to_json() if as_json else f"{text}{written}")
 
 
 def other_writes() -> bool:
-    """Whether this is one of several processes and another one writes, which is said."""
+    """Return whether another one of several processes writes the result; then print that."""
     from orthaug.models.hosts import waits
 
     text = waits()
@@ -214,21 +266,23 @@ def other_writes() -> bool:
 
 
 def arguments(command: str, spec: Path, **options: Any) -> tuple[str, ...]:
-    """What a command was asked for, to be asked again: the options that were given, under their names.
+    """Return the arguments of a command, to run it again: the options that were given, by name.
 
     Examples:
         >>> arguments("fit", Path("a.toml"), out=Path("b"), resume=False, model=None, force=True)
         ('fit', 'a.toml', '--out', 'b', '--force')
     """
-    told = [command, str(spec)]
+    words = [command, str(spec)]
     for name, value in options.items():
         if value is True:
-            told.append(f"--{name}")
+            words.append(f"--{name}")
         elif value:
-            told += [
-                part for one in (value if isinstance(value, list) else [value]) for part in (f"--{name}", str(one))
+            words += [
+                part
+                for one in (value if isinstance(value, list) else [value])
+                for part in (f"--{name}", str(one))
             ]
-    return tuple(told)
+    return tuple(words)
 
 
 def prepare_jax() -> None:

@@ -1,4 +1,4 @@
-"""Saved models on data files: what `orthaug simulate`, `orthaug predict` and `orthaug explain` do."""
+"""Saved models on data files: `orthaug simulate`, `orthaug predict` and `orthaug explain`."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Reading:
-    """Which rows and columns of a data file are read, as a part of a spec says it."""
+class ReadOptions:
+    """The rows and columns of a data file to read, as a part of a spec declares them."""
 
     missing: str = "error"
     rows: Any = None
@@ -40,14 +40,22 @@ class Reading:
     every: int = 1
     columns: Mapping[str, str] = field(default_factory=dict)
     prepare: bool | None = None
-    """Whether the rows go through the steps of the model's training data; None where nobody has said."""
+    """Whether the rows go through the preparation of the training data; None where that is open.
+    """
 
     @classmethod
-    def of(cls, missing: str, rows: str | None, every: int, columns: Sequence[str], prepare: bool | None) -> Reading:
-        """Of the options of a command.
+    def of(
+        cls,
+        missing: str,
+        rows: str | None,
+        every: int,
+        columns: Sequence[str],
+        prepare: bool | None,
+    ) -> ReadOptions:
+        """Return the options of a command.
 
         Raises:
-            InputError: an option that is none.
+            InputError: an invalid value of an option.
         """
         check_choice(missing, ("error", "skip"), "--missing")
         if every < 1:
@@ -56,14 +64,16 @@ class Reading:
         for text in columns:
             name, equal, column = text.partition("=")
             if not (name and equal and column):
-                raise InputError(f"--column: found '{text}'; expected NAME=COLUMN, such as position=yVal.")
+                raise InputError(
+                    f"--column: found '{text}'; expected NAME=COLUMN, such as position=yVal."
+                )
             named[name] = column
         return cls(missing, read_rows(rows), every, named, prepare)
 
 
 @dataclass(frozen=True, eq=False)
 class ModelOnData:
-    """A saved model with the record of a data file, and how many rows of it were read, missing ones too."""
+    """A saved model with the record of a data file, and the number of rows read."""
 
     model: Model | MotionModel
     record: Record
@@ -74,29 +84,38 @@ class ModelOnData:
 
 
 def read_rows(text: str | None) -> tuple[int, int] | None:
-    """`A:B` as a half-open range of rows."""
+    """Return the range `A:B` as a half-open range of rows."""
     if text is None:
         return None
     start, _, stop = text.partition(":")
     if not (start.isdecimal() and stop.isdecimal() and text.isascii()):
-        raise InputError(f"--rows: found '{text}'; expected a half-open range of rows such as 0:1000.")
+        raise InputError(
+            f"--rows: found '{text}'; expected a half-open range of rows such as 0:1000."
+        )
     return int(start), int(stop)
 
 
-def trained_reading(model: Path, data: Path) -> Reading | None:
-    """How a file was read to train a model, by the result beside that; None where it is none of its files."""
+def trained_reading(model: Path, data: Path) -> ReadOptions | None:
+    """Return the options by which a model's training file was read, from the result beside it.
+
+    None for a file that the model was not trained on.
+    """
     digest = file_digest(data)
     for content in results_beside(model):
         with suppress(AttributeError, KeyError, TypeError, ValueError):
             if digest in [file["sha256"] for file in content["data"]["train"]]:
                 part = content["spec"]["data"]["train"]
                 rows = np.reshape(part.get("rows") or [], (-1, 2)).astype(int).tolist() or None
-                return Reading("skip", rows, int(part.get("every") or 1), dict(part.get("columns") or {}), True)
+                return ReadOptions(
+                    "skip", rows, int(part.get("every") or 1), dict(part.get("columns") or {}), True
+                )
     return None
 
 
 def open_explained(model: Path, data: Sequence[Path], rows: tuple[int, int] | None) -> ModelOnData:
-    """A model with files to explain it over: of those that it was trained on, where no `rows` are given, those rows.
+    """Return a model with the files to explain it over.
+
+    Of files that it was trained on, those rows are read where no `rows` are given.
 
     Raises:
         InputError: as `open_run`.
@@ -105,27 +124,43 @@ def open_explained(model: Path, data: Sequence[Path], rows: tuple[int, int] | No
     for path in data:
         check_readable(path)
         trained = trained_reading(model, path)
-        reading = trained or Reading("skip", prepare=True)
+        reading = trained or ReadOptions("skip", prepare=True)
         opened.append(open_run(model, path, reading=replace(reading, rows=rows or reading.rows)))
         taken = rows_taken(trained) if trained and not rows else ""
         notes += opened[-1].notes
-        notes += [f"note: {path.name}: {taken}, those of the training; --rows takes others."] if taken else []
+        notes += (
+            [f"note: {path.name}: {taken}, those of the training; --rows takes others."]
+            if taken
+            else []
+        )
     whole = Record.join([one.record for one in opened]) if len(opened) > 1 else opened[0].record
     return replace(opened[0], record=whole, notes=tuple(dict.fromkeys(notes)))
 
 
-def rows_taken(reading: Reading) -> str:
-    """Which rows of a file were trained on, where that is not all."""
-    return "rows " + " and ".join(f"{start}:{stop}" for start, stop in reading.rows) if reading.rows else ""
+def rows_taken(reading: ReadOptions) -> str:
+    """Return a text on the rows of a file that were trained on; empty where these are all."""
+    return (
+        "rows " + " and ".join(f"{start}:{stop}" for start, stop in reading.rows)
+        if reading.rows
+        else ""
+    )
 
 
 def open_run(
-    model: Path, data: Path, *, need_outputs: bool = False, reading: Reading | None = None, ahead: int = 0
+    model: Path,
+    data: Path,
+    *,
+    need_outputs: bool = False,
+    reading: ReadOptions | None = None,
+    ahead: int = 0,
 ) -> ModelOnData:
-    """Load a model and read its channels from a file; outputs only where the file has them, unless needed.
+    """Load a model and read its channels from a file.
+
+    Outputs are optional unless needed.
 
     Args:
-        ahead: rows behind the first usable one before a stretch between missing samples has a value.
+        ahead: rows behind the first usable one before a stretch between missing samples has a
+            value.
 
     Raises:
         InputError: no model, no file, missing columns, no stretch that is long enough.
@@ -133,12 +168,13 @@ def open_run(
     check_readable(data)
     from orthaug.models.storage import load
 
-    loaded, reading = load(model), reading or Reading()
+    loaded, reading = load(model), reading or ReadOptions()
     names = [c.name for c in (*loaded.inputs, *loaded.outputs)]
     for name in reading.columns:
         if name not in names:
             raise InputError(
-                f"--column: '{name}' is no channel of the model{nearest(name, names)}; it has {', '.join(names)}."
+                f"--column: '{name}' is no channel of the model{nearest(name, names)}; it has "
+                f"{', '.join(names)}."
             )
     if reading.prepare is None:
         check_instants(loaded, data)
@@ -147,22 +183,32 @@ def open_run(
         held = list(loaded.outputs)
     elif held:
         missing = [c.name for c in loaded.outputs if c not in held]
-        raise InputError(f"{data}: has some of the model's outputs but not {', '.join(missing)}; give all or none.")
+        raise InputError(
+            f"{data}: has some of the model's outputs but lacks {', '.join(missing)}; give all "
+            "or none."
+        )
     try:
         record = record_for(loaded, data, held, reading)
     except MissingSampleError as error:
         raise InputError(f"{error} --missing skip leaves such rows out.") from None
-    rows, told = len(record) + record.missing, prepared_notes(loaded, record if reading.prepare else None)
+    rows, notes = (
+        len(record) + record.missing,
+        prepared_notes(loaded, record if reading.prepare else None),
+    )
     if record.missing:
-        estimated = need_outputs and loaded.form.states and not loaded.form.memory  # a state to predict from
+        estimated = (
+            need_outputs and loaded.form.states and not loaded.form.memory
+        )  # a state to predict from
         first = loaded.form.first_row + ahead + bool(estimated)
         record, text = long_stretches(record, [0] * len(record.experiments), first)
-        told += (f"note: {data}: {text}",)
-    return ModelOnData(loaded, record, data, rows, told)
+        notes += (f"note: {data}: {text}",)
+    return ModelOnData(loaded, record, data, rows, notes)
 
 
-def record_for(model: Model | MotionModel, data: Path, outputs: Sequence[Channel], reading: Reading) -> Record:
-    """A model's inputs, and some outputs, from a file.
+def record_for(
+    model: Model | MotionModel, data: Path, outputs: Sequence[Channel], reading: ReadOptions
+) -> Record:
+    """Return a model's inputs, and some outputs, from a file.
 
     Raises:
         InputError: as `read_record`.
@@ -185,34 +231,42 @@ def record_for(model: Model | MotionModel, data: Path, outputs: Sequence[Channel
 
 
 def check_instants(model: Model | MotionModel, data: Path) -> None:
-    """Raise InputError for a model of data with other instants than their files: nobody said which these are."""
+    """Raise InputError where the file cannot give the instants that the model needs."""
     steps = [done.named for done in model.prepared if done.step in SAMPLING]
     if steps:
         raise InputError(
-            f"{data}: the model was fitted to data after {', '.join(steps)}; give --prepare for a file as it was "
-            f"measured, or --no-prepare for one that has a row every {model.sampling_time:g} s already."
+            f"{data}: the model was fitted to data after {', '.join(steps)}; give --prepare "
+            "for a file as it was measured, or --no-prepare for one that has a row every "
+            f"{model.sampling_time:g} s already."
         )
 
 
-def held_outputs(model: Model | MotionModel, data: Path, reading: Reading) -> list[Channel]:
-    """The outputs that a file has columns of."""
-    return [c for c in model.outputs if has_column(data, reading.columns.get(c.name, c.file_column))]
+def held_outputs(model: Model | MotionModel, data: Path, reading: ReadOptions) -> list[Channel]:
+    """Return the outputs that a file has columns for."""
+    return [
+        c for c in model.outputs if has_column(data, reading.columns.get(c.name, c.file_column))
+    ]
 
 
 _RAW = "The rows of this file are taken as they are; --prepare does the same to them."
 _DETRENDED = " Detrended signals are deviations from their trend in each file."
 
 
-def prepared_notes(model: Model | MotionModel, record: Record | None = None, what: str = _RAW) -> tuple[str, ...]:
-    """What to know of a model whose training data were prepared.
+def prepared_notes(
+    model: Model | MotionModel, record: Record | None = None, what: str = _RAW
+) -> tuple[str, ...]:
+    """Return notes on a model whose training data were prepared.
 
     Args:
-        record: other data that went through the same; what the steps found there is told.
-        what: stands behind the steps where there are no such data.
+        record: other data after the same steps, whose effects there are reported.
+        what: sentence after the steps where there are no such data.
     """
     if not model.prepared:
         return ()
-    named = f"note: the model was fitted to prepared data: {', '.join(done.named for done in model.prepared)}."
+    named = (
+        "note: the model was fitted to prepared data: "
+        f"{', '.join(done.named for done in model.prepared)}."
+    )
     trends = _DETRENDED if any(done.step == "detrend" for done in model.prepared) else ""
     if record is None:
         return (f"{named} {what}",)
@@ -222,22 +276,38 @@ def prepared_notes(model: Model | MotionModel, record: Record | None = None, wha
 
 
 def read_initial(initial: str | None, opened: ModelOnData) -> str | Any:
-    """The `initial` of `Model.simulate`: measured where the data have outputs, zero otherwise, or a CSV's rows."""
+    """Return the `initial` of `Model.simulate`.
+
+    It is "measured" where the data have outputs, "zero" otherwise, or the rows of a CSV.
+    """
     gaps, measured = len(opened.record.experiments) > 1, bool(opened.record.outputs)
     if gaps and not (measured and initial in (None, "measured")):
-        remedy = "leave --initial out" if measured else "a free run without measured outputs cannot go on behind them"
+        remedy = (
+            "leave --initial out"
+            if measured
+            else "a free run without measured outputs cannot continue after them"
+        )
         raise InputError(
-            f"{opened.source}: has missing samples, and each stretch starts from its own outputs; {remedy}."
+            f"{opened.source}: has missing samples, and each stretch starts from its own "
+            f"outputs; {remedy}."
         )
     if initial is None:
         return "measured" if measured else "zero"
     if initial in ("measured", "zero"):
         if initial == "measured" and not opened.record.outputs:
-            raise InputError(f"{opened.source}: has no measured outputs to start from; use --initial zero or a CSV.")
+            raise InputError(
+                f"{opened.source}: has no measured outputs to start from; use --initial zero "
+                "or a CSV."
+            )
         return initial
     if not Path(initial).suffix and "/" not in initial:
-        raise InputError(f"--initial: found '{initial}'; expected measured, zero, or a CSV file of the first outputs.")
-    record = read_record(initial, outputs=opened.model.outputs, sampling_time=opened.model.sampling_time)
+        raise InputError(
+            f"--initial: found '{initial}'; expected measured, zero, or a CSV file of the "
+            "first outputs."
+        )
+    record = read_record(
+        initial, outputs=opened.model.outputs, sampling_time=opened.model.sampling_time
+    )
     try:
         opened.model.check_initial(record.experiments[0].outputs)
     except InputError as error:
@@ -246,25 +316,26 @@ def read_initial(initial: str | None, opened: ModelOnData) -> str | Any:
 
 
 def notes(opened: ModelOnData, initial: str | None) -> list[str]:
-    """What a user may not expect of a free run: where it starts when nothing says so."""
+    """Return notes on a free run: where it starts when no initial state is given."""
     if initial is not None or opened.record.outputs or not opened.model.form.states:
         return [*opened.notes]
     names = ", ".join(channel.name for channel in opened.model.outputs)
     return [
         *opened.notes,
-        f"note: {opened.source} has no {names}: the free run starts from 0; --initial CSV gives other outputs.",
+        f"note: {opened.source} has no {names}: the free run starts from 0; --initial CSV "
+        "gives other outputs.",
     ]
 
 
 def with_initial(opened: ModelOnData, initial: str | Any) -> Record:
-    """The record with the outputs of its first rows replaced, for predictions that start from others."""
+    """Return the record with the outputs of its first rows replaced, as another initial state."""
     if isinstance(initial, str) and initial == "measured":
         return opened.record
     start = opened.model.form.first_row
     if opened.model.form.states and not opened.model.form.memory:
         raise InputError(
-            "--initial: found with a motion, whose predictions start from states that are estimated from the rows "
-            "before them; leave it out."
+            "--initial: found with a motion, whose predictions start from states that are "
+            "estimated from the rows before them; leave it out."
         )
     (experiment,) = opened.record.experiments
     outputs = experiment.outputs.copy()
@@ -274,22 +345,37 @@ def with_initial(opened: ModelOnData, initial: str | Any) -> Record:
 
 
 def open_ahead(
-    model: Path, data: Path, reading: Reading, horizon: int, initial: str | None, *, observer: bool = False
+    model: Path,
+    data: Path,
+    reading: ReadOptions,
+    horizon: int,
+    initial: str | None,
+    *,
+    observer: bool = False,
 ) -> ModelOnData:
-    """As `open_run` for predictions `horizon` steps ahead; an observer's record keeps missing outputs.
+    """Load a model and read its channels as `open_run`, for predictions `horizon` steps ahead.
+
+    An observer's record keeps missing outputs.
 
     Raises:
         InputError: as there; other first outputs for an observer.
     """
     if observer and initial is not None:
-        raise InputError("--initial: found with --observer, which estimates where it starts; leave one of them out.")
+        raise InputError(
+            "--initial: found with --observer, which estimates where it starts; leave one of "
+            "them out."
+        )
     reading = replace(reading, missing="keep") if observer else reading
     opened = open_run(model, data, need_outputs=True, reading=reading, ahead=max(horizon, 1) - 1)
-    return opened if observer else replace(opened, record=with_initial(opened, read_initial(initial, opened)))
+    return (
+        opened
+        if observer
+        else replace(opened, record=with_initial(opened, read_initial(initial, opened)))
+    )
 
 
 def observed(opened: ModelOnData, horizon: int) -> tuple[Response, list[str]]:
-    """The prediction `horizon` steps ahead from an observer's state, and whether its band is what it says."""
+    """Return the prediction `horizon` steps ahead from an observer's state, and notes."""
     from orthaug.analysis.observer import Observer
 
     observer = Observer(opened.model)
@@ -298,36 +384,53 @@ def observed(opened: ModelOnData, horizon: int) -> tuple[Response, list[str]]:
 
 
 def _of_band(found: Consistency, response: Response) -> list[str]:
-    """NIS with its interval where outputs were measured; a warning where it leaves that, for the band is then wrong."""
+    """Return the NIS with its interval where outputs were measured.
+
+    It is a warning outside of that interval, since the band is then wrong.
+    """
     from orthaug.models.response import BAND
 
-    apart = [(t.measured - t.model) / t.std for t in response.trajectories if t.measured is not None]
-    apart = np.concatenate([errors[np.isfinite(errors)] for errors in apart]) if apart else np.zeros(0)
+    apart = [
+        (t.measured - t.model) / t.std for t in response.trajectories if t.measured is not None
+    ]
+    apart = (
+        np.concatenate([errors[np.isfinite(errors)] for errors in apart]) if apart else np.zeros(0)
+    )
     if not np.isfinite(found.nis) or not len(apart):
         return []
     held, (low, high) = float(np.mean(np.abs(apart) <= BAND)), found.expected
-    told = (
-        f"the innovations' squares are {found.nis:.3g} times what the observer expects (NIS, {low:.3g} to {high:.3g} "
-        f"where it knows its noise); its 95 % band holds {percent(held, 3)} of what was measured."
+    text = (
+        f"the squared innovations are {found.nis:.3g} times as large as the observer expects "
+        f"(NIS; {low:.3g} to {high:.3g} with the right noises). Its 95 % band contains "
+        f"{percent(held, 3)} of the measured values."
     )
     if found.consistent:
-        return [f"note: {told}"]
-    why = "its noises are too small, or the model is wrong here" if found.nis > high else "its noises are too large"
+        return [f"note: {text}"]
+    why = (
+        "its noises are too small, or the model is wrong here"
+        if found.nis > high
+        else "its noises are too large"
+    )
     return [
-        f"warning: {told} Do not take the band for one of 95 %: {why}. oa.Observer(oa.load(MODEL)).tuned(record) finds "
-        "noises by the likelihood of a record."
+        f"warning: {text} Do not use the band as one of 95 %: {why}. "
+        "oa.Observer(oa.load(MODEL)).tuned(record) finds noises by the likelihood of a record."
     ]
 
 
 def warnings(response: Response) -> list[Warning]:
-    """Warnings about a response."""
-    told = "the free run diverged in output '{}' at step {}; it has no values from there on."
+    """Return warnings about a response."""
+    text = "the free run diverged in output '{}' at step {}; it has no values from there on."
     ends = (trajectory.diverged for trajectory in response.trajectories if trajectory.diverged)
-    return [Warning("free_run_diverged", told.format(output, step)) for step, output in ends]
+    return [Warning("free_run_diverged", text.format(output, step)) for step, output in ends]
 
 
-def write_csv(response: Response, opened: ModelOnData, out: Path | None, *, force: bool = False) -> None:
-    """One row per data row, empty cells where there is no value; to a file (whole or not at all) or standard output."""
+def write_csv(
+    response: Response, opened: ModelOnData, out: Path | None, *, force: bool = False
+) -> None:
+    """Write one row per data row, with empty cells where there is no value.
+
+    It goes to a file (whole or not at all) or standard output.
+    """
     frame = _table(response, opened)
     if out is None:
         frame.to_csv(sys.stdout, index=False)
@@ -337,14 +440,20 @@ def write_csv(response: Response, opened: ModelOnData, out: Path | None, *, forc
 
 
 def _table(response: Response, opened: ModelOnData) -> Any:
-    """The tables of all stretches in the rows of the file; of rows that were left out the time alone."""
+    """Return the tables of all stretches in the order of the file's rows.
+
+    Rows that were left out have their time only.
+    """
     stretches = opened.record.experiments
     frames = [response.to_frame(i) for i in range(len(stretches))]
     if len(stretches[0]) == opened.rows:
         return frames[0]
     import pandas as pd
 
-    placed = [frame.set_axis(range(e.offset, e.offset + len(e))) for frame, e in zip(frames, stretches, strict=True)]
+    placed = [
+        frame.set_axis(range(e.offset, e.offset + len(e)))
+        for frame, e in zip(frames, stretches, strict=True)
+    ]
     whole = pd.concat(placed).reindex(range(opened.rows))
     first = stretches[0]
     time = first.start_time + (np.arange(opened.rows) - first.offset) * response.sampling_time
@@ -352,22 +461,26 @@ def _table(response: Response, opened: ModelOnData) -> Any:
 
 
 def explain_notes(model: Path) -> list[str]:
-    """What to write beside proposed terms, where the result of the model has a map to physical parameters."""
+    """Return notes beside proposed terms, where the result has a map to physical parameters."""
     for content in results_beside(model):
         with suppress(AttributeError, KeyError, TypeError):
             if content["spec"].get("physics"):
                 return [
-                    "note: the spec has [physics]: a term from here also takes a line of [physics.theta], such as "
-                    'drag = "drag", its parameter in [physics.parameters] with that `initial`, and none in the term.'
+                    "note: the spec has [physics]. For a term from here add a line to "
+                    '[physics.theta], such as drag = "drag". Declare its parameter in '
+                    "[physics.parameters] with that `initial`, not in the term."
                 ]
     return []
 
 
-def explain_model(opened: ModelOnData, *, degree: int, functions: Sequence[str], most: int) -> ExplainResult:
-    """The content of the explanation of a model over its data.
+def explain_model(
+    opened: ModelOnData, *, degree: int, functions: Sequence[str], most: int
+) -> ExplainResult:
+    """Return the content of the explanation of a model over its data.
 
     Raises:
-        InputError: physics alone, data without what the learner is evaluated at, too many candidates.
+        InputError: physics alone, data without what the learner is evaluated at, too many
+            candidates.
     """
     from orthaug.analysis.hidden_state import structure_test
     from orthaug.commands.attempt import attempt
@@ -376,14 +489,18 @@ def explain_model(opened: ModelOnData, *, degree: int, functions: Sequence[str],
     from orthaug.selection.explanation import explain
 
     try:
-        explained = explain(opened.model, opened.record, degree=degree, functions=functions, most=most)
+        explained = explain(
+            opened.model, opened.record, degree=degree, functions=functions, most=most
+        )
     except InputError as error:
         raise type(error)(f"{opened.source}: {error}") from None
     result = ExplainResult.model_validate(explained)
     if not opened.record.outputs:
         return result
     failed: list[Any] = []
-    test = attempt("the search for memory", lambda: structure_test(opened.model, opened.record), failed, None)
+    test = attempt(
+        "the search for memory", lambda: structure_test(opened.model, opened.record), failed, None
+    )
     memory = [memory_result(one) for one in test.families if one.sure] if test is not None else []
     warnings = [*result.warnings, *map(WarningResult.model_validate, failed)]
     return result.model_copy(update={"memory": memory, "warnings": warnings})

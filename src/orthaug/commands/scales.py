@@ -1,4 +1,4 @@
-"""Channels whose numbers are of a size that hardly any unit has: the likely cause where a free run overflows."""
+"""Channels with numbers of an unlikely size: a probable cause where a free run overflows."""
 
 from __future__ import annotations
 
@@ -6,7 +6,10 @@ import numpy as np
 
 from orthaug.data.record import Record
 
-_SMALL, _LARGE = 1e-8, 1e8  # in the unit of a channel: beyond these a scale is more often wrong than right
+_SMALL, _LARGE = (
+    1e-8,
+    1e8,
+)  # in the unit of a channel: beyond these a scale is more often wrong than right
 _FAR = 1e5  # a mean so many times the spread is more often an offset than a signal
 
 
@@ -15,7 +18,9 @@ def describe_scales(record: Record) -> str:
     found = []
     for kind in ("outputs", "inputs"):
         for i, channel in enumerate(getattr(record, kind)):
-            values = np.concatenate([getattr(experiment, kind)[:, i] for experiment in record.experiments])
+            values = np.concatenate(
+                [getattr(experiment, kind)[:, i] for experiment in record.experiments]
+            )
             if not np.isfinite(values).any():
                 continue
             middle, spread = float(np.nanmean(values)), float(np.nanstd(values))
@@ -23,8 +28,13 @@ def describe_scales(record: Record) -> str:
             if spread and not _SMALL < spread < _LARGE:
                 found.append(f"{channel.name} varies by {spread:.3g}{unit}")
             elif spread and abs(middle) > _FAR * spread:
-                found.append(f"{channel.name} varies by {spread:.3g}{unit} about {middle:.3g}{unit}")
+                found.append(
+                    f"{channel.name} varies by {spread:.3g}{unit} about {middle:.3g}{unit}"
+                )
     if not found:
         return ""
     named = ", ".join(found)
-    return f"in the data {named}: check `scale`, `offset` and `unit` in [data.channels] against the initial values."
+    return (
+        f"in the data {named}: check `scale`, `offset` and `unit` in [data.channels] against "
+        "the initial values."
+    )

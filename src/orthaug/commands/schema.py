@@ -1,4 +1,4 @@
-"""What `orthaug schema` prints: every key of a spec in words, and JSON schemas of specs and of all results."""
+"""Output of `orthaug schema`: the keys of a spec in words, JSON schemas of specs and results."""
 
 from __future__ import annotations
 
@@ -25,23 +25,23 @@ RESULTS: dict[str, type[Content]] = {
     "linearize": LinearizeResult,
     "track": TrackResult,
 }
-"""By command."""
+"""Contents of results by command."""
 
 
 def schema_of(command: str) -> dict[str, Any]:
-    """The JSON schema of what a command writes."""
+    """Return the JSON schema of what a command writes."""
     return RESULTS[command].model_json_schema(mode="serialization")
 
 
 def keys_of_a_spec() -> str:
-    """docs/spec.md, which a wheel carries beside this file, and a checkout in its folder docs."""
+    """Return docs/spec.md: a wheel has it beside this file, a checkout in its folder docs."""
     carried = files("orthaug.commands").joinpath("spec.md")
     page = carried if carried.is_file() else Path(__file__).parents[3] / "docs" / "spec.md"
     return re.sub("<!--.*-->\n", "", page.read_text(encoding="utf-8")).rstrip()
 
 
 def schema_of_a_spec() -> dict[str, Any]:
-    """Keys, types, limits and defaults."""
+    """Return the JSON schema of a spec: keys, types, limits and defaults."""
     from orthaug.commands.spec import Spec
 
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **Spec.model_json_schema()}

@@ -1,6 +1,6 @@
-"""Tables of the spec as pydantic models: their common base, and the keys that a registry's kinds declare.
+"""Tables of the spec as pydantic models: a common base, and the keys of the kinds in a registry.
 
-What is wrong with one is told in one sentence: pydantic's complaints in the words of TOML.
+An error is one sentence: pydantic's message in the words of TOML.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
 from orthaug._base.checks import nearest
 from orthaug._base.errors import KeyedError, cut
-from orthaug._base.registry import InSpec, Key, OneOf, Option, Registry
+from orthaug._base.registry import Key, OneOf, Option, Registry, SpecLimit
 from orthaug.physics.parameters import PhysicalParameter
 
 Count = Annotated[int, Field(ge=0, strict=True)]
@@ -40,23 +40,29 @@ class PhysicalSection(Section):
     max: Finite | None = None
 
     def declared(self, name: str) -> PhysicalParameter:
-        """The parameter of this name."""
-        low, high = -math.inf if self.min is None else self.min, math.inf if self.max is None else self.max
+        """Return the parameter of this name."""
+        low, high = (
+            -math.inf if self.min is None else self.min,
+            math.inf if self.max is None else self.max,
+        )
         return PhysicalParameter(name, self.initial, self.unit, low, high)
 
 
 class KindSection(Section):
-    """A table whose keys are those of the kinds in a registry; keys of kinds that are not chosen have no effect."""
+    """A table whose keys are those of the kinds in a registry.
+
+    Keys of kinds that are not chosen have no effect.
+    """
 
     registries: ClassVar[Mapping[str, Registry]] = {}
-    """By the key that chooses a kind."""
+    """The registries, by the key that chooses a kind."""
 
     if TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> Any: ...
 
     def declared(self, registry: Registry, kind: str) -> Any:
-        """The declaration of a kind with the keys that the file gives."""
+        """Return the declaration of a kind with the keys that the file gives."""
         return registry.declare(kind, {name: getattr(self, name) for name in self.model_fields_set})
 
     @model_validator(mode="after")
@@ -70,7 +76,7 @@ Kinds = TypeVar("Kinds", bound=KindSection)
 
 
 def with_kinds(section: type[Kinds], **other: Any) -> type[Kinds]:
-    """A section with the keys of all kinds of its registries.
+    """Return a section with the keys of all kinds of its registries.
 
     Args:
         section: has each key that chooses a kind, with the default kind.
@@ -84,25 +90,36 @@ def with_kinds(section: type[Kinds], **other: Any) -> type[Kinds]:
 
 
 def _field(key: Key) -> tuple[Any, Any]:
-    """A key as pydantic's type and default; one that its kind needs is None where another kind is chosen."""
+    """Return a key as pydantic's type and default.
+
+    A required key is None where another kind is chosen.
+    """
     if key.default is MISSING:
         return Union[_in_file(key.annotation), None], None  # noqa: UP007  (the parts are known at run time only)
     return _in_file(key.annotation), _thawed(key.default)
 
 
 def _in_file(annotation: Any) -> Any:
-    """The type of what a file holds for a declaration's type: lists for tuples, finite numbers."""
+    """Return the type in a file for a type in a declaration: lists for tuples, finite numbers."""
     origin, inner = typing.get_origin(annotation), typing.get_args(annotation)
     if origin is Annotated:
         limits = []
         for limit in annotation.__metadata__:
             if isinstance(limit, OneOf):
                 return Literal[tuple(limit.choices)]
-            limits += [limit.limit] if isinstance(limit, InSpec) else [] if isinstance(limit, Option) else [limit]
+            limits += (
+                [limit.limit]
+                if isinstance(limit, SpecLimit)
+                else []
+                if isinstance(limit, Option)
+                else [limit]
+            )
         plain = _in_file(inner[0])
         return Annotated[(plain, *limits)] if limits else plain  # type: ignore[return-value]
     if origin is tuple and inner[-1] is not Ellipsis:
-        return Annotated[list[_in_file(inner[0])], Field(min_length=len(inner), max_length=len(inner))]
+        return Annotated[
+            list[_in_file(inner[0])], Field(min_length=len(inner), max_length=len(inner))
+        ]
     if origin in (tuple, list, Sequence):
         return list[_in_file(inner[0])]
     if origin is Mapping:
@@ -113,16 +130,21 @@ def _in_file(annotation: Any) -> Any:
 
 
 def _thawed(value: Any) -> Any:
-    """Tuples as lists, as files hold them."""
+    """Return a value with tuples as lists, as files hold them."""
     if isinstance(value, tuple | list):
         return [_thawed(item) for item in value]
-    return {name: _thawed(item) for name, item in value.items()} if isinstance(value, Mapping) else value
+    return (
+        {name: _thawed(item) for name, item in value.items()}
+        if isinstance(value, Mapping)
+        else value
+    )
 
 
 def first_message(error: ValidationError, content: dict[str, Any], model: type[BaseModel]) -> str:
-    """The first error as `key: found …; expected …`."""
+    """Return the first error as `key: found …; expected …`."""
     errors = error.errors()
-    # every branch of a union complains: the branch was meant whose type fits, and there the deepest complaint counts
+    # every branch of a union has errors: the branch whose type fits was meant, and there the
+    # deepest error counts
     fitting = [e for e in errors if not e["type"].endswith("_type")]
     first = max(fitting or errors[:1], key=lambda e: len(e["loc"]))
     key = _key(first["loc"], content)
@@ -130,7 +152,9 @@ def first_message(error: ValidationError, content: dict[str, Any], model: type[B
     if kind == "extra_forbidden":
         *parents, name = [part for part in first["loc"] if isinstance(part, str | int)]
         known = _known_keys(parents, model)
-        return f"unknown key '{key}'{nearest(str(name), known) or ', known are ' + ', '.join(known)}"
+        return (
+            f"unknown key '{key}'{nearest(str(name), known) or ', known are ' + ', '.join(known)}"
+        )
     if kind == "missing":
         return f"the key '{key}' is missing"
     if kind == "value_error":
@@ -145,26 +169,34 @@ def first_message(error: ValidationError, content: dict[str, Any], model: type[B
 
 
 def _shown(value: Any) -> str:
-    """A value as the file writes it, cut where it is long."""
+    """Return a value as the file writes it, cut where it is long."""
     try:
-        text = json.dumps(value, default=str, ensure_ascii=False).replace("Infinity", "inf").replace("NaN", "nan")
+        text = (
+            json.dumps(value, default=str, ensure_ascii=False)
+            .replace("Infinity", "inf")
+            .replace("NaN", "nan")
+        )
     except RecursionError:
         return "what is nested too deeply"
     return cut(text)
 
 
 def _plain(message: str) -> str:
-    """Pydantic's words in those of TOML."""
+    """Return a message of pydantic in the words of TOML."""
     if "at least 1 item" in message or "at least 1 character" in message:
         return "at least one entry" if "item" in message else "some text"
     if "after validation" in message:
         return "two numbers, [start, stop]"
-    message = message.removeprefix("Input should be ").replace("a valid ", "a ").replace("a integer", "an integer")
+    message = (
+        message.removeprefix("Input should be ")
+        .replace("a valid ", "a ")
+        .replace("a integer", "an integer")
+    )
     return "a table" if "dictionary" in message else message
 
 
 def _key(location: tuple[Any, ...], content: Any) -> str:
-    """The key's path in the file; pydantic's names of union branches are not part of it."""
+    """Return the key's path in the file, without pydantic's names of union branches."""
     text = ""
     for i, part in enumerate(location):
         if isinstance(part, int):
@@ -177,7 +209,7 @@ def _key(location: tuple[Any, ...], content: Any) -> str:
 
 
 def _known_keys(parents: list[Any], model: Any) -> list[str]:
-    """The keys of the section at a path such as ["data", "tests", "steps"]."""
+    """Return the keys of the section at a path such as ["data", "tests", "steps"]."""
     for part in parents:
         if isinstance(part, int) or not isinstance(model, type):
             continue
@@ -187,7 +219,7 @@ def _known_keys(parents: list[Any], model: Any) -> list[str]:
 
 
 def _section_of(annotation: Any) -> Any:
-    """The section inside an annotation such as `dict[str, PartSection] | None`."""
+    """Return the section inside an annotation such as `dict[str, PartSection] | None`."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
     for inner in getattr(annotation, "__args__", ()):

@@ -1,17 +1,18 @@
-"""The structure for a spec: what `orthaug select` does."""
+"""Selection of the structure of a spec: what `orthaug select` does."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import tomlkit
 
 from orthaug._base.errors import InputError
 from orthaug._base.folders import whole_folder
+from orthaug.commands.chosen_rows import cut, parts_of
 from orthaug.commands.data_sections import EngineSection, engine_of
 from orthaug.commands.folder import relative
 from orthaug.commands.lagged_job import LaggedJob, open_lagged
@@ -20,30 +21,31 @@ from orthaug.data.regressors import Lags
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.kinds import CRITERIA
 from orthaug.models.kinds import LEARNERS
-from orthaug.models.learners import Learner
+from orthaug.models.learners import MLP, Learner
 from orthaug.models.terms import Terms
 from orthaug.reports.selection import SelectResult
+from orthaug.selection.parts import CONDITIONAL, Parts
 
 if TYPE_CHECKING:
     from orthaug.selection.kept_physics import Shift
-    from orthaug.selection.selecting import Selection, Told
+    from orthaug.selection.selecting import OnStage, Selection
 
-_DEGREE = 3  # of the terms that a spec without [learner] is searched with
+_DEGREE = 3  # of the terms to search where a spec has no [learner]
 
 
 @dataclass(frozen=True, eq=False)
-class Selected:
-    """A job, what was selected for it, and the result that is written."""
+class SelectionReport:
+    """A job, its selected structure, and the result that is written."""
 
     job: LaggedJob
     selection: Selection
     result: SelectResult
     spec: str
-    """The spec with the choice, for its folder."""
+    """The spec with the selection, for its folder."""
 
 
 def open_select(path: Path) -> tuple[LaggedJob, Spec]:
-    """The job of a spec's physics alone, and the spec as it was given.
+    """Return the job of a spec's physics alone, and the spec as it was given.
 
     Raises:
         InputError: a motion, and anything wrong with spec, files or physics.
@@ -51,27 +53,33 @@ def open_select(path: Path) -> tuple[LaggedJob, Spec]:
     spec = load_spec(path)
     if spec.motion is not None:
         raise InputError(
-            f"{path}: structure is selected for lagged signals; for a motion declare a learner of terms "
-            '(kind = "terms"), or a network, and ask `orthaug explain` what it found.'
+            f"{path}: structure is selected for lagged signals; for a motion declare a learner of "
+            'terms (kind = "terms"), or a network, and ask `orthaug explain` what it found.'
         )
     if spec.engine.kind not in ("auto", "memory", "dask"):
-        raise InputError(f"{path}: `engine.kind`: found {spec.engine.kind}; expected memory, or dask, to select.")
-    parts = {"learner": LearnerSection(kind="none"), "lags": None, "engine": EngineSection(kind="memory")}
+        raise InputError(
+            f"{path}: `engine.kind`: found {spec.engine.kind}; expected memory, or dask, to select."
+        )
+    parts = {
+        "learner": LearnerSection(kind="none"),
+        "lags": None,
+        "engine": EngineSection(kind="memory"),
+    }
     alone = spec.model_copy(update=parts)
     return open_lagged(path, alone), spec
 
 
-def select_for(job: LaggedJob, spec: Spec, folder: Path, told: Told) -> Selected:
-    """Select, and write the choice into the spec.
+def select_for(job: LaggedJob, spec: Spec, folder: Path, report_model: OnStage) -> SelectionReport:
+    """Select the structure, and write the choice into the spec.
 
     Args:
-        folder: where the new spec will be; its paths are relative to that.
-        told: called with the stage and each model that was judged.
+        folder: of the new spec; its paths are relative to that.
+        report_model: called with the stage and each model that was judged.
 
     Raises:
-        InputError: what cannot be selected from.
+        InputError: data or physics that selection does not support.
     """
-    from orthaug.selection.selecting import MOST, WIDTHS, select
+    from orthaug.selection.selecting import MOST, WIDTHS, lagged_rows, select
 
     section, began = spec.selection, time.monotonic()
     options: dict[str, Any] = {
@@ -81,30 +89,34 @@ def select_for(job: LaggedJob, spec: Spec, folder: Path, told: Told) -> Selected
         "widths": section.hidden or WIDTHS,
         "most": MOST if section.terms is None else section.terms,
         "blocks": section.blocks,
-        "halves": section.halves,
         "collinear": section.collinear,
+        "level": section.level,
     }
-    if section.halves and len(job.train.record.experiments) != 1:
-        raise InputError(f"{job.path}: 'selection.halves' needs training data of one experiment, to be cut in two.")
+    halves = None if section.halves == "auto" else section.halves
+    network = isinstance(options["learner"], MLP)
+    lags = lagged_rows(job.problem, options["lags"])
+    parts = parts_of(job, job.problem.baseline, lags, halves, network=network)
     options["engine"] = engine_of(spec.engine, "dask") if spec.engine.kind == "dask" else None
     try:
-        selection = select(job.train.record, job.problem.baseline, **options, progress=told)
+        selection = select(
+            job.train.record, job.problem.baseline, **options, halves=parts, progress=report_model
+        )
     except InputError as error:
         raise InputError(f"{job.path}: {error}") from None
     result = _result(job, selection, time.monotonic() - began)
-    return Selected(job, selection, result, _new_spec(job, folder, selection, halved=section.halves))
+    return SelectionReport(job, selection, result, _new_spec(job, folder, selection, parts))
 
 
 def steps_at_most(terms: int | None) -> int:
-    """How many models the path of terms has at most, forward."""
+    """Return the largest number of models on the path of terms, forward."""
     from orthaug.selection.selecting import MOST
     from orthaug.selection.term_path import steps
 
     return steps(MOST if terms is None else terms)
 
 
-def write_selected(selected: Selected, folder: Path, *, force: bool = False) -> None:
-    """result.json, spec.toml, table.csv and the figure, whole or not at all."""
+def write_selected(selected: SelectionReport, folder: Path, *, force: bool = False) -> None:
+    """Write result.json, spec.toml, table.csv and the figure, whole or not at all."""
     from orthaug.reports.drawing import save
     from orthaug.reports.plots import selection_figure
 
@@ -118,7 +130,7 @@ def write_selected(selected: Selected, folder: Path, *, force: bool = False) -> 
 
 
 def _learner(spec: Spec) -> Learner | None:
-    """What is searched: the declared learner, or terms where none is declared."""
+    """Return the learner to search: the declared one, or terms where none is declared."""
     if "learner" not in spec.model_fields_set:
         return Terms(degree=_DEGREE)
     declared = spec.learner.declared(LEARNERS, spec.learner.kind)
@@ -126,7 +138,7 @@ def _learner(spec: Spec) -> Learner | None:
 
 
 def _largest(spec: Spec) -> Lags | None:
-    """The largest orders: of [selection], or of [lags]."""
+    """Return the largest orders: of [selection], or of [lags]."""
     section, lags = spec.selection, spec.lags
     if section.na is None and section.nb is None and section.nk is None:
         return spec.lag_orders()
@@ -140,14 +152,15 @@ def _largest(spec: Spec) -> Lags | None:
 
 
 def _criterion(spec: Spec) -> Criterion:
-    """The declared one; the free run where the spec does not say."""
+    """Return the declared criterion; the free run where the spec has none."""
     focus = "simulation" if spec.training.focus == "auto" else spec.training.focus
     return spec.training.declared(CRITERIA, focus)
 
 
 def _result(job: LaggedJob, selection: Selection, seconds: float) -> SelectResult:
     orders, test, learner = selection.orders.chosen, selection.nonlinearity, selection.learner
-    shares, physics = selection.shares, selection.physics
+    shares, physics, confirmed = selection.shares, selection.physics, selection.confirmed
+    rates = {} if selection.terms is None else selection.terms.rates()
     terms = learner.terms if isinstance(learner, Terms) else ()
     content = {
         "data": job.data,
@@ -155,10 +168,29 @@ def _result(job: LaggedJob, selection: Selection, seconds: float) -> SelectResul
         "delays": selection.delays,
         "nonlinearity": None
         if test is None
-        else {"p": test.p, "regressors": test.regressors, "matter": list(test.matter), "text": str(test)},
+        else {
+            "p": test.p,
+            "regressors": test.regressors,
+            "matter": list(test.matter),
+            "text": str(test),
+        },
         "learner": _declared(learner),
         "focus": CRITERIA.kind_of(selection.criterion),
-        "terms": [{"term": t, "chosen": shares.get(t), "left": physics and physics.left.get(t)} for t in terms] or None,
+        "terms": [
+            {
+                "term": t,
+                "chosen": shares.get(t),
+                "left": physics and physics.left.get(t),
+                "rate": rates.get(t),
+                "p": confirmed[t].p if t in confirmed else None,
+                "q": confirmed[t].q if t in confirmed else None,
+                "rivals": list(selection.rivals.get(t, ())),
+            }
+            for t in terms
+        ]
+        or None,
+        "intervals": selection.intervals,
+        "level": selection.level,
         "physics": physics and [_moved(shift) for shift in physics.shifts],
         "condition": physics and physics.condition,
         "models": selection.table.to_dict("records"),
@@ -170,7 +202,12 @@ def _result(job: LaggedJob, selection: Selection, seconds: float) -> SelectResul
 
 
 def _moved(shift: Shift) -> dict[str, Any]:
-    own = {"parameter": shift.parameter, "unit": shift.unit, "left": shift.left, "moved": shift.moved}
+    own = {
+        "parameter": shift.parameter,
+        "unit": shift.unit,
+        "left": shift.left,
+        "moved": shift.moved,
+    }
     values = {
         "before": shift.before,
         "before_std": shift.before_std,
@@ -181,7 +218,7 @@ def _moved(shift: Shift) -> dict[str, Any]:
 
 
 def _declared(learner: Learner | None) -> dict[str, Any] | None:
-    """The section [learner] of a choice."""
+    """Return the section [learner] of a choice."""
     if learner is None:
         return None
     if isinstance(learner, Terms):
@@ -190,17 +227,14 @@ def _declared(learner: Learner | None) -> dict[str, Any] | None:
     return {"kind": "mlp", "hidden": list(learner.hidden), "activation": learner.activation} | seen  # type: ignore[attr-defined]
 
 
-def _new_spec(job: LaggedJob, folder: Path, selection: Selection, *, halved: bool) -> str:
-    """The spec with the choice in it; comments and order are kept, paths made relative to the new folder."""
+def _new_spec(job: LaggedJob, folder: Path, selection: Selection, parts: Parts) -> str:
+    """Return the spec with the choice in it.
+
+    Comments and order are kept, paths made relative to the new folder.
+    """
     path = job.path
     document: Any = tomlkit.parse(path.read_text(encoding="utf-8-sig"))
     _rebase(document, path.parent, folder)
-    if halved:  # the half that the choice was not made on
-        train = document["data"]["train"]
-        every, rows = train.get("every", 1), np.ravel(train.get("rows") or [0])
-        first = int(rows[0])
-        cut = first + every * (len(job.train.record) - len(selection.record))
-        train["rows"] = [cut, first + every * len(job.train.record)]
     learner, orders = _declared(selection.learner), selection.reach or selection.orders.chosen
     document["lags"] = tomlkit.item({"na": orders.na, "nb": list(orders.nb), "nk": list(orders.nk)})
     document["learner"] = tomlkit.item(learner or {"kind": "none"})
@@ -208,20 +242,50 @@ def _new_spec(job: LaggedJob, folder: Path, selection: Selection, *, halved: boo
         document["learner"]["terms"].multiline(True)
     training = document.setdefault("training", tomlkit.table())
     training["focus"] = CRITERIA.kind_of(selection.criterion)
-    if learner is None or learner["kind"] == "terms":  # linear in its weights: one start, and no prior
+    if (
+        learner is None or learner["kind"] == "terms"
+    ):  # linear in its weights: one start, and no prior
         training["regularization"] = "none"
         training["restarts"] = 1
         training["fallback"] = False  # physics alone was judged beside it
     elif training.get("regularization") is None:
         training["regularization"] = "evidence"
+    _say_rows(document, job, folder, selection, parts)
     head = f"# Selected by orthaug from {path.name}: {orders}. The other models are in table.csv.\n"
     return head + tomlkit.dumps(document)
 
 
+def _say_rows(
+    document: Any, job: LaggedJob, folder: Path, selection: Selection, parts: Parts
+) -> None:
+    """Write which rows chose the terms, and have the others fitted."""
+    section = document.setdefault("selection", tomlkit.table())
+    section.pop("chosen_on", None)
+    if selection.learner is None or parts.intervals is CONDITIONAL:
+        return
+    chosen, fitted = (
+        {**one.declared, "files": _from(folder, job, one.files)} for one in cut(job, parts)
+    )
+    if parts.fitted is not parts.chooses:
+        document["data"]["train"].update(fitted)
+    table = tomlkit.inline_table()
+    table.update(chosen)
+    section["chosen_on"] = table
+    section["chosen_on"].comment("where `data.train` has rows of these, a fit has no intervals")
+
+
+def _from(folder: Path, job: LaggedJob, files: Sequence[str]) -> list[str]:
+    """Return files of the job's spec as seen from another folder."""
+    old = job.path.parent
+    return [file if Path(file).is_absolute() else relative(old / file, folder) for file in files]
+
+
 def _rebase(table: Any, old: Path, new: Path) -> None:
-    """Make every list `files` relative to another folder."""
+    """Rewrite every list `files` relative to another folder."""
     for key, value in table.items():
         if isinstance(value, dict):
             _rebase(value, old, new)
         elif key == "files" and isinstance(value, list):
-            table[key] = [file if Path(file).is_absolute() else relative(old / file, new) for file in value]
+            table[key] = [
+                file if Path(file).is_absolute() else relative(old / file, new) for file in value
+            ]

@@ -1,8 +1,9 @@
 """Signals that end the program: Ctrl-C, a request to terminate, a terminal that is closed.
 
-A thread waits for them, so that the program ends at once, whatever compiled code runs: what is partial is removed, one
-line says so, and the exit code is 128 and the signal's number. An exception in the main thread would come late, or
-inside a callback of JAX, which swallows it and prints a traceback instead.
+A thread waits for them, so that the program ends at once, whatever compiled code runs: what is
+partial is removed, one line says so, and the exit code is 128 and the signal's number. An exception
+in the main thread would come late, or inside a callback of JAX, which swallows it and prints a
+traceback instead.
 
 Little is imported here: signals may come while everything else is being imported.
 """
@@ -29,17 +30,32 @@ def _nothing() -> str:
     return ""
 
 
-class Watch:
-    """Ends the program on a signal, once it is started; before that, signals do what they always do."""
+def ending(words: str, during: str, kept: str = "", then: str = "") -> str:
+    """Return the message of an early end: what was stopped, what is written, how to continue."""
+    return (
+        f"{words}{during and f' during {during}'}; {kept or 'nothing'} is "
+        f"written{then and f'. {then}'}"
+    )
+
+
+class SignalWatch:
+    """A watch that ends the program on a signal, once it is started.
+
+    Before that, signals have their usual effect.
+    """
 
     def __init__(self) -> None:
         self.active = self.ending = False
         self._during: Callable[[], str] = _nothing
         self._stop: Callable[[], Any] = _nothing
+        self._then = ""
         self._asked: threading.Event | None = None
 
     def start(self) -> None:
-        """Wait for signals from now on. Those that the program is to ignore, as `nohup` asks, are ignored."""
+        """Begin to wait for signals.
+
+        Signals that `nohup` made the program ignore stay ignored.
+        """
         if os.name != "posix":  # elsewhere Ctrl-C is an exception in the main thread
             return
         reader, writer = os.pipe()
@@ -53,17 +69,23 @@ class Watch:
         _thread.start_new_thread(self._wait, (reader,))
 
     @contextmanager
-    def telling(self, during: Callable[[], str], stop: Callable[[], Any]) -> Iterator[None]:
-        """Say what a signal stopped, and stop drawing before that."""
-        self._during, self._stop = during, stop
+    def reporting(
+        self, during: Callable[[], str], stop: Callable[[], Any] = _nothing, then: str = ""
+    ) -> Iterator[None]:
+        """Say what a signal stopped and how to go on, `then`, and stop drawing before that."""
+        self._during, self._stop, self._then = during, stop, then
         try:
             yield
         finally:
             self._during = self._stop = _nothing
+            self._then = ""
 
     @contextmanager
     def asking(self) -> Iterator[threading.Event]:
-        """The first Ctrl-C sets the event, for whoever can stop with what there is; the next ends the program."""
+        """Yield an event that the first Ctrl-C sets, for work that can stop with a partial result.
+
+        A second one ends the program.
+        """
         import threading
 
         self._asked = threading.Event()
@@ -73,7 +95,7 @@ class Watch:
             self._asked = None
 
     def hold(self) -> None:
-        """Do not go on where the program is about to end: what fails then fails because of that."""
+        """Wait where the program is about to end: an error then is only a consequence."""
         while self.ending:
             time.sleep(1.0)
 
@@ -95,9 +117,14 @@ class Watch:
                 partials.discard_all()
             kept = ", ".join(str(path) for path in getattr(partials, "placed", ()) if path.exists())
             self._stop_drawing()
-            line = f"{words}{f' during {during}' if during else ''}; {kept or 'nothing'} is written\n"
+            line = ending(words, during, kept, self._then) + "\n"
             with suppress(OSError):
-                os.write(2, line.encode("utf-8" if sys.stderr is None else sys.stderr.encoding, "backslashreplace"))
+                os.write(
+                    2,
+                    line.encode(
+                        "utf-8" if sys.stderr is None else sys.stderr.encoding, "backslashreplace"
+                    ),
+                )
         finally:
             os._exit(128 + number)
 
@@ -117,7 +144,10 @@ class Watch:
 
 
 def _leave_to_the_thread(number: int, frame: object) -> None:
-    """Python must have a handler, or the signal ends the process before the thread hears of it."""
+    """Install a handler that does nothing: the thread receives the signal.
+
+    Without a handler Python ends the process before the thread hears of it.
+    """
 
 
-WATCH = Watch()  # of the process, as its signals are
+WATCH = SignalWatch()  # of the process, as its signals are

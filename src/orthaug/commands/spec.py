@@ -1,7 +1,8 @@
 """The spec file: TOML in, checked declarations out.
 
-The sections [learner], [structure], [structure.measure] and [training] have the keys that the registered kinds
-declare. Every error is one line that names the file, the key, what was found and what was expected.
+The sections [learner], [structure], [structure.measure] and [training] have the keys that the
+registered kinds declare. Every error is one line that names the file, the key, what was found and
+what was expected.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from pydantic import Field, ValidationError, create_model, model_validator
 
 from orthaug._base.errors import InputError
 from orthaug._base.registry import resolve
-from orthaug.commands.data_sections import Data, EngineSection, MotionSection
+from orthaug.commands.data_sections import Data, EngineSection, MotionSection, Range
 from orthaug.commands.sections import (
     Count,
     Finite,
@@ -45,11 +46,14 @@ from orthaug.physics.baseline import Baseline, Term
 from orthaug.physics.parameters import PhysicsMap
 
 Orders = Count | list[Count]
-Regularization = Literal["none", "evidence", "ard"] | Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Regularization = (
+    Literal["none", "evidence", "ard"] | Annotated[float, Field(ge=0, allow_inf_nan=False)]
+)
 
 _BESIDE_MOTION = {
-    "baseline": "expected one of them, for both are the physics",
-    "lags": "expected none, for a motion has states instead; `learner.inputs` says what its learner sees",
+    "baseline": "expected one of them, because both are the physics",
+    "lags": "expected none, because a motion has states instead; `learner.inputs` declares the "
+    "inputs of its learner",
     "physics": "expected none, for the parameters of a motion are physical: [motion.parameters]",
 }
 
@@ -87,7 +91,7 @@ class BaselineSection(Section):
 
 
 class PhysicsSection(Section):
-    """What θ is made of."""
+    """Physical parameters, and the expressions of θ in them."""
 
     parameters: Annotated[dict[str, PhysicalSection], Field(min_length=1)]
     theta: Annotated[dict[str, str], Field(min_length=1)]
@@ -144,7 +148,7 @@ class MeasureSection(KindSection):
 
 
 class StructureSection(KindSection):
-    """How physics and learner share the fitted function."""
+    """The structure: how physics and learner share the fitted function."""
 
     registries = {"kind": STRUCTURES}
     kind: str = "orthogonal"
@@ -161,24 +165,39 @@ class TrainingSection(KindSection):
     ensemble: bool = False
     fallback: bool = True
     seed: Annotated[int, Field(ge=0, lt=2**63, strict=True)] = 0
-    regularization: Literal["auto"] | Regularization | Annotated[list[Regularization], Field(min_length=1)] = "auto"
+    regularization: (
+        Literal["auto"] | Regularization | Annotated[list[Regularization], Field(min_length=1)]
+    ) = "auto"
     output_weights: str | list[float] = "auto"
 
     @model_validator(mode="after")
     def _check(self) -> TrainingSection:
         check_starts(self.restarts, self.seed, ensemble=self.ensemble)
-        solver, criterion = self.declared(SOLVERS, self.solver), self.declared(CRITERIA, self.chosen_focus())
+        solver, criterion = (
+            self.declared(SOLVERS, self.solver),
+            self.declared(CRITERIA, self.chosen_focus()),
+        )
         check_solver(solver, criterion, _as_list(self.regularization))
         return self
 
     def chosen_focus(self) -> str:
-        """Return the focus; `prediction` where `horizon` asks for more than one step ahead and no focus is written."""
+        """Return the focus of training.
+
+        `prediction` where `horizon` asks for more than one step ahead and no focus is written.
+        """
         ahead = "focus" not in self.model_fields_set and getattr(self, "horizon", 1) > 1
         return "prediction" if ahead else self.focus
 
 
+class ChosenOnSection(Section):
+    """The rows that `orthaug select` chose terms on, which it writes."""
+
+    files: Annotated[list[str], Field(min_length=1)]
+    rows: Range | Annotated[list[Range], Field(min_length=1)] | None = None
+
+
 class SelectionSection(Section):
-    """What `orthaug select` looks through: the largest orders, terms at most, widths, blocks held out; and on what."""
+    """Limits of `orthaug select`: the largest orders, terms at most, widths, blocks held out."""
 
     na: Count | None = None
     nb: Orders | None = None
@@ -186,8 +205,10 @@ class SelectionSection(Section):
     terms: Count | None = None
     hidden: Annotated[list[Positive], Field(min_length=1)] | None = None
     blocks: Annotated[int, Field(ge=2, strict=True)] = 5
-    halves: bool = False
+    halves: Literal["auto"] | bool = "auto"
     collinear: Annotated[float, Field(ge=0, lt=1)] = 0.05
+    level: Annotated[float, Field(gt=0, le=1)] = 0.05
+    chosen_on: ChosenOnSection | None = None
 
 
 class ValidationSection(Section):
@@ -216,23 +237,34 @@ class Spec(Section):
     @model_validator(mode="after")
     def _one_physics(self) -> Spec:
         if self.motion is None and self.baseline is None:
-            raise ValueError("the key 'baseline' is missing; expected [[baseline.terms]], or a [motion] instead")
+            raise ValueError(
+                "the key 'baseline' is missing; expected [[baseline.terms]], or a [motion] instead"
+            )
         for name in ("baseline", "lags", "physics") if self.motion is not None else ():
             if name in self.model_fields_set:
                 raise ValueError(f"`{name}`: found beside [motion]; {_BESIDE_MOTION[name]}")
         wrong = {"output"} if self.motion is not None else {"equation", "factor", "unit"}
         for i, section in enumerate(self.suspects):
             for key in sorted(section.model_fields_set & wrong):
-                told = "beside [motion]; expected `equation`" if self.motion else "without [motion], whose key it is"
-                raise ValueError(f"`suspects[{i}].{key}`: found {told}")
+                found = (
+                    "beside [motion]; expected `equation`"
+                    if self.motion
+                    else "without [motion], which it belongs to"
+                )
+                raise ValueError(f"`suspects[{i}].{key}`: found {found}")
         if self.motion is not None and self.training.ensemble:
-            raise ValueError("`training.ensemble`: a motion has none, for medians of runs follow no equations")
+            raise ValueError(
+                "`training.ensemble`: a motion has none, because medians of runs follow no "
+                "equations"
+            )
         return self
 
     @model_validator(mode="after")
     def _blocks_are_several(self) -> Spec:
         if self.validation.blocks == 1:
-            raise ValueError("`validation.blocks`: found 1; expected 2 or more, or 0 for no cross-validation")
+            raise ValueError(
+                "`validation.blocks`: found 1; expected 2 or more, or 0 for no cross-validation"
+            )
         return self
 
     @model_validator(mode="after")
@@ -240,23 +272,31 @@ class Spec(Section):
         several = isinstance(self.training.regularization, list)
         if several and self.data.validation is None and self.validation.blocks == 0:
             raise ValueError(
-                "`training.regularization` is a list; expected [data.validation] or `validation.blocks` to choose by"
+                "`training.regularization` is a list; expected [data.validation] or "
+                "`validation.blocks` to choose by"
             )
         return self
 
     def channels(self, names: list[str]) -> tuple[Channel, ...]:
-        """The named channels with unit, column, scale and offset."""
+        """Return the named channels with unit, column, scale and offset."""
         given = self.data.channels
-        return tuple(Channel(name, **(given[name].model_dump() if name in given else {})) for name in names)
+        return tuple(
+            Channel(name, **(given[name].model_dump() if name in given else {})) for name in names
+        )
 
     def lag_orders(self) -> Lags | None:
-        """The learner's orders; None for the raw lags that the baseline uses."""
+        """Return the learner's orders; None for the raw lags that the baseline uses."""
         if self.lags is None:
             return None
-        return Lags(*(tuple(v) if isinstance(v, list) else v for v in (self.lags.na, self.lags.nb, self.lags.nk)))
+        return Lags(
+            *(
+                tuple(v) if isinstance(v, list) else v
+                for v in (self.lags.na, self.lags.nb, self.lags.nk)
+            )
+        )
 
     def declared_baseline(self) -> Baseline:
-        """The baseline as declared."""
+        """Return the baseline as declared."""
         assert self.baseline is not None, "a motion has no baseline"
         terms = [
             Term(t.parameter, str(t.regressor), t.initial, t.unit, t.output, t.fixed, t.min, t.max)
@@ -265,15 +305,24 @@ class Spec(Section):
         return Baseline.from_terms(terms, self.baseline.constants)
 
     def physics_map(self, sampling_time: float) -> PhysicsMap | None:
-        """The physical parameters and their map to θ, if the spec has one; `Ts` in it is the sampling time [s]."""
+        """Return the physical parameters and their map to θ, if the spec has one.
+
+        `Ts` in it is the sampling time [s].
+        """
         if self.physics is None or self.baseline is None:
             return None
         parameters = [section.declared(name) for name, section in self.physics.parameters.items()]
-        return PhysicsMap.of(parameters, self.physics.theta, {SAMPLING_TIME: sampling_time} | self.baseline.constants)
+        return PhysicsMap.of(
+            parameters, self.physics.theta, {SAMPLING_TIME: sampling_time} | self.baseline.constants
+        )
 
     def declared_learner(self) -> Learner | None:
-        """The learner; None for physics alone, as of a motion that nothing is added to."""
-        if self.motion is not None and not self.motion.learns and "learner" not in self.model_fields_set:
+        """Return the learner; None for physics alone, as of a motion with no learned part."""
+        if (
+            self.motion is not None
+            and not self.motion.learns
+            and "learner" not in self.model_fields_set
+        ):
             return None
         learner = resolve(self.learner.declared(LEARNERS, self.learner.kind))
         if not hasattr(learner, "over"):
@@ -284,22 +333,30 @@ class Spec(Section):
         return over_lags(learner, self.declared_baseline(), self.lag_orders(), *channels)
 
     def learner_inputs(self) -> tuple[str, ...] | None:
-        """What the learner sees; None for all lags."""
+        """Return the learner's inputs; None for all lags."""
         return getattr(self.declared_learner(), "inputs", None)
 
-    def declared_structure(self, kind: str | None = None, measure: Measure | None = None) -> Structure:
-        """The structure, or another kind with the same keys; under a measure where it splits θ by one."""
+    def declared_structure(
+        self, kind: str | None = None, measure: Measure | None = None
+    ) -> Structure:
+        """Return the declared structure, or another kind with the same keys.
+
+        It has a measure where it splits θ.
+        """
         structure = resolve(self.structure.declared(STRUCTURES, kind or self.structure.kind))
         takes = any(field.name == "measure" for field in fields(structure))
         return replace(structure, measure=measure) if takes and measure is not None else structure
 
     def declared_measure(self, place: MeasurePlace) -> Measure:
-        """The measure, with what it reads from files."""
+        """Return the measure, with its data read from files."""
         section = self.structure.measure
         return resolve(section.declared(MEASURES, section.kind), place)
 
     def declared_criterion(self) -> Criterion:
-        """The criterion. A motion is trained on its free run, from starts that are estimated: without a washout."""
+        """Return the criterion.
+
+        A motion is trained on its free run, from starts that are estimated: without a washout.
+        """
         training = self.training
         if self.motion is None:
             return resolve(training.declared(CRITERIA, training.chosen_focus()))
@@ -308,48 +365,67 @@ class Spec(Section):
         return resolve(training.model_copy(update=washout).declared(CRITERIA, focus))
 
     def declared_solver(self) -> Solver:
-        """The solver."""
+        """Return the solver."""
         return resolve(self.training.declared(SOLVERS, self.training.solver))
 
     def engine_kind(self, files: Sequence[Path]) -> str:
-        """Who sums over rows that come from these files.
+        """Return the kind of engine that sums over the rows of these files.
 
         Raises:
-            InputError: rows that are not in memory, for training that flies over them.
+            InputError: rows that are not in memory, for training by free runs over them.
         """
         if not self.brought:
             return self.engine.chosen(files)
         if self.engine.kind == "stream":
-            what = "`training.segment` = 0, whole experiments," if self.motion is None else "a motion"
+            what = (
+                "`training.segment` = 0, whole experiments," if self.motion is None else "a motion"
+            )
             raise InputError(
-                f"`engine.kind`: found stream; expected memory, devices or dask: {what} reads its rows into memory, "
-                "which dask then shares among its workers."
+                f"`engine.kind`: found stream; expected memory, devices or dask: {what} reads "
+                "its rows into memory, which dask then shares among its workers."
             )
         return "memory" if self.engine.kind == "auto" else self.engine.kind
 
     @property
     def brought(self) -> bool:
-        """Whether training reads all rows into memory: of a motion, and of free runs over whole experiments."""
-        flown = self.declared_criterion().flown
-        return self.motion is not None or (flown is not None and not flown.steps)
+        """Whether training reads all rows into memory."""
+        free_run = self.declared_criterion().free_run
+        return self.motion is not None or (free_run is not None and not free_run.steps)
 
-    def regularizations(self, *, linear: bool, validated: bool, kind: str | None = None) -> tuple[str | float, ...]:
-        """Those that every start is run with, in the structure that is declared or another kind."""
+    def regularizations(
+        self, *, linear: bool, validated: bool, kind: str | None = None
+    ) -> tuple[str | float, ...]:
+        """Return the regularizations that every start is run with, in a structure."""
         given = self.training.regularization
-        declared = (self.declared_solver(), self.declared_criterion(), self.declared_structure(kind))
+        declared = (
+            self.declared_solver(),
+            self.declared_criterion(),
+            self.declared_structure(kind),
+        )
         conditions: dict[str, Any] = {"linear": linear, "validated": validated}
-        return tried(given, *declared, **conditions, motion=self.motion is not None, learner=self.declared_learner())
+        return tried(
+            given,
+            *declared,
+            **conditions,
+            motion=self.motion is not None,
+            learner=self.declared_learner(),
+        )
 
     def runs(self, *, linear: bool) -> int:
-        """How many runs a fit makes: restarts times regularizations."""
+        """Number of runs in a fit: restarts times regularizations."""
         validated = self.data.validation is not None
-        return self.training.restarts * len(self.regularizations(linear=linear, validated=validated))
+        return self.training.restarts * len(
+            self.regularizations(linear=linear, validated=validated)
+        )
 
 
 def spec_model() -> type[Spec]:
     """`Spec` with the keys of every kind that is registered now."""
     return _spec_model(
-        tuple(tuple(registry.items()) for registry in (LEARNERS, MEASURES, STRUCTURES, SOLVERS, CRITERIA))
+        tuple(
+            tuple(registry.items())
+            for registry in (LEARNERS, MEASURES, STRUCTURES, SOLVERS, CRITERIA)
+        )
     )
 
 
@@ -357,8 +433,13 @@ def spec_model() -> type[Spec]:
 def _spec_model(registered: object) -> type[Spec]:
     measure = with_kinds(MeasureSection)
     structure = with_kinds(StructureSection, measure=(measure, measure()))
-    sections = {"learner": with_kinds(LearnerSection), "structure": structure, "training": with_kinds(TrainingSection)}
-    return create_model("Spec", __base__=Spec, **{name: (section, section()) for name, section in sections.items()})  # type: ignore[call-overload]
+    sections = {
+        "learner": with_kinds(LearnerSection),
+        "structure": structure,
+        "training": with_kinds(TrainingSection),
+    }
+    fields: dict[str, Any] = {name: (section, section()) for name, section in sections.items()}
+    return create_model("Spec", __base__=Spec, **fields)
 
 
 def load_spec(path: Path) -> Spec:

@@ -1,4 +1,4 @@
-"""Parameters of a saved model under another measure: what `orthaug split` does."""
+"""Parameters of a saved model under another measure: `orthaug split`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,14 @@ from orthaug._base.errors import InputError, KeyedError, Warning
 from orthaug._base.folders import file_digest
 from orthaug._base.registry import Key, keys_of, resolve
 from orthaug.commands.folder import results_beside
-from orthaug.commands.run import ModelOnData, Reading, prepared_notes, record_for, rows_taken, trained_reading
+from orthaug.commands.run import (
+    ModelOnData,
+    ReadOptions,
+    prepared_notes,
+    record_for,
+    rows_taken,
+    trained_reading,
+)
 from orthaug.data.record import Record
 from orthaug.data.tables import check_readable
 from orthaug.inference.kinds import MEASURES, MeasurePlace
@@ -28,7 +35,10 @@ _UNKNOWN = Warning("no_statistics", "no standard errors: training left no statis
 
 
 def open_training(model: Path, data: Sequence[Path], rows: tuple[int, int] | None) -> ModelOnData:
-    """A model with the files that it was trained on, `rows` of each; None for those that its result names."""
+    """Return a model with the files that it was trained on, `rows` of each.
+
+    None for those that its result names.
+    """
     from orthaug.models.storage import load
 
     for path in data:
@@ -37,39 +47,52 @@ def open_training(model: Path, data: Sequence[Path], rows: tuple[int, int] | Non
     trained = [trained_reading(model, path) for path in data]
     read, notes = [], []
     for path, own in zip(data, trained, strict=True):
-        reading = own or Reading("skip", prepare=True)  # of rows with missing cells none were trained on
+        reading = own or ReadOptions(
+            "skip", prepare=True
+        )  # of rows with missing cells none were trained on
         taken = rows_taken(reading)
         if rows is None:
             notes += [f"note: {path.name}: {taken}, those of the training."] if taken else []
         elif own and own.rows != [list(rows)]:
-            told = f"the model was trained on {taken or 'all rows'} of {path.name}, not on rows {rows[0]}:{rows[1]}."
-            warnings.append(Warning("other_training_data", told))
-        read.append(record_for(loaded, path, loaded.outputs, replace(reading, rows=rows or reading.rows)))
+            text = (
+                f"the model was trained on {taken or 'all rows'} of {path.name}, not on rows "
+                f"{rows[0]}:{rows[1]}."
+            )
+            warnings.append(Warning("other_training_data", text))
+        read.append(
+            record_for(loaded, path, loaded.outputs, replace(reading, rows=rows or reading.rows))
+        )
     record = Record.join(read)
-    return ModelOnData(loaded, record, data[0], 0, (*prepared_notes(loaded, record), *notes), tuple(warnings))
+    return ModelOnData(
+        loaded, record, data[0], 0, (*prepared_notes(loaded, record), *notes), tuple(warnings)
+    )
 
 
 def _other_files(model: Path, data: Sequence[Path]) -> list[Warning]:
-    """A warning where the result of a model has other files' checksums."""
+    """Return a warning where the checksums of the files differ from those in the model's result."""
     for content in results_beside(model):
         with suppress(KeyError, TypeError):
             kept = {file["sha256"]: file["file"] for file in content["data"]["train"]}
             if kept.keys() == set(map(file_digest, data)):
                 return []
             text = (
-                f"the model was trained on {', '.join(kept.values())}; by the checksums in its result.json that is "
-                f"not what was given ({', '.join(path.name for path in data)}). Give the files that it was trained "
-                "on: a split over other data does not belong to the fit."
+                f"the model was trained on {', '.join(kept.values())}; the checksums in its "
+                f"result.json differ from those of {', '.join(path.name for path in data)}. "
+                "Give the files that it was trained on: a split over other data does not "
+                "belong to the fit."
             )
             return [Warning("other_training_data", text)]
     return []
 
 
 def read_measure(kind: str, given: Mapping[str, Sequence[str]], opened: ModelOnData) -> Measure:
-    """The measure of a kind from the values `given` to each option; the registry says which kind takes which.
+    """Return the measure of a kind from the values `given` for each option.
+
+    The registry says which kind takes which.
 
     Raises:
-        InputError: an unknown kind, an option of another kind or without what it needs, files that do not fit.
+        InputError: an unknown kind, an option of another kind or without what it needs, files that
+            do not fit.
     """
     check_choice(kind, MEASURES, "--measure")
     values = {}
@@ -91,7 +114,7 @@ def read_measure(kind: str, given: Mapping[str, Sequence[str]], opened: ModelOnD
 
 
 def _read(key: Key, option: str, texts: Sequence[str]) -> Any:
-    """The value of a key: limits by raw lag for a mapping, the texts themselves otherwise."""
+    """Return the value of a key: for a mapping limits by raw lag, otherwise the texts."""
     if get_origin(key.type) is not Mapping:
         return tuple(texts)
     limits: dict[str, tuple[float, float]] = {}
@@ -102,7 +125,10 @@ def _read(key: Key, option: str, texts: Sequence[str]) -> Any:
         except ValueError:
             equals = ""
         if not equals:
-            raise InputError(f"--{option}: found '{text}'; expected a raw lag and its limits, such as 'u[k]=-0.6:0.6'.")
+            raise InputError(
+                f"--{option}: found '{text}'; expected a raw lag and its limits, such as "
+                "'u[k]=-0.6:0.6'."
+            )
         if lag.strip() in limits:
             raise InputError(f"--{option}: {lag.strip()} is given twice.")
         limits[lag.strip()] = (low, high)
@@ -110,24 +136,29 @@ def _read(key: Key, option: str, texts: Sequence[str]) -> Any:
 
 
 def split_model(opened: ModelOnData, measure: Measure) -> SplitResult:
-    """The parameters of a saved model under a measure.
+    """Return the parameters of a saved model under a measure.
 
     Raises:
-        InputError: a θ at a bound, a measure that does not fit the model, other data than those of its training.
+        InputError: a θ at a bound, a measure that does not fit the model, other data than those of
+            its training.
     """
     return _SPLITS[type(opened.model)](opened.model, opened.record, measure, opened.warnings)
 
 
-def _split_lagged(model: Model, record: Record, measure: Measure, told: Sequence[Warning]) -> SplitResult:
+def _split_lagged(
+    model: Model, record: Record, measure: Measure, warnings: Sequence[Warning]
+) -> SplitResult:
     from orthaug.inference.covariance import interval
     from orthaug.inference.splitting import split_under
 
     parameters = model.form.baseline.parameters
-    stands = [p.name for p, value in zip(parameters, model.theta, strict=True) if value in (p.min, p.max)]
-    if stands:
+    bounded = [
+        p.name for p, value in zip(parameters, model.theta, strict=True) if value in (p.min, p.max)
+    ]
+    if bounded:
         raise InputError(
-            f"{', '.join(stands)} stands at a bound, and a split knows none; fit without the bound, or with "
-            "`fixed = true` there."
+            f"{', '.join(bounded)} is at a bound, which a split does not impose; fit without the "
+            "bound, or with `fixed = true` there."
         )
     support = Support(model.fitting(record, need_outputs=True), model.form.layout, model.form.used)
     under = split_under(measure, model, support, model.statistics.joint(len(model.theta)))
@@ -140,12 +171,14 @@ def _split_lagged(model: Model, record: Record, measure: Measure, told: Sequence
             "measure": measure.name,
             "measure_detail": under,
             "orthogonality_defect": under.defect,
-            "warnings": [*told, *under.warnings, *([] if std is not None else [_UNKNOWN])],
+            "warnings": [*warnings, *under.warnings, *([] if std is not None else [_UNKNOWN])],
         }
     )
 
 
-def _split_motion(model: MotionModel, record: Record, measure: Measure, told: Sequence[Warning]) -> SplitResult:
+def _split_motion(
+    model: MotionModel, record: Record, measure: Measure, warnings: Sequence[Warning]
+) -> SplitResult:
     from orthaug.fitting.motion_estimation import reopened
 
     fit = reopened(model, record).split(measure)
@@ -158,7 +191,7 @@ def _split_motion(model: MotionModel, record: Record, measure: Measure, told: Se
             "measure": split.name,
             "measure_detail": MeasureResult.of_motion(split),
             "orthogonality_defect": split.defect,
-            "warnings": [*told, *fit.warnings, *([_UNKNOWN] if lacking else [])],
+            "warnings": [*warnings, *fit.warnings, *([_UNKNOWN] if lacking else [])],
         }
     )
 

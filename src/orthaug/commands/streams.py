@@ -1,4 +1,4 @@
-"""Standard input, output and error as they may be: closed, full, or in an encoding that lacks our letters."""
+"""Standard input, output and error that may be closed, full, or in a limited encoding."""
 
 from __future__ import annotations
 
@@ -12,14 +12,35 @@ from typing import Any, TextIO
 from orthaug._base.lines import fit_screen
 
 _PLAIN = {
-    **{"‖": "||", "±": "+-", "…": "...", "–": "-", "−": "-", "×": "x", "·": "*", "⊥": "_|_", "ᵀ": "^T", "\u0303": "~"},
-    **{"≤": "<=", "≥": ">=", "≠": "!=", "≈": "~", "→": "->", "½": "1/2", "\u2011": "-", "√": "sqrt", "∂": "d"},
+    **{
+        "‖": "||",
+        "±": "+-",
+        "…": "...",
+        "–": "-",
+        "−": "-",
+        "×": "x",
+        "·": "*",
+        "⊥": "_|_",
+        "ᵀ": "^T",
+        "\u0303": "~",
+    },
+    **{
+        "≤": "<=",
+        "≥": ">=",
+        "≠": "!=",
+        "≈": "~",
+        "→": "->",
+        "½": "1/2",
+        "\u2011": "-",
+        "√": "sqrt",
+        "∂": "d",
+    },
     **{"✓": "", "\u0302": "^", "“": '"', "”": '"', "’": "'", "─": "-", "━": "-"},
 }
 
 
 def prepare() -> None:
-    """Let every letter be written, and a stream that was closed be written to."""
+    """Prepare the streams, so that no letter and no closed stream makes writing fail."""
     codecs.register_error("orthaug.plain", plain)
     for name, number in (("stdout", 1), ("stderr", 2)):
         if getattr(sys, name) is None:
@@ -33,7 +54,10 @@ def prepare() -> None:
 
 
 def plain(error: UnicodeError) -> tuple[str, int]:
-    """What stands for letters that an encoding lacks: words and ASCII; in JSON the escape that means the same."""
+    """Return an ASCII replacement for letters that an encoding lacks.
+
+    In JSON it is the equivalent escape.
+    """
     if not isinstance(error, UnicodeEncodeError):
         raise error
     missing = error.object[error.start : error.end]
@@ -53,26 +77,26 @@ def _plain(letter: str) -> str:
 
 
 def _escaped(letter: str) -> str:
-    """As JSON writes it: two escapes for a letter beyond 16 bits."""
+    """Return a letter as JSON writes it: two escapes for one beyond 16 bits."""
     units = letter.encode("utf-16-be", "surrogatepass")
     return "".join(f"\\u{units[i]:02x}{units[i + 1]:02x}" for i in range(0, len(units), 2))
 
 
 def echo(text: str) -> None:
-    """A result on standard output."""
+    """Print a result on standard output."""
     sys.stdout.write(text + "\n")
     sys.stdout.flush()
 
 
 def say(line: str) -> None:
-    """A line on standard error, if it can be written."""
+    """Print a line on standard error, if it can be written."""
     with suppress(OSError, ValueError):
         sys.stderr.write(line + "\n")
         sys.stderr.flush()
 
 
 def silence(stream: TextIO | Any) -> None:
-    """Let what a stream still holds go nowhere, so that the end of the program does not fail on it."""
+    """Discard what a stream still holds, so that the end of the program does not fail on it."""
     with suppress(OSError, ValueError, AttributeError):
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, stream.fileno())

@@ -13,7 +13,9 @@ from orthaug.physics.problem import Problem
 
 
 def declared(sections: Sequence[SuspectSection], problem: Problem) -> tuple[Suspect, ...]:
-    """The suspects of a spec. A width that is not given is the median size of what the term acts on.
+    """Return the suspects of a spec.
+
+    A width that is not given is the median size of what the term acts on.
 
     Raises:
         InputError: an unknown kind, channel or lag, an expression that cannot be read.
@@ -22,9 +24,16 @@ def declared(sections: Sequence[SuspectSection], problem: Problem) -> tuple[Susp
     only = problem.outputs[0] if len(problem.outputs) == 1 else None
     suspects = []
     for section in sections:
-        width = _width(section, lambda on: data_width(on, problem.rows.x, problem.layout, constants))
+        width = _width(
+            section, lambda on: data_width(on, problem.rows.x, problem.layout, constants)
+        )
         output = section.output if section.output is not None else only
-        options = {"width": width, "output": output, "coefficient": section.coefficient, "name": section.name}
+        options = {
+            "width": width,
+            "output": output,
+            "coefficient": section.coefficient,
+            "name": section.name,
+        }
         suspects.append(Suspect.of(section.kind, section.on, constants=constants, **options))
     return tuple(suspects)
 
@@ -34,11 +43,14 @@ def check_suspects(sections: Sequence[SuspectSection], problem: Problem) -> None
     suspect_columns(declared(sections, problem), problem.rows.x, problem.layout, problem.outputs)
 
 
-def declared_terms(sections: Sequence[SuspectSection], problem: MotionProblem) -> tuple[MotionSuspect, ...]:
-    """As `declared`, of a motion.
+def declared_terms(
+    sections: Sequence[SuspectSection], problem: MotionProblem
+) -> tuple[MotionSuspect, ...]:
+    """Return the suspects of a spec, as terms of a motion.
 
     Raises:
-        InputError: an unknown kind, equation or name, an expression that cannot be read or has no value.
+        InputError: an unknown kind, equation or name, an expression that cannot be read or has no
+            value.
     """
     suspects, (x, u) = [], problem.looked_at
     for section in sections:

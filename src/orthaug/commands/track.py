@@ -1,4 +1,4 @@
-"""The parameters of a saved model followed over new data: what `orthaug track` does."""
+"""Tracking of a saved model's parameters over new data: `orthaug track`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from orthaug._base.errors import InputError, Warning
 from orthaug._base.folders import file_digest, whole_folder
 from orthaug.commands.folder import results_beside
-from orthaug.commands.run import Reading, record_for
+from orthaug.commands.run import ReadOptions, record_for
 from orthaug.commands.split import open_training
 from orthaug.data.record import Record
 from orthaug.data.tables import check_readable
@@ -25,12 +25,12 @@ if TYPE_CHECKING:
     from orthaug.models.model import Model
 
 STATE = "state"
-"""The folder in a result from which a later run goes on."""
+"""The folder in a result that a later run continues from."""
 
 
 @dataclass(frozen=True, eq=False)
-class Opened:
-    """A model with new data, what it was trained on, and the physical parameters that its result declares."""
+class TrackingInput:
+    """A model with new data, its training data, and the physical parameters of its result."""
 
     model: Model
     record: Record
@@ -40,8 +40,8 @@ class Opened:
 
 
 @dataclass(frozen=True, eq=False)
-class Tracked:
-    """What was found."""
+class TrackingReport:
+    """The result of tracking."""
 
     online: Recursive
     result: TrackResult
@@ -49,12 +49,17 @@ class Tracked:
 
 
 def open_track(
-    model: Path, data: Sequence[Path], training: Sequence[Path], rows: tuple[int, int] | None, state: Path | None
-) -> Opened:
+    model: Path,
+    data: Sequence[Path],
+    training: Sequence[Path],
+    rows: tuple[int, int] | None,
+    state: Path | None,
+) -> TrackingInput:
     """Load a model, new data, and the files that it was trained on.
 
     Raises:
-        InputError: no model, no data, a motion, training files missing where no state is given, or given beside one.
+        InputError: no model, no data, a motion, training files missing where no state is given, or
+            given beside one.
     """
     from orthaug.models.model import Model
     from orthaug.models.storage import load
@@ -62,9 +67,15 @@ def open_track(
     if not data:
         raise InputError("--data: is missing; give at least one file of new data.")
     if state is None and not training:
-        raise InputError("--training: is missing; give the files that the model was trained on, or --state of a run.")
+        raise InputError(
+            "--training: is missing; give the files that the model was trained on, or --state "
+            "of a run."
+        )
     if state is not None and training:
-        raise InputError("--training: found beside --state, which holds what training left; leave one of them out.")
+        raise InputError(
+            "--training: found beside --state, which holds the statistics of training; leave "
+            "one of them out."
+        )
     for path in data:
         check_readable(path)
     loaded = load(model)
@@ -74,14 +85,16 @@ def open_track(
         raise InputError(f"{model}: {MOTION}")
     records, files = [], []
     for path in data:
-        records.append(record_for(loaded, path, loaded.outputs, Reading("skip", prepare=True)))
+        records.append(record_for(loaded, path, loaded.outputs, ReadOptions("skip", prepare=True)))
         files.append(FileResult(file=str(path), sha256=file_digest(path), rows=len(records[-1])))
     given = open_training(model, training, rows).record if training else None
-    return Opened(loaded, Record.join(records), given, tuple(files), _physics_of(model, loaded.sampling_time))
+    return TrackingInput(
+        loaded, Record.join(records), given, tuple(files), _physics_of(model, loaded.sampling_time)
+    )
 
 
 def _physics_of(model: Path, sampling_time: float) -> PhysicsMap | None:
-    """What θ is made of, from the result beside a model; None where there is none."""
+    """Return the map to physical parameters, from the result beside a model; None without one."""
     from orthaug.commands.spec import spec_model
 
     for content in results_beside(model):
@@ -91,35 +104,42 @@ def _physics_of(model: Path, sampling_time: float) -> PhysicsMap | None:
 
 
 def track(
-    opened: Opened,
+    opened: TrackingInput,
     *,
     forgetting: float | None,
     memory: float | None,
     state: Path | None,
     follows: bool,
-) -> Tracked:
-    """Follow the new rows.
+) -> TrackingReport:
+    """Track the parameters over the new rows.
 
     Raises:
-        InputError: forgetting beside a state, a state of another model, other than the training data.
+        InputError: forgetting beside a state, a state of another model, other than the training
+            data.
     """
     from orthaug.fitting.recursive import Recursive
     from orthaug.models.storage import digest
 
     if state is None:
-        online = Recursive(opened.model, training=opened.training, forgetting=forgetting, memory=memory)
+        online = Recursive(
+            opened.model, training=opened.training, forgetting=forgetting, memory=memory
+        )
     else:
         if forgetting is not None or memory is not None:
-            raise InputError("--forgetting, --memory: found beside --state, which holds them; leave them out.")
+            raise InputError(
+                "--forgetting, --memory: found beside --state, which holds them; leave them out."
+            )
         place = state / STATE if (state / STATE).is_dir() else state
         online = Recursive.load(place)
         if digest(online.fitted) != digest(opened.model):
-            raise InputError(f"{state}: is the state of another model; give the one that it was begun with.")
+            raise InputError(
+                f"{state}: is the state of another model; give the one that it was begun with."
+            )
     online.update(opened.record, gap=not follows)
-    return Tracked(online, _result(opened, online), opened.physics)
+    return TrackingReport(online, _result(opened, online), opened.physics)
 
 
-def _result(opened: Opened, online: Recursive) -> TrackResult:
+def _result(opened: TrackingInput, online: Recursive) -> TrackResult:
     from orthaug.fitting.recursive import outside_text
     from orthaug.models.storage import digest
 
@@ -127,7 +147,7 @@ def _result(opened: Opened, online: Recursive) -> TrackResult:
     baseline = opened.model.form.baseline
     warnings = []
     if online.std is None:
-        text = "no standard errors: the fit has none, or the rows do not tell θ."
+        text = "no standard errors: the fit has none, or the rows do not determine θ."
         warnings.append(Warning("no_standard_errors", text))
     if online.outside:
         text = outside_text(online.outside, online.rows)
@@ -147,7 +167,9 @@ def _result(opened: Opened, online: Recursive) -> TrackResult:
             "forgetting": factor,
             "memory": None if factor == 1 else -step / math.log(factor),
             "effective_rows": online.effective_rows,
-            "parameters": parameter_rows(baseline.parameters, online.theta, online.std, online.interval),
+            "parameters": parameter_rows(
+                baseline.parameters, online.theta, online.std, online.interval
+            ),
             "physical_parameters": physical,
             "alarms": list(online.alarms),
             "alarmed": online.alarmed,
@@ -157,8 +179,8 @@ def _result(opened: Opened, online: Recursive) -> TrackResult:
     )
 
 
-def write_tracked(tracked: Tracked, folder: Path, text: str, *, force: bool = False) -> None:
-    """result.json, report.txt, table.csv, figures/ and the state, whole or not at all."""
+def write_tracked(tracked: TrackingReport, folder: Path, text: str, *, force: bool = False) -> None:
+    """Write result.json, report.txt, table.csv, figures/ and the state, whole or not at all."""
     from orthaug.reports.drawing import save
     from orthaug.reports.plots import tracking_figure
 
@@ -173,7 +195,9 @@ def write_tracked(tracked: Tracked, folder: Path, text: str, *, force: bool = Fa
         if physical is not None:
             physical.to_csv(partial / "physical.csv")
         (partial / "figures").mkdir()
-        figure = tracking_figure(history, result.parameters, alarms, None, physical, result.physical_parameters or ())
+        figure = tracking_figure(
+            history, result.parameters, alarms, None, physical, result.physical_parameters or ()
+        )
         save(figure, partial / "figures" / "parameters.png")
         (partial / STATE).mkdir()
         online.fill(partial / STATE)

@@ -1,8 +1,8 @@
 from .dask_source import open_frame as open_frame
-from .filters import Decimate as Decimate
-from .filters import Highpass as Highpass
-from .filters import Lowpass as Lowpass
 from .parquet_source import open_parquet as open_parquet
+from .preparation import Decimate as Decimate
+from .preparation import Highpass as Highpass
+from .preparation import Lowpass as Lowpass
 from .preparation import prepare as prepare
 from .readers import read_record as read_record
 from .record import Channel as Channel

@@ -1,4 +1,4 @@
-"""How a data file tells its sampling time: which column is the time, by what stands in it, and which only looks so."""
+"""Sampling time of a data file: the column that is the time, and those that only resemble it."""
 
 from __future__ import annotations
 
@@ -17,21 +17,29 @@ from orthaug.data.record import same_step
 from orthaug.data.tables import column_names, read_table
 from orthaug.data.variables import ENDINGS, scalars
 
-JITTER = 0.45  # largest deviation of a step from the usual one, relative: one lost sample is a deviation of 1 or ½
-DRIFT = 0.02  # largest change of the mean step over the record, relative; it must also displace half a sample
+# Largest deviation of a step from the usual one, relative: one lost sample deviates by 1 or ½.
+JITTER = 0.45
+# Largest change of the mean step over the record, relative; it must also displace half a sample.
+DRIFT = 0.02
 DATES = "dates"
-"""What a column of them is, no signal."""
-_JITTERS = 0.02  # largest deviation of a step that is not told, relative
-_HEAD = 10_000  # rows of a text file that tell its step well enough
+"""Type of a column of dates, which is no signal."""
+_JITTERS = 0.02  # largest deviation of a step that is not reported, relative
+_HEAD = 10_000  # rows of a text file that are enough to determine its step
 _FEWEST = 10  # rows from which on rising evenly is no chance
-_MOSTLY = 0.98  # share of the steps of a time that are as usual at least; the others are lost samples
-_RISES = 0.9  # share of the steps of a column named as the time that rise, from which on it is a time with a fault
+_MOSTLY = (
+    0.98  # share of the steps of a time that are as usual at least; the others are lost samples
+)
+# Share of rising steps from which on a column named as the time is a time with a fault.
+_RISES = 0.9
 _COUNTING = (0.0, 1.0)  # where counters of rows begin
 
 
 @dataclass(frozen=True, eq=False)
-class Refused:
-    """A column that could be the time and is not, with the reason; `signal` says whether it may be a channel."""
+class RefusedColumn:
+    """A column that could be the time and is not, with the reason.
+
+    `signal` says whether it may be a channel.
+    """
 
     column: Column
     reason: str
@@ -40,55 +48,69 @@ class Refused:
 
 @dataclass(frozen=True, eq=False)
 class Clock:
-    """How a file tells its sampling time: by a column of instants, by a cell, or not at all (`column` None)."""
+    """Source of the sampling time: a column of instants, a single number, or neither.
+
+    `column` is None where the file has neither.
+    """
 
     step: float | None = None
-    """In s."""
+    """Sampling time in s."""
     column: Column | None = None
     seconds: Vector | None = None
     """The instants in s, where the column holds them: it can be the spec's `time`."""
     even: bool = True
-    refused: tuple[Refused, ...] = ()
+    refused: tuple[RefusedColumn, ...] = ()
     """Columns that could be taken for the time."""
 
     @property
     def instants(self) -> bool:
-        """Whether the column holds instants."""
+        """True if the column holds instants."""
         return self.seconds is not None
 
     @property
     def steady(self) -> bool:
-        """Whether parts of the file tell the same sampling time from their instants."""
+        """True if the instants of all parts of the file have the same sampling time."""
         seconds = np.zeros(0) if self.seconds is None else self.seconds[np.isfinite(self.seconds)]
         means = [part.mean() for part in np.array_split(np.diff(seconds), 4) if len(part)]
         return bool(means) and same_step(min(means), max(means))
 
     @property
     def by_name(self) -> bool:
-        """Whether the column's name or its dates say that it is the time, and not only its values."""
+        """True if the name or the dates of the column show that it is the time.
+
+        Otherwise only its values do.
+        """
         return self.column is not None and (
             not self.instants or bool(self.column.unusable) or is_time(self.column.header)
         )
 
     def __str__(self) -> str:
         if self.column is None or self.step is None:
-            return "no column tells it"
+            return "no column states it"
         header, known = self.column.header, ""
         if not self.by_name:
             known = ", which rises as time does"
-            known += "" if split_header(header)[1] else " and whose header names no unit, so s is taken"
+            known += (
+                "" if split_header(header)[1] else " and whose header has no unit; s is assumed"
+            )
         if not self.even:
             text = f"{self.step:g} s is usual in column '{header}'{known}, but the steps are uneven"
         else:
             text = f"{self.step:g} s, from column '{header}'{known}"
-        steps = np.diff(self.seconds[np.isfinite(self.seconds)]) if self.seconds is not None else np.zeros(0)
+        steps = (
+            np.diff(self.seconds[np.isfinite(self.seconds)])
+            if self.seconds is not None
+            else np.zeros(0)
+        )
         if len(steps) and np.abs(steps - self.step).max() > _JITTERS * self.step:
             text += f"; single steps are {steps.min():.3g} to {steps.max():.3g} s"
         return text
 
 
 def find_clock(columns: Sequence[Column], near: str = "") -> Clock:
-    """Return the clock of columns: a column named as the time, dates, a constant `Ts`, or what rises as time does.
+    """Return the clock among some columns.
+
+    It is a column named as the time, dates, a constant `Ts`, or a column that rises as time does.
 
     Args:
         near: where the channels are, as in `run.y`; a time beside them comes before others.
@@ -96,7 +118,9 @@ def find_clock(columns: Sequence[Column], near: str = "") -> Clock:
     rows = max(column.filled for column in columns)
     parent = _parent(near)
     clock, refused = Clock(), []
-    for column in sorted(columns, key=lambda c: (not is_time(c.header), bool(near) and _parent(c.header) != parent)):
+    for column in sorted(
+        columns, key=lambda c: (not is_time(c.header), bool(near) and _parent(c.header) != parent)
+    ):
         values, dates = column.finite, column.unusable == DATES
         if column.unusable and not dates:
             continue
@@ -109,9 +133,13 @@ def find_clock(columns: Sequence[Column], near: str = "") -> Clock:
         if fault is not None and not column.constant:
             refused.append(fault)
         elif fault is None and clock.column is None:
-            clock = _ticking(column, column.values if dates else in_seconds(column.values, column.header))
+            clock = _ticking(
+                column, column.values if dates else in_seconds(column.values, column.header)
+            )
         elif fault is None and not dates:
-            refused.append(Refused(column, "rises as a time does, and another column is the time", False))
+            refused.append(
+                RefusedColumn(column, "rises as a time does, and another column is the time", False)
+            )
     for column in columns:
         if column.unusable or column is clock.column or is_time(column.header):
             continue
@@ -119,15 +147,21 @@ def find_clock(columns: Sequence[Column], near: str = "") -> Clock:
         if verdict is None and clock.column is None and column.filled == rows:
             clock = _ticking(column, in_seconds(column.values, column.header))
         elif verdict is None:
-            refused.append(Refused(column, f"rises by {_mean_step(column):g} in each row, as a time does", False))
+            refused.append(
+                RefusedColumn(
+                    column, f"rises by {_mean_step(column):g} in each row, as a time does", False
+                )
+            )
         elif verdict:
             refused.append(verdict)
-    kept = tuple(one for one in refused if not clock.instants or not one.signal or is_time(one.column.header))
+    kept = tuple(
+        one for one in refused if not clock.instants or not one.signal or is_time(one.column.header)
+    )
     return replace(clock, refused=kept)
 
 
 def _parent(path: str) -> str:
-    """The struct or group that a variable is in."""
+    """Return the struct or group that a variable is in."""
     return path[: max(path.rfind("."), path.rfind("/"), 0)]
 
 
@@ -136,26 +170,30 @@ def _mean_step(column: Column) -> float:
     return float((column.finite[-1] - column.finite[0]) / (rows[-1] - rows[0]))
 
 
-def _fault(column: Column, rows: int) -> Refused | None:
+def _fault(column: Column, rows: int) -> RefusedColumn | None:
     """Return why a column that is named as the time cannot be it; None where it can."""
     values = column.finite
     steps = np.diff(values)
     if len(steps) and (steps > 0).all() and column.filled == rows:
         return None
     if column.filled != rows:
-        return Refused(column, f"ends after {column.filled} of {rows} rows, so it is not the time", False)
+        return RefusedColumn(
+            column, f"ends after {column.filled} of {rows} rows, so it is not the time", False
+        )
     if len(steps) and not ((steps > 0).mean() >= _RISES or (steps >= 0).all()):
-        return Refused(column, "falls in many rows, so it is taken for a signal", True)
+        return RefusedColumn(column, "falls in many rows, so it is taken for a signal", True)
     at = int(np.flatnonzero(steps <= 0)[0]) + 1 if len(steps) else 0
     row = int(np.flatnonzero(np.isfinite(column.values))[at])
-    went = f"stands still at {values[at]:g}"
+    went = f"stays at {values[at]:g}"
     if len(steps) and steps[at - 1] < 0:
         went = f"falls from {values[at - 1]:g} to {values[at]:g}"
-    return Refused(column, f"{went} in row {row}, so it is not the time", False)
+    return RefusedColumn(column, f"{went} in row {row}, so it is not the time", False)
 
 
-def _resemblance(column: Column) -> Refused | bool | None:
-    """Return whether a column of any name is the time by its values: None where it is, False where nothing says so.
+def _resemblance(column: Column) -> RefusedColumn | bool | None:
+    """Return whether the values of a column are those of time, whatever its name.
+
+    The result is None where they are, False where nothing shows it.
 
     A column that rises and is not the time for another reason comes with the reason.
     """
@@ -167,21 +205,29 @@ def _resemblance(column: Column) -> Refused | bool | None:
     line = np.interp(rows, rows[[0, -1]], values[[0, -1]])
     on_line = bool(np.abs(values - line).max() < 0.5 * steps.mean())
     thirds = [float(np.median(part)) for part in np.array_split(steps, 3)]
-    alike = (np.abs(steps - usual) <= JITTER * usual).mean() >= _MOSTLY and max(thirds) - min(thirds) <= DRIFT * usual
+    alike = (np.abs(steps - usual) <= JITTER * usual).mean() >= _MOSTLY and max(thirds) - min(
+        thirds
+    ) <= DRIFT * usual
     if not (on_line or alike):
-        reason = f"rises, but in steps of {steps.min():.3g} to {steps.max():.3g}, so it is taken for a signal"
-        return Refused(column, reason, True)
+        reason = (
+            f"rises, but in steps of {steps.min():.3g} to {steps.max():.3g}, so it is taken "
+            "for a signal"
+        )
+        return RefusedColumn(column, reason, True)
     unit = unit_of_time(header)[1]
     if unit is None:
-        reason = f"rises evenly, but its unit {split_header(header)[1]} is none of time, so it is taken for a signal"
-        return Refused(column, reason, True)
+        reason = (
+            f"rises evenly, but its unit {split_header(header)[1]} is no unit of time, so it is "
+            "taken for a signal"
+        )
+        return RefusedColumn(column, reason, True)
     if (steps == 1).all() and values[0] in _COUNTING and not split_header(header)[1]:
-        return Refused(column, "counts the rows", False)
+        return RefusedColumn(column, "counts the rows", False)
     return None
 
 
-def told_clock(path: Path, apart: Collection[str] = (), *, by_content: bool = False) -> Clock:
-    """What a file tells of its sampling time by the names of its columns and their first rows.
+def read_clock(path: Path, apart: Collection[str] = (), *, by_content: bool = False) -> Clock:
+    """Return the clock in the names of a file's columns and in their first rows.
 
     Args:
         apart: columns that are channels, whatever they are called.
@@ -197,14 +243,21 @@ def told_clock(path: Path, apart: Collection[str] = (), *, by_content: bool = Fa
         with suppress(InputError):
             named = header if is_time(header) else None  # it comes in s, as dates do
             if named or header not in values:
-                values = {**values, header: read_table(path, [header], named, most=_HEAD).columns[header]}
+                values = {
+                    **values,
+                    header: read_table(path, [header], named, most=_HEAD).columns[header],
+                }
             columns.append(Column(header, header, "", values[header], DATES if named else ""))
     clock = find_clock(columns) if columns else Clock()
     return clock if clock.column else by_single_number(path)
 
 
-def thinned_twice(path: Path, sampling_time: float | None, every: int, apart: Collection[str]) -> str:
-    """Return what is wrong where a sampling time is that of the rows that are kept and not that of the file's rows.
+def thinned_twice(
+    path: Path, sampling_time: float | None, every: int, apart: Collection[str]
+) -> str:
+    """Return the fault of a sampling time that is that of the kept rows, not of the file's rows.
+
+    Empty where there is no fault.
 
     Args:
         sampling_time: as given, in s, to be multiplied by `every`.
@@ -212,7 +265,7 @@ def thinned_twice(path: Path, sampling_time: float | None, every: int, apart: Co
     """
     if every == 1 or sampling_time is None:
         return ""
-    clock = told_clock(path, apart, by_content=True)
+    clock = read_clock(path, apart, by_content=True)
     if clock.column is None or clock.step is None or same_step(clock.step, sampling_time):
         return ""
     if abs(clock.step * every - sampling_time) > DRIFT * sampling_time:
@@ -220,22 +273,23 @@ def thinned_twice(path: Path, sampling_time: float | None, every: int, apart: Co
     header, step = clock.column.header, clock.step
     other = f', or time = "{header}" instead' if clock.instants else ""
     return (
-        f"every = {every} multiplies the sampling time {sampling_time:g} s to {every * sampling_time:g} s, but column "
-        f"'{header}' of {path.name} tells {step:g} s from row to row, so rows of which one in {every} is kept are "
-        f"{every * step:g} s apart. Give sampling_time = {step:g}, that of the file's rows{other}."
+        f"every = {every} multiplies the sampling time {sampling_time:g} s to "
+        f"{every * sampling_time:g} s. But the rows of {path.name} are {step:g} s apart by "
+        f"column '{header}', and the rows that are kept {every * step:g} s. Give "
+        f"sampling_time = {step:g}, that of the file's rows{other}."
     )
 
 
 def by_single_number(path: Path) -> Clock:
-    """A clock of single numbers called `Ts` or `fs` beside the channels, where all that there are agree."""
+    """Return a clock from single numbers called `Ts` or `fs`, where all of them agree."""
     if path.suffix.lower() not in ENDINGS:
         return Clock()
     found = scalars(path, lambda name: step_of(name, 1.0) is not None)
     steps = {name: step_of(name, value) for name, value in found.items()}
-    told = {name: step for name, step in steps.items() if step is not None and np.isfinite(step)}
-    if not told or not same_step(min(told.values()), max(told.values())):
+    known = {name: step for name, step in steps.items() if step is not None and np.isfinite(step)}
+    if not known or not same_step(min(known.values()), max(known.values())):
         return Clock()
-    name, step = next(iter(told.items()))
+    name, step = next(iter(known.items()))
     return Clock(step, Column(name, name, "", np.array([found[name]])))
 
 

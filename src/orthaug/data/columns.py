@@ -1,4 +1,4 @@
-"""A column of a data file: its values, the channel that it would be, and what is odd about it."""
+"""A column of a data file: its values, the channel that it would be, and its peculiarities."""
 
 from __future__ import annotations
 
@@ -22,12 +22,18 @@ _OUTPUT = re.compile(r"^(y|y_?\d+|out|output|output_?\d+)$", re.IGNORECASE)
 _HELD = 6  # rows at the largest or smallest value from which on it is suspected to be a limit
 _OFTEN = 5.0  # times the rows that a value usually has
 _LONGER = 3.0  # times the rows for which other values are usually held
-_LEVELS = 20  # of a signal at least, for one with fewer stands at its extremes anyway
+_LEVELS = 20  # of a signal at least, for one with fewer is often at its extremes anyway
 _FINEST = 1e5  # steps within the range from which on rounding of the numbers could make them
-_COARSE = 0.02  # steps of a signal over its standard deviation that are told
+_COARSE = 0.02  # steps of a signal over its standard deviation that are reported
 SPIKE = 15.0
-"""Deviations from its neighbours that a sample is a spike from on."""
-_LOWER = (SPIKE, 10.0, 7.0, 5.0, 4.0)  # tried where a sample stands far outside the range of all others
+"""Deviations from its neighbours from which on a sample is a spike."""
+_LOWER = (
+    SPIKE,
+    10.0,
+    7.0,
+    5.0,
+    4.0,
+)  # tried where a sample is far outside the range of all others
 _BEYOND = 0.5  # of that range
 _OUTSIDE = 2.5  # interquartile ranges from the middle
 _FEW = 0.01  # share of samples that spikes are at most
@@ -43,7 +49,7 @@ class Column:
     unit: str
     values: Vector
     unusable: str = ""
-    """Why it can be no channel, in words."""
+    """Reason why it can be no channel."""
 
     @property
     def finite(self) -> Vector:
@@ -63,30 +69,42 @@ class Column:
 
     @property
     def constant(self) -> bool:
-        """Whether all values are the same."""
+        """True if all values are the same."""
         return len(self.finite) > 0 and bool(np.ptp(self.finite) == 0)
 
     @property
     def limits(self) -> tuple[tuple[float, int], ...]:
-        """Extreme values where the signal stands much more often than elsewhere, with the rows; perhaps saturated."""
+        """Extreme values that the signal has much more often than others, with the rows.
+
+        Such a signal may be saturated.
+        """
         levels, counts = np.unique(self.finite, return_counts=True)
         if len(levels) < _LEVELS:
             return ()
         x = self.finite
         edges = np.concatenate([[0], np.flatnonzero(np.diff(x)) + 1, [len(x)]])
         held = np.diff(edges)
-        held = held[(held > 1) & ~np.isin(x[edges[:-1]], levels[[0, -1]])]  # as inputs are, between their steps
-        least = max(_HELD, _OFTEN * float(np.median(counts)), _LONGER * float(np.median(held)) if len(held) else 0.0)
+        held = held[
+            (held > 1) & ~np.isin(x[edges[:-1]], levels[[0, -1]])
+        ]  # as inputs are, between their steps
+        least = max(
+            _HELD,
+            _OFTEN * float(np.median(counts)),
+            _LONGER * float(np.median(held)) if len(held) else 0.0,
+        )
         return tuple((float(levels[i]), int(counts[i])) for i in (0, -1) if counts[i] >= least)
 
     @property
     def spikes(self) -> int:
-        """Samples far from all their neighbours and from what the signal usually is, where they are few."""
+        """Samples far from all their neighbours and from the usual values, where they are few."""
         return self._spiky[1]
 
     @property
     def threshold(self) -> float:
-        """The step `outliers` takes the spikes away with it: `SPIKE`, lower where they need it."""
+        """Threshold with which the step `outliers` takes the spikes away.
+
+        It is `SPIKE`, or lower where the spikes need it.
+        """
         return self._spiky[0]
 
     @cached_property
@@ -107,7 +125,10 @@ class Column:
 
     @property
     def quantum(self) -> float | None:
-        """The step of which all values are multiples, where it is coarse beside deviation or movement of a sample."""
+        """Step of which all values are multiples, where it is coarse.
+
+        It is coarse if it is large beside the deviation or the movement of a sample.
+        """
         step = quantum_of(self.finite)
         if step is None or step <= min(_COARSE * float(self.finite.std()), self.movement):
             return None
@@ -115,18 +136,21 @@ class Column:
 
     @property
     def movement(self) -> float:
-        """By how much the signal moves between two rows, on the average."""
+        """Mean absolute change of the signal between two rows."""
         return float(np.abs(np.diff(self.finite)).mean()) if len(self.finite) > 1 else 0.0
 
     @property
     def kind(self) -> str:
-        """'input' or 'output' where the name says so, otherwise ''."""
+        """'input' or 'output' where the name shows it, otherwise ''."""
         name = channel_name(last_part(split_header(self.header)[0]))
         return "input" if _INPUT.match(name) else "output" if _OUTPUT.match(name) else ""
 
 
 def quantum_of(values: Vector) -> float | None:
-    """The step of which all differences between values are multiples, up to rounding; None where there is none."""
+    """Return the step of which all differences between values are multiples, up to rounding.
+
+    None where there is none.
+    """
     levels = np.unique(values)
     if len(levels) < 3 or not np.isfinite(levels[[0, -1]]).all():
         return None
@@ -137,8 +161,14 @@ def quantum_of(values: Vector) -> float | None:
 
 
 def channel_name(text: str, taken: Iterable[str] = ()) -> str:
-    """An identifier for a column: other letters become underscores; a name that is taken gets a number."""
-    name = re.sub(r"\W+", "_", unicodedata.normalize("NFKC", text)).strip("_")[: LONGEST - 4] or "channel"
+    """Return an identifier for a column: other letters become underscores.
+
+    A name that is taken gets a number.
+    """
+    name = (
+        re.sub(r"\W+", "_", unicodedata.normalize("NFKC", text)).strip("_")[: LONGEST - 4]
+        or "channel"
+    )
     name = f"x{name}" if name[0].isdigit() else name
     if not is_name(name) or keyword.iskeyword(name) or name in (SAMPLING_TIME, "time"):
         name += "_"

@@ -18,7 +18,10 @@ _HISTORY = 10_000  # rows of the partition before that are kept beside each: no 
 
 @dataclass(frozen=True, eq=False)
 class FramePartition:
-    """One partition of a DataFrame; `held` are futures of it and of the last rows of the one before."""
+    """One partition of a DataFrame.
+
+    `held` are futures of it and of the last rows of the one before.
+    """
 
     name: str
     rows: int
@@ -29,23 +32,23 @@ class FramePartition:
     missing: str
     held: tuple[Any, ...]
 
-    def on(self, frame: Any, before: Any) -> HeldFrame:
-        """The same where the rows are."""
-        return HeldFrame(replace(self, held=()), frame, before)
+    def on(self, frame: Any, before: Any) -> FramePartitionData:
+        """Return the partition with its rows, on the worker that holds them."""
+        return FramePartitionData(replace(self, held=()), frame, before)
 
     def head(self, rows: int) -> FramePartition:
-        """Its first rows, taken where they are."""
+        """Return its first rows, taken on the worker that holds them."""
         first = self.held[0].client.submit(_rows, self.held[0], 0, rows, pure=False)
         return replace(self, rows=min(rows, self.rows), held=(first, self.held[1]))
 
     def pieces(self, lead: int) -> Iterator[Experiment]:
-        """Brings the rows here; an engine of the cluster reads them where they are."""
+        """Yield its rows, brought here; an engine of the cluster reads them on the workers."""
         frame, before = (future.result() for future in self.held)
         return self.on(frame, before).pieces(lead)
 
 
 @dataclass(frozen=True, eq=False)
-class HeldFrame:
+class FramePartitionData:
     """A partition with its rows."""
 
     of: FramePartition
@@ -61,22 +64,28 @@ class HeldFrame:
         return self.of.rows
 
     def pieces(self, lead: int) -> Iterator[Experiment]:
-        """See `Partition.pieces`."""
+        """Yield its rows; see `Partition.pieces`."""
         own = self.of
         known = 0 if self.before is None else len(self.before)
         if known < min(lead, own.first_row):
             raise InputError(
-                f"{own.name}: the one before has {known} rows, fewer than the largest lag, {lead}; repartition the "
-                "DataFrame."
+                f"{own.name}: the one before has {known} rows, fewer than the largest lag, "
+                f"{lead}; repartition the DataFrame."
             )
         frames = [self.frame] if self.before is None else [self.before, self.frame]
         try:
-            values = np.concatenate([frame[list(own.columns)].to_numpy(dtype=float) for frame in frames])
+            values = np.concatenate(
+                [frame[list(own.columns)].to_numpy(dtype=float) for frame in frames]
+            )
         except (KeyError, TypeError, ValueError) as error:
-            raise InputError(f"{own.name}: {error}; expected the columns {', '.join(own.columns)}, numbers.") from None
+            raise InputError(
+                f"{own.name}: {error}; expected the columns {', '.join(own.columns)}, numbers."
+            ) from None
         labels = np.zeros(len(values))
         if own.experiment is not None:
-            labels = np.concatenate([frame[own.experiment].to_numpy(dtype=float) for frame in frames])
+            labels = np.concatenate(
+                [frame[own.experiment].to_numpy(dtype=float) for frame in frames]
+            )
         borders = [0, *(1 + np.flatnonzero(np.diff(labels))).tolist(), len(values)]
         for start, stop in zip(borders, borders[1:], strict=False):
             first = max(start, known - lead)
@@ -91,14 +100,18 @@ class HeldFrame:
             values[:, part] * [c.scale for c in group] + [c.offset for c in group]
             for part, group in ((slice(len(outputs)), outputs), (slice(len(outputs), None), inputs))
         ]
-        experiment = Experiment(signals[1], signals[0], f"{_NAME}{label}", first_row=row, offset=row)
+        experiment = Experiment(
+            signals[1], signals[0], f"{_NAME}{label}", first_row=row, offset=row
+        )
         if self.of.missing == "skip":
             yield from stretches(experiment, lead)
             return
         bad = np.argwhere(~np.isfinite(values))
         if len(bad):
             where = f"row {row + bad[0][0]}, column '{self.of.columns[bad[0][1]]}'"
-            raise InputError(f"{self.name}: {where}: found {values[tuple(bad[0])]}; expected a finite number.")
+            raise InputError(
+                f"{self.name}: {where}: found {values[tuple(bad[0])]}; expected a finite number."
+            )
         yield experiment
 
 
@@ -114,14 +127,17 @@ class FrameSource:
     time_column: str | None = None
 
     def window(self, start: int, stop: int) -> list[Experiment]:
-        """Rows `[start, stop)`, brought here."""
+        """Return rows `[start, stop)`, brought here."""
         found = []
         for partition in self.partitions:
-            a, b = max(start - partition.first_row, 0), min(stop - partition.first_row, partition.rows)
+            a, b = (
+                max(start - partition.first_row, 0),
+                min(stop - partition.first_row, partition.rows),
+            )
             if a < b:
                 frame = self.client.submit(_rows, partition.held[0], a, b, pure=False).result()
                 shown = replace(partition, first_row=partition.first_row + a, rows=b - a, held=())
-                found += HeldFrame(shown, frame, None).pieces(0)
+                found += FramePartitionData(shown, frame, None).pieces(0)
         return joined(found)
 
 
@@ -136,13 +152,13 @@ def open_frame(
     missing: str = "error",
     client: Any = None,
 ) -> FrameSource:
-    """A Dask DataFrame whose rows are in order; its partitions are kept on the workers.
+    """Return a Dask DataFrame whose rows are in order; its partitions are kept on the workers.
 
     Args:
         frame: a `dask.dataframe.DataFrame`.
         inputs, outputs: channel names, or `Channel`s with column, unit, scale and offset.
         sampling_time: seconds between rows.
-        experiment: the column, of numbers, that tells experiments apart; each is in one piece.
+        experiment: the column of numbers that labels the experiments; each is in one piece.
         columns: the frame's column for a channel.
         missing: "error", or "skip" to end a stretch at rows with a missing sample.
         client: a `distributed.Client`; None for the one at hand.
@@ -156,14 +172,21 @@ def open_frame(
     check_channels(groups[1], groups[0])
     given = dict(columns or {})
     own = tuple(given.get(c.name, c.file_column) for group in groups for c in group)
-    absent = [name for name in (*own, *([experiment] if experiment else [])) if name not in frame.columns]
+    absent = [
+        name for name in (*own, *([experiment] if experiment else [])) if name not in frame.columns
+    ]
     if absent:
-        raise InputError(f"the DataFrame has no column '{absent[0]}'; it has {', '.join(map(str, frame.columns))}.")
+        raise InputError(
+            f"the DataFrame has no column '{absent[0]}'; it has "
+            f"{', '.join(map(str, frame.columns))}."
+        )
     if client is None:
         try:
             client = default_client()
         except ValueError:
-            raise InputError("there is no Dask client; make one, `distributed.Client()`, or give `client`.") from None
+            raise InputError(
+                "there is no Dask client; make one, `distributed.Client()`, or give `client`."
+            ) from None
     frames = client.compute(frame.to_delayed())
     tails = [None, *(client.submit(_tail, future, pure=False) for future in frames[:-1])]
     counts = client.gather(client.map(len, frames, pure=False))
@@ -173,7 +196,14 @@ def open_frame(
     first = np.concatenate([[0], np.cumsum(counts)]).astype(int).tolist()
     partitions = tuple(
         FramePartition(
-            f"{_NAME}, partition {i}", count, own, experiment, groups, first[i], missing, (frames[i], tails[i])
+            f"{_NAME}, partition {i}",
+            count,
+            own,
+            experiment,
+            groups,
+            first[i],
+            missing,
+            (frames[i], tails[i]),
         )
         for i, count in enumerate(counts)
     )

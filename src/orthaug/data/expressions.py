@@ -1,8 +1,8 @@
-"""Expressions of lagged signals, such as `"sign(v[k-1])*v[k-1]**2"`: a whitelisted parser, no `eval`.
+"""Expressions of lagged signals, such as `"sign(v[k-1])*v[k-1]**2"`, parsed without `eval`.
 
-Python's own grammar reads the text into a syntax tree. A node that is not on the list below is refused by
-name, so an expression can only do arithmetic. NumPy evaluates the tree on whole records, JAX inside a
-compiled free run.
+Python's own grammar reads the text into a syntax tree. A node that is not on the list below is
+refused by name, so an expression can only do arithmetic. NumPy evaluates the tree on whole records,
+JAX inside a compiled free run.
 """
 
 from __future__ import annotations
@@ -37,7 +37,10 @@ class Lag(NamedTuple):
 _OF_ONE = ("sin", "cos", "tan", "atan", "exp", "log", "sqrt", "abs", "sign", "floor", "tanh")
 _OF_MANY = ("min", "max")
 FUNCTIONS = (*_OF_ONE, "atan2", *_OF_MANY)
-_ELSEWHERE = {"atan": "arctan", "atan2": "arctan2"}  # as NumPy and JAX call them, where that is another name
+_ELSEWHERE = {
+    "atan": "arctan",
+    "atan2": "arctan2",
+}  # as NumPy and JAX call them, where that is another name
 RESERVED = frozenset((*FUNCTIONS, "k"))
 SAMPLING_TIME = "Ts"  # a name that need not be declared: it is the record's sampling time
 LARGEST_LAG = 100_000  # more is a mistake, and would fill the memory
@@ -49,9 +52,13 @@ _BINARY = {
     ast.Div: lambda a, b: a / b,
     ast.Pow: lambda a, b: a**b,
 }
-_ALLOWED = "channels at a lag such as y[k-1], numbers, constants, + - * / ** ( ) and " + ", ".join(FUNCTIONS)
+_ALLOWED = "channels at a lag such as y[k-1], numbers, constants, + - * / ** ( ) and " + ", ".join(
+    FUNCTIONS
+)
 _POWER, _ELEMENTWISE = re.compile(r"\.?\^"), re.compile(r"\.([*/])")
-_LAGGED = re.compile(r"\b([^\W\d]\w*)\s*[({]\s*[kt]\s*([-+]\s*\d+)?\s*[)}]|\b([^\W\d]\w*)\[\s*t\s*([-+]\s*\d+)?\s*\]")
+_LAGGED = re.compile(
+    r"\b([^\W\d]\w*)\s*[({]\s*[kt]\s*([-+]\s*\d+)?\s*[)}]|\b([^\W\d]\w*)\[\s*t\s*([-+]\s*\d+)?\s*\]"
+)
 
 
 @dataclass(frozen=True)
@@ -87,37 +94,49 @@ class Expression:
 
     @cached_property
     def unsampled(self) -> bool:
-        """Whether it reads `Ts`, and has no value for that yet."""
-        named = any(isinstance(node, ast.Name) and node.id == SAMPLING_TIME for node in _free_names(self.tree))
+        """True if it reads `Ts`, and has no value for that yet."""
+        named = any(
+            isinstance(node, ast.Name) and node.id == SAMPLING_TIME
+            for node in _free_names(self.tree)
+        )
         return named and SAMPLING_TIME not in dict(self.constants)
 
     def sampled(self, sampling_time: float) -> Expression:
-        """The expression with this value [s] of `Ts`; the same one where it does not wait for it."""
+        """Return the expression with this value [s] of `Ts`.
+
+        The same one where it does not wait for it.
+        """
         if not self.unsampled:
             return self
-        return replace(self, constants=tuple(sorted((*self.constants, (SAMPLING_TIME, float(sampling_time))))))
+        return replace(
+            self, constants=tuple(sorted((*self.constants, (SAMPLING_TIME, float(sampling_time)))))
+        )
 
     def evaluate(self, columns: Mapping[Lag, Any], xp: Any) -> Any:
-        """Value for `columns[lag]` (scalars or arrays of one shape), computed by `xp` (numpy or jax.numpy).
+        """Return the value for `columns[lag]`, computed by `xp` (numpy or jax.numpy).
+
+        The columns are scalars or arrays of one shape.
 
         Raises:
             InputError: the sampling time is asked for and not known here.
         """
         if self.unsampled:
-            raise InputError(f"'{self.text}': {SAMPLING_TIME} has no value here; give it as a constant.")
+            raise InputError(
+                f"'{self.text}': {SAMPLING_TIME} has no value here; give it as a constant."
+            )
         return _evaluate(self.tree, columns, dict(self.constants), xp, self.text)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The names that stand for numbers in it."""
+        """The names of numbers in it."""
         return tuple(name for name, _ in self.constants)
 
     def value(self, values: Mapping[str, Any], xp: Any) -> Any:
-        """Value where its names stand for `values`; of an expression without channels."""
+        """Return its value for `values` of its names; of an expression without channels."""
         return _evaluate(self.tree, {}, values, xp, self.text)
 
     def term_without_value(self, values: Mapping[str, Any]) -> tuple[str, tuple[str, ...]]:
-        """The smallest term that is not finite although all in it is, and its names."""
+        """Return the smallest term that is not finite although all in it is, and its names."""
 
         def finite(node: ast.expr) -> bool:
             with np.errstate(all="ignore"):
@@ -125,7 +144,11 @@ class Expression:
 
         node = self.tree
         while True:
-            inner = [child for child in ast.walk(node) if isinstance(child, ast.expr) and child is not node]
+            inner = [
+                child
+                for child in ast.walk(node)
+                if isinstance(child, ast.expr) and child is not node
+            ]
             functions = [child.func for child in ast.walk(node) if isinstance(child, ast.Call)]
             worse = [child for child in inner if child not in functions and not finite(child)]
             if not worse:
@@ -134,7 +157,10 @@ class Expression:
 
 
 def is_name(name: str, taken: Container[str] = RESERVED) -> bool:
-    """Whether expressions can use `name`: Python reads an identifier in its normal form only."""
+    """Return whether expressions can use `name`.
+
+    Python reads an identifier in its normal form only.
+    """
     return (
         is_identifier(name)
         and not keyword.iskeyword(name)
@@ -144,17 +170,22 @@ def is_name(name: str, taken: Container[str] = RESERVED) -> bool:
 
 
 def is_identifier(name: Any) -> bool:
-    """Whether `name` is made of letters, digits and underscores, does not start with a digit and is not too long."""
+    """Return whether `name` is an identifier: letters, digits and underscores.
+
+    It does not start with a digit and is not too long.
+    """
     return isinstance(name, str) and name.isidentifier() and len(name) <= LONGEST
 
 
 def parse(text: str, constants: Mapping[str, float] | None = None) -> Expression:
     """Read `text`. Besides channels and functions it may use the names in `constants`.
 
-    It may also use `Ts`, the sampling time of the record that it will be read on (`Expression.sampled`).
+    It may also use `Ts`, the sampling time of the record that it will be read on
+    (`Expression.sampled`).
 
     Raises:
-        InputError: anything that is not arithmetic on lagged channels, with the offending piece named.
+        InputError: anything that is not arithmetic on lagged channels, with the offending piece
+            named.
     """
     constants = dict(constants or {})
     if not isinstance(text, str):
@@ -163,9 +194,13 @@ def parse(text: str, constants: Mapping[str, float] | None = None) -> Expression
     if not text:
         raise InputError("An expression is empty; write for example y[k-1], or 1 for an offset.")
     if "#" in text:
-        raise InputError(f"'{text[:_MAX_LENGTH]}': '#' is not allowed in an expression; allowed are {_ALLOWED}.")
+        raise InputError(
+            f"'{text[:_MAX_LENGTH]}': '#' is not allowed in an expression; allowed are {_ALLOWED}."
+        )
     if len(text) > _MAX_LENGTH:
-        raise InputError(f"An expression has {len(text)} characters; at most {_MAX_LENGTH} are read.")
+        raise InputError(
+            f"An expression has {len(text)} characters; at most {_MAX_LENGTH} are read."
+        )
     try:
         return _read(text, constants)
     except (SyntaxError, ValueError) as error:
@@ -173,11 +208,15 @@ def parse(text: str, constants: Mapping[str, float] | None = None) -> Expression
         if isinstance(error, InputError):
             raise
         if any(mark in text for mark in ("&&", "||", "~=", "==")):
-            raise InputError(f"'{text}': there is no logic in an expression; sign, min and max can switch.") from None
+            raise InputError(
+                f"'{text}': there is no logic in an expression; sign, min and max can switch."
+            ) from None
         reason = getattr(error, "msg", str(error))
-        raise InputError(f"'{text}' is not an expression ({reason}); allowed are {_ALLOWED}.") from None
+        raise InputError(
+            f"'{text}' is not an expression ({reason}); allowed are {_ALLOWED}."
+        ) from None
     except (RecursionError, MemoryError):
-        raise InputError(f"'{text[:40]}…' is nested too deeply; write it in simpler terms.") from None
+        raise InputError(f"'{text[:40]}…' is nested too deeply; write it more simply.") from None
 
 
 def parse_named(
@@ -195,15 +234,22 @@ def parse_named(
         InputError: anything else.
     """
     if not isinstance(text, str):
-        raise InputError(f"{where} must be an expression in text such as 'Ts**2 / m'; got {shown(text)}.")
+        raise InputError(
+            f"{where} must be an expression in text such as 'Ts**2 / m'; got {shown(text)}."
+        )
     if "[" in text:
-        raise InputError(f"{where} = {text}: a signal such as y[k-1] is no part of it; known are {', '.join(known)}.")
+        raise InputError(
+            f"{where} = {text}: a signal such as y[k-1] is not allowed here; known are "
+            f"{', '.join(known)}."
+        )
     for word in re.findall(r"\b[^\W\d]\w*", unicodedata.normalize("NFKC", text)):
         if word not in known and word not in FUNCTIONS and not keyword.iskeyword(word):
             hint = nearest(word, known) or f"; known are {', '.join(known)}"
             if word == "pi":
                 hint = "; write 3.141592653589793, or give a channel in degrees a `scale`"
-            raise InputError(f"{where} = {text}: unknown name '{word}'{(hints or {}).get(word, hint)}.")
+            raise InputError(
+                f"{where} = {text}: unknown name '{word}'{(hints or {}).get(word, hint)}."
+            )
     try:
         return parse(text, known)
     except InputError as error:
@@ -220,7 +266,7 @@ def _read(text: str, constants: Mapping[str, float]) -> Expression:
 
 
 def _suggest(text: str, constants: Mapping[str, float]) -> None:
-    """Raise InputError with the text as it is written here, where it is one in the habits of MATLAB."""
+    """Raise InputError with the correct text for one that is written as in MATLAB."""
 
     def lagged(found: re.Match[str]) -> str:
         name, lag = found[1] or found[3], found[2] or found[4] or ""
@@ -275,20 +321,26 @@ def _check(node: ast.AST, text: str, constants: Mapping[str, float], used: set[s
             raise InputError(f"'{text}': '^' is not a power here; write **, as in y[k-1]**2.")
         if isinstance(node, ast.Compare | ast.BoolOp | ast.IfExp):
             raise InputError(
-                f"'{text}': '{ast.unparse(node)}' is not allowed in an expression, which has no logic; sign, min and "
-                "max can switch."
+                f"'{text}': '{ast.unparse(node)}' is not allowed in an expression, which has "
+                "no logic; sign, min and max can switch."
             )
         what = ast.unparse(node) if isinstance(node, ast.expr) else type(node).__name__
-        raise InputError(f"'{text}': '{what}' is not allowed in an expression; allowed are {_ALLOWED}.")
+        raise InputError(
+            f"'{text}': '{what}' is not allowed in an expression; allowed are {_ALLOWED}."
+        )
 
 
 def _check_call(node: ast.Call, text: str) -> None:
     name = node.func.id if isinstance(node.func, ast.Name) else None
     if name is None or node.keywords or any(isinstance(a, ast.Starred) for a in node.args):
-        raise InputError(f"'{text}': '{ast.unparse(node)}' is not allowed; functions are {', '.join(FUNCTIONS)}.")
+        raise InputError(
+            f"'{text}': '{ast.unparse(node)}' is not allowed; functions are {', '.join(FUNCTIONS)}."
+        )
     if name not in FUNCTIONS:
         hint = ", did you mean 'log'?" if name == "ln" else nearest(name, FUNCTIONS)
-        raise InputError(f"'{text}': unknown function '{name}'{hint}; known are {', '.join(FUNCTIONS)}.")
+        raise InputError(
+            f"'{text}': unknown function '{name}'{hint}; known are {', '.join(FUNCTIONS)}."
+        )
     many, exact = name in _OF_MANY, 1 if name in _OF_ONE else 2
     wanted = "two or more arguments" if many else "two arguments" if exact == 2 else "one argument"
     if (len(node.args) < 2) if many else (len(node.args) != exact):
@@ -296,7 +348,7 @@ def _check_call(node: ast.Call, text: str) -> None:
 
 
 def _free_names(node: ast.AST) -> Iterator[ast.Name]:
-    """The names that stand for numbers: neither channels nor functions."""
+    """Yield the names of numbers: neither channels nor functions."""
     if isinstance(node, ast.Name):
         yield node
     elif isinstance(node, ast.Call):
@@ -308,9 +360,11 @@ def _free_names(node: ast.AST) -> Iterator[ast.Name]:
 
 
 def _lag(node: ast.Subscript, text: str) -> Lag:
-    """The raw lag that `name[k]` or `name[k-3]` stands for."""
+    """Return the raw lag that `name[k]` or `name[k-3]` denotes."""
     if not isinstance(node.value, ast.Name):
-        raise InputError(f"'{text}': '{ast.unparse(node)}' is not a channel at a lag such as y[k-1].")
+        raise InputError(
+            f"'{text}': '{ast.unparse(node)}' is not a channel at a lag such as y[k-1]."
+        )
     name, index = node.value.id, node.slice
     if isinstance(index, ast.Name) and index.id == "k":
         return Lag(name, 0)
@@ -324,17 +378,24 @@ def _lag(node: ast.Subscript, text: str) -> Lag:
     ):
         if isinstance(index.op, ast.Add) and index.right.value > 0:
             raise InputError(
-                f"'{text}': '{ast.unparse(node)}' looks ahead; a regressor uses {name}[k] or earlier samples."
+                f"'{text}': '{ast.unparse(node)}' looks ahead; a regressor uses {name}[k] or "
+                "earlier samples."
             )
         if index.right.value > LARGEST_LAG:
             raise InputError(
-                f"'{text}': '{ast.unparse(node)}' reaches too far back; lags up to {LARGEST_LAG} are read."
+                f"'{text}': '{ast.unparse(node)}' reaches too far back; lags up to "
+                f"{LARGEST_LAG} are read."
             )
         return Lag(name, index.right.value)
-    raise InputError(f"'{text}': the index of '{ast.unparse(node)}' must be k or k-1, k-2, … with a whole number.")
+    raise InputError(
+        f"'{text}': the index of '{ast.unparse(node)}' must be k or k-1, k-2, … with a whole "
+        "number."
+    )
 
 
-def _evaluate(node: ast.expr, columns: Mapping[Lag, Any], constants: Mapping[str, float], xp: Any, text: str) -> Any:
+def _evaluate(
+    node: ast.expr, columns: Mapping[Lag, Any], constants: Mapping[str, float], xp: Any, text: str
+) -> Any:
     if isinstance(node, ast.Constant):
         return float(node.value)  # type: ignore[arg-type]  (checked by `parse`)
     if isinstance(node, ast.Name):
@@ -363,8 +424,14 @@ def _evaluate(node: ast.expr, columns: Mapping[Lag, Any], constants: Mapping[str
 
 def _unknown_name(name: str, text: str, constants: Mapping[str, float]) -> str:
     if name == "k":
-        return f"'{text}': k is the time index and cannot stand alone; write a channel at a lag, y[k-1]."
+        return (
+            f"'{text}': k is the time index and no value by itself; write a channel at a lag, "
+            "y[k-1]."
+        )
     if name in FUNCTIONS:
         return f"'{text}': {name} is a function; write {name}(…)."
-    hint = nearest(name, constants) or f"; declare it with its value, or, for a channel, give its lag, {name}[k-1]"
+    hint = (
+        nearest(name, constants)
+        or f"; declare it with its value, or, for a channel, give its lag, {name}[k-1]"
+    )
     return f"'{text}': unknown constant '{name}'{hint}."

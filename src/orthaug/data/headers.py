@@ -1,4 +1,7 @@
-"""What the header of a column says: name, unit, whether it is the time; and instants in s, of numbers or dates."""
+"""Name and unit in the header of a column, and whether it is the time.
+
+Instants in s are made of numbers or dates.
+"""
 
 from __future__ import annotations
 
@@ -15,12 +18,13 @@ from orthaug._base.checks import Vector
 from orthaug._base.errors import InputError
 
 _UNITS = re.compile(
-    r"A|mA|V|mV|kV|W|kW|N|kN|mN|Nm|m|mm|cm|km|um|s|ms|us|rad|mrad|deg|rpm|Hz|kHz|Pa|kPa|MPa|bar|mbar|K|degC|degF|kg|J|"
-    r"kJ|ohm|percent|m_s2?|rad_s2?|l_min|kg_s"
+    r"A|mA|V|mV|kV|W|kW|N|kN|mN|Nm|m|mm|cm|km|um|s|ms|us|rad|mrad|deg|rpm|Hz|kHz|Pa|kPa|MPa|"
+    r"bar|mbar|K|degC|degF|kg|J|kJ|ohm|percent|m_s2?|rad_s2?|l_min|kg_s"
 )
 _BRACKETS = re.compile(r"^(.*?)\s*[\[(]\s*([^\[\]()]+?)\s*[\])]$")
 _TIME = re.compile(
-    r"^(t|times?|time[ _]?stamp|zeit|zeitstempel|uhrzeit|datum|date([ _/]?time)?|elapsed([ _]?time)?|sec|seconds)$",
+    r"^(t|times?|time[ _]?stamp|zeit|zeitstempel|uhrzeit|datum|date([ _/]?time)?|"
+    r"elapsed([ _]?time)?|sec|seconds)$",
     re.IGNORECASE,
 )
 _STEP = re.compile(r"^(ts|dt|t_s|sampling_?time|sample_?time)$", re.IGNORECASE)
@@ -28,16 +32,24 @@ _RATE = re.compile(r"^(fs|sampling_?rate|sample_?rate|sampling_?frequency)$", re
 _PARTS = {"s": 1, "sec": 1, "ms": 1e3, "us": 1e6, "µs": 1e6, "μs": 1e6, "ns": 1e9}  # of a second
 _MULTIPLES = {"min": 60.0, "h": 3600.0, "d": 86400.0}
 _OF_TIME = re.compile(rf"(.+)_({'|'.join([*_PARTS, *_MULTIPLES])})")
-_DATES = {".": ("%d.%m.%Y", "%d.%m.%y"), "/": ("%d/%m/%Y", "%m/%d/%Y", "%Y/%m/%d"), "-": ("%d-%m-%Y",), ":": ("",)}
+_DATES = {
+    ".": ("%d.%m.%Y", "%d.%m.%y"),
+    "/": ("%d/%m/%Y", "%m/%d/%Y", "%Y/%m/%d"),
+    "-": ("%d-%m-%Y",),
+    ":": ("",),
+}
 _TIMES = ("%H:%M:%S.%f", "%H:%M:%S", "%H:%M", "%I:%M:%S %p")
 _MOST_OF = 0.9  # share of the cells that have to be dates
 _COMMA = r"(:\d\d),(\d+)"
 
 
 def split_header(header: str) -> tuple[str, str]:
-    """Name and unit of a header: `force [N]`, `force (N)`, `force_N`; an index, as in `U[2]`, is no unit.
+    """Return name and unit of a header: `force [N]`, `force (N)`, `force_N`.
 
-    The number that tells columns of one name apart stays with the name: `force [N].1` is `force.1` in N.
+    An index, as in `U[2]`, is no unit.
+
+    The number that follows columns of one name stays with the name: `force [N].1` is `force.1`
+    in N.
     """
     numbered = re.fullmatch(r"(.*)(\.\d+)", header)
     if numbered:
@@ -48,17 +60,22 @@ def split_header(header: str) -> tuple[str, str]:
         return found[1].strip(), found[2].strip()
     for cut in (i for i, letter in enumerate(header) if letter == "_" and i):
         if _UNITS.fullmatch(header[cut + 1 :]):
-            return header[:cut], header[cut + 1 :].replace("_s", "/s").replace("_min", "/min").replace("s2", "s^2")
+            return header[:cut], header[cut + 1 :].replace("_s", "/s").replace(
+                "_min", "/min"
+            ).replace("s2", "s^2")
     return header, ""
 
 
 def last_part(name: str) -> str:
-    """The name of a variable without the struct or group that it is in: `u` of `data.u`."""
+    """Return the name of a variable without the struct or group that it is in: `u` of `data.u`."""
     return re.split(r"[./]", name)[-1]
 
 
 def unit_of_time(header: str) -> tuple[str, float | None]:
-    """Name of a column, and what its unit is in s: 1 without one, None for a unit that is none of time."""
+    """Return the name of a column, and its unit in s.
+
+    The unit is 1 where the header has none, None where it is none of time.
+    """
     base, unit = split_header(header)
     own = _OF_TIME.fullmatch(header)
     if not unit and own and _TIME.match(last_part(own[1])):
@@ -69,13 +86,16 @@ def unit_of_time(header: str) -> tuple[str, float | None]:
 
 
 def is_time(header: str) -> bool:
-    """Whether the name says that the column holds instants."""
+    """Return whether the name says that the column holds instants."""
     base, unit = unit_of_time(header)
     return unit is not None and bool(_TIME.match(base) or _TIME.match(last_part(base)))
 
 
 def step_of(header: str, value: float) -> float | None:
-    """The sampling time in s where the name says that the value is one, or a rate in Hz; otherwise None."""
+    """Return the sampling time in s where the name says that the value is one, or a rate in Hz.
+
+    Otherwise None.
+    """
     base, unit = unit_of_time(header)
     if unit is not None and value > 0 and _STEP.match(last_part(base)):
         return unit * value
@@ -86,7 +106,10 @@ def step_of(header: str, value: float) -> float | None:
 
 
 def in_seconds(values: Vector, header: str) -> Vector:
-    """Numbers of a time column in s, by the unit in its header; a unit that is none of time is no unit."""
+    """Return the numbers of a time column in s, by the unit in its header.
+
+    A unit that is none of time is no unit.
+    """
     unit = unit_of_time(header)[1]
     if unit is None or unit == 1:
         return values
@@ -94,20 +117,26 @@ def in_seconds(values: Vector, header: str) -> Vector:
 
 
 def dated(cells: Sequence[Any] | np.ndarray, where: str) -> Vector | None:
-    """Dates as seconds since the first of them, NaN where a cell is none; None where they are no dates.
+    """Return dates as seconds since the first of them, NaN where a cell is none.
+
+    None where they are no dates.
 
     Args:
-        cells: texts, or what a library makes of a date, a time of the day or a duration; None or "" where empty.
+        cells: texts, or what a library makes of a date, a time of the day or a duration; None or ""
+            where empty.
         where: begins messages.
 
     Raises:
-        InputError: dates that may begin with the day or with the month, where that makes a difference.
+        InputError: dates that may begin with the day or with the month, where that makes a
+            difference.
     """
     import pandas as pd
 
     found = pd.Series(cells).map(_plain) if np.asarray(cells).dtype == object else pd.Series(cells)
     kind = found.dtype.kind if isinstance(found.dtype, np.dtype) else ""
-    if kind == "m" or (kind == "O" and found.map(lambda cell: isinstance(cell, datetime.timedelta)).any()):
+    if kind == "m" or (
+        kind == "O" and found.map(lambda cell: isinstance(cell, datetime.timedelta)).any()
+    ):
         spans = pd.to_timedelta(found, errors="coerce")
         return spans.dt.total_seconds().to_numpy(dtype=float)
     if kind == "M":
@@ -118,10 +147,12 @@ def dated(cells: Sequence[Any] | np.ndarray, where: str) -> Vector | None:
 
 
 def _plain(cell: Any) -> Any:
-    """A time of the day as a duration; anything else as it is."""
+    """Return a time of the day as a duration; anything else as it is."""
     if not isinstance(cell, datetime.time):
         return cell
-    return datetime.timedelta(hours=cell.hour, minutes=cell.minute, seconds=cell.second, microseconds=cell.microsecond)
+    return datetime.timedelta(
+        hours=cell.hour, minutes=cell.minute, seconds=cell.second, microseconds=cell.microsecond
+    )
 
 
 def _since_first(instants: Any) -> Vector:
@@ -130,7 +161,10 @@ def _since_first(instants: Any) -> Vector:
 
 
 def _parsed(cells: Any, where: str) -> Any:
-    """ISO 8601, then day, month and year as people write them; None where most cells are neither."""
+    """Read ISO 8601, then day, month and year as people write them.
+
+    None where most cells are neither.
+    """
     import pandas as pd
 
     def read(**options: Any) -> Any:
@@ -164,6 +198,7 @@ def _parsed(cells: Any, where: str) -> Any:
     best = [_since_first(found) for found in good if found.notna().sum() == most]
     if any(not np.array_equal(best[0], other, equal_nan=True) for other in best[1:]):
         raise InputError(
-            f"{where}: '{cells.iloc[0]}' may begin with the day or with the month; write dates as 2024-12-31."
+            f"{where}: '{cells.iloc[0]}' may begin with the day or with the month; write dates "
+            "as 2024-12-31."
         )
     return next(found for found in good if found.notna().sum() == most)

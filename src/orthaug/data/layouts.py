@@ -1,4 +1,7 @@
-"""What stands where in a table: encoding, line of the header and separator of a text; the cells of a workbook."""
+"""Layout of a table: encoding, line of the header and separator of a text.
+
+The cells of a workbook are read here as well.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +27,7 @@ _NUMBER = re.compile(r'[\s"]*[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?[\s"]*
 _COMMA = re.compile(r"(\d*),(\d+)")
 _DATE = re.compile(r"\d[\d.:/+ T-]*[.:/-][\d.:/+ T-]*\dZ?")
 _MISSING = ("", "nan", "na", "n/a", "null", "none")
-_BLANK = " "  # the separator that stands for any run of spaces and tabs
+_BLANK = " "  # the separator that means any run of spaces and tabs
 _SEPARATORS = ("\t", ";", ",", _BLANK)
 _WITH_UNIT = re.compile(r'"[^"]*"|[^\s"]+(?:\s+(?:\[[^\]]*\]|\([^)]*\)))?')
 _DECIMAL_COMMA = {
@@ -33,18 +36,25 @@ _DECIMAL_COMMA = {
     _BLANK: re.compile(r"(?:^|[ \t])[+-]?\d*,\d+(?:[eE][+-]?\d+)?(?=\s|$)", re.MULTILINE),
 }
 _AHEAD = 50  # lines in which the header is looked for
-_MARKS = {codecs.BOM_UTF8: "utf-8-sig", codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
+_MARKS = {
+    codecs.BOM_UTF8: "utf-8-sig",
+    codecs.BOM_UTF16_LE: "utf-16",
+    codecs.BOM_UTF16_BE: "utf-16",
+}
 _CONTROL = re.compile(r"[\x00-\x08\x0b\x0e-\x19\x1b-\x1f]")  # what no text holds
 _FALLBACK = "cp1252"  # of Windows, where a file is no UTF-8
 _ROWS, _COLUMNS = 1_048_576, 16_384  # of a sheet at most
 Place = Callable[[Sequence[str]], Sequence[int]]
-_PROLOGUE = 4096  # bytes of a part in which a document type would stand
+_PROLOGUE = 4096  # bytes of a part in which a document type would be
 
 
 class Layout(NamedTuple):
-    """Column names, the number of lines above the first row, the separator, the encoding, and whether names were read.
+    """Layout of a text table: names, lines above the first row, separator, encoding.
 
-    The separator `" "` stands for any run of spaces and tabs. Columns without names are `x1`, `x2`, …
+    It also holds whether names were read.
+
+    The separator `" "` means any run of spaces and tabs. Columns without names are `x1`, `x2`,
+    …
     """
 
     names: list[str]
@@ -55,12 +65,14 @@ class Layout(NamedTuple):
 
     @property
     def note(self) -> str:
-        """What to know of the encoding and of the names; mostly nothing."""
-        notes = ["no UTF-8, so read as Windows-1252"] if self.encoding == _FALLBACK else []
+        """Note on the encoding and the names; mostly empty."""
+        notes = ["not UTF-8, so read as Windows-1252"] if self.encoding == _FALLBACK else []
         if not self.headed:
             named = [name for name in self.names if name]
             called = (
-                f"columns are called {named[0]} to {named[-1]}" if len(named) > 1 else f"column is called {named[0]}"
+                f"columns are called {named[0]} to {named[-1]}"
+                if len(named) > 1
+                else f"column is called {named[0]}"
             )
             notes.append(f"no header, so the {called}")
         return "; ".join(notes)
@@ -80,22 +92,25 @@ class Layout(NamedTuple):
 
 
 def layout(path: Path, columns: Sequence[str] = ()) -> Layout:
-    """Return the layout of a text table; remarks above its header are skipped.
+    """Find the layout of a text table; remarks above its header are skipped.
 
     Args:
-        columns: names that are asked for. A first line of numbers is a header only where it holds all of them.
+        columns: names that are asked for. A first line of numbers is a header only where it holds
+            all of them.
 
     Raises:
         InputError: what is no text, or only blank lines.
     """
     try:
-        encoding = _encoding(path)
+        encoding = encoding_of(path)
         return _layout(path, encoding, columns)
     except (UnicodeError, csv.Error):
-        raise InputError(f"{path}: not a text table; expected UTF-8 text with a header row.") from None
+        raise InputError(
+            f"{path}: not a text table; expected UTF-8 text with a header row."
+        ) from None
 
 
-def _encoding(path: Path) -> str:
+def encoding_of(path: Path) -> str:
     """By the byte-order mark; otherwise UTF-8, or Windows-1252 where it is none.
 
     Raises:
@@ -117,6 +132,22 @@ def _encoding(path: Path) -> str:
     return _FALLBACK
 
 
+def guessed_at(path: Path) -> int | None:
+    """Return the first line of a text that is no UTF-8, so that it is read as Windows-1252.
+
+    None where none is.
+    """
+    if encoding_of(path) != _FALLBACK:
+        return None
+    with path.open("rb") as file:
+        for number, line in enumerate(file, start=1):
+            try:
+                line.decode()
+            except UnicodeDecodeError:
+                return number
+    return None
+
+
 def _check_text(path: Path, encoding: str, *, strict: bool = False) -> None:
     """Decode all of a file, piece by piece; `strict` where any byte would have a letter."""
     decoder = codecs.getincrementaldecoder(encoding)()
@@ -136,7 +167,9 @@ def _layout(path: Path, encoding: str, columns: Sequence[str]) -> Layout:
         ahead = [(line, number)]
         while line.lstrip().startswith(_REMARK):
             after, further = _next_line(file, number)
-            if not after or _has_numbers(after):  # the names themselves stand behind the sign, right above the numbers
+            if not after or _has_numbers(
+                after
+            ):  # the names themselves follow the sign, right above the numbers
                 ahead += [(after, further)] if after else []
                 break
             line, number = after, further
@@ -149,24 +182,37 @@ def _layout(path: Path, encoding: str, columns: Sequence[str]) -> Layout:
     separator = "\t" if path.suffix.lower() == ".tsv" else _separator([text for text, _ in ahead])
     rows = [(_cells(text, separator), number) for text, number in ahead]
     first = _first_unnamed(rows, separator, ahead[0][0])
-    if first is not None and not (columns and set(columns) <= {cell.strip() for cell in rows[first][0]}):
-        return Layout(_unnamed([cells for cells, _ in rows[first:]]), rows[first][1] - 1, separator, encoding, False)
+    if first is not None and not (
+        columns and set(columns) <= {cell.strip() for cell in rows[first][0]}
+    ):
+        return Layout(
+            _unnamed([cells for cells, _ in rows[first:]]),
+            rows[first][1] - 1,
+            separator,
+            encoding,
+            False,
+        )
     names, number = _below_remarks(rows, separator)
     return Layout([name.strip() for name in names], number, separator, encoding)
 
 
 def _has_numbers(line: str) -> bool:
-    """Whether a line is one of a table and no remark: a cell between separators is a number, or each between spaces."""
+    """Return whether a line is one of a table and no remark.
+
+    One cell between separators is a number, or each cell between spaces.
+    """
     if line.lstrip().startswith(_REMARK):
         return False
-    return any(map(_NUMBER.fullmatch, re.split(r"[,;\t]", line))) or all(map(_NUMBER.fullmatch, line.split()))
+    return any(map(_NUMBER.fullmatch, re.split(r"[,;\t]", line))) or all(
+        map(_NUMBER.fullmatch, line.split())
+    )
 
 
 def _first_unnamed(rows: list[tuple[list[str], int]], separator: str, line: str) -> int | None:
-    """Index of the first row of a table without a header, None where it has one.
+    """Return the index of the first row of a table without a header, None where it has one.
 
     Args:
-        line: the first of the lines as it stands, which may be a remark.
+        line: the first of the lines unchanged, which may be a remark.
     """
     cells = rows[0][0]
     if _is_row(cells, separator):
@@ -177,33 +223,47 @@ def _first_unnamed(rows: list[tuple[list[str], int]], separator: str, line: str)
 
 
 def _is_row(cells: list[str], separator: str) -> bool:
-    """Whether cells hold numbers, dates or nothing, and at least one of the former."""
-    found = [_is_number(cell, separator) or _DATE.fullmatch(cell.strip()) is not None for cell in cells]
-    return any(found) and all(good or cell.strip().lower() in _MISSING for good, cell in zip(found, cells, strict=True))
+    """Return whether cells hold numbers, dates or nothing, and at least one of the first two."""
+    found = [
+        _is_number(cell, separator) or _DATE.fullmatch(cell.strip()) is not None for cell in cells
+    ]
+    return any(found) and all(
+        good or cell.strip().lower() in _MISSING for good, cell in zip(found, cells, strict=True)
+    )
 
 
 def _counts_columns(rows: list[tuple[list[str], int]], separator: str) -> bool:
-    """Whether the first line, 0, 1, 2, …, stands for columns without names, as pandas writes it.
+    """Return whether the first line, 0, 1, 2, …, counts columns without names, as pandas writes it.
 
-    It does not where the table has one column, or where the first column goes on evenly from it, as time does.
+    It does not where the table has one column, or where the first column goes on evenly from it, as
+    time does.
     """
     names = [cell.strip() for cell in rows[0][0] if cell.strip()]
     if len(names) < 2 or names != [str(i) for i in range(len(names))]:
         return False
-    begin = [text_number(cells[0].strip().replace(",", "." if separator != "," else ",")) for cells, _ in rows[:4]]
+    begin = [
+        text_number(cells[0].strip().replace(",", "." if separator != "," else ","))
+        for cells, _ in rows[:4]
+    ]
     steps = np.diff(begin)
     return not (len(steps) > 1 and steps[0] > 0 and np.allclose(steps, steps[0], rtol=1e-6))
 
 
 def _unnamed(rows: list[list[str]]) -> list[str]:
-    """Names x1, x2, … for the columns of rows; none for those behind the last that holds anything."""
+    """Return the names x1, x2, … for the columns of rows.
+
+    None for those behind the last that holds anything.
+    """
     count = len(rows[0])
-    used = max((i + 1 for cells in rows for i, cell in enumerate(cells[:count]) if cell.strip()), default=count)
+    used = max(
+        (i + 1 for cells in rows for i, cell in enumerate(cells[:count]) if cell.strip()),
+        default=count,
+    )
     return [f"x{i + 1}" if i < used else "" for i in range(count)]
 
 
 def _below_remarks(rows: list[tuple[list[str], int]], separator: str) -> tuple[list[str], int]:
-    """The first line with as many cells as the rows below, or simply the first."""
+    """Return the first line with as many cells as the rows below, or else the first line."""
     for at, (cells, _) in enumerate(rows[1:], start=1):
         if len(cells) > 1 and any(_is_number(cell, separator) for cell in cells):
             count = len(cells)
@@ -213,11 +273,17 @@ def _below_remarks(rows: list[tuple[list[str], int]], separator: str) -> tuple[l
 
 
 def _is_number(cell: str, separator: str) -> bool:
-    return _NUMBER.fullmatch(_COMMA.sub(r"\1.\2", cell, count=1) if separator != "," else cell) is not None
+    return (
+        _NUMBER.fullmatch(_COMMA.sub(r"\1.\2", cell, count=1) if separator != "," else cell)
+        is not None
+    )
 
 
 def _count(cells: list[str]) -> int:
-    """How many there are, empty ones at the end too; 0 where one of the others is a number or empty: no header."""
+    """Return the number of cells, with empty ones at the end.
+
+    0 where one of the others is a number or empty: no header.
+    """
     named = [cell.strip() for cell in cells]
     while named and not named[-1]:
         named.pop()
@@ -225,7 +291,10 @@ def _count(cells: list[str]) -> int:
 
 
 def _separator(lines: list[str]) -> str:
-    """Return what separates the cells: of what splits most rows alike, what fits the header and leaves most numbers."""
+    """Return the separator of the cells.
+
+    Of those that split most rows alike, it fits the header and leaves most numbers.
+    """
     best, found = (False, 0.0), ""
     for separator in _SEPARATORS:
         split = [_cells(line, separator) for line in lines]
@@ -254,7 +323,10 @@ def _cells(line: str, separator: str) -> list[str]:
 
 
 def _next_line(file: TextIO, number: int) -> tuple[str, int]:
-    """The next line that is not blank, empty at the end of the file, and its number, after line `number`."""
+    """Return the next line that is not blank, and its number, after line `number`.
+
+    The line is empty at the end of the file.
+    """
     for line in iter(file.readline, ""):
         number += 1
         if line.strip():
@@ -263,7 +335,7 @@ def _next_line(file: TextIO, number: int) -> tuple[str, int]:
 
 
 def numbers_only(names: list[str]) -> bool:
-    """Whether a header is a row of numbers; 0, 1, 2, … stand for columns without names."""
+    """Return whether a header is a row of numbers; 0, 1, 2, … count columns without names."""
     found = [name for name in names if name]
     if not found or not all(map(_NUMBER.fullmatch, found)):
         return False
@@ -271,12 +343,15 @@ def numbers_only(names: list[str]) -> bool:
 
 
 def read_sheet(path: Path, place: Place) -> tuple[int, list[list[Any]]]:
-    """The row of the header, counted from 1, and the cells below it in the columns that `place` finds in the header.
+    """Return the row of the header, counted from 1, and the cells below it.
+
+    The cells are those of the columns that `place` finds in the header.
 
     The first row that holds anything is the header. A cell that is not there is None.
 
     Raises:
-        InputError: no openpyxl, an encrypted file, no worksheet, an empty one, entities, more than fits into memory.
+        InputError: no openpyxl, an encrypted file, no worksheet, an empty one, entities, more than
+            fits into memory.
     """
     try:
         import openpyxl
@@ -300,19 +375,28 @@ def _check_parts(path: Path, file: Any) -> None:
     """Raise InputError for a workbook that is encrypted, too large, or declares entities."""
     if file.read(8) == b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1":
         raise InputError(
-            f"{path}: an encrypted workbook, or one of Excel 97 (.xls); save it as .xlsx without password."
+            f"{path}: an encrypted workbook, or one of Excel 97 (.xls); save it as .xlsx "
+            "without password."
         )
     with zipfile.ZipFile(file) as archive:
-        check_memory(4 * sum(info.file_size for info in archive.infolist()), f"{path}: reading the workbook")
+        check_memory(
+            4 * sum(info.file_size for info in archive.infolist()), f"{path}: reading the workbook"
+        )
         for info in archive.infolist():
             with archive.open(info) as part:
                 if b"<!DOCTYPE" in part.read(_PROLOGUE):
-                    raise InputError(f"{path}: '{info.filename}' declares a document type, which no workbook has.")
+                    raise InputError(
+                        f"{path}: '{info.filename}' declares a document type, which no "
+                        "workbook has."
+                    )
     file.seek(0)
 
 
 def _check_order(path: Path, sheet: Any) -> None:
-    """Raise InputError unless rows and cells follow each other: openpyxl would leave out what does not."""
+    """Raise InputError unless rows and cells are in order.
+
+    openpyxl would leave out the others.
+    """
     row, column = 0, 0
     with sheet._get_source() as source:
         for event, element in iterparse(source, ("start", "end")):
@@ -320,27 +404,33 @@ def _check_order(path: Path, sheet: Any) -> None:
             if event == "start" and kind == "row":
                 before, row, column = row, int(element.get("r", row + 1)), 0
                 if not before < row <= _ROWS:
-                    raise InputError(f"{path}: the rows of the sheet are out of order at row {shown(row)}.")
+                    raise InputError(
+                        f"{path}: the rows of the sheet are out of order at row {shown(row)}."
+                    )
             elif event == "start" and kind == "c":
                 place = element.get("r")
                 there = (row, column + 1) if place is None else _place(place)
                 if there[0] != row or not column < there[1] <= _COLUMNS:
-                    raise InputError(f"{path}: the cells of the sheet are out of order at '{place}'.")
+                    raise InputError(
+                        f"{path}: the cells of the sheet are out of order at '{place}'."
+                    )
                 column = there[1]
             elif event == "end" and kind == "row":
                 element.clear()
 
 
 def _place(name: str) -> tuple[int, int]:
-    """Row and column, counted from 1, of a cell such as `B7`; of no cell (0, 0)."""
+    """Return row and column, counted from 1, of a cell such as `B7`; (0, 0) of no cell."""
     found = re.fullmatch(r"([A-Z]{1,3})([1-9][0-9]{0,6})", name)
     if found is None:
         return 0, 0
-    return int(found[2]), functools.reduce(lambda total, letter: 26 * total + ord(letter) - 64, found[1], 0)
+    return int(found[2]), functools.reduce(
+        lambda total, letter: 26 * total + ord(letter) - 64, found[1], 0
+    )
 
 
 class _Strings(tuple[str, ...]):
-    """The shared texts, of which a negative index names none."""
+    """The shared texts; a negative index names none."""
 
     def __getitem__(self, index: Any) -> Any:
         if index < 0:
@@ -370,7 +460,7 @@ def _pick(path: Path, sheet: Any, place: Place) -> tuple[int, list[list[Any]]]:
 
 
 def as_number(value: Any) -> float:
-    """A cell as a float, NaN where it holds none; dates are none."""
+    """Return a cell as a float, NaN where it holds none; dates are none."""
     if isinstance(value, str):
         return text_number(value)
     if not isinstance(value, int | float | np.number):
@@ -382,7 +472,10 @@ def as_number(value: Any) -> float:
 
 
 def text_number(text: str) -> float:
-    """The number that a text is in ASCII digits with a decimal point, to the last digit; NaN where it is none."""
+    """Return the number that a text is in ASCII digits with a decimal point, to the last digit.
+
+    NaN where it is none.
+    """
     try:
         return float(text) if text.isascii() and "_" not in text else np.nan
     except ValueError:

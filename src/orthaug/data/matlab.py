@@ -1,4 +1,7 @@
-"""MATLAB's v5 files, every length in them checked: SciPy's reader ends the process on some that are corrupt."""
+"""MATLAB's v5 files, every length in them checked.
+
+SciPy's reader ends the process on some files that are corrupt.
+"""
 
 from __future__ import annotations
 
@@ -12,19 +15,43 @@ import numpy as np
 
 from orthaug._base.memory import check_memory
 
-_NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
+_NUMBERS = {
+    1: "i1",
+    2: "u1",
+    3: "i2",
+    4: "u2",
+    5: "i4",
+    6: "u4",
+    7: "f4",
+    9: "f8",
+    12: "i8",
+    13: "u8",
+}
 _INT32, _UINT32, _MATRIX, _COMPRESSED = 5, 6, 14, 15
 _CELL, _STRUCT, _OBJECT = 1, 2, 3
 MOST_ELEMENTS = 1000  # of an array of structs or a cell that is looked into
-_NO_NUMBERS = {_CELL: "a cell", _STRUCT: "a struct", _OBJECT: "an object", 4: "text", 5: "a sparse matrix",
-               16: "a function", 17: "an opaque object"}  # fmt: skip
+_NO_NUMBERS = {
+    _CELL: "a cell",
+    _STRUCT: "a struct",
+    _OBJECT: "an object",
+    4: "text",
+    5: "a sparse matrix",
+    16: "a function",
+    17: "an opaque object",
+}
 _COMPLEX_FLAG = 0x0800
-_HEADER, _PREFIX = 128, 4096  # bytes of the file's header; of a compressed variable that hold its name and shape
+_HEADER, _PREFIX = (
+    128,
+    4096,
+)  # bytes of the file's header; of a compressed variable that hold its name and shape
 
 
 @dataclass(frozen=True, eq=False)
 class Variable:
-    """A variable of a file, or a field of one; `what` says in words why it holds no numbers, "" where it does."""
+    """A variable of a file, or a field of one.
+
+    `what` says in words why it holds no numbers, "" where it does.
+    """
 
     name: str
     what: str
@@ -35,7 +62,7 @@ class Variable:
     _body: Callable[[], memoryview]
 
     def numbers(self) -> np.ndarray:
-        """The values, of the variable's shape."""
+        """Read the values, in the variable's shape."""
         kind, data, at = _element(body := self._body(), self._begin, self._order)
         values = self._values(kind, data)
         if self._flags & _COMPLEX_FLAG:
@@ -44,7 +71,7 @@ class Variable:
         return values
 
     def text(self) -> str:
-        """Return the characters of a text."""
+        """Read the characters of a text."""
         kind, data, _ = _element(self._body(), self._begin, self._order)
         utf_16 = "utf-16-le" if self._order == "<" else "utf-16-be"
         return bytes(data).decode({4: utf_16, 17: utf_16, 16: "utf-8"}.get(kind, "latin-1"))
@@ -52,13 +79,16 @@ class Variable:
     def _values(self, kind: int, data: memoryview) -> np.ndarray:
         values = np.frombuffer(data, self._order + _NUMBERS[kind])
         if len(values) != math.prod(self.shape):
-            raise ValueError(f"'{self.name}' has {len(values)} numbers; declared are {math.prod(self.shape)}")
+            raise ValueError(
+                f"'{self.name}' has {len(values)} numbers; declared are {math.prod(self.shape)}"
+            )
         return values.reshape(self.shape, order="F")
 
     def parts(self) -> Iterator[Variable]:
-        """What is in a struct, an object or a cell, by its path; nothing of anything else.
+        """Yield the contents of a struct, an object or a cell, by path; nothing of anything else.
 
-        Elements of arrays are counted from 0: `runs[1].u`, `c[0]`. The only element of a cell has the cell's own name.
+        Elements of arrays are counted from 0: `runs[1].u`, `c[0]`. The only element of a cell has
+        the cell's own name.
         """
         kind, count = self._flags & 0xFF, math.prod(self.shape)
         if kind not in (_CELL, _STRUCT, _OBJECT) or not 0 < count <= MOST_ELEMENTS:
@@ -78,14 +108,14 @@ class Variable:
             for name in names:
                 type_, data, at = _element(body, at, self._order)
                 if type_ != _MATRIX:
-                    raise ValueError("what is in a struct or cell is no matrix")
+                    raise ValueError("the content of a struct or cell is not a matrix")
                 if data:
                     path = f"{self.name}{f'[{i}]' if count > 1 else ''}{name}"
                     yield _variable(data, self._order, lambda data=data: data, path)
 
 
 def read_mat5(content: bytes, path: object) -> dict[str, Variable]:
-    """The variables of a v5 file by name; their numbers are read when they are asked for.
+    """Return the variables of a v5 file by name; their numbers are read when they are asked for.
 
     Raises:
         ValueError, KeyError, struct.error, zlib.error: what is no such file, or ends too early.
@@ -107,7 +137,7 @@ def read_mat5(content: bytes, path: object) -> dict[str, Variable]:
 
 
 def _element(data: memoryview, at: int, order: str) -> tuple[int, memoryview, int]:
-    """Type and content of the element at a place, and the place behind it."""
+    """Return type and content of the element at a place, and the place behind it."""
     kind, size = struct.unpack_from(order + "II", data, at)
     if kind >> 16:  # a small one: type and size share a word, the data have the other
         kind, size, begin, end = kind & 0xFFFF, kind >> 16, at + 4, at + 8
@@ -121,8 +151,10 @@ def _element(data: memoryview, at: int, order: str) -> tuple[int, memoryview, in
     return kind, data[begin : begin + size], end
 
 
-def _inflated(data: memoryview, order: str, path: object) -> tuple[int, memoryview, Callable[[], memoryview]]:
-    """Type, first bytes, and how to get all bytes of a compressed element."""
+def _inflated(
+    data: memoryview, order: str, path: object
+) -> tuple[int, memoryview, Callable[[], memoryview]]:
+    """Return type, first bytes, and a function for all bytes of a compressed element."""
     first = zlib.decompressobj().decompress(data, _PREFIX)
     kind, size = struct.unpack_from(order + "II", first)
 
@@ -130,15 +162,19 @@ def _inflated(data: memoryview, order: str, path: object) -> tuple[int, memoryvi
         check_memory(3 * size, f"{path}: a compressed variable")
         inflate = zlib.decompressobj()
         inflated = inflate.decompress(data, size + 16)
-        if len(inflated) < size + 8 or not inflate.eof:  # at the end of the stream its checksum was compared
+        if (
+            len(inflated) < size + 8 or not inflate.eof
+        ):  # at the end of the stream its checksum was compared
             raise ValueError("a compressed variable is cut")
         return memoryview(inflated)[8 : size + 8]
 
     return kind, memoryview(first)[8:], body
 
 
-def _variable(data: memoryview, order: str, body: Callable[[], memoryview], name: str | None = None) -> Variable:
-    """A variable by its header; `body` gives all of its bytes."""
+def _variable(
+    data: memoryview, order: str, body: Callable[[], memoryview], name: str | None = None
+) -> Variable:
+    """Return a variable by its header; `body` gives all of its bytes."""
     kind, flags, at = _element(data, 0, order)
     if kind != _UINT32 or len(flags) != 8:
         raise ValueError("a variable has no flags")

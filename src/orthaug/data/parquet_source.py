@@ -1,7 +1,7 @@
 """Parquet files as a source: a partition is a run of row groups, read batch by batch.
 
-A file is an experiment, or several where a column tells them apart. Lags are exact at the borders of batches, row
-groups and partitions: each reads the rows before it too.
+A file is an experiment, or several where a column distinguishes them. Lags are exact at the borders
+of batches, row groups and partitions: each reads the rows before it too.
 """
 
 from __future__ import annotations
@@ -19,18 +19,25 @@ import numpy as np
 from orthaug._base.errors import InputError
 from orthaug.data.clock import DRIFT, JITTER
 from orthaug.data.headers import in_seconds
-from orthaug.data.record import Channel, Experiment, as_channels, check_channels, check_step, same_step
+from orthaug.data.record import (
+    Channel,
+    Experiment,
+    as_channels,
+    check_channels,
+    check_step,
+    same_step,
+)
 from orthaug.data.sources import joined, stretches
 from orthaug.data.tables import check_present, check_readable, parquet_file
 
-BATCH_ROWS = 32_768  # what is laid out at once: several such blocks are in memory
-_FEWEST_STEPS = 1000  # that tell the rate of a batch
+BATCH_ROWS = 32_768  # rows that are built at once: several such blocks are in memory
+_FEWEST_STEPS = 1000  # from which the rate of a batch is determined
 PARTITION_ROWS = 1_000_000
-"""Rows of a partition at least, where the file has as many: row groups are never cut."""
+"""Least number of rows of a partition, where the file has as many: row groups are never cut."""
 
 
 class Stamp(NamedTuple):
-    """What changes when a file is written again: its size [B], its time [ns], and a checksum of its footer."""
+    """Size [B], time [ns] and checksum of the footer, which change if a file is written again."""
 
     size: int
     modified: int
@@ -44,19 +51,19 @@ class Runs(NamedTuple):
     began: tuple[float, ...]
 
     def within(self, start: int, stop: int) -> Runs:
-        """Those with a row in `[start, stop)`."""
+        """Return the ranges with a row in `[start, stop)`."""
         kept = [i for i, (a, b) in enumerate(self.ranges) if a < stop and b > start]
         return Runs(tuple(self.ranges[i] for i in kept), tuple(self.began[i] for i in kept))
 
 
 @dataclass(frozen=True)
-class Reading:
-    """How the channels stand in the files."""
+class ChannelColumns:
+    """Columns of the channels in the files."""
 
     inputs: tuple[Channel, ...]
     outputs: tuple[Channel, ...]
     columns: tuple[str, ...]
-    """Of the outputs, then of the inputs."""
+    """File columns of the outputs, then of the inputs."""
     missing: str
 
     @property
@@ -72,7 +79,7 @@ class RowGroups:
     start: int
     stop: int
     runs: Runs
-    reading: Reading
+    reading: ChannelColumns
     stamp: Stamp
 
     @property
@@ -87,25 +94,38 @@ class RowGroups:
         yield from self.between(self.start, self.stop, lead)
 
     def between(self, start: int, stop: int, lead: int) -> Iterator[Experiment]:
-        """Pieces of the rows `[start, stop)`; see `Partition.pieces`."""
+        """Yield the pieces of the rows `[start, stop)`; see `Partition.pieces`."""
         self.check_unchanged()
         runs = self.runs.within(start, stop)
         if not runs.ranges:
             return
         held = np.zeros((0, len(self.reading.columns)))
-        for position, batch in _batches(Path(self.path), max(start - lead, runs.ranges[0][0]), stop, self.reading):
+        for position, batch in _batches(
+            Path(self.path), max(start - lead, runs.ranges[0][0]), stop, self.reading
+        ):
             buffer = np.concatenate([held, batch]) if len(held) else batch
             begin, end = position - len(held), position + len(batch)
             for (a, b), began in zip(runs.ranges, runs.began, strict=True):
                 first = max(a, position, start)
                 if first < min(b, end):
-                    yield from self._piece(buffer, begin, (max(a, first - lead), min(b, end)), began, a, lead)
+                    yield from self._piece(
+                        buffer, begin, (max(a, first - lead), min(b, end)), began, a, lead
+                    )
             held = buffer[max(len(buffer) - lead, 0) :]
 
     def _piece(
-        self, buffer: np.ndarray, begin: int, rows: tuple[int, int], began: float, first: int, lead: int
+        self,
+        buffer: np.ndarray,
+        begin: int,
+        rows: tuple[int, int],
+        began: float,
+        first: int,
+        lead: int,
     ) -> Iterator[Experiment]:
-        """Rows of a buffer that begins at row `begin` of the file; their experiment begins at `first`."""
+        """Return rows of a buffer that begins at row `begin` of the file.
+
+        Their experiment begins at `first`.
+        """
         reading, ny = self.reading, len(self.reading.outputs)
         values = buffer[rows[0] - begin : rows[1] - begin]
         place: dict[str, Any] = {"source": self.path, "first_row": rows[0], "start_time": began}
@@ -131,7 +151,8 @@ class RowGroups:
         """Raise InputError where the file is not the one that was opened."""
         if stamp_of(Path(self.path)) != self.stamp:
             raise InputError(
-                f"{self.path}: the file has changed since it was opened (size, time or footer); start again."
+                f"{self.path}: the file has changed since it was opened (size, time or "
+                "footer); start again."
             )
 
 
@@ -178,25 +199,29 @@ def open_parquet(
     missing: str = "error",
     partition_rows: int = PARTITION_ROWS,
 ) -> ParquetSource:
-    """Look at the files without reading their channels: rows, columns and their types, experiments, sampling time.
+    """Look at the files without reading their channels.
 
-    Args:
-        paths: of the files, in order; none of them reaches into the next.
-        inputs, outputs: channel names, or `Channel`s with column, unit, scale and offset.
-        sampling_time: seconds between rows; or `time`, the column that holds the instants.
-        experiment: a column of whole numbers that tells experiments apart within a file; None for one a file.
-        columns: the files' column for a channel, `{"position": "yVal"}`.
-        missing: "error", or "skip" to end a stretch at rows with a missing sample.
-        partition_rows: rows of a partition at least; row groups are never cut.
+    Rows, columns and their types, experiments and the sampling time are read.
+
+    Args: paths: of the files, in order; none of them reaches into the next. inputs, outputs:
+        channel names, or `Channel`s with column, unit, scale and offset. sampling_time: seconds
+        between rows; or `time`, the column that holds the instants. experiment: a column of whole
+        numbers that labels the experiments within a file; None for one a file. columns: the files'
+        column for a channel, `{"position": "yVal"}`. missing: "error", or "skip" to end a stretch
+        at rows with a missing sample. partition_rows: rows of a partition at least; row groups are
+        never cut.
 
     Raises:
-        InputError: a file that cannot be read, has no rows, lacks a column or holds another type in it; experiments
-            that are not in one piece; time that does not rise evenly within one.
+        InputError: a file that cannot be read, has no rows, lacks a column or holds another type in
+            it; experiments that are not in one piece; time that does not rise evenly within one.
     """
-    given, groups = dict(columns or {}), (as_channels(inputs, "inputs"), as_channels(outputs, "outputs"))
+    given, groups = (
+        dict(columns or {}),
+        (as_channels(inputs, "inputs"), as_channels(outputs, "outputs")),
+    )
     check_channels(*groups)
     own = tuple(given.get(c.name, c.file_column) for c in (*groups[1], *groups[0]))
-    reading = Reading(*groups, own, missing)
+    reading = ChannelColumns(*groups, own, missing)
     partitions, steps, types = [], [], {}
     for path in map(Path, paths):
         check_readable(path)
@@ -205,7 +230,9 @@ def open_parquet(
             wanted = [*reading.distinct, *(name for name in (time, experiment) if name)]
             check_present(path, wanted, file.schema_arrow.names)
             _check_types(path, file.schema_arrow, wanted, types, time)
-            groups = [file.metadata.row_group(i).num_rows for i in range(file.metadata.num_row_groups)]
+            groups = [
+                file.metadata.row_group(i).num_rows for i in range(file.metadata.num_row_groups)
+            ]
             total = sum(groups)
             if not total:
                 raise InputError(f"{path}: there are no data rows.")
@@ -213,18 +240,21 @@ def open_parquet(
         if step is not None:
             steps.append((path, step))
         for start, stop in _grouped(groups, partition_rows):
-            partitions.append(RowGroups(str(path), start, stop, runs.within(start, stop), reading, stamp))
+            partitions.append(
+                RowGroups(str(path), start, stop, runs.within(start, stop), reading, stamp)
+            )
     step = steps[0][1] if steps else 1.0 if sampling_time is None else sampling_time
     for path, other in steps:
         if not same_step(other, step):
             raise InputError(
-                f"{path}: sampled every {other:g} s, {steps[0][0]} every {step:g} s; resample one of them."
+                f"{path}: sampled every {other:g} s, {steps[0][0]} every {step:g} s; resample "
+                "one of them."
             )
     return ParquetSource(reading.inputs, reading.outputs, check_step(step), time, tuple(partitions))
 
 
 def stamp_of(path: Path) -> Stamp:
-    """Size, time and footer of a Parquet file.
+    """Return size, time and footer of a Parquet file.
 
     Raises:
         InputError: a file that is gone or too short to be one.
@@ -242,9 +272,16 @@ def stamp_of(path: Path) -> Stamp:
 
 
 def _check_types(
-    path: Path, schema: Any, names: Sequence[str], types: dict[str, tuple[Any, Path]], time: str | None
+    path: Path,
+    schema: Any,
+    names: Sequence[str],
+    types: dict[str, tuple[Any, Path]],
+    time: str | None,
 ) -> None:
-    """Raise InputError for a column that holds no numbers (or dates, in that of time), or others than before."""
+    """Raise InputError for a column without numbers, or with another type than before.
+
+    The column of time may hold dates.
+    """
     for name in names:
         found = schema.field(name).type
         known_kinds = ("int", "uint", "float", "double", "halffloat", "bool")
@@ -253,24 +290,34 @@ def _check_types(
         known, first = types.setdefault(name, (found, path))
         if found != known:
             raise InputError(
-                f"{path}: column '{name}' holds {found} values, in {first} {known}; give all files the same types."
+                f"{path}: column '{name}' holds {found} values, in {first} {known}; give all "
+                "files the same types."
             )
 
 
-def _look(file: Any, path: Path, total: int, time: str | None, experiment: str | None) -> tuple[Runs, float | None]:
-    """The file's experiments and its sampling time [s], by a pass over the two columns that tell them."""
+def _look(
+    file: Any, path: Path, total: int, time: str | None, experiment: str | None
+) -> tuple[Runs, float | None]:
+    """Return the file's experiments and its sampling time [s], by a pass over two columns."""
     if time is None and experiment is None:
         return Runs(((0, total),), (0.0,)), None
     wanted = [name for name in (time, experiment) if name]
-    found = _Look(path, time, experiment)
+    found = _BatchScan(path, time, experiment)
     for batch in file.iter_batches(batch_size=BATCH_ROWS, columns=wanted):
-        instants = None if time is None else found.seconds(batch.column(time).to_numpy(zero_copy_only=False))
+        instants = (
+            None
+            if time is None
+            else found.seconds(batch.column(time).to_numpy(zero_copy_only=False))
+        )
         found.add(instants, None if experiment is None else _numbers(batch, experiment))
     return found.ended()
 
 
-class _Look:
-    """Where experiments begin and how time steps, batch by batch; each batch is joined to the last row before it."""
+class _BatchScan:
+    """Begins of experiments and steps of time, batch by batch.
+
+    Each batch is joined to the last row before it.
+    """
 
     def __init__(self, path: Path, time: str | None, experiment: str | None) -> None:
         self.path, self.time, self.experiment = path, time, experiment
@@ -283,28 +330,35 @@ class _Look:
         self.origin: Any = None
 
     def seconds(self, instants: np.ndarray) -> np.ndarray:
-        """A batch of the time column in s, dates since the first row of the file."""
+        """Return a batch of the time column in s, dates since the first row of the file."""
         if instants.dtype.kind != "M":
             return in_seconds(np.asarray(instants, dtype=float), self.time or "")
         self.origin = instants[0] if self.origin is None else self.origin
         return (instants - self.origin) / np.timedelta64(1, "s")
 
     def add(self, instants: np.ndarray | None, labels: np.ndarray | None) -> None:
-        instants, labels = (np.zeros(len(b if a is None else a)) if a is None else a  # type: ignore[arg-type]
-                            for a, b in ((instants, labels), (labels, instants)))  # fmt: skip
+        instants, labels = (
+            np.zeros(len(b if a is None else a)) if a is None else a  # type: ignore[arg-type]
+            for a, b in ((instants, labels), (labels, instants))
+        )
         for values, name in ((instants, self.time), (labels, self.experiment)):
             bad = np.flatnonzero(~np.isfinite(values))
             if len(bad):
                 row = self.rows + int(bad[0])
-                raise InputError(f"{self.path}: row {row}, column '{name}': expected a finite number.")
+                raise InputError(
+                    f"{self.path}: row {row}, column '{name}': expected a finite number."
+                )
         known = len(self.before[0])
-        instants, labels = (np.concatenate(pair) for pair in zip(self.before, (instants, labels), strict=True))
+        instants, labels = (
+            np.concatenate(pair) for pair in zip(self.before, (instants, labels), strict=True)
+        )
         fresh = np.diff(labels) != 0
         for i in [*([] if known else [0]), *(np.flatnonzero(fresh) + 1).tolist()]:
             if labels[i] in self.labels:
                 raise InputError(
-                    f"{self.path}: row {self.rows - known + i}: experiment {labels[i]:g} goes on after another has "
-                    f"begun; sort the rows by '{self.experiment}', then by time."
+                    f"{self.path}: row {self.rows - known + i}: experiment {labels[i]:g} goes "
+                    f"on after another has begun; sort the rows by '{self.experiment}', then "
+                    "by time."
                 )
             self.labels.add(labels[i])
             self.begins.append(self.rows - known + i)
@@ -315,7 +369,10 @@ class _Look:
         self.before = instants[-1:], labels[-1:]
 
     def _follow(self, steps: np.ndarray, first: int) -> None:
-        """Raise InputError for a step of time that is not the usual one of this file; NaN between experiments."""
+        """Raise InputError for a step of time that is not the usual one of this file.
+
+        Steps between experiments are NaN.
+        """
         inside = np.isfinite(steps)
         if not inside.any():
             return
@@ -324,11 +381,15 @@ class _Look:
         odd = np.flatnonzero(inside & ~(np.abs(steps - self.usual) <= JITTER * self.usual))
         if len(odd):
             raise InputError(
-                f"{self.path}: row {first + int(odd[0])}, column '{self.time}': a step of {steps[odd[0]]:g} s where "
-                f"{self.usual:g} s is usual; expected evenly sampled, rising time within an experiment. Resample, "
-                "sort, or name the column that tells experiments apart."
+                f"{self.path}: row {first + int(odd[0])}, column '{self.time}': a step of "
+                f"{steps[odd[0]]:g} s where {self.usual:g} s is usual; expected evenly "
+                "sampled, rising time within an experiment. Resample, sort, or name the column "
+                "that labels the experiments."
             )
-        self.steps, self.counted = self.steps + float(np.nansum(steps)), self.counted + int(inside.sum())
+        self.steps, self.counted = (
+            self.steps + float(np.nansum(steps)),
+            self.counted + int(inside.sum()),
+        )
         if inside.sum() >= _FEWEST_STEPS:
             self.rates.append(float(np.nanmean(steps)))
 
@@ -337,16 +398,20 @@ class _Look:
         if self.time is None:
             return Runs(ranges, (0.0,) * len(ranges)), None
         if not self.counted:
-            raise InputError(f"{self.path}: one row is too few to tell the sampling time from column '{self.time}'.")
+            raise InputError(
+                f"{self.path}: one row is too few for a sampling time from column '{self.time}'."
+            )
         step = self.steps / self.counted
         if self.rates and max(self.rates) - min(self.rates) > DRIFT * step:
             drifts = f"the step drifts between {min(self.rates):g} s and {max(self.rates):g} s"
-            raise InputError(f"{self.path}: column '{self.time}': {drifts}; resample, or take files at one rate.")
+            raise InputError(
+                f"{self.path}: column '{self.time}': {drifts}; resample, or take files at one rate."
+            )
         return Runs(ranges, tuple(self.began)), step
 
 
 def _grouped(groups: Sequence[int], least: int) -> Iterator[tuple[int, int]]:
-    """Row ranges of partitions: row groups taken together until there are `least` rows."""
+    """Return row ranges of partitions: row groups joined until there are `least` rows."""
     start = stop = 0
     for rows in groups:
         stop += rows
@@ -357,10 +422,14 @@ def _grouped(groups: Sequence[int], least: int) -> Iterator[tuple[int, int]]:
         yield start, stop
 
 
-def _batches(path: Path, start: int, stop: int, reading: Reading) -> Iterator[tuple[int, np.ndarray]]:
-    """Rows `[start, stop)` of a file as (first row, matrix of its columns)."""
+def _batches(
+    path: Path, start: int, stop: int, reading: ChannelColumns
+) -> Iterator[tuple[int, np.ndarray]]:
+    """Yield rows `[start, stop)` of a file as (first row, matrix of its columns)."""
     with parquet_file(path) as file:
-        ends = np.cumsum([file.metadata.row_group(i).num_rows for i in range(file.metadata.num_row_groups)])
+        ends = np.cumsum(
+            [file.metadata.row_group(i).num_rows for i in range(file.metadata.num_row_groups)]
+        )
         first, last = np.searchsorted(ends, [start, stop - 1], side="right").tolist()
         position = int(ends[first - 1]) if first else 0
         groups = list(range(first, last + 1))

@@ -4,17 +4,160 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import Ge, Gt
 
-from orthaug._base.checks import check_type
-from orthaug._base.errors import InputError, Warning
-from orthaug._base.registry import Registry
-from orthaug.data.filters import Decimate, Highpass, Lowpass
+from orthaug._base.checks import Matrix, check_type
+from orthaug._base.errors import InputError, Warning, shown
+from orthaug._base.registry import OneOf, Registry, check_fields
 from orthaug.data.prepared import Prepared
 from orthaug.data.record import Experiment, Record, same_step, unbroken
-from orthaug.data.steps import Detrend, Fill, Outliers, Resample, Run, Shift, Step
+from orthaug.data.steps import Channels, Detrend, Fill, Outliers, Resample, Run, Shift, Step
+
+_ANTI_ALIAS, _RIPPLE, _CORNER = (
+    8,
+    0.05,
+    0.8,
+)  # Chebyshev filter of decimation: order, dB, share of the new Nyquist
+
+Phase = Annotated[str, OneOf(("zero", "causal"))]
+
+
+def _filtered(values: Matrix, sections: Matrix, phase: str, what: str) -> Matrix:
+    """Filter every stretch without a gap; samples of stretches that are too short are missing."""
+    from scipy.signal import sosfilt, sosfilt_zi, sosfiltfilt
+
+    result, pad = np.full_like(values, np.nan), 3 * (2 * len(sections) + 1)
+    for a, b in unbroken(values):
+        piece, part = values[a:b], slice(a, b)
+        if phase == "causal":
+            start = sosfilt_zi(sections)[:, :, None] * piece[0]
+            result[part] = sosfilt(sections, piece, axis=0, zi=start)[0]
+        elif len(piece) > pad:
+            result[part] = sosfiltfilt(sections, piece, axis=0, padtype="odd", padlen=pad)
+    if not np.isfinite(result).all(axis=1).any():
+        longest = max((b - a for a, b in unbroken(values)), default=0)
+        raise InputError(
+            f"{what}: the longest stretch without a gap has {longest} rows, but a filter of "
+            f"zero phase needs {pad + 1}. Fill gaps before it, take a lower order, or "
+            'phase = "causal".'
+        )
+    return result
+
+
+@dataclass(frozen=True)
+class _Butterworth:
+    """A Butterworth filter.
+
+    With zero phase it runs forward and backward, which squares its gain: −6 dB at the cutoff.
+    """
+
+    cutoff: Annotated[float, Gt(0)]
+    """Hz"""
+    order: Annotated[int, Ge(1)] = 4
+    phase: Phase = "zero"
+    channels: Channels = None
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        if self.order > 10:
+            raise InputError(f"`order` must be at most 10; got {shown(self.order)}.")
+
+    def _through(self, run: Run, kind: str) -> Run:
+        from scipy.signal import butter
+
+        run.check_even(f"`{kind}`")
+        nyquist = 0.5 / run.step
+        if self.cutoff >= nyquist:
+            raise InputError(
+                f"`cutoff`: {self.cutoff:g} Hz is not below {nyquist:g} Hz, half the sampling "
+                f"frequency at steps of {run.step:g} s; take a lower one."
+            )
+        columns = run.columns(self.channels)
+        sections = np.asarray(butter(self.order, self.cutoff / nyquist, kind, output="sos"))
+        return run.holding(
+            columns, _filtered(run.values[:, columns], sections, self.phase, f"`{kind}`")
+        )
+
+
+@dataclass(frozen=True)
+class Lowpass(_Butterworth):
+    """A Butterworth low-pass over all channels alike; `cutoff` in Hz.
+
+    Args:
+        cutoff: Hz, below half the sampling frequency.
+        order: 1 to 10.
+        phase: "zero" goes forth and back: nothing is delayed, the gain is squared (−6 dB at the
+            cutoff), and a sample depends on later ones, which a loop does not have. "causal" goes
+            forth once and delays what it filters.
+        channels: names; None for all. Inputs and outputs that are filtered alike keep the linear
+            relation between them; filter some alone, and the filter becomes part of the model.
+
+    Examples:
+        >>> Lowpass(cutoff=10.0, phase="causal")
+        Lowpass(cutoff=10.0, order=4, phase='causal', channels=None)
+    """
+
+    def apply(self, run: Run) -> Run:
+        return self._through(run, "lowpass")
+
+
+@dataclass(frozen=True)
+class Highpass(_Butterworth):
+    """A Butterworth high-pass over all channels alike; `cutoff` in Hz.
+
+    Args:
+        cutoff: Hz, below half the sampling frequency.
+        order: 1 to 10.
+        phase: "zero" goes forth and back: nothing is delayed, the gain is squared (−6 dB at the
+            cutoff), and a sample depends on later ones, which a loop does not have. "causal" goes
+            forth once and delays what it filters.
+        channels: names; None for all. Inputs and outputs that are filtered alike keep the linear
+            relation between them; filter some alone, and the filter becomes part of the model.
+    """
+
+    def apply(self, run: Run) -> Run:
+        return self._through(run, "highpass")
+
+
+@dataclass(frozen=True)
+class Decimate:
+    """Step that keeps each `factor`-th row behind a low-pass.
+
+    The low-pass is a Chebyshev filter of order 8 at 0.8 of the new Nyquist frequency.
+
+    Args:
+        factor: 2 or more; the sampling time is multiplied by it.
+        phase: of the low-pass, over all channels: "zero" (forth and back, no delay, looks at later
+            samples) or "causal" (delays all channels alike).
+
+    Examples:
+        >>> import numpy as np
+        >>> from orthaug.data import Record, prepare
+        >>> record = Record.from_arrays(u=np.ones(400), y=np.ones(400), sampling_time=0.01)
+        >>> prepare(record, Decimate(4))
+        Record(1 experiment, 100 samples, Ts = 0.04 s, inputs: u; outputs: y)
+    """
+
+    factor: Annotated[int, Ge(2)]
+    phase: Phase = "zero"
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+    def apply(self, run: Run) -> Run:
+        from scipy.signal import cheby1
+
+        run.check_even("`decimate`")
+        sections = np.asarray(cheby1(_ANTI_ALIAS, _RIPPLE, _CORNER / self.factor, output="sos"))
+        values = _filtered(run.values, sections, self.phase, "`decimate`")[:: self.factor]
+        kept = replace(
+            run, values=values, instants=run.instants[:: self.factor], step=run.step * self.factor
+        )
+        return replace(kept, stride=run.stride * self.factor)
+
 
 STEPS = Registry(
     "step",
@@ -38,10 +181,13 @@ SAMPLING = ("decimate", "resample")
 
 
 def prepare(record: Record, *steps: Any) -> Record:
-    """A record after steps such as `Detrend()` and `Lowpass(cutoff=10.0)`, in this order; `.prepared` tells of them.
+    """Return a record after steps such as `Detrend()` and `Lowpass(cutoff=10.0)`, in this order.
 
-    Every step acts within an experiment, never across. Samples that are missing afterwards split experiments. Gaps
-    that were left out when the record was read are not seen: to fill them give the steps to `read_record(prepare=…)`.
+    `.prepared` lists them.
+
+    Every step acts within an experiment, never across. Samples that are missing afterwards split
+    experiments. Gaps that were left out when the record was read are not seen: to fill them give
+    the steps to `read_record(prepare=…)`.
 
     Raises:
         InputError: no step, or one that cannot be done with these samples.
@@ -62,21 +208,29 @@ def prepare(record: Record, *steps: Any) -> Record:
         values = np.hstack([e.inputs, e.outputs])
         runs.append((Run(values, instants, names, len(record.inputs), record.sampling_time), e))
     experiments, step, done, lost = prepared_experiments(runs, steps)
-    changed = replace(record, experiments=experiments, sampling_time=step, missing=record.missing + lost)
+    changed = replace(
+        record, experiments=experiments, sampling_time=step, missing=record.missing + lost
+    )
     return replace(changed, prepared=(*record.prepared, *done))
 
 
 def check_steps(steps: Any) -> None:
-    """Raise InputError for what are no steps."""
-    if not isinstance(steps, list | tuple) or not all(type(step) in STEPS.values() for step in steps):
+    """Raise InputError for an argument that is no list of steps."""
+    if not isinstance(steps, list | tuple) or not all(
+        type(step) in STEPS.values() for step in steps
+    ):
         known = ", ".join(kind.__name__ for kind in STEPS.values())
-        raise InputError(f"preparation takes steps, which are {known}, each with its arguments; got {steps!r:.80}.")
+        raise InputError(
+            f"preparation takes a list of steps with their arguments: {known}; got {steps!r:.80}."
+        )
 
 
 def prepared_experiments(
     runs: Iterable[tuple[Run, Experiment]], steps: Sequence[Step], *, keep: bool = False
 ) -> tuple[tuple[Experiment, ...], float, tuple[Prepared, ...], int]:
-    """Experiments after the steps, their sampling time, what was done, and how many rows are left out as missing.
+    """Return the experiments after the steps, with their sampling time and an account.
+
+    The account is what was done, and how many rows are left out as missing.
 
     Args:
         runs: with the experiment that each was, for its place in the file.
@@ -100,16 +254,20 @@ def prepared_experiments(
         sampling.append(run.step)
         where = place.source
     if not found:
-        raise InputError(f"{where + ': ' if where else ''}after preparation every row has a missing sample.")
+        raise InputError(
+            f"{where + ': ' if where else ''}after preparation every row has a missing sample."
+        )
     if not all(same_step(step, sampling[0]) for step in sampling):
         apart = f"{min(sampling):g} to {max(sampling):g} s"
-        raise InputError(f"after preparation samples are {apart} apart; say one `sampling_time` in `resample`.")
-    return tuple(found), sampling[0], tuple(account.told() for account in done), lost
+        raise InputError(
+            f"after preparation samples are {apart} apart; give one `sampling_time` in `resample`."
+        )
+    return tuple(found), sampling[0], tuple(account.prepared() for account in done), lost
 
 
 @dataclass(eq=False)
 class _Account:
-    """How many samples a step marked as missing or filled."""
+    """Number of samples that a step marked as missing or filled."""
 
     kind: str
     step: Any
@@ -122,14 +280,16 @@ class _Account:
             self.marked += int((old & ~new).sum())
             self.filled += int((new & ~old).sum())
 
-    def told(self) -> Prepared:
+    def prepared(self) -> Prepared:
         return Prepared(self.kind, _options_of(self.step), self.marked + self.filled)
 
 
 def _options_of(step: Any) -> dict[str, Any]:
-    """The fields of a step that have values."""
+    """Return the fields of a step that have values."""
     found = {name: getattr(step, name) for name in type(step).__dataclass_fields__}
-    plain = {name: list(value) if isinstance(value, tuple) else value for name, value in found.items()}
+    plain = {
+        name: list(value) if isinstance(value, tuple) else value for name, value in found.items()
+    }
     return {name: value for name, value in plain.items() if value is not None}
 
 
@@ -138,14 +298,21 @@ def _kind(step: Any) -> str:
 
 
 def _pieces(run: Run, place: Experiment, keep: bool) -> list[Experiment]:
-    """The stretches of rows that have all that is needed."""
+    """Return the stretches of rows without a missing sample."""
     stride = place.stride * run.stride
     line = None if run.moved else place.first_line
     pieces = []
     for a, b in unbroken(run.values[:, : run.inputs] if keep else run.values):
         first = a if run.moved else place.first_row + place.stride * run.first + stride * a
         values = run.values[a:b]
-        where = (place.source, first, 1 if run.moved else stride, line, float(run.instants[a]), place.offset + a)
+        where = (
+            place.source,
+            first,
+            1 if run.moved else stride,
+            line,
+            float(run.instants[a]),
+            place.offset + a,
+        )
         pieces.append(Experiment(values[:, : run.inputs], values[:, run.inputs :], *where))
     return pieces
 
@@ -153,7 +320,9 @@ def _pieces(run: Run, place: Experiment, keep: bool) -> list[Experiment]:
 def steps_again(
     prepared: Sequence[Prepared], names: Sequence[str], sampling_time: float
 ) -> tuple[tuple[Step, ...], float]:
-    """The steps that prepare a new record as another one was, and its sampling time [s] before them.
+    """Return the steps that prepare a new record as another one was.
+
+    The second result is its sampling time [s] before the steps.
 
     Args:
         names: channels that the new record has; the steps leave out others.
@@ -161,7 +330,10 @@ def steps_again(
     """
     steps: list[Step] = []
     for done in reversed(prepared):
-        options = {name: tuple(value) if isinstance(value, list) else value for name, value in done.options.items()}
+        options = {
+            name: tuple(value) if isinstance(value, list) else value
+            for name, value in done.options.items()
+        }
         if done.step == "resample":
             options["sampling_time"] = sampling_time
         if done.step == "decimate":
@@ -174,7 +346,7 @@ def steps_again(
 
 
 def warnings_of(prepared: Sequence[Prepared], names: Sequence[str]) -> tuple[Warning, ...]:
-    """What must be known of a fit to data that were prepared so."""
+    """Return warnings about a fit to data that were prepared so."""
     found = []
     for done in prepared:
         channels = done.options.get("channels")
@@ -182,19 +354,21 @@ def warnings_of(prepared: Sequence[Prepared], names: Sequence[str]) -> tuple[War
             found.append(
                 Warning(
                     "filtered_alone",
-                    f"{done.step} acts on {', '.join(channels)} only: the model then explains the filter too, and θ "
-                    "is biased. Leave `channels` out, so that inputs and outputs are filtered alike.",
+                    f"{done.step} acts on {', '.join(channels)} only: the model then explains "
+                    "the filter too, and θ is biased. Leave `channels` out, so that inputs and "
+                    "outputs are filtered alike.",
                 )
             )
         if done.step not in _FILTERS:
             continue
-        late = ", and delays all that it acts on" if done.options.get("phase") == "causal" else ""
+        late = ", and delays its channels" if done.options.get("phase") == "causal" else ""
         found.append(
             Warning(
                 "filtered_noise",
-                f"{done.step} colours the noise{late}: residuals follow from one another, and one step ahead θ is "
-                "biased by that. What is nonlinear in physics or learner is not the same of filtered signals. Compare "
-                'with a fit to the data as they are, and with training.focus = "simulation".',
+                f"{done.step} colours the noise{late}: residuals are correlated, which biases θ "
+                "one step ahead. Nonlinear terms are not the same of filtered signals. Compare "
+                "with a fit to the data as they are, and with training.focus = "
+                '"simulation".',
             )
         )
     return tuple(found)

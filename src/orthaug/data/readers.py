@@ -1,6 +1,7 @@
 """Records from files: rows, ranges and sampling time of named channels.
 
-Rows count from 0 behind the header; messages name the file's own line, column and what stands there.
+Rows count from 0 behind the header; messages name the file's own line, column and what is
+there.
 """
 
 from __future__ import annotations
@@ -19,14 +20,30 @@ from orthaug._base.lines import counted
 from orthaug.data.clock import DRIFT, JITTER, thinned_twice
 from orthaug.data.layouts import text_number
 from orthaug.data.preparation import check_steps, prepared_experiments
-from orthaug.data.record import Channel, Experiment, Record, as_channels, check_step, same_step, unbroken
+from orthaug.data.record import (
+    Channel,
+    Experiment,
+    Record,
+    as_channels,
+    check_step,
+    same_step,
+    unbroken,
+)
 from orthaug.data.steps import Fill, Outliers, Resample, Run
 from orthaug.data.tables import Table, check_readable, has_column, read_table
 
 RowRange = tuple[int, int] | list[int]
 _RESOLUTION = 1e-6  # what rounding of the instants may change the mean step by, relative
 _LATEST = 1e11  # s; later than the year 5000
-_MISSING = ("", "nan", "na", "n/a", "#n/a", "null", "none")  # how files write a sample that is not there
+_MISSING = (
+    "",
+    "nan",
+    "na",
+    "n/a",
+    "#n/a",
+    "null",
+    "none",
+)  # how files write a sample that is not there
 
 
 def read_record(
@@ -45,23 +62,25 @@ def read_record(
 ) -> Record:
     r"""Read one file; several row ranges are experiments of their own.
 
-    Args:
-        path: of a file that ends in .csv, .tsv, .txt, .dat, .parquet, .xlsx, .npz, .mat or .h5.
+    Args: path: of a file that ends in .csv, .tsv, .txt, .dat, .parquet, .xlsx, .npz, .mat or .h5.
         inputs, outputs: channel names, or `Channel`s with column, unit, scale and offset.
-        sampling_time: seconds between rows; or `time`, the column that holds the instants: numbers in the unit of its
+        sampling_time: seconds between rows; or `time`, the column that holds the instants: numbers
+        in the unit of its
             header (`t [ms]`; s without one), or dates, which count from the first row of the file.
         rows: half-open range `(start, stop)` of data rows, or several; None for all.
-        every: keep each n-th row (no filter); the sampling time is multiplied, so it is that of the file's rows.
+        every: keep each n-th row (no filter); the sampling time is multiplied, so it is that of the
+            file's rows.
         columns: this file's column for a channel, `{"position": "yVal"}`.
-        missing: "error", or "skip" to leave out rows with empty or NaN cells. Each stretch between them is then an
-            experiment of its own, so that no lag reaches across a gap. "keep" does so where inputs are missing, and
-            keeps missing outputs as NaN: an `Observer` takes them.
-        experiment: the column, of numbers, that tells experiments apart; each is in one piece.
-        prepare: steps such as `Fill()` or `Lowpass(cutoff=10.0)`, in order, before missing samples are looked at;
-            with `Resample()` the instants of `time` may be uneven.
+        missing: "error", or "skip" to leave out rows with empty or NaN cells. Each stretch between
+            them is then an experiment of its own, so that no lag reaches across a gap. "keep" does
+            so where inputs are missing, and keeps missing outputs as NaN: an `Observer` takes them.
+        experiment: the column, of numbers, that labels the experiments; each is in one piece.
+        prepare: steps such as `Fill()` or `Lowpass(cutoff=10.0)`, in order, before missing samples
+            are looked at; with `Resample()` the instants of `time` may be uneven.
 
     Raises:
-        InputError: no such file, wrong type, missing columns, cells that are empty or no finite numbers.
+        InputError: no such file, wrong type, missing columns, cells that are empty or no finite
+            numbers.
 
     Examples:
         >>> import tempfile
@@ -77,7 +96,9 @@ def read_record(
     _check_time(time, sampling_time, {c.name: column_of[c.name] for c in channels[1]})
     check_choice(missing, ("error", "skip", "keep"), "`missing`")
     check_count(every, "every")
-    wanted: list[str] = list(dict.fromkeys([*column_of.values(), *(name for name in (time, experiment) if name)]))
+    wanted: list[str] = list(
+        dict.fromkeys([*column_of.values(), *(name for name in (time, experiment) if name)])
+    )
     if not column_of:
         raise InputError("no channels are asked for; name inputs, outputs or both.")
     if fault := thinned_twice(path, sampling_time, every, wanted):
@@ -91,37 +112,49 @@ def read_record(
     ranges = _ranges(rows, total, path)
     ranges = ranges if experiment is None else _labelled(table, experiment, ranges)
     if prepare:
-        return _Uncut(table, channels, column_of, time, sampling_time or 1.0, every, missing).prepared(prepare, ranges)
+        return _RawRanges(
+            table, channels, column_of, time, sampling_time or 1.0, every, missing
+        ).prepared(prepare, ranges)
     for begin, end in ranges:
         recorded += len(range(begin, end, every))
         for start, stop in _stretches(table, wanted, needed, begin, end, every, missing):
             pick = slice(start, stop, every)
             signals = [
-                np.stack([c.scale * table.columns[column_of[c.name]][pick] + c.offset for c in group], axis=-1)
+                np.stack(
+                    [c.scale * table.columns[column_of[c.name]][pick] + c.offset for c in group],
+                    axis=-1,
+                )
                 if group
                 else np.empty((len(range(start, stop, every)), 0))
                 for group in channels
             ]
             offset = (start - begin) // every
-            began = float(table.columns[time][start]) if time else offset * every * (sampling_time or 1.0)
+            began = (
+                float(table.columns[time][start])
+                if time
+                else offset * every * (sampling_time or 1.0)
+            )
             place = (str(path), start, every, table.first_line, began, offset)
             experiments.append(Experiment(signals[0], signals[1], *place))
             if time and (stop - start > 1 or missing == "error"):
                 steps.append(_uniform_step(table, time, start, stop))
     if time and not steps:
-        raise InputError(f"{path}: no two rows without missing cells follow each other; the sampling time is unknown.")
+        raise InputError(
+            f"{path}: no two rows without missing cells follow each other; the sampling time "
+            "is unknown."
+        )
     step = steps[0] if time else (1.0 if sampling_time is None else float(sampling_time))
     if others := [other for other in steps if not same_step(other, step)]:
-        told = f"steps by {step:g} s in one row range and by {others[0]:g} s in another"
-        raise InputError(f"{path}: column '{time}' {told}.")
+        steps_text = f"steps by {step:g} s in one row range and by {others[0]:g} s in another"
+        raise InputError(f"{path}: column '{time}' {steps_text}.")
     left_out = recorded - sum(len(experiment) for experiment in experiments)
     step *= min(every, 10**15)  # what is longer is refused
     return Record(tuple(channels[0]), tuple(channels[1]), step, tuple(experiments), time, left_out)
 
 
 @dataclass(frozen=True, eq=False)
-class _Uncut:
-    """Ranges of a table as they are, missing samples too, for steps that may mend them."""
+class _RawRanges:
+    """Ranges of a table with their missing samples, for steps that may mend them."""
 
     table: Table
     channels: list[tuple[Channel, ...]]
@@ -132,25 +165,39 @@ class _Uncut:
     missing: str
 
     def prepared(self, steps: Sequence[Any], ranges: Sequence[tuple[int, int]]) -> Record:
-        """The record after the steps."""
+        """Return the record after the steps."""
         check_steps(steps)
         mends = self.missing != "error" or any(isinstance(step, Outliers | Fill) for step in steps)
         uneven = any(isinstance(step, Resample) for step in steps)
         runs = [self._run(begin, end, mends=mends, uneven=uneven) for begin, end in ranges]
-        experiments, step, done, lost = prepared_experiments(runs, steps, keep=self.missing == "keep")
+        experiments, step, done, lost = prepared_experiments(
+            runs, steps, keep=self.missing == "keep"
+        )
         if lost and self.missing == "error":
-            told = f"{counted(lost, 'row')} {'lacks' if lost == 1 else 'lack'} a sample after preparation"
+            lacking = (
+                f"{counted(lost, 'row')} {'lacks' if lost == 1 else 'lack'} a sample after "
+                "preparation"
+            )
             raise MissingSampleError(
-                f'{self.table.path}: {told}. Let `fill` reach over longer gaps, or leave them out (missing = "skip").'
+                f"{self.table.path}: {lacking}. Let `fill` reach over longer gaps, or leave them "
+                'out (missing = "skip").'
             )
         return Record(self.channels[0], self.channels[1], step, experiments, self.time, lost, done)
 
     def _run(self, begin: int, end: int, *, mends: bool, uneven: bool) -> tuple[Run, Experiment]:
-        """The rows of a range, and where they stand."""
-        table, pick, both = self.table, slice(begin, end, self.every), [*self.channels[0], *self.channels[1]]
+        """Return the rows of a range, and their place in the file."""
+        table, pick, both = (
+            self.table,
+            slice(begin, end, self.every),
+            [*self.channels[0], *self.channels[1]],
+        )
         names = [self.column_of[c.name] for c in both]
-        _stretches(table, names, names, begin, end, self.every, "skip" if mends else "error")  # text is refused
-        values = np.column_stack([c.scale * table.columns[self.column_of[c.name]][pick] + c.offset for c in both])
+        _stretches(
+            table, names, names, begin, end, self.every, "skip" if mends else "error"
+        )  # text is refused
+        values = np.column_stack(
+            [c.scale * table.columns[self.column_of[c.name]][pick] + c.offset for c in both]
+        )
         step = self.step * self.every
         instants = step * np.arange(len(values))
         if self.time:
@@ -162,14 +209,23 @@ class _Uncut:
                 step = _uniform_step(table, self.time, begin, end) * self.every
         place = (str(table.path), begin, self.every, table.first_line, float(instants[0]))
         count = len(self.channels[0])
-        run = Run(values, instants, tuple(c.name for c in both), count, step, even=not (self.time and uneven))
+        run = Run(
+            values,
+            instants,
+            tuple(c.name for c in both),
+            count,
+            step,
+            even=not (self.time and uneven),
+        )
         return run, Experiment(values[:, :count], values[:, count:], *place)
 
 
 def read_samples(
     paths: Sequence[str | Path], lags: Sequence[str], *, rows: Any = None, every: int = 1
 ) -> tuple[dict[str, Vector], Vector | None]:
-    """Points from files: a column per raw lag, named as in expressions, and their `weight` where there is one.
+    """Read points from files: a column per raw lag, named as in expressions, and their `weight`.
+
+    Files need no column `weight`.
 
     Raises:
         InputError: no such file, missing columns, cells that are no finite numbers.
@@ -179,30 +235,40 @@ def read_samples(
         check_readable(path)
         own = has_column(path, "weight")
         if weighted not in (None, own):
-            raise InputError(f"{path}: some files of the samples have a column 'weight' and some have not.")
+            raise InputError(
+                f"{path}: some files of the samples have a column 'weight' and some have not."
+            )
         weighted = own
         names = [*lags, *(["weight"] if own else [])]
         table = _trim(read_table(path, names))
         total = len(table.columns[names[0]])
         for start, stop in _ranges(rows, total, path):
             _check_cells(table, names, start, stop)
-            pieces.append(np.stack([table.columns[name][start:stop:every] for name in names], axis=-1))
+            pieces.append(
+                np.stack([table.columns[name][start:stop:every] for name in names], axis=-1)
+            )
     values = np.concatenate(pieces)
     weights = values[:, -1] if weighted else None
     return {lag: values[:, j] for j, lag in enumerate(lags)}, weights
 
 
 def _trim(table: Table, *, uneven: bool = False) -> Table:
-    """The table without its last rows where every used column is empty (blank lines, longer unused columns)."""
+    """Return the table without its last rows where every used column is empty.
+
+    Such are blank lines, and the ends of longer unused columns.
+    """
     longest = max(table.filled.values())
     if longest == 0:
         raise InputError(f"{table.path}: there are no data rows in {', '.join(table.columns)}.")
     if len(set(table.filled.values())) > 1 and not uneven:
         listing = ", ".join(f"'{name}' {length}" for name, length in table.filled.items())
         raise InputError(
-            f"{table.path}: the used columns have unequal lengths: {listing} rows. Give all the same length."
+            f"{table.path}: the used columns have unequal lengths: {listing} rows. Give all "
+            "the same length."
         )
-    return replace(table, columns={name: values[:longest] for name, values in table.columns.items()})
+    return replace(
+        table, columns={name: values[:longest] for name, values in table.columns.items()}
+    )
 
 
 def _path(path: Any) -> Path:
@@ -211,16 +277,20 @@ def _path(path: Any) -> Path:
 
 
 def _columns(channels: Sequence[Sequence[Channel]], columns: Any) -> dict[str, str]:
-    check_type(columns, Mapping | None, "columns", "this file's column by channel, such as {'y': 'yVal'}")
+    check_type(
+        columns, Mapping | None, "columns", "this file's column by channel, such as {'y': 'yVal'}"
+    )
     given = dict(columns or {})
     for name, column in given.items():
         if not isinstance(column, str):
-            raise InputError(f"`columns`: the column of {shown(name)} must be a name; got {shown(column)}.")
+            raise InputError(
+                f"`columns`: the column of {shown(name)} must be a name; got {shown(column)}."
+            )
     return {c.name: given.get(c.name, c.file_column) for group in channels for c in group}
 
 
 def _check_time(time: Any, sampling_time: Any, outputs: Mapping[str, str]) -> None:
-    """Raise InputError for instants that are no column, given twice, or an output as well."""
+    """Raise InputError for instants that are no column, given twice, or also an output."""
     check_type(time, str | None, "time", "a column's name")
     if sampling_time is not None and time is not None:
         raise InputError("give `sampling_time` or `time`, not both.")
@@ -228,7 +298,9 @@ def _check_time(time: Any, sampling_time: Any, outputs: Mapping[str, str]) -> No
         check_step(sampling_time)
     for name, column in outputs.items():
         if column == time:
-            raise InputError(f"the column '{time}' is `time` and the output '{name}'; one of them is wrong.")
+            raise InputError(
+                f"the column '{time}' is both `time` and the output '{name}'; correct one of them."
+            )
 
 
 def _listed(value: Any) -> bool:
@@ -239,8 +311,10 @@ def _whole(value: Any) -> bool:
     return isinstance(value, int | np.integer) and not isinstance(value, bool | np.bool_)
 
 
-def _ranges(rows: RowRange | Sequence[RowRange] | None, total: int, path: Path) -> list[tuple[int, int]]:
-    """Half-open ranges of rows, each checked against the file."""
+def _ranges(
+    rows: RowRange | Sequence[RowRange] | None, total: int, path: Path
+) -> list[tuple[int, int]]:
+    """Return half-open ranges of rows, each checked against the file."""
     if rows is None:
         return [(0, total)]
     pairs: list = list(rows) if _listed(rows) else []
@@ -248,24 +322,33 @@ def _ranges(rows: RowRange | Sequence[RowRange] | None, total: int, path: Path) 
         pairs = [pairs]
     if not _listed(rows) or not all(_listed(pair) and all(map(_whole, pair)) for pair in pairs):
         raise InputError(
-            f"{path}: `rows` must be two whole numbers, [start, stop], or a list of such pairs; got {shown(rows)}."
+            f"{path}: `rows` must be two whole numbers, [start, stop], or a list of such "
+            f"pairs; got {shown(rows)}."
         )
     for pair in pairs:
         if len(pair) != 2 or not 0 <= pair[0] < pair[1]:
-            raise InputError(f"{path}: rows {list(pair)} is no half-open range [start, stop] with 0 ≤ start < stop.")
+            raise InputError(
+                f"{path}: rows {list(pair)} is no half-open range [start, stop] with 0 ≤ start "
+                "< stop."
+            )
         if pair[1] > total:
-            raise InputError(f"{path}: rows {list(pair)} reaches past the end; the file has {total} data rows.")
+            raise InputError(
+                f"{path}: rows {list(pair)} reaches past the end; the file has {total} data rows."
+            )
     ordered = sorted((int(start), int(stop)) for start, stop in pairs)
     for before, after in zip(ordered, ordered[1:], strict=False):
         if after[0] < before[1]:
             raise InputError(
-                f"{path}: the row ranges {list(before)} and {list(after)} overlap; samples would count twice."
+                f"{path}: the row ranges {list(before)} and {list(after)} overlap; samples "
+                "would count twice."
             )
     return [(int(start), int(stop)) for start, stop in pairs]
 
 
-def _labelled(table: Table, column: str, ranges: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
-    """The ranges cut where the label of the experiment changes."""
+def _labelled(
+    table: Table, column: str, ranges: Sequence[tuple[int, int]]
+) -> list[tuple[int, int]]:
+    """Return the ranges cut where the label of the experiment changes."""
     found, seen, labels = [], set(), table.columns[column]
     for start, stop in ranges:
         _check_cells(table, [column], start, stop)
@@ -273,8 +356,8 @@ def _labelled(table: Table, column: str, ranges: Sequence[tuple[int, int]]) -> l
         for a, b in zip(borders, borders[1:], strict=False):
             if labels[a] in seen:
                 raise InputError(
-                    f"{table.path}: {table.where(a)}: experiment {labels[a]:g} goes on after another has begun; sort "
-                    f"the rows by '{column}', then by time."
+                    f"{table.path}: {table.where(a)}: experiment {labels[a]:g} goes on after "
+                    f"another has begun; sort the rows by '{column}', then by time."
                 )
             seen.add(labels[a])
             found.append((a, b))
@@ -282,9 +365,18 @@ def _labelled(table: Table, column: str, ranges: Sequence[tuple[int, int]]) -> l
 
 
 def _stretches(
-    table: Table, columns: Sequence[str], needed: Sequence[str], begin: int, end: int, every: int, missing: str
+    table: Table,
+    columns: Sequence[str],
+    needed: Sequence[str],
+    begin: int,
+    end: int,
+    every: int,
+    missing: str,
 ) -> list[tuple[int, int]]:
-    """Half-open row ranges without missing cells in the needed columns; the whole range where they are errors."""
+    """Return half-open row ranges without missing cells in the needed columns.
+
+    The whole range where they are errors.
+    """
     if missing == "error":
         _check_cells(table, columns, begin, end)
         return [(begin, end)]
@@ -292,11 +384,19 @@ def _stretches(
     full = np.all([np.isfinite(table.columns[name][kept]) for name in columns], axis=0)
     for row in kept[~full]:
         for name in columns:
-            if not np.isfinite(table.columns[name][row]) and table.cell(name, row).strip().lower() not in _MISSING:
+            if (
+                not np.isfinite(table.columns[name][row])
+                and table.cell(name, row).strip().lower() not in _MISSING
+            ):
                 _check_cells(table, [name], row, row + 1)
-    ranges = unbroken(np.column_stack([np.ones(len(kept)), *(table.columns[name][kept] for name in needed)]))
+    ranges = unbroken(
+        np.column_stack([np.ones(len(kept)), *(table.columns[name][kept] for name in needed)])
+    )
     if not ranges:
-        raise InputError(f"{table.path}: every row from {begin} to {end - 1} has a missing cell; nothing is left.")
+        raise InputError(
+            f"{table.path}: every row from {begin} to {end - 1} has a missing cell; nothing is "
+            "left."
+        )
     return [(int(kept[a]), int(kept[b - 1]) + 1) for a, b in ranges]
 
 
@@ -311,14 +411,21 @@ def _check_cells(table: Table, columns: Sequence[str], start: int, stop: int) ->
             dated, number = name == table.dated, np.isfinite(text_number(text))
             kind = "a date" if dated else "decimals with commas" if number else ""
             wanted = f"{kind}, as in other cells" if kind else "a finite number"
-            raise error(f"{table.path}: {table.where(row)}, column '{name}': {what}; expected {wanted}.")
+            raise error(
+                f"{table.path}: {table.where(row)}, column '{name}': {what}; expected {wanted}."
+            )
 
 
 def _uniform_step(table: Table, time: str, start: int, stop: int) -> float:
-    """Mean step of the time column, checked to be even: no sample is missing, and the rate stays the same."""
+    """Return the mean step of the time column, checked to be even.
+
+    No sample is missing, and the rate stays the same.
+    """
     instants = table.columns[time][start:stop]
     if len(instants) < 2:
-        raise InputError(f"{table.path}: one row is too few to tell the sampling time from column '{time}'.")
+        raise InputError(
+            f"{table.path}: one row is too few for a sampling time from column '{time}'."
+        )
     steps = np.diff(instants)
     mean, usual = float(steps.mean()), float(np.sort(steps)[(len(steps) - 1) // 2])
     odd = np.flatnonzero(np.abs(steps - usual) > JITTER * usual) if usual > 0 else np.array([0])
@@ -326,12 +433,14 @@ def _uniform_step(table: Table, time: str, start: int, stop: int) -> float:
     if odd.size:
         row = start + int(odd[0]) + 1
         raise InputError(
-            f"{table.path}: {table.where(row)}, column '{time}': a step of {steps[odd[0]]:g} s where {usual:g} s is "
-            f"usual; {remedy}"
+            f"{table.path}: {table.where(row)}, column '{time}': a step of {steps[odd[0]]:g} s "
+            f"where {usual:g} s is usual; {remedy}"
         )
     third = len(steps) // 3
     if third:
-        rates = [float(piece.mean()) for piece in (steps[:third], steps[third:-third], steps[-third:])]
+        rates = [
+            float(piece.mean()) for piece in (steps[:third], steps[third:-third], steps[-third:])
+        ]
         change = max(rates) - min(rates)
         if change > DRIFT * mean and change * third > 0.5 * mean:
             drifts = f"the step drifts between {min(rates):g} s and {max(rates):g} s"
@@ -339,12 +448,13 @@ def _uniform_step(table: Table, time: str, start: int, stop: int) -> float:
     resolution = float(np.spacing(np.abs(instants).max())) / len(steps)
     if resolution > _RESOLUTION * mean:
         raise InputError(
-            f"{table.path}: column '{time}': instants of {np.abs(instants).max():.3g} s are too large for steps of "
-            f"{mean:g} s in double precision; subtract the first instant, and write seconds."
+            f"{table.path}: column '{time}': instants of {np.abs(instants).max():.3g} s are "
+            f"too large for steps of {mean:g} s in double precision; subtract the first "
+            "instant, and write seconds."
         )
     if np.abs(instants).max() > _LATEST:
         raise InputError(
-            f"{table.path}: column '{time}': instants of {np.abs(instants).max():.3g} are no seconds; perhaps they "
-            "are milli- or nanoseconds since 1970. Write seconds."
+            f"{table.path}: column '{time}': instants of {np.abs(instants).max():.3g} are no "
+            "seconds; perhaps they are milli- or nanoseconds since 1970. Write seconds."
         )
     return mean

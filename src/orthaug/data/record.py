@@ -8,9 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from orthaug._base.checks import Matrix, as_signal, check_choice, check_label, check_type, check_unique, is_number
+from orthaug._base.checks import (
+    Matrix,
+    as_signal,
+    check_choice,
+    check_label,
+    check_type,
+    check_unique,
+    is_number,
+)
 from orthaug._base.errors import LONGEST, InputError, shown, visible
-from orthaug._base.views import Shown
+from orthaug._base.views import NotebookView
 from orthaug.data.expressions import RESERVED, is_name
 from orthaug.data.prepared import Prepared, added_up
 
@@ -19,12 +27,12 @@ _DERIVED = ("model", "baseline", "learner", "model_low", "model_high")  # column
 
 
 def same_step(step: float, other: float) -> bool:
-    """Whether two sampling times are the same to 0.1 %, as logged time columns are."""
+    """Return whether two sampling times are the same to 0.1 %, as logged time columns are."""
     return bool(np.isclose(step, other, rtol=1e-3, atol=0.0))
 
 
 def unbroken(values: Matrix) -> list[tuple[int, int]]:
-    """Half-open ranges of rows without a missing sample."""
+    """Return half-open ranges of rows without a missing sample."""
     there = np.isfinite(values).all(axis=1)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], there, [False]]).astype(int))).tolist()
     return list(zip(edges[::2], edges[1::2], strict=True))
@@ -32,7 +40,9 @@ def unbroken(values: Matrix) -> list[tuple[int, int]]:
 
 @dataclass(frozen=True)
 class Channel:
-    """A named signal with its unit, and how files hold it: `value = scale * cell + offset` of `column`.
+    """A named signal with its unit, and its form in files.
+
+    A file holds `value = scale * cell + offset` of `column`.
 
     Examples:
         >>> Channel("force", "N", column="F (kN)", scale=1000.0).label
@@ -48,9 +58,9 @@ class Channel:
     def __post_init__(self) -> None:
         if not is_name(self.name):
             raise InputError(
-                f"{_quoted(self.name)} cannot name a channel; use letters, digits and underscores, at most {LONGEST}, "
-                f"not starting with a digit, and none of {', '.join(sorted(RESERVED))}. A column of another name is "
-                "its `column`."
+                f"{_quoted(self.name)} cannot name a channel; use letters, digits and "
+                f"underscores, at most {LONGEST}, not starting with a digit, and none of "
+                f"{', '.join(sorted(RESERVED))}. A column of another name is its `column`."
             )
         check_label(self.unit, f"the unit of '{self.name}'")
         check_type(self.column, str, f"column of '{self.name}'", "a column's name")
@@ -67,7 +77,7 @@ class Channel:
 
     @property
     def label(self) -> str:
-        """`name [unit]`, as it stands at an axis."""
+        """`name [unit]`, the label of an axis."""
         return f"{self.name} [{self.unit}]" if self.unit else self.name
 
 
@@ -76,14 +86,22 @@ def _quoted(name: Any) -> str:
 
 
 def as_channels(given: Any, what: str) -> tuple[Channel, ...]:
-    """Channels of names or `Channel`s.
+    """Return the channels of names or `Channel`s.
 
     Raises:
         InputError: one text instead of several, or anything else that names no channels.
     """
-    if isinstance(given, str) or not isinstance(given, Iterable) or isinstance(given, np.ndarray) and not given.ndim:
+    if (
+        isinstance(given, str)
+        or not isinstance(given, Iterable)
+        or isinstance(given, np.ndarray)
+        and not given.ndim
+    ):
         example = given if isinstance(given, str) else "y"
-        raise InputError(f"`{what}` must be a list of names or Channels, such as ['{example}']; got {shown(given)}.")
+        raise InputError(
+            f"`{what}` must be a list of names or Channels, such as ['{example}']; got "
+            f"{shown(given)}."
+        )
     return tuple(name if isinstance(name, Channel) else Channel(name) for name in given)
 
 
@@ -91,27 +109,35 @@ def check_step(value: Any) -> float:
     """Return `value` if it is a sampling time in seconds, otherwise raise InputError."""
     if not is_number(value) or not 0 < value <= LONGEST_STEP:
         raise InputError(
-            f"the sampling time must be a positive number of seconds, at most {LONGEST_STEP:g}; got {shown(value)}."
+            "the sampling time must be a positive number of seconds, at most "
+            f"{LONGEST_STEP:g}; got {shown(value)}."
         )
     return float(value)
 
 
 def check_channels(inputs: Sequence[Channel], outputs: Sequence[Channel]) -> None:
-    """Raise InputError for a name that stands twice, or an output named like a column of result tables."""
+    """Raise InputError for a name that is given twice, or that result tables use.
+
+    Outputs must not be named like a column of result tables.
+    """
     check_unique((channel.name for channel in (*inputs, *outputs)), "channel")
     derived = [f"{c.name}_{part}" for c in outputs for part in _DERIVED]
     for channel in outputs:
         if channel.name in ("time", *derived):
-            raise InputError(f"an output cannot be called '{channel.name}': results have a column of that name.")
+            raise InputError(
+                f"an output cannot be called '{channel.name}': results have a column of that name."
+            )
 
 
 @dataclass(frozen=True, eq=False)
 class Experiment:
-    """One uninterrupted run: `inputs` (N, nu) and `outputs` (N, ny), row k taken at the same instant.
+    """One uninterrupted run: `inputs` (N, nu) and `outputs` (N, ny).
 
-    Messages say where a row came from: `source`, `first_row`, `stride` and `first_line`, the file's line of its row 0.
-    `start_time` [s] is the instant of the first row. A stretch between missing samples is a part of a recording, and
-    begins `offset` rows into it.
+    Row k of both was taken at the same instant.
+
+    Messages say where a row came from: `source`, `first_row`, `stride` and `first_line`, the file's
+    line of its row 0. `start_time` [s] is the instant of the first row. A stretch between missing
+    samples is a part of a recording, and begins `offset` rows into it.
     """
 
     inputs: Matrix
@@ -131,37 +157,43 @@ class Experiment:
         return f"Experiment({visible(self.source) + ': ' if self.source else ''}{shapes})"
 
     def check(self, inputs: int, outputs: int) -> None:
-        """Raise InputError unless there are as many columns, and as many rows of both."""
+        """Raise InputError unless the columns fit the channels, and both have as many rows."""
         wanted = (len(self), inputs), (len(self), outputs)
         found = np.shape(self.inputs), np.shape(self.outputs)
         if found != wanted:
             raise InputError(
-                f"{self.source or 'an experiment'}: `inputs` and `outputs` have the shapes {found[0]} and {found[1]}; "
-                f"expected (rows, {inputs}) and (rows, {outputs}), one column for each channel."
+                f"{self.source or 'an experiment'}: `inputs` and `outputs` have the shapes "
+                f"{found[0]} and {found[1]}; expected (rows, {inputs}) and (rows, {outputs}), "
+                "one column for each channel."
             )
 
     def where(self, row: int) -> str:
-        """`run.csv: line 17 (row 15)` for a row of this experiment, as much of it as is known."""
+        """Return the place of a row: `run.csv: line 17 (row 15)`, as much of it as is known."""
         row = self.first_row + self.stride * row
-        place = f"row {row}" if self.first_line is None else f"line {self.first_line + row} (row {row})"
+        place = (
+            f"row {row}" if self.first_line is None else f"line {self.first_line + row} (row {row})"
+        )
         return f"{visible(self.source)}: {place}" if self.source else place
 
     def rows(self, start: int | None, stop: int | None) -> Experiment:
-        """The half-open range of rows `[start, stop)` as an experiment of its own."""
+        """Return the half-open range of rows `[start, stop)` as an experiment of its own."""
         first = self.first_row + self.stride * range(len(self))[start:stop].start
-        return replace(self, inputs=self.inputs[start:stop], outputs=self.outputs[start:stop], first_row=first)
+        return replace(
+            self, inputs=self.inputs[start:stop], outputs=self.outputs[start:stop], first_row=first
+        )
 
 
 @dataclass(frozen=True, eq=False)
-class Record(Shown):
+class Record(NotebookView):
     """Experiments that share channels and sampling time; lags never reach across experiments.
 
-    `sampling_time` is in seconds. `outputs` is empty for a record that only carries inputs (something
-    to simulate), and `inputs` is empty for an autonomous system.
+    `sampling_time` is in seconds. `outputs` is empty for a record that only carries inputs
+    (something to simulate), and `inputs` is empty for an autonomous system.
 
     Examples:
         >>> import numpy as np
-        >>> record = Record.from_arrays(u=np.arange(5.0), y=np.ones(5), sampling_time=0.1, inputs=["force"])
+        >>> u, y = np.arange(5.0), np.ones(5)
+        >>> record = Record.from_arrays(u=u, y=y, sampling_time=0.1, inputs=["force"])
         >>> record
         Record(1 experiment, 5 samples, Ts = 0.1 s, inputs: force; outputs: y)
         >>> [len(part) for part in record.split(0.6)]
@@ -177,9 +209,11 @@ class Record(Shown):
     time_column: str | None = None
     """The column of the file that holds the instants, where there is one."""
     missing: int = 0
-    """Rows that were left out because a sample was missing: 0 unless it was read with `missing="skip"` or prepared."""
+    """Rows that were left out because a sample was missing: 0 unless it was read with
+    `missing="skip"` or prepared.
+    """
     prepared: tuple[Prepared, ...] = ()
-    """What was done to the samples, in order."""
+    """Preparation of the samples, in order."""
 
     def __post_init__(self) -> None:
         for name in ("inputs", "outputs"):
@@ -207,7 +241,7 @@ class Record(Shown):
         source: str = "",
         missing: str = "error",
     ) -> Record:
-        """One experiment from arrays.
+        """Return one experiment from arrays.
 
         Args:
             u: inputs, (N,) or (N, nu); None for none.
@@ -221,7 +255,8 @@ class Record(Shown):
             InputError: lengths that differ, cells that are not finite, names that do not fit.
 
         Examples:
-            >>> Record.from_arrays([0.0, 1.0], [[0, 1], [2, 3]], outputs=[Channel("angle", "rad"), "speed"])
+            >>> outputs = [Channel("angle", "rad"), "speed"]
+            >>> Record.from_arrays([0.0, 1.0], [[0, 1], [2, 3]], outputs=outputs)
             Record(1 experiment, 2 samples, Ts = 1 s, inputs: u; outputs: angle, speed)
         """
         if u is None and y is None:
@@ -246,7 +281,7 @@ class Record(Shown):
 
     @classmethod
     def join(cls, records: Iterable[Record]) -> Record:
-        """One record with the experiments of several, each kept as it is."""
+        """Return one record with the experiments of several, each kept as it is."""
         records = tuple(records)
         for record in records:
             check_type(record, Record, "records", "several Records")
@@ -255,16 +290,22 @@ class Record(Shown):
         first = records[0]
         for other in records[1:]:
             if (other.inputs, other.outputs) != (first.inputs, first.outputs):
-                raise InputError(f"records with other channels cannot be joined: {first!r} and {other!r}.")
+                raise InputError(
+                    f"records with other channels cannot be joined: {first!r} and {other!r}."
+                )
             if not same_step(other.sampling_time, first.sampling_time):
                 raise InputError(
-                    f"{other.experiments[0].source or 'a record'}: sampled every {other.sampling_time:g} s, "
-                    f"{first.experiments[0].source or 'another'} every {first.sampling_time:g} s; resample one of them."
+                    f"{other.experiments[0].source or 'a record'}: sampled every "
+                    f"{other.sampling_time:g} s, {first.experiments[0].source or 'another'} "
+                    f"every {first.sampling_time:g} s; resample one of them."
                 )
         experiments = tuple(e for record in records for e in record.experiments)
         missing = sum(record.missing for record in records)
         return replace(
-            first, experiments=experiments, missing=missing, prepared=added_up([r.prepared for r in records])
+            first,
+            experiments=experiments,
+            missing=missing,
+            prepared=added_up([r.prepared for r in records]),
         )
 
     def __len__(self) -> int:
@@ -273,10 +314,12 @@ class Record(Shown):
     __iter__ = None  # rows of several experiments would follow each other without a sign
 
     def __getitem__(self, rows: slice) -> Record:
-        """The half-open range of rows `record[start:stop]`; negative ones count from the end.
+        """Return the half-open range of rows `record[start:stop]`.
 
-        Rows count over all experiments, one behind the other, as `len(record)` does. Experiments stay apart: the range
-        cuts the first and the last of them, and those outside are left out.
+        Negative ones count from the end.
+
+        Rows count over all experiments, one behind the other, as `len(record)` does. Experiments
+        stay apart: the range cuts the first and the last of them, and those outside are left out.
 
         Raises:
             InputError: a row, a step, places that are no whole numbers, or a range without rows.
@@ -297,7 +340,10 @@ class Record(Shown):
             for kind, channels in (("inputs", self.inputs), ("outputs", self.outputs))
         )
         plural = "s" if count != 1 else ""
-        return f"Record({count} experiment{plural}, {len(self)} samples, Ts = {self.sampling_time:g} s, {names})"
+        return (
+            f"Record({count} experiment{plural}, {len(self)} samples, Ts = "
+            f"{self.sampling_time:g} s, {names})"
+        )
 
     @property
     def channels(self) -> tuple[Channel, ...]:
@@ -305,37 +351,47 @@ class Record(Shown):
         return self.outputs + self.inputs
 
     def check_measured(self) -> None:
-        """Raise InputError where an output is missing, as a record for an `Observer` may have it."""
+        """Raise InputError where an output is missing.
+
+        A record for an `Observer` may miss outputs.
+        """
         for experiment in self.experiments:
             bad = np.flatnonzero(np.isnan(experiment.outputs).any(axis=1))
             if bad.size:
                 raise InputError(
-                    f"{experiment.where(int(bad[0]))}: an output is missing there, which only an Observer takes; leave "
+                    f"{experiment.where(int(bad[0]))}: an output is missing, which only an "
+                    "Observer accepts; leave "
                     'such rows out (`missing = "skip"`), or split the experiment there.'
                 )
 
     def rows(self, start: int | None = None, stop: int | None = None) -> Record:
-        """The half-open range of rows `[start, stop)` of a single experiment; negative ones count from its end."""
+        """Return the half-open range of rows `[start, stop)` of a single experiment.
+
+        Negative ones count from its end.
+        """
         for name, value in (("start", start), ("stop", stop)):
             check_type(value, int | np.integer | None, name, "a whole number or None")
         if len(self.experiments) != 1:
-            raise InputError(f"`rows` needs a record of one experiment; this one has {len(self.experiments)}.")
+            raise InputError(
+                f"`rows` needs a record of one experiment; this one has {len(self.experiments)}."
+            )
         return replace(self, experiments=(self._piece(self.experiments[0], start, stop),))
 
     def split(self, fraction: float, by: str = "rows") -> tuple[Record, Record]:
-        """Two records: the first `fraction` and the rest.
+        """Return two records: the first `fraction` and the rest.
 
         Args:
             fraction: between 0 and 1, rounded to whole rows or experiments.
-            by: "rows" cuts every experiment, the first `fraction` of its rows into the first record; "experiments"
-                leaves each whole, and puts the first `fraction` of them into the first record.
+            by: "rows" cuts every experiment, the first `fraction` of its rows into the first
+                record; "experiments" leaves each whole, and puts the first `fraction` of them into
+                the first record.
 
         Raises:
             InputError: a part that would be empty.
 
         Examples:
             >>> import numpy as np
-            >>> both = Record.join([Record.from_arrays(y=np.ones(10)), Record.from_arrays(y=np.ones(20))])
+            >>> both = Record.join([Record.from_arrays(y=np.ones(n)) for n in (10, 20)])
             >>> both.split(0.8)[1]
             Record(2 experiments, 6 samples, Ts = 1 s, inputs: none; outputs: y)
             >>> both.split(0.5, by="experiments")[1]
@@ -348,9 +404,14 @@ class Record(Shown):
         cuts = [round(fraction * len(piece)) for piece in pieces]
         for piece, cut in zip(pieces, cuts, strict=True):
             if not 0 < cut < len(piece):
-                held = f"an experiment has {len(piece)} rows" if by == "rows" else f"there are {len(piece)} experiments"
+                held = (
+                    f"an experiment has {len(piece)} rows"
+                    if by == "rows"
+                    else f"there are {len(piece)} experiments"
+                )
                 raise InputError(
-                    f"a part of the split at {fraction:g} would be empty: {held}. Take another `fraction`."
+                    f"a part of the split at {fraction:g} would be empty: {held}. Take another "
+                    "`fraction`."
                 )
         if by == "experiments":
             first, second = self.experiments[: cuts[0]], self.experiments[cuts[0] :]
@@ -361,21 +422,33 @@ class Record(Shown):
         return replace(self, experiments=first), replace(self, experiments=second)
 
     def _piece(self, experiment: Experiment, start: int | None, stop: int | None) -> Experiment:
-        """Rows of an experiment, with the instant of their first."""
+        """Return rows of an experiment, with the instant of their first."""
         first = range(len(experiment))[start:stop].start
-        return replace(experiment.rows(start, stop), start_time=experiment.start_time + first * self.sampling_time)
+        return replace(
+            experiment.rows(start, stop),
+            start_time=experiment.start_time + first * self.sampling_time,
+        )
 
 
 def _range_of(rows: Any, count: int) -> tuple[int, int]:
     """Return start and stop of a slice of `count` rows."""
     if not isinstance(rows, slice):
-        raise InputError(f"a record is cut by a range of rows, such as record[100:500]; got record[{shown(rows)}].")
+        raise InputError(
+            "a record is cut by a range of rows, such as record[100:500]; got "
+            f"record[{shown(rows)}]."
+        )
     for place in (rows.start, rows.stop, rows.step):
-        check_type(place, int | np.integer | None, "the range of rows", "record[start:stop] with whole numbers")
+        check_type(
+            place,
+            int | np.integer | None,
+            "the range of rows",
+            "record[start:stop] with whole numbers",
+        )
     if rows.step not in (None, 1):
         raise InputError(
-            f"record[start:stop:{rows.step}]: a step would leave out rows without a filter, and change the sampling "
-            "time. Read the file with `every`, or take `prepare(record, Decimate(factor))`."
+            f"record[start:stop:{rows.step}]: a step would leave out rows without a filter, "
+            "and change the sampling time. Read the file with `every`, or take "
+            "`prepare(record, Decimate(factor))`."
         )
     start, stop, _ = rows.indices(count)
     if start >= stop:
@@ -384,10 +457,15 @@ def _range_of(rows: Any, count: int) -> tuple[int, int]:
     return start, stop
 
 
-def _channels(given: Sequence[str | Channel] | None, default: str, count: int) -> tuple[Channel, ...]:
+def _channels(
+    given: Sequence[str | Channel] | None, default: str, count: int
+) -> tuple[Channel, ...]:
     if given is None:
         given = [default] if count == 1 else [f"{default}{i + 1}" for i in range(count)]
     given = as_channels(given, "inputs" if default == "u" else "outputs")
     if len(given) != count:
-        raise InputError(f"{len(given)} names for {count} channels of `{default}`; give one name for each column.")
+        raise InputError(
+            f"{len(given)} names for {count} channels of `{default}`; give one name for each "
+            "column."
+        )
     return given

@@ -1,4 +1,4 @@
-"""Regressors: which lags of which channels, their matrix over a record, and the learner's view of it.
+"""Regressors: lags of channels, their matrix over a record, and the learner's features.
 
 Order, everywhere: outputs in order, each k-1 … k-na; then inputs in order, each k-nk … k-nk-nb+1.
 """
@@ -21,7 +21,9 @@ Layout = tuple[Lag, ...]
 
 @dataclass(frozen=True)
 class Lags:
-    """Orders as in MATLAB: `y[k-1..k-na]` and `u[k-nk..k-nk-nb+1]`; one number, or one per channel.
+    """Lags as orders in MATLAB: `y[k-1..k-na]` and `u[k-nk..k-nk-nb+1]`.
+
+    One number, or one per channel.
 
     The paper's `u_k … u_{k-n_b}` is `nk = 0, nb = n_b + 1`.
 
@@ -35,7 +37,7 @@ class Lags:
     nk: int | Sequence[int] = 1
 
     def layout(self, outputs: Sequence[str], inputs: Sequence[str]) -> Layout:
-        """The raw lags in regressor order.
+        """Return the raw lags in regressor order.
 
         Raises:
             InputError: negative orders, or a list whose length is not the number of channels.
@@ -43,18 +45,25 @@ class Lags:
         na = _per_channel(self.na, outputs, "na", "output")
         nb = _per_channel(self.nb, inputs, "nb", "input")
         nk = _per_channel(self.nk, inputs, "nk", "input")
-        past_outputs = [Lag(name, i) for name, n in zip(outputs, na, strict=True) for i in range(1, n + 1)]
-        past_inputs = [Lag(name, i) for name, n, d in zip(inputs, nb, nk, strict=True) for i in range(d, d + n)]
+        past_outputs = [
+            Lag(name, i) for name, n in zip(outputs, na, strict=True) for i in range(1, n + 1)
+        ]
+        past_inputs = [
+            Lag(name, i) for name, n, d in zip(inputs, nb, nk, strict=True) for i in range(d, d + n)
+        ]
         return (*past_outputs, *past_inputs)
 
 
-def _per_channel(value: int | Sequence[int], names: Sequence[str], key: str, kind: str) -> list[int]:
+def _per_channel(
+    value: int | Sequence[int], names: Sequence[str], key: str, kind: str
+) -> list[int]:
     given: Any = value
     several = isinstance(given, Sequence) or (isinstance(given, np.ndarray) and given.ndim > 0)
     values: list[Any] = list(given) if several else [given] * len(names)
     if len(values) != len(names):
         raise InputError(
-            f"`{key}` has {len(values)} numbers but there are {len(names)} {kind}s; give one number, or one per {kind}."
+            f"`{key}` has {len(values)} numbers but there are {len(names)} {kind}s; give one "
+            f"number, or one per {kind}."
         )
     if any(isinstance(v, bool) or not isinstance(v, int | np.integer) or v < 0 for v in values):
         raise InputError(f"`{key}` must be whole numbers, 0 or more; got {shown(value)}.")
@@ -64,29 +73,35 @@ def _per_channel(value: int | Sequence[int], names: Sequence[str], key: str, kin
 
 
 def in_order(lags: Iterable[Lag], outputs: Sequence[str], inputs: Sequence[str]) -> Layout:
-    """The distinct lags in regressor order.
+    """Return the distinct lags in regressor order.
 
     Raises:
-        InputError: an unknown channel, or an output at lag 0 (the model would look at what it predicts).
+        InputError: an unknown channel, or an output at lag 0 (the model would look at what it
+            predicts).
     """
     place = {name: i for i, name in enumerate((*outputs, *inputs))}
     for lag in lags:
         if lag.channel not in place:
-            raise InputError(f"'{lag}' uses the unknown channel '{lag.channel}'; known are {', '.join(place)}.")
+            raise InputError(
+                f"'{lag}' uses the unknown channel '{lag.channel}'; known are {', '.join(place)}."
+            )
         if lag.lag == 0 and lag.channel in outputs:
             raise InputError(
-                f"'{lag}' is the output that is to be predicted; outputs are used from lag 1, {lag.channel}[k-1]."
+                f"'{lag}' is the output that is to be predicted; outputs are used from lag 1, "
+                f"{lag.channel}[k-1]."
             )
     return tuple(sorted(set(lags), key=lambda lag: (place[lag.channel], lag.lag)))
 
 
 def largest_lag(layout: Layout) -> int:
-    """The first row of an experiment at which every lag of the layout exists."""
+    """Return the first row of an experiment at which every lag of the layout exists."""
     return max((lag.lag for lag in layout), default=0)
 
 
 def lag_matrix(experiment: Experiment, layout: Layout, record: Record, start: int) -> Matrix:
-    """Rows `start … N-1` of the regressor, (N - start, len(layout)), column by column in memory.
+    """Return rows `start … N-1` of the regressor, (N - start, len(layout)).
+
+    The matrix is column by column in memory.
 
     Never reaches before the experiment.
     """
@@ -99,14 +114,22 @@ def lag_matrix(experiment: Experiment, layout: Layout, record: Record, start: in
 
 
 def lag_rows(record: Record, layout: Layout) -> Matrix:
-    """The regressors of all rows from the largest lag on, experiment after experiment, (N, len(layout))."""
+    """Return the regressors of all rows from the largest lag on, (N, len(layout)).
+
+    The rows of all experiments follow each other.
+    """
     start = largest_lag(layout)
-    return np.concatenate([lag_matrix(experiment, layout, record, start) for experiment in record.experiments])
+    return np.concatenate(
+        [lag_matrix(experiment, layout, record, start) for experiment in record.experiments]
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class UsableRows:
-    """The usable rows of a record, stacked over experiments: regressors `x` (N, nx), outputs `y` (N, ny)."""
+    """The usable rows of a record: regressors `x` (N, nx), outputs `y` (N, ny).
+
+    The rows of all experiments follow each other.
+    """
 
     x: Matrix
     y: Matrix
@@ -118,7 +141,7 @@ class UsableRows:
 
 
 def stack_rows(record: Record, layout: Layout) -> UsableRows:
-    """All rows from the largest lag on, experiment after experiment.
+    """Return all rows from the largest lag on, experiment after experiment.
 
     Raises:
         InputError: an experiment with too few rows for a single prediction.
@@ -138,9 +161,9 @@ def stack_rows(record: Record, layout: Layout) -> UsableRows:
 
 @dataclass(frozen=True)
 class Features:
-    """What the learner sees: expressions of the regressor, most often single raw lags.
+    """Features of the learner: expressions of the regressor, most often single raw lags.
 
-    `linear` tells that the learner can be their linear combinations only.
+    With `linear` the learner can be their linear combinations only.
     """
 
     entries: tuple[Expression, ...]
@@ -148,7 +171,7 @@ class Features:
 
     @classmethod
     def of(cls, layout: Layout) -> Features:
-        """All raw lags of a layout."""
+        """Return all raw lags of a layout."""
         return cls(tuple(Expression(str(lag)) for lag in layout))
 
     @property
@@ -157,13 +180,15 @@ class Features:
         return tuple(dict.fromkeys(lag for entry in self.entries for lag in entry.lags))
 
     def sampled(self, sampling_time: float) -> Features:
-        """The features with this value [s] of `Ts`, where they read it."""
+        """Return the features with this value [s] of `Ts`, where they read it."""
         return Features(tuple(entry.sampled(sampling_time) for entry in self.entries), self.linear)
 
     def evaluate(self, x: Any, layout: Layout, xp: Any) -> Any:
-        """Features (…, nz) of regressors (…, nx), by `xp` (numpy or jax.numpy)."""
+        """Return features (…, nz) of regressors (…, nx), computed by `xp` (numpy or jax.numpy)."""
         if not self.entries:
             return xp.zeros((*x.shape[:-1], 0))
         columns = {lag: x[..., j] for j, lag in enumerate(layout)}
         values = [xp.asarray(entry.evaluate(columns, xp), dtype=float) for entry in self.entries]
-        return xp.moveaxis(xp.stack([xp.broadcast_to(v, x.shape[:-1]) for v in values]), 0, -1)  # a column in one piece
+        return xp.moveaxis(
+            xp.stack([xp.broadcast_to(v, x.shape[:-1]) for v in values]), 0, -1
+        )  # a column in one piece

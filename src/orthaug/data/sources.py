@@ -1,7 +1,7 @@
-"""Rows that stay where they are: files larger than memory, read piece by piece with the rows that lags need.
+"""Sources of rows: files larger than memory, read in pieces with the rows that lags need.
 
-A source is cut into partitions. Each can be read on its own, here or by another process, and gives pieces: experiments
-whose first rows are history only.
+A source is cut into partitions. Each can be read on its own, here or by another process, and gives
+pieces: experiments whose first rows are history only.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from orthaug.data.record import Channel, Experiment, Record, unbroken
 
 WITNESS_ROWS = 50_000
-"""Rows that are kept in memory to look at: for tests of residuals, findings and figures."""
+"""Rows kept in memory for tests of residuals, findings and figures."""
 _WINDOWS = 10  # that they are taken from, where the source has more
 
 
@@ -26,16 +26,18 @@ class Partition(Protocol):
 
     @property
     def name(self) -> str:
-        """What messages call it."""
+        """Name in messages."""
         ...
 
     @property
     def rows(self) -> int:
-        """How many it has, at most: missing samples are left out when it is read."""
+        """Largest number of rows: missing samples are left out when it is read."""
         ...
 
     def pieces(self, lead: int) -> Iterator[Experiment]:
-        """Its rows in order. The first `lead` rows of a piece are history, or the begin of an experiment.
+        """Yield its rows in order.
+
+        The first `lead` rows of a piece are history, or the begin of an experiment.
 
         Raises:
             InputError: cells that are no finite numbers, a file that has changed.
@@ -61,36 +63,43 @@ class Source(Protocol):
 
     @property
     def partitions(self) -> Sequence[Partition]:
-        """In order; experiments may begin in one and go on in the next."""
+        """Partitions in order; experiments may begin in one and go on in the next."""
         ...
 
     def window(self, start: int, stop: int) -> list[Experiment]:
-        """Rows `[start, stop)`, counted over all partitions."""
+        """Return rows `[start, stop)`, counted over all partitions."""
         ...
 
 
 def rows_of(source: Source) -> int:
-    """How many rows a source has."""
+    """Return the number of rows of a source."""
     return sum(partition.rows for partition in source.partitions)
 
 
 def as_record(source: Source, experiments: Sequence[Experiment]) -> Record:
-    """Some of its rows as a record in memory."""
-    return Record(source.inputs, source.outputs, source.sampling_time, tuple(experiments), source.time_column)
+    """Return some of its rows as a record in memory."""
+    return Record(
+        source.inputs, source.outputs, source.sampling_time, tuple(experiments), source.time_column
+    )
 
 
 def witness(source: Source, limit: int = WITNESS_ROWS) -> Record:
-    """A record in memory that stands for the source: all of it, or windows that are spread over it evenly."""
+    """Return a record in memory as a sample of the source.
+
+    It is all of the source, or windows that are spread evenly over it.
+    """
     total = rows_of(source)
     if total <= limit:
         return as_record(source, source.window(0, total))
     size = limit // _WINDOWS
     begins = np.linspace(0, total - size, _WINDOWS).astype(int)
-    return as_record(source, [e for begin in begins for e in source.window(int(begin), int(begin) + size)])
+    return as_record(
+        source, [e for begin in begins for e in source.window(int(begin), int(begin) + size)]
+    )
 
 
 @dataclass(frozen=True, eq=False)
-class HeldRows:
+class RowPartition:
     """A partition that carries its rows."""
 
     experiment: Experiment
@@ -111,7 +120,7 @@ class HeldRows:
 
 @dataclass(frozen=True, eq=False)
 class Span:
-    """A partition and those that follow it, from which what begins in it may have to be read on.
+    """A partition and those after it, from which its experiments are read to their end.
 
     `held` are the futures of those that have any, `counts` how many each.
     """
@@ -122,15 +131,20 @@ class Span:
 
     @classmethod
     def of(cls, partitions: Sequence[Any], rows: int) -> Span:
-        """The first with the others, of the last of which no more than the first `rows` are needed."""
+        """Return a span of the first partition and the others.
+
+        No more than the first `rows` are needed of the last one.
+        """
         if len(partitions) > 1 and hasattr(partitions[-1], "head"):
             partitions = (*partitions[:-1], partitions[-1].head(rows))
         held = [getattr(partition, "held", ()) for partition in partitions]
         bare = (replace(p, held=()) if own else p for p, own in zip(partitions, held, strict=True))
-        return cls(tuple(bare), tuple(future for own in held for future in own), tuple(map(len, held)))
+        return cls(
+            tuple(bare), tuple(future for own in held for future in own), tuple(map(len, held))
+        )
 
     def on(self, *held: Any) -> Span:
-        """The same where the rows are."""
+        """Return the span with the rows, on the worker that holds them."""
         ends = np.cumsum(self.counts).tolist()
         there = (
             p.on(*held[end - count : end]) if count else p
@@ -144,22 +158,25 @@ class Span:
 
     @property
     def rows(self) -> int:
-        """Of the first partition."""
+        """Number of rows of the first partition."""
         return self.partitions[0].rows
 
     def pieces(self, lead: int) -> Iterator[Experiment]:
-        """Of all its partitions."""
+        """Yield the pieces of all its partitions."""
         return (piece for partition in self.partitions for piece in partition.pieces(lead))
 
 
 def _later(experiment: Experiment, start: int, stop: int | None) -> Experiment:
-    """Rows of an experiment that know how far into the recording they begin."""
+    """Return rows of an experiment with their offset from the start of the recording."""
     return replace(experiment.rows(start, stop), offset=experiment.offset + start)
 
 
 @dataclass(frozen=True, eq=False)
 class RecordSource:
-    """A record in memory as a source, in partitions of `size` rows that carry `lead` rows of history."""
+    """A record in memory as a source, in partitions of `size` rows.
+
+    Each partition carries `lead` rows of history.
+    """
 
     record: Record
     lead: int
@@ -182,16 +199,18 @@ class RecordSource:
         return self.record.time_column
 
     @property
-    def partitions(self) -> tuple[HeldRows, ...]:
+    def partitions(self) -> tuple[RowPartition, ...]:
         return self._held
 
     @cached_property
-    def _held(self) -> tuple[HeldRows, ...]:
+    def _held(self) -> tuple[RowPartition, ...]:
         held = []
         for experiment in self.record.experiments:
             for begin in range(0, len(experiment), self.size):
                 first = max(begin - self.lead, 0)
-                held.append(HeldRows(_later(experiment, first, begin + self.size), begin - first))
+                held.append(
+                    RowPartition(_later(experiment, first, begin + self.size), begin - first)
+                )
         return tuple(held)
 
     def window(self, start: int, stop: int) -> list[Experiment]:
@@ -205,7 +224,10 @@ class RecordSource:
 
 
 def stretches(experiment: Experiment, lead: int) -> Iterator[Experiment]:
-    """A piece without its rows that have a missing sample, cut there: no lag reaches across."""
+    """Yield the stretches of a piece without missing samples.
+
+    It is cut at the missing ones: no lag reaches across.
+    """
     for begin, end in unbroken(np.hstack([experiment.inputs, experiment.outputs])):
         if end - begin == len(experiment):
             yield experiment
@@ -214,13 +236,13 @@ def stretches(experiment: Experiment, lead: int) -> Iterator[Experiment]:
 
 
 def follows(one: Any, other: Any) -> bool:
-    """Whether the other experiment is of the same recording, from where the one ends."""
+    """Return whether the other experiment continues the recording where the one ends."""
     ends = (one.source, one.first_row + len(one), one.offset + len(one))
     return ends == (other.source, other.first_row, other.offset)
 
 
 def joined(pieces: Sequence[Experiment]) -> list[Experiment]:
-    """Pieces that follow one another within an experiment as one."""
+    """Return the pieces of an experiment that follow one another as one."""
     joined: list[list[Experiment]] = []
     for piece in pieces:
         last = joined[-1][-1] if joined else None

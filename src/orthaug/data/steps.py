@@ -1,4 +1,7 @@
-"""Steps of preparing data, each within one experiment: what a step is, trends, sampling, outliers, gaps, delays."""
+"""Steps of preparation, each within one experiment.
+
+They are trends, sampling, outliers, gaps and delays.
+"""
 
 from __future__ import annotations
 
@@ -24,13 +27,13 @@ Method = Annotated[str, OneOf(("linear", "pchip"))]
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """An experiment on its way through the steps: `values` (N, n), NaN where a sample is missing, at `instants` [s]."""
+    """An experiment between two steps: `values` (N, n) at `instants` [s]; NaN is missing."""
 
     values: Matrix
     instants: Vector
     names: tuple[str, ...]
     inputs: int
-    """How many of the channels, the first ones, are inputs."""
+    """Number of inputs, which are the first channels."""
     step: float
     """Sampling time [s]; of uneven instants the usual one."""
     even: bool = True
@@ -41,18 +44,24 @@ class Run:
     """Whether the samples are no rows of the file any more."""
 
     def columns(self, channels: Channels, usual: range | None = None) -> list[int]:
-        """Indices of channels; without names the usual ones, which are all unless given."""
+        """Return indices of channels.
+
+        Without names they are those given as usual, by default all.
+        """
         if channels is None:
             return list(range(len(self.names)) if usual is None else usual)
         check_type(channels, tuple | list, "channels", "a list of channel names")
         for name in channels:
             if name not in self.names:
                 known = ", ".join(self.names)
-                raise InputError(f"`channels`: no channel '{name}'{nearest(name, self.names)}; there are {known}.")
+                raise InputError(
+                    f"`channels`: no channel '{name}'{nearest(name, self.names)}; there are "
+                    f"{known}."
+                )
         return [self.names.index(name) for name in channels]
 
     def holding(self, columns: list[int], values: Matrix) -> Run:
-        """The same with other values in some columns."""
+        """Return the experiment with other values in some columns."""
         changed = self.values.copy()
         changed[:, columns] = values
         return replace(self, values=changed)
@@ -68,7 +77,7 @@ class Step(Protocol):
     """A step of preparation: a frozen declaration."""
 
     def apply(self, run: Run) -> Run:
-        """The experiment after the step.
+        """Return the experiment after the step.
 
         Raises:
             InputError: what cannot be done with these samples.
@@ -78,7 +87,7 @@ class Step(Protocol):
 
 @dataclass(frozen=True)
 class Detrend:
-    """Takes the mean (`degree` 0) or the straight line (1) out of each channel, of each experiment its own.
+    """Step that removes the mean or the straight line of each channel, per experiment.
 
     Args:
         degree: 0 for the mean, 1 for a straight line.
@@ -97,7 +106,9 @@ class Detrend:
     def __post_init__(self) -> None:
         check_fields(self)
         if self.degree > 1:
-            raise InputError(f"`degree` must be 0, the mean, or 1, a straight line; got {shown(self.degree)}.")
+            raise InputError(
+                f"`degree` must be 0, the mean, or 1, a straight line; got {shown(self.degree)}."
+            )
 
     def apply(self, run: Run) -> Run:
         columns, t = run.columns(self.channels), run.instants - run.instants[0]
@@ -111,16 +122,21 @@ class Detrend:
 
 @dataclass(frozen=True)
 class Resample:
-    """Uneven time stamps onto an even grid, from the first on; nothing across more than three steps.
+    """Step that interpolates samples at uneven instants onto an even grid.
+
+    The grid begins at the first instant.
+
+    Nothing across more than three steps.
 
     Args:
         sampling_time: s; None for the median of the steps.
-        method: "linear" between neighbours, or "pchip", a smooth cubic without overshoot. Both look at the next
-            sample, and neither removes what is faster than the new grid: put a `Lowpass` before it where that matters.
+        method: "linear" between neighbours, or "pchip", a smooth cubic without overshoot. Both look
+            at the next sample, and neither removes what is faster than the new grid: put a
+            `Lowpass` before it where that matters.
     """
 
     sampling_time: float | None = None
-    """s; None for the median of the steps."""
+    """Sampling time in s; None for the median of the steps."""
     method: Method = "linear"
 
     def __post_init__(self) -> None:
@@ -131,26 +147,41 @@ class Resample:
     def apply(self, run: Run) -> Run:
         step, t = self.sampling_time or run.step, run.instants
         if len(t) < 2 or not (np.diff(t) > 0).all():
-            raise InputError("`resample` needs at least two instants, each later than the one before it.")
+            raise InputError(
+                "`resample` needs at least two instants, each later than the one before it."
+            )
         count = np.floor((t[-1] - t[0]) / step + _SAME) + 1
         if count > 100 * len(t):
-            raise InputError(f"`resample`: {step:g} s would make {count:.3g} samples of {len(t)}; take a longer one.")
+            raise InputError(
+                f"`resample`: {step:g} s would make {count:.3g} samples of {len(t)}; take a "
+                "longer one."
+            )
         grid = t[0] + step * np.arange(int(count))
         most = _APART * max(step, run.step)
         at = _measured(t, grid, _SAME * step)
-        values = np.column_stack([_between(t, column, at, self.method, most) for column in run.values.T])
-        return replace(run, values=values, instants=grid, step=step, even=True, first=0, stride=1, moved=True)
+        values = np.column_stack(
+            [_between(t, column, at, self.method, most) for column in run.values.T]
+        )
+        return replace(
+            run, values=values, instants=grid, step=step, even=True, first=0, stride=1, moved=True
+        )
 
 
 def _measured(t: Vector, grid: Vector, near: float) -> Vector:
-    """The grid, with the measured instant itself where one lies that near: a sample is not lost by rounding."""
+    """Return the grid, with a measured instant in place of one that is near it.
+
+    Then no sample is lost by rounding.
+    """
     after = np.clip(np.searchsorted(t, grid), 1, len(t) - 1)
     closest = np.where(grid - t[after - 1] < t[after] - grid, t[after - 1], t[after])
     return np.where(np.abs(closest - grid) <= near, closest, grid)
 
 
 def _between(t: Vector, column: Vector, grid: Vector, method: str, most: float) -> Vector:
-    """A channel at other instants; NaN outside of it, and between neighbours more than `most` apart."""
+    """Return a channel at other instants.
+
+    NaN outside of it, and between neighbours more than `most` apart.
+    """
     there = np.isfinite(column)
     known, values = t[there], column[there]
     if len(known) < 2:
@@ -162,14 +193,20 @@ def _between(t: Vector, column: Vector, grid: Vector, method: str, most: float) 
     else:
         result = np.interp(grid, known, values, left=np.nan, right=np.nan)
     after = np.clip(np.searchsorted(known, grid, side="left"), 1, len(known) - 1)
-    apart = (known[after] - known[after - 1] > most) & (known[after] != grid) & (known[after - 1] != grid)
+    apart = (
+        (known[after] - known[after - 1] > most)
+        & (known[after] != grid)
+        & (known[after - 1] != grid)
+    )
     result[apart] = np.nan
     return result
 
 
 @dataclass(frozen=True)
 class Outliers:
-    """Hampel's: samples over `threshold` deviations off the median of `window` rows on either side are missing.
+    """Step that marks samples far from the median of their window as missing (Hampel).
+
+    They are over `threshold` deviations off the median of `window` rows on either side.
 
     The deviation is 1.4826 times the median absolute one.
 
@@ -180,7 +217,8 @@ class Outliers:
 
     Examples:
         >>> from orthaug.data import Record, prepare
-        >>> record = Record.from_arrays(u=[0.0] * 9, y=[0.0, 0.1, 0.0, 0.1, 50.0, 0.1, 0.0, 0.1, 0.0])
+        >>> y = [0.0, 0.1, 0.0, 0.1, 50.0, 0.1, 0.0, 0.1, 0.0]
+        >>> record = Record.from_arrays(u=[0.0] * 9, y=y)
         >>> prepare(record, Outliers(), Fill()).experiments[0].outputs[4]
         array([0.1])
     """
@@ -204,11 +242,16 @@ class Outliers:
         return distance > self.threshold * deviation
 
     def distances(self, x: Vector) -> tuple[Vector, Vector]:
-        """How far each sample is from the median of its window, and the deviation there; NaN where one is missing."""
+        """Return the distance of each sample from the median of its window, and the deviation.
+
+        NaN where one is missing.
+        """
         if len(x) < 2:
             return np.zeros(len(x)), np.zeros(len(x))
         width = min(self.window, len(x) - 1)
-        rows = np.lib.stride_tricks.sliding_window_view(np.pad(x, width, mode="reflect"), 2 * width + 1)
+        rows = np.lib.stride_tricks.sliding_window_view(
+            np.pad(x, width, mode="reflect"), 2 * width + 1
+        )
         middle, spread = np.full(len(x), np.nan), np.full(len(x), np.nan)
         for begin in range(0, len(x), _CHUNK):
             part = slice(begin, begin + _CHUNK)
@@ -224,7 +267,9 @@ class Outliers:
 
 @dataclass(frozen=True)
 class Fill:
-    """Reconstructs gaps of at most `most` samples between measured ones; longer ones stay.
+    """Step that reconstructs gaps of at most `most` samples between measured ones.
+
+    Longer ones stay.
 
     Args:
         most: samples of a gap that is filled.
@@ -255,7 +300,9 @@ class Fill:
 
 @dataclass(frozen=True)
 class Shift:
-    """Delays an input by `samples`: row k gets what was at row k − samples. The rows without one are cut off.
+    """Step that delays an input by `samples`: row k gets the value of row k − samples.
+
+    The rows without one are cut off.
 
     Args:
         channel: an input's name.
@@ -263,7 +310,8 @@ class Shift:
 
     Examples:
         >>> from orthaug.data import Record, prepare
-        >>> moved = prepare(Record.from_arrays(u=[1.0, 2.0, 3.0], y=[4.0, 5.0, 6.0]), Shift("u", 1)).experiments[0]
+        >>> record = Record.from_arrays(u=[1.0, 2.0, 3.0], y=[4.0, 5.0, 6.0])
+        >>> moved = prepare(record, Shift("u", 1)).experiments[0]
         >>> moved.inputs.T, moved.outputs.T
         (array([[1., 2.]]), array([[5., 6.]]))
     """
@@ -279,12 +327,15 @@ class Shift:
     def apply(self, run: Run) -> Run:
         if self.channel not in run.names[: run.inputs]:
             raise InputError(
-                f"`channel`: '{self.channel}' is no input; the inputs are {', '.join(run.names[: run.inputs])}."
+                f"`channel`: '{self.channel}' is no input; the inputs are "
+                f"{', '.join(run.names[: run.inputs])}."
             )
         run.check_even("`shift`")
         j, n, late = run.names.index(self.channel), len(run.values), self.samples
         if abs(late) >= n:
-            raise InputError(f"`samples`: an experiment has {n} rows, too few to be shifted by {late}.")
+            raise InputError(
+                f"`samples`: an experiment has {n} rows, too few to be shifted by {late}."
+            )
         kept = slice(max(late, 0), n + min(late, 0))
         values = run.values[kept].copy()
         values[:, j] = run.values[kept.start - late : kept.stop - late, j]

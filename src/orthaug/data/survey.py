@@ -1,4 +1,4 @@
-"""What a data file seems to hold: its columns one by one, their units, and what could be time."""
+"""Survey of a data file: its columns one by one, their units, and its sampling time."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from orthaug._base.checks import Vector, nearest
 from orthaug._base.errors import InputError, shown
-from orthaug.data.clock import DATES, Clock, Refused, by_single_number, find_clock
+from orthaug.data.clock import DATES, Clock, RefusedColumn, by_single_number, find_clock
 from orthaug.data.columns import Column, channel_name
 from orthaug.data.headers import split_header
 from orthaug.data.layouts import numbers_only
@@ -27,58 +27,92 @@ class Survey:
     columns: tuple[Column, ...]
     clock: Clock
     note: str = ""
-    """What to know of how the file was read."""
+    """Note on how the file was read."""
 
     @property
     def signals(self) -> tuple[Column, ...]:
-        """Columns that could be channels: numbers that vary and are not time."""
+        """Columns that could be channels: their numbers vary and are not time."""
         apart = [self.clock.column, *(one.column for one in self.clock.refused if not one.signal)]
         found = [c for c in self.columns if not c.unusable and not c.constant]
         return tuple(c for c in found if not any(c is one for one in apart))
 
-    def looks_like_time(self, column: Column) -> Refused | None:
-        """Return why a column is no channel although it has numbers that vary: it rises as a time does."""
-        return next((one for one in self.clock.refused if one.column is column and not one.signal), None)
+    def looks_like_time(self, column: Column) -> RefusedColumn | None:
+        """Return the reason why a column of varying numbers is no channel: it rises as time."""
+        return next(
+            (one for one in self.clock.refused if one.column is column and not one.signal), None
+        )
 
     def why_not(self, column: Column) -> str:
-        """Return why a column is no channel."""
+        """Return the reason why a column is no channel."""
         refused = self.looks_like_time(column)
-        return column.unusable or ("constant" if column.constant else refused.reason if refused else "not named")
+        return column.unusable or (
+            "constant" if column.constant else refused.reason if refused else "not named"
+        )
 
     def same_lengths(self, columns: Sequence[Column]) -> bool:
-        """Return whether columns belong to one run: those of a table do, arrays where they have as many rows."""
-        return self.path.suffix.lower() not in ENDINGS or len({len(column.values) for column in columns}) < 2
+        """Return whether columns belong to one run.
+
+        Those of a table do, arrays if they have as many rows.
+        """
+        return (
+            self.path.suffix.lower() not in ENDINGS
+            or len({len(column.values) for column in columns}) < 2
+        )
 
     def beside(self, channels: Sequence[Column]) -> Survey:
-        """Return the survey with the clock of these channels, where the file has columns of several lengths."""
+        """Return the survey with the clock of these channels.
+
+        Files may have columns of several lengths.
+        """
         rows = max(column.filled for column in channels)
-        if all(column.filled == rows for column in self.columns) or not self.clock.instants and self.clock.column:
+        if (
+            all(column.filled == rows for column in self.columns)
+            or not self.clock.instants
+            and self.clock.column
+        ):
             return self
-        clock = find_clock([c for c in self.columns if c.filled == rows and c not in channels], channels[0].header)
+        clock = find_clock(
+            [c for c in self.columns if c.filled == rows and c not in channels], channels[0].header
+        )
         return replace(self, clock=clock if clock.column else self.clock)
 
     def find(self, name: str) -> Column:
-        """A column by its header, or by the name of its channel.
+        """Return a column by its header, or by the name of its channel.
 
         Raises:
             InputError: no such column, one without numbers, or one that never changes.
         """
         twice = [c.header for c in self.columns if c.header in (f"{name}.0", f"{name}.1")]
         if len(twice) == 2 and not any(c.header == name for c in self.columns):
-            raise InputError(f"{self.path}: the name '{name}' stands twice; from the left: {', '.join(twice)}.")
-        named = [c for c in self.columns if c.header == name] or [c for c in self.columns if c.name == name]
+            raise InputError(
+                f"{self.path}: several columns are called '{name}'; from the left: "
+                f"{', '.join(twice)}."
+            )
+        named = [c for c in self.columns if c.header == name] or [
+            c for c in self.columns if c.name == name
+        ]
         if not named:
             known = [c.header for c in self.columns]
-            raise InputError(f"{self.path}: no column '{name}'{nearest(name, known)}; the file has {', '.join(known)}.")
+            raise InputError(
+                f"{self.path}: no column '{name}'{nearest(name, known)}; the file has "
+                f"{', '.join(known)}."
+            )
         column = named[0]
         if column.unusable:
-            raise InputError(f"{self.path}: column '{name}' cannot be a channel: {column.unusable}.")
+            raise InputError(
+                f"{self.path}: column '{name}' cannot be a channel: {column.unusable}."
+            )
         if column.constant:
-            raise InputError(f"{self.path}: column '{name}' is {column.finite[0]:g} in every row; leave it out.")
+            raise InputError(
+                f"{self.path}: column '{name}' is {column.finite[0]:g} in every row; leave it out."
+            )
         return column
 
     def roles(self) -> tuple[list[Column], list[Column]] | None:
-        """Inputs and outputs where every signal's name says what it is and there is an output, otherwise None."""
+        """Return inputs and outputs, or None where a signal's name does not show its role.
+
+        There must also be an output.
+        """
         kinds = [c.kind for c in self.signals]
         if any(one.column.kind for one in self.clock.refused if not one.signal):
             return None  # a name says one thing and the values another
@@ -96,17 +130,22 @@ def survey(path: Path) -> Survey:
     """Look at every column of a file.
 
     Raises:
-        InputError: no such file, an unknown ending, a file that cannot be read or has no column of numbers.
+        InputError: no such file, an unknown ending, a file that cannot be read or has no column of
+            numbers.
     """
     columns: list[Column] = []
     every = list(column_names(path))
     if numbers_only(every):
-        raise InputError(f"{path}: the first line holds numbers; a header with names is expected there. Write one.")
+        raise InputError(
+            f"{path}: the first line holds numbers; a header with names is expected there. "
+            "Write one."
+        )
     headers = list(dict.fromkeys(every))
+    table, refused = {}, None
     try:
         table = read_table(path, headers).columns
-    except InputError:  # one of them cannot be read: each by itself
-        table = {}
+    except InputError as error:  # one of them cannot be read: each by itself
+        refused = error
     for header in headers:
         base, unit = split_header(header)
         try:
@@ -115,15 +154,18 @@ def survey(path: Path) -> Survey:
             if unusable and len(values):
                 values, unusable = _as_dates(path, header)
         except InputError:  # text, complex numbers, or not known which
-            values, unusable = np.empty(0), "its name stands twice"
+            values, unusable = np.empty(0), "its name is there twice"
             if every.count(header) == 1:
                 values, unusable = _as_dates(path, header)
         name = channel_name(base, [c.name for c in columns])
         columns.append(Column(header, name, unit, values, unusable))
     if all(c.unusable for c in columns):
+        if refused and path.suffix.lower() in ENDINGS:  # of variables, which have no header
+            raise refused
         raise InputError(
-            f"{path}: no column holds numbers; expected one for each signal, under a header. The names that were found "
-            f"are {shown(', '.join(every))}; a line above the header must begin with # or %."
+            f"{path}: no column holds numbers; expected one for each signal, under a header. "
+            f"The names that were found are {shown(', '.join(every))}; a line above the header "
+            "must begin with # or %."
         )
     clock = find_clock(columns)
     if clock.column is None:
@@ -132,7 +174,7 @@ def survey(path: Path) -> Survey:
 
 
 def _as_dates(path: Path, header: str) -> tuple[Vector, str]:
-    """Seconds since the first of them, and what a column holds that is not of numbers."""
+    """Return dates as seconds since the first of them, and the kind of other columns."""
     with suppress(InputError):
         table = read_table(path, [header], header)
         if table.dated and np.isfinite(table.columns[header]).any():

@@ -1,4 +1,7 @@
-"""Named columns of floats from files, by the file's ending. What is no number is kept, so that messages can name it."""
+"""Named columns of floats from files, by the file's ending.
+
+Cells that are no numbers are kept, so that messages can name it.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +20,15 @@ from orthaug._base.errors import InputError, MissingColumnError
 from orthaug._base.memory import check_memory
 from orthaug._base.progress import LOG
 from orthaug.data.headers import dated, in_seconds
-from orthaug.data.layouts import Layout, as_number, layout, numbers_only, read_sheet, text_number
+from orthaug.data.layouts import (
+    Layout,
+    as_number,
+    guessed_at,
+    layout,
+    numbers_only,
+    read_sheet,
+    text_number,
+)
 from orthaug.data.variables import ENDINGS, foreign, read_variables, short, variable_names
 
 _SMALL = 4_000_000  # bytes of a text file that NumPy reads sooner than pandas is imported
@@ -28,10 +39,12 @@ _NAMED = 30  # columns that a message lists
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """Columns of a file as floats, NaN where the cell is empty or no number. `where` and `cell` are for messages.
+    """Columns of a file as floats, NaN where the cell is empty or no number.
 
-    `filled` counts the rows of each column up to its last cell that holds anything. In a text file `first_line` is
-    the line of row 0; `dated` is the column of time where it held dates.
+    `where` and `cell` are for messages.
+
+    `filled` counts the rows of each column up to its last cell that holds anything. In a text file
+    `first_line` is the line of row 0; `dated` is the column of time where it held dates.
     """
 
     path: Path
@@ -42,24 +55,32 @@ class Table:
     dated: str = ""
 
     def where(self, row: int) -> str:
-        """`line 17 (row 15)` in a text file, `row 15` otherwise."""
-        return f"row {row}" if self.first_line is None else f"line {self.first_line + row} (row {row})"
+        """Return `line 17 (row 15)` of a text file, `row 15` of others."""
+        return (
+            f"row {row}" if self.first_line is None else f"line {self.first_line + row} (row {row})"
+        )
 
 
-def read_table(path: Path, columns: Sequence[str], time: str | None = None, *, most: int | None = None) -> Table:
-    """The named columns of a file.
+def read_table(
+    path: Path, columns: Sequence[str], time: str | None = None, *, most: int | None = None
+) -> Table:
+    """Return the named columns of a file.
 
     Args:
-        time: the one of them that holds instants, numbers in the unit of its header or dates: it comes in s.
+        time: the one of them that holds instants, numbers in the unit of its header or dates: it
+            comes in s.
         most: rows that are enough, where a file can be read in part; None for all.
 
     Raises:
-        InputError: no such file, an unknown ending, content that does not fit it, or missing columns.
+        InputError: no such file, an unknown ending, content that does not fit it, or missing
+            columns.
     """
     check_readable(path)
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
-        raise InputError(f"{path}: unknown file type '{path.suffix}'; known are {', '.join(_READERS)}.")
+        raise InputError(
+            f"{path}: unknown file type '{path.suffix}'; known are {', '.join(_READERS)}."
+        )
     with foreign(path):
         part = {"most": most} if reader is _read_text else {}
         table = reader(path, columns, time, **part)
@@ -69,7 +90,7 @@ def read_table(path: Path, columns: Sequence[str], time: str | None = None, *, m
 
 
 def has_column(path: Path, name: str) -> bool:
-    """Whether the file has a column (or variable) of that name.
+    """Return whether the file has a column (or variable) of that name.
 
     Raises:
         InputError: a file that cannot be read, or holds the column twice.
@@ -82,7 +103,7 @@ def has_column(path: Path, name: str) -> bool:
 
 
 def column_names(path: Path) -> list[str]:
-    """The columns (or variables) of a file that could be read, in order.
+    """Return the columns (or variables) of a file that could be read, in order.
 
     Raises:
         InputError: no such file, an unknown ending, content that does not fit it.
@@ -90,7 +111,9 @@ def column_names(path: Path) -> list[str]:
     check_readable(path)
     ending = path.suffix.lower()
     if ending not in _READERS:
-        raise InputError(f"{path}: unknown file type '{path.suffix}'; known are {', '.join(_READERS)}.")
+        raise InputError(
+            f"{path}: unknown file type '{path.suffix}'; known are {', '.join(_READERS)}."
+        )
     with foreign(path):
         if ending in ENDINGS:
             return variable_names(path)
@@ -102,12 +125,20 @@ def column_names(path: Path) -> list[str]:
             read_sheet(path, lambda header: found.extend(header) or [])
         else:
             found = layout(path).names
-    return [name for name in told_apart(found) if name]
+    return [name for name in numbered(found) if name]
 
 
 def reading_note(path: Path) -> str:
-    """What to know of how a file is read: an encoding that was guessed; mostly nothing."""
+    """Return a note on how a file is read, such as a guessed encoding; mostly empty."""
     return layout(path).note if _READERS.get(path.suffix.lower()) is _read_text else ""
+
+
+def guessed_encoding(path: Path) -> int | None:
+    """Return the first line that is no UTF-8 of a text that is read all the same.
+
+    None of any other file.
+    """
+    return guessed_at(path) if _READERS.get(path.suffix.lower()) is _read_text else None
 
 
 def check_readable(path: Path) -> None:
@@ -129,15 +160,23 @@ def check_readable(path: Path) -> None:
         raise InputError(f"{path}: the file is empty (0 bytes).")
 
 
-def _read_text(path: Path, columns: Sequence[str], time: str | None, most: int | None = None) -> Table:
-    """Text tables as they occur: byte-order mark, trailing separators, units in headers, decimal commas, no header."""
+def _read_text(
+    path: Path, columns: Sequence[str], time: str | None, most: int | None = None
+) -> Table:
+    """Read a text table as it occurs in practice.
+
+    It may have a byte-order mark, trailing separators, units in headers, decimal commas or no
+    header.
+    """
     found = layout(path, columns)
     header, header_line = found.names, found.header_line
     if found.note:
         LOG.info("%s: %s", path, found.note)
     place = {
         name: str(index)
-        for name, index in zip(columns, places(path, columns, header, headed=found.headed), strict=True)
+        for name, index in zip(
+            columns, places(path, columns, header, headed=found.headed), strict=True
+        )
     }
     commas = found.has_decimal_commas(path)
     beyond = str(len(header))  # a column that must stay empty: cells behind the last header
@@ -145,7 +184,11 @@ def _read_text(path: Path, columns: Sequence[str], time: str | None, most: int |
     numbers, texts, held = _cells(path, found, [*place.values(), beyond], commas, apart, most)
     extra = np.flatnonzero(np.asarray(held[beyond]))
     if extra.size:
-        under = f"under {len(header)} headers" if found.headed else f"and line {header_line + 1} has {len(header)}"
+        under = (
+            f"under {len(header)} headers"
+            if found.headed
+            else f"and line {header_line + 1} has {len(header)}"
+        )
         raise InputError(
             f"{path}: line {header_line + 1 + extra[0]} has {len(header) + 1} cells {under}; "
             "is a separator or a decimal comma wrong?"
@@ -164,13 +207,17 @@ def _read_text(path: Path, columns: Sequence[str], time: str | None, most: int |
         return "" if np.isnan(value) else str(value)
 
     filled = {name: _up_to_last(np.asarray(held[place[name]])) for name in columns}
-    return Table(path, values, filled, header_line + 1, cell, time if time and dates is not None else "")
+    return Table(
+        path, values, filled, header_line + 1, cell, time if time and dates is not None else ""
+    )
 
 
 def _cells(
     path: Path, found: Layout, used: list[str], commas: bool, apart: str | None, most: int | None
 ) -> tuple[Any, Any, Any]:
-    """The used columns as numbers, as text (None where all are numbers or empty), and what is not empty.
+    """Return the used columns as numbers and as text, and which cells are not empty.
+
+    The text is None where all cells are numbers or empty.
 
     The one `apart` may hold text, so that it is looked at by itself.
     """
@@ -200,8 +247,12 @@ def _cells(
         return frame
 
     if not commas:
-        with suppress(ValueError):  # something is no number: read again as text, to be able to name it
-            numbers = read(dtype=dict.fromkeys(used, np.float64), na_values=[""], float_precision="round_trip")
+        with suppress(
+            ValueError
+        ):  # something is no number: read again as text, to be able to name it
+            numbers = read(
+                dtype=dict.fromkeys(used, np.float64), na_values=[""], float_precision="round_trip"
+            )
             return numbers, None, numbers.notna()
     if not commas and apart is not None:
         kinds: dict[str, Any] = {**dict.fromkeys(used, np.float64), apart: str}
@@ -216,11 +267,17 @@ def _cells(
         if "found 0" in str(error) or isinstance(error, pd.errors.EmptyDataError):
             raise InputError(f"{path}: there are no data rows below the header.") from None
         raise InputError(f"{path}: not a readable table ({short(error)}).") from None
-    return texts.apply(lambda column: column.map(_comma_number if commas else text_number)), texts, texts != ""
+    return (
+        texts.apply(lambda column: column.map(_comma_number if commas else text_number)),
+        texts,
+        texts != "",
+    )
 
 
 def _plain_numbers(path: Path, found: Layout) -> Matrix | None:
-    """The columns (count, rows) of a small file with a finite number in every cell of every line; None for all others.
+    """Return the columns (count, rows) of a small file in which every cell is a finite number.
+
+    The result is None for all other files.
 
     NumPy reads it before pandas would be imported.
     """
@@ -247,7 +304,10 @@ def _plain_numbers(path: Path, found: Layout) -> Matrix | None:
 
 
 def _comma_number(text: str) -> float:
-    """A number where decimals are commas; a point would be one of thousands, and is refused."""
+    """Return a number with a decimal comma.
+
+    A point would be one of thousands, and is refused.
+    """
     return np.nan if "." in text else text_number(text.replace(",", "."))
 
 
@@ -258,7 +318,10 @@ def _up_to_last(held: np.ndarray) -> int:
 def _read_parquet(path: Path, columns: Sequence[str], time: str | None) -> Table:
     with parquet_file(path) as file:
         check_present(path, columns, file.schema_arrow.names)
-        check_memory(16 * file.metadata.num_rows * len(columns), f"{path}: reading {file.metadata.num_rows} rows")
+        check_memory(
+            16 * file.metadata.num_rows * len(columns),
+            f"{path}: reading {file.metadata.num_rows} rows",
+        )
         table = file.read(columns=list(columns))
         table.validate(full=True)
     arrays = {name: table.column(name).to_numpy(zero_copy_only=False) for name in columns}
@@ -266,17 +329,20 @@ def _read_parquet(path: Path, columns: Sequence[str], time: str | None) -> Table
     if time and arrays[time].dtype.kind not in "fiub":
         dates = dated(arrays.pop(time), f"{path}: column '{time}'")
         if dates is None:
-            raise InputError(f"{path}: column '{time}' holds text; expected instants, numbers or dates.")
+            raise InputError(
+                f"{path}: column '{time}' holds text; expected instants, numbers or dates."
+            )
     values = {name: _as_floats(array, name, path) for name, array in arrays.items()}
     values |= {time: dates} if time and dates is not None else {}
     return replace(
-        _full(path, {name: values[name] for name in columns}), dated=time if time and dates is not None else ""
+        _full(path, {name: values[name] for name in columns}),
+        dated=time if time and dates is not None else "",
     )
 
 
 @contextmanager
 def parquet_file(path: Path) -> Iterator[Any]:
-    """The file, opened by pyarrow.
+    """Yield the file, opened by pyarrow.
 
     Raises:
         InputError: without pyarrow, and for a file that is none or breaks off.
@@ -285,24 +351,33 @@ def parquet_file(path: Path) -> Iterator[Any]:
         import pyarrow as pa
         import pyarrow.parquet as pq
     except ImportError:
-        raise InputError(f"{path}: reading Parquet needs pyarrow; install orthaug[parquet].") from None
+        raise InputError(
+            f"{path}: reading Parquet needs pyarrow; install orthaug[parquet]."
+        ) from None
     try:
-        with pq.ParquetFile(path, page_checksum_verification=True, pre_buffer=False, buffer_size=1 << 20) as file:
+        with pq.ParquetFile(
+            path, page_checksum_verification=True, pre_buffer=False, buffer_size=1 << 20
+        ) as file:
             yield file
     except (pa.ArrowException, OSError) as error:
         raise InputError(f"{path}: not a readable Parquet file ({short(error)}).") from None
 
 
 def _read_excel(path: Path, columns: Sequence[str], time: str | None) -> Table:
-    """The first worksheet."""
+    """Return the first worksheet."""
 
     def place(header: Sequence[str]) -> list[int]:
         return places(path, columns, header)
 
     top, found = read_sheet(path, place)
     cells = dict(zip(columns, found, strict=True))
-    values = {name: np.array([as_number(cell) for cell in column]) for name, column in cells.items()}
-    filled = {name: _up_to_last(np.array([c is not None for c in column])) for name, column in cells.items()}
+    values = {
+        name: np.array([as_number(cell) for cell in column]) for name, column in cells.items()
+    }
+    filled = {
+        name: _up_to_last(np.array([c is not None for c in column]))
+        for name, column in cells.items()
+    }
 
     def cell(column: str, row: int) -> str:
         return "" if cells[column][row] is None else str(cells[column][row])
@@ -319,7 +394,7 @@ def _read_variables(path: Path, columns: Sequence[str], time: str | None) -> Tab
 
 
 def _full(path: Path, columns: Mapping[str, Vector]) -> Table:
-    """A table of a file type that has no empty cells."""
+    """Return a table of a file type that has no empty cells."""
     filled = {name: len(values) for name, values in columns.items()}
     return Table(path, columns, filled, cell=lambda column, row: str(columns[column][row]))
 
@@ -330,7 +405,9 @@ def _as_floats(array: np.ndarray, name: str, path: Path) -> Vector:
             raise TypeError
         return np.asarray(array, dtype=float)
     except (TypeError, ValueError):
-        raise InputError(f"{path}: column '{name}' holds {array.dtype} values; expected numbers.") from None
+        raise InputError(
+            f"{path}: column '{name}' holds {array.dtype} values; expected numbers."
+        ) from None
 
 
 _READERS: dict[str, Callable[..., Table]] = {
@@ -346,42 +423,69 @@ KNOWN = tuple(_READERS)
 
 
 def check_present(
-    path: Path, columns: Sequence[str], header: Sequence[str], *, named_apart: bool = False, headed: bool = True
+    path: Path,
+    columns: Sequence[str],
+    header: Sequence[str],
+    *,
+    named_apart: bool = False,
+    headed: bool = True,
 ) -> None:
-    """Raise InputError for a column that is not there, or stands twice."""
+    """Raise InputError for a column that is missing, or is in the header twice."""
     for name in columns:
         if name not in header:
             if not headed:
                 called = ", ".join(h for h in list(header)[:_NAMED] if h)
                 raise MissingColumnError(
-                    f"{path}: no column '{name}': the file has no header, so its columns are called {called}."
+                    f"{path}: no column '{name}': the file has no header, so its columns are "
+                    f"called {called}."
                 )
             if numbers_only(list(header)):
                 raise MissingColumnError(
-                    f"{path}: no column '{name}': the first line holds numbers; a header with names is expected."
+                    f"{path}: no column '{name}': the first line holds numbers; a header with "
+                    "names is expected."
                 )
             known = ", ".join(f"'{h}'" for h in list(header)[:_NAMED] if h) or "no column names"
             known += f" and {len(header) - _NAMED} more" if len(header) > _NAMED else ""
-            raise MissingColumnError(f"{path}: no column '{name}'{nearest(name, header)}; the file has {known}.")
+            raise MissingColumnError(
+                f"{path}: no column '{name}'{nearest(name, header)}; the file has {known}."
+            )
         if list(header).count(name) > 1:
-            twice = f"the column '{name}' stands {list(header).count(name)} times; names must differ"
-            apart = f", or be told apart from the left as '{name}.0', '{name}.1'" if named_apart else ""
+            twice = (
+                f"the header has the column '{name}' {list(header).count(name)} times; "
+                "names must differ"
+            )
+            apart = (
+                f", or be numbered from the left as '{name}.0', '{name}.1'" if named_apart else ""
+            )
             raise InputError(f"{path}: {twice}{apart}.")
 
 
-def places(path: Path, columns: Sequence[str], header: Sequence[str], *, headed: bool = True) -> list[int]:
-    """Where the columns stand in a header; columns of one name are `name.0`, `name.1`, ... from the left.
+def places(
+    path: Path, columns: Sequence[str], header: Sequence[str], *, headed: bool = True
+) -> list[int]:
+    """Return the places of columns in a header.
+
+    Columns of one name are `name.0`, `name.1`, ... from the left.
 
     Raises:
-        InputError: a column that is not there, or a name that stands twice.
+        InputError: a column that is not there, or a name that is there twice.
     """
-    apart = told_apart(header)
-    check_present(path, [name for name in columns if name not in apart], header, named_apart=True, headed=headed)
+    apart = numbered(header)
+    check_present(
+        path,
+        [name for name in columns if name not in apart],
+        header,
+        named_apart=True,
+        headed=headed,
+    )
     return [apart.index(name) for name in columns]
 
 
-def told_apart(header: Sequence[str]) -> list[str]:
-    """Names with a number behind those that stand more than once, as pandas counts them: `u.1` is the second `u`."""
+def numbered(header: Sequence[str]) -> list[str]:
+    """Return names with a number behind those that occur more than once.
+
+    They are counted as in pandas: `u.1` is the second `u`.
+    """
     often, seen, apart = Counter(header), Counter[str](), []
     for name in header:
         number = seen[name]

@@ -1,7 +1,9 @@
-"""Libraries of terms: products of signals and of functions of them, such as `v[k-1]**2*abs(v[k-2])`, written as text.
+"""Libraries of terms, written as text: products of signals and of functions of them.
 
-A term is a product of factors. So a library of many thousand terms is evaluated from few factors, and its terms are
-chosen by numbers while a program runs, without compiling anew.
+For example `v[k-1]**2*abs(v[k-2])`.
+
+A term is a product of factors. So a library of many thousand terms is evaluated from few factors,
+and its terms are chosen by numbers while a program runs, without compiling anew.
 """
 
 from __future__ import annotations
@@ -28,14 +30,16 @@ OF_SIGNALS = {
     "cos": "cos({})",
     "exp": "exp({})",
 }
-"""The functions that a library makes factors of, and how they are written of a signal."""
+"""Functions that a library makes factors of, as text of a signal."""
 MOST_TERMS = 200_000
 CONSTANT = "1"
 
 
 @dataclass(frozen=True)
 class TermLibrary:
-    """Terms as products of factors; `products` holds the numbers of their factors, in order, and () is the constant.
+    """Terms as products of factors.
+
+    `products` holds the numbers of their factors, in order, and () is the constant.
 
     Examples:
         >>> library = TermLibrary.of(["u", "v"], degree=2)
@@ -55,7 +59,9 @@ class TermLibrary:
         terms: Sequence[str] = (),
         exclude: Iterable[str] = (),
     ) -> TermLibrary:
-        """All products of up to `degree` signals, of which one may be a function of a signal instead; and `terms`.
+        """Return all products of up to `degree` signals, and `terms`.
+
+        One signal of a product may be replaced by a function of a signal.
 
         Args:
             signals: as expressions can read them, `y[k-1]` or the name of a state.
@@ -65,23 +71,32 @@ class TermLibrary:
             exclude: texts of terms to leave out; factors in any order.
 
         Raises:
-            InputError: an unknown function, an excluded term that is none, or more terms than can be weighed.
+            InputError: an unknown function, an excluded term that is none, or more terms than can
+                be weighed.
         """
         unknown = [name for name in functions if name not in OF_SIGNALS]
         if unknown:
             hint = nearest(unknown[0], OF_SIGNALS) or f"; known are {', '.join(OF_SIGNALS)}"
-            raise InputError(f"no terms are made of the function '{unknown[0]}'{hint}.")
+            raise InputError(f"a library has no terms of the function '{unknown[0]}'{hint}.")
         signals = tuple(dict.fromkeys(signals))
-        made = [OF_SIGNALS[name].format(signal) for name in dict.fromkeys(functions) for signal in signals]
+        made = [
+            OF_SIGNALS[name].format(signal)
+            for name in dict.fromkeys(functions)
+            for signal in signals
+        ]
         plain = comb(len(signals) + degree, degree) if degree else 0
         count = plain + len(made) * (comb(len(signals) + degree - 1, degree - 1) if degree else 0)
         if count > MOST_TERMS:
             raise InputError(
-                f"{len(signals)} signals to the degree {degree} make {count} terms; at most {MOST_TERMS} are weighed. "
-                "Lower the degree, or give fewer signals."
+                f"{len(signals)} signals to the degree {degree} make {count} terms; at most "
+                f"{MOST_TERMS} are allowed. Lower the degree, or give fewer signals."
             )
         numbers = range(len(signals))
-        products = [p for d in range(degree + 1) for p in combinations_with_replacement(numbers, d)] if degree else []
+        products = (
+            [p for d in range(degree + 1) for p in combinations_with_replacement(numbers, d)]
+            if degree
+            else []
+        )
         lower = [p for p in products if len(p) < degree]
         products += [(*p, len(signals) + i) for i in range(len(made)) for p in lower]
         given = [" ".join(term.split()) for term in terms]
@@ -89,7 +104,9 @@ class TermLibrary:
         known = set(library.texts)
         new = tuple(dict.fromkeys(term for term in given if term not in known))
         first = len(library.factors)
-        library = cls((*library.factors, *new), (*products, *((first + i,) for i in range(len(new)))))
+        library = cls(
+            (*library.factors, *new), (*products, *((first + i,) for i in range(len(new))))
+        )
         return library._without(exclude)
 
     def __len__(self) -> int:
@@ -107,14 +124,17 @@ class TermLibrary:
 
     @property
     def numbers(self) -> Int[np.ndarray, "terms order"]:
-        """The factors of each term; the number of all factors, one more than the last, stands for 1."""
+        """The factors of each term.
+
+        The number of all factors, one more than the last, is 1.
+        """
         table = np.full((len(self), max(self.order, 1)), len(self.factors))
         for row, product in zip(table, self.products, strict=True):
             row[: len(product)] = product
         return table
 
     def picked(self, chosen: Iterable[int]) -> TermLibrary:
-        """Some of the terms, of the same factors."""
+        """Return some of the terms, of the same factors."""
         return TermLibrary(self.factors, tuple(self.products[i] for i in chosen))
 
     def _text(self, product: tuple[int, ...]) -> str:
@@ -124,25 +144,36 @@ class TermLibrary:
         written = []
         for number, power in powers.items():
             factor = self.factors[number]
-            atom = factor if len(product) == 1 or not outside_brackets(factor, "+-*/ ") else f"({factor})"
+            atom = (
+                factor
+                if len(product) == 1 or not outside_brackets(factor, "+-*/ ")
+                else f"({factor})"
+            )
             written.append(atom if power == 1 else f"{atom}**{power}")
         return "*".join(written)
 
     def _without(self, exclude: Iterable[str]) -> TermLibrary:
         texts = self.texts
-        by_factors: Mapping[tuple[str, ...], int] = {_factors_of(text): i for i, text in enumerate(texts)}
+        by_factors: Mapping[tuple[str, ...], int] = {
+            _factors_of(text): i for i, text in enumerate(texts)
+        }
         gone = set()
         for text in exclude:
             there = by_factors.get(_factors_of(text))
             if there is None:
                 hint = nearest(text, texts) if len(texts) < 1000 else ""
-                raise InputError(f"`exclude` names the term '{text}', which is not among the terms{hint}.")
+                raise InputError(
+                    f"`exclude` names the term '{text}', which is not among the terms{hint}."
+                )
             gone.add(there)
         return self.picked(i for i in range(len(self)) if i not in gone) if gone else self
 
 
 def products_of(factors: Any, numbers: Any, xp: Any) -> Any:
-    """The terms (K, …) of factors (nf, …) by their factors' numbers (K, order); number nf stands for 1."""
+    """Return the terms (K, …) of factors (nf, …) by their factors' numbers (K, order).
+
+    Number nf is 1.
+    """
     with_one = xp.concatenate([factors, xp.ones((1, *factors.shape[1:]))])
     value = with_one[numbers[:, 0]]
     for column in range(1, numbers.shape[1]):
@@ -151,7 +182,7 @@ def products_of(factors: Any, numbers: Any, xp: Any) -> Any:
 
 
 def outside_brackets(text: str, marks: str) -> bool:
-    """Whether one of some marks stands in a text outside of all brackets."""
+    """Return whether one of some marks is outside all brackets of a text."""
     depth = 0
     for character in text:
         depth += (character in "([") - (character in ")]")
@@ -161,7 +192,7 @@ def outside_brackets(text: str, marks: str) -> bool:
 
 
 def _factors_of(text: str) -> tuple[str, ...]:
-    """The factors of a product as it is written, in order; `v**2` is v and v."""
+    """Return the factors of a product in order; `v**2` is v and v."""
     text, pieces, depth, begin = text.replace(" ", ""), [], 0, 0
     for i, character in enumerate(text):
         depth += (character in "([") - (character in ")]")

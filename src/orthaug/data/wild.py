@@ -1,8 +1,9 @@
-"""Samples of a record that are no measurements: wild ones, rows that stand there twice, a sensor that has frozen.
+"""Samples of a record that are no measurements: wild samples, doubled rows, a frozen sensor.
 
-A sample is wild if it is many times farther from the median than all others of its channel, and nothing answers for it:
-an input's has no response in an output, an output's no cause in an input. So heavy tails, steps, and the impulses of a
-hammer are none. One rule for the data of every physics.
+A sample is wild if it is many times farther from the median than all others of its channel, and
+nothing answers for it: an input's has no response in an output, an output's no cause in an input.
+So heavy tails, steps, and the impulses of a hammer are none. One rule for the data of every
+physics.
 """
 
 from __future__ import annotations
@@ -18,26 +19,30 @@ from orthaug._base.lines import counted, percent
 from orthaug.data.record import Record
 from orthaug.data.steps import Outliers
 
-_APART = 8.0  # times the distance of the farthest other sample; Student's t with 4 degrees of freedom: 1 in 4000
-_FEW, _LEAST = 0.005, 1  # share of a channel's samples that are wild at most, and the number that is always few
+# Times the distance of the farthest other sample: 1 in 4000 of Student's t, 4 degrees of freedom.
+_APART = 8.0
+_FEW, _LEAST = (
+    0.005,
+    1,
+)  # share of a channel's samples that are wild at most, and the number that is always few
 _RESPONSE = 50  # rows within which an output answers an input
 _ANSWERS = 3.0  # times what it was before
 _FIRST = 10  # rows before which nothing was seen to compare with
 _NAMED = 3
 _FEWEST = 20  # samples of a channel
-_FROZEN, _FROZEN_SHARE = 20, 0.02  # rows for which a sensor stands still, at least
+_FROZEN, _FROZEN_SHARE = 20, 0.02  # rows for which a frozen sensor does not move, at least
 _STILL = 0.02  # share of equal neighbours elsewhere, at most
 _TWICE = 0.98  # share of rows that equal the one before, of those that should
 
 
 @dataclass(frozen=True)
 class WildSample:
-    """A sample of the record: where it stands, and the channel."""
+    """A sample of the record: experiment, row and channel."""
 
     experiment: int
     row: int
     column: int
-    """Of inputs, then outputs."""
+    """Column among the inputs, then the outputs."""
     name: str
     value: float
     apart: float
@@ -45,7 +50,7 @@ class WildSample:
 
 
 def wild_samples(record: Record) -> tuple[WildSample, ...]:
-    """Return the samples of a record that nothing answers for, channel by channel."""
+    """Return the samples that no other channel explains, channel by channel."""
     values = [np.hstack([e.inputs, e.outputs]) for e in record.experiments]
     names = [c.name for c in (*record.inputs, *record.outputs)]
     inputs = len(record.inputs)
@@ -58,7 +63,10 @@ def wild_samples(record: Record) -> tuple[WildSample, ...]:
         if len(rows) and not _explained(distance, rows, j, inputs, starts):
             owner = np.searchsorted(starts, rows, side="right") - 1
             at = [(int(i), int(k - starts[i])) for i, k in zip(owner, rows, strict=True)]
-            found += [WildSample(*p, j, name, float(whole[k, j]), apart) for p, k in zip(at, rows, strict=True)]
+            found += [
+                WildSample(*p, j, name, float(whole[k, j]), apart)
+                for p, k in zip(at, rows, strict=True)
+            ]
     return tuple(found)
 
 
@@ -69,7 +77,7 @@ def _distance(column: Vector) -> Vector:
 
 
 def _far(distance: Vector) -> tuple[list[int], float]:
-    """Return the few samples that lie many times farther than all others, and how many times."""
+    """Return the few samples that are many times farther than all others, and how many times."""
     if len(distance) < _FEWEST:
         return [], 0.0
     most = max(_LEAST, int(_FEW * len(distance)))
@@ -77,37 +85,51 @@ def _far(distance: Vector) -> tuple[list[int], float]:
     for count in range(most, 0, -1):
         nearest, other = distance[order[count - 1]], distance[order[count]]
         if nearest > _APART * other and nearest > 0:
-            return sorted(int(k) for k in order[:count]), float(nearest / other) if other > 0 else np.inf
+            return sorted(int(k) for k in order[:count]), float(
+                nearest / other
+            ) if other > 0 else np.inf
     return [], 0.0
 
 
 def _explained(distance: Matrix, rows: list[int], j: int, inputs: int, starts: np.ndarray) -> bool:
-    """Return whether other channels answer for these samples: outputs by a response, an input as the cause."""
+    """Return whether other channels explain these samples.
+
+    Outputs do by a response, an input as the cause.
+    """
     first = rows[0]
     if j < inputs:
         if first - starts[np.searchsorted(starts, first, side="right") - 1] < _FIRST:
             return True
-        return any(_stands_out(distance[:, i], first, first + _RESPONSE) for i in range(inputs, distance.shape[1]))
-    return any(_stands_out(distance[:, i], first - _RESPONSE, first + 1) for i in range(inputs))
+        return any(
+            _is_farther(distance[:, i], first, first + _RESPONSE)
+            for i in range(inputs, distance.shape[1])
+        )
+    return any(_is_farther(distance[:, i], first - _RESPONSE, first + 1) for i in range(inputs))
 
 
-def _stands_out(distance: Vector, begin: int, end: int) -> bool:
-    """Return whether a channel goes in these rows where it never was before them, or outside of them at all."""
+def _is_farther(distance: Vector, begin: int, end: int) -> bool:
+    """Return whether a channel is farther out in these rows than before them, or elsewhere."""
     begin = max(begin, 0)
     within = float(distance[begin:end].max(initial=0.0))
-    before = float(distance[:begin].max(initial=0.0)) if begin >= _FIRST else float(distance[end:].max(initial=0.0))
+    before = (
+        float(distance[:begin].max(initial=0.0))
+        if begin >= _FIRST
+        else float(distance[end:].max(initial=0.0))
+    )
     return within > _ANSWERS * before
 
 
 def threshold_for(record: Record, samples: tuple[WildSample, ...]) -> float:
-    """Return the threshold with which the step `outliers` marks these samples of a channel and hardly another."""
+    """Return the threshold with which `outliers` marks these samples and hardly another."""
     least, others = np.inf, 0.0
     for i, experiment in enumerate(record.experiments):
         values = np.hstack([experiment.inputs, experiment.outputs])
         for j in {sample.column for sample in samples}:
             distance, deviation = Outliers().distances(values[:, j])
             ratio = distance / np.where(deviation > 0, deviation, np.inf)
-            rows = [sample.row for sample in samples if (sample.experiment, sample.column) == (i, j)]
+            rows = [
+                sample.row for sample in samples if (sample.experiment, sample.column) == (i, j)
+            ]
             least = min([least, *ratio[rows]])
             others = max(others, float(np.delete(ratio, rows).max(initial=0.0)))
     if not np.isfinite(least) or least <= 0:
@@ -115,8 +137,10 @@ def threshold_for(record: Record, samples: tuple[WildSample, ...]) -> float:
     return float(f"{min(max(np.sqrt(max(others, 1.0) * least), 4.0), 0.9 * least):.2g}")
 
 
-def data_warnings(record: Record, effect: Callable[[tuple[WildSample, ...]], str] | None = None) -> list[Warning]:
-    """Return warnings of wild samples, of rows that stand there twice, and of outputs that stand still.
+def data_warnings(
+    record: Record, effect: Callable[[tuple[WildSample, ...]], str] | None = None
+) -> list[Warning]:
+    """Return warnings of wild samples, of doubled rows, and of outputs that are constant.
 
     Args:
         effect: says in a sentence what a fit without some samples gives.
@@ -124,13 +148,18 @@ def data_warnings(record: Record, effect: Callable[[tuple[WildSample, ...]], str
     found, samples = [], wild_samples(record)
     for name in dict.fromkeys(sample.name for sample in samples):
         own = tuple(sample for sample in samples if sample.name == name)
-        found.append(Warning("wild_samples", _wild_text(record, own, effect(samples) if effect else "")))
+        found.append(
+            Warning("wild_samples", _wild_text(record, own, effect(samples) if effect else ""))
+        )
     return [*found, *_twice(record), *_frozen(record)]
 
 
 def _wild_text(record: Record, own: tuple[WildSample, ...], effect: str) -> str:
     name = own[0].name
-    where = [f"{record.experiments[s.experiment].where(s.row)}: {name} = {s.value:.6g}" for s in own[:_NAMED]]
+    where = [
+        f"{record.experiments[s.experiment].where(s.row)}: {name} = {s.value:.6g}"
+        for s in own[:_NAMED]
+    ]
     more = f" and {len(own) - _NAMED} more" if len(own) > _NAMED else ""
     column = next(c.file_column for c in (*record.inputs, *record.outputs) if c.name == name)
     of = f" (column '{column}')" if column != name else ""
@@ -138,21 +167,30 @@ def _wild_text(record: Record, own: tuple[WildSample, ...], effect: str) -> str:
     if own[0].column >= len(record.inputs) and not record.inputs:
         answer = "no neighbour is near it"
     effect = f" {effect}" if effect else ""
-    far = f"{own[0].apart:.3g} times farther from the median than" if np.isfinite(own[0].apart) else "apart from"
+    far = (
+        f"{own[0].apart:.3g} times farther from the median than"
+        if np.isfinite(own[0].apart)
+        else "apart from"
+    )
     return (
-        f"{'; '.join(where)}{more}{of}, {far} every other sample, and {answer}: a wild "
-        f"sample, {percent(_share_of(record, own), 3)} of the squares of {name}.{effect} Mark it with a step of "
-        f'[[data.prepare]], step = "outliers", channels = ["{name}"], threshold = {threshold_for(record, own):g}, with '
-        'missing = "skip" in [data] or a step "fill" behind it.'
+        f"{'; '.join(where)}{more}{of}, {far} every other sample, and {answer}: a wild sample "
+        f"with {percent(_share_of(record, own), 3)} of the squares of {name}.{effect} Mark it by "
+        f'[[data.prepare]], step = "outliers", channels = ["{name}"], '
+        f"threshold = {threshold_for(record, own):g}. Add "
+        'missing = "skip" in [data], or a step "fill" behind it.'
     )
 
 
 def _share_of(record: Record, own: tuple[WildSample, ...]) -> float:
     """Return the share of a channel's squares about its median that these samples make up."""
-    column = np.concatenate([np.hstack([e.inputs, e.outputs])[:, own[0].column] for e in record.experiments])
+    column = np.concatenate(
+        [np.hstack([e.inputs, e.outputs])[:, own[0].column] for e in record.experiments]
+    )
     middle, scale = np.median(column), max(abs(s.value) for s in own)
     squares = float(np.sum(((column - middle) / scale) ** 2))
-    return min(float(np.sum([((s.value - middle) / scale) ** 2 for s in own])) / max(squares, 1e-300), 1.0)
+    return min(
+        float(np.sum([((s.value - middle) / scale) ** 2 for s in own])) / max(squares, 1e-300), 1.0
+    )
 
 
 def _twice(record: Record) -> list[Warning]:
@@ -166,16 +204,20 @@ def _twice(record: Record) -> list[Warning]:
             if pairs.mean() > _TWICE and between.mean() < 1 - _TWICE:
                 where = experiment.where(first)
                 text = (
-                    f"{where}: from here on each row stands there twice, in all channels: the file was written at "
-                    "twice the rate of the measurement. Standard errors count every sample twice, and over one step "
-                    "nothing moves. Give `every = 2` for these files, with the sampling time of the measurement."
+                    f"{where}: from here on each row is there twice, in all channels: the file was "
+                    "written at twice the rate of the measurement. Standard errors count every "
+                    "sample twice, and over one step nothing moves. Give `every = 2` for these "
+                    "files, with the sampling time of the measurement."
                 )
                 return [Warning("rows_twice", text)]
     return []
 
 
 def _frozen(record: Record) -> list[Warning]:
-    """Outputs that stand still for many rows while an input moves, and hardly ever for two rows elsewhere."""
+    """Return warnings of frozen outputs: constant for many rows while an input moves.
+
+    Elsewhere hardly two neighbouring rows are equal.
+    """
     found = []
     for j, output in enumerate(record.outputs):
         for experiment in record.experiments:
@@ -190,9 +232,10 @@ def _frozen(record: Record) -> list[Warning]:
             if experiment.inputs.shape[1] and not moves.any():
                 continue
             text = (
-                f"{experiment.where(begin)}: {output.name} is {y[begin]:.6g} for {counted(rows + 1, 'row')} from here "
-                f"on ({percent((rows + 1) / n)} of them), and moves from row to row everywhere else: a sensor or a "
-                "recorder that has frozen. Leave these rows out (`rows` of the data)."
+                f"{experiment.where(begin)}: {output.name} is {y[begin]:.6g} for "
+                f"{counted(rows + 1, 'row')} from here on ({percent((rows + 1) / n)} of them), "
+                "and changes from row to row elsewhere: a sensor or a recorder was frozen. "
+                "Leave these rows out (`rows` of the data)."
             )
             found.append(Warning("frozen_output", text))
             break

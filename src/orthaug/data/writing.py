@@ -1,4 +1,4 @@
-"""Expressions written for others: their unit, and as LaTeX."""
+"""Units and LaTeX of expressions."""
 
 from __future__ import annotations
 
@@ -9,16 +9,36 @@ from fractions import Fraction
 
 from orthaug.data.expressions import Expression
 
-_PLAIN = ("sign", "tanh", "sin", "cos", "tan", "atan", "atan2", "exp", "log", "floor")  # of numbers without unit
+_PLAIN = (
+    "sign",
+    "tanh",
+    "sin",
+    "cos",
+    "tan",
+    "atan",
+    "atan2",
+    "exp",
+    "log",
+    "floor",
+)  # of numbers without unit
 _SAME = ("abs", "min", "max")
-_LATEX = {"sin": r"\sin", "cos": r"\cos", "tan": r"\tan", "atan": r"\arctan", "exp": r"\exp", "log": r"\ln"}
+_LATEX = {
+    "sin": r"\sin",
+    "cos": r"\cos",
+    "tan": r"\tan",
+    "atan": r"\arctan",
+    "exp": r"\exp",
+    "log": r"\ln",
+}
 _LATEX |= {"tanh": r"\tanh", "sign": r"\operatorname{sgn}", "min": r"\min", "max": r"\max"}
 Unit = Counter[str]
 """Powers by the name of a unit."""
 
 
 def coefficient_unit(unit: str, term: Expression, units: Mapping[str, str]) -> str | None:
-    """The unit of a term's coefficient, where the sum has `unit` and channels or states theirs; None if not told.
+    """Return the unit of a term's coefficient; None where a unit is missing.
+
+    The sum has `unit`; channels and states have theirs.
 
     Examples:
         >>> from orthaug.data.expressions import parse
@@ -39,7 +59,7 @@ def coefficient_unit(unit: str, term: Expression, units: Mapping[str, str]) -> s
 
 
 def latex(expression: Expression) -> str:
-    r"""The expression as LaTeX, lags as indices.
+    r"""Return the expression as LaTeX, lags as indices.
 
     Examples:
         >>> from orthaug.data.expressions import parse
@@ -107,7 +127,11 @@ def _latex(node: ast.AST) -> str:
     if isinstance(node.op, ast.Div):
         return rf"\frac{{{_latex(node.left)}}}{{{_latex(node.right)}}}"
     if isinstance(node.op, ast.Pow):
-        base = _latex(node.left) if isinstance(node.left, ast.Name | ast.Subscript) else f"({_latex(node.left)})"
+        base = (
+            _latex(node.left)
+            if isinstance(node.left, ast.Name | ast.Subscript)
+            else f"({_latex(node.left)})"
+        )
         return f"{base}^{{{_latex(node.right)}}}"
     if isinstance(node.op, ast.Mult):
         return rf"{_tight(node.left)}\,{_tight(node.right)}"
@@ -116,15 +140,25 @@ def _latex(node: ast.AST) -> str:
 
 
 def _tight(node: ast.AST) -> str:
-    """In brackets where it is a sum."""
+    """Return LaTeX in brackets where it is a sum."""
     loose = isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add | ast.Sub)
     return f"({_latex(node)})" if loose else _latex(node)
 
 
 _TEX = {
     **{letter: rf"\{letter}" for letter in "_%&#${}"},
-    **{"\\": r"\textbackslash{}", "^": r"\textasciicircum{}", "~": r"\textasciitilde{}", "<": r"\textless{}"},
-    **{">": r"\textgreater{}", "|": r"\textbar{}", '"': r"\textquotedbl{}", "`": r"\textasciigrave{}"},
+    **{
+        "\\": r"\textbackslash{}",
+        "^": r"\textasciicircum{}",
+        "~": r"\textasciitilde{}",
+        "<": r"\textless{}",
+    },
+    **{
+        ">": r"\textgreater{}",
+        "|": r"\textbar{}",
+        '"': r"\textquotedbl{}",
+        "`": r"\textasciigrave{}",
+    },
 }
 
 
@@ -139,7 +173,7 @@ def tex_text(text: str) -> str:
 
 
 def symbol(name: str, index: str = "") -> str:
-    """A name: one letter as it stands, with digits behind it as an index, words upright."""
+    """Return a name in LaTeX: letters, digits behind one letter as an index, words upright."""
     letters = name.rstrip("0123456789")
     if len(letters) == 1:
         base, below = letters, ",".join(filter(None, (name[1:], index)))

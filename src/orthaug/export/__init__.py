@@ -1,4 +1,4 @@
-"""Models as code that needs no orthaug: one intermediate form, and a file for each target language."""
+"""Models as code that needs no orthaug: an intermediate form, and a file for each language."""
 
 import lazy_loader
 

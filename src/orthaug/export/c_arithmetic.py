@@ -1,4 +1,4 @@
-"""The arithmetic of a program in C: constants, activations, blocks with their networks, and integrators."""
+"""The arithmetic of a program in C: constants, activations, blocks, networks, integrators."""
 
 from __future__ import annotations
 
@@ -9,7 +9,20 @@ import numpy as np
 from orthaug.export.nodes import ACTIVATIONS, Language, decimal, functions_in, names_in, wrapped
 from orthaug.export.program import Block, Constant, Layer, Program
 
-_MATH = {"sin", "cos", "tan", "atan", "atan2", "exp", "log", "sqrt", "floor", "tanh", "expm1", "log1p"}
+_MATH = {
+    "sin",
+    "cos",
+    "tan",
+    "atan",
+    "atan2",
+    "exp",
+    "log",
+    "sqrt",
+    "floor",
+    "tanh",
+    "expm1",
+    "log1p",
+}
 _OWN = {
     "sign": "static real sign(real a) { return a > 0 ? 1 : a < 0 ? -1 : a; } /* NaN stays NaN */",
     "min": "static real least(real a, real b) { return a < b || isnan(a) ? a : b; }",
@@ -32,13 +45,14 @@ _NAMES = {name: f"{name}_" for name in _MATH} | {
     "max": "largest",
 }
 _WORDS = """
-auto break case char const continue default do double else enum extern float for goto if inline int long register
-restrict return short signed sizeof static struct switch typedef union unsigned void volatile while flag
-class bool true false new delete this template operator private public protected namespace try catch throw using
+auto break case char const continue default do double else enum extern float for goto if
+inline int long register restrict return short signed sizeof static struct switch typedef
+union unsigned void volatile while flag class bool true false new delete this template
+operator private public protected namespace try catch throw using
 typename virtual friend explicit export mutable and or not xor real
 """
 FIELD_WORDS = frozenset(_WORDS.split())
-"""What cannot name a field of the state, in C or in C++."""
+"""Names that a field of the state cannot have, in C or in C++."""
 
 
 def _language(entry: Callable[[str, int], str]) -> Language:
@@ -60,10 +74,13 @@ def _plain(vector: str, index: int) -> str:
 
 
 def arithmetic(program: Program) -> str:
-    """Everything before the functions that the header declares."""
+    """Return the code before the functions that the header declares."""
     parts = [_functions(program)]
     parts += [
-        "\n".join(f"static const real {c.name} = {_number(c.value)}; /* {_safe(c.meaning)} */" for c in _used(program))
+        "\n".join(
+            f"static const real {c.name} = {_number(c.value)}; /* {_safe(c.meaning)} */"
+            for c in _used(program)
+        )
     ]
     for name in sorted(program.activations - {"identity"}):
         written = _language(_plain).write(ACTIVATIONS[name])
@@ -80,32 +97,46 @@ def _safe(text: str) -> str:
 
 
 def _used(program: Program) -> list[Constant]:
-    """Constants that some block reads: an unused one would be warned of."""
+    """Return constants that some block reads: compilers warn of an unused one."""
     read = set[str]().union(*(names_in(node) for block in program.blocks for node in block.nodes))
     return [constant for constant in program.constants if constant.name in read]
 
 
 def _functions(program: Program) -> str:
-    """Names of the mathematical functions for either precision, and those that C lacks."""
-    wanted = program.functions | set[str]().union(*(functions_in(ACTIVATIONS[name]) for name in program.activations))
-    called = sorted({"abs": "fabs", "power": "pow"}.get(name, name) for name in wanted & (_MATH | {"abs", "power"}))
+    """Return names of mathematical functions for either precision, and those that C lacks."""
+    wanted = program.functions | set[str]().union(
+        *(functions_in(ACTIVATIONS[name]) for name in program.activations)
+    )
+    called = sorted(
+        {"abs": "fabs", "power": "pow"}.get(name, name)
+        for name in wanted & (_MATH | {"abs", "power"})
+    )
     upper = program.name.upper()
     lines = []
     if called:
-        lines += [f"#ifdef {upper}_FLOAT", *(f"#define {name}_ {name}f" for name in called), "#else"]
+        lines += [
+            f"#ifdef {upper}_FLOAT",
+            *(f"#define {name}_ {name}f" for name in called),
+            "#else",
+        ]
         lines += [*(f"#define {name}_ {name}" for name in called), "#endif"]
     return "\n".join([*lines, *(text for name, text in _OWN.items() if name in wanted)])
 
 
 def _table(name: str, values: np.ndarray) -> str:
     if values.ndim == 1:
-        return f"static const real {name}[{len(values)}] = {{\n{wrapped(list(map(_number, values)), ' ' * 4)}\n}};"
-    rows = ",\n".join(f"    {{{wrapped(list(map(_number, row)), ' ' * 5).strip()}}}" for row in values)
+        return (
+            f"static const real {name}[{len(values)}] = "
+            f"{{\n{wrapped(list(map(_number, values)), ' ' * 4)}\n}};"
+        )
+    rows = ",\n".join(
+        f"    {{{wrapped(list(map(_number, row)), ' ' * 5).strip()}}}" for row in values
+    )
     return f"static const real {name}[{values.shape[0]}][{values.shape[1]}] = {{\n{rows}\n}};"
 
 
 def _network(block: Block) -> str:
-    """The tables of a network and the function that evaluates it."""
+    """Return the tables of a network and the function that evaluates it."""
     assert block.network is not None
     layers, parts, declared, loops = block.network.layers, [], [], []
     for i, layer in enumerate(layers, start=1):
@@ -133,7 +164,7 @@ def _layer(prefix: str, number: int, layer: Layer, target: str, source: str) -> 
 
 
 def body(block: Block, result: str, entry: Callable[[str, int], str] = _plain) -> list[str]:
-    """The lines that evaluate a block, in braces of their own, into the vector `result`."""
+    """Return the lines that evaluate a block, in braces of their own, into the vector `result`."""
     write = _language(entry).write
     lines = [f"const real {name} = {write(node)};" for name, node in block.locals]
     if block.network is not None:
@@ -153,7 +184,7 @@ def _function(block: Block, program: Program) -> str:
 
 
 def advance(program: Program) -> list[str]:
-    """The lines of a step that make `x` the next state."""
+    """Return the lines of a step that make `x` the next state."""
     scheme = program.scheme
     assert scheme is not None
     n = len(program.states)
@@ -175,7 +206,10 @@ def advance(program: Program) -> list[str]:
         "        int j;",
         f"        for (j = 0; j < {held}; j++) {{",
         f"            const real slope = (u[{held} + j] - u[j]) / {halves};",
-        *(f"            {point}[j] = u[j] + (real)(i{f' + {k}' * (k > 0)}) * slope;" for k, point in enumerate(points)),
+        *(
+            f"            {point}[j] = u[j] + (real)(i{f' + {k}' * (k > 0)}) * slope;"
+            for k, point in enumerate(points)
+        ),
         "        }",
         "        substep(x, first, middle, last);",
         "    }",
@@ -189,7 +223,10 @@ def _integrator(program: Program) -> list[str]:
     if scheme.kind == "discrete":
         return []
     if scheme.kind == "rk4":
-        return [f"static const real step = {_number(scheme.step)}; /* s */\n{_RK4.replace('NX', str(n))}"]
+        return [
+            f"static const real step = {_number(scheme.step)}; /* s "
+            f"*/\n{_RK4.replace('NX', str(n))}"
+        ]
     tables = [_table(f"m_{name}", matrix) for name, matrix in scheme.matrices]
     return ["\n".join(tables), _EXACT.replace("NX", str(n))]
 

@@ -30,7 +30,8 @@ class CSource:
 cc -std=c99 -O2 -Wall -Wextra -pedantic {name}.c check.c -lm -o check && ./check
 ```
 
-says the largest difference from the test vectors. With `-D{name.upper()}_FLOAT` all numbers are `float`.
+says the largest difference from the test vectors. With `-D{name.upper()}_FLOAT` all numbers are
+`float`.
 
 ```c
 {name}_state state;
@@ -39,14 +40,19 @@ says the largest difference from the test vectors. With `-D{name.upper()}_FLOAT`
 {name}_step(&state, u, y);     /* one sample: y, and the state goes on */
 ```
 
-`{name}_run` takes many samples at once. Where an input or a result is NaN or infinite, `state.flag` is 1 after the
-step and the state is left as it was; otherwise it is 0. There is no allocation, no input or output and no global that
-changes, so that several instances need a state each and nothing else. Not to be compiled with `-ffast-math`, which
+`{name}_run` takes many samples at once. Where an input or a result is NaN or infinite,
+`state.flag` is 1 after the step and the state is left as it was; otherwise it is 0. There is no
+allocation, no input or output, and no global that changes, so that several instances need only a
+state each. Do not compile with `-ffast-math`, which
+DELETE
 takes NaN for impossible."""
 
 
 def fields_of(program: Program) -> list[tuple[str, Signal, int]]:
-    """The fields of the state: its name in C, what it holds, and how many samples, 0 for a number by itself."""
+    """Return the fields of the state: C name, signal, and number of samples.
+
+    The number is 0 for a field that is one number.
+    """
     if program.scheme is None:
         wanted = [(signal.identifier, signal, depth) for signal, depth in program.lines if depth]
     else:
@@ -62,8 +68,10 @@ def fields_of(program: Program) -> list[tuple[str, Signal, int]]:
 
 
 def places_of(fields: list[tuple[str, Signal, int]]) -> list[str]:
-    """Every entry of the state as a member of its struct."""
-    return [f"{name}[{i}]" if depth else name for name, _, depth in fields for i in range(max(depth, 1))]
+    """Return every entry of the state as a member of its struct."""
+    return [
+        f"{name}[{i}]" if depth else name for name, _, depth in fields for i in range(max(depth, 1))
+    ]
 
 
 def _header(program: Program, fields: list[tuple[str, Signal, int]]) -> str:
@@ -71,14 +79,26 @@ def _header(program: Program, fields: list[tuple[str, Signal, int]]) -> str:
     members = []
     for identifier, signal, depth in fields:
         unit = f" [{signal.unit}]" if signal.unit else ""
-        what = f"{signal.name}[k-1] to {signal.name}[k-{depth}]" if depth > 1 else f"{signal.name}[k-1]"
+        what = (
+            f"{signal.name}[k-1] to {signal.name}[k-{depth}]"
+            if depth > 1
+            else f"{signal.name}[k-1]"
+        )
         size = f"[{depth}]" if depth else ""
-        members.append(f"    {name}_real {identifier}{size}; /* {comment((what if depth else signal.name) + unit)} */")
-    inputs = "".join(f"\n *   u[{i}]  {comment(signal.label)}" for i, signal in enumerate(program.inputs))
-    outputs = "".join(f"\n *   y[{i}]  {comment(signal.label)}" for i, signal in enumerate(program.outputs))
+        members.append(
+            f"    {name}_real {identifier}{size}; /* "
+            f"{comment((what if depth else signal.name) + unit)} */"
+        )
+    inputs = "".join(
+        f"\n *   u[{i}]  {comment(signal.label)}" for i, signal in enumerate(program.inputs)
+    )
+    outputs = "".join(
+        f"\n *   y[{i}]  {comment(signal.label)}" for i, signal in enumerate(program.outputs)
+    )
     done = comment(program.preparation)
-    prepared = f" * Inputs and outputs stand for data after {done}.\n" if done else ""
-    return f"""/* {name}: one step of a fitted model, every {program.sampling_time!r} s. Written by orthaug.
+    prepared = f" * Inputs and outputs are data after {done}.\n" if done else ""
+    return f"""/* {name}: one step of a fitted model, every {program.sampling_time!r} s.
+ * Written by orthaug.
  * Model sha256 {program.digest}
 {prepared} *{inputs}{outputs}
  */
@@ -124,13 +144,15 @@ size_t {name}_run({name}_state *state, const {name}_real u[], {name}_real y[], s
 
 
 def comment(text: str) -> str:
-    """Text that cannot end a comment."""
+    """Return text that cannot end a comment."""
     return text.replace("*/", "* /").replace("/*", "/ *").replace("??", "? ?").replace("\\", "/")
 
 
 def _source(program: Program, fields: list[tuple[str, Signal, int]]) -> str:
     name, upper = program.name, program.name.upper()
-    step = _lagged_step(program, fields) if program.scheme is None else _motion_step(program, fields)
+    step = (
+        _lagged_step(program, fields) if program.scheme is None else _motion_step(program, fields)
+    )
     zeros = []
     for identifier, _, depth in fields:
         if depth:
@@ -138,7 +160,7 @@ def _source(program: Program, fields: list[tuple[str, Signal, int]]) -> str:
         else:
             zeros.append(f"    state->{identifier} = 0;")
     counter = ["    int i;"] if any(depth for *_, depth in fields) else []
-    return f"""/* {name}: one step of a fitted model. Written by orthaug; the header says what it is. */
+    return f"""/* {name}: one step of a fitted model (see the header). Written by orthaug. */
 #include "{name}.h"
 
 #include <math.h>
@@ -184,16 +206,21 @@ def _checks(program: Program, following: bool) -> list[str]:
 
 
 def _lagged_step(program: Program, fields: list[tuple[str, Signal, int]]) -> str:
-    """The block in place on the state's fields, then every line moved on by one sample."""
+    """Return the block on the state's fields, and the lines that shift the state by one sample."""
     place = [f"state->{place}" for place in places_of(fields)]
     lines = [*_step_head(program), "    int i, ok = 1;"]
-    lines += c_arithmetic.body(program.output, "y", lambda vector, i: place[i] if vector == "x" else f"{vector}[{i}]")
+    lines += c_arithmetic.body(
+        program.output, "y", lambda vector, i: place[i] if vector == "x" else f"{vector}[{i}]"
+    )
     lines += _checks(program, following=False)
     now = {s.name: f"y[{i}]" for i, s in enumerate(program.outputs)}
     now |= {s.name: f"u[{i}]" for i, s in enumerate(program.inputs)}
     for identifier, signal, depth in fields:
         if depth > 1:
-            lines.append(f"    for (i = {depth - 1}; i > 0; i--) state->{identifier}[i] = state->{identifier}[i - 1];")
+            lines.append(
+                f"    for (i = {depth - 1}; i > 0; i--) state->{identifier}[i] = "
+                f"state->{identifier}[i - 1];"
+            )
         lines.append(f"    state->{identifier}[0] = {now[signal.name]};")
     return "\n".join([*lines, "}"])
 
@@ -203,7 +230,11 @@ def _motion_step(program: Program, fields: list[tuple[str, Signal, int]]) -> str
     assert scheme is not None
     lines = [*_step_head(program), f"    real x[{len(program.states)}];", "    int i, ok = 1;"]
     lines += [f"    x[{i}] = state->{identifier};" for i, (identifier, *_) in enumerate(fields)]
-    lines += ["    output(x, u, y);", *c_arithmetic.advance(program), *_checks(program, following=True)]
+    lines += [
+        "    output(x, u, y);",
+        *c_arithmetic.advance(program),
+        *_checks(program, following=True),
+    ]
     lines += [f"    state->{identifier} = x[{i}];" for i, (identifier, *_) in enumerate(fields)]
     return "\n".join([*lines, "}"])
 
@@ -215,13 +246,18 @@ def _check(program: Program, fields: list[tuple[str, Signal, int]], vectors: Vec
     def table(kind: str, values: list[list[float]]) -> str:
         body = ",\n".join("    {" + ", ".join(map(repr, row)) + "}" for row in values or [[0.0]])
         return (
-            f"static const double {kind}[{max(rows, 1)}][{max(len(values[0]) if values else 1, 1)}] = {{\n{body}\n}};"
+            "static const double "
+            f"{kind}[{max(rows, 1)}][{max(len(values[0]) if values else 1, 1)}] = "
+            f"{{\n{body}\n}};"
         )
 
     inputs = vectors.inputs.tolist() if program.inputs else [[0.0]] * rows
-    setting = "\n".join(f"        state.{place} = (real)states[k][{i}];" for i, place in enumerate(places_of(fields)))
+    setting = "\n".join(
+        f"        state.{place} = (real)states[k][{i}];"
+        for i, place in enumerate(places_of(fields))
+    )
     states = vectors.states.tolist() if program.states else [[0.0]] * rows
-    return f"""/* Runs the test vectors: `cc -std=c99 -O2 {name}.c check.c -lm -o check && ./check`. */
+    return f"""/* Test vectors: `cc -std=c99 -O2 {name}.c check.c -lm -o check && ./check`. */
 #include "{name}.h"
 
 #include <math.h>
@@ -255,7 +291,8 @@ int main(void)
             if (size > largest) largest = size;
         }}
     }}
-    printf("%d steps: largest difference %.3g, largest output %.3g, %d flagged\\n", (int)ROWS, worst, largest, flagged);
+    printf("%d steps: largest difference %.3g, largest output %.3g, %d flagged\\n",
+           (int)ROWS, worst, largest, flagged);
     return flagged || !(worst <= allowed * (largest > 1e-300 ? largest : 1));
 }}
 """

@@ -1,4 +1,7 @@
-"""The verb `export`: a folder with the code of a model, its test vectors and how to run it; whole or not at all."""
+"""The verb `export`: a folder with the code of a model, its test vectors and how to run it.
+
+The folder is written whole or not at all.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,7 @@ from orthaug.models import storage
 from orthaug.models.model import Model
 from orthaug.models.motion_model import MotionModel
 
-_LONGEST = 40  # characters of a name, which stands in front of others
+_LONGEST = 40  # characters of a name, which is put in front of others
 _TAKEN = (
     "check",
     "numpy",
@@ -46,7 +49,7 @@ _HELD = 8  # rows of each level: under a new one in every row an inertia hardly 
 
 
 def check_target(to: str) -> str:
-    """`to` where it is a target.
+    """Return `to` if it is a target.
 
     Raises:
         InputError: none of that name; the nearest is named.
@@ -60,17 +63,27 @@ def check_target(to: str) -> str:
 def check_export(to: str, folder: Path, name: str = "model", *, force: bool = False) -> None:
     """Raise InputError early where there is no such target, name or place."""
     check_target(to)
-    plain = isinstance(name, str) and re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) and len(name) <= _LONGEST
+    plain = (
+        isinstance(name, str)
+        and re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name)
+        and len(name) <= _LONGEST
+    )
     if not plain or keyword.iskeyword(name) or name in _TAKEN:
         raise InputError(
-            f"{shown(name)} cannot name the exported code; use ASCII letters, digits and underscores, at most "
-            f"{_LONGEST}, starting with a letter, and no word of a language or library."
+            f"{shown(name)} cannot name the exported code; use ASCII letters, digits and "
+            f"underscores, at most {_LONGEST}, starting with a letter, and no word of a "
+            "language or library."
         )
     check_replaceable(folder, force=force)
 
 
 def export(
-    model: Model | MotionModel, folder: str | Path, to: str, *, name: str = "model", force: bool = False
+    model: Model | MotionModel,
+    folder: str | Path,
+    to: str,
+    *,
+    name: str = "model",
+    force: bool = False,
 ) -> Program:
     """Write a model as code that needs no orthaug, and return the program that was written.
 
@@ -78,19 +91,20 @@ def export(
         model: what to write.
         folder: a new one, or one that holds an export.
         to: c, casadi, control, fmu, numpy, onnx or latex.
-        name: stands in front of the functions in C, and names the files.
+        name: is put in front of the functions in C, and names the files.
         force: replace the folder whatever it holds.
 
     Raises:
-        InputError: an unknown target, a model that has no code (a Python function, an ensemble, a spline hold), or a
-            folder that cannot be written.
+        InputError: an unknown target, a model that has no code (a Python function, an ensemble, a
+            spline hold), or a folder that cannot be written.
 
     Examples:
         >>> import tempfile
         >>> import numpy as np
         >>> import orthaug as oa
         >>> record = oa.Record.from_arrays(u=np.sin(np.arange(50.0)), y=2 * np.sin(np.arange(50.0)))
-        >>> fit = oa.estimate(record, oa.Baseline.from_terms([oa.Term("gain", "u[k]")]), learner=None)
+        >>> physics = oa.Baseline.from_terms([oa.Term("gain", "u[k]")])
+        >>> fit = oa.estimate(record, physics, learner=None)
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     _ = export(fit.model, Path(folder, "code"), to="c", name="plant")
         ...     sorted(file.name for file in Path(folder, "code").iterdir())
@@ -104,10 +118,15 @@ def export(
     program = program_of(model, name, storage.digest(model))
     vectors = _vectors_of(model, program)
     files = dict(target.files(program, vectors))
-    files |= {VECTORS: vectors.csv(program), "README.md": _readme(program, target, len(vectors.outputs))}
+    files |= {
+        VECTORS: vectors.csv(program),
+        "README.md": _readme(program, target, len(vectors.outputs)),
+    }
     with whole_folder(folder, force=force) as partial:
         for file, content in files.items():
-            (partial / file).write_bytes(content if isinstance(content, bytes) else content.encode("utf-8"))
+            (partial / file).write_bytes(
+                content if isinstance(content, bytes) else content.encode("utf-8")
+            )
     return program
 
 
@@ -118,8 +137,8 @@ def _readme(program: Program, target: Target, rows: int) -> str:
         hold = "\nInputs are held from one sample to the next.\n"
         if program.ends == 2:
             hold = (
-                "\nInputs run straight from one sample to the next, so that a step takes those of the next sample too: "
-                "a step can be made when the next inputs are known.\n"
+                "\nInputs run straight from one sample to the next, so that a step takes those "
+                "of the next sample too. It can be made when the next inputs are known.\n"
             )
     prepared = _of_prepared(program)
     return f"""# {program.name}
@@ -128,7 +147,8 @@ A step of a fitted model, {target.summary}. Written by orthaug {__version__}.
 
 Model sha256: `{program.digest}` (`checksum` in `model.json`)
 
-{prepared}Sampling time: {program.sampling_time:.9g} s. A step takes the inputs of one sample and gives its outputs.
+{prepared}Sampling time: {program.sampling_time:.9g} s.
+A step takes the inputs of one sample and gives its outputs.
 
 {_listed("Inputs, in order:", program.inputs)}
 {_listed("Outputs:", program.outputs)}
@@ -139,7 +159,8 @@ Model sha256: `{program.digest}` (`checksum` in `model.json`)
 
 ## Test vectors
 
-`{VECTORS}` has {rows} steps of a free run of the model in double precision: inputs, the state before the step, and the
+`{VECTORS}` has {rows} steps of a free run of the model in double precision.
+Each row has the inputs, the state before the step and the
 outputs. Each row can be checked by itself.
 """
 
@@ -148,8 +169,9 @@ def _of_prepared(program: Program) -> str:
     if not program.preparation:
         return ""
     return (
-        f"**The model was fitted to prepared data: {program.preparation}.** Inputs and outputs here stand for data "
-        "after these steps: what a `shift` delays comes late by as much, and of `detrend` they are deviations.\n\n"
+        f"**The model was fitted to prepared data: {program.preparation}.** Inputs and outputs "
+        "here are data after these steps. What a `shift` delays comes late by as much; after "
+        "`detrend` they are deviations.\n\n"
     )
 
 
@@ -159,14 +181,20 @@ def _listed(head: str, signals: Sequence[Signal]) -> str:
 
 
 def _vectors_of(model: Any, program: Program) -> Vectors:
-    """A free run under random levels of the inputs, in the range that the model was trained on where that is known.
+    """Return a free run under random levels of the inputs.
+
+    The levels are in the range that the model was trained on, where that is known.
 
     Of the starts it takes the one from which the outputs stay finite for longest.
     """
     rng = np.random.default_rng(_SEED)
     middle, reach = _range(model, program)
-    drawn = middle + reach * np.repeat(rng.uniform(-1, 1, (_ROWS // _HELD, program.held)), _HELD, axis=0)
-    inputs = drawn if program.ends == 1 else np.concatenate([drawn, np.roll(drawn, -1, axis=0)], axis=1)
+    drawn = middle + reach * np.repeat(
+        rng.uniform(-1, 1, (_ROWS // _HELD, program.held)), _HELD, axis=0
+    )
+    inputs = (
+        drawn if program.ends == 1 else np.concatenate([drawn, np.roll(drawn, -1, axis=0)], axis=1)
+    )
 
     def run(state: Any, rows: Any) -> Any:
         def one(state: Any, row: Any) -> Any:
@@ -185,25 +213,34 @@ def _vectors_of(model: Any, program: Program) -> Vectors:
 
 
 def _starts(model: Any, program: Program) -> Iterator[np.ndarray]:
-    """States to start from: in the middle of what the learner saw of their channels, zero, one."""
+    """Return initial states: in the middle of the learner's features, zero, one."""
     zero = np.zeros(len(program.states))
     if model.form.bound is not None:
         entries = model.form.features.entries if isinstance(model, Model) else model.form.features
-        centres = {entry.text.partition("[")[0]: c for entry, c in zip(entries, model.numbers.centre, strict=True)}
-        yield np.array([float(centres.get(signal.name.partition("[")[0], 0.0)) for signal in program.states])
+        centres = {
+            entry.text.partition("[")[0]: c
+            for entry, c in zip(entries, model.numbers.centre, strict=True)
+        }
+        yield np.array(
+            [float(centres.get(signal.name.partition("[")[0], 0.0)) for signal in program.states]
+        )
     yield zero
     yield zero + 1
 
 
 def _range(model: Any, program: Program) -> tuple[Any, Any]:
-    """Middle and half width of each input where the learner saw it by itself; 0 and 1 elsewhere."""
+    """Return middle and half width of each input in the learner's features; 0 and 1 elsewhere."""
     middle, reach = np.zeros(program.held), np.ones(program.held)
     if model.form.bound is None:
         return middle, reach
     entries = model.form.features.entries if isinstance(model, Model) else model.form.features
     names = [signal.name for signal in program.inputs[: program.held]]
-    for entry, centre, width in zip(entries, model.numbers.centre, model.numbers.halfwidth, strict=True):
+    for entry, centre, width in zip(
+        entries, model.numbers.centre, model.numbers.halfwidth, strict=True
+    ):
         name = entry.text.partition("[")[0]
-        if name in names and (entry.text == name or str(entry.lags[0] if entry.lags else "") == entry.text):
+        if name in names and (
+            entry.text == name or str(entry.lags[0] if entry.lags else "") == entry.text
+        ):
             middle[names.index(name)], reach[names.index(name)] = float(centre), float(width)
     return middle, reach

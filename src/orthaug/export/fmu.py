@@ -1,4 +1,4 @@
-"""An FMU 2.0 for co-simulation: the C export behind the functions of that standard, compiled where it is made."""
+"""An FMU 2.0 for co-simulation: the C export behind that standard, compiled here."""
 
 from __future__ import annotations
 
@@ -23,7 +23,14 @@ from orthaug.export.program import Program, Vectors
 _WRAPPER = Path(__file__).parent / "templates" / "fmi2.c"
 _SOURCES = ("model.c", "fmi2.c")
 _PLATFORMS = {"linux": ("linux64", ".so"), "darwin": ("darwin64", ".dylib")}
-_EPOCH = (2020, 1, 1, 0, 0, 0)  # of the files in the archive, so that the same model makes the same archive
+_EPOCH = (
+    2020,
+    1,
+    1,
+    0,
+    0,
+    0,
+)  # of the files in the archive, so that the same model makes the same archive
 _PATIENCE = 300  # seconds that a compiler may take
 
 
@@ -37,7 +44,10 @@ class Fmu:
         inner = replace(program, name="model")
         sources = dict(CSource().files(inner, vectors))
         del sources["check.c"]
-        sources |= {"fmi2.c": _WRAPPER.read_text(encoding="utf-8"), "variables.h": _variables(program)}
+        sources |= {
+            "fmi2.c": _WRAPPER.read_text(encoding="utf-8"),
+            "variables.h": _variables(program),
+        }
         folder, ending, library = _compiled(sources)
         archive = BytesIO()
         with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as packed:
@@ -56,14 +66,15 @@ step = {program.sampling_time!r}
 result = simulate_fmu("{program.name}.fmu", output_interval=step, stop_time=100 * step)
 ```
 
-It was compiled for {_target()[0]}; for other platforms compile its `sources/`. A communication step is the sampling
-time or a multiple of it. Inputs are held during a step; an output is that of the current instant, of the state there
-and the inputs that are set. The entries of the state are variables that can be set before the run. Where NaN or
+It was compiled for {_target()[0]}; for other platforms compile its `sources/`. A communication
+step is the sampling time or a multiple of it. Inputs are held during a step. An output is that of
+the current instant, of the state there and the inputs that are set. The entries of the state are
+variables that can be set before the run. Where NaN or
 infinity comes in, a step is discarded."""
 
 
 def _target() -> tuple[str, str]:
-    """Folder and ending of the library for this machine.
+    """Return folder and ending of the library for this machine.
 
     Raises:
         InputError: a machine that this is not made for.
@@ -71,22 +82,26 @@ def _target() -> tuple[str, str]:
     machine = platform.machine().lower() in ("x86_64", "amd64")
     if sys.platform not in _PLATFORMS or not machine:
         raise InputError(
-            "an FMU is compiled for 64-bit x86 under Linux or macOS, which this machine is not; export to c, and "
-            "compile it where it is to run."
+            "an FMU is compiled for 64-bit x86 under Linux or macOS, which this machine is "
+            "not; export to c, and compile it where it is to run."
         )
     return _PLATFORMS[sys.platform]
 
 
 def _compiled(sources: Mapping[str, str]) -> tuple[str, str, bytes]:
-    """Folder, ending and content of the shared library.
+    """Return folder, ending and content of the shared library.
 
     Raises:
         InputError: no C compiler, or one that fails.
     """
     folder, ending = _target()
-    compiler = next(filter(None, map(shutil.which, (os.environ.get("CC") or "cc", "gcc", "clang"))), None)
+    compiler = next(
+        filter(None, map(shutil.which, (os.environ.get("CC") or "cc", "gcc", "clang"))), None
+    )
     if compiler is None:
-        raise InputError("an FMU holds compiled code, and no C compiler was found (cc, gcc, clang); install one.")
+        raise InputError(
+            "an FMU holds compiled code, and no C compiler was found (cc, gcc, clang); install one."
+        )
     with tempfile.TemporaryDirectory() as place:
         for name, text in sources.items():
             (Path(place) / name).write_text(text, encoding="utf-8")
@@ -103,16 +118,23 @@ def _compiled(sources: Mapping[str, str]) -> tuple[str, str, bytes]:
             "made",
         ]
         try:
-            subprocess.run(command, cwd=place, check=True, capture_output=True, text=True, timeout=_PATIENCE)
+            subprocess.run(
+                command, cwd=place, check=True, capture_output=True, text=True, timeout=_PATIENCE
+            )
         except (OSError, subprocess.SubprocessError) as error:
             said = (getattr(error, "stderr", "") or str(error)).strip().splitlines()
-            raise InputError(f"the C compiler {compiler} failed: {said[0] if said else 'without a word'}.") from None
+            raise InputError(
+                f"the C compiler {compiler} failed: {said[0] if said else 'without a word'}."
+            ) from None
         return folder, ending, (Path(place) / "made").read_bytes()
 
 
 def _variables(program: Program) -> str:
-    """What the wrapper has to know of the model."""
-    cases = "\n".join(f"    case {i}: return &state->{place};" for i, place in enumerate(places_of(fields_of(program))))
+    """Return the data that the wrapper needs of the model."""
+    cases = "\n".join(
+        f"    case {i}: return &state->{place};"
+        for i, place in enumerate(places_of(fields_of(program)))
+    )
     return f"""/* Written by orthaug. */
 #define GUID "{_guid(program)}"
 #define SAMPLING_TIME {program.sampling_time!r}
@@ -139,16 +161,22 @@ def _guid(program: Program) -> str:
 
 
 def _description(program: Program) -> str:
-    kinds = [("input", "continuous", "", program.inputs), ("output", "continuous", "", program.outputs)]
+    kinds = [
+        ("input", "continuous", "", program.inputs),
+        ("output", "continuous", "", program.outputs),
+    ]
     kinds.append(("local", "continuous", "exact", program.states))
     variables, taken = [], set()
     for causality, variability, initial, signals in kinds:
         for signal in signals:
-            name = _unique(f"state.{signal.identifier}" if causality == "local" else signal.identifier, taken)
+            name = _unique(
+                f"state.{signal.identifier}" if causality == "local" else signal.identifier, taken
+            )
             start = ' start="0"' if causality != "output" else ""
             exact = f' initial="{initial}"' if initial else ""
             variables.append(
-                f'    <ScalarVariable name={quoteattr(name)} valueReference="{len(variables)}" causality="{causality}" '
+                f"    <ScalarVariable name={quoteattr(name)} "
+                f'valueReference="{len(variables)}" causality="{causality}" '
                 f'variability="{variability}"{exact} description={quoteattr(signal.label)}>'
                 f"<Real{start}/></ScalarVariable>"
             )

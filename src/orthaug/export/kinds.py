@@ -1,4 +1,7 @@
-"""What a target of `orthaug export --to` is, and all of them. A new one is a file with a declaration, and an entry."""
+"""Targets of `orthaug export --to`.
+
+A new one is a file with a declaration, and an entry.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,7 @@ class Target(Protocol):
     summary: str
 
     def files(self, program: Program, vectors: Vectors) -> Mapping[str, str | bytes]:
-        """Content by file name; README.md and the test vectors are added to them.
+        """Return content by file name; README.md and the test vectors are added to them.
 
         Raises:
             InputError: a model that this target cannot hold.
@@ -31,7 +34,7 @@ class Target(Protocol):
         ...
 
     def usage(self, program: Program) -> str:
-        """How to run what was made, as Markdown."""
+        """Return instructions in Markdown to run the exported code."""
         ...
 
 

@@ -12,7 +12,12 @@ from orthaug.data.writing import symbol, tex_text
 from orthaug.export.nodes import Apply, Entry, Name, Node, Number
 from orthaug.export.program import Block, Program, Signal, Vectors
 
-_FUNCTIONS = {"atan": r"\arctan", "log": r"\ln", "sign": r"\operatorname{sgn}", "atan2": r"\operatorname{atan2}"}
+_FUNCTIONS = {
+    "atan": r"\arctan",
+    "log": r"\ln",
+    "sign": r"\operatorname{sgn}",
+    "atan2": r"\operatorname{atan2}",
+}
 _UPRIGHT = {"expm1", "log1p"}
 _INFIX = {"add": (1, "+"), "sub": (1, "-"), "mul": (2, r"\,")}
 
@@ -28,8 +33,9 @@ class LatexText:
 
     def usage(self, program: Program) -> str:
         return (
-            f"`pdflatex {program.name}.tex` makes a page. Each `align` can be copied into a text of your own; it needs "
-            "the package amsmath. Numbers have six digits: to compute with them, export to another target."
+            f"`pdflatex {program.name}.tex` makes a page. Each `align` can be copied into a "
+            "text of your own; it needs the package amsmath. Numbers have six digits: to "
+            "compute with them, export to another target."
         )
 
 
@@ -45,14 +51,20 @@ def _document(program: Program) -> str:
     moves = program.scheme is not None
     if program.rate is not None and program.scheme is not None:
         discrete = program.scheme.kind == "discrete"
-        left = [rf"{_name(signal)}_{{k+1}}" if discrete else rf"\dot{{{_name(signal)}}}" for signal in program.states]
+        left = [
+            rf"{_name(signal)}_{{k+1}}" if discrete else rf"\dot{{{_name(signal)}}}"
+            for signal in program.states
+        ]
         lines += _equations(program.rate, left, program)
     lines += _equations(
-        program.output, [_name(signal) if moves else f"{_name(signal)}_{{k}}" for signal in program.outputs], program
+        program.output,
+        [_name(signal) if moves else f"{_name(signal)}_{{k}}" for signal in program.outputs],
+        program,
     )
     lines += [r"\begin{center}", r"\begin{tabular}{lll}"]
     lines += [
-        rf"${_constant(c.name, program)}$ & ${number(c.value)}$ & {tex_text(c.meaning)} \\" for c in program.constants
+        rf"${_constant(c.name, program)}$ & ${number(c.value)}$ & {tex_text(c.meaning)} \\"
+        for c in program.constants
     ]
     lines += [r"\end{tabular}", r"\end{center}", r"\end{document}", ""]
     return "\n".join([*head, *_letters("".join(lines)), *lines])
@@ -64,8 +76,13 @@ def _name(signal: Signal) -> str:
 
 def _equations(block: Block, left: list[str], program: Program) -> list[str]:
     suffix = "r" if block is program.rate else "y"
-    pairs = [(_constant(name, program), _latex(node, program, suffix)) for name, node in block.locals]
-    pairs += [(text, _latex(node, program, suffix)) for text, node in zip(left, block.results, strict=True)]
+    pairs = [
+        (_constant(name, program), _latex(node, program, suffix)) for name, node in block.locals
+    ]
+    pairs += [
+        (text, _latex(node, program, suffix))
+        for text, node in zip(left, block.results, strict=True)
+    ]
     if block.network is not None:
         pairs += [
             (rf"z^{{{suffix}}}_{{{i}}}", _latex(node, program, suffix))
@@ -92,7 +109,7 @@ def _matrix(values: np.ndarray) -> str:
 
 
 def number(value: float) -> str:
-    """Six digits, with a power of ten where that is shorter."""
+    """Return six digits, with a power of ten where that is shorter."""
     mantissa, _, power = f"{value:.6g}".partition("e")
     return rf"{mantissa} \cdot 10^{{{int(power)}}}" if power else mantissa
 
@@ -102,7 +119,7 @@ def _constant(name: str, program: Program) -> str:
 
 
 def _letters(text: str) -> list[str]:
-    """What Greek letters and the micro sign are, so that pdflatex reads them."""
+    """Return declarations of Greek letters and the micro sign for pdflatex."""
     lines = []
     for letter in sorted(set(text)):
         kind, _, name = unicodedata.name(letter, "").partition(" LETTER ")
@@ -110,7 +127,9 @@ def _letters(text: str) -> list[str]:
             kind, name = "GREEK SMALL", "mu"
         if kind in ("GREEK SMALL", "GREEK CAPITAL") and " " not in name:
             written = name.lower() if kind == "GREEK SMALL" else name.capitalize()
-            lines.append(rf"\DeclareUnicodeCharacter{{{ord(letter):04X}}}{{\ensuremath{{\{written}}}}}")
+            lines.append(
+                rf"\DeclareUnicodeCharacter{{{ord(letter):04X}}}{{\ensuremath{{\{written}}}}}"
+            )
     return lines
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,25 +13,99 @@ from orthaug._base.errors import InputError
 from orthaug.data.expressions import Expression, Lag
 from orthaug.data.preparation import MENDING
 from orthaug.data.record import Channel
-from orthaug.export.holding import Held
 from orthaug.export.nodes import Apply, Entry, Name, Node, Number, apply, identifier, node_of, total
 from orthaug.export.program import Block, Constant, Layer, Network, Program, Scheme, Signal
+from orthaug.models.beyond import FADED
 from orthaug.models.dynamics import Numbers
+from orthaug.models.lagged import Lagged
 from orthaug.models.learners import ACTIVATIONS, Bound
 from orthaug.models.model import Model
+from orthaug.models.motion_field import MotionField
 from orthaug.models.motion_model import MotionModel
 
+
+@dataclass(frozen=True, eq=False)
+class FadeNodes:
+    """Nodes of the intermediate results of a limited correction.
+
+    They are the features on the range of training, the point x̄ there, and the factor of fading.
+    """
+
+    locals: tuple[tuple[str, Node], ...]
+    features: tuple[Node, ...]
+    """z̄ (nz,)."""
+    inside: tuple[Node, ...]
+    """x̄ (nx,), in the order of the points that were given."""
+    share: Node | None
+    """None where the correction is held."""
+
+    @classmethod
+    def of(
+        cls,
+        form: Lagged | MotionField,
+        numbers: Numbers,
+        features: Sequence[Node],
+        points: Sequence[Node],
+    ) -> FadeNodes:
+        """Return the intermediate results for features z (nz,) of a point x (nx,)."""
+        low, high = np.asarray(numbers.limits).tolist()
+        found: dict[str, Node] = {}
+
+        def name(key: str, node: Node) -> Node:
+            found[key] = node
+            return Name(key)
+
+        seen = [name(f"h_seen_{i}", node) for i, node in enumerate(features)]
+        inside = [
+            name(f"h_inside_{i}", apply("min", apply("max", node, Number(low[i])), Number(high[i])))
+            for i, node in enumerate(seen)
+        ]
+        over = [apply("sub", there, node) for there, node in zip(inside, seen, strict=True)]
+        moved = []
+        for j, (point, row) in enumerate(
+            zip(points, np.asarray(numbers.pull).tolist(), strict=True)
+        ):
+            steps = [apply("mul", Number(by), over[i]) for i, by in enumerate(row) if by]
+            moved.append(name(f"h_point_{j}", total([point, *steps])) if steps else point)
+        share = None
+        if form.beyond == "fade":
+            halves = [(b - a) / 2 or 1.0 for a, b in zip(low, high, strict=True)]
+            apart = [
+                apply("div", step, Number(half * FADED))
+                for step, half in zip(over, halves, strict=True)
+            ]
+            squares = total([apply("mul", part, part) for part in apart])
+            share = name("h_share", apply("exp", apply("neg", squares)))
+        return cls(tuple(found.items()), tuple(inside), tuple(moved), share)
+
+    @property
+    def symbols(self) -> dict[str, str]:
+        """Names of the intermediate results for a reader, numbered from 1 like the features."""
+        return {key: _read(key) for key, _ in self.locals}
+
+    def faded(self, correction: Node) -> Node:
+        """Return a correction multiplied by the factor of fading."""
+        return correction if self.share is None else apply("mul", self.share, correction)
+
+
+def _read(key: str) -> str:
+    """Return `h_inside_0` as `inside_1`."""
+    _, kind, *number = key.split("_")
+    return "_".join([kind, *(str(int(i) + 1) for i in number)])
+
+
 _OWN_FUNCTION = (
-    "is a Python function, which no target can write; give it as expressions, or call `model.step` where Python with "
-    "JAX runs"
+    "is a Python function, which no target can write; give it as expressions, or call "
+    "`model.step` where Python with JAX runs"
 )
 
 
 def program_of(model: Model | MotionModel, name: str = "model", digest: str = "") -> Program:
-    """The step of a model in the intermediate form.
+    """Return the step of a model in the intermediate form.
 
     Raises:
-        InputError: physics or a learner that is a Python function, an ensemble, a hold that needs the whole record.
+        InputError: physics or a learner that is a Python function, an ensemble, a hold that needs
+            the whole record.
     """
     check_type(model, Model | MotionModel, "model", "a fitted model")
     numbers = model.numbers
@@ -49,7 +123,7 @@ class _Constants:
         self.symbols: dict[str, str] = {}
 
     def node(self, kind: str, name: str, value: float, meaning: str) -> Name:
-        """The constant's node, `p_` for parameters and `c_` for others before its name.
+        """Return the constant's node, `p_` for parameters and `c_` for others before its name.
 
         Another value under the same name gets a name of its own.
         """
@@ -62,8 +136,11 @@ class _Constants:
         return Name(written)
 
     def of(self, expression: Expression) -> dict[str, Node]:
-        """The constants of an expression of lagged channels."""
-        return {name: self.node("c", name, value, f"constant {name}") for name, value in expression.constants}
+        """Return the constants of an expression of lagged channels."""
+        return {
+            name: self.node("c", name, value, f"constant {name}")
+            for name, value in expression.constants
+        }
 
 
 def _lagged(model: Model, name: str, digest: str) -> Program:
@@ -72,8 +149,9 @@ def _lagged(model: Model, name: str, digest: str) -> Program:
         raise InputError(f"the physics {_OWN_FUNCTION}.")
     if numbers.tilt is not None:
         raise InputError(
-            "the model is an ensemble, whose learner is the median of several; fit with `restarts` but without an "
-            "ensemble to export it, or call `model.step` where Python with JAX runs."
+            "the model is an ensemble, whose learner is the median of several; fit with "
+            "`restarts` but without an ensemble to export it, or call `model.step` where "
+            "Python with JAX runs."
         )
     channels = {channel.name: channel for channel in (*model.outputs, *model.inputs)}
     lags: dict[Lag, Node] = {lag: Entry("x", i) for i, lag in enumerate(memory.lags)}
@@ -85,7 +163,11 @@ def _lagged(model: Model, name: str, digest: str) -> Program:
 
     limited = numbers.limits is not None
     features = [written(entry) for entry in form.features.entries]
-    held = Held.of(form, numbers, features, [lags[lag] for lag in form.layout]) if limited else None
+    held = (
+        FadeNodes.of(form, numbers, features, [lags[lag] for lag in form.layout])
+        if limited
+        else None
+    )
     constants.symbols |= {} if held is None else held.symbols
     sums, corrections = _weighted_terms(model, constants, written, held)
     network = None
@@ -98,7 +180,8 @@ def _lagged(model: Model, name: str, digest: str) -> Program:
     block = Block("output", () if held is None else held.locals, network, tuple(map(total, sums)))
     lines = tuple((_signal(channels[channel]), depth) for channel, depth in memory.depths)
     states = tuple(
-        Signal(str(lag), f"{identifier(lag.channel)}_{lag.lag}", channels[lag.channel].unit) for lag in memory.lags
+        Signal(str(lag), f"{identifier(lag.channel)}_{lag.lag}", channels[lag.channel].unit)
+        for lag in memory.lags
     )
     return Program(
         name=name,
@@ -116,9 +199,12 @@ def _lagged(model: Model, name: str, digest: str) -> Program:
 
 
 def _weighted_terms(
-    model: Model, constants: _Constants, written: Callable[..., Node], held: Held | None
+    model: Model, constants: _Constants, written: Callable[..., Node], held: FadeNodes | None
 ) -> tuple[list[list[Node]], list[list[Node]]]:
-    """Of each output the terms of the physics, and those that the learner's correction takes back where it is held."""
+    """Return the terms of the physics of each output, and those of the learner's correction.
+
+    The latter are what the correction takes back where it is held.
+    """
     form = model.form
     values = np.asarray(model.theta if held is not None else model.theta - model.theta_aux).tolist()
     effective = dict(zip(form.baseline.names, values, strict=True))
@@ -135,30 +221,41 @@ def _weighted_terms(
         row = form.outputs.index(term.output) if term.output is not None else 0
         sums[row].append(apply("mul", factor, written(expression)))
         if held is not None and not term.fixed and moved[term.parameter]:
-            aux = constants.node("p", f"{term.parameter}_aux", moved[term.parameter], f"{named}, theta_aux")
+            aux = constants.node(
+                "p", f"{term.parameter}_aux", moved[term.parameter], f"{named}, theta_aux"
+            )
             inside = dict(zip(form.layout, held.inside, strict=True))
             corrections[row].append(apply("neg", apply("mul", aux, written(expression, inside))))
     return sums, corrections
 
 
 def _motion_names(model: MotionModel, constants: _Constants) -> dict[str, Node]:
-    """What the names of constants, parameters, states and inputs stand for."""
+    """Return the meaning of the names of constants, parameters, states and inputs."""
     form, numbers, motion = model.form, model.numbers, model.form.motion
-    values = np.asarray(motion.coordinates.physical(np.asarray(numbers.theta) - np.asarray(numbers.theta_aux)))
+    values = np.asarray(
+        motion.coordinates.physical(np.asarray(numbers.theta) - np.asarray(numbers.theta_aux))
+    )
     names: dict[str, Node] = {
         key: constants.node("c", key, value, f"constant {key}") for key, value in motion.constants
     }
     for parameter, value in zip(motion.parameters, values.tolist(), strict=True):
         unit = f" [{parameter.unit}]" if parameter.unit else ""
         beside = "" if form.bound is None else ", beside the learner"
-        names[parameter.name] = constants.node("p", parameter.name, value, f"{parameter.name}{unit}{beside}")
+        names[parameter.name] = constants.node(
+            "p", parameter.name, value, f"{parameter.name}{unit}{beside}"
+        )
     names |= {state.name: Entry("x", i) for i, state in enumerate(motion.states)}
     names |= {channel: Entry("u", i) for i, channel in enumerate(motion.inputs)}
     return names
 
 
-def _with_correction(correction: Node, physics: Node, held: Held | None, rows: Sequence[Node]) -> Node:
-    """A learned equation with what is added to it; `rows` are its physics at p̂, and where it is held at c and at p̂."""
+def _with_correction(
+    correction: Node, physics: Node, held: FadeNodes | None, rows: Sequence[Node]
+) -> Node:
+    """Return a learned equation with what is added to it.
+
+    `rows` are its physics at p̂, and where it is held at c and at p̂.
+    """
     if rows:
         physics, own, split = rows
         correction = apply("add", correction, apply("sub", own, split))
@@ -166,11 +263,13 @@ def _with_correction(correction: Node, physics: Node, held: Held | None, rows: S
 
 
 def _split_parameters(model: MotionModel, constants: _Constants) -> dict[str, Node]:
-    """The estimated parameters, with which the physics goes on beyond the data."""
+    """Return the estimated parameters, with which the physics continues beyond the data."""
     motion = model.form.motion
     values = np.asarray(motion.coordinates.physical(np.asarray(model.numbers.theta))).tolist()
     return {
-        parameter.name: constants.node("p", f"{parameter.name}_split", value, f"{parameter.name}, as estimated")
+        parameter.name: constants.node(
+            "p", f"{parameter.name}_split", value, f"{parameter.name}, as estimated"
+        )
         for parameter, value in zip(motion.parameters, values, strict=True)
     }
 
@@ -185,7 +284,7 @@ def _motion(model: MotionModel, name: str, digest: str) -> Program:
     defined: dict[str, Node] = {}
 
     def define(names: dict[str, Node], suffix: str = "") -> dict[str, Node]:
-        """The names with those of the definitions, in terms of the others."""
+        """Return the names with those of the definitions, in terms of the others."""
         for key, expression in motion.definitions:
             local = f"v_{identifier(key)}{suffix}"
             defined[local] = node_of(expression, names, {}, numeric)
@@ -204,26 +303,42 @@ def _motion(model: MotionModel, name: str, digest: str) -> Program:
     results = {kind: list(map(written, expressions)) for kind, expressions in equations.items()}
     held, changed = None, list[dict[str, Node]]()
     if numbers.limits is not None:
-        points: list[Node] = [*(Entry("x", i) for i in range(form.states)), *(names[key] for key in motion.inputs)]
-        held = Held.of(form, numbers, features, points)
+        points: list[Node] = [
+            *(Entry("x", i) for i in range(form.states)),
+            *(names[key] for key in motion.inputs),
+        ]
+        held = FadeNodes.of(form, numbers, features, points)
         defined |= dict(held.locals)
         constants.symbols |= held.symbols
-        if np.any(numbers.theta_aux):  # the physics itself extrapolates with the parameters that were split off
+        if np.any(
+            numbers.theta_aux
+        ):  # the physics itself extrapolates with the parameters that were split off
             split = _split_parameters(model, constants)
             inside = dict(zip((*motion.names_of_states, *motion.inputs), held.inside, strict=True))
             bare = {key: node for key, node in names.items() if key not in dict(motion.definitions)}
-            changed = [define(bare | split, "_s"), define(bare | inside, "_h"), define(bare | inside | split, "_hs")]
+            changed = [
+                define(bare | split, "_s"),
+                define(bare | inside, "_h"),
+                define(bare | inside | split, "_hs"),
+            ]
     blocks = {}
-    for kind, learned, first in (("output", learned_outputs, len(learned_states)), ("rate", learned_states, 0)):
+    for kind, learned, first in (
+        ("output", learned_outputs, len(learned_states)),
+        ("rate", learned_states, 0),
+    ):
         network = None
         if form.bound is not None and learned:
             seen = features if held is None else held.features
             network = _network(form.bound, numbers, seen, first + np.arange(len(learned)))
             for i, place in enumerate(learned):
                 rows = [written(equations[kind][place], there) for there in changed]
-                results[kind][place] = _with_correction(Entry("g", i), results[kind][place], held, rows)
+                results[kind][place] = _with_correction(
+                    Entry("g", i), results[kind][place], held, rows
+                )
         seen = list(network.features) if network is not None else []
-        blocks[kind] = Block(kind, _needed(defined, [*results[kind], *seen]), network, tuple(results[kind]))
+        blocks[kind] = Block(
+            kind, _needed(defined, [*results[kind], *seen]), network, tuple(results[kind])
+        )
     return _moving_program(model, blocks, constants, name, digest)
 
 
@@ -234,7 +349,9 @@ def _moving_program(
     units = {channel.name: channel.unit for channel in model.inputs}
     return Program(
         name=name,
-        states=tuple(Signal(state.name, identifier(state.name), state.unit) for state in motion.states),
+        states=tuple(
+            Signal(state.name, identifier(state.name), state.unit) for state in motion.states
+        ),
         inputs=tuple(_step_input(key, units) for key in step_inputs),
         outputs=tuple(map(_signal, model.outputs)),
         sampling_time=model.sampling_time,
@@ -261,7 +378,7 @@ def _step_input(name: str, units: Mapping[str, str]) -> Signal:
 
 
 def _needed(defined: Mapping[str, Node], roots: Sequence[Node]) -> tuple[tuple[str, Node], ...]:
-    """The definitions that some nodes reach, in order."""
+    """Return the definitions that some nodes reach, in order."""
     reached: set[str] = set()
 
     def visit(node: Node) -> None:
@@ -278,13 +395,14 @@ def _needed(defined: Mapping[str, Node], roots: Sequence[Node]) -> tuple[tuple[s
 
 
 def _network(bound: Bound, numbers: Numbers, features: Sequence[Node], rows: Vector) -> Network:
-    """The learner with its scaling; `rows` are those of its values that are wanted."""
+    """Return the learner with its scaling; `rows` are the indices of its wanted values."""
     declared = getattr(bound.learner, "layers", None)
     if declared is None:
         raise InputError(
-            f"the learner {type(bound.learner).__name__} is a function that no target can write; fit with an MLP or "
-            "Terms, or give its class a method `layers(tree)` that returns weight, bias and activation of each layer. "
-            "`model.step` runs it where Python with JAX does."
+            f"the learner {type(bound.learner).__name__} is a function that no target can "
+            "write; fit with an MLP or Terms, or give its class a method `layers(tree)` that "
+            "returns weight, bias and activation of each layer. `model.step` runs it where "
+            "Python with JAX does."
         )
     centre, halfwidth = np.asarray(numbers.centre), np.asarray(numbers.halfwidth)
     scaled: list[Node] = []
@@ -294,13 +412,22 @@ def _network(bound: Bound, numbers: Numbers, features: Sequence[Node], rows: Vec
     layers = []
     for weight, bias, activation in declared(bound.tree(bound.leaves(np.asarray(numbers.weights)))):
         if activation not in ACTIVATIONS:
-            raise InputError(f"the learner has the activation {activation!r}; known are {', '.join(ACTIVATIONS)}.")
+            raise InputError(
+                f"the learner has the activation {activation!r}; known are "
+                f"{', '.join(ACTIVATIONS)}."
+            )
         layers.append(
-            Layer(np.asarray(weight, dtype=float), None if bias is None else np.asarray(bias, dtype=float), activation)
+            Layer(
+                np.asarray(weight, dtype=float),
+                None if bias is None else np.asarray(bias, dtype=float),
+                activation,
+            )
         )
     last, gain = layers[-1], np.asarray(numbers.gain, dtype=float)[rows]
     layers[-1] = Layer(
-        gain[:, None] * last.weight[rows], None if last.bias is None else gain * last.bias[rows], last.activation
+        gain[:, None] * last.weight[rows],
+        None if last.bias is None else gain * last.bias[rows],
+        last.activation,
     )
     return Network(tuple(scaled), tuple(layers))
 

@@ -1,7 +1,9 @@
-"""Scalar expressions in the intermediate form: numbers, names, entries of vectors, functions of them, and activations.
+"""Scalar expressions in the intermediate form.
 
-Targets write them, those in languages that write sums and products as C and Python do by a `Language`; nothing of
-Python's syntax tree, of NumPy or of JAX is left in them.
+They are numbers, names, entries of vectors, functions of them, and activations.
+
+Targets write them, those in languages that write sums and products as C and Python do by a
+`Language`; nothing of Python's syntax tree, of NumPy or of JAX is left in them.
 """
 
 from __future__ import annotations
@@ -27,12 +29,12 @@ ARITHMETIC: dict[str, Callable[..., float]] = {
     "power": lambda a, b: a**b,
     "whole_power": lambda a, b: a**b,
 }
-"""Beside these a node may hold every function of expressions."""
+"""A node may also hold every function of expressions."""
 
 
 @dataclass(frozen=True)
 class Number:
-    """A number as it stands."""
+    """A number."""
 
     value: float
 
@@ -54,7 +56,9 @@ class Entry:
 
 @dataclass(frozen=True)
 class Apply:
-    """A function of nodes: of `ARITHMETIC` or of `FUNCTIONS` of expressions; `min` and `max` of two.
+    """A function of nodes: of `ARITHMETIC` or of `FUNCTIONS` of expressions.
+
+    `min` and `max` of two.
 
     The second argument of `whole_power` is a whole `Number`.
     """
@@ -67,7 +71,10 @@ Node = Union[Number, Name, Entry, Apply]  # noqa: UP007  (refers to itself)
 
 
 def apply(function: str, *arguments: Node) -> Node:
-    """A function of nodes; arithmetic on numbers is done here, by the rules of floating point."""
+    """Return a function of nodes.
+
+    Arithmetic on numbers is done here, by the rules of floating point.
+    """
     numbers = [argument.value for argument in arguments if isinstance(argument, Number)]
     if function in ARITHMETIC and len(numbers) == len(arguments):
         with np.errstate(all="ignore"):
@@ -76,7 +83,7 @@ def apply(function: str, *arguments: Node) -> Node:
 
 
 def total(summands: list[Node]) -> Node:
-    """Their sum, from the left; 0 of none."""
+    """Return the sum of nodes, from the left; 0 of none."""
     if not summands:
         return Number(0.0)
     value = summands[0]
@@ -91,17 +98,22 @@ def node_of(
     lags: Mapping[Lag, Node],
     numbers: Mapping[str, float],
 ) -> Node:
-    """An expression as a node.
+    """Return an expression as a node.
 
     Args:
         expression: from the parser.
-        names, lags: what its names and its channels at a lag stand for.
-        numbers: names of constants, whose values tell whether a power is a whole one.
+        names, lags: nodes of its names and of its channels at a lag.
+        numbers: names of constants, whose values show whether a power is a whole one.
     """
     return _node(expression.tree, names, lags, numbers)
 
 
-def _node(tree: ast.expr, names: Mapping[str, Node], lags: Mapping[Lag, Node], numbers: Mapping[str, float]) -> Node:
+def _node(
+    tree: ast.expr,
+    names: Mapping[str, Node],
+    lags: Mapping[Lag, Node],
+    numbers: Mapping[str, float],
+) -> Node:
     if isinstance(tree, ast.Constant):
         return Number(float(tree.value))  # type: ignore[arg-type]  (checked by the parser)
     if isinstance(tree, ast.Name):
@@ -130,7 +142,7 @@ def _node(tree: ast.expr, names: Mapping[str, Node], lags: Mapping[Lag, Node], n
 
 
 def _constant(tree: ast.expr, numbers: Mapping[str, float]) -> float | None:
-    """The number that an exponent is, where it is one."""
+    """Return the number that an exponent is, None where it is none."""
     if isinstance(tree, ast.Constant):
         return float(tree.value)  # type: ignore[arg-type]
     if isinstance(tree, ast.Name):
@@ -142,7 +154,7 @@ def _constant(tree: ast.expr, numbers: Mapping[str, float]) -> float | None:
 
 
 def functions_in(node: Node) -> set[str]:
-    """The functions that a node is made of; a whole power of 2 counts as `square`."""
+    """Return the functions that a node is made of; a whole power of 2 counts as `square`."""
     if not isinstance(node, Apply):
         return set()
     square = node.function == "whole_power" and node.arguments[1] == Number(2.0)
@@ -150,16 +162,18 @@ def functions_in(node: Node) -> set[str]:
 
 
 def names_in(node: Node) -> set[str]:
-    """The names that a node reads."""
+    """Return the names that a node reads."""
     if isinstance(node, Name):
         return {node.name}
     return set[str]().union(*map(names_in, node.arguments)) if isinstance(node, Apply) else set()
 
 
 def identifier(name: str) -> str:
-    """A name in ASCII: other letters by their code point, as `u03b8` for θ."""
+    """Return a name in ASCII: other letters by their code point, as `u03b8` for θ."""
     plain = unicodedata.normalize("NFKC", name)
-    return "".join(c if c.isascii() and (c.isalnum() or c == "_") else f"u{ord(c):04x}" for c in plain)
+    return "".join(
+        c if c.isascii() and (c.isalnum() or c == "_") else f"u{ord(c):04x}" for c in plain
+    )
 
 
 def _of(function: str, *arguments: Node) -> Node:
@@ -182,11 +196,14 @@ ACTIVATIONS: dict[str, Node] = {
     "sigmoid": _SIGMOID,
     "silu": _of("mul", _A, _SIGMOID),
     "elu": _of("add", _of("max", _A, _NULL), _of("expm1", _of("min", _A, _NULL))),
-    "softplus": _of("add", _of("max", _A, _NULL), _of("log1p", _of("exp", _of("neg", _of("abs", _A))))),
+    "softplus": _of(
+        "add", _of("max", _A, _NULL), _of("log1p", _of("exp", _of("neg", _of("abs", _A))))
+    ),
     "identity": _A,
 }
-"""The activations of networks as nodes of `a`, so that no target needs a table of them; the names are those of
-`models.learners`."""
+"""The activations of networks as nodes of `a`, so that no target needs a table of them. Names are
+those of `models.learners`.
+"""
 
 
 _INFIX = {"add": (1, "+"), "sub": (1, "-"), "mul": (2, "*"), "div": (2, "/")}
@@ -195,7 +212,7 @@ _ATOM = 9
 
 @dataclass(frozen=True)
 class Language:
-    """How a language writes what is no sum or product.
+    """Syntax of a language beyond sums and products.
 
     Args:
         functions: the function's name by ours.
@@ -212,11 +229,11 @@ class Language:
     name: Callable[[str], str] = lambda name: name
 
     def write(self, node: Node) -> str:
-        """An expression."""
+        """Return an expression."""
         return self._level(node)[1]
 
     def _level(self, node: Node) -> tuple[int, str]:
-        """How strongly the text binds, and the text."""
+        """Return the binding strength of the text, and the text."""
         if isinstance(node, Number):
             return (0 if node.value < 0 else _ATOM), self.number(node.value)
         if isinstance(node, Name):
@@ -244,12 +261,12 @@ class Language:
 
 
 def decimal(value: float) -> str:
-    """A number that reads back exactly, with a point or an exponent."""
+    """Return a number that reads back exactly, with a point or an exponent."""
     return repr(float(value))
 
 
 def wrapped(items: list[str], indent: str, width: int = 110) -> str:
-    """Items with commas, in lines."""
+    """Return items with commas, in lines."""
     lines, line = [], ""
     for item in items:
         piece = f"{item}, "

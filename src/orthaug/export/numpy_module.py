@@ -1,4 +1,4 @@
-"""A Python module that needs NumPy alone, and the same with a nonlinear system of python-control."""
+"""A Python module that needs only NumPy, and one with a nonlinear system of python-control."""
 
 from __future__ import annotations
 
@@ -8,7 +8,21 @@ from dataclasses import dataclass
 from orthaug.export.program import Program, Vectors
 from orthaug.export.python_code import Dialect, arithmetic, declarations, python_language
 
-_SAME = ("sin", "cos", "tan", "exp", "log", "sqrt", "abs", "sign", "floor", "tanh", "expm1", "log1p", "power")
+_SAME = (
+    "sin",
+    "cos",
+    "tan",
+    "exp",
+    "log",
+    "sqrt",
+    "abs",
+    "sign",
+    "floor",
+    "tanh",
+    "expm1",
+    "log1p",
+    "power",
+)
 _OTHER = {"atan": "np.arctan", "atan2": "np.arctan2", "min": "np.minimum", "max": "np.maximum"}
 NUMPY = Dialect(
     python_language({name: f"np.{name}" for name in _SAME} | _OTHER),
@@ -34,7 +48,7 @@ import numpy as np
 import {program.name} as model
 
 state = model.start()                             # zeros, in the order of model.STATES
-state, outputs = model.step(state, np.zeros({len(program.inputs)}))  # inputs in the order of model.INPUTS
+state, outputs = model.step(state, np.zeros({len(program.inputs)}))  # inputs as model.INPUTS
 outputs = model.run(state, np.zeros((100, {len(program.inputs)})))   # a free run
 ```
 
@@ -42,10 +56,10 @@ outputs = model.run(state, np.zeros((100, {len(program.inputs)})))   # a free ru
 
 
 def module(program: Program) -> str:
-    """The text of the module."""
+    """Return the text of the module."""
     return "\n".join(
         [
-            f'"""{program.name}: one step of a fitted model. Written by orthaug; needs NumPy alone."""',
+            f'"""{program.name}: one step of a fitted model. Written by orthaug."""',
             "",
             "import numpy as np",
             "",
@@ -89,7 +103,8 @@ class ControlModule:
 
     def files(self, program: Program, vectors: Vectors) -> Mapping[str, str]:
         labels = {
-            kind: [signal.identifier for signal in getattr(program, kind)] for kind in ("inputs", "outputs", "states")
+            kind: [signal.identifier for signal in getattr(program, kind)]
+            for kind in ("inputs", "outputs", "states")
         }
         text = _SYSTEM.replace("NAME", program.name).replace("LABELS", repr(labels))
         return {f"{program.name}.py": module(program) + text}
@@ -105,7 +120,8 @@ time = np.arange(100) * model.SAMPLING_TIME
 response = control.input_output_response(plant, time, np.zeros(({len(program.inputs)}, 100)))
 ```
 
-It needs `control` (python-control) and NumPy. The system runs in discrete time with the model's sampling time; its
+It needs `control` (python-control) and NumPy. The system runs in discrete time with the model's
+sampling time; its
 states are named `y_1` for `y[k-1]`. `step` and `run` work without python-control."""
 
 

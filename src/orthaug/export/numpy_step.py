@@ -20,7 +20,20 @@ Values = dict[str, Any]
 """`x`, `u`, `g` and intermediate results by name."""
 Evaluation = Callable[[Values], Any]
 
-_SAME = ("sin", "cos", "tan", "exp", "log", "sqrt", "abs", "sign", "floor", "tanh", "expm1", "log1p")
+_SAME = (
+    "sin",
+    "cos",
+    "tan",
+    "exp",
+    "log",
+    "sqrt",
+    "abs",
+    "sign",
+    "floor",
+    "tanh",
+    "expm1",
+    "log1p",
+)
 FUNCTIONS: dict[str, Any] = {
     "neg": np.negative,
     "add": lambda a, b: a + b,
@@ -37,22 +50,29 @@ FUNCTIONS: dict[str, Any] = {
 
 
 class NumpyStep:
-    """`state, outputs = step(state, inputs)` on NumPy vectors, as `model.step`; make one with `numpy_step`."""
+    """`state, outputs = step(state, inputs)` on NumPy vectors, as `model.step`.
+
+    Make one with `numpy_step`.
+    """
 
     def __init__(self, program: Program) -> None:
         self.state_names = tuple(signal.name for signal in program.states)
         self.step_inputs = tuple(signal.name for signal in program.inputs)
         self._sizes = len(program.states), len(program.inputs)
-        self._constants = {constant.name: np.float64(constant.value) for constant in program.constants}
+        self._constants = {
+            constant.name: np.float64(constant.value) for constant in program.constants
+        }
         self._output = self._block(program.output)
         self._following = np.array(program.following, dtype=int)
         self._advance = None
         if program.rate is not None and program.scheme is not None:
-            self._advance = _advancing(self._block(program.rate), program.scheme, program.held, program.ends)
+            self._advance = _advancing(
+                self._block(program.rate), program.scheme, program.held, program.ends
+            )
         self._held = program.held
 
     def __call__(self, state: Any, inputs: Any) -> tuple[Vector, Vector]:
-        """The next state (n,) and the outputs (ny,) of one sample.
+        """Return the next state (n,) and the outputs (ny,) of one sample.
 
         Raises:
             InputError: vectors of another length.
@@ -60,8 +80,8 @@ class NumpyStep:
         x, u = np.asarray(state, dtype=float), np.asarray(inputs, dtype=float)
         if x.shape != self._sizes[:1] or u.shape != self._sizes[1:]:
             raise InputError(
-                f"a step takes a state of {self._sizes[0]} and inputs of {self._sizes[1]} numbers; got the shapes "
-                f"{x.shape} and {u.shape}."
+                f"a step takes a state of {self._sizes[0]} and inputs of {self._sizes[1]} "
+                f"numbers; got the shapes {x.shape} and {u.shape}."
             )
         with np.errstate(all="ignore"):
             y = self._output(x, u[: self._held])
@@ -71,11 +91,17 @@ class NumpyStep:
 
     def _block(self, block: Block) -> Callable[[Vector, Vector], Vector]:
         intermediate = [(name, self._evaluation(node)) for name, node in block.locals]
-        features = [] if block.network is None else list(map(self._evaluation, block.network.features))
+        features = (
+            [] if block.network is None else list(map(self._evaluation, block.network.features))
+        )
         layers = []
         for layer in block.layers:
             bias = np.zeros(len(layer.weight)) if layer.bias is None else layer.bias
-            act = None if layer.activation == "identity" else self._evaluation(ACTIVATIONS[layer.activation])
+            act = (
+                None
+                if layer.activation == "identity"
+                else self._evaluation(ACTIVATIONS[layer.activation])
+            )
             layers.append((layer.weight, bias, act))
         results = [self._evaluation(node) for node in block.results]
 
@@ -107,7 +133,10 @@ class NumpyStep:
             vector, index = node.vector, node.index
             return lambda values: values[vector][index]
         assert isinstance(node, Apply)
-        function, arguments = FUNCTIONS[node.function], [self._evaluation(argument) for argument in node.arguments]
+        function, arguments = (
+            FUNCTIONS[node.function],
+            [self._evaluation(argument) for argument in node.arguments],
+        )
         if len(arguments) == 1:
             (only,) = arguments
             return lambda values: function(only(values))
@@ -116,13 +145,15 @@ class NumpyStep:
 
 
 def numpy_step(model: Model | MotionModel) -> NumpyStep:
-    """The step of a fitted model in NumPy alone, for loops in Python and where JAX is too slow to call.
+    """Return the step of a fitted model in NumPy, for loops in Python.
+
+    It is for places where JAX is too slow to call.
 
     Args:
         model: as `estimate` or `load` gives it.
 
-    Returns:
-        `state, outputs = step(state, inputs)`; `step.state_names` and `step.step_inputs` tell what is in both.
+    Returns: `state, outputs = step(state, inputs)`; `step.state_names` and `step.step_inputs` list
+        what is in both.
 
     Raises:
         InputError: physics or a learner that is a Python function, an ensemble, a spline hold.
@@ -130,7 +161,8 @@ def numpy_step(model: Model | MotionModel) -> NumpyStep:
     Examples:
         >>> import orthaug as oa
         >>> u = [1.0, 2.0, 0.0, 3.0, 1.0, 0.0]
-        >>> record = oa.Record.from_arrays(u=u, y=[0.0, 0.5, 1.25, 0.625, 1.8125, 1.40625])  # 0.5 (y[k-1] + u[k-1])
+        >>> y = [0.0, 0.5, 1.25, 0.625, 1.8125, 1.40625]  # 0.5 (y[k-1] + u[k-1])
+        >>> record = oa.Record.from_arrays(u=u, y=y)
         >>> physics = oa.Baseline.from_terms([oa.Term("a", "y[k-1]"), oa.Term("b", "u[k-1]")])
         >>> step = numpy_step(oa.estimate(record, physics, learner=None).model)
         >>> step.state_names, step.step_inputs
@@ -145,18 +177,24 @@ def numpy_step(model: Model | MotionModel) -> NumpyStep:
 def _advancing(
     rate: Callable[[Vector, Vector], Vector], scheme: Scheme, held: int, ends: int
 ) -> Callable[[Vector, Vector], Vector]:
-    """x one sample later, of x and the step's inputs."""
+    """Return x one sample later, of x and the step's inputs."""
     if scheme.kind == "discrete":
         return rate
     h, halves = scheme.step, 2 * scheme.substeps
-    one = _exponential(rate, dict(scheme.matrices)) if scheme.kind == "exact" else runge_kutta(rate, h)
+    one = (
+        _exponential(rate, dict(scheme.matrices))
+        if scheme.kind == "exact"
+        else runge_kutta(rate, h)
+    )
 
     def advance(x: Vector, u: Vector) -> Vector:
         now = u[:held]
         slope = (u[held:] - now) / halves if ends == 2 else None
         for j in range(0, halves, 2):
             points = (
-                (now, now, now) if slope is None else (now + j * slope, now + (j + 1) * slope, now + (j + 2) * slope)
+                (now, now, now)
+                if slope is None
+                else (now + j * slope, now + (j + 1) * slope, now + (j + 2) * slope)
             )
             x = one(x, *points)
         return x
@@ -164,7 +202,9 @@ def _advancing(
     return advance
 
 
-def _exponential(rate: Callable[[Vector, Vector], Vector], m: dict[str, Any]) -> Callable[..., Vector]:
+def _exponential(
+    rate: Callable[[Vector, Vector], Vector], m: dict[str, Any]
+) -> Callable[..., Vector]:
     def rest(x: Vector, u: Vector) -> Vector:
         return rate(x, u) - m["linear"] @ x
 

@@ -13,15 +13,32 @@ from orthaug._base.errors import InputError
 from orthaug.export.nodes import ACTIVATIONS, Apply, Entry, Name, Node, Number
 from orthaug.export.program import Block, Program, Vectors
 
-_OPERATORS = {"add": "Add", "sub": "Sub", "mul": "Mul", "div": "Div", "power": "Pow", "whole_power": "Pow"}
+_OPERATORS = {
+    "add": "Add",
+    "sub": "Sub",
+    "mul": "Mul",
+    "div": "Div",
+    "power": "Pow",
+    "whole_power": "Pow",
+}
 _OPERATORS |= {"neg": "Neg", "sin": "Sin", "cos": "Cos", "exp": "Exp", "log": "Log", "sqrt": "Sqrt"}
-_OPERATORS |= {"abs": "Abs", "sign": "Sign", "floor": "Floor", "tanh": "Tanh", "min": "Min", "max": "Max"}
+_OPERATORS |= {
+    "abs": "Abs",
+    "sign": "Sign",
+    "floor": "Floor",
+    "tanh": "Tanh",
+    "min": "Min",
+    "max": "Max",
+}
 _OPSET = 18
 
 
 @dataclass(frozen=True)
 class OnnxGraph:
-    """`NAME.onnx`: (state, inputs) → (next_state, outputs), vectors of doubles, without empty ones."""
+    """`NAME.onnx`: (state, inputs) → (next_state, outputs), vectors of doubles.
+
+    Empty vectors are left out.
+    """
 
     summary = "an ONNX graph in double precision"
 
@@ -49,7 +66,8 @@ class _Graph:
             import onnx  # pyright: ignore[reportMissingImports]  (optional)
         except ImportError:
             raise InputError(
-                "an ONNX graph is written by the package onnx, which is not installed; pip install onnx."
+                "an ONNX graph is written by the package onnx, which is not installed; pip "
+                "install onnx."
             ) from None
         self.onnx, self.program = onnx, program
         self.nodes: list[Any] = []
@@ -67,24 +85,32 @@ class _Graph:
         sizes = {"state": program.states, "inputs": program.inputs}
         results = {"next_state": program.states, "outputs": program.outputs}
         given, made = (
-            [helper.make_tensor_value_info(name, real, [len(signals)]) for name, signals in group.items() if signals]
+            [
+                helper.make_tensor_value_info(name, real, [len(signals)])
+                for name, signals in group.items()
+                if signals
+            ]
             for group in (sizes, results)
         )
-        tables = [self.onnx.numpy_helper.from_array(value, name) for name, value in self.tables.items()]
+        tables = [
+            self.onnx.numpy_helper.from_array(value, name) for name, value in self.tables.items()
+        ]
         graph = helper.make_graph(self.nodes, program.name, given, made, tables)
         about = {"producer_name": "orthaug", "doc_string": f"sha256 {program.digest}"}
-        model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", _OPSET)], ir_version=8, **about)
+        model = helper.make_model(
+            graph, opset_imports=[helper.make_opsetid("", _OPSET)], ir_version=8, **about
+        )
         self.onnx.checker.check_model(model)
         return model.SerializeToString()
 
     def add(self, operator: str, *inputs: str, out: str | None = None, **attributes: Any) -> str:
-        """A node; its result."""
+        """Add a node and return its result."""
         out = out or f"n{len(self.nodes)}"
         self.nodes.append(self.onnx.helper.make_node(operator, list(inputs), [out], **attributes))
         return out
 
     def table(self, value: Any) -> str:
-        """A constant tensor."""
+        """Return a constant tensor."""
         name = f"t{len(self.tables)}"
         self.tables[name] = np.ascontiguousarray(value)
         return name
@@ -99,7 +125,7 @@ class _Graph:
         return parts[0] if len(parts) == 1 else self.add("Concat", *parts, axis=0)
 
     def block(self, block: Block, x: str, u: str) -> str:
-        """The results of a block as a vector."""
+        """Return the results of a block as a vector."""
         known = {"x": x, "u": u}
         for name, node in block.locals:
             known[name] = self.node(node, known)
@@ -108,18 +134,26 @@ class _Graph:
             for layer in block.network.layers:
                 z = self.product(layer.weight, z)
                 z = z if layer.bias is None else self.add("Add", z, self.table(layer.bias))
-                z = z if layer.activation == "identity" else self.node(ACTIVATIONS[layer.activation], {"a": z})
+                z = (
+                    z
+                    if layer.activation == "identity"
+                    else self.node(ACTIVATIONS[layer.activation], {"a": z})
+                )
             known["g"] = z
         return self.joined([self.node(node, known) for node in block.results])
 
     def product(self, weight: Matrix, z: str) -> str:
-        """W z. Of one entry it is no matrix product: runtimes would draw its scaling in, in single precision."""
+        """Return W z.
+
+        Of one entry it is no matrix product: runtimes would draw its scaling in, in single
+        precision.
+        """
         if weight.shape[1] == 1:
             return self.add("Mul", self.table(weight[:, 0]), z)
         return self.add("MatMul", self.table(weight), z)
 
     def node(self, node: Node, known: Mapping[str, str]) -> str:
-        """A node of the program as a vector of one entry, or of a layer's entries."""
+        """Return a node of the program as a vector of one entry, or of a layer's entries."""
         if isinstance(node, Number):
             return self.real(node.value)
         if isinstance(node, Name):
@@ -139,7 +173,10 @@ class _Graph:
         return self.add(_OPERATORS[node.function], *inner)
 
     def arctangent(self, x: str) -> str:
-        """atan(x) from that in single precision, which is all that runtimes have: what it lacks is a small angle."""
+        """Return atan(x) from that in single precision, which is all that runtimes have.
+
+        What it lacks is a small angle.
+        """
         types = self.onnx.TensorProto
         near = self.add("Atan", self.add("Cast", x, to=types.FLOAT))
         near = self.add("Cast", near, to=types.DOUBLE)
@@ -149,7 +186,7 @@ class _Graph:
         return self.add("Add", near, self.add("Div", across, along))
 
     def angle(self, y: str, x: str) -> str:
-        """atan2(y, x), which ONNX lacks: by the half plane of x."""
+        """Return atan2(y, x), which ONNX lacks, by the half plane of x."""
         zero, turned = self.real(0.0), self.real(np.pi)
         right = self.arctangent(self.add("Div", y, x))
         up = self.add("Where", self.add("Less", y, zero), self.add("Neg", turned), turned)
@@ -158,10 +195,14 @@ class _Graph:
         return self.add("Where", self.add("Equal", x, zero), upright, beside)
 
     def following(self, now: str, u: str, y: str) -> str:
-        """The next state."""
+        """Return the next state."""
         program, scheme = self.program, self.program.scheme
         if scheme is None or program.rate is None:
-            parts = [name for name, there in ((y, True), (u, program.inputs), ("state", program.states)) if there]
+            parts = [
+                name
+                for name, there in ((y, True), (u, program.inputs), ("state", program.states))
+                if there
+            ]
             return self.part(self.joined(parts), program.following)
         if scheme.kind == "discrete":
             return self.block(program.rate, "state", u)
@@ -175,7 +216,7 @@ class _Graph:
         return x
 
     def combined(self, x: str, *terms: tuple[float, str]) -> str:
-        """x plus multiples of vectors."""
+        """Return x plus multiples of vectors."""
         for factor, vector in terms:
             x = self.add("Add", x, self.add("Mul", self.real(factor), vector))
         return x
@@ -188,7 +229,9 @@ class _Graph:
         k2 = self.block(rate, self.combined(x, (h / 2, k1)), middle)
         k3 = self.block(rate, self.combined(x, (h / 2, k2)), middle)
         k4 = self.block(rate, self.combined(x, (h, k3)), last)
-        return self.combined(x, (h / 6, self.add("Add", self.combined(k1, (2.0, self.add("Add", k2, k3))), k4)))
+        return self.combined(
+            x, (h / 6, self.add("Add", self.combined(k1, (2.0, self.add("Add", k2, k3))), k4))
+        )
 
     def exact(self, x: str, first: str, middle: str, last: str) -> str:
         rate, scheme = self.program.rate, self.program.scheme

@@ -1,4 +1,4 @@
-"""A model's step in the intermediate form: constants, blocks of scalar expressions with a network, and how to advance.
+"""A model's step in the intermediate form: constants, blocks of expressions, integration.
 
 A target writes a `Program`, and knows nothing of models.
 """
@@ -17,7 +17,7 @@ from orthaug.export.nodes import Node, functions_in
 
 @dataclass(frozen=True)
 class Signal:
-    """An entry of state, inputs or outputs: its name as users write it, an identifier in ASCII, its unit."""
+    """An entry of state, inputs or outputs: the user's name, an ASCII identifier, the unit."""
 
     name: str
     identifier: str
@@ -49,7 +49,10 @@ class Layer:
 
 @dataclass(frozen=True, eq=False)
 class Network:
-    """The learner: layers on scaled features. Its values are the vector `g` of the block that it stands in."""
+    """The learner: layers on scaled features.
+
+    Its values are the vector `g` of its block.
+    """
 
     features: tuple[Node, ...]
     layers: tuple[Layer, ...]
@@ -57,7 +60,7 @@ class Network:
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """A function of `x` and `u`: named intermediate results in order, a network, and the results."""
+    """A function of `x` and `u`: intermediate results in order, a network, and the results."""
 
     name: str
     locals: tuple[tuple[str, Node], ...]
@@ -72,13 +75,13 @@ class Block:
 
     @property
     def layers(self) -> tuple[Layer, ...]:
-        """Those of its network."""
+        """The layers of its network."""
         return self.network.layers if self.network is not None else ()
 
 
 @dataclass(frozen=True, eq=False)
 class Scheme:
-    """How a motion goes on by one sample: `discrete`, `rk4`, or `exact` by matrices.
+    """Scheme by which a motion advances one sample: `discrete`, `rk4`, or `exact` by matrices.
 
     Of the exact one, with the rest r = rate − `linear` x and substep h:
     `a = half x + half1 r(x)`, `b = half x + half1 r(a)`, `c = half a + half1 (2 r(b) − r(x))`,
@@ -96,9 +99,10 @@ class Scheme:
 class Program:
     """A step: `output` gives y of state x and inputs u; then the state goes on.
 
-    Of a lagged model `lines` are the channels that it remembers with how many samples of each, outputs first; the state
-    is these lines, newest first, and outputs and inputs are put in front of them. Of a motion `rate` and `scheme` make
-    the next state; under a first-order hold, `ends` = 2, the inputs of the next sample stand behind those of this one.
+    Of a lagged model `lines` are the channels that it remembers with how many samples of each,
+    outputs first; the state is these lines, newest first, and outputs and inputs are put in front
+    of them. Of a motion `rate` and `scheme` make the next state; under a first-order hold, `ends` =
+    2, the inputs of the next sample follow those of this one.
     """
 
     name: str
@@ -110,7 +114,7 @@ class Program:
     output: Block
     lines: tuple[tuple[Signal, int], ...] = ()
     following: tuple[int, ...] = ()
-    """Of a lagged model where the next state's entries are among outputs, inputs and state."""
+    """Positions of the next state's entries of a lagged model among outputs, inputs and state."""
     rate: Block | None = None
     scheme: Scheme | None = None
     ends: int = 1
@@ -118,43 +122,50 @@ class Program:
     """The names of constants and intermediate results as users write them."""
     digest: str = ""
     preparation: str = ""
-    """What the data went through that inputs, outputs and state stand for, in words."""
+    """Preparation of the data that inputs, outputs and state refer to, in words."""
 
     @property
     def blocks(self) -> tuple[Block, ...]:
-        """What a step evaluates."""
+        """Blocks that a step evaluates."""
         return (self.output,) if self.rate is None else (self.output, self.rate)
 
     @property
     def functions(self) -> set[str]:
         """The functions of all expressions."""
-        return set[str]().union(*(functions_in(node) for block in self.blocks for node in block.nodes))
+        return set[str]().union(
+            *(functions_in(node) for block in self.blocks for node in block.nodes)
+        )
 
     @property
     def activations(self) -> set[str]:
-        """Those of all networks."""
+        """The activations of all networks."""
         return {layer.activation for block in self.blocks for layer in block.layers}
 
     @property
     def held(self) -> int:
-        """Inputs at an instant, of which a step takes `ends`."""
+        """Number of inputs at one instant, of which a step takes `ends`."""
         return len(self.inputs) // self.ends
 
 
 @dataclass(frozen=True, eq=False)
 class Vectors:
-    """Steps by which an export is checked where it runs: inputs, the state before and the outputs, all finite."""
+    """Test vectors of an export: inputs, the state before each step and the outputs, all finite."""
 
     inputs: Float[np.ndarray, "r nu"]
     states: Float[np.ndarray, "r n"]
     outputs: Float[np.ndarray, "r ny"]
 
     def csv(self, program: Program) -> str:
-        """A column for each input, state and output, with `state:` or `output:` before names that stand twice."""
+        """Return a column for each input, state and output.
+
+        Names that occur twice get `state:` or `output:` in front.
+        """
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
         kinds = {"input": program.inputs, "state": program.states, "output": program.outputs}
-        writer.writerow([f"{kind}:{signal.name}" for kind, signals in kinds.items() for signal in signals])
+        writer.writerow(
+            [f"{kind}:{signal.name}" for kind, signals in kinds.items() for signal in signals]
+        )
         for row in np.concatenate([self.inputs, self.states, self.outputs], axis=1):
             writer.writerow([repr(float(value)) for value in row])
         return text.getvalue()

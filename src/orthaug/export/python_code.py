@@ -1,4 +1,4 @@
-"""A program as a Python module, for NumPy and for libraries of symbols alike, such as CasADi for optimal control."""
+"""A program as a Python module, for NumPy and for symbolic libraries such as CasADi."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from orthaug.export.program import Block, Program, Vectors
 
 @dataclass(frozen=True)
 class Dialect:
-    """How a library writes what Python has no sign for.
+    """Syntax of a library for operations that Python has no sign for.
 
     Args:
         language: of scalar expressions.
@@ -31,12 +31,14 @@ class Dialect:
 
 
 def python_language(functions: dict[str, str]) -> Language:
-    """Python with these functions."""
-    return Language(functions, decimal, lambda base, n: f"{base}**{n}" if n >= 0 else f"{base}**({n})")
+    """Return Python with these functions."""
+    return Language(
+        functions, decimal, lambda base, n: f"{base}**{n}" if n >= 0 else f"{base}**({n})"
+    )
 
 
 def declarations(program: Program) -> str:
-    """The names and the sampling time of a model."""
+    """Return the names and the sampling time of a model."""
     names = {
         kind.upper(): tuple(signal.name for signal in getattr(program, kind))
         for kind in ("states", "inputs", "outputs")
@@ -48,8 +50,11 @@ def declarations(program: Program) -> str:
 
 
 def arithmetic(program: Program, dialect: Dialect) -> str:
-    """Constants, activations, blocks and `advance(x, u, y)`, which gives the next state."""
-    constants = [f"{c.name} = {dialect.constant.format(decimal(c.value))}  # {c.meaning}" for c in program.constants]
+    """Return constants, activations, blocks and `advance(x, u, y)`, which gives the next state."""
+    constants = [
+        f"{c.name} = {dialect.constant.format(decimal(c.value))}  # {c.meaning}"
+        for c in program.constants
+    ]
     parts = ["\n".join(constants)] if constants else []
     parts += [array for block in program.blocks for array in _arrays(block, dialect)]
     for name in sorted(program.activations - {"identity"}):
@@ -85,37 +90,54 @@ def _block(block: Block, dialect: Dialect) -> str:
         last = len(block.layers)
         for i, layer in enumerate(block.layers, start=1):
             target, source = "g" if i == last else f"h{i}", "z" if i == 1 else f"h{i - 1}"
-            value = f"{block.name}_w{i} @ {source}" + (f" + {block.name}_b{i}" if layer.bias is not None else "")
-            lines.append(f"{target} = {value if layer.activation == 'identity' else f'_{layer.activation}({value})'}")
+            value = f"{block.name}_w{i} @ {source}" + (
+                f" + {block.name}_b{i}" if layer.bias is not None else ""
+            )
+            lines.append(
+                f"{target} = "
+                f"{value if layer.activation == 'identity' else f'_{layer.activation}({value})'}"
+            )
     lines.append(f"return {_vector([write(node) for node in block.results], dialect)}")
     return f"\ndef {block.name}(x, u):\n" + "\n".join(f"    {line}" for line in lines)
 
 
 def _vector(entries: Sequence[str], dialect: Dialect) -> str:
     text = ", ".join(entries)
-    return dialect.vector.format(f"\n{wrapped([*entries], ' ' * 8)},\n    " if len(text) > 90 else text)
+    return dialect.vector.format(
+        f"\n{wrapped([*entries], ' ' * 8)},\n    " if len(text) > 90 else text
+    )
 
 
 def _advance(program: Program, dialect: Dialect) -> list[str]:
     scheme = program.scheme
     if scheme is None:
         joined = dialect.join.format("y, u, x")
-        return [f"FOLLOWING = {list(program.following)!r}", f"\ndef advance(x, u, y):\n    return {joined}[FOLLOWING]"]
+        return [
+            f"FOLLOWING = {list(program.following)!r}",
+            f"\ndef advance(x, u, y):\n    return {joined}[FOLLOWING]",
+        ]
     if scheme.kind == "discrete":
         return ["\ndef advance(x, u, y):\n    return rate(x, u)"]
     constants = f"STEP = {scheme.step!r}  # s, {scheme.substeps} in a sample"
-    parts = [constants, *(_array(name.upper(), matrix, dialect) for name, matrix in scheme.matrices)]
+    parts = [
+        constants,
+        *(_array(name.upper(), matrix, dialect) for name, matrix in scheme.matrices),
+    ]
     parts.append(_EXACT if scheme.kind == "exact" else _RK4)
     if program.ends == 1:
-        body = f"    for _ in range({scheme.substeps}):\n        x = substep(x, u, u, u)\n    return x"
+        body = (
+            f"    for _ in range({scheme.substeps}):\n        x = substep(x, u, u, u)\n    return x"
+        )
     else:
         halves, held = 2 * scheme.substeps, program.held
-        now, after = (dialect.vector.format(", ".join(f"u[{i + first}]" for i in range(held))) for first in (0, held))
+        now, after = (
+            dialect.vector.format(", ".join(f"u[{i + first}]" for i in range(held)))
+            for first in (0, held)
+        )
         body = (
-            f"    now, slope = {now}, ({after} - {now}) / {halves}\n"
-            f"    for j in range(0, {halves}, 2):\n"
-            "        x = substep(x, now + j * slope, now + (j + 1) * slope, now + (j + 2) * slope)\n"
-            "    return x"
+            f"    now, slope = {now}, ({after} - {now}) / {halves}\n    for j in range(0, "
+            f"{halves}, 2):\n        x = substep(x, now + j * slope, now + (j + 1) * slope, "
+            "now + (j + 2) * slope)\n    return x"
         )
     return [*parts, f"\ndef advance(x, u, y):\n{body}"]
 
@@ -143,7 +165,22 @@ def substep(x, first, middle, last):
     return WHOLE @ x + FIRST @ begin + MIDDLE @ (at_a + at_b) + LAST @ rest(c, last)"""
 
 
-_SAME = ("sin", "cos", "tan", "atan", "atan2", "exp", "log", "sqrt", "sign", "floor", "tanh", "expm1", "log1p", "power")
+_SAME = (
+    "sin",
+    "cos",
+    "tan",
+    "atan",
+    "atan2",
+    "exp",
+    "log",
+    "sqrt",
+    "sign",
+    "floor",
+    "tanh",
+    "expm1",
+    "log1p",
+    "power",
+)
 _OTHER = {"abs": "ca.fabs", "min": "ca.fmin", "max": "ca.fmax"}
 CASADI = Dialect(
     python_language({name: f"ca.{name}" for name in _SAME} | _OTHER),
@@ -160,9 +197,19 @@ class CasadiModule:
     summary = "a Python module that makes a CasADi Function"
 
     def files(self, program: Program, vectors: Vectors) -> Mapping[str, str]:
-        head = f'"""{program.name}: one step of a fitted model as a CasADi Function. Written by orthaug."""'
+        title = f"{program.name}: one step of a fitted model as a CasADi Function."
+        head = f'"""{title} Written by orthaug."""'
         step = _STEP.replace("NAME", program.name)
-        text = [head, "", "import casadi as ca", "", declarations(program), "", arithmetic(program, CASADI), step]
+        text = [
+            head,
+            "",
+            "import casadi as ca",
+            "",
+            declarations(program),
+            "",
+            arithmetic(program, CASADI),
+            step,
+        ]
         return {f"{program.name}.py": "\n".join(text)}
 
     def usage(self, program: Program) -> str:
@@ -174,8 +221,9 @@ state, outputs = step({[0] * len(program.states)}, {[0] * len(program.inputs)})
 run = step.mapaccum(100)           # a free run of 100 steps, inputs in columns
 ```
 
-It needs `casadi` (`pip install casadi`; the extra `orthaug[casadi]` installs it too). `step` takes symbols as well as
-numbers, so that it can stand in an optimal control problem: one call for each step of the horizon."""
+It needs `casadi` (`pip install casadi`; the extra `orthaug[casadi]` installs it too).
+`step` takes symbols as well as
+numbers, so that an optimal control problem can call it once for each step of the horizon."""
 
 
 _STEP = '''
@@ -186,5 +234,6 @@ def step(name="NAME"):
     outputs = output(state, inputs)
     following = ca.densify(ca.SX(advance(state, inputs, outputs)))
     results = [following, ca.densify(ca.SX(outputs))]
-    return ca.Function(name, [state, inputs], results, ["state", "inputs"], ["next_state", "outputs"])
+    names = ["state", "inputs"], ["next_state", "outputs"]
+    return ca.Function(name, [state, inputs], results, *names)
 '''

@@ -1,4 +1,4 @@
-"""Fitting a model to a record: criteria, structures, solvers, and the verb."""
+"""Fitting a model to a record: criteria, structures, solvers, and `estimate`."""
 
 import lazy_loader
 

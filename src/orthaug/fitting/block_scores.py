@@ -1,17 +1,20 @@
-"""Scores of a free run in blocks of steps: what its standard errors are made of where its errors are coloured.
+"""Scores of a free run in blocks of steps, for standard errors under coloured errors.
 
-θ and weights p minimise a sum of squares, so that `p̂ − p ≈ M⁻¹ Σ_k s_kᵀe_k` with M the information and s_k the
-sensitivities of step k. Coloured errors make the products s_kᵀe_k of neighbours dependent. Batch means (Carlstein 1986)
-need no model of the colour: with B_j the sum over a block of many steps, `Ω = Σ_j B_j B_jᵀ` estimates the covariance of
-the whole sum, and `M⁻¹ Ω M⁻¹` that of p̂. To first order that is Newey and West's estimate with as many lags as a block
-has steps (Andrews 1991); in the words of cluster-robust errors (Liang and Zeger 1986) a block is a cluster.
+θ and weights p minimise a sum of squares, so that `p̂ − p ≈ M⁻¹ Σ_k s_kᵀe_k` with M the information
+and s_k the sensitivities of step k. Coloured errors make the products s_kᵀe_k of neighbours
+dependent. Batch means (Carlstein 1986) need no model of the colour: with B_j the sum over a block
+of many steps, `Ω = Σ_j B_j B_jᵀ` estimates the covariance of the whole sum, and `M⁻¹ Ω M⁻¹` that of
+p̂. To first order that is Newey and West's estimate with as many lags as a block has steps (Andrews
+1991); in the words of cluster-robust errors (Liang and Zeger 1986) a block is a cluster.
 
-The state that a segment starts from is an unknown too. It is eliminated from every step alike, with χ_k the sensitivity
-to it: `s_k − S_px S_xx⁻¹ χ_k`, the Schur complement of M. That is linear in the steps, so it can follow the sum over a
-block. What the measured state adds counts to the first block of its segment. No block crosses the end of a segment.
+The state that a segment starts from is an unknown too. It is eliminated from every step alike, with
+χ_k the sensitivity to it: `s_k − S_px S_xx⁻¹ χ_k`, the Schur complement of M. That is linear in the
+steps, so it can follow the sum over a block. What the measured state adds counts to the first block
+of its segment. No block crosses the end of a segment.
 
-A record that is too short for blocks may still tell the colour by few numbers: with e an autoregressive process of
-autocovariance γ, `Ω = Σ_jk s_jᵀ γ_{j−k} s_k`, for s follows the inputs and not the noise (`fitting/colour.py`).
+A record that is too short for blocks may still show the colour by few numbers: with e an
+autoregressive process of autocovariance γ, `Ω = Σ_jk s_jᵀ γ_{j−k} s_k`, for s follows the inputs
+and not the noise (`fitting/colour.py`).
 """
 
 from __future__ import annotations
@@ -37,9 +40,10 @@ _MEMORIES = 3  # times as many steps in a block as the errors' correlation lasts
 class FreeRunScores:
     """A trained free run, whose scores of p = (c, w) can be summed over blocks.
 
-    `slope` and `pull` are how the best states follow p and the measured states; None where the states are no unknowns.
-    `unit` scales the information of p to the Gram matrix that the model keeps. `share` is how many times more was
-    trained on than these segments, which are then a witness of it.
+    `slope` and `pull` are how the best states follow p and the measured states; None where the
+    states are no unknowns. `unit` scales the information of p to the Gram matrix that the model
+    keeps. `share` is how many times more was trained on than these segments, which are then a
+    subsample of it.
     """
 
     dynamics: Dynamics
@@ -58,12 +62,14 @@ class FreeRunScores:
         return int(np.asarray(self.segments.scored).sum(axis=1).max())
 
     def errors(self) -> Float[np.ndarray, "ny s T"]:
-        """The errors of each output by segments, 0 where a step is not scored."""
+        """Return the errors of each output by segments, 0 where a step is not scored."""
         errors = errors_of(self.dynamics, self.numbers, self.states, self.segments)
         return np.moveaxis(errors, 3, 1).reshape(-1, *errors.shape[1:3]).transpose(2, 0, 1)
 
     def block(self) -> int | None:
-        """Steps of a block: three times as many as the correlation of the errors lasts, at most those of a segment.
+        """Return the steps of a block: three times the correlation length of the errors.
+
+        At most those of a segment.
 
         None where the correlation has no end, or lasts longer than a segment.
         """
@@ -74,24 +80,33 @@ class FreeRunScores:
         return min(_MEMORIES * max(known), self.longest)
 
     def blocks(self, steps: int) -> Float[np.ndarray, "b n"]:
-        """The score of every block of about `steps` scored steps, no fewer where the segment has as many."""
+        """Return the score of every block of about `steps` scored steps.
+
+        No block is shorter where the segment has as many steps.
+        """
         scored = np.asarray(self.segments.scored)
         first = int(np.argmax(scored.any(axis=(0, 2))))
         count = max(self.longest // steps, 1)
         place = np.maximum(np.arange(self.segments.steps) - first, 0) // -(-self.longest // count)
         made = (self.dynamics, self.numbers, self.segments, self.states, self.weight)
-        sums = np.moveaxis(np.asarray(block_scores(*made, place.astype(np.int32), int(place[-1]) + 1)), -1, 1)
+        sums = np.moveaxis(
+            np.asarray(block_scores(*made, place.astype(np.int32), int(place[-1]) + 1)), -1, 1
+        )
         n0 = self.segments.start.shape[1]
         scores = sums[..., n0:]  # (k, m, b, n)
         if self.slope is not None and self.pull is not None:
             of_state = sums[..., :n0].copy()
             of_state[:, :, 0] += self.pull
             scores = scores - of_state @ self.slope
-        counts = np.stack([scored[:, place == block].sum(axis=1) for block in range(int(place[-1]) + 1)], axis=-1)
+        counts = np.stack(
+            [scored[:, place == block].sum(axis=1) for block in range(int(place[-1]) + 1)], axis=-1
+        )
         return scores[counts > 0]
 
     def slopes(self) -> Float[np.ndarray, "N ny n"]:
-        """The sensitivities of p on every scored step, the starts eliminated, in the units of the model's Gram matrix.
+        """Return the sensitivities of p on every scored step, the starts eliminated.
+
+        In the units of the model's Gram matrix.
 
         They are the scores of errors of 1 in one whitened output after the other.
         """
@@ -101,20 +116,34 @@ class FreeRunScores:
         found = []
         for unit in np.linalg.inv(self.weight).T:
             segments = self.segments._replace(target=model + unit[:, None])
-            made = (self.dynamics, self.numbers, segments, self.states, self.weight, place, len(place))
+            made = (
+                self.dynamics,
+                self.numbers,
+                segments,
+                self.states,
+                self.weight,
+                place,
+                len(place),
+            )
             sums = np.moveaxis(np.asarray(block_scores(*made)), -1, 1)  # (k, m, T, n0 + n)
-            own = sums[..., n0:] if self.slope is None else sums[..., n0:] - sums[..., :n0] @ self.slope
+            own = (
+                sums[..., n0:]
+                if self.slope is None
+                else sums[..., n0:] - sums[..., :n0] @ self.slope
+            )
             found.append(own[np.moveaxis(scored, -1, 1)])
         return np.sqrt(self.unit) * np.stack(found, axis=1)
 
     def whitened(self) -> Float[np.ndarray, "N ny"]:
-        """The errors of the same steps in whitened outputs, in the same units."""
-        errors = np.moveaxis(errors_of(self.dynamics, self.numbers, self.states, self.segments), 3, 1)  # (k, m, T, ny)
+        """Return the errors of the same steps in whitened outputs, in the same units."""
+        errors = np.moveaxis(
+            errors_of(self.dynamics, self.numbers, self.states, self.segments), 3, 1
+        )  # (k, m, T, ny)
         there = errors[np.moveaxis(np.asarray(self.segments.scored), -1, 1)]
         return np.sqrt(self.unit) * there @ self.weight.T
 
     def middle(self, steps: int, used: float) -> tuple[Matrix, int]:
-        """Ω of p in the units of the model's Gram matrix, and the number of blocks that it is made of.
+        """Return Ω of p in the units of the model's Gram matrix, and its number of blocks.
 
         Args:
             used: parameters of the fit, by which its errors are too small.
@@ -125,7 +154,9 @@ class FreeRunScores:
         return self.share * correction * self.unit**2 * scores.T @ scores, blocks
 
     def coloured_middle(self, used: float) -> tuple[Matrix, float]:
-        """Ω of p under autoregressive errors, in the units of the model's Gram matrix, and their independent number.
+        """Return Ω of p under autoregressive errors, and their independent number.
+
+        In the units of the model's Gram matrix.
 
         Errors of several outputs are whitened against each other; each has a colour of its own.
 
@@ -142,15 +173,31 @@ class FreeRunScores:
             gamma = colour.autocovariance(max(lengths))
             for own in slopes:
                 if len(own):
-                    total = total + own[:, o].T @ scipy.linalg.matmul_toeplitz(gamma[: len(own)], own[:, o])
+                    total = total + own[:, o].T @ scipy.linalg.matmul_toeplitz(
+                        gamma[: len(own)], own[:, o]
+                    )
             independent = min(independent, self.share * float(colour.independent(lengths)))
-        correction = rows * outputs / max(rows * outputs - used, 1.0) * independent / max(independent - 1.0, 1.0)
+        correction = (
+            rows
+            * outputs
+            / max(rows * outputs - used, 1.0)
+            * independent
+            / max(independent - 1.0, 1.0)
+        )
         return self.share * correction * np.asarray(total), independent
 
     def robust(
-        self, statistics: Statistics, freedom: float, used: float, steps: int | None, *, modelled: bool = False
+        self,
+        statistics: Statistics,
+        freedom: float,
+        used: float,
+        steps: int | None,
+        *,
+        modelled: bool = False,
     ) -> Statistics:
-        """The model's statistics for coloured errors, from blocks of so many steps; None for as many as `block` says.
+        """Return the model's statistics for coloured errors, from blocks of `steps` steps.
+
+        None for as many as `block` says.
 
         Args:
             statistics, freedom: of errors that are white.
@@ -163,9 +210,14 @@ class FreeRunScores:
         """
         if modelled:
             middle, independent = self.coloured_middle(used)
-            return replace(statistics, middle=middle, freedom=float(min(freedom, max(independent - 1.0, 1.0))))
+            return replace(
+                statistics, middle=middle, freedom=float(min(freedom, max(independent - 1.0, 1.0)))
+            )
         steps = self.block() if steps is None else steps
         if steps is None:
-            raise InputError("the errors of the free run remember each other for too long to take them in blocks.")
+            raise InputError(
+                "the errors of the free run are correlated over too many steps for blocks; use "
+                "a longer record."
+            )
         middle, blocks = self.middle(steps, used)
         return replace(statistics, middle=middle, freedom=min(freedom, blocks - 1.0))

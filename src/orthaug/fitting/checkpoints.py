@@ -1,6 +1,7 @@
-"""States of training that outlive the process: written every so often, whole or not at all, and taken up again.
+"""States of training on disk, from which an interrupted fit resumes.
 
-A state is that of the Levenberg-Marquardt loop between two steps, so a resumed run takes the same steps, bit by bit.
+A state is that of the Levenberg-Marquardt loop between two steps, so a resumed run takes the same
+steps, bit by bit.
 """
 
 from __future__ import annotations
@@ -29,7 +30,18 @@ _ABOUT = "training.json"
 _FORMAT = b"orthaug state 1 "
 _HEAD = len(_FORMAT) + 65  # bytes: format, checksum, end of line
 _ONE: Any = 0
-_LEAVES = State(_ONE, Normal(_ONE, _ONE, _ONE, Overlap(_ONE, _ONE)), _ONE, _ONE, _ONE, _ONE, _ONE, _ONE, _ONE, _ONE)
+_LEAVES = State(
+    _ONE,
+    Normal(_ONE, _ONE, _ONE, Overlap(_ONE, _ONE)),
+    _ONE,
+    _ONE,
+    _ONE,
+    _ONE,
+    _ONE,
+    _ONE,
+    _ONE,
+    _ONE,
+)
 
 OF_DESCENT = Pause((_ONE,) * 5, _ONE, _ONE, _ONE, _ONE, _ONE, _ONE, _ONE, _ONE)
 """The form of what a descent keeps."""
@@ -37,7 +49,9 @@ OF_DESCENT = Pause((_ONE,) * 5, _ONE, _ONE, _ONE, _ONE, _ONE, _ONE, _ONE, _ONE)
 
 @dataclass(eq=False)
 class Checkpoints:
-    """A folder with the state of every run of one fit; `fingerprint` is of all that the fit depends on.
+    """A folder with the state of every run of one fit.
+
+    `fingerprint` is of all that the fit depends on.
 
     `every` is the time [s] between two states of a run.
     """
@@ -51,7 +65,7 @@ class Checkpoints:
     """Why the last state could not be written; the one before it stays."""
 
     def opened(self, *, resume: bool) -> Checkpoints:
-        """Ready to keep states: emptied, or with `resume` with those that are there.
+        """Return a folder ready for states: emptied, or with `resume` as it is.
 
         Raises:
             InputError: states of another fit, or something else in the folder.
@@ -62,18 +76,26 @@ class Checkpoints:
             raise InputError(f"{self.folder}: holds no state of a training; give another --out.")
         if resume and known not in (None, self.fingerprint):
             raise InputError(
-                f"{self.folder}: is the state of another spec, other data or another version; fit without --resume."
+                f"{self.folder}: is the state of another spec, other data or another version; "
+                "fit without --resume."
             )
         if not resume:
             self.discard()
         return self
 
-    def of_run(self, *parts: Any, form: Any = _LEAVES) -> Kept:
-        """What is kept of a run that begins with these weights and choices, in the form of the solver's states."""
+    def of_run(self, *parts: Any, form: Any = _LEAVES) -> RunCheckpoint:
+        """Return the checkpoint of a run that begins with these weights and choices.
+
+        States have the form of the solver's.
+        """
         digest = hashlib.sha256(self.fingerprint.encode())
         for part in parts:
-            digest.update(np.ascontiguousarray(part).tobytes() if isinstance(part, np.ndarray) else repr(part).encode())
-        return Kept(self, self.folder / f"{digest.hexdigest()[:24]}.safetensors", form)
+            digest.update(
+                np.ascontiguousarray(part).tobytes()
+                if isinstance(part, np.ndarray)
+                else repr(part).encode()
+            )
+        return RunCheckpoint(self, self.folder / f"{digest.hexdigest()[:24]}.safetensors", form)
 
     def discard(self) -> None:
         """Remove the states: the fit is done."""
@@ -87,7 +109,7 @@ class Checkpoints:
 
 
 @dataclass(eq=False)
-class Kept:
+class RunCheckpoint:
     """The state of one run in a file."""
 
     checkpoints: Checkpoints
@@ -95,13 +117,21 @@ class Kept:
     form: Any
     written: float = field(default_factory=time.monotonic)
 
-    def state(self) -> Any:
-        """The last one that was written whole; None where there is none."""
+    def state(self, *shapes: tuple[int, ...]) -> Any:
+        """Return the last one that was written whole, finite and with first arrays of these shapes.
+
+        None where there is none.
+
+        A checksum tells what was damaged, not what was made: a run does not go on from what it
+        cannot have written.
+        """
         from safetensors import SafetensorError
         from safetensors.numpy import load
 
         try:
-            content = self.path.read_bytes()  # mapped into memory, it could not be replaced on Windows
+            content = (
+                self.path.read_bytes()
+            )  # mapped into memory, it could not be replaced on Windows
         except OSError:
             return None
         try:
@@ -109,6 +139,10 @@ class Kept:
                 raise ValueError
             held = load(content[_HEAD:])
             leaves = [held[str(i)] for i in range(len(held))]
+            if any(np.shape(leaf) != shape for leaf, shape in zip(leaves, shapes, strict=False)):
+                raise ValueError
+            if not all(np.isfinite(leaf).all() for leaf in leaves):
+                raise ValueError
             state = jax.tree.unflatten(jax.tree.structure(self.form), leaves)
         except (KeyError, ValueError, SafetensorError):
             self.checkpoints.spoilt.append(self.path.name)
@@ -116,7 +150,10 @@ class Kept:
         return state
 
     def keep(self, state: Any, *, ended: bool = False) -> None:
-        """Write the state, or what makes it, if it is time or the run `ended`. A full disk leaves the one before."""
+        """Write the state, or the result of a call that makes it, if due or if the run `ended`.
+
+        A full disk leaves the one before.
+        """
         now = time.monotonic()
         if now - self.written < self.checkpoints.every and not (ended and self.path.exists()):
             return
@@ -135,19 +172,30 @@ class Kept:
         if folder not in PARTIALS.placed:
             PARTIALS.placed.append(folder)
         if not (folder / _ABOUT).exists():
-            _replace(folder / _ABOUT, json.dumps({"fingerprint": self.checkpoints.fingerprint}).encode())
-        leaves = jax.tree.leaves(state)
-        content = save({str(i): np.atleast_1d(leaf).reshape(np.shape(leaf)) for i, leaf in enumerate(leaves)})
+            _replace(
+                folder / _ABOUT, json.dumps({"fingerprint": self.checkpoints.fingerprint}).encode()
+            )
+        leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(state)]
+        if not all(
+            np.isfinite(leaf).all() for leaf in leaves
+        ):  # a run that failed: nothing goes on from there
+            return
+        content = save(
+            {
+                str(i): np.ascontiguousarray(leaf).reshape(leaf.shape)
+                for i, leaf in enumerate(leaves)
+            }
+        )
         _replace(self.path, _head(content) + content)
 
 
 def _head(content: bytes) -> bytes:
-    """Return what stands before a state: its format and its checksum."""
+    """Return the bytes before a state: its format and its checksum."""
     return _FORMAT + hashlib.sha256(content).hexdigest().encode() + b"\n"
 
 
 def _replace(path: Path, content: bytes) -> None:
-    """Write a file whole: it stands on the disk before it takes its place."""
+    """Write a file whole: it is on the disk before it takes its place."""
     partial = path.with_suffix(".partial")
     try:
         with partial.open("wb") as file:

@@ -1,4 +1,4 @@
-"""The colour of a free run's errors: coloured errors say less than their number, and remember each other."""
+"""The colour of a free run's errors, and their number of independent errors."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Autoregression:
         return np.fft.irfft(self.variance / np.abs(polynomial) ** 2, points)[:lags]
 
     def independent(self, lengths: Sequence[int] | Vector) -> float:
-        """Return how many independent errors tell a mean square as well as stretches of these lengths do.
+        """Return the number of independent errors that give a mean square as precisely.
 
         For a normal process that is `N / Σ ρ_j²` over all lags j of both signs (Bartlett 1946).
         """
@@ -43,16 +43,23 @@ class Autoregression:
 
 
 def autoregression(pieces: Sequence[Vector]) -> Autoregression:
-    """Return the autoregression of stretches of errors, as they are: their mean counts as colour."""
+    """Return the autoregression of stretches of errors.
+
+    Their mean is not subtracted: it counts as colour.
+    """
     rows = sum(map(len, pieces))
     size = float(np.sqrt(sum(float(piece @ piece) for piece in pieces) / max(rows, 1))) or 1.0
     a = burg([piece / size for piece in pieces], _MOST_ORDERS)
-    left = np.concatenate([np.convolve(piece, a, mode="valid") for piece in pieces if len(piece) >= len(a)])
+    left = np.concatenate(
+        [np.convolve(piece, a, mode="valid") for piece in pieces if len(piece) >= len(a)]
+    )
     return Autoregression(-a[1:], float(np.mean(left**2)))
 
 
 def burg(pieces: Sequence[Vector], largest: int) -> Vector:
-    """Return (1, a_1, …, a_p) of `A(q) e_k = ε_k`, ε white: Burg's recursion over all stretches, p by AIC.
+    """Return (1, a_1, …, a_p) of `A(q) e_k = ε_k`, ε white, by Burg's recursion.
+
+    It runs over all stretches; AIC chooses p.
 
     Burg's A is stable and, unlike that of Yule and Walker, hardly biased near the unit circle.
 
@@ -69,7 +76,9 @@ def burg(pieces: Sequence[Vector], largest: int) -> Vector:
         energy = sum(f @ f + b @ b for f, b in zip(forward, backward, strict=True))
         product = sum(f @ b for f, b in zip(forward, backward, strict=True))
         k = -2 * product / energy if energy > rows * _ROUNDING**2 else 1.0
-        if rows < _ROWS_PER_LAG * order or 1 - k**2 < _ROUNDING:  # too few rows, or nothing is left to predict
+        if (
+            rows < _ROWS_PER_LAG * order or 1 - k**2 < _ROUNDING
+        ):  # too few rows, or nothing is left to predict
             break
         both = list(zip(forward, backward, strict=True))
         forward, backward = [f + k * b for f, b in both], [b + k * f for f, b in both]
@@ -81,22 +90,30 @@ def burg(pieces: Sequence[Vector], largest: int) -> Vector:
 
 
 def autocorrelation(residuals: Matrix) -> Vector | None:
-    """Return the correlations ρ_1, ρ_2, … of stretches (s, T); None of fewer than 3 steps, and of zeros."""
+    """Return the correlations ρ_1, ρ_2, … of stretches (s, T).
+
+    None of fewer than 3 steps, and of zeros.
+    """
     return _correlations(_spectrum(residuals), residuals.shape[1])
 
 
 def independent_share(residuals: Matrix) -> float:
-    """1 / (1 + 2 Σ ρ_i), the inverse autocorrelation time, summed up to the first correlation that is noise.
+    """Return 1 / (1 + 2 Σ ρ_i), the inverse autocorrelation time.
+
+    The sum ends at the first correlation that is noise.
 
     Args:
-        residuals: stretches (s, T), 0 where there is no residual; lags never reach from one into the next.
+        residuals: stretches (s, T), 0 where there is no residual; lags never reach from one into
+            the next.
     """
     longest = residuals.shape[1]
     return share_of(_spectrum(residuals), longest, int(np.count_nonzero(residuals)))
 
 
 def share_of(spectrum: Vector, longest: int, count: int) -> float:
-    """The same of a spectrum, `Σ |DFT|²` over stretches of `longest` steps that have `count` residuals.
+    """Return the independent share of errors with a spectrum `Σ |DFT|²`.
+
+    The spectrum is that of stretches of `longest` steps with `count` residuals.
 
     The DFT has `spectrum_size(longest)` points.
     """
@@ -109,16 +126,18 @@ def share_of(spectrum: Vector, longest: int, count: int) -> float:
 
 
 def spectrum_size(longest: int) -> int:
-    """Points of a DFT in which products of lags do not wrap around."""
+    """Return the points of a DFT in which products of lags do not wrap around."""
     return 1 << (2 * longest - 1).bit_length()
 
 
 def correlation_length(residuals: Matrix) -> int | None:
-    """The lag τ from which to twice it correlations are noise, so that a resonance is not cut where it is 0.
+    """Return the lag τ from which to 2τ all correlations are noise.
 
-    Their root mean square there is that of correlations of coloured noise, `√((1 + 2 Σ_{j<τ} ρ_j²) / N)` (Bartlett
-    1946), or hardly more; or it is too small to count. None where there is no such lag among the first N / 20, or in
-    the first half of the stretches.
+    A resonance is thus not cut where its correlation crosses 0.
+
+    Their root mean square there is that of correlations of coloured noise, `√((1 + 2 Σ_{j<τ} ρ_j²)
+    / N)` (Bartlett 1946), or hardly more; or it is too small to count. None where there is no such
+    lag among the first N / 20, or in the first half of the stretches.
 
     Args:
         residuals: as above.
@@ -139,7 +158,7 @@ def correlation_length(residuals: Matrix) -> int | None:
 
 
 def _correlations(spectrum: Vector, longest: int) -> Vector | None:
-    """ρ_1, ρ_2, …; None where there are none."""
+    """Return ρ_1, ρ_2, …; None where there are none."""
     if longest < 3:
         return None
     covariance = _autocovariances(spectrum, longest)
@@ -147,9 +166,11 @@ def _correlations(spectrum: Vector, longest: int) -> Vector | None:
 
 
 def _autocovariances(spectrum: Vector, longest: int) -> Vector:
-    """`Σ e_k e_{k−τ}` over all stretches, from τ = 0 on."""
+    """Return `Σ e_k e_{k−τ}` over all stretches, from τ = 0 on."""
     return np.fft.irfft(spectrum, spectrum_size(longest))[:longest]
 
 
 def _spectrum(residuals: Matrix) -> Vector:
-    return np.sum(np.abs(np.fft.rfft(residuals, spectrum_size(residuals.shape[1]), axis=1)) ** 2, axis=0)
+    return np.sum(
+        np.abs(np.fft.rfft(residuals, spectrum_size(residuals.shape[1]), axis=1)) ** 2, axis=0
+    )

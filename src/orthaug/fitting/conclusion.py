@@ -17,12 +17,12 @@ from orthaug.data.record import Record
 from orthaug.data.regressors import Lags
 from orthaug.fitting.elimination import Fixed, ThetaSplit, directions, eliminate, split_theta
 from orthaug.fitting.estimates import NOT_UNIQUE, Estimate
-from orthaug.fitting.laid_rows import Share
-from orthaug.fitting.learned import ErrorStatistics, Learned
+from orthaug.fitting.learned import ErrorStatistics, TrainedLearner
 from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.silence import learner_silent
 from orthaug.fitting.status import ALONE, Ending, Status
 from orthaug.fitting.structures import Orthogonal, Structure
+from orthaug.fitting.training_rows import Share
 from orthaug.fitting.unfinished import (
     NOT_CONVERGED,
     ending_in_words,
@@ -39,17 +39,17 @@ from orthaug.models.lagged import Lagged
 from orthaug.models.learners import Bound, External, Function, Scaling
 from orthaug.models.model import Model
 from orthaug.models.statistics import JointCovariance, Statistics
+from orthaug.physics import ill_conditioned
 from orthaug.physics.baseline import Baseline
-from orthaug.physics.excitation import ILL_CONDITIONED
 from orthaug.physics.problem import Problem, pose
 
 _UNDETERMINED = (
-    "no standard errors: beside the learner's weights the data do not determine θ to rounding. Use more data, a "
-    "smaller learner, or one that sees less."
+    "no standard errors: beside the learner's weights the data do not determine θ to rounding. "
+    "Use more data, a smaller learner, or one that sees less."
 )
 
 
-def conclude(task: OneStepTask, structure: Structure, learned: Learned) -> Estimate:
+def conclude(task: OneStepTask, structure: Structure, learned: TrainedLearner) -> Estimate:
     """Solve θ, split it from the learner, and attach statistics.
 
     Args:
@@ -57,10 +57,12 @@ def conclude(task: OneStepTask, structure: Structure, learned: Learned) -> Estim
         learned: of these rows, or of a free run on the same problem.
     """
     problem = task.problem
-    told: list[Warning] = []
+    warnings: list[Warning] = []
     if unfinished(learned) and follows_training(structure, problem, learned):
         learned = withheld(learned)
-        told += [not_converged(learned)] if learned.tilt is None else []  # longer training gives an ensemble none
+        warnings += (
+            [not_converged(learned)] if learned.tilt is None else []
+        )  # longer training gives an ensemble none
     share = task.share(learned)
     finite = bool(np.isfinite(share.square) and np.isfinite(share.coordinates).all())
     ending = learned.ending if finite else Ending.NON_FINITE
@@ -75,15 +77,22 @@ def conclude(task: OneStepTask, structure: Structure, learned: Learned) -> Estim
     noise = errors.noise if ending.usable else None
     identified = structure.projects or (learned.bound is None and structure.identifies)
     known = noise is not None and identified and not learned.elsewhere
-    told += [] if learned.elsewhere else learner_silent(learned)
-    told += _warnings(problem, structure, learned, identified, noise, fixed)
-    if any(warning.code == NOT_CONVERGED for warning in told):
+    warnings += [] if learned.elsewhere else learner_silent(learned)
+    warnings += ill_conditioned.of_physics(
+        problem, theta, errors.covariance if ending.usable else None
+    )
+    warnings += _warnings(problem, structure, learned, identified, noise, fixed)
+    if any(warning.code == NOT_CONVERGED for warning in warnings):
         pass
     elif known and errors.covariance is None and learned.errors is None:
-        text = "no standard errors: beside a learner that sees only some features, an ensemble leaves none."
-        told.append(Warning("no_standard_errors", text))
-    elif known and errors.covariance is not None and np.isnan(np.diag(errors.covariance)).sum() > len(fixed):
-        told.append(Warning("no_standard_errors", _UNDETERMINED))
+        text = "no standard errors: an ensemble has none where its learner sees only some features."
+        warnings.append(Warning("no_standard_errors", text))
+    elif (
+        known
+        and errors.covariance is not None
+        and np.isnan(np.diag(errors.covariance)).sum() > len(fixed)
+    ):
+        warnings.append(Warning("no_standard_errors", _UNDETERMINED))
     reason = ALONE.get(ending, "") if learned.bound is None else ""
     reason = reason or ending_in_words(ending, learned.tail)
     model = _model(problem, structure, learned, ThetaSplit(theta, theta_aux, fixed), errors, noise)
@@ -91,7 +100,9 @@ def conclude(task: OneStepTask, structure: Structure, learned: Learned) -> Estim
     shared = problem.shared if partly and problem.features.entries else None
     return Estimate(
         model=model,
-        status=Status(ending, learned.iterations, learned.seconds, errors.mean_square, reason=reason),
+        status=Status(
+            ending, learned.iterations, learned.seconds, errors.mean_square, reason=reason
+        ),
         restarts=(),
         excitation=problem.excitation,
         covariance=grown(errors.covariance, model.statistics, shared) if known else None,
@@ -101,7 +112,7 @@ def conclude(task: OneStepTask, structure: Structure, learned: Learned) -> Estim
         problem=problem,
         criterion=task.criterion,
         at_bound={problem.baseline.names[i]: value for i, value in fixed.items()},
-        warnings=tuple(told),
+        warnings=tuple(warnings),
         scores=learned.scores,
     )
 
@@ -109,17 +120,26 @@ def conclude(task: OneStepTask, structure: Structure, learned: Learned) -> Estim
 def _model(
     problem: Problem,
     structure: Structure,
-    learned: Learned,
+    learned: TrainedLearner,
     parameters: ThetaSplit,
     errors: ErrorStatistics,
     noise: Matrix | None,
 ) -> Model:
     record, scaling = problem.record, learned.scaling
-    numbers = (parameters.theta, parameters.theta_aux, learned.weights, scaling.centre, scaling.halfwidth, learned.unit)
+    numbers = (
+        parameters.theta,
+        parameters.theta_aux,
+        learned.weights,
+        scaling.centre,
+        scaling.halfwidth,
+        learned.unit,
+    )
     middle = _middle(problem, learned, noise)
     decoupled = structure.projects and directions(structure, problem) is None
     held = {} if decoupled else parameters.fixed
-    form = Lagged(problem.baseline, problem.features, problem.layout, problem.outputs, learned.bound)
+    form = Lagged(
+        problem.baseline, problem.features, problem.layout, problem.outputs, learned.bound
+    )
     limits, pull = _limits(problem, form)
     return Model(
         form=form,
@@ -146,20 +166,27 @@ def _model(
 
 
 def _limits(problem: Problem, form: Lagged) -> tuple[Matrix | None, Matrix | None]:
-    """The range of the features, beyond which the correction is held or fades, and how x follows it there."""
+    """Return the range of the features, and how x follows its limits.
+
+    Beyond the range the correction stays constant or fades.
+    """
     limits = None if form.beyond == "free" else limits_of(problem.feature_range)
     if limits is None:
         return None, None
-    return limits, pull_of(lambda x: np.asarray(form.features.evaluate(x, form.layout, np)), problem.rows.x)
+    return limits, pull_of(
+        lambda x: np.asarray(form.features.evaluate(x, form.layout, np)), problem.rows.x
+    )
 
 
 def _one_step_errors(
-    task: OneStepTask, structure: Structure, learned: Learned, c: Vector, fixed: Fixed
+    task: OneStepTask, structure: Structure, learned: TrainedLearner, c: Vector, fixed: Fixed
 ) -> ErrorStatistics:
-    """The statistics of the one-step residual."""
+    """Return the statistics of the one-step residual."""
     problem, ny = task.problem, len(task.problem.outputs)
     whitened = task.residual_gram(learned, c)
-    freedom = degrees_of_freedom(problem.count, problem.freedom_used, learned.effective) + len(fixed) / ny
+    freedom = (
+        degrees_of_freedom(problem.count, problem.freedom_used, learned.effective) + len(fixed) / ny
+    )
     finite = bool(np.isfinite(whitened).all())
     mixed = noise_covariance(whitened, freedom) if finite else None
     noise = covariance = None
@@ -175,9 +202,11 @@ def _one_step_errors(
 
 
 def _beside_the_learner(
-    problem: Problem, structure: Structure, learned: Learned, whitened: Matrix, fixed: Fixed
+    problem: Problem, structure: Structure, learned: TrainedLearner, whitened: Matrix, fixed: Fixed
 ) -> Matrix | None:
-    """Cov θ̂ where only some directions are split off: `K Cov(c, w) Kᵀ` with `K = [I, ∂θ_aux/∂w]` (F8).
+    """Return Cov θ̂ where only some directions are split off (F8).
+
+    It is `K Cov(c, w) Kᵀ` with `K = [I, ∂θ_aux/∂w]`.
 
     Entries at a bound are no unknowns: they have NaN.
     """
@@ -189,21 +218,23 @@ def _beside_the_learner(
     nt = len(taken)
     overlap = np.linalg.solve(factor.to_coordinates.T, gram[:nt, nt:])  # QᵀJ
     k = np.column_stack([np.eye(nt), factor.from_coordinates(taken @ overlap)])
-    covariance = JointCovariance(_beside(fixed, gram), learned.ridge, _beside(fixed, middle), nt).of(k)
+    covariance = JointCovariance(
+        _beside(fixed, gram), learned.ridge, _beside(fixed, middle), nt
+    ).of(k)
     held = list(fixed)
     covariance[held] = covariance[:, held] = np.nan
     return covariance
 
 
 def _beside(fixed: Fixed, gram: Matrix) -> Matrix:
-    """A Gram matrix of (c, w) in which what stands at a bound is no unknown."""
+    """Return a Gram matrix of (c, w) in which entries at a bound are no unknowns."""
     unknown = np.ones(len(gram))
     unknown[list(fixed)] = 0.0
     return gram * np.outer(unknown, unknown)
 
 
-def _middle(problem: Problem, learned: Learned, noise: Matrix | None) -> Matrix | None:
-    """ΣψᵀΣ_eψ in whitened outputs, for the intervals of later splits and of predictions."""
+def _middle(problem: Problem, learned: TrainedLearner, noise: Matrix | None) -> Matrix | None:
+    """Return ΣψᵀΣ_eψ in whitened outputs, for intervals of later splits and predictions."""
     if noise is None or learned.gram is None:
         return None
     whitened = problem.weight.whitened(noise)
@@ -213,9 +244,16 @@ def _middle(problem: Problem, learned: Learned, noise: Matrix | None) -> Matrix 
 
 
 def _defect(
-    task: OneStepTask, structure: Structure, share: Share, parameters: ThetaSplit, learned: Learned
+    task: OneStepTask,
+    structure: Structure,
+    share: Share,
+    parameters: ThetaSplit,
+    learned: TrainedLearner,
 ) -> float | None:
-    """‖QᵀF̃‖ / ‖F‖ with F̃ = F − Φ θ_aux (eq:orth_property), along the shared directions; None for F = 0."""
+    """Return ‖QᵀF̃‖ / ‖F‖ with F̃ = F − Φ θ_aux (eq:orth_property), along the shared directions.
+
+    None for F = 0.
+    """
     size = np.sqrt(share.square)
     if not 0 < size < np.inf:
         return None
@@ -224,61 +262,67 @@ def _defect(
 
 
 def without_loss(mean_square: float) -> list[Warning]:
-    """What is told of a free run whose mean square over whole experiments does not exist."""
+    """Return the warning that a free run over whole experiments has no mean square."""
     if np.isfinite(mean_square):
         return []
     text = (
-        "the free run diverges over whole experiments of the training data, so it has no loss; train with longer "
-        "segments, or bound what makes it run away."
+        "the free run diverges over whole experiments of the training data, so it has no loss; "
+        "train with longer segments, or bound the parameters that make it diverge."
     )
     return [Warning("free_run_diverges", text)]
 
 
 def _warnings(
-    problem: Problem, structure: Structure, learned: Learned, identified: bool, noise: Matrix | None, fixed: Fixed
+    problem: Problem,
+    structure: Structure,
+    learned: TrainedLearner,
+    identified: bool,
+    noise: Matrix | None,
+    fixed: Fixed,
 ) -> list[Warning]:
-    told = []
-    condition = problem.excitation.condition
-    if condition is not None and condition > ILL_CONDITIONED:
-        text = (
-            f"the physics is ill-conditioned on the data (condition {condition:.1e} of the scaled columns): "
-            "θ is determined, but small changes of the data move it far."
-        )
-        told.append(Warning("ill_conditioned", text))
+    warnings: list[Warning] = []
     if learned.ending is Ending.SPANNED:
         text = (
-            "the learner lies in the span of the physics (P⊥J = 0): there is nothing for it to learn that the "
-            "physics does not express already. Give it another form or other inputs, or leave it out."
+            "the learner lies in the span of the physics (P⊥J = 0): there is nothing for it to "
+            "learn that the physics does not express already. Give it another form or other "
+            "inputs, or leave it out."
         )
-        told.append(Warning("learner_spanned", text))
+        warnings.append(Warning("learner_spanned", text))
     if learned.errors is not None:
-        told += without_loss(learned.errors.mean_square)
+        warnings += without_loss(learned.errors.mean_square)
     if learned.elsewhere:
-        told.append(Warning("no_standard_errors", "no standard errors: the function was trained elsewhere."))
+        warnings.append(
+            Warning("no_standard_errors", "no standard errors: the function was trained elsewhere.")
+        )
     elif not identified:
         text = (
-            f"θ of the {structure.name} structure is not unique (it depends on the learner's start or on the "
-            "penalty), so it has no standard error; use the orthogonal structure for parameters."
+            f"θ of the {structure.name} structure is not unique (it depends on the learner's "
+            "start or on the penalty), so it has no standard error; use the orthogonal "
+            "structure for parameters."
         )
-        told.append(Warning(NOT_UNIQUE, text))
+        warnings.append(Warning(NOT_UNIQUE, text))
     elif noise is None:
         text = (
             f"no standard errors: {problem.count} rows leave no degrees of freedom for "
-            f"{len(problem.baseline.names)} parameters and {learned.effective:.1f} effective weights; "
-            "use more data or a smaller learner."
+            f"{len(problem.baseline.names)} parameters and {learned.effective:.1f} effective "
+            "weights; use more data or a smaller learner."
         )
-        told.append(Warning("no_standard_errors", text))
+        warnings.append(Warning("no_standard_errors", text))
     if fixed:
         names = ", ".join(f"{problem.baseline.names[i]} = {value:g}" for i, value in fixed.items())
         text = (
-            f"at a bound: {names}. What stands at a bound is a known term, as with `fixed = true`: it has no standard "
-            "error, and the others and theirs hold with it there; "
+            f"at a bound: {names}. A parameter at a bound is a known term, as with `fixed = "
+            "true`: it has no standard error, and the other estimates hold with it there; "
         )
-        if structure.projects and learned.bound is not None and directions(structure, problem) is not None:
+        if (
+            structure.projects
+            and learned.bound is not None
+            and directions(structure, problem) is not None
+        ):
             text += "the learner is not made orthogonal to it; "
         text += "data that contradict a bound contradict the physics or the bound."
-        told.append(Warning("at_a_bound", text))
-    return told
+        warnings.append(Warning("at_a_bound", text))
+    return warnings
 
 
 def orthogonalize(
@@ -289,12 +333,13 @@ def orthogonalize(
     Args:
         record: the rows over which the rest is made orthogonal, usually the training data.
         baseline: the physics.
-        function: `g(x)` on NumPy regressors (N, nx) in `Lags` order, giving (N, ny); from any toolbox.
+        function: `g(x)` on NumPy regressors (N, nx) in `Lags` order, giving (N, ny); from any
+            toolbox.
         lags: the regressor that `function` expects; None for the raw lags of the baseline.
 
     Returns:
-        An estimate whose model predicts what `function` does, with `θ = Φ⁺G` and the learner `g − φθ`.
-        There are no standard errors: they belong to how `function` was trained.
+        An estimate whose model predicts what `function` does, with `θ = Φ⁺G` and the learner `g −
+        φθ`. There are no standard errors: they belong to how `function` was trained.
     """
     problem = pose(record, baseline, lags)
     ny, nz = len(problem.outputs), len(problem.features.entries)
@@ -303,9 +348,13 @@ def orthogonalize(
     scaling, unit = Scaling(np.zeros(nz), np.ones(nz)), np.ones(ny)
     task = OneStepTask.of(problem, None)
     gain = np.broadcast_to(problem.weight.matrix / task.rms, (*values.shape, ny))
-    rows = task.engine.lay(values, problem.projection.q, problem.unexplained / task.rms, gain)
+    rows = task.engine.build_rows(
+        values, problem.projection.q, problem.unexplained / task.rms, gain
+    )
     task = replace(task, rows=rows, unit=unit, bound=Bound(_GIVEN, ny, ny))
-    concluded = conclude(task, Orthogonal(), Learned(task.bound, np.zeros(0), scaling, unit, elsewhere=True))
+    concluded = conclude(
+        task, Orthogonal(), TrainedLearner(task.bound, np.zeros(0), scaling, unit, elsewhere=True)
+    )
     form = replace(concluded.model.form, bound=Bound(external, nz, ny))
     return replace(concluded, model=replace(concluded.model, form=form))
 

@@ -1,4 +1,7 @@
-"""Criteria: declarations of what is minimised, the error one step ahead, several steps ahead, or of a free run."""
+"""Criteria: declarations of the error that is minimised.
+
+One step ahead, several steps ahead, or of a free run.
+"""
 
 from __future__ import annotations
 
@@ -21,16 +24,16 @@ if TYPE_CHECKING:
 
 @runtime_checkable
 class Criterion(Protocol):
-    """What `estimate(criterion=…)` takes."""
+    """A criterion as `estimate(criterion=…)` accepts it."""
 
     @property
     def one_step(self) -> bool:
-        """Whether it is the error one step ahead, which is linear in θ."""
+        """True for the error one step ahead, which is linear in θ."""
         ...
 
     @property
     def simulates(self) -> bool:
-        """Whether runs are compared by free runs over whole experiments."""
+        """True where runs are compared by free runs over whole experiments."""
         ...
 
     @property
@@ -40,25 +43,25 @@ class Criterion(Protocol):
 
     @property
     def automatic(self) -> bool:
-        """Whether the data decide between one step ahead and the free run."""
+        """True where the data decide between one step ahead and the free run."""
         ...
 
     @property
-    def flown(self) -> Simulation | None:
+    def free_run(self) -> Simulation | None:
         """The free run that training makes; None for one step ahead."""
         ...
 
     def on(self, record: Record, first_row: int = 0) -> Any:
-        """The criterion with what it leaves to the record."""
+        """Return the criterion with its open choices made for a record."""
         ...
 
     @property
     def streamed(self) -> Any:
-        """The criterion with what it leaves to a record whose rows are not in memory."""
+        """The criterion with its open choices made for rows that are not in memory."""
         ...
 
     def response(self, model: Model, record: Record) -> Response:
-        """The response whose error judges a model on a validation part."""
+        """Return the response whose error judges a model on a validation part."""
         ...
 
 
@@ -70,10 +73,12 @@ _LOOKED_AT = 2**17  # samples of which the autocorrelation is taken
 
 @dataclass(frozen=True)
 class Prediction:
-    """Declaration: the error of the prediction `horizon` steps ahead; 1 is the paper's criterion (eq:cost_fun).
+    """Declaration: the error of the prediction `horizon` steps ahead.
+
+    1 is the paper's criterion (eq:cost_fun).
 
     Examples:
-        >>> Prediction(10).flown
+        >>> Prediction(10).free_run
         Simulation(segment=10, washout=9, start_iterations=20, exact_start=True)
     """
 
@@ -88,25 +93,32 @@ class Prediction:
 
     @property
     def one_step(self) -> bool:
-        """Whether it is the error one step ahead, which is linear in θ."""
+        """True for the error one step ahead, which is linear in θ."""
         return self.horizon == 1
 
     @property
-    def flown(self) -> Simulation | None:
-        """The free run that gives it: segments of `horizon` steps whose last one is scored; None for one step."""
-        return Simulation(self.horizon, self.horizon - 1, exact_start=True) if self.horizon > 1 else None
+    def free_run(self) -> Simulation | None:
+        """The free run of which it is a part: segments of `horizon` steps, the last one scored.
+
+        None for one step.
+        """
+        return (
+            Simulation(self.horizon, self.horizon - 1, exact_start=True)
+            if self.horizon > 1
+            else None
+        )
 
     def on(self, record: Record, first_row: int = 0) -> Prediction:
-        """Return itself: nothing of it depends on a record."""
+        """Return itself: it does not depend on a record."""
         return self
 
     @property
     def streamed(self) -> Prediction:
-        """Itself."""
+        """The declaration itself."""
         return self
 
     def response(self, model: Model, record: Record) -> Response:
-        """The prediction."""
+        """Return the prediction."""
         return model.predict(record, self.horizon)
 
 
@@ -114,18 +126,21 @@ class Prediction:
 class Simulation:
     """Declaration: the error of a free run over segments that start from measured lags.
 
-    With a washout, or over whole experiments, the outputs before a segment count as noisy like all others: they are
-    unknowns too (`InitialStates`). Segments without a washout start exactly from what was measured.
+    With a washout, or over whole experiments, the outputs before a segment count as noisy like all
+    others: they are unknowns too (`InitialStates`). Segments without a washout start exactly from
+    what was measured.
 
     Args:
-        segment: steps of a segment; 0 for whole experiments; "auto" for 20 times as many steps as the outputs remember
-            themselves, 512 or more, and whole experiments where these are not twice as long.
+        segment: steps of a segment; 0 for whole experiments; "auto" for 20 times as many steps as
+            the outputs remember themselves, 512 or more, and whole experiments where these are not
+            twice as long.
         washout: leading steps of a segment that are not scored, until its start is forgotten.
         start_iterations: one-step iterations that training starts from.
-        exact_start: whether a segment starts exactly from what was measured; None for the rule above.
+        exact_start: whether a segment starts exactly from what was measured; None for the rule
+            above.
 
     Examples:
-        >>> Simulation(segment=0, washout=0).estimates_pasts  # whole experiments, from starts that are estimated
+        >>> Simulation(segment=0, washout=0).estimates_pasts  # whole experiments, estimated starts
         True
     """
 
@@ -143,37 +158,45 @@ class Simulation:
         _check_segment(self.segment)
         if isinstance(self.segment, int) and self.segment and self.washout >= self.segment:
             raise KeyedError(
-                f"`washout` must be shorter than `segment`; got {self.washout} and {self.segment}: nothing is scored.",
+                f"`washout` must be shorter than `segment`; got {self.washout} and "
+                f"{self.segment}: nothing is scored.",
                 "washout",
                 f": found {self.washout}; expected less than the segment, {self.segment}",
             )
 
     @property
-    def flown(self) -> Simulation:
-        """Itself: the free run that training makes."""
+    def free_run(self) -> Simulation:
+        """The declaration itself: the free run that training makes."""
         return self
 
     @property
     def steps(self) -> int:
-        """Steps of a segment, 0 for whole experiments; the fewest where their number is left to a record."""
+        """Steps of a segment, 0 for whole experiments.
+
+        The fewest where their number is left to a record.
+        """
         return max(SHORT, 2 * self.washout) if isinstance(self.segment, str) else self.segment
 
     def on(self, record: Record, first_row: int = 0) -> Simulation:
-        """Return the same with segments of so many steps as a record asks for, where that is left to it."""
-        return self if self.segment != "auto" else replace(self, segment=segment_for(record, first_row, self.washout))
+        """Return the declaration with segments whose length suits a record, if none is given."""
+        return (
+            self
+            if self.segment != "auto"
+            else replace(self, segment=segment_for(record, first_row, self.washout))
+        )
 
     @property
     def streamed(self) -> Simulation:
-        """The same with the shortest segments, where their length is left to the record."""
+        """The declaration with the shortest segments, if no length is given."""
         return replace(self, segment=self.steps)
 
     def response(self, model: Model, record: Record) -> Response:
-        """The free run."""
+        """Return the free run."""
         return model.simulate(record)
 
     @property
     def estimates_pasts(self) -> bool:
-        """Whether the outputs before a segment are unknowns."""
+        """True where the outputs before a segment are unknowns."""
         if self.exact_start is not None:
             return not self.exact_start
         return self.washout > 0 or self.segment == 0
@@ -181,11 +204,12 @@ class Simulation:
 
 @dataclass(frozen=True)
 class Auto:
-    """Declaration: the error one step ahead, and that of the free run where one step ahead is not enough.
+    """Declaration: the error one step ahead, or that of the free run where this is not enough.
 
-    A fit one step ahead stays where its free run is finite and no worse than that of physics alone where nothing was
-    fitted, and where its residual is noise of the equation. Otherwise physics and learner are trained on the free run
-    as well, and the best of all in free run is the result (`Estimate.focus`).
+    A fit one step ahead stays where its free run is finite and no worse than that of physics alone
+    where nothing was fitted, and where its residual is noise of the equation. Otherwise physics and
+    learner are trained on the free run as well, and the best of all in free run is the result
+    (`Estimate.focus`).
 
     Args:
         segment, washout, start_iterations: of the free run, as in `Simulation`.
@@ -208,8 +232,8 @@ class Auto:
         Simulation(self.segment, self.washout, self.start_iterations)
 
     @property
-    def flown(self) -> None:
-        """None: it begins one step ahead."""
+    def free_run(self) -> None:
+        """None: training begins one step ahead."""
         return None
 
     @property
@@ -218,7 +242,7 @@ class Auto:
         return Simulation(self.segment, self.washout, self.start_iterations)
 
     def on(self, record: Record, first_row: int = 0) -> Auto:
-        """Return itself: it is one step ahead that it begins with."""
+        """Return itself: training begins one step ahead."""
         return self
 
     @property
@@ -227,15 +251,15 @@ class Auto:
         return Prediction()
 
     def response(self, model: Model, record: Record) -> Response:
-        """The free run."""
+        """Return the free run."""
         return model.simulate(record)
 
 
 def segment_for(record: Record, first_row: int, washout: int) -> int:
-    """Return how many steps a segment of a free run has; 0 for whole experiments.
+    """Return the steps of a segment of a free run; 0 for whole experiments.
 
-    It is 20 times as long as the outputs remember themselves (their autocorrelation is below 1/e), so that it shows
-    the slowest mode that they have, and longer than its washout.
+    It is 20 times as long as the outputs remember themselves (their autocorrelation is below 1/e),
+    so that it shows the slowest mode that they have, and longer than its washout.
     """
     longest = max(record.experiments, key=len)
     steps = len(longest) - first_row
@@ -249,6 +273,6 @@ def segment_for(record: Record, first_row: int, washout: int) -> int:
 
 
 def _check_segment(segment: object) -> None:
-    """Raise InputError for what is no number of steps."""
+    """Raise InputError for an invalid number of steps."""
     if segment != "auto":
         check_count(segment, "segment", least=0)

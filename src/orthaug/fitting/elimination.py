@@ -1,4 +1,4 @@
-"""θ is eliminated from the criterion, whatever the structure: what remains is one small quadratic in QᵀF (F1)."""
+"""Elimination of θ from the criterion, which leaves a small quadratic in QᵀF (F1)."""
 
 from __future__ import annotations
 
@@ -14,17 +14,16 @@ from orthaug.physics.problem import Problem
 from orthaug.physics.shared import Shared
 
 Fixed = dict[int, float]
-"""Entries of θ that stand at a bound, with its value."""
+"""Entries of θ at a bound, with its value."""
 
 
 def settle(fixed: Fixed, run: Callable[[Fixed], Fixed | None]) -> Fixed:
-    """What stands at a bound where a run with the same entries held ended.
+    """Return the entries at a bound where a run with the same entries fixed ended.
 
     What was held together once before is not released again, so that this ends.
 
-    Args:
-        fixed: what is held first.
-        run: runs with some entries held, and gives those that stand at one then; None to leave it at that.
+    Args: fixed: what is held first. run: runs with some entries held, and gives those that are at
+        one then; None to leave it at that.
     """
     tried = [fixed]
     while (active := run(fixed)) is not None:
@@ -38,12 +37,16 @@ def settle(fixed: Fixed, run: Callable[[Fixed], Fixed | None]) -> Fixed:
 
 @dataclass(frozen=True, eq=False)
 class Elimination:
-    """θ eliminated from `‖p − (I − P) f − Tθ‖² + ‖e − A θ − B f‖²`, f = QᵀF, p = QᵀY, `T` = coordinates of θ.
+    """θ eliminated from the criterion.
 
-    P, `taken`, is the projector onto what a split moves from the learner to θ: all in the paper's structure, nothing in
-    the additive one. `(A, B, e)` are the structure's rows. An active set meets the bounds: some entries of θ stand at a
-    bound, and the others minimise the rest. Where the learner can imitate part of the physics only, they are known
-    terms then, which a split moves nothing to: P is that of the `shared` directions that leave them alone.
+    The criterion is `‖p − (I − P) f − Tθ‖² + ‖e − A θ − B f‖²` with f = QᵀF, p = QᵀY, and `T` the
+    coordinates of θ.
+
+    P, `taken`, is the projector onto what a split moves from the learner to θ: all in the paper's
+    structure, nothing in the additive one. `(A, B, e)` are the structure's rows. An active set
+    meets the bounds: some entries of θ are at a bound, and the others minimise the rest. Where
+    the learner can imitate part of the physics only, they are known terms then, which a split moves
+    nothing to: P is that of the `shared` directions that leave them alone.
     """
 
     to_coordinates: Matrix
@@ -53,25 +56,27 @@ class Elimination:
     lower: Vector
     upper: Vector
     shared: Shared | None = None
-    """The directions that P projects onto; None where P is the same whatever stands at a bound."""
+    """The directions that P projects onto; None where P is the same whichever entries are at a
+    bound.
+    """
 
     @property
     def bounded(self) -> bool:
-        """Whether any entry of θ has a bound."""
+        """True where an entry of θ has a bound."""
         return bool(np.isfinite(self.lower).any() or np.isfinite(self.upper).any())
 
     @property
     def projects(self) -> bool:
-        """Whether anything is moved from the learner to θ."""
+        """True where a part of the learner is moved to θ."""
         return bool(self.taken.any())
 
     @property
     def decoupled(self) -> bool:
-        """Whether θ does not depend on the learner, nor the learner on bounds (F1)."""
+        """True where θ is independent of the learner, and the learner of bounds (F1)."""
         return not self._learner({}).any()
 
     def taken_beside(self, fixed: Fixed) -> Matrix:
-        """P (nθ, nθ) where some entries of θ stand at a bound."""
+        """Return P (nθ, nθ) where some entries of θ are at a bound."""
         if not fixed or self.shared is None:
             return self.taken
         basis = np.linalg.qr(self.to_coordinates @ self.shared.leaving(fixed).basis)[0]
@@ -82,14 +87,18 @@ class Elimination:
         return np.concatenate([self.to_coordinates, self.rows.theta])
 
     def _learner(self, fixed: Fixed) -> Matrix:
-        return np.concatenate([np.eye(len(self.outputs)) - self.taken_beside(fixed), self.rows.learner])
+        return np.concatenate(
+            [np.eye(len(self.outputs)) - self.taken_beside(fixed), self.rows.learner]
+        )
 
     @property
     def _target(self) -> Vector:
         return np.concatenate([self.outputs, self.rows.target])
 
     def hold(self, fixed: Fixed) -> tuple[Matrix, Vector]:
-        """`(S, t)` with `min_θ (…) = ‖t − S f‖² + constant`, (nθ, nθ) and (nθ,): all that the learner sees of θ.
+        """Return `(S, t)`, (nθ, nθ) and (nθ,), through which the learner depends on θ.
+
+        `min_θ (…) = ‖t − S f‖² + constant`.
 
         S is zero where θ can follow any f: without penalty rows and with no entry at a bound.
         """
@@ -105,7 +114,7 @@ class Elimination:
         return small[:, :nt], small[:, nt]
 
     def theta(self, f: Vector, fixed: Fixed) -> Vector:
-        """The minimising θ (nθ,) for the learner's coordinates f (nθ,)."""
+        """Return the minimising θ (nθ,) for the learner's coordinates f (nθ,)."""
         free, offset = self._split(fixed)
         scale = np.linalg.norm(free, axis=0)
         right = self._target - self._learner(fixed) @ f - offset
@@ -118,10 +127,10 @@ class Elimination:
         return theta
 
     def active(self, f: Vector) -> Fixed:
-        """Which entries of θ stand at which bound, for the learner's coordinates f.
+        """Return a mask of the entries of θ at a bound, for the learner's coordinates f.
 
-        Those of the nearest θ in the bounds where nothing is held; what a held entry leaves to the learner may move
-        others past theirs, and these are added (`past`).
+        Those of the nearest θ in the bounds where nothing is held; what a held entry leaves to the
+        learner may move others past theirs, and these are added (`past`).
         """
         if not self.bounded:
             return {}
@@ -130,7 +139,11 @@ class Elimination:
         matrix, right = self._theta, self._target - self._learner({}) @ f
         scale = np.linalg.norm(matrix, axis=0)
         solution = lsq_linear(
-            matrix / scale, right, bounds=(self.lower * scale, self.upper * scale), method="bvls", tol=1e-14
+            matrix / scale,
+            right,
+            bounds=(self.lower * scale, self.upper * scale),
+            method="bvls",
+            tol=1e-14,
         )
         return self.past(
             f,
@@ -142,32 +155,45 @@ class Elimination:
         )
 
     def settled(self, run: Callable[[Fixed], Vector | None]) -> Fixed:
-        """What stands at a bound where training with the same entries held ended; those of physics alone at first.
+        """Return the entries at a bound where training with the same entries fixed ended.
+
+        Those of physics alone at first.
 
         Args:
-            run: trains with some entries held, and gives the learner's coordinates f; None to leave it at that.
+            run: trains with some entries held, and gives the learner's coordinates f; None to leave
+                it at that.
         """
         first = {} if self.decoupled else self.active(np.zeros_like(self.outputs))
         return settle(first, lambda fixed: None if (f := run(fixed)) is None else self.active(f))
 
     def past(self, f: Vector, fixed: Fixed) -> Fixed:
-        """The `fixed`, and at their bounds all entries that would else leave them, for the learner's coordinates f."""
+        """Return `fixed` and, at their bounds, all entries that would leave them.
+
+        For the learner's coordinates f.
+        """
         while True:
             theta = self.theta(f, fixed)
-            beyond = {i: float(v) for i, v in enumerate(np.clip(theta, self.lower, self.upper)) if v != theta[i]}
+            beyond = {
+                i: float(v)
+                for i, v in enumerate(np.clip(theta, self.lower, self.upper))
+                if v != theta[i]
+            }
             if not beyond or not np.isfinite(theta).all():
                 return fixed
             fixed = fixed | beyond
 
     def _split(self, fixed: Fixed) -> tuple[Matrix, Vector]:
-        """The columns of the free entries, and what the fixed ones contribute."""
+        """Return the columns of the free entries, and the contribution of the fixed ones."""
         matrix = self._theta
         free = [i for i in range(matrix.shape[1]) if i not in fixed]
         return matrix[:, free], matrix[:, list(fixed)] @ np.array(list(fixed.values()), dtype=float)
 
 
 def eliminate(structure: Structure, problem: Problem) -> Elimination:
-    """The elimination of θ from a problem's criterion with a structure's rows and the baseline's bounds."""
+    """Return the elimination of θ from a problem's criterion.
+
+    With a structure's rows and the baseline's bounds.
+    """
     baseline, projection = problem.baseline, problem.projection
     nt = len(baseline.names)
     shared = _shared(structure, problem)
@@ -175,7 +201,9 @@ def eliminate(structure: Structure, problem: Problem) -> Elimination:
     return Elimination(
         to_coordinates=projection.to_coordinates,
         outputs=problem.target_coordinates,
-        taken=projection.along(directions(structure, problem)) if structure.projects else np.zeros((nt, nt)),
+        taken=projection.along(directions(structure, problem))
+        if structure.projects
+        else np.zeros((nt, nt)),
         rows=structure.penalty(baseline.names, baseline.initial, problem.weight.unit),
         lower=baseline.bounds[0],
         upper=baseline.bounds[1],
@@ -189,17 +217,19 @@ def _shared(structure: Structure, problem: Problem) -> Shared:
 
 
 def directions(structure: Structure, problem: Problem, fixed: Iterable[int] = ()) -> Matrix | None:
-    """The directions of θ (nθ, s) along which a split makes the learner orthogonal; None for all.
+    """Return the directions of θ (nθ, s) along which a split makes the learner orthogonal.
+
+    None for all.
 
     Args:
-        fixed: entries of θ that stand at a bound, which no direction moves.
+        fixed: entries of θ at a bound, which no direction moves.
     """
     shared = _shared(structure, problem)
     return None if shared.all else shared.leaving(fixed).basis
 
 
 class ThetaSplit(NamedTuple):
-    """θ and θ_aux, and which entries of θ stand at a bound."""
+    """θ and θ_aux, and the entries of θ that are at a bound."""
 
     theta: Vector
     theta_aux: Vector
@@ -213,19 +243,27 @@ def split_theta(
     coefficients: Vector | None = None,
     fixed: Fixed | None = None,
 ) -> ThetaSplit:
-    """θ for the learner's share QᵀF (nθ,) in the physics, and its part θ_aux that the structure moves to θ.
+    """Return θ, and θ_aux, the part of the learner that the structure moves to θ.
+
+    They follow from the learner's share QᵀF (nθ,) in the physics.
 
     Args:
         coefficients: c = θ − θ_aux (nθ,) where it was an unknown of training; None to solve for θ.
-        fixed: what stands at a bound, where training knows that.
+        fixed: entries at a bound, where training knows them.
     """
     baseline, factor = problem.baseline, problem.projection
     elimination = eliminate(structure, problem)
-    if coefficients is not None and fixed is None:  # an iterate need not satisfy what only its end satisfies
-        apart = elimination.shared is not None  # nothing is moved to what stands at a bound
-        reached = coefficients + (0.0 if apart else factor.from_coordinates(elimination.taken @ share))
+    if (
+        coefficients is not None and fixed is None
+    ):  # an iterate need not satisfy what only its end satisfies
+        apart = elimination.shared is not None  # nothing is moved to entries at a bound
+        reached = coefficients + (
+            0.0 if apart else factor.from_coordinates(elimination.taken @ share)
+        )
         inside = np.clip(reached, *baseline.bounds)
-        fixed = elimination.active(share) | {i: value for i, value in enumerate(inside) if value != reached[i]}
+        fixed = elimination.active(share) | {
+            i: value for i, value in enumerate(inside) if value != reached[i]
+        }
     fixed = elimination.active(share) if fixed is None else fixed
     taken = elimination.taken_beside(fixed) @ share
     aux = factor.from_coordinates(taken)

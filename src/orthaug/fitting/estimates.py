@@ -1,4 +1,4 @@
-"""The result of an estimation: parameters with intervals, status with cause and remedy, the model."""
+"""The result of an estimation: parameters with intervals, status, model."""
 
 from __future__ import annotations
 
@@ -12,14 +12,19 @@ import numpy as np
 from orthaug._base.checks import Matrix, Vector, check_choice, check_count, check_type
 from orthaug._base.errors import InputError, Warning
 from orthaug._base.lines import fold
-from orthaug._base.views import ShownFit
+from orthaug._base.views import FitView
 from orthaug.data.record import Record
 from orthaug.data.regressors import Layout, lag_rows
 from orthaug.fitting.block_scores import FreeRunScores
 from orthaug.fitting.criteria import Criterion, Prediction
-from orthaug.fitting.held_out import Focus, HeldOut
+from orthaug.fitting.held_out import Focus, HeldOutErrors
 from orthaug.fitting.status import Status
-from orthaug.inference.covariance import interval, joint_covariance, robust_covariance, robust_split_covariance
+from orthaug.inference.covariance import (
+    interval,
+    joint_covariance,
+    robust_covariance,
+    robust_split_covariance,
+)
 from orthaug.inference.influence import hc3, one_step_slopes
 from orthaug.inference.learned_terms import equation, learned_terms, term_frame, term_lines
 from orthaug.inference.measures import Measure, Points, Support, Training
@@ -40,15 +45,22 @@ if TYPE_CHECKING:
 NOT_UNIQUE = "theta_not_unique"
 """The code of the warning that a split under a measure makes untrue."""
 STD_KINDS = {
-    "plain": "those of white errors of even size",
-    "hc3": "robust (HC3), for the errors are of uneven size",
-    "newey-west": "robust (Newey-West), for the one-step residual is coloured",
-    "batch-means": "robust (batch means), for the errors of the free run are coloured",
-    "autoregressive": "robust (an autoregressive model of the errors), for the errors of the free run are coloured",
-    "batch-means-uneven": "robust (batch means), for the errors of the free run are of uneven size",
-    "none": "none: the errors of the free run remember each other for too long",
+    "plain": "for white errors of constant variance",
+    "hc3": "robust (HC3), because the variance of the errors is not constant",
+    "newey-west": "robust (Newey-West), because the one-step residual is coloured",
+    "batch-means": "robust (batch means), because the errors of the free run are coloured",
+    "autoregressive": (
+        "robust (autoregressive errors), because the errors of the free run are coloured"
+    ),
+    "batch-means-uneven": (
+        "robust (batch means), because the variance of the free run's errors is not constant"
+    ),
+    "none": "none: the errors of the free run are correlated over too many steps",
+    "chosen": "none: the terms were chosen on the rows that were fitted",
 }
 """How standard errors were made, in words."""
+WITHHELD = ("none", "chosen")
+"""The kinds of fits that have none."""
 
 
 @dataclass(frozen=True)
@@ -62,13 +74,14 @@ class Restart:
     chosen: bool
     regularization: str | float = "none"
     validation: float | None = None
-    """Mean squared error where nothing was fitted: on the validation record, or on held-out blocks."""
+    """Mean squared error where nothing was fitted: on the validation record, or on held-out blocks.
+    """
     score: float | None = None
     """Generalised cross-validation, where that chose among the runs."""
 
 
-class AnyFit(ShownFit):
-    """What fits of lagged models and of motions have in common."""
+class AnyFit(FitView):
+    """Methods common to fits of lagged models and of motions."""
 
     model: Any
     warnings: tuple[Warning, ...]
@@ -80,11 +93,16 @@ class AnyFit(ShownFit):
 
     @cached_property
     def terms(self) -> pd.DataFrame:
-        """Table with a row per term of a learner of terms: coefficient, unit, std, 95 % interval; else empty."""
+        """Table with a row per term of a learner of terms: coefficient, unit, std, 95 % interval.
+
+        Else empty.
+        """
         return term_frame(learned_terms(self.model))
 
     def equation(self, writing: str = "text") -> str:
-        """The fitted equations with their numbers, where the learner is a sum of terms; as "text", "latex", "python".
+        """Return the fitted equations with their numbers, where the learner is a sum of terms.
+
+        As "text", "latex", "python".
 
         Raises:
             InputError: another learner, physics that are Python functions, another writing.
@@ -92,18 +110,20 @@ class AnyFit(ShownFit):
         return equation(self.model, writing)
 
     def lines(self) -> list[str]:
-        """The lines of `summary` before its warnings."""
+        """Return the lines of `summary` before its warnings."""
         raise NotImplementedError
 
     def summary(self) -> str:
-        """A page of text: status, parameters, what is known of them, warnings."""
-        warnings = ["", *(f"warning: {warning}" for warning in self.warnings)] if self.warnings else []
+        """Return a page of text: status, parameters with their uncertainty, warnings."""
+        warnings = (
+            ["", *(f"warning: {warning}" for warning in self.warnings)] if self.warnings else []
+        )
         return "\n".join(fold([*self.lines(), *warnings]))
 
 
 @dataclass(frozen=True, eq=False)
 class Estimate(AnyFit):
-    """What `estimate` returns. Print `fit.summary()`; use `fit.model`; read `fit.parameters`."""
+    """Result of `estimate`. Print `fit.summary()`; use `fit.model`; read `fit.parameters`."""
 
     model: Model
     status: Status
@@ -112,18 +132,22 @@ class Estimate(AnyFit):
     covariance: Matrix | None
     """Cov θ̂ (nθ, nθ); None where θ has no standard error."""
     freedom: float
-    """Degrees of freedom of the residual, rows less parameters less effective weights; of robust errors on the free run
-    blocks less one."""
+    """Degrees of freedom of the residual: rows less parameters less effective weights.
+
+    For robust errors on the free run: blocks less one.
+    """
     effective_weights: float
     defect: float | None
-    """‖QᵀF̃‖ / ‖F‖ over the training rows: how much of the learner the physics could express; None without one."""
+    """‖QᵀF̃‖ / ‖F‖ over the training rows: how much of the learner the physics could express; None
+    without one.
+    """
     problem: Problem = field(repr=False)
     criterion: Criterion = Prediction()  # noqa: RUF009  (frozen)
     measure: MeasureSplit | None = None
     """What θ was split under, if not the training measure."""
     at_bound: Mapping[str, float] = field(default_factory=dict)
-    """Parameters that stand at a bound, with its value."""
-    held_out: HeldOut | None = None
+    """Parameters at a bound, with its value."""
+    held_out: HeldOutErrors | None = None
     """By what the run was chosen; None where the lowest training loss chose."""
     focus: Focus | None = None
     """What `Auto` chose, and why; None where the criterion was declared."""
@@ -144,17 +168,20 @@ class Estimate(AnyFit):
 
     @property
     def layout(self) -> Layout:
-        """What the entries of `reach` are called."""
+        """Names of the entries of `reach`."""
         return self.problem.layout
 
     def reach(self, record: Record) -> Matrix:
-        """The regressors (N, nx) of a record in the model's order of channels."""
+        """Return the regressors (N, nx) of a record in the model's order of channels."""
         return lag_rows(record, self.problem.layout)
 
     @property
     def one_step_theta(self) -> Vector | None:
-        """Φ⁺Y (nθ,), what one-step least squares gives, where θ was trained on something else; None otherwise."""
-        if self.criterion.flown is None:
+        """Φ⁺Y (nθ,), the one-step least squares, where θ was trained on another criterion.
+
+        None otherwise.
+        """
+        if self.criterion.free_run is None:
             return None
         return self.problem.least_squares
 
@@ -172,10 +199,14 @@ class Estimate(AnyFit):
     @cached_property
     def parameters(self) -> pd.DataFrame:
         """Table with a row per parameter: unit, initial, value, std, and the 95 % interval."""
-        return parameter_frame(self.problem.baseline.parameters, self.theta, self.std, self.interval)
+        return parameter_frame(
+            self.problem.baseline.parameters, self.theta, self.std, self.interval
+        )
 
     def split(self, measure: Measure) -> Estimate:
-        """The same fitted function with θ, θ_aux, components and intervals under a measure, without training (F2).
+        """Return the same function with θ, components and intervals under a measure (F2).
+
+        Nothing is trained again.
 
         Raises:
             InputError: a measure that does not fit the model, or a θ at a bound.
@@ -183,15 +214,22 @@ class Estimate(AnyFit):
         check_type(measure, Measure, "measure", "a measure such as Uniform()")
         if self.at_bound:
             raise InputError(
-                f"{', '.join(self.at_bound)} stand at a bound, and a split under the {measure.name} measure knows "
-                "none: drop the bounds, keep the training measure, or give them `fixed = true` there."
+                f"{', '.join(self.at_bound)} at a bound: a split under the {measure.name} "
+                "measure has no bounds. Drop the bounds, keep the training measure, or set "
+                "`fixed = true` there."
             )
-        support = Support(self.problem.record, self.problem.layout, self.model.form.used, self.problem.rows.x)
+        support = Support(
+            self.problem.record, self.problem.layout, self.model.form.used, self.problem.rows.x
+        )
         joint = self.model.statistics.joint(len(self.theta))
         under = split_under(measure, self.model, support, joint)
         if under.covariance is not None:
             training = self.covariance if self.measure is None else None
-            training = split_under(Training(), self.model, support, joint).covariance if training is None else training
+            training = (
+                split_under(Training(), self.model, support, joint).covariance
+                if training is None
+                else training
+            )
             with np.errstate(all="ignore"):
                 price = np.sqrt(np.diag(under.covariance) / np.diag(np.asarray(training)))
             under = replace(under, price=price)
@@ -204,50 +242,87 @@ class Estimate(AnyFit):
         numbers = self.model.numbers._replace(theta=under.theta, theta_aux=under.theta_aux)
         return replace(
             self,
-            model=replace(self.model, numbers=numbers, structure="orthogonal", measure=measure.name),
-            covariance=None if self.std_kind == "none" else under.covariance,
+            model=replace(
+                self.model, numbers=numbers, structure="orthogonal", measure=measure.name
+            ),
+            covariance=None if self.std_kind in WITHHELD else under.covariance,
             plain_covariance=plain,
-            std_kind=self.std_kind if plain is not None or self.std_kind == "none" else "plain",
+            std_kind=self.std_kind if plain is not None or self.std_kind in WITHHELD else "plain",
             defect=under.defect,
             measure=under,
-            warnings=(*(w for w in self.warnings if w.code != NOT_UNIQUE), *under.warnings, *unknown),
+            warnings=(
+                *(w for w in self.warnings if w.code != NOT_UNIQUE),
+                *under.warnings,
+                *unknown,
+            ),
+        )
+
+    def withheld(self, kind: str, why: Warning) -> Estimate:
+        """The same without standard errors and intervals, of θ, of terms and of predictions.
+
+        A warning says why.
+        """
+        statistics = replace(self.model.statistics, middle=None)
+        return replace(
+            self,
+            model=replace(self.model, statistics=statistics),
+            covariance=None,
+            plain_covariance=None,
+            plain_statistics=None,
+            std_kind=kind,
+            warnings=(*self.warnings, why),
         )
 
     def joint_covariance(self, convention: str = "calibrated") -> Matrix:
-        """Cov of θ̂ and the weights from the raw `[Φ P⊥J]`, (nθ + nw)²; convention "paper" for eq:cov_approx / N."""
-        if self.criterion.flown is not None or (self.model.statistics.gram is None and self.model.numbers.tilt is None):
-            raise InputError("the joint covariance is that of a one-step fit with statistics of its own.")
+        """Return Cov (nθ + nw)² of θ̂ and the weights from the raw `[Φ P⊥J]`.
+
+        Convention "paper" for eq:cov_approx / N.
+        """
+        if self.criterion.free_run is not None or (
+            self.model.statistics.gram is None and self.model.numbers.tilt is None
+        ):
+            raise InputError("the joint covariance needs a one-step fit with its own statistics.")
         return joint_covariance(self.problem, self.model, convention)
 
     def robust(self, lags: int | None = None, kind: str | None = None) -> Estimate:
-        """The same with standard errors of θ that hold for coloured and uneven noise.
+        """Return the fit with standard errors of θ that hold for coloured and uneven noise.
 
-        One step ahead they are those of Newey and West, or HC3 for noise that is uneven and white. On the free run they
-        are batch means of the scores (`fitting/block_scores.py`). Both these hold for predictions too.
+        One step ahead they are those of Newey and West, or HC3 for noise that is uneven and white.
+        On the free run they are batch means of the scores (`fitting/block_scores.py`). Both these
+        hold for predictions too.
 
         Args:
-            lags: of the autocovariances; on the free run steps of a block. By default `⌊4 (N/100)^(2/9)⌋`, on the free
-                run three times as many as the correlation of the errors lasts.
-            kind: "newey-west" or "hc3" one step ahead; on the free run "batch-means", or "autoregressive" for errors of
-                an autoregressive process; None for the first that there is.
+            lags: of the autocovariances; on the free run steps of a block. By default `⌊4
+                (N/100)^(2/9)⌋`, on the free run three times as many as the correlation of the
+                errors lasts.
+            kind: "newey-west" or "hc3" one step ahead; on the free run "batch-means", or
+                "autoregressive" for errors of an autoregressive process; None for the first that
+                there is.
 
         Raises:
-            InputError: a fit without standard errors or with a parameter at a bound; errors that remember each other
-                for too long; a kind that is not for this criterion.
+            InputError: a fit without standard errors or with a parameter at a bound; errors that
+                remember each other for too long; a kind that is not for this criterion.
         """
-        flown = self.criterion.flown is not None
-        kinds = ("batch-means", "batch-means-uneven", "autoregressive") if flown else ("newey-west", "hc3")
+        simulates = self.criterion.free_run is not None
+        kinds = (
+            ("batch-means", "batch-means-uneven", "autoregressive")
+            if simulates
+            else ("newey-west", "hc3")
+        )
         kind = kinds[0] if kind is None else check_choice(kind, kinds, "`kind`")
-        if self.covariance is None or self.at_bound or (flown and self.scores is None):
+        if self.covariance is None or self.at_bound or (simulates and self.scores is None):
             raise InputError(
-                "robust standard errors are those of a fit that has standard errors, with no parameter at a bound."
+                "robust standard errors need a fit with standard errors and no parameter at a "
+                "bound."
             )
-        if flown:
-            return replace(self._robust_flown(lags, kind), std_kind=kind)
+        if simulates:
+            return replace(self._robust_free_run(lags, kind), std_kind=kind)
         if kind == "hc3":
             return self._hc3()
         trajectories = self.model.predict(self.problem.record).trajectories
-        residual = np.concatenate([(t.measured - t.model)[t.start :] for t in trajectories])  # type: ignore[operator]
+        errors = [t.measured - t.model for t in trajectories]  # type: ignore[operator]
+        starts = [t.start for t in trajectories]
+        residual = np.concatenate([e[s:] for e, s in zip(errors, starts, strict=True)])
         used = (self.problem, residual, self.effective_weights, lags)
         if self.measure is None and self.model.shared is None:
             covariance = robust_covariance(*used)
@@ -259,33 +334,55 @@ class Estimate(AnyFit):
         return replace(self, covariance=covariance, plain_covariance=plain, std_kind=kind)
 
     def _hc3(self) -> Estimate:
-        """With every row's own error in place of one noise variance."""
+        """Return the fit with each row's own error in place of one noise variance."""
         statistics = self.plain_statistics or self.model.statistics
-        if statistics.gram is None or self.model.numbers.tilt is not None or isinstance(self.problem, StreamedProblem):
-            raise InputError("the fit has no statistics that robust standard errors could be made of.")
+        if (
+            statistics.gram is None
+            or self.model.numbers.tilt is not None
+            or isinstance(self.problem, StreamedProblem)
+        ):
+            raise InputError(
+                "the fit has no statistics for robust standard errors; fit the data again."
+            )
         trajectories = self.model.predict(self.problem.record).trajectories
-        residual = np.concatenate([(t.measured - t.model)[t.start :] for t in trajectories])  # type: ignore[operator]
-        slopes, share = one_step_slopes(self.problem, self.model), self.problem.count / len(self.problem.rows)
-        own = hc3(statistics, slopes, residual @ self.problem.weight.matrix.T, len(self.theta), share)
+        errors = [t.measured - t.model for t in trajectories]  # type: ignore[operator]
+        starts = [t.start for t in trajectories]
+        residual = np.concatenate([e[s:] for e, s in zip(errors, starts, strict=True)])
+        slopes, share = (
+            one_step_slopes(self.problem, self.model),
+            self.problem.count / len(self.problem.rows),
+        )
+        own = hc3(
+            statistics, slopes, residual @ self.problem.weight.matrix.T, len(self.theta), share
+        )
         return replace(
             self,
             model=replace(self.model, statistics=own),
             covariance=self._grown(self._cov_along(own, self._slope()), own),
-            plain_covariance=self.covariance if self.plain_covariance is None else self.plain_covariance,
+            plain_covariance=self.covariance
+            if self.plain_covariance is None
+            else self.plain_covariance,
             plain_statistics=statistics,
             std_kind="hc3",
         )
 
     def _grown(self, covariance: Matrix | None, statistics: Statistics) -> Matrix | None:
-        """Return Cov θ̂, larger along directions that the learner could nearly imitate on the rows."""
-        return grown(covariance, statistics, None if self.model.shared is None else self.problem.shared)
+        """Return Cov θ̂, larger along directions that the learner could nearly imitate."""
+        return grown(
+            covariance, statistics, None if self.model.shared is None else self.problem.shared
+        )
 
-    def _robust_flown(self, steps: int | None, kind: str) -> Estimate:
-        """From blocks of so many steps of the free run, or from the colour of its errors."""
+    def _robust_free_run(self, steps: int | None, kind: str) -> Estimate:
+        """Return the fit with robust standard errors of its free run.
+
+        From blocks of so many steps, or from the colour of its errors.
+        """
         assert self.scores is not None
         statistics = self.model.statistics
         if statistics.gram is None or self.model.numbers.tilt is not None:
-            raise InputError("the fit has no statistics that robust standard errors could be made of.")
+            raise InputError(
+                "the fit has no statistics for robust standard errors; fit the data again."
+            )
         steps = None if steps is None else check_count(steps, "lags")
         used = len(self.theta) + self.effective_weights
         modelled = kind == "autoregressive"
@@ -294,23 +391,29 @@ class Estimate(AnyFit):
             self,
             model=replace(self.model, statistics=statistics),
             covariance=self._cov_along(statistics, self._slope()),
-            plain_covariance=self.covariance if self.plain_covariance is None else self.plain_covariance,
-            plain_statistics=self.model.statistics if self.plain_statistics is None else self.plain_statistics,
+            plain_covariance=self.covariance
+            if self.plain_covariance is None
+            else self.plain_covariance,
+            plain_statistics=self.model.statistics
+            if self.plain_statistics is None
+            else self.plain_statistics,
             freedom=statistics.freedom,
         )
 
     def _cov_along(self, statistics: Statistics, slope: Matrix) -> Matrix | None:
-        """Cov of `θ = c + θ_aux(w)` from statistics of (c, w)."""
+        """Return Cov of `θ = c + θ_aux(w)` from statistics of (c, w)."""
         joint = statistics.joint(len(self.theta))
-        return None if joint is None else joint.of(np.column_stack([np.eye(len(self.theta)), slope]))
+        return (
+            None if joint is None else joint.of(np.column_stack([np.eye(len(self.theta)), slope]))
+        )
 
     def moves_by(self) -> tuple[Matrix, Vector] | None:
-        """How θ follows (c, w), [I ∂θ_aux/∂w], and which entries of these move."""
+        """Return the derivative [I ∂θ_aux/∂w] of θ by (c, w), and which entries of these move."""
         k = np.column_stack([np.eye(len(self.theta)), self._slope()])
         return k, np.ones(k.shape[1], dtype=bool)
 
     def _slope(self) -> Matrix:
-        """∂θ_aux/∂w under the measure that θ was split under."""
+        """Return ∂θ_aux/∂w under the measure that θ was split under."""
         if self.measure is not None and self.measure.slope is not None:
             return self.measure.slope
         problem = self.problem
@@ -323,12 +426,15 @@ class Estimate(AnyFit):
         return learner_slope(self.model, points, problem.projection, unit)
 
     def physical(self, physics: PhysicsMap) -> PhysicalEstimate:
-        """The physical parameters that θ̂ is made of, with intervals by the delta method."""
+        """Return the physical parameters of θ̂, with intervals by the delta method."""
         order, covariance = self._in_order_of(physics)
         return solve(physics, self.theta[order], covariance, freedom=max(self.freedom, 1.0))
 
     def physical_profile(self, physics: PhysicsMap, name: str) -> tuple[float, float]:
-        """95 % profile-likelihood interval of one physical parameter; a side without limit is infinite."""
+        """Return the 95 % profile-likelihood interval of one physical parameter.
+
+        A side without limit is infinite.
+        """
         order, covariance = self._in_order_of(physics)
         if covariance is None:
             raise InputError("θ has no standard errors, so physical parameters have no profile.")
@@ -339,13 +445,20 @@ class Estimate(AnyFit):
         return order, None if self.covariance is None else self.covariance[np.ix_(order, order)]
 
     def __repr__(self) -> str:
-        values = ", ".join(f"{n} = {v:.6g}" for n, v in zip(self.problem.baseline.names, self.theta, strict=True))
-        return f"Estimate({self.model.structure}, {self.status.code}, loss {self.status.loss:.3g}, {values})"
+        values = ", ".join(
+            f"{n} = {v:.6g}" for n, v in zip(self.problem.baseline.names, self.theta, strict=True)
+        )
+        return (
+            f"Estimate({self.model.structure}, {self.status.code}, loss "
+            f"{self.status.loss:.3g}, {values})"
+        )
 
     def lines(self) -> list[str]:
         baseline, bound, learner = self.problem.baseline, self.model.form.bound, "none"
         if bound is not None:
-            learner = f"{bound.learner}, {bound.size} weights, {self.effective_weights:.1f} effective"
+            learner = (
+                f"{bound.learner}, {bound.size} weights, {self.effective_weights:.1f} effective"
+            )
         lines = [
             f"structure   {self.model.structure}",
             f"learner     {learner}",
@@ -354,7 +467,10 @@ class Estimate(AnyFit):
         ]
         if self.defect is not None:
             weight = self.problem.weight
-            lines.append(f"orthogonal  ‖QᵀF̃‖/‖F‖ = {self.defect:.1e}" + ("" if weight.one_output else f", {weight}"))
+            lines.append(
+                f"orthogonal  ‖QᵀF̃‖/‖F‖ = {self.defect:.1e}"
+                + ("" if weight.one_output else f", {weight}")
+            )
         condition = self.excitation.condition
         lines.append(
             f"excitation  rank {self.excitation.rank} of {self.excitation.columns}"
@@ -364,7 +480,9 @@ class Estimate(AnyFit):
             lines.append(f"measure     {self.measure}")
         one_step = self.one_step_theta
         if one_step is not None:
-            moved = ", ".join(f"{name} {value:.6g}" for name, value in zip(baseline.names, one_step, strict=True))
+            moved = ", ".join(
+                f"{name} {value:.6g}" for name, value in zip(baseline.names, one_step, strict=True)
+            )
             lines.append(f"one step    Φ⁺Y would give {moved}")
         if self.plain_covariance is not None:
             lines.append(f"std         {STD_KINDS[self.std_kind]}")
@@ -373,21 +491,29 @@ class Estimate(AnyFit):
 
 
 def order_of(physics: PhysicsMap, names: Sequence[str], sampling_time: float) -> list[int]:
-    """Where the θ that the physics gives are among `names`.
+    """Return the places among `names` of the θ that the physics gives.
 
     Raises:
-        InputError: no PhysicsMap, a θ that is not among them, a constant `Ts` that is not the sampling time.
+        InputError: no PhysicsMap, a θ that is not among them, a constant `Ts` that is not the
+            sampling time.
     """
     check_type(physics, PhysicsMap, "physics", "a PhysicsMap, such as PhysicsMap.of(…)")
     check_sampling_constant(physics.constants, sampling_time)
     missing = [name for name in physics.theta_names if name not in names]
     if missing:
-        raise InputError(f"the physics gives {', '.join(missing)}, which the baseline does not have.")
+        raise InputError(
+            f"the physics gives {', '.join(missing)}, which the baseline does not have."
+        )
     return [names.index(name) for name in physics.theta_names]
 
 
-def parameter_frame(parameters: Sequence[Any], values: Vector, std: Vector | None, ci: Matrix | None) -> pd.DataFrame:
-    """A row per parameter: unit, initial, value, std, and the 95 % interval; NaN where there is none."""
+def parameter_frame(
+    parameters: Sequence[Any], values: Vector, std: Vector | None, ci: Matrix | None
+) -> pd.DataFrame:
+    """Return a table with a row per parameter: unit, initial, value, std, 95 % interval.
+
+    NaN where there is none.
+    """
     import pandas as pd
 
     nothing = np.full(len(parameters), np.nan)
@@ -405,10 +531,15 @@ def parameter_frame(parameters: Sequence[Any], values: Vector, std: Vector | Non
     )
 
 
-def parameter_lines(parameters: Sequence[Any], values: Vector, std: Vector | None, ci: Matrix | None) -> list[str]:
-    """The same as lines of text, a heading first; a dash where there is no interval."""
+def parameter_lines(
+    parameters: Sequence[Any], values: Vector, std: Vector | None, ci: Matrix | None
+) -> list[str]:
+    """Return the parameters as lines of text, a heading first; a dash for no interval."""
     width = max([9, *(len(p.name) for p in parameters)])
-    lines = [f"{'parameter':<{width}}  {'value':>14}  {'std':>11}  {'95 % interval':^29}  {'initial':>11}  unit"]
+    lines = [
+        f"{'parameter':<{width}}  {'value':>14}  {'std':>11}  {'95 % interval':^29}  "
+        f"{'initial':>11}  unit"
+    ]
     for i, parameter in enumerate(parameters):
         spread, reach = f"{'–':>11}", f"{'–':^29}"
         if std is not None and ci is not None and np.isfinite(std[i]):

@@ -1,8 +1,8 @@
-"""The one verb: fit physics and learner to a record."""
+"""`estimate`: fit physics and learner to a record."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any, TypedDict, Unpack, overload
@@ -10,8 +10,8 @@ from typing import Any, TypedDict, Unpack, overload
 import numpy as np
 
 from orthaug._base.checks import Vector, check_choice, check_count, check_type, is_number
-from orthaug._base.errors import InputError, shown
-from orthaug._base.progress import SILENT, Tell
+from orthaug._base.errors import InputError, Warning, shown
+from orthaug._base.progress import SILENT, ProgressCallback
 from orthaug._base.views import with_progress
 from orthaug.data.record import Record
 from orthaug.data.regressors import Lags
@@ -27,11 +27,11 @@ from orthaug.fitting.kinds import Solver
 from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.fitting.motion_estimation import DEFAULT, fit_motion, pose_for
 from orthaug.fitting.one_step import OneStepTask
-from orthaug.fitting.reweighting import reweighted
 from orthaug.fitting.rules import check_cost, check_solver, checked_starts, tried
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.structures import Orthogonal, Structure
 from orthaug.fitting.training import Choice, PlannedRun, planned, train
+from orthaug.inference.covariance import whitening
 from orthaug.inference.measures import Training
 from orthaug.models.learners import MLP, Learner, Scaling
 from orthaug.models.model import Model
@@ -40,8 +40,46 @@ from orthaug.models.tasks import Tasks, runs_on
 from orthaug.models.terms import over_lags, over_states
 from orthaug.physics.baseline import Baseline
 from orthaug.physics.motion import Motion
+from orthaug.physics.output_weights import by_covariance
 from orthaug.physics.problem import Problem, pose
 from orthaug.physics.streamed import StreamedProblem, pose_streamed
+
+_TURNS = 30
+_SETTLED = 1e-6  # relative change of W
+
+
+def reweighted(first: Estimate, again: Callable[[Problem, Estimate], Estimate]) -> Estimate:
+    """Return the fit whose outputs are weighted by the covariance of its own errors.
+
+    Args:
+        first: a fit with any output weights.
+        again: the fit of a problem with other weights, begun from an earlier estimate.
+
+    Returns: The last fit, with the restarts of the first one. It stays at the weights it has where
+        the errors' covariance is singular; a warning says that the turns did not settle.
+    """
+    estimate, problem = first, first.problem
+    covariance = problem.target_covariance
+    for _ in range(_TURNS):
+        noise = estimate.model.statistics.noise if estimate.status.ok else None
+        white = None if noise is None else whitening(noise)
+        if white is None:
+            return replace(estimate, restarts=first.restarts)
+        weight = by_covariance(white, covariance)
+        change = np.linalg.norm(weight.matrix - problem.weight.matrix) / np.linalg.norm(
+            weight.matrix
+        )
+        if change <= _SETTLED:
+            return replace(estimate, restarts=first.restarts)
+        problem = problem.weighed(weight)
+        estimate = again(problem, estimate)
+    text = (
+        f"the weights of the outputs still change by {change:.1g} after {_TURNS} fits; θ "
+        "depends on where they stopped."
+    )
+    warnings = (*estimate.warnings, Warning("output_weights_unsettled", text))
+    return replace(estimate, restarts=first.restarts, warnings=warnings)
+
 
 Regularization = str | float
 
@@ -63,12 +101,14 @@ class Options(TypedDict, total=False):
     initial: Estimate | Model | None
     validation: Record | None
     output_weights: str | Sequence[float]
-    progress: Tell | bool
+    progress: ProgressCallback | bool
     engine: Engine | None
 
 
 @overload
-def estimate(record: Record | Source, baseline: Baseline, **options: Unpack[Options]) -> Estimate: ...
+def estimate(
+    record: Record | Source, baseline: Baseline, **options: Unpack[Options]
+) -> Estimate: ...
 @overload
 def estimate(record: Record, baseline: Motion, **options: Unpack[Options]) -> MotionEstimate: ...
 @with_progress
@@ -90,47 +130,56 @@ def estimate(
     initial: Estimate | Model | None = None,
     validation: Record | None = None,
     output_weights: str | Sequence[float] = "auto",
-    progress: Tell = SILENT,
+    progress: ProgressCallback = SILENT,
     engine: Engine | None = None,
 ) -> Estimate | MotionEstimate:
-    """Fit `y_k = φ(x_k)θ + learner(x_k) + e_k` by prediction error (eq:cost_fun) or by the error of a free run.
+    """Fit `y_k = φ(x_k)θ + learner(x_k) + e_k` to a record.
 
-    θ is solved, never iterated (F1): with the orthogonal structure it is `Φ⁺Y` whatever the learner does. Equations of
-    motion (`Motion`) are fitted on their free run, and their parameters are the physics nearest to the fitted motion.
+    The criterion is the prediction error (eq:cost_fun), or the error of a free run.
+
+    θ is solved, never iterated (F1): with the orthogonal structure it is `Φ⁺Y` whatever the learner
+    does. Equations of motion (`Motion`) are fitted on their free run, and their parameters are the
+    physics nearest to the fitted motion.
 
     Args:
-        record: measured inputs and outputs; or `open_parquet(…)`, `open_frame(…)`, whose rows stay where they are.
+        record: measured inputs and outputs; or `open_parquet(…)`, `open_frame(…)`, whose rows stay
+            where they are.
         baseline: the physics; a `Motion` has no `lags`, `ensemble` and `initial`.
         lags: the learner's regressor; None for the raw lags that the baseline's expressions use.
         learner: a declaration such as `MLP(hidden=(16,))`; None for physics alone.
         structure: `Orthogonal()`, `Additive()`, `OrthogonalPenalty(λ)` or `BaselinePenalty(λ)`.
-        criterion: `Prediction(horizon)`, 1 step by default, or `Simulation(segment, washout)`, the free run: then θ is
-            trained with the weights and split off at the end (F2). A motion takes the latter, by default without
-            washout.
+        criterion: `Prediction(horizon)`, 1 step by default, or `Simulation(segment, washout)`, the
+            free run: then θ is trained with the weights and split off at the end (F2). A motion
+            takes the latter, by default without washout.
         solver: `LevenbergMarquardt(…)`, or `AdamLBFGS(…)`, the paper's pipeline from θ⁰.
-        regularization: "none"; "evidence" (MacKay; the weights' prior is estimated too); "ard" (automatic relevance
-            determination: the prior of each neuron, one step ahead); or a number: the ridge α on the weights, against
-            squared errors in units of the baseline's RMS residual. Several may be given with `validation` or `blocks`,
-            which then choose. "auto" runs none and ard from every start, one step ahead with Levenberg-Marquardt, and
-            keeps the lower generalised cross-validation; it is none otherwise, and none and evidence where
-            `validation` chooses on the free run. For a motion it is evidence.
-        restarts: runs from initial weights of seeds `seed … seed + restarts - 1`, spread over the cores. Kept is the
-            one of the lowest error of the criterion on `validation`; without that, of free runs and of several
-            regularizations, on `blocks` that are held out; else of the lowest generalised cross-validation under
-            "auto", and of the lowest training loss otherwise.
+        regularization: "none"; "evidence" (MacKay; the weights' prior is estimated too); "ard"
+            (automatic relevance determination: the prior of each neuron, one step ahead); or a
+            number: the ridge α on the weights, against squared errors in units of the baseline's
+            RMS residual. Several may be given with `validation` or `blocks`, which then choose.
+            "auto" runs none and ard from every start, one step ahead with Levenberg-Marquardt, and
+            keeps the lower generalised cross-validation; it is none otherwise, and none and
+            evidence where `validation` chooses on the free run. For a motion it is evidence.
+        restarts: runs from initial weights of seeds `seed … seed + restarts - 1`, spread over the
+            cores. Kept is the one of the lowest error of the criterion on `validation`; without
+            that, of free runs and of several regularizations, on `blocks` that are held out; else
+            of the lowest generalised cross-validation under "auto", and of the lowest training loss
+            otherwise.
         seed: of the initial weights.
         ensemble: the median of all restarts as one model, instead of the best one.
         blocks: parts into which the training data are cut for that, each held out once; 0 for none.
-        fallback: whether physics alone is the result where no free run of the learner is better than its there.
-        initial: warm start from an earlier estimate or model. Its learner, features, scaling and weights replace
-            `learner`, `restarts` and `seed`.
+        fallback: whether physics alone is the result where no free run of the learner is better
+            than its there.
+        initial: warm start from an earlier estimate or model. Its learner, features, scaling and
+            weights replace `learner`, `restarts` and `seed`.
         validation: a record that chooses between restarts and regularizations; it is never fitted.
-        output_weights: how several outputs are weighed against each other, in criterion and measure alike: "none" for
-            the plain sum of squares, as in the paper; "std" for each in its standard deviation; "covariance" by that
-            of their errors, fit and weights in turn until they agree; numbers for the weights of the squared errors.
-            "auto" is "std" one step ahead and "covariance" on the free run.
+        output_weights: how several outputs are weighed against each other, in criterion and measure
+            alike: "none" for the plain sum of squares, as in the paper; "std" for each in its
+            standard deviation; "covariance" by that of their errors, fit and weights in turn until
+            they agree; numbers for the weights of the squared errors. "auto" is "std" one step
+            ahead and "covariance" on the free run.
         progress: called about twice a second with (restart, iteration, loss); True for a bar.
-        engine: who sums over the rows: `Stream()`, `Devices()`, `Dask(client)`; None for what suits the record.
+        engine: who sums over the rows: `Stream()`, `Devices()`, `Dask(client)`; None for what suits
+            the record.
 
     Raises:
         InputError: data and physics that do not fit together; RankError where θ is not determined.
@@ -140,34 +189,61 @@ def estimate(
         >>> from orthaug.physics.baseline import Term
         >>> u = np.linspace(-1, 1, 200)
         >>> record = Record.from_arrays(u=u, y=2 * u + u**2)
-        >>> fit = estimate(record, Baseline.from_terms([Term("gain", "u[k]")]), learner=MLP(hidden=(4,)))
+        >>> physics = Baseline.from_terms([Term("gain", "u[k]")])
+        >>> fit = estimate(record, physics, learner=MLP(hidden=(4,)))
         >>> f"{fit.theta[0]:.3f}"
         '2.000'
     """
-    options: dict[str, Any] = {"structure": structure, "solver": solver, "regularization": regularization, "seed": seed}
-    options |= {"restarts": restarts, "fallback": fallback, "validation": validation, "progress": progress}
+    options: dict[str, Any] = {
+        "structure": structure,
+        "solver": solver,
+        "regularization": regularization,
+        "seed": seed,
+    }
+    options |= {
+        "restarts": restarts,
+        "fallback": fallback,
+        "validation": validation,
+        "progress": progress,
+    }
     if isinstance(baseline, Motion):
         if lags is not None or initial is not None or ensemble:
-            raise InputError("a motion has no `lags`, no `initial` and no `ensemble`; leave them out.")
+            raise InputError(
+                "a motion has no `lags`, no `initial` and no `ensemble`; leave them out."
+            )
         check_record(record, moves=True)
         assert isinstance(record, Record)
         learner = over_states(learner, baseline)
         problem = pose_for(record, baseline, learner, output_weights)
-        options |= {"criterion": criterion or DEFAULT, "blocks": _check_blocks(blocks), "engine": engine or InMemory()}
+        options |= {
+            "criterion": criterion or DEFAULT,
+            "blocks": _check_blocks(blocks),
+            "engine": engine or InMemory(),
+        }
         return fit_motion(problem, learner=learner, **options)
     check_record(record)
     _check_types(baseline=baseline, lags=lags, learner=learner)
     check_type(initial, Estimate | Model | None, "initial", "an Estimate, a Model or None")
     criterion = Prediction() if criterion is None else criterion
     model = initial.model if isinstance(initial, Estimate) else initial
-    channels = (tuple(channel.name for channel in group) for group in (record.outputs, record.inputs))
+    channels = (
+        tuple(channel.name for channel in group) for group in (record.outputs, record.inputs)
+    )
     learner = over_lags(learner, baseline, lags, *channels)
     inputs = None if learner is None else learner.inputs
     if model is not None:
         inputs = tuple(str(entry) for entry in model.form.features.entries)
     _check_types(criterion=criterion)
-    problem, engine = posed_on(record, engine, baseline, lags, inputs, output_weights=output_weights)
-    options |= {"criterion": criterion, "ensemble": ensemble, "blocks": blocks, "initial": model, "engine": engine}
+    problem, engine = posed_on(
+        record, engine, baseline, lags, inputs, output_weights=output_weights
+    )
+    options |= {
+        "criterion": criterion,
+        "ensemble": ensemble,
+        "blocks": blocks,
+        "initial": model,
+        "engine": engine,
+    }
     return fit(problem, learner=learner, **options)
 
 
@@ -186,17 +262,18 @@ def fit(
     fallback: bool = True,
     initial: Model | None = None,
     validation: Record | None = None,
-    progress: Tell = SILENT,
+    progress: ProgressCallback = SILENT,
     engine: Engine = InMemory(),  # noqa: B008  (frozen)
     checkpoints: Checkpoints | None = None,
 ) -> Estimate:
-    """`estimate` for a problem that is posed already.
+    """Fit a problem that is posed already; arguments as of `estimate`.
 
     Args:
         problem: record, physics and learner inputs; the other arguments as of `estimate`.
         learner: None for physics alone, on the rows of the problem.
-        engine: where the rows are, or segments of a free run, and who sums over them. On a cluster several runs over
-            rows that are in memory are tasks, each whole on one worker, and so are their held-out blocks.
+        engine: where the rows are, or segments of a free run, and who sums over them. On a cluster
+            several runs over rows that are in memory are tasks, each whole on one worker, and so
+            are their held-out blocks.
         checkpoints: where the states of its runs are kept, to go on from; None to keep none.
 
     Raises:
@@ -205,26 +282,47 @@ def fit(
     _check_types(learner=learner, structure=structure, criterion=criterion, solver=solver)
     _check_types(initial=initial, validation=validation)
     _check_splittable(structure, problem.baseline, learner)
-    if criterion.automatic and _undecided(problem, solver, structure, warm=initial is not None, ensemble=ensemble):
-        options: dict[str, Any] = {"learner": learner, "structure": structure, "solver": solver, "seed": seed}
-        options |= {"regularization": regularization, "restarts": restarts, "blocks": blocks, "fallback": fallback}
-        options |= {"validation": validation, "progress": progress, "engine": engine, "checkpoints": checkpoints}
+    if criterion.automatic and _may_decide(
+        problem, solver, structure, warm=initial is not None, ensemble=ensemble
+    ):
+        options: dict[str, Any] = {
+            "learner": learner,
+            "structure": structure,
+            "solver": solver,
+            "seed": seed,
+        }
+        options |= {
+            "regularization": regularization,
+            "restarts": restarts,
+            "blocks": blocks,
+            "fallback": fallback,
+        }
+        options |= {
+            "validation": validation,
+            "progress": progress,
+            "engine": engine,
+            "checkpoints": checkpoints,
+        }
         return choose_focus(problem, fit, options, criterion)
-    criterion = _settled(criterion, problem)
+    criterion = _settle(criterion, problem)
     blocks = _check_blocks(blocks)
-    given = {"linear": problem.baseline.linear, "validated": validation is not None, "learner": learner}
+    given = {
+        "linear": problem.baseline.linear,
+        "validated": validation is not None,
+        "learner": learner,
+    }
     choices = tried(regularization, solver, criterion, structure, **given)
     auto = _check_regularizations(regularization, choices, validation is not None or blocks > 0)
     restarts, seed = checked_starts(restarts, seed, warm=initial is not None, ensemble=ensemble)
     check_solver(solver, criterion, () if learner is None else choices)
     engine = _for_runs(engine, problem, len(choices) * (restarts if initial is None else 1))
-    warm, told = None, ()
+    warm, warnings = None, ()
     if initial is not None:
         task, weights, warm = _warm_start(problem, initial, engine)
         starts = [PlannedRun(0, weights, choice) for choice in choices]
     else:
         _check_cost(problem, learner, solver, restarts * len(choices), engine)
-        problem, learner, told = independent_terms(problem, learner)
+        problem, learner, warnings = independent_terms(problem, learner)
         task = OneStepTask.of(problem, learner, engine=engine)
         starts = planned(task.bound, range(seed, seed + restarts), choices)
     solved = criterion.one_step and problem.baseline.linear
@@ -232,34 +330,54 @@ def fit(
     if task.bound is None and solved:
         estimate = _physics_alone(task, structure)
     else:
-        task = replace(task, checkpoints=None if isinstance(task.engine, Tasks) else checkpoints)  # not a worker's disk
+        task = replace(
+            task, checkpoints=None if isinstance(task.engine, Tasks) else checkpoints
+        )  # not a worker's disk
         trained = task if solved else FreeRunTask.of(task, criterion, warm)
-        chosen = Choice(validation, blocks if initial is None else 0, fallback, ensemble, scored=auto and solved)
+        chosen = Choice(
+            validation, blocks if initial is None else 0, fallback, ensemble, scored=auto and solved
+        )
         estimate = train(trained, starts, structure, solver, chosen, progress, runner=engine)
         if _splits(structure) and estimate.status.ok and estimate.model.form.bound is not None:
             estimate = estimate.split(structure.measure)
-    estimate = replace(estimate, warnings=(*told, *estimate.warnings))
+    estimate = replace(estimate, warnings=(*warnings, *estimate.warnings))
     if problem.weight.choice != "covariance" or problem.weight.kind == "covariance" or not solved:
         return estimate
-    more = {"learner": learner, "structure": structure, "criterion": criterion, "solver": solver, "engine": engine}
+    more = {
+        "learner": learner,
+        "structure": structure,
+        "criterion": criterion,
+        "solver": solver,
+        "engine": engine,
+    }
     return reweighted(estimate, partial(_again, **more, progress=progress))
 
 
 def _again(problem: Problem, last: Estimate, **options: Any) -> Estimate:
-    """The fit to other weights of the outputs, from where the last one ended."""
+    """Return the fit to other weights of the outputs, from the end of the last fit."""
     chosen = next((r.regularization for r in last.restarts if r.chosen), "none")
     start = None if last.model.form.bound is None else last.model
     return fit(problem, initial=start, regularization=chosen, **options)
 
 
-def _undecided(problem: Problem, solver: Solver, structure: Structure, *, warm: bool, ensemble: bool) -> bool:
-    """Whether the data may decide for the free run: not where nothing but one step ahead can be trained."""
-    able = solver.gauss_newton and problem.baseline.linear and not isinstance(problem, StreamedProblem)
+def _may_decide(
+    problem: Problem, solver: Solver, structure: Structure, *, warm: bool, ensemble: bool
+) -> bool:
+    """Return whether the data may decide for the free run.
+
+    They may not where only one step ahead can be trained.
+    """
+    able = (
+        solver.gauss_newton and problem.baseline.linear and not isinstance(problem, StreamedProblem)
+    )
     return able and not (warm or ensemble or structure.from_initial)
 
 
-def _settled(criterion: Criterion, problem: Problem) -> Criterion:
-    """The criterion with what it left to the record; one step ahead where nothing else can be trained."""
+def _settle(criterion: Criterion, problem: Problem) -> Criterion:
+    """Return the criterion with its open choices made for the record.
+
+    One step ahead where nothing else can be trained.
+    """
     criterion = Prediction() if criterion.automatic else criterion
     if isinstance(problem, StreamedProblem):
         return criterion.streamed
@@ -267,24 +385,37 @@ def _settled(criterion: Criterion, problem: Problem) -> Criterion:
 
 
 def _for_runs(engine: Engine, problem: Problem, runs: int) -> Engine:
-    """With a cluster several runs over rows in memory are its tasks."""
+    """Return the engine by which several runs over rows in memory are tasks of a cluster."""
     return runs_on(engine) if runs > 1 and not isinstance(problem, StreamedProblem) else engine
 
 
 def _physics_alone(task: OneStepTask, structure: Structure) -> Estimate:
-    """Physics alone, which is solved: it ends at the loss where it starts."""
+    """Return physics alone, which is solved: it ends at the loss where it starts."""
     estimate = conclude(task, structure, task.physics_learned())
     return replace(estimate, status=replace(estimate.status, start_loss=estimate.status.loss))
 
 
-def _check_cost(problem: Problem, learner: Learner | None, solver: Solver, runs: int, engine: Engine) -> None:
-    """Raise InputError for what would take more memory or time than there is."""
-    sizes = {"rows": problem.count, "features": len(problem.features.entries), "outputs": len(problem.outputs)}
-    check_cost(learner, **sizes, held=len(problem.rows), iterations=solver.iterations, runs=runs, room=engine.room())
+def _check_cost(
+    problem: Problem, learner: Learner | None, solver: Solver, runs: int, engine: Engine
+) -> None:
+    """Raise InputError for a fit that would take more memory or time than there is."""
+    sizes = {
+        "rows": problem.count,
+        "features": len(problem.features.entries),
+        "outputs": len(problem.outputs),
+    }
+    check_cost(
+        learner,
+        **sizes,
+        held=len(problem.rows),
+        iterations=solver.iterations,
+        runs=runs,
+        room=engine.room(),
+    )
 
 
 def _check_blocks(blocks: int) -> int:
-    """How many blocks are held out in turn.
+    """Return how many blocks are held out in turn.
 
     Raises:
         InputError: one, of which nothing would be left to train on.
@@ -296,9 +427,15 @@ def _check_blocks(blocks: int) -> int:
 
 
 def _check_ensemble(ensemble: bool, problem: Problem) -> bool:
-    """Whether there is one; raise InputError for a median of outputs that are mixed with each other."""
+    """Return whether an ensemble is asked for, and check the request.
+
+    Raise InputError for a median of outputs that are mixed with each other.
+    """
     if ensemble and problem.weight.choice == "covariance":
-        raise InputError("an ensemble takes the median of each output; use `output_weights` std, none or numbers.")
+        raise InputError(
+            "an ensemble takes the median of each output; use `output_weights` std, none or "
+            "numbers."
+        )
     return ensemble
 
 
@@ -309,25 +446,34 @@ def _check_splittable(structure: Structure, baseline: Baseline, learner: Learner
     bounded = [p.name for p in baseline.parameters if np.isfinite(p.min) or np.isfinite(p.max)]
     if bounded:
         raise InputError(
-            f"{', '.join(bounded)} have bounds, which hold under the training measure only: under another one θ is "
-            "split off after training. Drop the bounds or the measure."
+            f"{', '.join(bounded)} have bounds, which hold under the training measure only: "
+            "under another one θ is split off after training. Drop the bounds or the measure."
         )
 
 
 def _splits(structure: Structure) -> bool:
-    """Whether θ is split off under another measure than that of training."""
+    """Return whether θ is split off under another measure than that of training."""
     return structure.measure != Training()
 
 
-def _warm_start(problem: Problem, model: Model, engine: Engine) -> tuple[OneStepTask, Vector, Vector]:
-    """The task of going on from an earlier model's weights, in its scaling; and the model's c."""
+def _warm_start(
+    problem: Problem, model: Model, engine: Engine
+) -> tuple[OneStepTask, Vector, Vector]:
+    """Return the task of training on from an earlier model's weights, in its scaling.
+
+    And the model's c.
+    """
     bound, numbers = model.form.bound, model.numbers
     if numbers.tilt is not None:
-        raise InputError("`initial` is an ensemble, which has no single weights to start from; fit anew.")
+        raise InputError(
+            "`initial` is an ensemble, which has no single weights to start from; fit anew."
+        )
     if bound is None:
         raise InputError("`initial` is physics alone and has nothing to start from; leave it out.")
     if len(problem.outputs) != bound.ny:
-        raise InputError(f"`initial` has {bound.ny} outputs, the record {len(problem.outputs)}; fit anew.")
+        raise InputError(
+            f"`initial` has {bound.ny} outputs, the record {len(problem.outputs)}; fit anew."
+        )
     scaling = Scaling(np.asarray(numbers.centre), np.asarray(numbers.halfwidth))
     problem = problem.seen_linearly() if model.form.features.linear else problem
     task = OneStepTask.of(problem, bound.learner, scaling, np.asarray(numbers.gain), engine)
@@ -354,15 +500,23 @@ def _check_types(**given: Any) -> None:
 
 
 def _check_regularizations(given: Any, choices: Sequence[Any], chosen: bool) -> bool:
-    """Whether "auto" was given; raise InputError for what is none, or for several that nothing chooses between."""
+    """Return whether "auto" was given, and check the regularizations.
+
+    Raise InputError for what is none, or for several that nothing chooses between.
+    """
     auto = isinstance(given, str) and given == "auto"
     if len(choices) > 1 and not (auto or chosen):
-        raise InputError("several regularizations need `validation` or `blocks` to choose between them.")
+        raise InputError(
+            "several regularizations need `validation` or `blocks` to choose between them."
+        )
     for choice in choices:
         if isinstance(choice, str):
             check_choice(choice, ("none", "evidence", "ard"), "`regularization`")
         elif isinstance(choice, bool) or not isinstance(choice, int | float | np.number):
-            raise InputError(f"`regularization` must be auto, none, evidence, ard or a number; got {shown(choice)}.")
+            raise InputError(
+                "`regularization` must be auto, none, evidence, ard or a number; got "
+                f"{shown(choice)}."
+            )
         elif not (is_number(choice) and choice >= 0):
             raise InputError(f"`regularization` must be 0 or more; got {shown(choice)}.")
     if not choices:
@@ -373,10 +527,11 @@ def _check_regularizations(given: Any, choices: Sequence[Any], chosen: bool) -> 
 def posed_on(
     record: Record | Source, engine: Engine | None, baseline: Baseline, *args: Any, **options: Any
 ) -> tuple[Problem, Engine]:
-    """The problem with the engine that sums over its rows; further arguments as of `pose`.
+    """Return the problem with the engine that sums over its rows; further arguments as of `pose`.
 
     Args:
-        engine: None for what suits the record: memory, a stream of its files, the cluster that holds it.
+        engine: None for what suits the record: memory, a stream of its files, the cluster that
+            holds it.
 
     Raises:
         InputError: as `pose`.
@@ -399,11 +554,11 @@ def _engine_of(source: Source) -> Engine:
 
 
 def check_record(record: Any, *, moves: bool = False) -> None:
-    """Raise InputError for what holds no rows, or none in memory where a motion needs them."""
+    """Raise InputError for a record without rows, or with none in memory for a motion."""
     if not isinstance(record, Source):
         check_type(record, Record, "record", "a Record")
     elif moves and not isinstance(record, Record):
         raise InputError(
-            "a motion takes a Record, whose segments an engine may share out; read these rows into memory "
-            "(read_record, Record.join), or fit the physics in its lagged form."
+            "a motion needs its rows in memory: read them with read_record or Record.join, or "
+            "fit the physics in its lagged form."
         )

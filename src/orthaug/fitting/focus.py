@@ -1,9 +1,9 @@
-"""One step ahead or the free run: what `Auto` chooses, by free runs over rows that were not fitted.
+"""The choice of `Auto` between one step ahead and the free run, by held-out free runs.
 
-A fit one step ahead stays where its free run is finite, no worse than that of physics alone, and where its residual is
-noise of the equation. Otherwise physics and learner are trained on the free run, too. Of all candidates, physics alone
-among them, the one is handed over that predicts the held-out free runs best. `benchmarks/defaults.py` has the records
-by which these rules were chosen.
+A fit one step ahead stays where its free run is finite, no worse than that of physics alone, and
+where its residual is noise of the equation. Otherwise physics and learner are trained on the free
+run, too. Of all candidates, physics alone among them, the one is handed over that predicts the
+held-out free runs best. `benchmarks/defaults.py` has the records by which these rules were chosen.
 """
 
 from __future__ import annotations
@@ -29,9 +29,11 @@ ONE_STEP, FREE_RUN = "prediction", "simulation"
 BLOCKS = 4  # blocks that are held out in turn where that is not said
 HALVES = 2  # the later one is run over by a fit to the other
 _SLACK = 1.02  # errors closer than this are the same: then the simpler candidate stays
-_PREFERRED = 1.1  # physics alone one step ahead has to be better by this to stand against that of the free run
+# physics alone one step ahead has to be better by this to be preferred to that of the free run
+_PREFERRED = 1.1
 _LAGS = 20  # of the residual's autocorrelation
-_COLOURED = 0.1  # autocorrelation from which a residual is no noise of the equation, where it is significant, too
+# autocorrelation from which a residual is no noise of the equation, where it is significant, too
+_COLOURED = 0.1
 _SIGNIFICANT = 4.0  # standard deviations of the autocorrelation of white noise: one lag in 16,000
 
 Fit = Callable[..., Any]
@@ -41,7 +43,7 @@ Key = tuple[str, bool]
 
 
 def choose_focus(problem: Any, fit: Fit, options: Mapping[str, Any], criterion: Any) -> Any:
-    """Return the estimate one step ahead, or the best of it and those trained on the free run.
+    """Return the best of the estimates one step ahead and on the free run.
 
     Args:
         problem: posed, with its rows in memory.
@@ -54,19 +56,22 @@ def choose_focus(problem: Any, fit: Fit, options: Mapping[str, Any], criterion: 
         return first
     reason = _why_not(problem, first, fit, options)
     if reason is None:
-        text = "one step ahead is enough: the free run holds where nothing was fitted, and the residual is white."
+        text = (
+            "one step ahead is enough: the free run is good on held-out rows, and the residual "
+            "is white."
+        )
         return replace(first, focus=Focus(ONE_STEP, text))
     LOG.info("auto: %s; the free run is trained, too", reason)
-    flown = _free_run(criterion, problem)
+    free_run = _free_run(criterion, problem)
     try:
-        return _best(_Choosing(problem, first, fit, options, flown), reason)
+        return _best(_FocusChoice(problem, first, fit, options, free_run), reason)
     except InputError as error:  # too few rows for a free run
         text = f"trained one step ahead; {reason}, but the free run cannot be trained: {error}"
         return replace(first, focus=Focus(ONE_STEP, text))
 
 
 def _why_not(problem: Any, first: Any, fit: Fit, options: Mapping[str, Any]) -> str | None:
-    """Return why one step ahead is not enough; None where it is."""
+    """Return the reason why one step ahead is not enough; None where it is."""
     if not first.model.form.states:
         return None  # nothing is fed back: a free run is the prediction
     wrong = _beside_physics(first, [problem.record], problem)
@@ -74,32 +79,48 @@ def _why_not(problem: Any, first: Any, fit: Fit, options: Mapping[str, Any]) -> 
         return f"{wrong} over the training data"
     if first.model.form.bound is not None:
         validation = options["validation"]
-        where = "over the half of the rows that was held out" if validation is None else "on the validation part"
-        made, held = (first, validation) if validation is not None else _on_half(problem, fit, options)
+        where = (
+            "over the half of the rows that was held out"
+            if validation is None
+            else "on the validation part"
+        )
+        made, held = (
+            (first, validation) if validation is not None else _on_half(problem, fit, options)
+        )
         wrong = None if made is None else _beside_physics(made, [held], problem)
         if wrong is not None:
             return f"{wrong} {where}"
-    return "its residual remembers its past, as noise on the sensor makes it" if _coloured(first) else None
+    return (
+        "its residual is correlated with its past, as sensor noise makes it"
+        if _is_coloured(first)
+        else None
+    )
 
 
 def _beside_physics(fit: Any, records: Sequence[Record], problem: Any) -> str | None:
-    """Return what is wrong with the free runs of a fit beside those of its physics alone; None for nothing."""
+    """Return the fault of a fit's free runs compared to those of its physics alone.
+
+    None for nothing.
+    """
     physics = fit if fit.physics_alone is None else fit.physics_alone
-    own, alone = (mean_square([p for r in records for p in _errors(one, r, problem)]) for one in (fit, physics))
+    own, alone = (
+        mean_square([p for r in records for p in _errors(one, r, problem)])
+        for one in (fit, physics)
+    )
     if math.isinf(own):
         return "its free run diverges"
     return "its free run is worse than that of physics alone" if own > _SLACK**2 * alone else None
 
 
 def _errors(fit: Any, record: Record, problem: Any) -> Pieces:
-    """Squared errors along the free run of each experiment."""
+    """Return the squared errors along the free run of each experiment."""
     if fit is None or not fit.status.ok:
         return [None] * len(record.experiments)
     return squared_errors(fit.model.simulate(record), problem.deviation)
 
 
 def _on_half(problem: Any, fit: Fit, options: Mapping[str, Any]) -> tuple[Any, Any]:
-    """Return a fit to the first half, and the other half; nothing where the rows are too few."""
+    """Return a fit to the first half, and the other half; nothing for too few rows."""
     try:
         training, held = blocked(problem.record, HALVES, problem.first_row)[-1]
         return fit(problem.on(training), criterion=Prediction(), **_quick(options)), held
@@ -108,7 +129,10 @@ def _on_half(problem: Any, fit: Fit, options: Mapping[str, Any]) -> tuple[Any, A
 
 
 def _quick(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options of a fit to a part of the rows: one start, few iterations, nothing to choose."""
+    """Return options for a quick fit to a part of the rows.
+
+    One start, few iterations, nothing to choose.
+    """
     given = options["regularization"]
     return {
         **{name: value for name, value in options.items() if name != "progress"},
@@ -122,8 +146,11 @@ def _quick(options: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _coloured(fit: Any) -> bool:
-    """Return whether the residual one step ahead is correlated with its own past, clearly and by more than a little."""
+def _is_coloured(fit: Any) -> bool:
+    """Return whether the one-step residual is clearly correlated with its past.
+
+    And by more than a little.
+    """
     for trajectory in fit.model.predict(fit.problem.record).trajectories:
         errors = (trajectory.measured - trajectory.model)[trajectory.start :]
         limit = max(_COLOURED, _SIGNIFICANT / math.sqrt(len(errors)))
@@ -135,32 +162,41 @@ def _coloured(fit: Any) -> bool:
 
 
 def _free_run(criterion: Any, problem: Any) -> Any:
-    """Return the free run that is trained, with a washout that leaves most of a short record to be scored."""
+    """Return the free run to train, with a washout that leaves most of a record."""
     usable = max(map(len, problem.record.experiments)) - problem.first_row
     declared = criterion.simulation
-    return replace(declared, washout=min(declared.washout, usable // 4)).on(problem.record, problem.first_row)
+    return replace(declared, washout=min(declared.washout, usable // 4)).on(
+        problem.record, problem.first_row
+    )
 
 
 @dataclass(frozen=True, eq=False)
-class _Choosing:
-    """A problem with its fit one step ahead, and how others are made of it."""
+class _FocusChoice:
+    """A problem with its fit one step ahead, from which the other candidates are made."""
 
     problem: Any
     first: Any
     fit: Fit
     options: Mapping[str, Any]
-    flown: Any
+    free_run: Any
 
     @property
     def learns(self) -> bool:
-        """Whether there is a learner to be with or without."""
+        """True where there is a learner to compare with physics alone."""
         return self.options["learner"] is not None
 
     @cached_property
     def free(self) -> Any:
-        """The fit on the free run, from one start, for all begin at physics alone; within its limit, to save time."""
+        """The fit on the free run, from one start, for all begin at physics alone.
+
+        Within its limit, to save time.
+        """
         chosen = {**self.options, "fallback": False, "blocks": 0, "restarts": 1}
-        return self.fit(self.problem, criterion=self.flown, **chosen | {"solver": self.options["solver"].within_limit})
+        return self.fit(
+            self.problem,
+            criterion=self.free_run,
+            **chosen | {"solver": self.options["solver"].within_limit},
+        )
 
     @cached_property
     def free_physics(self) -> Any:
@@ -168,7 +204,7 @@ class _Choosing:
         if "free" in vars(self) and self.free.physics_alone is not None:
             return self.free.physics_alone
         chosen = {**self.options, "learner": None, "fallback": False, "blocks": 0, "restarts": 1}
-        return self.fit(self.problem, criterion=self.flown, **chosen)
+        return self.fit(self.problem, criterion=self.free_run, **chosen)
 
     def estimate(self, key: Key) -> Any:
         """Return the estimate of a candidate from all rows."""
@@ -179,24 +215,33 @@ class _Choosing:
 
     @cached_property
     def errors(self) -> dict[Key, float]:
-        """RMS errors of the free runs of all candidates where nothing was fitted, the simplest first."""
-        keys = [(focus, own) for focus in (ONE_STEP, FREE_RUN) for own in ((False, True) if self.learns else (False,))]
+        """RMS errors of the held-out free runs of all candidates, the simplest first."""
+        keys = [
+            (focus, own)
+            for focus in (ONE_STEP, FREE_RUN)
+            for own in ((False, True) if self.learns else (False,))
+        ]
         validation = self.options["validation"]
         records = [(self.problem.record, validation)] if validation is not None else self._folds()
         pieces: dict[Key, list[Any]] = {key: [] for key in keys}
         for training, held in records:
             whole = training is self.problem.record
             made = {} if whole else {ONE_STEP: self._made(training, Prediction()),
-                                     FREE_RUN: self._made(training, self.flown)}  # fmt: skip
+                                     FREE_RUN: self._made(training, self.free_run)}  # fmt: skip
             for key, found in pieces.items():
                 one = self.estimate(key) if whole else _without(made[key[0]], key[1])
                 found += _errors(one, held, self.problem)
         return {key: math.sqrt(mean_square(found)) for key, found in pieces.items()}
 
     def _folds(self) -> list[tuple[Record, Record]]:
-        """What blocks are left out of, and these; of few rows the training data themselves."""
+        """Return pairs of training rows and held-out blocks.
+
+        Of few rows the training data themselves.
+        """
         try:
-            return blocked(self.problem.record, self.options["blocks"] or BLOCKS, self.problem.first_row)
+            return blocked(
+                self.problem.record, self.options["blocks"] or BLOCKS, self.problem.first_row
+            )
         except InputError:
             return [(self.problem.record, self.problem.record)]
 
@@ -208,62 +253,92 @@ class _Choosing:
 
 
 def _without(estimate: Any, learner: bool) -> Any:
-    """Return an estimate, or that of physics alone beside it."""
+    """Return an estimate, or that of its physics alone."""
     if learner or estimate is None or estimate.physics_alone is None:
         return estimate
     return estimate.physics_alone
 
 
-def _best(choosing: _Choosing, reason: str) -> Any:
-    """Return the estimate of the candidate with the least error, of those whose free run over all rows is sound."""
+def _best(choosing: _FocusChoice, reason: str) -> Any:
+    """Return the estimate of the candidate with the least error.
+
+    Only candidates whose free run over all rows is sound count.
+    """
     errors = choosing.errors
-    ranked = _ranked(errors, with_learner=choosing.learns and not choosing.options["fallback"])
+    ranked = _rank(errors, with_learner=choosing.learns and not choosing.options["fallback"])
     chosen = next((key for key in ranked if _sound(choosing, key)), None)
     lost = chosen is None
     key = (ONE_STEP, False) if chosen is None else chosen
-    best, compared = choosing.estimate(key), tuple(Candidate(*one, error) for one, error in errors.items())
+    best, compared = (
+        choosing.estimate(key),
+        tuple(Candidate(*one, error) for one, error in errors.items()),
+    )
     named = {(one.focus, one.learner): one for one in compared}
     text = (
-        f"trained one step ahead and, because {reason}, on the free run as well. Errors of free runs where nothing was "
-        f"fitted, in standard deviations of the output: {'; '.join(one.described for one in compared)}. The result is "
-        f"{named[key]}."
+        f"trained one step ahead and, because {reason}, on the free run as well. Errors of free "
+        "runs on held-out rows, in standard deviations of the output: "
+        f"{'; '.join(one.described for one in compared)}. The result is {named[key]}."
     )
     warnings = list(best.warnings)
     if any(warning.code == NOT_CONVERGED for warning in warnings):
-        text += ' Training on the free run stopped at its limit to save time; `focus = "simulation"` goes on.'
+        text += (
+            " Training on the free run stopped at its limit to save time; `focus = "
+            '"simulation"` trains to the end.'
+        )
     if choosing.learns and not key[1]:
         rival = min((one for one in compared if one.learner), key=lambda one: one.error)
-        told = f"no learner is better in free run where nothing was fitted ({rival.described}), so the result is"
-        warnings.append(Warning("physics_alone", f"{told} {named[key].described}."))
+        beginning = (
+            f"no learner is better in the free run on held-out rows ({rival.described}), so the "
+            "result is"
+        )
+        warnings.append(Warning("physics_alone", f"{beginning} {named[key].described}."))
     if lost:
-        told = "every free run diverges, over training or held-out rows: the model is for one-step prediction only."
-        warnings.append(Warning("one_step_only", told))
+        text_of_runs = (
+            "every free run diverges, over training or held-out rows: the model is for "
+            "one-step prediction only."
+        )
+        warnings.append(Warning("one_step_only", text_of_runs))
     physics = min((one for one in errors if not one[1]), key=lambda one: errors[one])
     kept = choosing.estimate(physics) if key[1] else None
-    return replace(best, focus=Focus(key[0], text, compared), physics_alone=kept, warnings=tuple(warnings))
+    return replace(
+        best, focus=Focus(key[0], text, compared), physics_alone=kept, warnings=tuple(warnings)
+    )
 
 
-def _ranked(errors: Mapping[Key, float], *, with_learner: bool) -> list[Key]:
-    """Return the candidates, the least error first and of alike ones the simplest; wanted learners before physics.
+def _rank(errors: Mapping[Key, float], *, with_learner: bool) -> list[Key]:
+    """Return the candidates by error, of similar ones the simplest first.
 
-    Physics alone that was fitted to the free run stands before that of one step ahead where the errors of a few
-    blocks do not clearly speak against it: it minimises what is compared.
+    Wanted learners before physics.
+
+    Physics alone that was fitted to the free run comes before that of one step ahead where the
+    errors of a few blocks do not clearly speak against it: it minimises what is compared.
     """
     among = [key for key in errors if key[1] or not with_learner]
     least = min(errors[key] for key in among)
     alike = [key for key in among if errors[key] <= _SLACK * least]
     one_step, free_run = (ONE_STEP, False), (FREE_RUN, False)
-    if alike[:1] == [one_step] and free_run in among and errors[free_run] <= _PREFERRED * errors[one_step]:
+    if (
+        alike[:1] == [one_step]
+        and free_run in among
+        and errors[free_run] <= _PREFERRED * errors[one_step]
+    ):
         alike = [free_run, *(key for key in alike if key != free_run)]
-    return alike + sorted((key for key in errors if key not in alike), key=lambda key: (key not in among, errors[key]))
+    return alike + sorted(
+        (key for key in errors if key not in alike), key=lambda key: (key not in among, errors[key])
+    )
 
 
-def _sound(choosing: _Choosing, key: Key) -> bool:
-    """Return whether a candidate runs over all training data, with a learner no worse than physics if that may be."""
+def _sound(choosing: _FocusChoice, key: Key) -> bool:
+    """Return whether a candidate runs over all training data.
+
+    Its learner may be no worse than physics, where `physics` is a candidate.
+    """
     if not math.isfinite(choosing.errors[key]):
         return False
     problem = choosing.problem
     own = mean_square(_errors(choosing.estimate(key), problem.record, problem))
     if not key[1] or not math.isfinite(own) or not choosing.options["fallback"]:
         return math.isfinite(own)
-    return own <= _SLACK**2 * mean_square(_errors(choosing.estimate((key[0], False)), problem.record, problem))
+    return own <= _SLACK**2 * mean_square(
+        _errors(choosing.estimate((key[0], False)), problem.record, problem)
+    )

@@ -1,10 +1,11 @@
-"""Training on the free run: θ and the weights together, from physics alone (the criterion `Simulation`).
+"""Training on the free run (criterion `Simulation`): θ and the weights together.
 
-Here θ is an unknown beside the weights (F1 does not hold). The split at the end is over the *measured* regressors (F2),
-which keeps the orthogonal structure exact.
+Here θ is an unknown beside the weights (F1 does not hold). The split at the end is over the
+*measured* regressors (F2), which keeps the orthogonal structure exact.
 
-Physics alone is what every learner has to beat, and where it starts: from random weights a learner often ends above
-it, since its start runs away. From physics alone, with a silent learner, a descent cannot.
+Physics alone is what every learner has to beat, and where it starts: from random weights a learner
+often ends above it, since its start runs away. From physics alone, with a silent learner, a descent
+cannot.
 """
 
 from __future__ import annotations
@@ -16,45 +17,60 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.checks import Vector
-from orthaug._base.progress import RunTell, quiet
+from orthaug._base.progress import RunProgress, quiet
 from orthaug.data.record import Record
-from orthaug.fitting.course import Flight
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.elimination import Fixed, settle
-from orthaug.fitting.flight_plan import FlightPlan, StructuredObjective
-from orthaug.fitting.flights import FlightTask, Place
 from orthaug.fitting.initial_states import Start
-from orthaug.fitting.learned import Learned
+from orthaug.fitting.learned import TrainedLearner
 from orthaug.fitting.one_step import OneStepTask
+from orthaug.fitting.segmented_lagged import SegmentedLagged, StructuredObjective
+from orthaug.fitting.segmented_problem import FreeRunFit
+from orthaug.fitting.segmented_streamed import SegmentedStreamed
+from orthaug.fitting.simulation_task import SimulationTask, StartPoint
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
-from orthaug.fitting.source_plan import SourcePlan
 from orthaug.fitting.structures import Structure
 from orthaug.physics.streamed import StreamedProblem
 
 _SHORTEST = 4  # steps of a segment
-_LONGER = (4.0, 2.0, 1.4, 1.15)  # times, from one length of the segments to the next: the first that flies
-_SHRUNK = (0.99, 0.9, 0.5, 0.0)  # of the one-step θ: less feedback flies longer
+_LONGER = (
+    4.0,
+    2.0,
+    1.4,
+    1.15,
+)  # times, from one length of the segments to the next: the first with a finite run
+_SHRUNK = (0.99, 0.9, 0.5, 0.0)  # of the one-step θ: less feedback diverges later
 
 
-def fly_alone(
-    plan: FlightPlan, solver: LevenbergMarquardt, structure: Structure, tell: RunTell = quiet
-) -> Flight | None:
-    """θ of physics alone under the plan's criterion and the structure's rows and bounds; None where none can fly.
+def train_physics_only(
+    plan: SegmentedLagged,
+    solver: LevenbergMarquardt,
+    structure: Structure,
+    progress: RunProgress = quiet,
+) -> FreeRunFit | None:
+    """Return θ of physics alone under the criterion and the structure's rows and bounds.
 
-    Training starts at the one-step solution, or at the initial values where these fly better. Where neither flies, or
-    the end runs away over whole experiments, it goes over segments that lengthen. Of all ends the best over whole
-    experiments is kept; where a start was better than them, whole experiments are trained on too.
+    None where no run is finite.
+
+    Training starts at the one-step solution, or at the initial values where these run better. Where
+    neither run is finite, or the end diverges over whole experiments, it goes over segments that
+    lengthen. Of all ends the best over whole experiments is kept; where a start was better than
+    them, whole experiments are trained on too.
     """
     plan = plan.alone
     objective = plan.objective(structure)
     least_squares, initial = objective.begin(np.zeros(0)), plan.problem.baseline.initial
-    starts = [least_squares, *([initial] if initial.any() else []), *(share * least_squares for share in _SHRUNK)]
-    losses = [objective.fly(p, Start(objective.initial.measured)).loss for p in starts]
-    ends: list[Flight] = []
+    starts = [
+        least_squares,
+        *([initial] if initial.any() else []),
+        *(share * least_squares for share in _SHRUNK),
+    ]
+    losses = [objective.evaluate(p, Start(objective.initial.measured)).loss for p in starts]
+    ends: list[FreeRunFit] = []
     if np.isfinite(losses).any():
-        ends.append(plan.descend(objective, starts[int(np.argmin(losses))], solver, tell))
+        ends.append(plan.descend(objective, starts[int(np.argmin(losses))], solver, progress))
     if not np.isfinite(losses[0]) or not ends or not np.isfinite(ends[0].mean_square):
-        ends += _lengthening(plan, solver, structure, starts)
+        ends += _lengthen(plan, solver, structure, starts)
     if plan.whole is not plan.segments and plan.lengthens:
         ends += _over_whole(plan, solver, structure, starts, ends)
     best = _best(ends)
@@ -62,40 +78,53 @@ def fly_alone(
     return None if best is None else best._replace(**spent)
 
 
-def _lengthening(
-    plan: FlightPlan, solver: LevenbergMarquardt, structure: Structure, starts: Sequence[Vector]
-) -> list[Flight]:
-    """The end over the plan's own segments, reached over shorter ones, from the first start that flies over them."""
+def _lengthen(
+    plan: SegmentedLagged,
+    solver: LevenbergMarquardt,
+    structure: Structure,
+    starts: Sequence[Vector],
+) -> list[FreeRunFit]:
+    """Return the end over the plan's own segments, by way of shorter ones.
+
+    It begins at the first start whose run over them is finite.
+    """
     p, segment, shortest = None, _SHORTEST, plan.over(_SHORTEST)
     for start in starts:
         end = shortest.descend(shortest.objective(structure), start, solver.within_limit)
         if end.ending.usable:
-            p = end.end.flown.p
+            p = end.end.point.p
             break
     while p is not None:
         for longer in _LONGER:
             steps = min(int(np.ceil(longer * segment)), plan.segments.steps)
-            course = plan if steps == plan.segments.steps else plan.over(steps)
-            end = course.descend(course.objective(structure), p, solver if course is plan else solver.within_limit)
+            segmented = plan if steps == plan.segments.steps else plan.over(steps)
+            end = segmented.descend(
+                segmented.objective(structure),
+                p,
+                solver if segmented is plan else solver.within_limit,
+            )
             if end.ending.usable:
                 break
         else:
             return []
-        p, segment = end.end.flown.p, steps
-        if course is plan:
+        p, segment = end.end.point.p, steps
+        if segmented is plan:
             return [end]
     return []
 
 
 def _over_whole(
-    plan: FlightPlan,
+    plan: SegmentedLagged,
     solver: LevenbergMarquardt,
     structure: Structure,
     starts: Sequence[Vector],
-    ends: Sequence[Flight],
-) -> list[Flight]:
-    """The end over whole experiments, where no end over segments is as good there as every start."""
-    places = [(end.mean_square, end.end.flown.p) for end in ends]
+    ends: Sequence[FreeRunFit],
+) -> list[FreeRunFit]:
+    """Return the end over whole experiments, where ends over segments are worse there.
+
+    That is, where none is as good over whole experiments as every start.
+    """
+    places = [(end.mean_square, end.end.point.p) for end in ends]
     objective = plan.objective(structure)
     begun = [(plan.mean_square(objective.place(p)[1], np.zeros(0)), p) for p in starts]
     known = [place for place in (*places, *begun) if np.isfinite(place[0])]
@@ -108,60 +137,65 @@ def _over_whole(
     end = whole.descend(whole.objective(structure), best[1], solver)
     if not end.ending.usable:
         return []
-    own = plan.descend(objective, end.end.flown.p, solver.at_most(0))  # its statistics are those of the plan's segments
+    own = plan.descend(
+        objective, end.end.point.p, solver.at_most(0)
+    )  # its statistics are those of the plan's segments
     if not own.ending.usable:
         return []
     own = own._replace(end=own.end._replace(ending=end.ending, tail=end.end.tail))
     return [own._replace(iterations=end.iterations, seconds=end.seconds)]
 
 
-def _best(ends: Sequence[Flight]) -> Flight | None:
-    """The lowest over whole experiments; where all run away, the lowest over segments."""
+def _best(ends: Sequence[FreeRunFit]) -> FreeRunFit | None:
+    """Return the lowest end over whole experiments, or over segments where all diverge."""
     usable = [end for end in ends if end.ending.usable]
     flying = [end for end in usable if np.isfinite(end.mean_square)]
     if flying:
         return min(flying, key=lambda end: end.mean_square)
-    return min(usable, key=lambda end: end.end.flown.loss, default=None)
+    return min(usable, key=lambda end: end.end.point.loss, default=None)
 
 
 @dataclass(frozen=True, eq=False)
-class FreeRunTask(FlightTask):
-    """A plan of segments, what physics alone does on it, and where an earlier model stands."""
+class FreeRunTask(SimulationTask):
+    """Training on the free run: segments, physics alone on them, an earlier model."""
 
-    plan: FlightPlan
+    plan: SegmentedLagged
     warm: Vector | None = None
     """c of an earlier model, with whose weights training starts."""
 
     @classmethod
     def of(cls, task: OneStepTask, criterion: Criterion, warm: Vector | None = None) -> FreeRunTask:
-        """Lay the problem's record out as a criterion of several steps declares.
+        """Lay out the problem's record as a criterion of several steps declares.
 
         Raises:
             InputError: nothing would be scored; whole experiments of rows that are not in memory.
         """
-        plan = SourcePlan if isinstance(task.problem, StreamedProblem) else FlightPlan
+        plan = SegmentedStreamed if isinstance(task.problem, StreamedProblem) else SegmentedLagged
         return cls(plan.of(task, criterion), None, warm).keeping(task.checkpoints)
 
     @property
     def rows_task(self) -> OneStepTask:
         return self.plan.task
 
-    def physics_alone(self) -> tuple[OneStepTask, Learned]:
-        """The rows without a learner, and what physics alone leaves on them; least squares where it cannot fly."""
+    def physics_alone(self) -> tuple[OneStepTask, TrainedLearner]:
+        """Return the task without a learner, and the residual of physics alone.
+
+        Least squares where no run of it is finite.
+        """
         if self.physics is None:
             return self.rows_task.physics_alone()
         plan = self.plan.alone
         return plan.task, replace(self, plan=plan).learned(self.physics)
 
     def on(self, record: Record) -> FreeRunTask:
-        """The same problem on another record."""
-        like = None if isinstance(self.plan, SourcePlan) else self.plan
-        return FreeRunTask(FlightPlan.of(self.rows_task.on(record), self.criterion, like))
+        """Return the task on another record."""
+        like = None if isinstance(self.plan, SegmentedStreamed) else self.plan
+        return FreeRunTask(SegmentedLagged.of(self.rows_task.on(record), self.criterion, like))
 
-    def flown_alone(
-        self, solver: LevenbergMarquardt, structure: Structure, tell: RunTell
-    ) -> tuple[FlightPlan, Flight | None]:
-        return self.plan, fly_alone(self.plan, solver, structure, tell)
+    def train_physics_only(
+        self, solver: LevenbergMarquardt, structure: Structure, progress: RunProgress
+    ) -> tuple[SegmentedLagged, FreeRunFit | None]:
+        return self.plan, train_physics_only(self.plan, solver, structure, progress)
 
     def run(
         self,
@@ -169,31 +203,36 @@ class FreeRunTask(FlightTask):
         w: Any,
         structure: Structure,
         regularization: str | float = "none",
-        progress: RunTell = quiet,
-    ) -> Flight:
-        """As any run on the free run, with an orthogonal θ at a bound a known term beside the learner.
+        progress: RunProgress = quiet,
+    ) -> FreeRunFit:
+        """Run, with an orthogonal θ at a bound as a known term beside the learner.
 
-        What stands at a bound where physics alone ends is held there from the start. The run is made again, from there
-        too, where other entries stand at one at its end; what was held once before is not released again.
+        Entries at a bound where physics alone ends are fixed there from the start. The run is
+        made again, from there too, where other entries are at one at its end; what was fixed once
+        before is not released again.
         """
         alone: Any = self.physics
         first: Fixed = {}
         if alone is not None and self.plan.objective(structure).apart:
             first = alone.objective.held(alone.end)
-        flights: list[Flight] = []
+        free_fits: list[FreeRunFit] = []
 
-        def fly(fixed: Fixed, solver: LevenbergMarquardt = solver) -> Fixed | None:
+        def evaluate(fixed: Fixed, solver: LevenbergMarquardt = solver) -> Fixed | None:
             own = replace(self, plan=replace(self.plan, fixed=fixed))
-            flights.append(super(FreeRunTask, own).run(solver, w, structure, regularization, progress))
-            end, objective = flights[-1].end, flights[-1].objective
+            free_fits.append(
+                super(FreeRunTask, own).run(solver, w, structure, regularization, progress)
+            )
+            end, objective = free_fits[-1].end, free_fits[-1].objective
             assert isinstance(objective, StructuredObjective)
             return objective.held(end) if end.ending.usable and objective.apart else None
 
-        if settle(first, fly) != first and alone is not None:  # other bounds than those of its start
-            flown = flights[-1].end.flown
-            if alone.mean_square < self.plan.mean_square(flown.c, flown.w):
-                fly(first, solver.at_most(0))
-        return flights[-1]._replace(seconds=sum(flight.seconds for flight in flights))
+        if (
+            settle(first, evaluate) != first and alone is not None
+        ):  # other bounds than those of its start
+            point = free_fits[-1].end.point
+            if alone.mean_square < self.plan.mean_square(point.c, point.w):
+                evaluate(first, solver.at_most(0))
+        return free_fits[-1]._replace(seconds=sum(free_fit.seconds for free_fit in free_fits))
 
     def places(
         self,
@@ -202,38 +241,45 @@ class FreeRunTask(FlightTask):
         w: Vector,
         structure: Structure,
         regularization: str | float,
-    ) -> list[Place]:
-        """Where a run may start: physics alone, an earlier model, the solution one step ahead where it flies well."""
+    ) -> list[StartPoint]:
+        """Return possible starts: physics alone, an earlier model, the one-step solution.
+
+        The last one only where its free run is good.
+        """
         plan, measured = self.plan, objective.initial.measured
-        places: list[Place] = []
+        places: list[StartPoint] = []
 
         def add(p: Vector, states: Any = measured, silent: bool = False) -> None:
-            loss = objective.fly(p, Start(states)).loss
-            places.append(Place(p, states, loss if np.isfinite(loss) else np.inf, silent))
+            loss = objective.evaluate(p, Start(states)).loss
+            places.append(StartPoint(p, states, loss if np.isfinite(loss) else np.inf, silent))
 
         silenced = None if self.bound is None or self.warm is not None else self.bound.silent(w)
         if self.physics is not None and silenced is not None:
-            flown = self.physics.end.flown
-            add(np.concatenate([flown.theta, silenced]), flown.states, silent=True)
+            point = self.physics.end.point
+            add(np.concatenate([point.theta, silenced]), point.states, silent=True)
         if self.warm is not None and not objective.follows:
             add(np.concatenate([self.warm, w]))
         elif not places:
             add(objective.begin(w))
-        if self.bound is not None and plan.flown.start_iterations and self.warm is None:
-            steps = plan.flown.start_iterations
+        if self.bound is not None and plan.free_run.start_iterations and self.warm is None:
+            steps = plan.free_run.start_iterations
             short = LevenbergMarquardt(steps, solver.tolerance, longest=steps)
-            begun = objective.begin(np.asarray(plan.task.run(short, w, structure, regularization).w))
-            if self._flies_better(objective, begun):
+            begun = objective.begin(
+                np.asarray(plan.task.run(short, w, structure, regularization).w)
+            )
+            if self._simulates_better(objective, begun):
                 add(begun)
         return places
 
-    def _flies_better(self, objective: StructuredObjective, p: Vector) -> bool:
-        """Whether over whole experiments the loss at p is no higher than that of physics alone."""
+    def _simulates_better(self, objective: StructuredObjective, p: Vector) -> bool:
+        """Return whether the loss at p over whole experiments is at most that of physics."""
         square = self.plan.mean_square(*objective.place(p)[1:])
-        return bool(np.isfinite(square)) and (self.physics is None or square <= self.physics.mean_square)
+        return bool(np.isfinite(square)) and (
+            self.physics is None or square <= self.physics.mean_square
+        )
 
-    def median(self, members: list[Learned], best: int) -> Learned:
-        """The median of several, with the error of its own free run."""
+    def median(self, members: list[TrainedLearner], best: int) -> TrainedLearner:
+        """Return the median of several runs, with the error of its own free run."""
         learned = self.rows_task.median(members, best)
         assert learned.errors is not None and learned.coefficients is not None
         own = self.plan.mean_square(learned.coefficients, learned.weights, learned.tilt)

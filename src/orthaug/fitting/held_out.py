@@ -1,8 +1,8 @@
-"""Errors on rows that were not fitted, and the one rule by which two models are compared there.
+"""Errors on held-out rows, and the one rule by which two models are compared there.
 
-Starts, regularizations, the fallback to physics alone and every verdict rest on it. Blocked cross-validation leaves out
-one contiguous block after another, with gaps of the lag length, so that no sample is predicted from its own neighbours
-in the training data.
+Starts, regularizations, the fallback to physics alone and every verdict rest on it. Blocked
+cross-validation leaves out one contiguous block after another, with gaps of the lag length, so that
+no sample is predicted from its own neighbours in the training data.
 """
 
 from __future__ import annotations
@@ -22,7 +22,9 @@ from orthaug.models.response import Response
 
 WORTH = 0.02  # of the error: less than this is neither help nor harm
 _FEWEST = 20  # usable rows of a block
-_STRETCHES = 20  # pieces of a free run that the bootstrap draws from: longer than its errors remember
+_STRETCHES = (
+    20  # pieces of a free run that the bootstrap draws from: longer than its errors remember
+)
 _DRAWS = 999
 
 Pieces = Sequence[Vector | None]
@@ -31,9 +33,12 @@ Pieces = Sequence[Vector | None]
 
 @dataclass(frozen=True)
 class Ratio:
-    """RMS error of a model over that of another on the same rows, with a 95 % interval by the block bootstrap.
+    """RMS error of a model over that of another on the same rows.
 
-    Where only one of them diverges it is 0 or infinite, and the interval with it; where both do there is none.
+    The 95 % interval is by the block bootstrap.
+
+    Where only one of them diverges it is 0 or infinite, and the interval with it; where both do
+    there is none.
     """
 
     value: float
@@ -42,12 +47,17 @@ class Ratio:
 
     @classmethod
     def of(cls, model: Pieces, other: Pieces) -> Ratio:
-        """The model against the other. Runs that diverge count first; then those that both survive."""
+        """Return the ratio of one model's errors to the other's.
+
+        Runs that diverge count first; then those that both survive.
+        """
         lost, other_lost = (sum(piece is None for piece in pieces) for pieces in (model, other))
         if lost != other_lost:
             certain = math.inf if lost > other_lost else 0.0
             return cls(certain, certain, certain)
-        both = [(a, b) for a, b in zip(model, other, strict=True) if a is not None and b is not None]
+        both = [
+            (a, b) for a, b in zip(model, other, strict=True) if a is not None and b is not None
+        ]
         if not both:
             return cls(math.nan, math.nan, math.nan)
         sums = np.concatenate([_stretches(a, b, sum(len(a) for a, _ in both)) for a, b in both])
@@ -62,7 +72,7 @@ class Ratio:
 
     @classmethod
     def exactly(cls, model: float, other: float) -> Ratio:
-        """Of two errors that are all that is known."""
+        """Return the ratio of two known errors, without an interval."""
         if math.isinf(model) and math.isinf(other):
             value = math.nan
         else:
@@ -83,14 +93,20 @@ class Ratio:
 
 
 def _tail(count: int) -> float:
-    """Level of the percentiles of `count` stretches: 2.5 %, expanded as they are few (Hesterberg 2015, sect. 5)."""
+    """Return the level of the percentiles of `count` stretches.
+
+    2.5 %, expanded for few stretches (Hesterberg 2015, sect. 5).
+    """
     if count < 2:
         return 0.0
     return float(special.ndtr(np.sqrt(count / (count - 1)) * special.stdtrit(count - 1, 0.025)))
 
 
 def _stretches(model: Vector, other: Vector, rows: int) -> np.ndarray:
-    """Sums of both over stretches of one run, (stretches, 2); `rows` of all runs together make `_STRETCHES`."""
+    """Return sums of both over stretches of one run, (stretches, 2).
+
+    `rows` of all runs together make `_STRETCHES`.
+    """
     count = max(1, min(round(_STRETCHES * len(model) / rows), len(model)))
     edges = np.linspace(0, len(model), count + 1).astype(int)[:-1]
     return np.stack([np.add.reduceat(errors, edges) for errors in (model, other)], axis=-1)
@@ -98,10 +114,10 @@ def _stretches(model: Vector, other: Vector, rows: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Candidate:
-    """One of the models that were compared: how it was trained, `prediction` or `simulation`, and its free run's error.
+    """A compared model: its criterion `prediction` or `simulation`, its free run's error.
 
-    `error` is the RMS error where nothing was fitted, in standard deviations of the training output; infinite where
-    the run diverges, NaN where it was not tried.
+    `error` is the RMS error where nothing was fitted, in standard deviations of the training
+    output; infinite where the run diverges, NaN where it was not tried.
     """
 
     focus: str
@@ -120,7 +136,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Focus:
-    """What `Auto` chose: `prediction` or `simulation`, why, and what was compared."""
+    """The choice of `Auto`, `prediction` or `simulation`, with reason and candidates."""
 
     chosen: str
     text: str
@@ -128,11 +144,13 @@ class Focus:
 
 
 @dataclass(frozen=True, eq=False)
-class HeldOut:
-    """Squared errors where nothing was fitted: of physics alone and of every run, in `Estimate.restarts`' order.
+class HeldOutErrors:
+    """Squared errors on held-out rows, of physics alone and of every run.
 
-    In deviations of the training output, of the criterion's own response; by pieces, None for one that diverged.
-    `chosen` is the number of the run of the lowest error.
+    Runs are in the order of `Estimate.restarts`.
+
+    In deviations of the training output, of the criterion's own response; by pieces, None for one
+    that diverged. `chosen` is the number of the run of the lowest error.
     """
 
     where: str
@@ -144,19 +162,23 @@ class HeldOut:
 
     @property
     def ratio(self) -> Ratio:
-        """The chosen run against physics alone."""
+        """Ratio of the chosen run's error to that of physics alone."""
         return Ratio.of(self.runs[self.chosen], self.alone)
 
 
 def mean_square(pieces: Pieces) -> float:
-    """Over all rows of all runs; infinite where one diverged."""
+    """Return the mean over all rows of all runs; infinite where one diverged."""
     if any(piece is None for piece in pieces):
         return math.inf
     return float(np.mean(np.concatenate([piece for piece in pieces if piece is not None])))
 
 
-def squared_errors(response: Response, unit: Any, skip: int | tuple[int, ...] = 0) -> list[Vector | None]:
-    """Squared errors of a response along each experiment, each output in its `unit`, mean over the outputs.
+def squared_errors(
+    response: Response, unit: Any, skip: int | tuple[int, ...] = 0
+) -> list[Vector | None]:
+    """Return the squared errors of a response along each experiment.
+
+    Each output counts in its `unit`; the mean is over the outputs.
 
     Args:
         skip: leading samples of each experiment that do not count, as in `Response.scores`.
@@ -167,15 +189,22 @@ def squared_errors(response: Response, unit: Any, skip: int | tuple[int, ...] = 
         assert trajectory.measured is not None, "errors need measured outputs"
         rows = slice(max(trajectory.start, first), None)
         with np.errstate(all="ignore"):
-            squares = np.mean(((trajectory.measured[rows] - trajectory.model[rows]) / unit) ** 2, axis=1)
-        pieces.append(squares if trajectory.diverged is None and np.isfinite(squares).all() else None)
+            squares = np.mean(
+                ((trajectory.measured[rows] - trajectory.model[rows]) / unit) ** 2, axis=1
+            )
+        pieces.append(
+            squares if trajectory.diverged is None and np.isfinite(squares).all() else None
+        )
     return pieces
 
 
 def blocked(record: Record, blocks: int, start: int) -> list[tuple[Record, Record]]:
-    """(training, held out) for each of `blocks` contiguous blocks of about equal length, `start` rows of gap around.
+    """Return (training, held out) for each of `blocks` contiguous blocks of similar length.
 
-    All training records have the same number of usable rows after the first `start` of each experiment.
+    `start` rows around a block are left out.
+
+    All training records have the same number of usable rows after the first `start` of each
+    experiment.
 
     Raises:
         InputError: too few rows for so many blocks.
@@ -194,22 +223,34 @@ def blocked(record: Record, blocks: int, start: int) -> list[tuple[Record, Recor
             kept += [experiment.rows(after, rows)] if rows - after > start else []
             offset += rows
         held = [e for e in held if len(e) > start]
-        if sum(len(e) - start for e in held) < _FEWEST or sum(len(e) - start for e in kept) < _FEWEST:
-            raise InputError(f"{len(record)} rows are too few for {blocks} blocks with gaps of {start} rows.")
+        if (
+            sum(len(e) - start for e in held) < _FEWEST
+            or sum(len(e) - start for e in kept) < _FEWEST
+        ):
+            raise InputError(
+                f"{len(record)} rows are too few for {blocks} blocks with gaps of {start} rows."
+            )
         folds.append((kept, held))
     least = min(sum(len(e) - start for e in kept) for kept, _ in folds)
     return [
-        (replace(record, experiments=_cut(kept, least, start)), replace(record, experiments=tuple(held)))
+        (
+            replace(record, experiments=_cut(kept, least, start)),
+            replace(record, experiments=tuple(held)),
+        )
         for kept, held in folds
     ]
 
 
 def _cut(experiments: list[Experiment], usable: int, start: int) -> tuple[Experiment, ...]:
-    """The experiments without the last rows of the longest ones, so that `usable` rows remain."""
+    """Return the experiments less the last rows of the longest, so that `usable` remain."""
     cut = list(experiments)
     while (surplus := sum(len(e) - start for e in cut) - usable) > 0:
         longest = max(range(len(cut)), key=lambda i: len(cut[i]))
         length = len(cut[longest])
-        shorter = max(length - surplus, max((len(e) for e in cut if len(e) < length), default=start + 1), start + 1)
+        shorter = max(
+            length - surplus,
+            max((len(e) for e in cut if len(e) < length), default=start + 1),
+            start + 1,
+        )
         cut[longest] = cut[longest].rows(0, min(shorter, length - 1))
     return tuple(e for e in cut if len(e) > start)

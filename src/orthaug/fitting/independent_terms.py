@@ -1,4 +1,4 @@
-"""Terms of a learner that say nothing of their own on the data: they are left out, with a sentence."""
+"""Removal of learner terms that are linear combinations of others on the data."""
 
 from __future__ import annotations
 
@@ -16,48 +16,61 @@ _LEFT = 3e-5  # of a term's norm: what the physics and the terms before it leave
 _NAMED = 6
 
 
-def independent_terms(problem: Problem, learner: Learner | None) -> tuple[Problem, Learner | None, tuple[Warning, ...]]:
-    """Problem and learner without the terms that the physics or the terms before them express on these rows.
+def independent_terms(
+    problem: Problem, learner: Learner | None
+) -> tuple[Problem, Learner | None, tuple[Warning, ...]]:
+    """Return problem and learner without linearly dependent terms, and a warning.
+
+    A term depends on the physics or on the terms before it, on these rows.
 
     Another learner is left as it is; without one the problem has no features.
 
     Raises:
-        InputError: more terms than rows could tell apart.
+        InputError: more terms than rows can separate.
     """
     if learner is None:
         return replace(problem, features=Features(())), None, ()
     if not isinstance(learner, Terms):
         return problem, learner, ()
     problem = problem.seen_linearly()
-    texts, rows, nt = [str(entry) for entry in problem.features.entries], problem.rows, len(problem.baseline.names)
+    texts, rows, nt = (
+        [str(entry) for entry in problem.features.entries],
+        problem.rows,
+        len(problem.baseline.names),
+    )
     if len(texts) + nt > rows.y.size:
         raise InputError(
-            f"the learner has {len(texts)} terms beside {nt} parameters, but there are {rows.y.size} usable samples; "
-            "give fewer terms, or let `orthaug select` choose among them."
+            f"the learner has {len(texts)} terms beside {nt} parameters, but there are "
+            f"{rows.y.size} usable samples; give fewer terms, or let `orthaug select` choose "
+            "among them."
         )
     z = problem.feature_rows()
     phi = problem.projection.phi[:, 0] if len(problem.outputs) == 1 else np.ones((len(z), 0))
     columns = np.column_stack([phi, z])
     size = np.linalg.norm(columns, axis=0)
-    kept, gone = _told_apart(columns / np.where(size > 0, size, 1.0), phi.shape[1])
+    kept, gone = _independent_columns(columns / np.where(size > 0, size, 1.0), phi.shape[1])
     if not gone:
         return problem, learner if len(learner.terms) == len(texts) else learner.among(texts), ()
-    told = (_warning([texts[i] for i in gone]),)
-    left = replace(problem, features=Features(tuple(problem.features.entries[i] for i in kept), linear=True))
-    return left, learner.among([texts[i] for i in kept]) if kept else None, told
+    warnings = (_warning([texts[i] for i in gone]),)
+    left = replace(
+        problem, features=Features(tuple(problem.features.entries[i] for i in kept), linear=True)
+    )
+    return left, learner.among([texts[i] for i in kept]) if kept else None, warnings
 
 
-def _told_apart(columns: np.ndarray, first: int) -> tuple[list[int], list[int]]:
-    """Which columns from the `first` on are independent of all before them, and which are not."""
+def _independent_columns(columns: np.ndarray, first: int) -> tuple[list[int], list[int]]:
+    """Return the columns from `first` that are independent of all before, and the rest."""
     r = np.abs(np.diag(np.linalg.qr(columns, mode="r")))
     left = r[first:] > _LEFT
     return [int(i) for i in np.flatnonzero(left)], [int(i) for i in np.flatnonzero(~left)]
 
 
 def _warning(gone: list[str]) -> Warning:
-    named = ", ".join(gone[:_NAMED]) + (f" and {len(gone) - _NAMED} more" if len(gone) > _NAMED else "")
+    named = ", ".join(gone[:_NAMED]) + (
+        f" and {len(gone) - _NAMED} more" if len(gone) > _NAMED else ""
+    )
     text = (
-        f"left out of the learner: {named}. On these data the physics, or the terms before, express "
-        f"{'them' if len(gone) > 1 else 'it'} already."
+        f"left out of the learner: {named}. On these data the physics, or the terms before, "
+        f"express {'them' if len(gone) > 1 else 'it'} already."
     )
     return Warning("terms_left_out", text)

@@ -1,8 +1,9 @@
-"""The states that segments start from: unknowns of their own, eliminated from the normal equations.
+"""Initial states of segments: unknowns that are eliminated from the normal equations.
 
-A state is scored against the measured one, `‖L (x − measured)‖²`, because past outputs have errors like all others. A
-state acts on its own segment only, so a Schur complement per segment removes it. If the states were not unknowns, noise
-in a segment's measured lags would be a disturbance that the model has to explain.
+A state is scored against the measured one, `‖L (x − measured)‖²`, because past outputs have errors
+like all others. A state acts on its own segment only, so a Schur complement per segment removes it.
+If the states were not unknowns, noise in a segment's measured lags would be a disturbance that the
+model has to explain.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from orthaug.fitting.segments import Sensitivity
 
 
 class Start(NamedTuple):
-    """States to start a trial from, (k, n0, m), and how the best ones follow (c, w) to first order."""
+    """Start states of a trial (k, n0, m), and their derivative by (c, w)."""
 
     values: Float[np.ndarray, "k n0 m"]
     misfit: float = np.inf
@@ -32,11 +33,14 @@ class Start(NamedTuple):
 
     @property
     def follows(self) -> bool:
-        """Whether it is known how the best states follow (c, w)."""
+        """True where the derivative of the best states by (c, w) is known."""
         return self.slope is not None or self.there is not None
 
     def at(self, unknowns: Vector) -> Float[np.ndarray, "k n0 m"] | None:
-        """The best states to first order where (c, w) is `unknowns`; None where that is not known."""
+        """Return the best states to first order where (c, w) is `unknowns`.
+
+        None where that is not known.
+        """
         if self.offset is None or self.slope is None or self.unknowns is None:
             return None
         moved = self.offset - self.slope @ (unknowns - self.unknowns)
@@ -51,14 +55,18 @@ class InitialStates:
     free: bool
 
     def loss(self, values: Float[np.ndarray, "k n0 m"], rows: Matrix) -> float:
-        """`‖L (measured − x)‖²`, L = `rows` (n0, n0)."""
+        """Return `‖L (measured − x)‖²`, L = `rows` (n0, n0)."""
         with np.errstate(all="ignore"):
             return float(np.sum(np.einsum("oi,kim->kom", rows, self.measured - values) ** 2))
 
     def eliminate(
         self, sensitivity: Sensitivity, values: Float[np.ndarray, "k n0 m"], rows: Matrix
-    ) -> tuple[Matrix, Vector, Float[np.ndarray, "k m n0"] | None, Float[np.ndarray, "k m n0 n"] | None]:
-        """Normal matrix and right-hand side of (c, w) with the states at their best, and how these follow (c, w).
+    ) -> tuple[
+        Matrix, Vector, Float[np.ndarray, "k m n0"] | None, Float[np.ndarray, "k m n0 n"] | None
+    ]:
+        """Return the normal equations of (c, w) with the states at their best.
+
+        And the derivative of these states by (c, w).
 
         The best states are `values + offset − slope · step` for a small step of (c, w).
         """
@@ -69,13 +77,19 @@ class InitialStates:
         missed = np.moveaxis(self.measured - values, -1, 1)
         try:
             return without_states(shared, own, missed, rows.T @ rows, np)
-        except np.linalg.LinAlgError:  # states that no output shows: no normal equations, and the trial is rejected
+        except (
+            np.linalg.LinAlgError
+        ):  # states that no output shows: no normal equations, and the trial is rejected
             nothing = np.full_like(shared[:-1, :-1], np.nan)
             return nothing, nothing[0], None, None
 
 
-def without_states(shared: Any, own: Any, missed: Any, prior: Any, xp: Any) -> tuple[Any, Any, Any, Any]:
-    """Normal matrix and right-hand side of (c, w), offset and slope of the states: a Schur complement per segment.
+def without_states(
+    shared: Any, own: Any, missed: Any, prior: Any, xp: Any
+) -> tuple[Any, Any, Any, Any]:
+    """Return the normal equations of (c, w), and offset and slope of the states.
+
+    By a Schur complement per segment.
 
     Args:
         own: (…, n0, n0 + n + 1), of the segments in front.

@@ -1,4 +1,4 @@
-"""The structures, criteria and solvers that a spec knows by name, and what a solver declares.
+"""The structures, criteria and solvers that a spec refers to by name, and `Solver`.
 
 A new one is a file, and an entry here.
 """
@@ -17,14 +17,14 @@ from orthaug.fitting.structures import Additive, BaselinePenalty, Orthogonal, Or
 
 @runtime_checkable
 class Solver(Protocol):
-    """What `estimate(solver=…)` takes: a frozen declaration."""
+    """A solver as `estimate(solver=…)` accepts it: a frozen declaration."""
 
     @property
     def gauss_newton(self) -> bool:
-        """Whether it works on normal equations over the weights, with θ eliminated.
+        """True for a solver of normal equations over the weights, with θ eliminated.
 
-        Evidence and the free run need them. Other solvers get the criterion of θ and the weights together
-        (`PaperCriterion`).
+        Evidence and the free run need them. Other solvers get the criterion of θ and the weights
+        together (`PaperCriterion`).
         """
         ...
 
@@ -35,11 +35,11 @@ class Solver(Protocol):
 
     @property
     def minimise(self) -> Callable[..., Any]:
-        """One run: as `LevenbergMarquardt.minimise` on normal equations, otherwise as `AdamLBFGS.minimise`."""
+        """`LevenbergMarquardt.minimise` on normal equations, else `AdamLBFGS.minimise`."""
         ...
 
     def at_most(self, iterations: int) -> Solver:
-        """The same with fewer iterations, where that is the same method."""
+        """Return the solver with fewer iterations, where that is the same method."""
         ...
 
 
@@ -53,8 +53,22 @@ STRUCTURES = Registry(
     },
     reserved=("kind", "measure"),
 )
-_BESIDE = ("solver", "focus", "restarts", "ensemble", "seed", "regularization")  # the other keys of [training]
-CRITERIA = Registry("criterion", {"auto": Auto, "prediction": Prediction, "simulation": Simulation}, reserved=_BESIDE)
+_BESIDE = (
+    "solver",
+    "focus",
+    "restarts",
+    "ensemble",
+    "seed",
+    "regularization",
+)  # the other keys of [training]
+CRITERIA = Registry(
+    "criterion",
+    {"auto": Auto, "prediction": Prediction, "simulation": Simulation},
+    reserved=_BESIDE,
+)
 SOLVERS = Registry(
-    "solver", {"levenberg-marquardt": LevenbergMarquardt, "adam-lbfgs": AdamLBFGS}, reserved=_BESIDE, beside=CRITERIA
+    "solver",
+    {"levenberg-marquardt": LevenbergMarquardt, "adam-lbfgs": AdamLBFGS},
+    reserved=_BESIDE,
+    beside=CRITERIA,
 )

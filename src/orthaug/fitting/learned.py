@@ -1,4 +1,4 @@
-"""What training leaves, under any criterion: the estimate is concluded from it."""
+"""Results of training under any criterion, from which an estimate is concluded."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import Warning
-from orthaug._base.progress import RunTell, quiet
+from orthaug._base.progress import RunProgress, quiet
 from orthaug.data.record import Record
 from orthaug.fitting.block_scores import FreeRunScores
 from orthaug.fitting.criteria import Criterion
@@ -21,7 +21,7 @@ from orthaug.physics.problem import Problem
 
 
 class ErrorStatistics(NamedTuple):
-    """Statistics of the errors of a fit, and of θ as they follow from them."""
+    """Statistics of the errors of a fit, and of the θ that follows from them."""
 
     noise: Matrix | None
     """Covariance (ny, ny) of the errors, in the outputs' units."""
@@ -34,8 +34,8 @@ class ErrorStatistics(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Learned:
-    """A trained learner: its weights, and what the run knows of them."""
+class TrainedLearner:
+    """A trained learner: its weights, and the results of its run."""
 
     bound: Bound | None
     weights: Vector
@@ -68,7 +68,7 @@ class Learned:
 
 @runtime_checkable
 class Task(Protocol):
-    """A problem laid out for training on one criterion; `OneStepTask` and `FreeRunTask`."""
+    """A problem prepared for training on one criterion; `OneStepTask` and `FreeRunTask`."""
 
     @property
     def problem(self) -> Problem: ...
@@ -86,29 +86,29 @@ class Task(Protocol):
 
     @property
     def seconds(self) -> float:
-        """What was spent before the first run."""
+        """Seconds that were spent before the first run."""
         ...
 
     @property
     def warnings(self) -> tuple[Warning, ...]:
-        """What physics alone gave reason to tell."""
+        """Warnings about physics alone."""
         ...
 
     @property
     def rows_task(self) -> Any:
-        """The rows laid out for one step, to sum over (`OneStepTask`)."""
+        """The rows prepared for one step, to sum over (`OneStepTask`)."""
         ...
 
     def on(self, record: Record) -> Task:
-        """The same problem on another record."""
+        """Return the task on another record."""
         ...
 
-    def physics_alone(self) -> tuple[Any, Learned]:
-        """The rows without a learner, and what physics alone leaves on them."""
+    def physics_alone(self) -> tuple[Any, TrainedLearner]:
+        """Return the task without a learner, and the residual of physics alone."""
         ...
 
-    def prepared(self, solver: Any, structure: Structure, progress: RunTell = quiet) -> Task:
-        """The same with physics alone trained: what all runs start from."""
+    def prepared(self, solver: Any, structure: Structure, progress: RunProgress = quiet) -> Task:
+        """Return the task with physics alone trained: all runs start from it."""
         ...
 
     def run(
@@ -117,19 +117,25 @@ class Task(Protocol):
         w: Any,
         structure: Structure,
         regularization: str | float = "none",
-        progress: RunTell = quiet,
+        progress: RunProgress = quiet,
     ) -> Any:
-        """One run from the weights `w`, with `ending`, `iterations` and `seconds`; arguments as in `estimate`."""
+        """Return one run from the weights `w`, with `ending`, `iterations` and `seconds`.
+
+        Arguments as in `estimate`.
+        """
         ...
 
     def loss(self, run: Any) -> float:
-        """What runs are compared by: a mean of squared errors, each output in its standard deviation."""
+        """Return the figure that runs are compared by.
+
+        A mean of squared errors, each output in its standard deviation.
+        """
         ...
 
-    def learned(self, run: Any) -> Learned:
-        """What a run left."""
+    def learned(self, run: Any) -> TrainedLearner:
+        """Return the learner as a run left it."""
         ...
 
-    def median(self, members: list[Learned], best: int) -> Learned:
-        """Several members as one, the median of their predictions (`ensemble`)."""
+    def median(self, members: list[TrainedLearner], best: int) -> TrainedLearner:
+        """Return several members as one, the median of their predictions (`ensemble`)."""
         ...

@@ -1,4 +1,4 @@
-"""The result of a motion's estimation: physical parameters with intervals, the model, and what may be doubted."""
+"""The result of a motion's estimation: physical parameters with intervals, model."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from orthaug.data.regressors import Layout
 from orthaug.fitting.block_scores import FreeRunScores
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.estimates import STD_KINDS, AnyFit, Restart, parameter_frame, parameter_lines
-from orthaug.fitting.held_out import Focus, HeldOut
+from orthaug.fitting.held_out import Focus, HeldOutErrors
 from orthaug.fitting.motion_measures import field_under, wobble
 from orthaug.fitting.status import Status
 from orthaug.inference.covariance import interval
@@ -27,37 +27,46 @@ from orthaug.inference.nearly_shared import grown
 from orthaug.models.dynamics import Numbers
 from orthaug.models.motion_model import MotionModel
 from orthaug.models.statistics import JointCovariance, column_units
+from orthaug.physics import ill_conditioned
 from orthaug.physics.motion_problem import MotionProblem, layout_of
 from orthaug.physics.shared import Shared
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from orthaug.fitting.motion_course import MotionCourse
+    from orthaug.fitting.segmented_motion import SegmentedMotion
 
-_UNSEEN = 1e-3  # share of a parameter in directions that no output shows, above which it is not identified
+# share of a parameter in directions that no output shows, above which it is not identified
+_UNSEEN = 1e-3
 _VAGUE = 1.0  # standard error of a logarithm above which only the order of magnitude is known
-_LEANING = 2.0  # times wider an interval without the prior of the weights: three quarters of what is known is the prior
+# times wider an interval without the prior of the weights: the prior is 3/4 of the information
+_LEANING = 2.0
 _ROUNDING = 1e-11  # of the largest eigenvalue of the information with unit columns
 
 
 @dataclass(frozen=True, eq=False)
 class MotionEstimate(AnyFit):
-    """What `estimate` returns for a motion. Print `fit.summary()`; use `fit.model`; read `fit.parameters`."""
+    """Result of `estimate` for a motion.
+
+    Print `fit.summary()`; use `fit.model`; read `fit.parameters`.
+    """
 
     model: MotionModel
     status: Status
     restarts: tuple[Restart, ...]
     covariance: Matrix | None
-    """Covariance of the parameters' coordinates (np, np), NaN where one has none; None where there is none at all."""
+    """Covariance of the parameters' coordinates (np, np), NaN where one has none; None where there
+    is none at all.
+    """
     freedom: float
     effective_weights: float
     defect: float | None
-    """How much of the learner the shared directions of the physics could express; None without one."""
+    """How much of the learner the shared directions of the physics could express; None without one.
+    """
     problem: MotionProblem = field(repr=False)
     criterion: Criterion
     split_by: MotionSplit = field(repr=False)
-    course: MotionCourse = field(repr=False)
+    segmented: SegmentedMotion = field(repr=False)
     states: Any = field(repr=False)
     """The segments' starts, as estimated."""
     slope: Any = field(repr=False)
@@ -72,8 +81,8 @@ class MotionEstimate(AnyFit):
     """How the standard errors were made, a key of `STD_KINDS`."""
     at_bound: tuple[str, ...] = ()
     unidentified: tuple[str, ...] = ()
-    """Parameters that no output tells beside the learner, or only the prior of its weights."""
-    held_out: HeldOut | None = None
+    """Parameters that no output determines beside the learner, or only the prior of its weights."""
+    held_out: HeldOutErrors | None = None
     focus: Focus | None = None
     physics_alone: Any = field(default=None, repr=False)
     """The estimate of physics alone that the learner had to beat; None without a learner."""
@@ -83,11 +92,11 @@ class MotionEstimate(AnyFit):
 
     @property
     def layout(self) -> Layout:
-        """What the entries of `reach` are called."""
+        """Names of the entries of `reach`."""
         return layout_of(self.problem.motion)
 
     def reach(self, record: Record) -> Matrix:
-        """The states and inputs (N, nx + nu) of the free run on a record, where they are finite."""
+        """Return the states and inputs (N, nx + nu) of the free run, where they are finite."""
         return self.model.reach(record)
 
     @property
@@ -107,14 +116,19 @@ class MotionEstimate(AnyFit):
 
     @property
     def plain_std(self) -> Vector | None:
-        """The standard errors for white noise, where those of `std` are robust; None where they are not."""
+        """The standard errors for white noise, where those of `std` are robust.
+
+        None where they are not.
+        """
         return self._std_of(self.plain_covariance)
 
     def _std_of(self, covariance: Matrix | None) -> Vector | None:
-        """By the delta method, from a covariance of the coordinates."""
+        """Return standard errors by the delta method, from a covariance of the coordinates."""
         if covariance is None:
             return None
-        return np.sqrt(np.diag(covariance)) * np.abs(self.problem.motion.coordinates.slopes(self.theta))
+        return np.sqrt(np.diag(covariance)) * np.abs(
+            self.problem.motion.coordinates.slopes(self.theta)
+        )
 
     @property
     def interval(self) -> Matrix | None:
@@ -122,17 +136,21 @@ class MotionEstimate(AnyFit):
         if self.covariance is None:
             return None
         ends = interval(self.theta, np.sqrt(np.diag(self.covariance)), max(self.freedom, 1.0))
-        return np.stack([self.problem.motion.coordinates.physical(side) for side in ends.T], axis=-1)
+        return np.stack(
+            [self.problem.motion.coordinates.physical(side) for side in ends.T], axis=-1
+        )
 
     @cached_property
     def parameters(self) -> pd.DataFrame:
-        """Table with a row per parameter: unit, initial, value, std, the 95 % interval, and whether it is shared."""
+        """Table with a row per parameter: unit, initial, value, std, 95 % interval, shared."""
         motion = self.problem.motion
         table = parameter_frame(motion.parameters, self.values, self.std, self.interval)
         return table.assign(shared=[name not in self.shared.untouched for name in motion.names])
 
     def split(self, measure: Measure, shared: str = "auto") -> MotionEstimate:
-        """The same fitted motion with p̂ under another measure over states and inputs, without training.
+        """Return the same motion with p̂ under another measure over states and inputs.
+
+        Nothing is trained again.
 
         Args:
             measure: such as `Uniform({"v": (-1, 1)})`, by the names of states and inputs.
@@ -142,48 +160,64 @@ class MotionEstimate(AnyFit):
             InputError: a measure that does not fit the motion.
         """
         check_type(measure, Measure, "measure", "a measure such as Uniform()")
-        form, course = self.model.form, self.course
+        form, segmented = self.model.form, self.segmented
         whole = fitted_numbers(self.model.numbers)
-        field, support, told = field_under(measure, course, whole, self.states)
+        field, support, of_measure = field_under(measure, segmented, whole, self.states)
         moving = None
         if isinstance(measure, Training) and self.slope is not None:
-            moving = partial(wobble, form, whole, course.segments, self.states, self.slope, field.size)
+            moving = partial(
+                wobble, form, whole, segmented.segments, self.states, self.slope, field.size
+            )
         bounds = self.problem.motion.coordinates.bounds
         options = {"everything": shared == "all", "wobble": moving}
         split = split_motion(measure.name, form, whole, self.alone, field, bounds, **options)
-        return _with_split(self, replace(split, support=support), told)
+        return _with_split(self, replace(split, support=support), of_measure)
 
     def robust(self, steps: int | None = None, kind: str = "batch-means") -> MotionEstimate:
-        """The same with standard errors that hold for coloured errors: batch means of the scores (`block_scores`).
+        """Return the fit with standard errors that hold for coloured errors.
+
+        By batch means of the scores (`block_scores`).
 
         Args:
             steps: of a block; None to choose it by how long the errors remember each other.
-            kind: "batch-means", "batch-means-uneven" where the errors are white and of uneven size, or "autoregressive"
-                for errors of an autoregressive process.
+            kind: "batch-means", "batch-means-uneven" where the errors are white and of uneven size,
+                or "autoregressive" for errors of an autoregressive process.
 
         Raises:
-            InputError: another kind, no statistics, or errors that remember each other for too long.
+            InputError: another kind, no statistics, or errors that remember each other for too
+                long.
         """
         statistics = self.model.statistics
         check_choice(kind, ("batch-means", "batch-means-uneven", "autoregressive"), "`kind`")
         if self.scores is None or self.covariance is None or statistics.gram is None:
-            raise InputError("the fit has no statistics that robust standard errors could be made of.")
+            raise InputError(
+                "the fit has no statistics for robust standard errors; fit the data again."
+            )
         used = len(self.theta) + self.effective_weights
         modelled = kind == "autoregressive"
         statistics = self.scores.robust(statistics, self.freedom, used, steps, modelled=modelled)
         plain = self.covariance if self.plain_covariance is None else self.plain_covariance
         model = replace(self.model, statistics=statistics)
         kept = tuple(w for w in self.warnings if w.code == "measure_beyond_data")
-        robust = replace(self, model=model, freedom=statistics.freedom, plain_covariance=plain, std_kind=kind)
+        robust = replace(
+            self, model=model, freedom=statistics.freedom, plain_covariance=plain, std_kind=kind
+        )
         return _with_split(robust, self.split_by, kept)
 
     def moves_by(self) -> tuple[Matrix, Vector] | None:
-        """How the coordinates follow (c, w), and which entries of these move; None without statistics."""
+        """Return the derivative of the coordinates by (c, w), and which of these move.
+
+        None without statistics.
+        """
         made = free_covariance(self)
-        return None if made is None or self.split_by.slope is None else (self.split_by.slope, made[1])
+        return (
+            None if made is None or self.split_by.slope is None else (self.split_by.slope, made[1])
+        )
 
     def __repr__(self) -> str:
-        values = ", ".join(f"{n} = {v:.6g}" for n, v in zip(self.problem.motion.names, self.values, strict=True))
+        values = ", ".join(
+            f"{n} = {v:.6g}" for n, v in zip(self.problem.motion.names, self.values, strict=True)
+        )
         return f"MotionEstimate({self.status.code}, loss {self.status.loss:.3g}, {values})"
 
     def lines(self) -> list[str]:
@@ -191,16 +225,23 @@ class MotionEstimate(AnyFit):
         seen = ", ".join(str(entry) for entry in form.features)
         learner = "none"
         if bound is not None:
-            learner = f"{bound.learner} of {seen}, {bound.size} weights, {self.effective_weights:.1f} effective"
+            learner = (
+                f"{bound.learner} of {seen}, {bound.size} weights, "
+                f"{self.effective_weights:.1f} effective"
+            )
         steps = f"{form.substeps} substep{'s' * (form.substeps > 1)}"
         lines = [
-            f"motion      {', '.join(motion.names_of_states)}; {motion.integrator}, {steps}, {motion.hold} hold",
+            f"motion      {', '.join(motion.names_of_states)}; {motion.integrator}, {steps}, "
+            f"{motion.hold} hold",
             f"learner     {learner}",
             f"data        {self.problem.record!r}",
             *self.status.lines,
         ]
         if bound is not None:
-            lines += [f"shared      {shared_in_words(self.shared)}", f"measure     {self.split_by.name}"]
+            lines += [
+                f"shared      {shared_in_words(self.shared)}",
+                f"measure     {self.split_by.name}",
+            ]
         if self.plain_covariance is not None:
             lines.append(f"std         {STD_KINDS[self.std_kind]}")
         lines += ["", *parameter_lines(motion.parameters, self.values, self.std, self.interval)]
@@ -208,25 +249,41 @@ class MotionEstimate(AnyFit):
 
 
 def fitted_numbers(numbers: Numbers) -> Numbers:
-    """The numbers before any split: θ are those beside the learner."""
+    """Return the numbers before any split: θ is the one fitted beside the learner."""
     c = np.asarray(numbers.theta - numbers.theta_aux)
     return numbers._replace(theta=c, theta_aux=np.zeros_like(c))
 
 
-def _with_split(fit: MotionEstimate, split: MotionSplit, told: tuple[Warning, ...] = ()) -> MotionEstimate:
-    """The estimate with p̂, its intervals and its warnings as a split gives them."""
+def _with_split(
+    fit: MotionEstimate, split: MotionSplit, of_measure: tuple[Warning, ...] = ()
+) -> MotionEstimate:
+    """Return the estimate with p̂, intervals and warnings of a split."""
     motion, numbers = fit.problem.motion, fit.model.numbers
     c = np.asarray(numbers.theta - numbers.theta_aux)
     bounds = motion.coordinates.bounds
-    at_bound = tuple(n for n, q, low, high in zip(motion.names, split.q, *bounds, strict=True) if q <= low or q >= high)
+    at_bound = tuple(
+        n
+        for n, q, low, high in zip(motion.names, split.q, *bounds, strict=True)
+        if q <= low or q >= high
+    )
     covariance, unseen = _covariance(fit, split, at_bound)
-    warnings = [*told, *_doubts(split, at_bound, unseen, fit.model.form.bound is not None)]
-    model = replace(fit.model, numbers=numbers._replace(theta=split.q, theta_aux=split.q - c), measure=split.name)
-    own = {"not_unique", "at_a_bound", "not_identified", "measure_beyond_data"}
+    warnings = [
+        *of_measure,
+        *_ill_conditioned(fit, split),
+        *_doubts(split, at_bound, unseen, fit.model.form.bound is not None),
+    ]
+    model = replace(
+        fit.model,
+        numbers=numbers._replace(theta=split.q, theta_aux=split.q - c),
+        measure=split.name,
+    )
+    own = {"ill_conditioned", "not_unique", "at_a_bound", "not_identified", "measure_beyond_data"}
     return replace(
         fit,
         model=model,
-        covariance=None if fit.std_kind == "none" else grown(covariance, fit.model.statistics, split.shared),
+        covariance=None
+        if fit.std_kind == "none"
+        else grown(covariance, fit.model.statistics, split.shared),
         defect=split.defect,
         split_by=split,
         at_bound=at_bound,
@@ -235,10 +292,22 @@ def _with_split(fit: MotionEstimate, split: MotionSplit, told: tuple[Warning, ..
     )
 
 
+def _ill_conditioned(fit: MotionEstimate, split: MotionSplit) -> list[Warning]:
+    gram, noise, count = fit.model.statistics.gram, fit.model.statistics.noise, len(split.q)
+    return (
+        []
+        if gram is None or noise is None
+        else ill_conditioned.of_motion(fit.problem, gram[:count, :count], split.q, noise)
+    )
+
+
 def _covariance(
     fit: MotionEstimate, split: MotionSplit, at_bound: tuple[str, ...]
 ) -> tuple[Matrix | None, tuple[str, ...]]:
-    """Cov q̂ = K Cov(c, w) Kᵀ, and which parameters no output tells, or the prior of the weights rather than they."""
+    """Return Cov q̂ = K Cov(c, w) Kᵀ, and the parameters that lack an interval.
+
+    No output determines these, or only the prior of the weights does.
+    """
     names, made = fit.problem.motion.names, free_covariance(fit)
     if split.slope is None or made is None:
         return None, ()
@@ -247,7 +316,9 @@ def _covariance(
     covariance = joint.of(slope)
     std, wider = np.sqrt(np.diag(covariance)), _wider_without_prior(joint, slope)
     vague = fit.problem.motion.coordinates.positive & (std > _VAGUE / wider)
-    unseen = tuple(name for name, hidden in zip(names, vague | (wider > _LEANING), strict=True) if hidden)
+    unseen = tuple(
+        name for name, hidden in zip(names, vague | (wider > _LEANING), strict=True) if hidden
+    )
     for i, name in enumerate(names):
         if name in unseen or name in at_bound:
             covariance[i] = covariance[:, i] = np.nan
@@ -255,21 +326,28 @@ def _covariance(
 
 
 def free_covariance(fit: MotionEstimate) -> tuple[JointCovariance, Bool[np.ndarray, "n"]] | None:
-    """Cov (c, w) of what is not at a bound, and which entries these are; None without statistics."""
+    """Return Cov (c, w) of the entries that are not at a bound, and a mask of these.
+
+    None without statistics.
+    """
     numbers, statistics = fit.model.numbers, fit.model.statistics
     if statistics.gram is None or statistics.middle is None:
         return None
     c = np.asarray(numbers.theta - numbers.theta_aux)
     low, high = fit.problem.motion.coordinates.bounds
-    moves = np.concatenate([(low < c) & (c < high), np.ones(len(statistics.gram) - len(c), dtype=bool)])
-    kept = np.ix_(moves, moves)  # what stands at a bound is a constant
+    moves = np.concatenate(
+        [(low < c) & (c < high), np.ones(len(statistics.gram) - len(c), dtype=bool)]
+    )
+    kept = np.ix_(moves, moves)  # an entry at a bound is a constant
     own = replace(statistics, gram=statistics.gram[kept], middle=statistics.middle[kept])
     joint = own.joint(int(moves[: len(c)].sum()))
     return None if joint is None else (joint, moves)
 
 
 def _wider_without_prior(joint: JointCovariance, slope: Matrix) -> Vector:
-    """How many times wider the intervals of K (c, w) were without the ridge on w (m,); inf where nothing tells them.
+    """Return how many times wider intervals of K (c, w) are without the ridge on w (m,).
+
+    Inf where the data do not determine them.
 
     Both for white noise: the question is where the information comes from.
     """
@@ -280,46 +358,55 @@ def _wider_without_prior(joint: JointCovariance, slope: Matrix) -> Vector:
     own = slope * unit
     share = np.linalg.norm(own @ hidden, axis=1) / np.maximum(np.linalg.norm(own, axis=1), 1e-300)
     white = replace(joint, middle=gram)
-    with_prior, by_data = (np.sqrt(np.diag(one.of(slope))) for one in (white, replace(white, ridge=0.0)))
+    with_prior, by_data = (
+        np.sqrt(np.diag(one.of(slope))) for one in (white, replace(white, ridge=0.0))
+    )
     wider = by_data / np.where(with_prior > 0, with_prior, 1.0)
     return np.where(share > _UNSEEN, np.inf, np.maximum(wider, 1.0))
 
 
-def _doubts(split: MotionSplit, at_bound: tuple[str, ...], unseen: tuple[str, ...], learns: bool) -> list[Warning]:
-    told = []
+def _doubts(
+    split: MotionSplit, at_bound: tuple[str, ...], unseen: tuple[str, ...], learns: bool
+) -> list[Warning]:
+    warnings = []
     if split.slope is None:
         text = (
-            "the distance between the fitted motion and the physics has no unique minimum near the estimate (it does "
-            f"not curve upwards, {split.curvature:.2g} of its curvature at a good fit), so there are no intervals: the "
-            "learner found something that several parameters could explain as well."
+            "the distance between the fitted motion and the physics has no unique minimum near "
+            f"the estimate, so there are no intervals. Its curvature is {split.curvature:.2g} "
+            "of that at a good fit: several parameters could explain what the learner found."
         )
-        told.append(Warning("not_unique", text))
+        warnings.append(Warning("not_unique", text))
     if at_bound:
         text = (
-            f"at a bound: {', '.join(at_bound)}. What stands at a bound has no interval, and the others and theirs "
-            "hold with it there; data that contradict a bound contradict the physics or the bound."
+            f"at a bound: {', '.join(at_bound)}. A parameter at a bound has no interval, and "
+            "the other estimates hold with it there. Data that contradict a bound contradict "
+            "the physics or the bound."
         )
-        told.append(Warning("at_a_bound", text))
+        warnings.append(Warning("at_a_bound", text))
     if unseen:
         text = (
-            f"not identified: {', '.join(unseen)}. Other values, with other weights of the learner, give the same "
-            "outputs or nearly so, and what picks among them is the prior of the weights, so there is no interval; "
-            "measure more, fix one of them as a constant, or let the learner see less or add it to fewer equations."
+            f"not identified: {', '.join(unseen)}. Other values, with other weights of the "
+            "learner, give nearly the same outputs, and only the prior of the weights decides, "
+            "so there is no interval. Measure more, fix one of them as a constant, give the "
+            "learner fewer inputs, or add it to fewer equations."
         )
         if not learns:
             text = (
-                f"not identified: {', '.join(unseen)}. Other values of them together give the same outputs, so there "
-                "is no interval; give some of them as constants."
+                f"not identified: {', '.join(unseen)}. Other values of them together give the "
+                "same outputs, so there is no interval; give some of them as constants."
             )
-        told.append(Warning("not_identified", text))
-    return told
+        warnings.append(Warning("not_identified", text))
+    return warnings
 
 
 def shared_in_words(shared: Shared) -> str:
-    """What the learner could imitate, in words."""
+    """Return the directions that the learner could imitate, in words."""
     if not shared.basis.size:
-        return "nothing: the fit tells all parameters from the learner"
+        return "nothing: the fit determines all parameters beside the learner"
     if shared.all:
         return "all parameters: they are those of the physics nearest to the fitted motion"
     moved = [" with ".join(direction) for direction in shared.directions]
-    return f"{'; '.join(moved)} (by the nearest physics); told by the fit: {', '.join(shared.untouched) or 'none'}"
+    return (
+        f"{'; '.join(moved)} (by the nearest physics); determined by the fit: "
+        f"{', '.join(shared.untouched) or 'none'}"
+    )

@@ -1,4 +1,4 @@
-"""Fitting a motion to a record, with a learner beside some of its equations: training, and the estimate after it."""
+"""Training of a motion, with a learner in some of its equations, and its estimate."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ import numpy as np
 from orthaug._base.checks import Matrix, check_type
 from orthaug._base.errors import InputError
 from orthaug._base.jax import jax, jnp
-from orthaug._base.progress import SILENT, Tell
+from orthaug._base.progress import SILENT, ProgressCallback
 from orthaug.data.record import Record
 from orthaug.fitting.checkpoints import Checkpoints
 from orthaug.fitting.conclusion import without_loss
 from orthaug.fitting.criteria import Criterion, Simulation
 from orthaug.fitting.kinds import Solver
-from orthaug.fitting.learned import Learned
-from orthaug.fitting.motion_course import MotionCourse
+from orthaug.fitting.learned import TrainedLearner
 from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.fitting.motion_task import MotionTask
 from orthaug.fitting.rules import check_motion_choices, check_solver, checked_starts, tried
+from orthaug.fitting.segmented_motion import SegmentedMotion
 from orthaug.fitting.silence import learner_silent, silenced
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.status import ALONE, Ending, Status
@@ -30,7 +30,7 @@ from orthaug.fitting.unfinished import ending_in_words, not_converged, unfinishe
 from orthaug.inference.motion_split import MotionSplit
 from orthaug.models.beyond import limits_of, pull_of
 from orthaug.models.learners import Learner, Scaling
-from orthaug.models.motion_model import MotionModel, Trained
+from orthaug.models.motion_model import MotionModel, TrainedSegments
 from orthaug.models.rows import Engine, InMemory
 from orthaug.models.statistics import Statistics
 from orthaug.models.tasks import Tasks, runs_on
@@ -38,13 +38,15 @@ from orthaug.physics.motion import Motion
 from orthaug.physics.motion_problem import MotionProblem, pose_motion
 
 DEFAULT = Simulation(washout=0)
-"""The criterion of a motion: its segments start at estimated states, so that none of their steps is left out."""
+"""The criterion of a motion: its segments start at estimated states, so that none of their steps is
+left out.
+"""
 
 
 def pose_for(
     record: Record, motion: Motion, learner: Learner | None, output_weights: str | Sequence[float]
 ) -> MotionProblem:
-    """The problem of a motion with what a learner sees.
+    """Return the problem of a motion with the inputs of a learner.
 
     Raises:
         InputError: as `pose_motion`.
@@ -67,11 +69,11 @@ def fit_motion(
     blocks: int = 4,
     fallback: bool = True,
     validation: Record | None = None,
-    progress: Tell = SILENT,
+    progress: ProgressCallback = SILENT,
     engine: Engine = InMemory(),  # noqa: B008  (frozen)
     checkpoints: Checkpoints | None = None,
 ) -> MotionEstimate:
-    """`estimate` for a motion that is posed already; arguments as there.
+    """Fit a motion that is posed already; arguments as of `estimate`.
 
     Raises:
         InputError: what a motion cannot be trained with.
@@ -94,7 +96,7 @@ def fit_motion(
 
 
 def without_learner(problem: MotionProblem) -> MotionProblem:
-    """The same problem with no state and no output learned."""
+    """Return the problem with no state and no output learned."""
     motion = problem.motion
     states = tuple(replace(state, learned=False) for state in motion.states)
     outputs = tuple(replace(output, learned=False) for output in motion.outputs)
@@ -105,7 +107,9 @@ _WINDOWS = (4, 16)  # times (states + 1): rows of a window to predict from
 _TRIED_ROWS = 1000  # on which windows are compared
 
 
-def conclude_motion(task: MotionTask, structure: Structure, learned: Learned) -> MotionEstimate:
+def conclude_motion(
+    task: MotionTask, structure: Structure, learned: TrainedLearner
+) -> MotionEstimate:
     """Split the fitted motion and attach statistics."""
     plan = task.plan
     assert learned.coefficients is not None and learned.errors is not None
@@ -115,18 +119,22 @@ def conclude_motion(task: MotionTask, structure: Structure, learned: Learned) ->
     learned = withheld(learned) if unsettled else learned
     errors = learned.errors
     assert errors is not None and learned.coefficients is not None
-    alone = np.asarray(learned.coefficients if task.physics is None else task.physics.end.flown.theta)
-    laid = (plan.flown.steps, plan.flown.washout, plan.segments.count)
-    trained = Trained(*laid, np.asarray(states), slope, alone)
+    alone = np.asarray(
+        learned.coefficients if task.physics is None else task.physics.end.point.theta
+    )
+    layout = (plan.free_run.steps, plan.free_run.washout, plan.segments.count)
+    trained = TrainedSegments(*layout, np.asarray(states), slope, alone)
     model = replace(_model(plan, structure, learned), trained=trained)
     reason = ALONE.get(learned.ending, "") if learned.bound is None or task.physics is None else ""
     if reason and not learned.ending.usable and (where := task.problem.without_value(np.any)):
-        reason = f"{where}; mend it, or bound what it reads"
+        reason = f"{where}; correct it, or bound its parameters"
     silent = learner_silent(learned, _learner_values(plan, learned))
     reason = reason or ending_in_words(learned.ending, learned.tail)
     fit = MotionEstimate(
         model=model,
-        status=Status(learned.ending, learned.iterations, learned.seconds, errors.mean_square, reason=reason),
+        status=Status(
+            learned.ending, learned.iterations, learned.seconds, errors.mean_square, reason=reason
+        ),
         restarts=(),
         covariance=None,
         freedom=errors.freedom,
@@ -135,18 +143,25 @@ def conclude_motion(task: MotionTask, structure: Structure, learned: Learned) ->
         problem=task.problem,
         criterion=task.criterion,
         split_by=MotionSplit.none("training", plan.dynamics, learned.coefficients),
-        course=plan,
+        segmented=plan,
         states=states,
         slope=slope,
         alone=alone,
         scores=learned.scores,
         warnings=(*without_loss(errors.mean_square), *unsettled, *silent),
     )
-    return fit.split(structure.measure, getattr(structure, "shared", "auto")) if learned.ending.usable else fit
+    return (
+        fit.split(structure.measure, getattr(structure, "shared", "auto"))
+        if learned.ending.usable
+        else fit
+    )
 
 
-def _learner_values(plan: MotionCourse, learned: Learned) -> Matrix | None:
-    """Return the values (N, nl) of a learner with few effective weights along the training runs; None of others."""
+def _learner_values(plan: SegmentedMotion, learned: TrainedLearner) -> Matrix | None:
+    """Return the values (N, nl) of a nearly silent learner along the training runs.
+
+    None of others.
+    """
     bound = plan.bound
     if bound is None or learned.scores is None or not silenced(learned.effective, bound.ny):
         return None
@@ -158,7 +173,7 @@ def _learner_values(plan: MotionCourse, learned: Learned) -> Matrix | None:
     return values if np.isfinite(values).all() else None
 
 
-def _model(plan: MotionCourse, structure: Structure, learned: Learned) -> MotionModel:
+def _model(plan: SegmentedMotion, structure: Structure, learned: TrainedLearner) -> MotionModel:
     record = plan.record
     assert learned.coefficients is not None and learned.errors is not None
     noise = learned.errors.noise
@@ -179,16 +194,25 @@ def _model(plan: MotionCourse, structure: Structure, learned: Learned) -> Motion
         window=_WINDOWS[0] * (plan.dynamics.states + 1),
         time_column=record.time_column,
         prepared=record.prepared,
-        statistics=Statistics(learned.gram, middle, noise, learned.ridge, learned.errors.freedom, flown=True),
+        statistics=Statistics(
+            learned.gram, middle, noise, learned.ridge, learned.errors.freedom, simulated=True
+        ),
     )
     if not learned.ending.usable:
         return model
     model = replace(model, window=_best_window(model, record))
-    return model if model.form.bound is None else _limited(replace(model, seen=_seen(model, record)), record)
+    return (
+        model
+        if model.form.bound is None
+        else _with_limits(replace(model, seen=_feature_range(model, record)), record)
+    )
 
 
-def _limited(model: MotionModel, record: Record) -> MotionModel:
-    """The model with the range beyond which its correction is held or fades: of the features over the fitted run."""
+def _with_limits(model: MotionModel, record: Record) -> MotionModel:
+    """Return the model with the range of its features over the fitted run.
+
+    Beyond that range the correction stays constant or fades.
+    """
     limits = None if model.form.beyond == "free" or model.seen is None else limits_of(model.seen)
     if limits is None:
         return model
@@ -201,8 +225,11 @@ def _limited(model: MotionModel, record: Record) -> MotionModel:
     return replace(model, numbers=model.numbers._replace(limits=limits, pull=pull))
 
 
-def _seen(model: MotionModel, record: Record) -> Matrix | None:
-    """Least and largest (2, nz) of the learner's features over the free run; None where it has no finite ones."""
+def _feature_range(model: MotionModel, record: Record) -> Matrix | None:
+    """Return the least and largest (2, nz) of the learner's features over the free run.
+
+    None where it has no finite ones.
+    """
     states, inputs = np.split(model.reach(record), [model.form.states], axis=1)
     with np.errstate(all="ignore"):
         features = np.asarray(model.form.seen(states.T, inputs.T, np))
@@ -211,7 +238,10 @@ def _seen(model: MotionModel, record: Record) -> Matrix | None:
 
 
 def _best_window(model: MotionModel, record: Record) -> int:
-    """The rows to predict from that give the least error one step ahead, on some of the training data."""
+    """Return the window of rows that predicts one step ahead best.
+
+    On some of the training data.
+    """
     longest = max(record.experiments, key=len).rows(0, _TRIED_ROWS)
     tried = [n * (model.form.states + 1) for n in _WINDOWS]
     best, least = tried[0], np.inf
@@ -226,7 +256,9 @@ def _best_window(model: MotionModel, record: Record) -> int:
         (trajectory,) = response.trajectories
         assert trajectory.measured is not None
         with np.errstate(all="ignore"):
-            errors = (trajectory.model - trajectory.measured)[tried[-1] if len(longest) > 4 * tried[-1] else window :]
+            errors = (trajectory.model - trajectory.measured)[
+                tried[-1] if len(longest) > 4 * tried[-1] else window :
+            ]
             square = float(np.mean(np.sum((errors @ model.weight.T) ** 2, axis=1)))
         if square < 0.98 * least:  # a longer one only where it is clearly better
             best, least = window, square
@@ -234,25 +266,38 @@ def _best_window(model: MotionModel, record: Record) -> int:
 
 
 def reopened(model: MotionModel, record: Record) -> MotionEstimate:
-    """The estimate of a saved model with its training data, to split again, less what was told of its training.
+    """Return the estimate of a saved model with its training data, to split again.
+
+    It lacks the results of its training.
 
     Raises:
         InputError: other data than the model was trained on.
     """
     kept, form, numbers = model.trained, model.form, model.numbers
     if kept is None:
-        raise InputError("the model was saved without what a split needs; fit it again.")
+        raise InputError(
+            "the model was saved without the statistics that a split needs; fit it again."
+        )
     record = model.fitting(record, need_outputs=True)
     problem = pose_motion(record, form.motion, [entry.text for entry in form.features] or None)
     problem = replace(problem, weight=replace(problem.weight, matrix=model.weight))
     criterion = Simulation(kept.segment, kept.washout)
-    course = MotionCourse.of(problem, form.bound, criterion).refined(form.substeps)
-    centre, half = (numbers.centre, numbers.halfwidth) if form.bound is not None else (np.zeros(0), np.ones(0))
-    course = replace(course, scaling=Scaling(np.asarray(centre), np.asarray(half)), unit=np.asarray(numbers.gain))
-    if course.segments.count != kept.rows or np.shape(course.segments.start) != np.shape(kept.states):
+    segmented = SegmentedMotion.of(problem, form.bound, criterion).refined(form.substeps)
+    centre, half = (
+        (numbers.centre, numbers.halfwidth) if form.bound is not None else (np.zeros(0), np.ones(0))
+    )
+    segmented = replace(
+        segmented,
+        scaling=Scaling(np.asarray(centre), np.asarray(half)),
+        unit=np.asarray(numbers.gain),
+    )
+    if segmented.segments.count != kept.rows or np.shape(segmented.segments.start) != np.shape(
+        kept.states
+    ):
         raise InputError(
-            f"the model was trained on other rows: on {kept.rows} where these have {course.segments.count}, or in "
-            "other experiments. Give the files, and --rows, that it was trained on."
+            f"the model was trained on other rows: {kept.rows} instead of "
+            f"{segmented.segments.count}, or other experiments. Give the files and --rows of "
+            "its training."
         )
     c = np.asarray(numbers.theta - numbers.theta_aux)
     return MotionEstimate(
@@ -266,7 +311,7 @@ def reopened(model: MotionModel, record: Record) -> MotionEstimate:
         problem=problem,
         criterion=criterion,
         split_by=MotionSplit.none(model.measure, form, c),
-        course=course,
+        segmented=segmented,
         states=kept.states,
         slope=kept.slope,
         alone=np.asarray(kept.alone),

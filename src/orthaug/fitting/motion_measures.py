@@ -1,4 +1,4 @@
-"""Measures over the states and inputs of a motion: the points on which physics and learner are told apart."""
+"""Measures over the states and inputs of a motion, on which physics is split from learner."""
 
 from __future__ import annotations
 
@@ -16,60 +16,67 @@ from orthaug.inference.measures import Measure, Support
 from orthaug.inference.motion_split import Field, rest_of
 from orthaug.inference.splitting import SUPPORTED
 from orthaug.models.dynamics import Numbers
-from orthaug.models.moving import Moving
+from orthaug.models.moving import MotionDynamics
 
 if TYPE_CHECKING:
-    from orthaug.fitting.motion_course import MotionCourse
+    from orthaug.fitting.segmented_motion import SegmentedMotion
 
 
 def field_under(
-    measure: Measure, course: MotionCourse, numbers: Numbers, states: Any
+    measure: Measure, segmented: SegmentedMotion, numbers: Numbers, states: Any
 ) -> tuple[Field, float, tuple[Warning, ...]]:
-    """Points of a measure with the sizes of the learned equations, its support by the data, and what to tell.
+    """Return the points of a measure, its support by the data, and warnings.
+
+    With the sizes of the learned equations.
 
     Raises:
-        InputError: a measure that does not fit the motion, or points at which the motion has no value.
+        InputError: a measure that does not fit the motion, or points at which the motion has no
+            value.
     """
-    motion, form = course.problem.motion, course.dynamics
+    motion, form = segmented.problem.motion, segmented.dynamics
     c, w = np.asarray(numbers.theta - numbers.theta_aux), numbers.weights
-    x, u = course.trajectory(c, w, states)
+    x, u = segmented.trajectory(c, w, states)
     finite = np.isfinite(x).all(axis=1)
     x, u = x[finite], u[finite]
     nx = x.shape[1]
     support = Support.of_motion(motion, x, u)
     points = measure.points(support)
     at, beside = points.x[:, :nx], points.x[:, nx:]
-    size = sizes_learned(course, c, x, u)
-    found = np.asarray(motion.rates(at.T, beside.T, motion.coordinates.physical(c), np), dtype=float)
+    size = sizes_learned(segmented, c, x, u)
+    found = np.asarray(
+        motion.rates(at.T, beside.T, motion.coordinates.physical(c), np), dtype=float
+    )
     if not np.isfinite(found).any():
         raise InputError(f"the motion has no value on the {measure.name} measure; narrow it.")
     finite = np.isfinite(found).all(axis=0)
     weight = np.where(finite, points.weight, 0.0)
     share = support.share(points)
-    told = ()
+    warnings = ()
     if share < SUPPORTED and form.bound is not None:
         text = (
-            f"only {100 * share:.0f} % of the {measure.name} measure lies within reach of the training data: elsewhere "
-            "the parameters rest on how the learner extrapolates."
+            f"only {100 * share:.0f} % of the {measure.name} measure lies within reach of the "
+            "training data: elsewhere the parameters depend on the learner's extrapolation."
         )
-        told = (Warning("measure_beyond_data", text),)
-    return Field(at[finite], beside[finite], weight[finite] / weight.sum(), size), share, told
+        warnings = (Warning("measure_beyond_data", text),)
+    return Field(at[finite], beside[finite], weight[finite] / weight.sum(), size), share, warnings
 
 
-def sizes_learned(course: MotionCourse, c: Any, x: Any, u: Any) -> Any:
-    """The size (nl,) of each learned equation and output over the runs."""
-    motion = course.problem.motion
+def sizes_learned(segmented: SegmentedMotion, c: Any, x: Any, u: Any) -> Any:
+    """Return the size (nl,) of each learned equation and output over the runs."""
+    motion = segmented.problem.motion
     with np.errstate(all="ignore"):
         rates = np.asarray(motion.rates(x.T, u.T, motion.coordinates.physical(c), np), dtype=float)
     if motion.integrator == "discrete":
         rates = rates - x.T
     states, outputs = motion.learned
-    size = np.concatenate([np.nanstd(rates[list(states)], axis=1), course.deviation[list(outputs)]])
+    size = np.concatenate(
+        [np.nanstd(rates[list(states)], axis=1), segmented.deviation[list(outputs)]]
+    )
     return np.where(np.isfinite(size) & (size > 0), size, 1.0)
 
 
 def wobble(
-    form: Moving,
+    form: MotionDynamics,
     numbers: Numbers,
     segments: Segments,
     states: Float[np.ndarray, "k n0 m"],
@@ -77,11 +84,13 @@ def wobble(
     size: Vector,
     q: Vector,
 ) -> Matrix:
-    """How the points of a motion's own measure follow its unknowns: they are where the fitted run goes.
+    """Return the derivative of the points of a motion's own measure by its unknowns.
 
-    A split under the training measure depends on the unknowns twice, through the fitted field and through these points.
-    Intervals that leave the second out cover too little. `Σ φ_qx dx/d(c, w)` (np, n) is over the scored steps with
-    equal weights that add up to 1.
+    These points are states of the fitted run.
+
+    A split under the training measure depends on the unknowns twice, through the fitted field and
+    through these points. Intervals that leave the second out cover too little. `Σ φ_qx dx/d(c, w)`
+    (np, n) is over the scored steps with equal weights that add up to 1.
 
     Args:
         slope: how the segments' starts follow the unknowns, less its sign.
@@ -89,17 +98,19 @@ def wobble(
         q: coordinates of the split.
     """
     total = np.zeros((len(q), form.unknowns))
-    for start, inputs, _, scored, own in zip(states, *map(np.asarray, segments[1:]), slope, strict=True):
+    for start, inputs, _, scored, own in zip(
+        states, *map(np.asarray, segments[1:]), slope, strict=True
+    ):
         n0 = start.shape[0]
-        found = np.asarray(_summed(form, numbers, start, inputs, scored, q, size))
+        found = np.asarray(_sum_over(form, numbers, start, inputs, scored, q, size))
         of_start = np.moveaxis(found[:, :n0], -1, 0)  # (m, np, n0)
         total += found[:, n0:].sum(axis=-1) - np.einsum("mqi,min->qn", of_start, own)
     return total / segments.count
 
 
 @partial(jax.jit, static_argnames="form")
-def _summed(
-    form: Moving,
+def _sum_over(
+    form: MotionDynamics,
     numbers: Numbers,
     state: Float[Array, "n0 m"],
     inputs: Float[Array, "T nu m"],

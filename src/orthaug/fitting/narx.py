@@ -1,4 +1,4 @@
-"""Records as arrays, experiments by groups, as an estimator of scikit-learn: physics in lags, and a correction."""
+"""Time series as an estimator of scikit-learn: physics in lags, and a correction."""
 
 from __future__ import annotations
 
@@ -34,21 +34,26 @@ class Group(NamedTuple):
 
 
 class AugmentedNARX(Augmented):
-    """`y_k = φ(x_k)θ + learner(x_k) + e_k`, x_k past outputs and inputs, in the manners of scikit-learn.
+    """`y_k = φ(x_k)θ + learner(x_k) + e_k`, as an estimator of scikit-learn.
 
-    The rows of X are inputs at successive samples and those of y the outputs measured with them. `groups` labels the
-    experiments; rows of one label belong together in their order, and lags never reach into another. It passes on to
-    `estimate` and gives the same numbers.
+    x_k are past outputs and inputs; records are arrays, experiments are groups.
 
-    The first `first_row_` rows of every experiment have no prediction, for there is no past that it could be made from:
-    they are NaN in what `predict` and `simulate` return, and no score counts them.
+    The rows of X are inputs at successive samples and those of y the outputs measured with them.
+    `groups` labels the experiments; rows of one label belong together in their order, and lags
+    never reach into another. It passes on to `estimate` and gives the same numbers.
+
+    The first `first_row_` rows of every experiment have no prediction, for there is no past that it
+    could be made from: they are NaN in what `predict` and `simulate` return, and no score counts
+    them.
 
     Args:
         physics: "linear", a line in every lag with an intercept; expressions such as
-            `["y[k-1]", "x0[k-1]*abs(x0[k-1])"]`, of parameters theta1, theta2, …; a mapping `{"pole": "y[k-1]"}`;
-            `Term`s; a `Baseline`; or a JAX function of the regressor, returning (n_outputs, n_parameters). Inputs are
-            named by the columns of a DataFrame, else x0, x1, …; the output is y, or y0, y1, … of several.
-        lags: a `Lags`, the learner's regressor; None for what the physics reads, of "linear" one sample back.
+            `["y[k-1]", "x0[k-1]*abs(x0[k-1])"]`, of parameters theta1, theta2, …; a mapping
+            `{"pole": "y[k-1]"}`; `Term`s; a `Baseline`; or a JAX function of the regressor,
+            returning (n_outputs, n_parameters). Inputs are named by the columns of a DataFrame,
+            else x0, x1, …; the output is y, or y0, y1, … of several.
+        lags: a `Lags`, the learner's regressor; None for what the physics reads, of "linear" one
+            sample back.
         learner: a declaration; "auto" for `MLP()`, None for physics alone.
         structure: as of `estimate`; None for `Orthogonal()`.
         criterion: `Prediction(…)` or `Simulation(…)`; None for one step ahead.
@@ -57,7 +62,8 @@ class AugmentedNARX(Augmented):
         restarts: runs from different initial weights.
         output_weights: as of `estimate`.
         sampling_time: seconds between rows.
-        score_on: whether `score` is that of the free run, "simulation", or one step ahead, "prediction".
+        score_on: whether `score` is that of the free run, "simulation", or one step ahead,
+            "prediction".
         random_state: seed of the initial weights; a RandomState or None draws it.
 
     Attributes:
@@ -120,9 +126,9 @@ class AugmentedNARX(Augmented):
             groups: the experiment of every row (n,); None for one.
 
         Raises:
-            InputError (a ValueError): data and physics that do not fit together, a signal that does not move, too short
-                an experiment; RankError where the rows do not determine θ. TrainingError where training gives no finite
-                model.
+            InputError (a ValueError): data and physics that do not fit together, a signal that does
+                not move, too short an experiment; RankError where the rows do not determine θ.
+                TrainingError where training gives no finite model.
         """
         check_choice(self.score_on, SCORED_ON, "`score_on`")
         given = y
@@ -137,7 +143,9 @@ class AugmentedNARX(Augmented):
         return self
 
     def predict(self, X: Any, y: Any, groups: Any = None) -> np.ndarray:
-        """ŷ one step ahead from measured inputs and outputs, (n,) or (n, n_outputs) as y was in the fit.
+        """Return ŷ one step ahead from measured inputs and outputs.
+
+        Its shape, (n,) or (n, n_outputs), is that of y in the fit.
 
         Raises:
             InputError (a ValueError): other columns than in the fit, too short an experiment.
@@ -148,20 +156,23 @@ class AugmentedNARX(Augmented):
         found = np.full(y.shape, np.nan)
         for group in _groups(groups, len(X)):
             found[group.rows] = model.predict(self._record(X, y, [group])).model
-        return self._shaped(found)
+        return self._shape(found)
 
     def simulate(self, X: Any, initial: Any = None, groups: Any = None) -> np.ndarray:
-        """ŷ of the free run, whose past outputs are the model's own, (n,) or (n, n_outputs) as y was in the fit.
+        """Return ŷ of the free run, whose past outputs are the model's own.
+
+        Its shape, (n,) or (n, n_outputs), is that of y in the fit.
 
         Args:
             X: inputs.
-            initial: outputs before the first prediction: y itself, (n,) or (n, n_outputs), of which only the first
-                `first_row_` rows of each experiment are looked at; or these rows alone, the same for every experiment;
-                None for zero.
+            initial: outputs before the first prediction: y itself, (n,) or (n, n_outputs), of which
+                only the first `first_row_` rows of each experiment are looked at; or these rows
+                alone, the same for every experiment; None for zero.
             groups: the experiment of every row (n,); None for one.
 
         Raises:
-            InputError (a ValueError): other columns than in the fit, too short an experiment or `initial`.
+            InputError (a ValueError): other columns than in the fit, too short an experiment or
+                `initial`.
         """
         model = self._fitted().model
         X = checked_again(self, X)
@@ -173,10 +184,12 @@ class AugmentedNARX(Augmented):
                 given = np.asarray(initial)[group.rows] if whole else initial
                 begin = as_signal(given[: self.first_row_] if np.ndim(given) else given, "initial")
             found[group.rows] = model.simulate(self._record(X, None, [group]), initial=begin).model
-        return self._shaped(found)
+        return self._shape(found)
 
     def score(self, X: Any, y: Any, groups: Any = None) -> float:
-        """R² on all rows that have a prediction, the mean over outputs: of the free run, or as `score_on` says.
+        """Return R² on all rows that have a prediction, the mean over outputs.
+
+        Of the free run, or as `score_on` says.
 
         The free run starts from the measured outputs; one that leaves all bounds scores −inf.
 
@@ -186,39 +199,54 @@ class AugmentedNARX(Augmented):
         from sklearn.metrics import r2_score
 
         check_choice(self.score_on, SCORED_ON, "`score_on`")
-        found = self.simulate(X, y, groups) if self.score_on == "simulation" else self.predict(X, y, groups)
+        found = (
+            self.simulate(X, y, groups)
+            if self.score_on == "simulation"
+            else self.predict(X, y, groups)
+        )
         measured = self._outputs(y, len(found))
         found = found.reshape(measured.shape)
-        scored = np.concatenate([group.rows[self.first_row_ :] for group in _groups(groups, len(found))])
+        scored = np.concatenate(
+            [group.rows[self.first_row_ :] for group in _groups(groups, len(found))]
+        )
         if not np.isfinite(found[scored]).all():
             return -np.inf
         return float(r2_score(measured[scored], found[scored]))
 
     def _layout(self, names: tuple[str, ...]) -> Layout:
-        """The regressor, for physics that are made of it."""
+        """Return the regressor, for physics that depend on it."""
         lags = _FIRST if self.lags is None else self.lags
         return lags.layout(self.output_names_, names) if isinstance(lags, Lags) else ()
 
     def _record(self, x: np.ndarray, y: np.ndarray | None, groups: list[Group]) -> Record:
-        """The experiments, with their outputs where they are given."""
+        """Return the experiments, with outputs where they are given."""
         outputs = np.empty((len(x), 0)) if y is None else y
         experiments = [
-            Experiment(x[group.rows], outputs[group.rows], "" if group.label is None else f"group {group.label}")
+            Experiment(
+                x[group.rows],
+                outputs[group.rows],
+                "" if group.label is None else f"group {group.label}",
+            )
             for group in groups
         ]
         named = () if y is None else self.output_names_
         return Record(input_names(self), named, self.sampling_time, tuple(experiments))  # type: ignore[arg-type]
 
     def _outputs(self, y: Any, rows: int) -> np.ndarray:
-        """Measured outputs (rows, n_outputs)."""
+        """Return measured outputs (rows, n_outputs)."""
         y = as_signal(y, "y")
         if y.shape != (rows, len(self.output_names_)):
-            raise InputError(f"`y` has the shape {y.shape}; expected {(rows, len(self.output_names_))}, rows as in X.")
+            raise InputError(
+                f"`y` has the shape {y.shape}; expected {(rows, len(self.output_names_))}, "
+                "rows as in X."
+            )
         return y
 
 
 def _groups(groups: Any, rows: int) -> Iterator[Group]:
-    """The experiments in order of first appearance; `groups` (rows,) labels them, None is one.
+    """Yield the experiments in order of first appearance.
+
+    `groups` (rows,) labels them, None is one.
 
     Raises:
         InputError: not one label for every row.
@@ -228,14 +256,20 @@ def _groups(groups: Any, rows: int) -> Iterator[Group]:
         return
     labels = np.asarray(groups)
     if labels.shape != (rows,):
-        raise InputError(f"`groups` has the shape {labels.shape}; expected one label for each of {rows} rows.")
+        raise InputError(
+            f"`groups` has the shape {labels.shape}; expected one label for each of {rows} rows."
+        )
     bare = [k for k, label in enumerate(labels.tolist()) if label is None or label != label]
     if bare:
-        raise InputError(f"`groups` has no label at row {bare[0]}: found {labels[bare[0]]}; every row needs one.")
+        raise InputError(
+            f"`groups` has no label at row {bare[0]}: found {labels[bare[0]]}; every row needs one."
+        )
     try:
         found, first = np.unique(labels, return_index=True)
     except TypeError:
         kinds = sorted({type(label).__name__ for label in labels})
-        raise InputError(f"`groups` mixes labels of the types {', '.join(kinds)}; take one type.") from None
+        raise InputError(
+            f"`groups` mixes labels of the types {', '.join(kinds)}; take one type."
+        ) from None
     for label in found[np.argsort(first)]:
         yield Group(label, np.flatnonzero(labels == label))

@@ -1,7 +1,7 @@
-"""The prediction criterion over the learner's weights, as normal equations from one pass over rows (F1, F4).
+"""Normal equations of the one-step criterion over the weights, in one pass over rows (F1, F4).
 
-Rows are whitened: each output is divided by its standard deviation, and all rows by the RMS of the baseline's
-residual. So a residual of 1 is as large as the baseline's own.
+Rows are whitened: each output is divided by its standard deviation, and all rows by the RMS of the
+baseline's residual. So a residual of 1 is as large as the baseline's own.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from orthaug.models.rows import Chunk, Engine, Overlap, gram, row_sum
 
 
 class Hold(NamedTuple):
-    """`‖target − matrix QᵀF‖²`: the structure's hold on the learner's share in the span of the physics."""
+    """`‖target − matrix QᵀF‖²`: the structure's term on the learner's share in the physics."""
 
     matrix: Float[Array | np.ndarray, "nt nt"]
     target: Float[Array | np.ndarray, "nt"]
 
 
 class Normal(NamedTuple):
-    """Gauss-Newton quantities of `‖r‖²`: `hessian` = JᵀJ, `gradient` = Jᵀr (downhill), `loss` = ‖r‖²."""
+    """Gauss-Newton quantities of `‖r‖²`: `hessian` JᵀJ, `gradient` Jᵀr (downhill), `loss` ‖r‖²."""
 
     hessian: Float[Array, "nw nw"]
     gradient: Float[Array, "nw"]
@@ -39,8 +39,8 @@ class Normal(NamedTuple):
 class Blocks:
     """Gram matrix of the columns `[Q r J]` of one chunk: its share of the sum.
 
-    Where J lies almost in the span of Q, `JᵀJ − (QᵀJ)ᵀ(QᵀJ)` cancels. So the overlap of the previous pass is
-    subtracted first.
+    Where J lies almost in the span of Q, `JᵀJ − (QᵀJ)ᵀ(QᵀJ)` cancels. So the overlap of the
+    previous pass is subtracted first.
     """
 
     bound: Bound
@@ -57,7 +57,10 @@ class Blocks:
 
 
 def collect(total: Float[Array, "n n"], hold: Hold, before: Overlap) -> Normal:
-    """The normal equations from the sum of all `Blocks`: `JᵀP⊥J = JᵀJ − (QᵀJ)ᵀ(QᵀJ)`, plus the structure's `Hold`."""
+    """Return the normal equations from the sum of all `Blocks`, plus the structure's `Hold`.
+
+    `JᵀP⊥J = JᵀJ − (QᵀJ)ᵀ(QᵀJ)`.
+    """
     nt = before.values.shape[0]
     g_qr, g_qj = total[:nt, nt], total[:nt, nt + 1 :]
     g_rr, g_jr, g_jj = total[nt, nt], total[nt + 1 :, nt], total[nt + 1 :, nt + 1 :]
@@ -67,7 +70,8 @@ def collect(total: Float[Array, "n n"], hold: Hold, before: Overlap) -> Normal:
     return Normal(
         hessian=g_jj - g_qj.T @ g_qj + held.T @ held,
         gradient=g_jr - g_qj.T @ g_qr + held.T @ miss,
-        loss=jnp.maximum(g_rr - g_qr @ g_qr, 0.0) + miss @ miss,  # a difference may round below zero
+        loss=jnp.maximum(g_rr - g_qr @ g_qr, 0.0)
+        + miss @ miss,  # a difference may round below zero
         overlap=overlap,
     )
 
@@ -88,22 +92,31 @@ class OneStep:
 
 @partial(jax.jit, static_argnames="criterion")
 def one_pass(
-    criterion: Callable[..., Normal], w: Float[Array, "nw"], arguments: tuple[Any, ...], overlap: Overlap
+    criterion: Callable[..., Normal],
+    w: Float[Array, "nw"],
+    arguments: tuple[Any, ...],
+    overlap: Overlap,
 ) -> Normal:
-    """The criterion at w. The programs around it trace it once, together."""
+    """Return the criterion at w.
+
+    The programs around it trace it once, together.
+    """
     return criterion(w, *arguments, overlap)
 
 
 def linearise(
-    criterion: Callable[..., Normal], w: Float[Array, "nw"], arguments: tuple[Any, ...], overlap: Overlap
+    criterion: Callable[..., Normal],
+    w: Float[Array, "nw"],
+    arguments: tuple[Any, ...],
+    overlap: Overlap,
 ) -> Normal:
-    """The criterion at w, in two passes: the second subtracts the overlap of the first."""
+    """Return the criterion at w, in two passes: the second subtracts the overlap of the first."""
     first = one_pass(criterion, w, arguments, overlap)
     return one_pass(criterion, w, arguments, first.overlap)
 
 
 @dataclass(frozen=True, eq=False)
-class Summed:
+class SummedOneStep:
     """The criterion `OneStep` over rows that an engine sums over, wherever they are."""
 
     engine: Engine
@@ -112,8 +125,10 @@ class Summed:
     hold: Hold
 
     def __call__(self, w: Any, before: Overlap) -> Normal:
-        """The normal equations at w; `before` is the overlap from the previous pass."""
-        return _collect(self.engine.sum(Blocks(self.bound), self.rows, w, before), self.hold, before)
+        """Return the normal equations at w; `before` is the overlap from the previous pass."""
+        return _collect(
+            self.engine.sum(Blocks(self.bound), self.rows, w, before), self.hold, before
+        )
 
 
 _collect = jax.jit(collect)

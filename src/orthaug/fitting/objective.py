@@ -1,4 +1,7 @@
-"""The free-run criterion as a function of p = (θ, w): a trial, and its linearisation. Both are pure."""
+"""The free-run criterion as a function of p = (θ, w): a trial, and its linearisation.
+
+Both are pure.
+"""
 
 from __future__ import annotations
 
@@ -20,10 +23,11 @@ RUNAWAY = 1e6  # mean square in deviations of the output: a free run beyond it h
 _LARGEST_ERROR = 1e120
 
 
-class Flown(NamedTuple):
-    """A trial at p: the unknown θ, c and w, the states that its segments started from, and the errors (k, T, ny, m).
+class TrialPoint(NamedTuple):
+    """A trial at p: the unknown θ, c and w, its initial states, and its errors (k, T, ny, m).
 
-    Where an engine keeps the segments, their `squares` Σ e eᵀ (ny, ny) are known instead of the errors.
+    Where an engine keeps the segments, their `squares` Σ e eᵀ (ny, ny) are known instead of the
+    errors.
     """
 
     p: Vector
@@ -40,7 +44,7 @@ class Flown(NamedTuple):
 
 
 class LinearisedFreeRun(NamedTuple):
-    """A trial linearised: normal equations of p, and what the next trial starts from."""
+    """A linearised trial: normal equations of p, and the start of the next trial."""
 
     hessian: Matrix
     gradient: Vector
@@ -53,10 +57,11 @@ class LinearisedFreeRun(NamedTuple):
 class FreeRunObjective:
     """`‖r‖²` of the free run.
 
-    `numbers` makes a model's numbers of (c, w). `weight` (ny, ny) multiplies the errors of a step; `rms` is their unit,
-    in whitened outputs; `deviation` (ny,) is that of the measured outputs. `physics` is nθ, and `bounds` are θ's.
-    `colour` holds longer segments, where the others are too short to show how long the errors remember. `sums` makes
-    the sums where an engine keeps the segments.
+    `numbers` makes a model's numbers of (c, w). `weight` (ny, ny) multiplies the errors of a step;
+    `rms` is their unit, in whitened outputs; `deviation` (ny,) is that of the measured outputs.
+    `physics` is nθ, and `bounds` are θ's. `colour` holds longer segments, where the others are too
+    short to show how long the errors remember. `sums` makes the sums where an engine keeps the
+    segments.
     """
 
     dynamics: Dynamics
@@ -77,26 +82,35 @@ class FreeRunObjective:
         return self.dynamics.start_rows(self.weight)
 
     def place(self, p: Vector) -> tuple[Vector, Vector, Vector]:
-        """(unknown θ, c, w) of p."""
+        """Return (unknown θ, c, w) of p."""
         return p[: self.physics], p[: self.physics], p[self.physics :]
 
-    def fly(self, p: Vector, start: Start) -> Flown:
-        """A trial at p. The states follow p to first order. Where that does not lower the misfit, they stay."""
+    def evaluate(self, p: Vector, start: Start) -> TrialPoint:
+        """Return a trial at p.
+
+        The states follow p to first order. Where that does not lower the misfit, they stay.
+        """
         theta, c, w = self.place(p)
-        trials: list[Flown] = []
+        trials: list[TrialPoint] = []
         for follows in (True, False) if self.initial.free and start.follows else (False,):
-            total, states, errors, squares = self._tried(c, w, start, follows)
+            total, states, errors, squares = self._try(c, w, start, follows)
             misfit = total if total < self._largest else np.inf
-            trials.append(Flown(p, theta, c, w, states, errors, misfit, misfit, squares))
+            trials.append(TrialPoint(p, theta, c, w, states, errors, misfit, misfit, squares))
             if total < start.misfit:
                 break
         best = min(trials, key=lambda trial: trial.misfit)
         if self.sums is not None and best is trials[0] and self.initial.free and start.follows:
-            return best._replace(states=self.sums.moved(start, np.concatenate([c, w]) - start.unknowns))
+            return best._replace(
+                states=self.sums.moved(start, np.concatenate([c, w]) - start.unknowns)
+            )
         return best
 
-    def _tried(self, c: Vector, w: Vector, start: Start, follows: bool) -> tuple[float, Any, Any, Matrix | None]:
-        """`‖r‖²`, states, errors and their squares from the start's states, or from those that follow (c, w).
+    def _try(
+        self, c: Vector, w: Vector, start: Start, follows: bool
+    ) -> tuple[float, Any, Any, Matrix | None]:
+        """Return `‖r‖²`, states, errors and their squares from the start's states.
+
+        Or from states that follow (c, w).
 
         An engine's states stay where they are: given are those of the start.
         """
@@ -104,7 +118,9 @@ class FreeRunObjective:
         if self.sums is not None:
             step = unknowns - start.unknowns if follows and start.unknowns is not None else None
             made = (self.weight, self.start_rows)
-            total, squares = self.sums.tried(self.dynamics, self.numbers(c, w), self.segments, start, step, *made)
+            total, squares = self.sums.tried(
+                self.dynamics, self.numbers(c, w), self.segments, start, step, *made
+            )
             return total, start.values, None, squares
         states: Any = start.at(unknowns) if follows else start.values
         errors = self.errors(c, w, states, self.segments)
@@ -113,28 +129,33 @@ class FreeRunObjective:
             total += self.initial.loss(states, self.start_rows)
         return total, states, errors, None
 
-    def linearise(self, flown: Flown) -> LinearisedFreeRun:
-        """Normal equations about a trial, with its states at their best."""
-        information, gradient, following = self.eliminated(flown, self.start_rows)
-        start = Start(flown.states, flown.misfit, np.concatenate([flown.c, flown.w]), **following)
+    def linearise(self, point: TrialPoint) -> LinearisedFreeRun:
+        """Return normal equations about a trial, with its states at their best."""
+        information, gradient, following = self.eliminated(point, self.start_rows)
+        start = Start(point.states, point.misfit, np.concatenate([point.c, point.w]), **following)
         return LinearisedFreeRun(information, gradient, information, start)
 
-    def kept(self, flown: Flown) -> tuple[Any, ...]:
-        """What `again` makes the trial of, bit by bit."""
-        squares = np.zeros((0, 0)) if flown.squares is None else flown.squares
-        return flown.p, np.asarray(flown.states), flown.misfit, flown.loss, squares
+    def kept(self, point: TrialPoint) -> tuple[Any, ...]:
+        """Return the values from which `again` makes the trial, bit by bit."""
+        squares = np.zeros((0, 0)) if point.squares is None else point.squares
+        return point.p, np.asarray(point.states), point.misfit, point.loss, squares
 
-    def again(self, kept: tuple[Any, ...]) -> Flown:
-        """The trial that was `kept`."""
+    def again(self, kept: tuple[Any, ...]) -> TrialPoint:
+        """Return the trial of values that were `kept`."""
         p, states, misfit, loss, squares = kept
         theta, c, w = self.place(p)
         known = self.sums is not None
         errors = None if known else self.errors(c, w, states, self.segments)
-        return Flown(p, theta, c, w, states, errors, float(misfit), float(loss), squares if known else None)
+        return TrialPoint(
+            p, theta, c, w, states, errors, float(misfit), float(loss), squares if known else None
+        )
 
-    def eliminated(self, flown: Flown, rows: Matrix) -> tuple[Matrix, Vector, dict[str, Any]]:
-        """Normal matrix and right-hand side of (c, w), L = `rows`, and how the states follow, as `Start` has it."""
-        numbers, states = self.numbers(flown.c, flown.w), flown.states
+    def eliminated(self, point: TrialPoint, rows: Matrix) -> tuple[Matrix, Vector, dict[str, Any]]:
+        """Return the normal equations of (c, w), L = `rows`, and how the states follow.
+
+        The latter in the form of `Start`.
+        """
+        numbers, states = self.numbers(point.c, point.w), point.states
         if self.sums is not None:
             made = (self.dynamics, numbers, self.segments, self.initial, states, self.weight, rows)
             information, gradient, there = self.sums.linearised(*made)
@@ -144,56 +165,85 @@ class FreeRunObjective:
         return information, gradient, {"offset": offset, "slope": slope}
 
     def slope(self, start: Start) -> Float[np.ndarray, "k m n0 n"] | None:
-        """How the best states follow (c, w)."""
-        return start.slope if self.sums is None or start.there is None else self.sums.slope(start.there)
+        """Return the derivative of the best states by (c, w)."""
+        return (
+            start.slope
+            if self.sums is None or start.there is None
+            else self.sums.slope(start.there)
+        )
 
     def theta_information(self, linear: LinearisedFreeRun, w: Vector) -> Matrix:
-        """The information of (θ, w), with θ as it is split from the learner."""
+        """Return the information of (θ, w), with θ as it is split from the learner."""
         return linear.information
 
-    def errors(self, c: Vector, w: Vector, states: Any, segments: Segments) -> Float[np.ndarray, "k T ny m"]:
-        """Errors of every segment from its state, in the outputs' units; 0 where they are not scored."""
+    def errors(
+        self, c: Vector, w: Vector, states: Any, segments: Segments
+    ) -> Float[np.ndarray, "k T ny m"]:
+        """Return the errors of every segment from its state, in the outputs' units.
+
+        0 where they are not scored.
+        """
         return errors_of(self.dynamics, self.numbers(c, w), states, segments)
 
-    def samples(self, flown: Flown) -> tuple[float, float]:
-        """Number of residuals less the physics' own parameters, and the share of them that is independent."""
-        ny, errors = len(self.weight), flown.errors
-        segments, states = self.segments, flown.states
+    def samples(self, point: TrialPoint) -> tuple[float, float]:
+        """Return the number of residuals, and the share of them that is independent.
+
+        The physics' own parameters are subtracted from the number.
+        """
+        ny, errors = len(self.weight), point.errors
+        segments, states = self.segments, point.states
         if self.colour is not None:
-            long = self._colour_errors(flown)
+            long = self._colour_errors(point)
             if long is None:
                 segments, states = self.colour, self.colour.start
             else:
                 errors = long if np.abs(long).max() < _LARGEST_ERROR else errors
         if errors is not None:
             moved = np.moveaxis(errors, 1, -1).swapaxes(1, 2)  # (k, m, ny, T)
-            shares = [independent_share(moved[:, :, i].reshape(-1, moved.shape[-1])) for i in range(ny)]
+            shares = [
+                independent_share(moved[:, :, i].reshape(-1, moved.shape[-1])) for i in range(ny)
+            ]
         else:
-            shares = self._shares(flown, segments, states)
+            shares = self._shares(point, segments, states)
         return self.segments.count * ny - self.physics, float(np.mean(shares))
 
-    def _colour_errors(self, flown: Flown) -> Any:
-        """Errors of the longer segments; None where they are not in memory, or the run is lost there."""
+    def _colour_errors(self, point: TrialPoint) -> Any:
+        """Return the errors of the longer segments.
+
+        None where they are not in memory, or the run is lost there.
+        """
         if not isinstance(self.colour, Segments):
             return None
-        return self.errors(flown.c, flown.w, self.colour.start, self.colour)
+        return self.errors(point.c, point.w, self.colour.start, self.colour)
 
-    def _shares(self, flown: Flown, segments: Any, states: Any) -> list[float]:
-        """Independent shares of each output's errors, from sums; of the own segments where a longer run is lost."""
+    def _shares(self, point: TrialPoint, segments: Any, states: Any) -> list[float]:
+        """Return the independent shares of each output's errors, from sums.
+
+        Of the own segments where a longer run is lost.
+        """
         assert self.sums is not None
-        numbers = self.numbers(flown.c, flown.w)
-        for one, start in ((segments, states), (self.segments, flown.states)):
+        numbers = self.numbers(point.c, point.w)
+        for one, start in ((segments, states), (self.segments, point.states)):
             found = self.sums.spectra(self.dynamics, numbers, one, start, spectrum_size(one.steps))
             if np.all(found[0] < _LARGEST_ERROR**2):
-                return [share_of(spectrum, one.steps, n) for spectrum, n in zip(*found, strict=True)]
+                return [
+                    share_of(spectrum, one.steps, n) for spectrum, n in zip(*found, strict=True)
+                ]
         return [1.0] * len(self.weight)
 
-    def squares(self, flown: Flown) -> Matrix | None:
-        """Σ e eᵀ (ny, ny) of a trial's errors, in the outputs' units; None where they are too large to square."""
-        if flown.errors is None:
-            found = flown.squares
-            return found if found is not None and np.abs(found).max(initial=0.0) < _LARGEST_ERROR**2 else None
-        errors = np.moveaxis(flown.errors, 2, -1).reshape(-1, len(self.weight))
+    def squares(self, point: TrialPoint) -> Matrix | None:
+        """Return Σ e eᵀ (ny, ny) of a trial's errors, in the outputs' units.
+
+        None where they are too large to square.
+        """
+        if point.errors is None:
+            found = point.squares
+            return (
+                found
+                if found is not None and np.abs(found).max(initial=0.0) < _LARGEST_ERROR**2
+                else None
+            )
+        errors = np.moveaxis(point.errors, 2, -1).reshape(-1, len(self.weight))
         return errors.T @ errors if np.abs(errors).max(initial=0.0) < _LARGEST_ERROR else None
 
     @property
@@ -202,8 +252,15 @@ class FreeRunObjective:
         return RUNAWAY * self.segments.count * float(np.sum((self.weight * self.deviation) ** 2))
 
 
-def errors_of(dynamics: Dynamics, numbers: Numbers, states: Any, segments: Segments) -> Float[np.ndarray, "k T ny m"]:
-    """Errors of every segment from its state, in the outputs' units; 0 where they are not scored."""
+def errors_of(
+    dynamics: Dynamics, numbers: Numbers, states: Any, segments: Segments
+) -> Float[np.ndarray, "k T ny m"]:
+    """Return the errors of every segment from its state, in the outputs' units.
+
+    0 where they are not scored.
+    """
     run = np.asarray(respond(dynamics, numbers, segments, states))
     with np.errstate(all="ignore"):
-        return np.where(np.asarray(segments.scored)[:, :, None], np.asarray(segments.target) - run, 0.0)
+        return np.where(
+            np.asarray(segments.scored)[:, :, None], np.asarray(segments.target) - run, 0.0
+        )

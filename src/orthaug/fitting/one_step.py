@@ -1,4 +1,4 @@
-"""Training one step ahead: the learner scaled, rows laid out for an engine, one run of a solver (F1, F5)."""
+"""Training one step ahead: the learner scaled, rows prepared, one run of a solver (F1, F5)."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ import numpy as np
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError, Warning
 from orthaug._base.jax import jnp
-from orthaug._base.progress import RunTell, quiet
+from orthaug._base.progress import RunProgress, quiet
 from orthaug.data.record import Record
 from orthaug.data.regressors import Features
 from orthaug.data.sources import RecordSource, witness
 from orthaug.fitting.checkpoints import Checkpoints
 from orthaug.fitting.criteria import Criterion, Prediction
 from orthaug.fitting.elimination import Elimination, Fixed, eliminate, split_theta
-from orthaug.fitting.laid_rows import LaidRows
-from orthaug.fitting.learned import Learned
-from orthaug.fitting.normal_equations import Hold, OneStep, Summed, linearise
+from orthaug.fitting.learned import TrainedLearner
+from orthaug.fitting.normal_equations import Hold, OneStep, SummedOneStep, linearise
 from orthaug.fitting.paper_criterion import JointOneStep, PaperCriterion, Physics
 from orthaug.fitting.rules import check_joint, ridge_of
 from orthaug.fitting.solvers import compiled
 from orthaug.fitting.solvers.adam_lbfgs import GradientRun
 from orthaug.fitting.solvers.limit import noticeable_in
 from orthaug.fitting.structures import Additive, Orthogonal, Structure
+from orthaug.fitting.training_rows import TrainingRows
 from orthaug.fitting.unfinished import noticeable_fall
 from orthaug.models.learners import Bound, Learner, Scaling
 from orthaug.models.rows import Engine, InMemory, Overlap
@@ -35,14 +35,18 @@ from orthaug.physics.problem import Problem
 from orthaug.physics.streamed import StreamedProblem
 
 MANY_ROWS, FEW_ROWS = 1_000_000, 200_000
-"""From how many rows on runs begin where runs over few of them ended; the table is in docs/design.md."""
+"""From how many rows on runs begin where runs over few of them ended; the table is in
+docs/design.md.
+"""
 OUTPUT_UNIT = 10.0
-"""The learner's output unit in standard deviations of the baseline's residual: the table is in docs/design.md."""
+"""The learner's output unit in standard deviations of the baseline's residual: the table is in
+docs/design.md.
+"""
 
 
 @dataclass(frozen=True, eq=False)
-class OneStepTask(LaidRows):
-    """Training on rows that are laid out: what physics alone does on them, and where states of runs are kept."""
+class OneStepTask(TrainingRows):
+    """Training on prepared rows, with physics alone on them and checkpoints of runs."""
 
     criterion: Criterion = Prediction()  # noqa: RUF009  (frozen)
     physics_loss: float | None = None
@@ -59,8 +63,15 @@ class OneStepTask(LaidRows):
         unit: Vector | None = None,
         engine: Engine = InMemory(),  # noqa: B008  (frozen)
     ) -> OneStepTask:
-        """Scale features to [-1, 1] and the learner's output to the baseline's residual, unless both are given."""
-        bound = None if learner is None else Bound(learner, len(problem.features.entries), len(problem.outputs))
+        """Scale the features to [-1, 1] and the learner's output to the residual of the physics.
+
+        Unless both scalings are given.
+        """
+        bound = (
+            None
+            if learner is None
+            else Bound(learner, len(problem.features.entries), len(problem.outputs))
+        )
         if isinstance(problem, StreamedProblem):
             z = problem.feature_range if bound else np.zeros((2, 0))
         else:
@@ -71,10 +82,14 @@ class OneStepTask(LaidRows):
         unit = np.asarray(OUTPUT_UNIT * spread if unit is None else unit) * (bound is not None)
         gain = problem.weight.matrix * unit / rms
         if isinstance(problem, StreamedProblem):
-            laying = problem.laying(scaling.centre, scaling.halfwidth, rms, gain)
-            return cls(problem, bound, scaling, unit, rms, engine, engine.draw(problem.source, laying))
+            row_builder = problem.row_builder(scaling.centre, scaling.halfwidth, rms, gain)
+            return cls(
+                problem, bound, scaling, unit, rms, engine, engine.draw(problem.source, row_builder)
+            )
         e = problem.unexplained / rms
-        rows = engine.lay(scaling(z), problem.projection.q, e, np.broadcast_to(gain, (*e.shape, e.shape[1])))
+        rows = engine.build_rows(
+            scaling(z), problem.projection.q, e, np.broadcast_to(gain, (*e.shape, e.shape[1]))
+        )
         return cls(problem, bound, scaling, unit, rms, engine, rows)
 
     @property
@@ -86,12 +101,12 @@ class OneStepTask(LaidRows):
 
     @property
     def seconds(self) -> float:
-        """What physics alone took."""
+        """Seconds that physics alone took."""
         return 0.0
 
     @property
     def warnings(self) -> tuple[Warning, ...]:
-        """None: least squares has nothing to tell here."""
+        """No warnings: least squares has none."""
         return ()
 
     @property
@@ -100,20 +115,32 @@ class OneStepTask(LaidRows):
 
     @property
     def alone(self) -> OneStepTask:
-        """The same rows without a learner."""
-        problem, scaling = replace(self.problem, features=Features(())), Scaling(np.zeros(0), np.ones(0))
-        return replace(self, problem=problem, bound=None, scaling=scaling, unit=np.zeros_like(self.unit))
+        """The task without a learner."""
+        problem, scaling = (
+            replace(self.problem, features=Features(())),
+            Scaling(np.zeros(0), np.ones(0)),
+        )
+        return replace(
+            self, problem=problem, bound=None, scaling=scaling, unit=np.zeros_like(self.unit)
+        )
 
-    def physics_alone(self) -> tuple[OneStepTask, Learned]:
-        """The rows without a learner, and least squares on them."""
+    def physics_alone(self) -> tuple[OneStepTask, TrainedLearner]:
+        """Return the task without a learner, and least squares on its rows."""
         return self.alone, self.alone.physics_learned()
 
     def on(self, record: Record) -> OneStepTask:
-        """The same problem on another record."""
-        return OneStepTask.of(self.problem.on(record), self.bound and self.bound.learner, engine=self.engine)
+        """Return the task on another record."""
+        return OneStepTask.of(
+            self.problem.on(record), self.bound and self.bound.learner, engine=self.engine
+        )
 
-    def prepared(self, solver: Any, structure: Structure, progress: RunTell = quiet) -> OneStepTask:
-        """The same with the loss of physics alone under the structure's rows and bounds; it is solved (F1)."""
+    def prepared(
+        self, solver: Any, structure: Structure, progress: RunProgress = quiet
+    ) -> OneStepTask:
+        """Return the task with the loss of physics alone under the structure's rows and bounds.
+
+        It is solved (F1).
+        """
         problem, elimination = self.problem, eliminate(structure, self.problem)
         nothing = np.zeros_like(problem.target_coordinates)
         theta = elimination.theta(nothing, elimination.active(nothing))
@@ -124,12 +151,21 @@ class OneStepTask(LaidRows):
         return replace(self, physics_loss=loss, few=few and few.prepared(solver, structure))
 
     def _few(self) -> OneStepTask | None:
-        """On a witness of the rows, the weights in the same units; None where it lacks what the physics needs."""
+        """Return the end of training on a subsample of the rows, weights in the same units.
+
+        None where it lacks what the physics needs.
+        """
         assert self.bound is not None
         problem = self.problem
-        source = problem.source if isinstance(problem, StreamedProblem) else RecordSource(problem.record, 0)
+        source = (
+            problem.source
+            if isinstance(problem, StreamedProblem)
+            else RecordSource(problem.record, 0)
+        )
         with suppress(InputError):
-            return OneStepTask.of(problem.on(witness(source, FEW_ROWS)), self.bound.learner, self.scaling, self.unit)
+            return OneStepTask.of(
+                problem.on(witness(source, FEW_ROWS)), self.bound.learner, self.scaling, self.unit
+            )
         return None
 
     def run(
@@ -138,15 +174,20 @@ class OneStepTask(LaidRows):
         w: Any,
         structure: Structure | None = None,
         regularization: str | float = "none",
-        progress: RunTell = quiet,
+        progress: RunProgress = quiet,
     ) -> compiled.TrainingRun:
-        """One run from the weights `w`; the arguments as in `estimate`, `structure` None for no penalty.
+        """Return one run from the weights `w`.
 
-        Over very many rows its iterations are those over all of them, its seconds those over the few as well.
+        The arguments as in `estimate`, `structure` None for no penalty.
+
+        Over very many rows its iterations are those over all of them, its seconds those over the
+        few as well.
         """
         structure = Orthogonal() if structure is None else structure
         if self.few is not None:
-            first = self.few.run(solver, w, structure, regularization, lambda iteration, loss: progress(0, loss))
+            first = self.few.run(
+                solver, w, structure, regularization, lambda iteration, loss: progress(0, loss)
+            )
             w = first.w if first.ending.usable else w
             own = replace(self, few=None).run(solver, w, structure, regularization, progress)
             return own._replace(seconds=first.seconds + own.seconds)
@@ -155,15 +196,21 @@ class OneStepTask(LaidRows):
         plain = not (structure.from_initial or len(elimination.rows.target))
         if not (plain and solver.gauss_newton and solver.iterations and self._above(run)):
             return run
-        silent = self.bound.silent(np.asarray(w)) if self.bound else None  # its runs end below physics alone
+        silent = (
+            self.bound.silent(np.asarray(w)) if self.bound else None
+        )  # its runs end below physics alone
         w = w if silent is None else jnp.asarray(silent)
         run = self._run_inside(solver, w, structure, elimination, regularization, progress)
-        if elimination.bounded and silent is not None and self._above(run):  # the bounds of another active set
-            return self._run_inside(solver.at_most(0), w, structure, elimination, regularization, progress)
+        if (
+            elimination.bounded and silent is not None and self._above(run)
+        ):  # the bounds of another active set
+            return self._run_inside(
+                solver.at_most(0), w, structure, elimination, regularization, progress
+            )
         return run
 
     def _above(self, run: compiled.TrainingRun) -> bool:
-        """Whether a run ended above physics alone."""
+        """Return whether a run ended above physics alone."""
         return run.ending.usable and self.loss(run) > self.start_loss
 
     def _run_inside(
@@ -173,22 +220,26 @@ class OneStepTask(LaidRows):
         structure: Structure,
         elimination: Elimination,
         regularization: str | float,
-        progress: RunTell,
+        progress: RunProgress,
     ) -> compiled.TrainingRun:
-        """One run with θ inside its bounds, which an active set meets (they reach into training, F1).
+        """Return one run with θ inside its bounds, by an active set.
 
-        Entries at a bound are known terms: they are held there from the first step on, as if they were `fixed`. Where
-        others stand there at the end, the run is made again.
+        Bounds reach into training (F1).
+
+        Entries at a bound are known terms: they are fixed there from the first step on, as if they
+        were `fixed`. Where others are at a bound at the end, the run is made again.
         """
 
-        def tell(iteration: int, loss: float) -> None:
+        def report(iteration: int, loss: float) -> None:
             progress(iteration, self.mean_square(loss))
 
         runs: list[compiled.TrainingRun] = []
 
         def share(fixed: Fixed) -> Vector | None:
-            """QᵀF at the end of a run with these held; None where nothing follows from it."""
-            runs.append(self._run_held(solver, w, structure, elimination, fixed, regularization, tell))
+            """Return QᵀF at the end of a run with these fixed; None where the run failed."""
+            runs.append(
+                self._run_held(solver, w, structure, elimination, fixed, regularization, report)
+            )
             reach = elimination.bounded and not elimination.decoupled
             return self.coordinates(runs[-1]) if reach and runs[-1].ending.usable else None
 
@@ -198,7 +249,7 @@ class OneStepTask(LaidRows):
         return runs[-1]._replace(seconds=sum(run.seconds for run in runs), held=held, fixed=known)
 
     def coordinates(self, run: compiled.TrainingRun) -> Vector:
-        """QᵀF (nθ,) in whitened outputs, at the end of a run."""
+        """Return QᵀF (nθ,) in whitened outputs, at the end of a run."""
         return np.asarray(run.normal.overlap.values) * self.rms
 
     def _run_held(
@@ -209,7 +260,7 @@ class OneStepTask(LaidRows):
         elimination: Elimination,
         fixed: Fixed,
         regularization: str | float,
-        progress: RunTell,
+        progress: RunProgress,
     ) -> compiled.TrainingRun:
         assert self.bound is not None, "physics alone is not trained one step ahead"
         matrix, target = elimination.hold(fixed)
@@ -217,55 +268,71 @@ class OneStepTask(LaidRows):
         ridge, evidence = ridge_of(regularization)
         if solver.gauss_newton and not structure.from_initial:
             options: dict[str, Any] = {"ridge": ridge, "evidence": evidence, "progress": progress}
-            options["noticeable"] = noticeable_fall(structure, elimination.decoupled, self.problem.samples)
+            options["noticeable"] = noticeable_fall(
+                structure, elimination.decoupled, self.problem.samples
+            )
             if regularization == "ard":
                 options["groups"] = self.bound.groups()
             if self.checkpoints is not None:
-                options["kept"] = self.checkpoints.of_run(np.asarray(w), regularization, structure.name, *hold)
+                options["kept"] = self.checkpoints.of_run(
+                    np.asarray(w), regularization, structure.name, *hold
+                )
             return self._least_squares(solver, w, hold, options)
         check_joint(solver, ridge, evidence, resident=self.engine.resident)
-        physics = Physics.of(self.problem, elimination, fixed, ridge, self.rms, solved=structure.projects)
+        physics = Physics.of(
+            self.problem, elimination, fixed, ridge, self.rms, solved=structure.projects
+        )
         if solver.gauss_newton:
             end = self._joint_least_squares(solver, w, physics, progress)
         else:
             joint = PaperCriterion(self.bound, structure.projects)
             end = solver.minimise(joint, w, self.rows, physics, progress=progress)
-        normal = linearise(OneStep(self.bound), end.w, (self.rows, hold), self._nothing)
+        normal = linearise(OneStep(self.bound), end.w, (self.rows, hold), self._no_overlap)
         coordinates = np.asarray(physics.start + physics.basis @ end.v) * self.rms
-        coefficients = None if structure.projects else self.problem.projection.from_coordinates(coordinates)
+        coefficients = (
+            None if structure.projects else self.problem.projection.from_coordinates(coordinates)
+        )
         effective = float(compiled.effective_weights(normal, ridge))
         return compiled.TrainingRun(
             end.w, normal, ridge, effective, end.iterations, end.ending, end.seconds, coefficients
         )
 
-    def _joint_least_squares(self, solver: Any, w: Any, physics: Physics, progress: RunTell) -> GradientRun:
-        """Levenberg-Marquardt over θ, from θ⁰, and the weights together."""
+    def _joint_least_squares(
+        self, solver: Any, w: Any, physics: Physics, progress: RunProgress
+    ) -> GradientRun:
+        """Run Levenberg-Marquardt over θ, from θ⁰, and the weights together."""
         assert self.bound is not None
         nt = len(physics.outputs)
         nothing = Overlap(np.zeros((nt, nt + self.bound.size)), np.zeros(nt))
         unknowns = np.concatenate([np.zeros(nt), w])
         options: dict[str, Any] = {"samples": self.problem.samples, "progress": progress}
         options["noticeable"] = noticeable_in(self.problem.samples)
-        end = solver.minimise(JointOneStep(self.bound), unknowns, (self.rows, physics), nothing, **options)
+        end = solver.minimise(
+            JointOneStep(self.bound), unknowns, (self.rows, physics), nothing, **options
+        )
         return GradientRun(end.w[:nt], end.w[nt:], end.iterations, end.ending, end.seconds)
 
-    def _least_squares(self, solver: Any, w: Any, hold: Hold, options: dict[str, Any]) -> compiled.TrainingRun:
-        """Levenberg-Marquardt: compiled whole where the rows are in memory, otherwise driven by the host."""
+    def _least_squares(
+        self, solver: Any, w: Any, hold: Hold, options: dict[str, Any]
+    ) -> compiled.TrainingRun:
+        """Run Levenberg-Marquardt, compiled whole for rows in memory, else driven by the host."""
         assert self.bound is not None
         samples = self.problem.samples - len(self.problem.baseline.names)
         if self.engine.resident:
             criterion, arguments = OneStep(self.bound), (self.rows, hold)
-            return solver.minimise(criterion, w, arguments, self._nothing, samples=samples, **options)
-        summed = Summed(self.engine, self.bound, self.rows, hold)
-        return solver.drive(summed, jnp.asarray(w), self._nothing, samples=samples, **options)
+            return solver.minimise(
+                criterion, w, arguments, self._no_overlap, samples=samples, **options
+            )
+        summed = SummedOneStep(self.engine, self.bound, self.rows, hold)
+        return solver.drive(summed, jnp.asarray(w), self._no_overlap, samples=samples, **options)
 
     def loss(self, run: compiled.TrainingRun) -> float:
-        """Mean of squared errors of a run, with each output in its standard deviation."""
+        """Return the mean of squared errors of a run, each output in its standard deviation."""
         return self.mean_square(run.normal.loss)
 
-    def learned(self, run: compiled.TrainingRun) -> Learned:
-        """What a run left."""
-        return Learned(
+    def learned(self, run: compiled.TrainingRun) -> TrainedLearner:
+        """Return the learner as a run left it."""
+        return TrainedLearner(
             bound=self.bound,
             weights=np.asarray(run.w),
             scaling=self.scaling,
@@ -282,11 +349,11 @@ class OneStepTask(LaidRows):
             tail=run.tail,
         )
 
-    def physics_learned(self) -> Learned:
-        """Physics alone, which is solved and not trained."""
+    def physics_learned(self) -> TrainedLearner:
+        """Return the result of physics alone, which is solved and not trained."""
         change = self.problem.projection.to_coordinates
         none = np.zeros(0)
-        return Learned(
+        return TrainedLearner(
             bound=None,
             weights=none,
             scaling=self.scaling,
@@ -295,14 +362,18 @@ class OneStepTask(LaidRows):
             middle=lambda noise: self.middle(none, noise),
         )
 
-    def median(self, members: list[Learned], best: int) -> Learned:
-        """The median of several: `g = φ c̄ + median_i(f_i + φ (c_i − c̄))`, each with its own c_i (F2).
+    def median(self, members: list[TrainedLearner], best: int) -> TrainedLearner:
+        """Return the median `g = φ c̄ + median_i(f_i + φ (c_i − c̄))` of several runs (F2).
 
-        The median is one function of the regressor again, and split like any other. It lacks some statistics: those
-        are taken from the `best` member.
+        Each run has its own c_i.
+
+        The median is one function of the regressor again, and split like any other. It lacks some
+        statistics: those are taken from the `best` member.
         """
         coefficients = [
-            split_theta(Additive(), self.problem, self.share(member).coordinates, fixed=member.fixed or {}).theta
+            split_theta(
+                Additive(), self.problem, self.share(member).coordinates, fixed=member.fixed or {}
+            ).theta
             if member.coefficients is None
             else member.coefficients
             for member in members
@@ -319,13 +390,18 @@ class OneStepTask(LaidRows):
         )
 
     def gram(self, run: compiled.TrainingRun) -> Matrix:
-        """Gram matrix of `[Φ J]` in whitened outputs, from the run's last pass; of a held run without the hold."""
+        """Return the Gram matrix of `[Φ J]` in whitened outputs, from the run's last pass.
+
+        Of a held run without the hold.
+        """
         normal = run.normal
         if run.held:
             nt = len(normal.overlap.values)
             free = Hold(np.zeros((nt, nt)), np.zeros(nt))
             assert self.bound is not None
-            normal = Summed(self.engine, self.bound, self.rows, free)(np.asarray(run.w), normal.overlap)
+            normal = SummedOneStep(self.engine, self.bound, self.rows, free)(
+                np.asarray(run.w), normal.overlap
+            )
         overlap = np.asarray(normal.overlap.jacobian) * self.rms
         to_phi = self.problem.projection.to_coordinates
         inner = np.asarray(normal.hessian) * self.rms**2 + overlap.T @ overlap

@@ -1,4 +1,4 @@
-"""The paper's own criterion: of θ and the learner's weights together, as a value and as normal equations."""
+"""The paper's own criterion over θ and weights together: value and normal equations."""
 
 from __future__ import annotations
 
@@ -17,7 +17,10 @@ from orthaug.physics.problem import Problem
 
 
 class Physics(NamedTuple):
-    """θ as an unknown beside w: its coordinates `q = start + basis v` in whitened rows, and the structure's rows."""
+    """θ as an unknown beside w, by its coordinates, with the structure's rows.
+
+    The coordinates are `q = start + basis v` in whitened rows.
+    """
 
     start: Float[Array, "nt"]
     basis: Float[Array, "nt nt"]
@@ -31,14 +34,26 @@ class Physics(NamedTuple):
 
     @classmethod
     def of(
-        cls, problem: Problem, elimination: Elimination, fixed: Fixed, ridge: float, rms: float, *, solved: bool
+        cls,
+        problem: Problem,
+        elimination: Elimination,
+        fixed: Fixed,
+        ridge: float,
+        rms: float,
+        *,
+        solved: bool,
     ) -> Physics:
-        """θ that starts at θ⁰. A free entry has a column, scaled to the size of a row; a fixed one has none.
+        """Return θ that starts at θ⁰; a free entry has a column, scaled to the size of a row.
 
-        Where θ is `solved` (F1), it stands at its end and has no columns: the learner's path does not depend on it.
+        A fixed one has none.
+
+        Where θ is `solved` (F1), it is at its end and has no columns: the learner's path does
+        not depend on it.
         """
         to_rows = elimination.to_coordinates / rms
-        initial = np.array([fixed.get(i, value) for i, value in enumerate(problem.baseline.initial)])
+        initial = np.array(
+            [fixed.get(i, value) for i, value in enumerate(problem.baseline.initial)]
+        )
         free = np.array([float(i not in fixed) for i in range(len(initial))])
         nt = len(initial)
         scale = free * np.sqrt(problem.count) / np.linalg.norm(to_rows, axis=0) if nt else free
@@ -72,7 +87,10 @@ class PaperCriterion:
     orthogonal: bool
 
     def __call__(
-        self, unknowns: tuple[Float[Array, "nt"], Float[Array, "nw"]], chunks: Chunk, physics: Physics
+        self,
+        unknowns: tuple[Float[Array, "nt"], Float[Array, "nw"]],
+        chunks: Chunk,
+        physics: Physics,
     ) -> Float[Array, ""]:
         v, w = unknowns
         miss = physics.outputs - physics.start - physics.basis @ v  # QᵀY − Rθ
@@ -82,8 +100,10 @@ class PaperCriterion:
         total = total + (miss @ miss if self.orthogonal else jnp.sum((miss - share) ** 2))
         return (total + physics.ridge * (w @ w)) / physics.samples
 
-    def _sums(self, w: Float[Array, "nw"], chunk: Chunk) -> tuple[Float[Array, ""], Float[Array, "nt"]]:
-        """‖P⊥Y − F‖² and QᵀF of one chunk."""
+    def _sums(
+        self, w: Float[Array, "nw"], chunk: Chunk
+    ) -> tuple[Float[Array, ""], Float[Array, "nt"]]:
+        """Return ‖P⊥Y − F‖² and QᵀF of one chunk."""
         row_values = jax.vmap(self.bound.values, in_axes=(None, -1), out_axes=-1)
         values = jnp.sum(chunk.gain * row_values(w, chunk.z), axis=1)
         return jnp.sum((chunk.e - values) ** 2), jnp.einsum("ytm,ym->t", chunk.q, values)
@@ -91,16 +111,25 @@ class PaperCriterion:
 
 @dataclass(frozen=True)
 class JointOneStep:
-    """One-step prediction error `‖Y − Φθ − F‖²` over p = (v, w), θ's unknowns and the weights, as normal equations."""
+    """Normal equations of the one-step error `‖Y − Φθ − F‖²` over p = (v, w).
+
+    v are θ's unknowns, w the weights.
+    """
 
     bound: Bound
 
-    def __call__(self, p: Float[Array, "n"], rows: Chunk, physics: Physics, before: Overlap) -> Normal:
+    def __call__(
+        self, p: Float[Array, "n"], rows: Chunk, physics: Physics, before: Overlap
+    ) -> Normal:
         nt = len(physics.outputs)
         v, w = p[:nt], p[nt:]
-        known = Overlap(before.jacobian[:, nt:], before.values)  # of QᵀJ and QᵀF, subtracted from the rows
+        known = Overlap(
+            before.jacobian[:, nt:], before.values
+        )  # of QᵀJ and QᵀF, subtracted from the rows
         blocks, free = Blocks(self.bound), Hold(jnp.zeros((nt, nt)), jnp.zeros(nt))
-        rest = collect(row_sum(lambda chunk: blocks(chunk, w, known), rows), free, known)  # what is orthogonal to Q
+        rest = collect(
+            row_sum(lambda chunk: blocks(chunk, w, known), rows), free, known
+        )  # what is orthogonal to Q
         share = rest.overlap
         miss = physics.outputs - physics.start - physics.basis @ v - share.values  # Qᵀ(Y − Φθ − F)
         slope = jnp.concatenate([physics.basis, share.jacobian], axis=1)  # Qᵀ of all columns

@@ -1,8 +1,11 @@
-"""Weighted least squares row by row: a triangular factor that each row updates by QR, with exponential forgetting.
+"""Recursive weighted least squares: each row updates a triangular factor by QR.
 
-With weights `w_i = λ^(k−i)` and `e₀ = y − φθ₀` the factor has `[R z]ᵀ[R z] = Σ w [φ e₀]ᵀ[φ e₀]`, so `θ = θ₀ + R⁻¹z`:
-`ΦᵀΦ` is never formed, and rounding adds up against the change of θ only. The covariance needs the squared weights too:
-`Cov θ = s² I⁻¹ M I⁻¹`, `I = RᵀR`, `M = Σ w² φᵀφ`. `Course` keeps what it is made of, row by row, within bounds.
+Old rows are forgotten exponentially.
+
+With weights `w_i = λ^(k−i)` and `e₀ = y − φθ₀` the factor has `[R z]ᵀ[R z] = Σ w [φ e₀]ᵀ[φ e₀]`, so
+`θ = θ₀ + R⁻¹z`: `ΦᵀΦ` is never formed, and rounding adds up against the change of θ only. The
+covariance needs the squared weights too: `Cov θ = s² I⁻¹ M I⁻¹`, `I = RᵀR`, `M = Σ w² φᵀφ`.
+`EstimateHistory` keeps what it is made of, row by row, within bounds.
 """
 
 from __future__ import annotations
@@ -17,21 +20,23 @@ from scipy.linalg.lapack import dtpqrt, dtrtrs  # pyright: ignore[reportAttribut
 from orthaug._base.checks import Matrix, Vector
 from orthaug.inference.covariance import interval
 
-_DETERMINED = 1e-12  # smallest singular value of R with unit columns that tells all of θ
+_DETERMINED = 1e-12  # smallest singular value of R with unit columns that determines all of θ
 _KEPT = 0.1
-"""Share of the information of a whole memory of training rows that forgetting leaves in every direction of θ."""
+"""Share of the information of a whole memory of training rows that forgetting leaves in every
+direction of θ.
+"""
 MOST = 10_000
-"""Rows that a course keeps; of more every second one, every fourth, and so on."""
+"""Rows that a history stores; of more every second one, every fourth, and so on."""
 
 
 @dataclass(eq=False)
 class Recursion:
     """The state of recursive least squares; `update` changes it.
 
-    `factor` (nθ+1, nθ+1) is `[R z]` above a row that is not used; `squared` is M. `level` is s², the mean square of
-    whitened errors, `_errors / _freedom`. `rows` and `rows_squared` are Σw and Σw². Where `floor` is given, directions
-    whose information has come down to `floorᵀ floor` are not forgotten further, so that rows without excitation do not
-    wind the covariance up.
+    `factor` (nθ+1, nθ+1) is `[R z]` above a row that is not used; `squared` is M. `level` is s²,
+    the mean square of whitened errors, `_errors / _freedom`. `rows` and `rows_squared` are Σw and
+    Σw². Where `floor` is given, directions whose information has come down to `floorᵀ floor` are
+    not forgotten further, so that rows without excitation do not wind the covariance up.
     """
 
     factor: Matrix
@@ -39,7 +44,7 @@ class Recursion:
     shape: Matrix
     """Covariance of whitened errors (ny, ny), with a mean of 1 on its diagonal."""
     start: Vector
-    """θ₀ (nθ,), which stays where rows do not tell θ."""
+    """θ₀ (nθ,), which stays where rows do not determine θ."""
     forgetting: float
     floor: Matrix | None
     errors: float
@@ -75,7 +80,10 @@ class Recursion:
         return self.rows**2 / self.rows_squared if self.rows_squared > 0 else 0.0
 
     def update(self, phi: Float[np.ndarray, "ny nt"], target: Vector) -> tuple[Vector, float]:
-        """Add a row of whitened outputs: the errors (ny,) of θ before it, and their variance in units of s²."""
+        """Add a row of whitened outputs.
+
+        Errors (ny,) are those of θ before the row, `variance` theirs in units of s².
+        """
         error = target - phi @ self.theta
         self._forget()
         spread = self._spread(phi)
@@ -91,7 +99,7 @@ class Recursion:
         return error, spread
 
     def _spread(self, phi: Float[np.ndarray, "ny nt"]) -> float:
-        """1 + φ Cov(θ) φᵀ / s² of a row before it is added; 1 where θ is not told yet."""
+        """Return 1 + φ Cov(θ) φᵀ / s² of a row before it is added; 1 while θ is undetermined."""
         if not self.determined or not phi.size:
             return 1.0
         inner = dtrtrs(self.factor[:-1, :-1], phi.T, trans=1)[0]
@@ -108,7 +116,9 @@ class Recursion:
         scaled = r / np.where(norms > 0, norms, 1.0)
         size = np.linalg.svd(scaled, compute_uv=False)
         self.determined = bool(size[-1] > _DETERMINED * size[0])
-        change = np.linalg.lstsq(scaled, z, rcond=_DETERMINED)[0]  # the least that explains the rows
+        change = np.linalg.lstsq(scaled, z, rcond=_DETERMINED)[
+            0
+        ]  # the least that explains the rows
         return self.start + change / np.where(norms > 0, norms, 1.0)
 
     def _forget(self) -> None:
@@ -126,7 +136,7 @@ class Recursion:
         self.squared *= self.forgetting**2
 
     def _keep(self) -> bool:
-        """Forget only what stands above the floor, where anything has come down to it."""
+        """Forget only directions above the floor, once one has come down to it."""
         assert self.floor is not None
         r = self.factor[:-1, :-1]
         u, size, _ = np.linalg.svd(np.linalg.solve(self.floor.T, r.T).T)
@@ -145,7 +155,7 @@ class Recursion:
 
 
 def upright(r: Float[np.ndarray, "*k n n"]) -> Float[np.ndarray, "*k n n"]:
-    """Triangular factors with positive diagonals, which makes them unique."""
+    """Return triangular factors with positive diagonals, which makes them unique."""
     sign = np.where(np.diagonal(r, axis1=-2, axis2=-1) < 0, -1.0, 1.0)
     return r * sign[..., None]
 
@@ -161,14 +171,18 @@ def started(
     *,
     empty: bool,
 ) -> Recursion:
-    """The state after the training rows in whitened outputs, which count as one memory at most.
+    """Return the state after the training rows, which count as one memory at most.
+
+    In whitened outputs.
 
     Args:
         level, freedom: s² and its degrees of freedom over these rows.
         empty: begin without them; they still say what the floor is.
     """
     count, ny, nt = phi.shape
-    whole = np.linalg.qr(np.column_stack([phi.reshape(-1, nt), (target - phi @ theta).ravel()]), mode="r")
+    whole = np.linalg.qr(
+        np.column_stack([phi.reshape(-1, nt), (target - phi @ theta).ravel()]), mode="r"
+    )
     factor = np.zeros((nt + 1, nt + 1))
     factor[: len(whole)] = whole
     memory = 1 / (1 - forgetting) if forgetting < 1 else np.inf
@@ -191,16 +205,18 @@ def started(
 
 
 def squares(phi: Float[np.ndarray, "N ny nt"], shape: Matrix) -> Matrix:
-    """M of rows of equal weight (nθ, nθ)."""
-    return phi[:, 0].T @ phi[:, 0] if len(shape) == 1 else np.einsum("kit,ij,kjs->ts", phi, shape, phi)
+    """Return M of rows of equal weight (nθ, nθ)."""
+    return (
+        phi[:, 0].T @ phi[:, 0] if len(shape) == 1 else np.einsum("kit,ij,kjs->ts", phi, shape, phi)
+    )
 
 
 @dataclass(eq=False)
-class Course:
+class EstimateHistory:
     """A row of numbers for each row of data that was used.
 
-    Columns: the row's number, the level of the alarm (above 1 it stands), s², degrees of freedom, whether θ is told,
-    the residuals (ny), θ (nθ), R and M (nθ² each).
+    Columns: the row's number, the level of the alarm (above 1 it is raised), s², degrees of
+    freedom, whether θ is determined, the residuals (ny), θ (nθ), R and M (nθ² each).
     """
 
     ny: int
@@ -210,11 +226,13 @@ class Course:
 
     @property
     def rows(self) -> Matrix:
-        """All that is kept (k, columns)."""
+        """All stored rows (k, columns)."""
         return np.reshape(self._lines, (-1, 5 + self.ny + self.nt + 2 * self.nt**2))
 
-    def line(self, row: int, level: float, freedom: float, residual: Vector, recursion: Recursion) -> Vector:
-        """What is kept of a row."""
+    def line(
+        self, row: int, level: float, freedom: float, residual: Vector, recursion: Recursion
+    ) -> Vector:
+        """Return the stored numbers of a row."""
         line = np.empty(5 + self.ny + self.nt + 2 * self.nt**2)
         first, second = 5 + self.ny, 5 + self.ny + self.nt
         line[:5] = row, level, recursion.level, freedom, recursion.determined
@@ -225,7 +243,7 @@ class Course:
         return line
 
     def add(self, line: Vector) -> None:
-        """Keep one more."""
+        """Store the numbers of one more row."""
         if int(line[0]) % self.stride:
             return
         self._lines.append(line)
@@ -247,12 +265,14 @@ class Course:
         return self.rows[:, 1]
 
     def covariances(self, inflation: Matrix | None) -> Float[np.ndarray, "k nt nt"]:
-        """Cov θ of every row; NaN where there is none."""
+        """Return Cov θ of every row; NaN where there is none."""
         squares = self.rows[:, 5 + self.ny + self.nt :].reshape(-1, 2, self.nt, self.nt)
-        return covariances(squares[:, 0], squares[:, 1], self.rows[:, 2], self.rows[:, 4] > 0, inflation)
+        return covariances(
+            squares[:, 0], squares[:, 1], self.rows[:, 2], self.rows[:, 4] > 0, inflation
+        )
 
     def intervals(self, inflation: Matrix | None) -> Float[np.ndarray, "k nt 2"]:
-        """95 % intervals of θ."""
+        """Return 95 % intervals of θ."""
         std = np.sqrt(np.diagonal(self.covariances(inflation), axis1=1, axis2=2))
         pairs = zip(self.theta, std, self.rows[:, 3], strict=True)
         return np.array([interval(*pair) for pair in pairs]).reshape(-1, self.nt, 2)
@@ -262,22 +282,30 @@ def covariances(
     r: Float[np.ndarray, "k nt nt"],
     squared: Float[np.ndarray, "k nt nt"],
     level: Vector,
-    told: Bool[np.ndarray, "k"],
+    determined: Bool[np.ndarray, "k"],
     inflation: Matrix | None,
 ) -> Float[np.ndarray, "k nt nt"]:
-    """`s² S G Sᵀ` with `S Sᵀ = I⁻¹ M I⁻¹`: G, the inflation, is by how much the fit's own covariance exceeds that."""
+    """Return `s² S G Sᵀ` with `S Sᵀ = I⁻¹ M I⁻¹`.
+
+    G, the inflation, is the factor by which the fit's own covariance exceeds that.
+    """
     result = np.full(r.shape, np.nan)
-    if inflation is None or not told.any():
+    if inflation is None or not determined.any():
         return result
-    half = _half(r[told], squared[told])
-    result[told] = level[told, None, None] * (half @ inflation @ np.swapaxes(half, 1, 2))
+    half = _half(r[determined], squared[determined])
+    result[determined] = level[determined, None, None] * (
+        half @ inflation @ np.swapaxes(half, 1, 2)
+    )
     return result
 
 
-def inflation_of(r: Matrix, squared: Matrix, level: float, covariance: Matrix | None) -> Matrix | None:
-    """G of a fit: its covariance in units of `s² I⁻¹ M I⁻¹`; None where it has none.
+def inflation_of(
+    r: Matrix, squared: Matrix, level: float, covariance: Matrix | None
+) -> Matrix | None:
+    """Return G of a fit: its covariance in units of `s² I⁻¹ M I⁻¹`; None without one.
 
-    It holds what else makes θ uncertain: the learner beside it, or the colour of the errors (`fit.robust()`).
+    It holds what else makes θ uncertain: the learner beside it, or the colour of the errors
+    (`fit.robust()`).
     """
     if covariance is None or not np.isfinite(covariance).all() or not level > 0:
         return None
@@ -285,10 +313,14 @@ def inflation_of(r: Matrix, squared: Matrix, level: float, covariance: Matrix | 
     return np.linalg.solve(half, np.linalg.solve(half, covariance).T) / level
 
 
-def _half(r: Float[np.ndarray, "k nt nt"], squared: Float[np.ndarray, "k nt nt"]) -> Float[np.ndarray, "k nt nt"]:
-    """`S = R⁻¹ (R⁻ᵀ M R⁻¹)^½` of factors that are made unique by a positive diagonal."""
+def _half(
+    r: Float[np.ndarray, "k nt nt"], squared: Float[np.ndarray, "k nt nt"]
+) -> Float[np.ndarray, "k nt nt"]:
+    """Return `S = R⁻¹ (R⁻ᵀ M R⁻¹)^½` of factors made unique by a positive diagonal."""
     r = upright(r)
     unit = np.linalg.norm(r, axis=1, keepdims=True)  # of the columns
     inverse = np.swapaxes(unit, 1, 2) ** -1 * np.linalg.inv(r / unit)
     values, vectors = np.linalg.eigh(np.swapaxes(inverse, 1, 2) @ squared @ inverse)
-    return inverse @ ((vectors * np.sqrt(np.maximum(values, 0.0))[:, None]) @ np.swapaxes(vectors, 1, 2))
+    return inverse @ (
+        (vectors * np.sqrt(np.maximum(values, 0.0))[:, None]) @ np.swapaxes(vectors, 1, 2)
+    )

@@ -1,8 +1,8 @@
-"""θ followed online: recursive least squares with the learner fixed, intervals, and an alarm.
+"""Recursive estimation of θ with the learner fixed: intervals and an alarm.
 
-With f and θ_aux fixed, the fitted model is linear in θ: `y − known − (f − φθ_aux) = φθ + e`. Over the training rows its
-least-squares solution is the fit's θ, whatever the structure's split: `Φ⁺(Y − F) + θ_aux = c + θ_aux` (F1, F2). New
-rows go on from there.
+With f and θ_aux fixed, the fitted model is linear in θ: `y − known − (f − φθ_aux) = φθ + e`. Over
+the training rows its least-squares solution is the fit's θ, whatever the structure's split: `Φ⁺(Y −
+F) + θ_aux = c + θ_aux` (F1, F2). New rows go on from there.
 """
 
 from __future__ import annotations
@@ -15,16 +15,31 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from orthaug._base.checks import Matrix, Vector, check_choice, check_count, check_number, check_type, is_number
+from orthaug._base.checks import (
+    Matrix,
+    Vector,
+    check_choice,
+    check_count,
+    check_number,
+    check_type,
+    is_number,
+)
 from orthaug._base.errors import InputError, shown
 from orthaug._base.jax import jax
 from orthaug._base.lines import percent
 from orthaug.data.record import Record
 from orthaug.fitting import recursive_storage
 from orthaug.fitting.estimates import Estimate, order_of, parameter_frame, parameter_lines
-from orthaug.fitting.recursion import Course, covariances
-from orthaug.fitting.recursive_rows import Lagging, Whitened, begin, joined_rows, trained, whitened_rows
-from orthaug.fitting.residual_band import Watch
+from orthaug.fitting.recursion import EstimateHistory, covariances
+from orthaug.fitting.recursive_rows import (
+    RegressorStream,
+    WhitenedRows,
+    begin,
+    joined_rows,
+    trained,
+    whitened_rows,
+)
+from orthaug.fitting.residual_band import ResidualMonitor
 from orthaug.inference.covariance import interval
 from orthaug.inference.physical import PhysicalEstimate, solve
 from orthaug.models.learners import Learner
@@ -42,7 +57,7 @@ _LEAST_FACTOR = 0.3  # of forgetting: a memory of one row
 
 
 class Alarm(NamedTuple):
-    """The residual has left its band at `row` of all rows handed in, `time` [s] after the first."""
+    """An alarm: residuals left their band at `row` of all rows, `time` [s] after the first."""
 
     row: int
     time: float
@@ -52,18 +67,21 @@ class Alarm(NamedTuple):
 
 
 class Recursive:
-    """A fitted model whose θ follows new rows, the learner fixed.
+    """A fitted model whose θ is updated by new rows, the learner fixed.
 
     Args:
         fit: of `estimate`, one step ahead, or a saved model.
         training: the record that a saved model was trained on; an `Estimate` knows it.
-        forgetting: λ in (0, 1], the weight of a row against the next one; 1 (default) forgets nothing.
+        forgetting: λ in (0, 1], the weight of a row against the next one; 1 (default) forgets
+            nothing.
         memory: the same in seconds, `λ = exp(−Ts / memory)`.
-        start: "fit" begins with the training rows, at most as many as one memory holds; "empty" without them.
+        start: "fit" begins with the training rows, at most as many as one memory holds; "empty"
+            without them.
         quiet: rows between false alarms, at least on average, while nothing changes.
 
     Raises:
-        InputError: a motion, a fit of the free run, a θ that is not the least squares of its rows (a bound, a penalty).
+        InputError: a motion, a fit of the free run, a θ that is not the least squares of its rows
+            (a bound, a penalty).
 
     Examples:
         >>> import numpy as np
@@ -72,7 +90,8 @@ class Recursive:
         >>> u = np.sin(np.arange(300.0) ** 1.1)
         >>> noise = 0.1 * np.cos(37 * np.arange(300.0) ** 1.3)
         >>> record = Record.from_arrays(u, 2 * u + noise)
-        >>> online = Recursive(estimate(record, Baseline.from_terms([Term("gain", "u[k]")]), learner=None), memory=50)
+        >>> fit = estimate(record, Baseline.from_terms([Term("gain", "u[k]")]), learner=None)
+        >>> online = Recursive(fit, memory=50)
         >>> alarms = online.update(u=u[:200], y=2.4 * u[:200] + noise[:200])
         >>> f"{online.theta[0]:.1f}"
         '2.4'
@@ -94,21 +113,30 @@ class Recursive:
         began = trained(fit, training)
         factor = forgetting_factor(forgetting, memory, began.model.sampling_time)
         recursion, reference, inflation = begin(began, factor, quiet, empty=start == "empty")
-        self._set(began.model, recursion, Watch(reference), inflation, began.used)
+        self._set(began.model, recursion, ResidualMonitor(reference), inflation, began.used)
 
-    def _set(self, model: Model, recursion: Any, watch: Watch, inflation: Matrix | None, used: float) -> None:
+    def _set(
+        self,
+        model: Model,
+        recursion: Any,
+        watch: ResidualMonitor,
+        inflation: Matrix | None,
+        used: float,
+    ) -> None:
         self._fitted, self._recursion, self._watch = model, recursion, watch
         self._inflation, self._used = inflation, used
         self._numbers = jax.device_put(model.numbers)
-        self._lagging = Lagging(model)
+        self._lagging = RegressorStream(model)
         self._tail = self._lagging.nothing
-        self._course = Course(len(model.outputs), len(model.theta))
+        self._rows_kept = EstimateHistory(len(model.outputs), len(model.theta))
         self.rows = self.outside = 0
         self.alarms: tuple[Alarm, ...] = ()
 
     @classmethod
-    def load(cls, folder: str | Path, *, baseline: Baseline | None = None, learner: Learner | None = None) -> Recursive:
-        """Go on from where `save` was called.
+    def load(
+        cls, folder: str | Path, *, baseline: Baseline | None = None, learner: Learner | None = None
+    ) -> Recursive:
+        """Return the estimate that `save` wrote, to go on from there.
 
         Args:
             baseline, learner: the Python callables again, where the model had such.
@@ -119,7 +147,7 @@ class Recursive:
         kept = recursive_storage.load(folder, baseline, learner)
         one = cls.__new__(cls)
         one._set(kept.model, kept.recursion, kept.watch, kept.inflation, kept.used)
-        one._tail, one._course, one.rows = kept.tail, kept.course, kept.rows
+        one._tail, one._rows_kept, one.rows = kept.tail, kept.kept_rows, kept.rows
         one.outside = kept.outside
         one.alarms = tuple(Alarm(int(row), row * kept.model.sampling_time) for row in kept.alarms)
         return one
@@ -136,27 +164,37 @@ class Recursive:
         """Write the files of `save` into an existing folder."""
         recursive_storage.write(self._kept(), folder)
 
-    def _kept(self) -> recursive_storage.Kept:
+    def _kept(self) -> recursive_storage.RecursiveState:
         alarms = np.array([alarm.row for alarm in self.alarms], dtype=float)
-        state = (self._fitted, self._recursion, self._watch, self._inflation, self._used, self._tail, self._course)
-        return recursive_storage.Kept(*state, self.rows, self.outside, alarms)
+        state = (
+            self._fitted,
+            self._recursion,
+            self._watch,
+            self._inflation,
+            self._used,
+            self._tail,
+            self._rows_kept,
+        )
+        return recursive_storage.RecursiveState(*state, self.rows, self.outside, alarms)
 
     def update(
         self, record: Record | None = None, *, u: Any = None, y: Any = None, gap: bool = False
     ) -> Sequence[Alarm]:
-        """Follow new rows, one or many; they follow on the last ones.
+        """Update θ by new rows, one or many, that follow on the last ones.
 
         Args:
             record: with the model's channels. Every experiment after the first begins after a gap.
-            u, y: instead of a record inputs and outputs, one row or many; NaN is a missing sample. Rows that read one
-                are left out.
-            gap: whether these rows do not follow on the last ones: then the first lags are history only.
+            u, y: instead of a record inputs and outputs, one row or many; NaN is a missing sample.
+                Rows that read one are left out.
+            gap: whether these rows do not follow on the last ones: then the first lags are history
+                only.
 
         Returns:
             The alarms that these rows raised.
 
         Raises:
-            InputError: other channels or sampling time, values that are infinite; nothing is changed then.
+            InputError: other channels or sampling time, values that are infinite; nothing is
+                changed then.
         """
         check_type(gap, bool, "gap", "true or false")
         begins: list[bool] = []
@@ -164,20 +202,22 @@ class Recursive:
         tail = self._tail
         for i, rows in enumerate(self._parts(record, u, y)):
             begins.append(gap or i > 0)
-            x, complete, tail = self._lagging.regressors(self._lagging.nothing if begins[-1] else tail, rows)
+            x, complete, tail = self._lagging.regressors(
+                self._lagging.nothing if begins[-1] else tail, rows
+            )
             prepared.append(self._whitened(x, complete, rows))
-        told = []
+        alarms = []
         for begun, (used, whitened, count) in zip(begins, prepared, strict=True):
             if begun:
                 self._watch.gap()
-            told += self._follow(used, whitened)
+            alarms += self._follow(used, whitened)
             self.rows += count
         self._tail = tail
-        self.alarms = (*self.alarms, *told)
-        return told
+        self.alarms = (*self.alarms, *alarms)
+        return alarms
 
     def _parts(self, record: Record | None, u: Any, y: Any) -> list[Matrix]:
-        """Rows (n, ny + nu) without gaps among them."""
+        """Yield rows (n, ny + nu) without gaps among them."""
         model = self._fitted
         if record is None:
             return [joined_rows(u, y, len(model.inputs), len(model.outputs))]
@@ -186,19 +226,21 @@ class Recursive:
         record = model.fitting(record, need_outputs=True)
         return [np.concatenate([e.outputs, e.inputs], axis=1) for e in record.experiments]
 
-    def _whitened(self, x: Matrix, complete: Any, rows: Matrix) -> tuple[Any, Whitened | None, int]:
-        """Which rows are used, and what θ is least squares of in them."""
+    def _whitened(
+        self, x: Matrix, complete: Any, rows: Matrix
+    ) -> tuple[Any, WhitenedRows | None, int]:
+        """Return the usable rows and their least-squares problem in θ."""
         used = np.flatnonzero(complete)
         if not len(used):
             return used, None, len(rows)
         y = rows[used, : len(self._fitted.outputs)]
         return used, whitened_rows(self._fitted, x[used], y, self._numbers), len(rows)
 
-    def _follow(self, used: Any, whitened: Whitened | None) -> list[Alarm]:
-        recursion, watch, course = self._recursion, self._watch, self._course
-        told: list[Alarm] = []
+    def _follow(self, used: Any, whitened: WhitenedRows | None) -> list[Alarm]:
+        recursion, watch, kept_rows = self._recursion, self._watch, self._rows_kept
+        alarms: list[Alarm] = []
         if whitened is None:
-            return told
+            return alarms
         for i, (k, phi, target, inside) in enumerate(zip(used, *whitened, strict=True)):
             if i and k != used[i - 1] + 1:
                 watch.gap()
@@ -208,17 +250,22 @@ class Recursive:
                 watch.skip()
                 self.outside += 1
             elif watch.step(error, spread):
-                told.append(Alarm(row, row * self._fitted.sampling_time))
-            if row % course.stride == 0:
-                course.add(course.line(row, watch.level, self._freedom, error, recursion))
-        return told
+                alarms.append(Alarm(row, row * self._fitted.sampling_time))
+            if row % kept_rows.stride == 0:
+                kept_rows.add(kept_rows.line(row, watch.level, self._freedom, error, recursion))
+        return alarms
 
     @property
     def _freedom(self) -> float:
-        """Degrees of freedom of s²: effective rows less what parameters and, as long as its rows count, learner use."""
+        """Degrees of freedom of s²: effective rows less those used by parameters and learner.
+
+        The learner's count as long as its training rows do.
+        """
         recursion = self._recursion
         used = self._used * recursion.oldest
-        return max(recursion.effective_rows * len(self._fitted.outputs) - len(self.theta) - used, 1.0)
+        return max(
+            recursion.effective_rows * len(self._fitted.outputs) - len(self.theta) - used, 1.0
+        )
 
     @property
     def theta(self) -> Vector:
@@ -227,12 +274,17 @@ class Recursive:
 
     @property
     def covariance(self) -> Matrix | None:
-        """Cov θ now (nθ, nθ): of noise, the learner fixed; None where the fit has none or the rows do not tell θ."""
+        """Cov θ now (nθ, nθ): of noise, the learner fixed.
+
+        None where the fit has none or the rows do not determine θ.
+        """
         recursion = self._recursion
         if self._inflation is None or not recursion.determined:
             return None
-        level, told = np.array([recursion.level]), np.array([True])
-        return covariances(recursion.factor_now[None], recursion.squared[None], level, told, self._inflation)[0]
+        level, determined = np.array([recursion.level]), np.array([True])
+        return covariances(
+            recursion.factor_now[None], recursion.squared[None], level, determined, self._inflation
+        )[0]
 
     @property
     def std(self) -> Vector | None:
@@ -248,7 +300,7 @@ class Recursive:
 
     @property
     def alarmed(self) -> bool:
-        """Whether the residual is out of its band now."""
+        """True while the residual is out of its band."""
         return self.alarm_level > 1
 
     @property
@@ -268,58 +320,77 @@ class Recursive:
 
     @property
     def effective_rows(self) -> float:
-        """As many rows of equal weight say as much as the weighted ones."""
+        """The number of equally weighted rows with the same information."""
         return self._recursion.effective_rows
 
     @property
     def model(self) -> Model:
-        """The fitted model with θ of now, to simulate and predict with; its statistics were those of training."""
+        """The fitted model with θ of now, to simulate and predict with.
+
+        Its statistics were those of training.
+        """
         numbers = self._fitted.numbers._replace(theta=self.theta)
         return replace(self._fitted, numbers=numbers, statistics=Statistics())
 
     @property
     def parameters(self) -> pd.DataFrame:
         """Table with a row per parameter: unit, initial, value now, std, and the 95 % interval."""
-        return parameter_frame(self._fitted.form.baseline.parameters, self.theta, self.std, self.interval)
+        return parameter_frame(
+            self._fitted.form.baseline.parameters, self.theta, self.std, self.interval
+        )
 
     @property
     def history(self) -> pd.DataFrame:
-        """A row per row that was used: time [s], residual of each output, each θ with its interval, alarm level.
+        """A row per row that was used.
 
-        `alarm` is the largest sum over its limit: above 1 the residual is out of its band. Of more than 10 000 rows
-        every second one is kept, every fourth, and so on.
+        Time [s], residual of each output, each θ with its interval, alarm level.
+
+        `alarm` is the largest sum over its limit: above 1 the residual is out of its band. Of more
+        than 10 000 rows every second one is kept, every fourth, and so on.
         """
         import pandas as pd
 
-        course, model = self._course, self._fitted
-        rows = course.rows
-        residual = course.residual @ np.linalg.inv(model.weight).T
-        ci = course.intervals(self._inflation)
+        kept_rows, model = self._rows_kept, self._fitted
+        rows = kept_rows.rows
+        residual = kept_rows.residual @ np.linalg.inv(model.weight).T
+        ci = kept_rows.intervals(self._inflation)
         columns: dict[str, Any] = {"time": rows[:, 0] * model.sampling_time}
         columns |= {f"residual_{c.name}": residual[:, i] for i, c in enumerate(model.outputs)}
         for i, name in enumerate(model.form.baseline.names):
-            columns |= {name: course.theta[:, i], f"{name}_low": ci[:, i, 0], f"{name}_high": ci[:, i, 1]}
-        columns["alarm"] = course.alarm
+            columns |= {
+                name: kept_rows.theta[:, i],
+                f"{name}_low": ci[:, i, 0],
+                f"{name}_high": ci[:, i, 1],
+            }
+        columns["alarm"] = kept_rows.alarm
         return pd.DataFrame(columns, index=pd.Index(rows[:, 0].astype(int), name="row"))
 
     def physical(self, physics: PhysicsMap) -> PhysicalEstimate:
-        """The physical parameters that θ is made of now, with intervals by the delta method."""
+        """Return the physical parameters of the present θ, with intervals (delta method)."""
         order = self._in_order_of(physics)
         covariance = self.covariance
         covariance = None if covariance is None else covariance[np.ix_(order, order)]
         return solve(physics, self.theta[order], covariance, freedom=self._freedom)
 
     def physical_history(self, physics: PhysicsMap, points: int = 100) -> pd.DataFrame:
-        """The physical parameters at some instants of `history`, the last one among them.
+        """Return the physical parameters at some instants of `history` and at the last.
 
         Args:
             points: how many, at most.
         """
         import pandas as pd
 
-        order, course = self._in_order_of(physics), self._course
-        rows, theta, spread = course.rows, course.theta, course.covariances(self._inflation)
-        places = np.linspace(len(rows) - 1, 0, check_count(points, "points")) if len(rows) else np.zeros(0)
+        order, kept_rows = self._in_order_of(physics), self._rows_kept
+        rows, theta, spread = (
+            kept_rows.rows,
+            kept_rows.theta,
+            kept_rows.covariances(self._inflation),
+        )
+        places = (
+            np.linspace(len(rows) - 1, 0, check_count(points, "points"))
+            if len(rows)
+            else np.zeros(0)
+        )
         chosen = np.unique(places.round().astype(int))
         lines = []
         for k in chosen:
@@ -339,33 +410,48 @@ class Recursive:
     def __repr__(self) -> str:
         names = self._fitted.form.baseline.names
         values = ", ".join(f"{n} = {v:.6g}" for n, v in zip(names, self.theta, strict=True))
-        return f"Recursive({self.rows} rows, forgetting {self.forgetting:g}, {len(self.alarms)} alarms, {values})"
+        return (
+            f"Recursive({self.rows} rows, forgetting {self.forgetting:g}, {len(self.alarms)} "
+            f"alarms, {values})"
+        )
 
     def summary(self) -> str:
-        """A page of text: rows, memory, parameters, alarms."""
+        """Return a page of text: rows, memory, parameters, alarms."""
         step = self._fitted.sampling_time
-        memory = "everything" if self.forgetting == 1 else f"{-step / math.log(self.forgetting):.4g} s"
+        memory = (
+            "everything" if self.forgetting == 1 else f"{-step / math.log(self.forgetting):.4g} s"
+        )
+        alarms = "; ".join(map(str, self.alarms)) or "none"
         lines = [
             f"rows        {self.rows}, {self.rows * step:g} s",
-            f"memory      {memory} (forgetting {self.forgetting:.8g}), worth {self.effective_rows:.0f} rows",
-            f"alarms      {'; '.join(map(str, self.alarms)) or 'none'}{' (it stands)' if self.alarmed else ''}",
+            f"memory      {memory} (forgetting {self.forgetting:.8g}), worth "
+            f"{self.effective_rows:.0f} rows",
+            f"alarms      {alarms}{' (still raised)' if self.alarmed else ''}",
         ]
         if self.outside:
             lines.append(f"outside     {outside_text(self.outside, self.rows)}")
         if self.std is None:
-            lines.append("intervals   none: the fit has no standard errors, or the rows do not tell θ yet")
-        rows = parameter_lines(self._fitted.form.baseline.parameters, self.theta, self.std, self.interval)
+            lines.append(
+                "intervals   none: the fit has no standard errors, or the rows do not determine "
+                "θ yet"
+            )
+        rows = parameter_lines(
+            self._fitted.form.baseline.parameters, self.theta, self.std, self.interval
+        )
         return "\n".join([*lines, "", *rows])
 
 
 def outside_text(outside: int, rows: int) -> str:
-    """How many rows the learner extrapolates on."""
+    """Return a sentence on the number of rows on which the learner extrapolates."""
     share = f"{percent(outside / rows)} of the rows"
-    return f"the learner's inputs leave those of training on {share}: it extrapolates there, which raises no alarm"
+    return (
+        f"the learner's inputs leave their training range on {share}: it extrapolates there, "
+        "without an alarm"
+    )
 
 
 def forgetting_factor(forgetting: Any, memory: Any, sampling_time: float) -> float:
-    """λ of either.
+    """Return λ from either a factor or a memory.
 
     Raises:
         InputError: both given, or values that are none.
@@ -375,10 +461,15 @@ def forgetting_factor(forgetting: Any, memory: Any, sampling_time: float) -> flo
     if memory is not None:
         seconds = check_number(memory, "memory", positive=True)
         if seconds < sampling_time:
-            raise InputError(f"`memory` must be at least one sampling time, {sampling_time:g} s; got {shown(memory)}.")
+            raise InputError(
+                f"`memory` must be at least one sampling time, {sampling_time:g} s; got "
+                f"{shown(memory)}."
+            )
         return math.exp(-sampling_time / seconds)
     if forgetting is None:
         return 1.0
     if not is_number(forgetting) or not _LEAST_FACTOR <= forgetting <= 1:
-        raise InputError(f"`forgetting` must lie between {_LEAST_FACTOR:g} and 1; got {shown(forgetting)}.")
+        raise InputError(
+            f"`forgetting` must lie between {_LEAST_FACTOR:g} and 1; got {shown(forgetting)}."
+        )
     return float(forgetting)

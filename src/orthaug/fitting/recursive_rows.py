@@ -1,4 +1,4 @@
-"""Rows of a fitted lagged model, learner fixed: new ones across calls, and those of training to start from."""
+"""Rows of a fitted lagged model with its learner fixed: new ones, and those of training."""
 
 from __future__ import annotations
 
@@ -31,8 +31,11 @@ _RIM = 1e-9  # the largest of training is no extrapolation
 
 
 @partial(jax.jit, static_argnames="form")
-def _evaluated(form: Lagged, numbers: Numbers, x: Float[Array, "m nx"]) -> Float[Array, "m ny ntp"]:
-    """`[φ, known + f − φθ_aux]` of every row, and the largest of its scaled features: 1 at the rim of training."""
+def _evaluate(form: Lagged, numbers: Numbers, x: Float[Array, "m nx"]) -> Float[Array, "m ny ntp"]:
+    """Return `[φ, known + f − φθ_aux]` of every row, and the largest of its scaled features.
+
+    That is 1 at the limit of the training data.
+    """
 
     def one(row: Any) -> Any:
         phi = form.baseline.phi(row, form.layout, form.outputs, jnp)
@@ -47,8 +50,10 @@ def _evaluated(form: Lagged, numbers: Numbers, x: Float[Array, "m nx"]) -> Float
     return jax.vmap(one)(x)
 
 
-class Whitened(NamedTuple):
-    """φ (n, ny, nθ) and `y − known − (f − φθ_aux)` (n, ny) in whitened outputs: what θ is least squares of.
+class WhitenedRows(NamedTuple):
+    """φ (n, ny, nθ) and `y − known − (f − φθ_aux)` (n, ny) in whitened outputs.
+
+    θ is the least squares of these.
 
     `inside` (n,) is where the learner's features lie within those of training.
     """
@@ -58,8 +63,10 @@ class Whitened(NamedTuple):
     inside: Bool[np.ndarray, "n"]
 
 
-def whitened_rows(model: Model, x: Matrix, y: Matrix, numbers: Numbers | None = None) -> Whitened:
-    """Rows of measured regressors x (n, nx) and outputs y (n, ny).
+def whitened_rows(
+    model: Model, x: Matrix, y: Matrix, numbers: Numbers | None = None
+) -> WhitenedRows:
+    """Return rows of measured regressors x (n, nx) and outputs y (n, ny), whitened.
 
     Args:
         numbers: the model's, where JAX has them already: a call with few rows is faster.
@@ -71,28 +78,41 @@ def whitened_rows(model: Model, x: Matrix, y: Matrix, numbers: Numbers | None = 
     size = 1 if len(x) == 1 else _BATCH
     for begin in range(0, len(x), size):
         rows = x[begin : begin + size]
-        padded = np.concatenate([rows, np.repeat(rows[-1:], size - len(rows), axis=0)]) if len(rows) < size else rows
-        pieces.append(np.asarray(_evaluated(model.form, numbers, padded))[: len(rows)])
+        padded = (
+            np.concatenate([rows, np.repeat(rows[-1:], size - len(rows), axis=0)])
+            if len(rows) < size
+            else rows
+        )
+        pieces.append(np.asarray(_evaluate(model.form, numbers, padded))[: len(rows)])
     values = np.concatenate(pieces) if len(pieces) > 1 else pieces[0]
     bad = ~np.isfinite(values).all(axis=(1, 2))
     if bad.any():
         row = x[int(np.argmax(bad))]
-        at = ", ".join(f"{lag} = {value:.6g}" for lag, value in zip(model.form.layout, row, strict=True))
-        raise InputError(f"physics or learner has no finite value at {at}; give NaN for such a row, or mend the data.")
+        at = ", ".join(
+            f"{lag} = {value:.6g}" for lag, value in zip(model.form.layout, row, strict=True)
+        )
+        raise InputError(
+            f"physics or learner has no finite value at {at}; give NaN for such a row, or "
+            "correct the data."
+        )
     inside = np.asarray(values[:, 0, -1] <= 1 + _RIM)
-    return Whitened(times(model.weight, values[..., :-2]), times(model.weight, y - values[..., -2]), inside)
+    return WhitenedRows(
+        times(model.weight, values[..., :-2]), times(model.weight, y - values[..., -2]), inside
+    )
 
 
 @dataclass(frozen=True, eq=False)
-class Lagging:
-    """Regressors of rows that are handed in a few at a time, from the rows before them."""
+class RegressorStream:
+    """Regressors of rows that arrive a few at a time, from the rows before them."""
 
     model: Model
 
     @cached_property
     def nothing(self) -> Matrix:
         """The tail (largest lag, ny + nu) behind which there is a gap."""
-        return np.full((self.model.form.first_row, len(self.model.outputs) + len(self.model.inputs)), np.nan)
+        return np.full(
+            (self.model.form.first_row, len(self.model.outputs) + len(self.model.inputs)), np.nan
+        )
 
     @cached_property
     def _read(self) -> tuple[Int[np.ndarray, "nx"], Int[np.ndarray, "nx"]]:
@@ -103,8 +123,10 @@ class Lagging:
             [names.index(e.channel) for e in layout], dtype=int
         )
 
-    def regressors(self, tail: Matrix, rows: Matrix) -> tuple[Matrix, Bool[np.ndarray, "n"], Matrix]:
-        """x (n, nx) of new rows (n, ny + nu), which of them are complete, and the tail after them."""
+    def regressors(
+        self, tail: Matrix, rows: Matrix
+    ) -> tuple[Matrix, Bool[np.ndarray, "n"], Matrix]:
+        """Return x (n, nx) of new rows (n, ny + nu), which are complete, and the new tail."""
         whole = np.concatenate([tail, rows])
         lag, column = self._read
         x = whole[(len(tail) + np.arange(len(rows)))[:, None] - lag, column]
@@ -114,13 +136,15 @@ class Lagging:
 
 
 def as_rows(values: Any, channels: int, name: str) -> Matrix:
-    """One row or many (n, channels); NaN is a missing sample.
+    """Return one row or many (n, channels); NaN is a missing sample.
 
     Raises:
         InputError: no numbers, another number of channels, or an infinite one.
     """
     try:
-        array = as_signal(values, name) if np.iscomplexobj(values) else np.asarray(values, dtype=float)
+        array = (
+            as_signal(values, name) if np.iscomplexobj(values) else np.asarray(values, dtype=float)
+        )
     except (TypeError, ValueError, OverflowError):
         array = as_signal(values, name)  # says what is wrong
     if array.ndim == 0 or (array.ndim == 1 and channels != 1):
@@ -130,36 +154,44 @@ def as_rows(values: Any, channels: int, name: str) -> Matrix:
     if array.ndim != 2 or np.isinf(array).any():
         as_signal(np.where(np.isnan(array), 0.0, array), name)
     if array.shape[1] != channels:
-        raise InputError(f"`{name}` has {array.shape[1]} columns; expected {channels}, one for each channel.")
+        raise InputError(
+            f"`{name}` has {array.shape[1]} columns; expected {channels}, one for each channel."
+        )
     return array
 
 
 def joined_rows(u: Any, y: Any, inputs: int, outputs: int) -> Matrix:
-    """Outputs and inputs side by side (n, ny + nu), as they are handed in.
+    """Return outputs and inputs side by side (n, ny + nu), as they were given.
 
     Raises:
         InputError: one of them missing, or of another length.
     """
     if y is None or (u is None and inputs):
         what = "`y`" if y is None else "`u`"
-        raise InputError(f"{what} is missing; give the measured outputs `y`{' and inputs `u`' if inputs else ''}.")
+        raise InputError(
+            f"{what} is missing; give the measured outputs "
+            f"`y`{' and inputs `u`' if inputs else ''}."
+        )
     right = as_rows(y, outputs, "y")
     left = as_rows(u, inputs, "u") if inputs else np.zeros((len(right), 0))
     if len(left) != len(right):
-        raise InputError(f"`y` has {len(right)} rows but `u` has {len(left)}. Give both the same length.")
+        raise InputError(
+            f"`y` has {len(right)} rows but `u` has {len(left)}. Give both the same length."
+        )
     return np.concatenate([right, left], axis=1)
 
 
 _SOLVED = 1e-6  # of the residual's norm: how far Φθ may be from that of least squares
-_LENGTHS, _ROWS_PER_LAG = 3, 20  # of the correlation of errors; of what tells it
+_LENGTHS, _ROWS_PER_LAG = 3, 20  # of the correlation of errors; of rows that determine it
 _SMALLEST = 1e-10  # of an output's deviation: a residual is at least rounding
 MOTION = (
-    "equations of motion cannot be followed by least squares: their outputs are not linear in the parameters. Write "
-    "the physics as terms of lagged signals and fit one step ahead, or fit the motion again on new data."
+    "recursive least squares cannot estimate equations of motion: their outputs are not linear "
+    "in the parameters. Write the physics as terms of lagged signals and fit one step ahead, or "
+    "fit the motion again on new data."
 )
 
 
-class Trained(NamedTuple):
+class TrainingRowsModel(NamedTuple):
     """A model with its training rows in whitened outputs, φ (N, ny, nθ) and target (N, ny)."""
 
     model: Model
@@ -174,48 +206,63 @@ class Trained(NamedTuple):
     """Whether the covariance counts the colour of the errors."""
 
 
-def trained(fit: Any, training: Record | None) -> Trained:
-    """The rows of a fit.
+def trained(fit: Any, training: Record | None) -> TrainingRowsModel:
+    """Return the rows of a fit.
 
     Raises:
         InputError: what cannot be followed, or a model without its training data.
     """
     check_type(
-        fit, Estimate | Model | MotionEstimate | MotionModel, "fit", "what `estimate` returned, or a saved model"
+        fit,
+        Estimate | Model | MotionEstimate | MotionModel,
+        "fit",
+        "what `estimate` returned, or a saved model",
     )
     if isinstance(fit, MotionEstimate | MotionModel):
         raise InputError(MOTION)
     covariance = None
     if isinstance(fit, Estimate):
-        if fit.criterion.flown is not None:
+        if fit.criterion.free_run is not None:
             raise InputError(
-                "the fit is one of the free run, and recursive least squares looks one step ahead: its θ would leave "
-                "this one. Fit with criterion = Prediction()."
+                "the fit minimises the free run's error, but recursive least squares that of "
+                "one step ahead, so θ would move away. Fit with criterion = Prediction()."
             )
         if fit.at_bound:
             names = ", ".join(fit.at_bound)
-            raise InputError(f"{names} stand at a bound, which new rows would leave; fit without the bound.")
+            raise InputError(
+                f"{names} at a bound: new rows would move them across it; fit without the bound."
+            )
         model, covariance, record = fit.model, fit.covariance, fit.problem.record
     else:
         model = fit
         if training is None:
-            raise InputError("a saved model does not hold its training data; give them, Recursive(model, training=…).")
+            raise InputError(
+                "a saved model does not contain its training data; give them, Recursive(model, "
+                "training=…)."
+            )
         record = model.fitting(training, need_outputs=True)
     if not len(model.theta):
-        raise InputError("the physics has no parameter to follow.")
+        raise InputError("the physics has no parameter to estimate.")
     rows = stack_rows(record, model.form.layout)
     phi, target, _ = whitened_rows(model, rows.x, rows.y)
     lengths = tuple(len(experiment) - rows.start for experiment in record.experiments)
     freedom = fit.freedom if isinstance(fit, Estimate) else model.statistics.freedom
-    used = target.size - len(model.theta) - freedom * target.shape[1] if np.isfinite(freedom) else 0.0
+    used = (
+        target.size - len(model.theta) - freedom * target.shape[1] if np.isfinite(freedom) else 0.0
+    )
     robust = isinstance(fit, Estimate) and fit.plain_covariance is not None
-    began = Trained(model, phi, target, lengths, covariance, max(used, 0.0), robust)
+    began = TrainingRowsModel(model, phi, target, lengths, covariance, max(used, 0.0), robust)
     _check_solved(began)
-    return began if isinstance(fit, Estimate) else began._replace(covariance=_saved_covariance(began))
+    return (
+        began if isinstance(fit, Estimate) else began._replace(covariance=_saved_covariance(began))
+    )
 
 
-def _check_solved(began: Trained) -> None:
-    """Raise InputError where θ is not the least squares of the rows: then new rows would not go on from it."""
+def _check_solved(began: TrainingRowsModel) -> None:
+    """Raise InputError where θ is not the least squares of the rows.
+
+    New rows could not continue from it.
+    """
     count, ny, nt = began.phi.shape
     stacked = began.phi.reshape(-1, nt)
     left = (began.target - began.phi @ began.model.theta).ravel()
@@ -223,14 +270,18 @@ def _check_solved(began: Trained) -> None:
     rounding = 1e-10 * np.linalg.norm(began.target)
     if np.linalg.norm(basis.T @ left) > _SOLVED * np.linalg.norm(left) + rounding:
         raise InputError(
-            f"θ of the {began.model.structure} model is not the least-squares estimate of these {count} rows beside "
-            "its learner: they are not those of its training, or a penalty, a bound, the free run or the paper's "
-            "pipeline has moved it. Give the training data, or fit with the orthogonal structure one step ahead."
+            f"θ of the {began.model.structure} model is not the least-squares estimate of these "
+            f"{count} rows with its learner. Either they are not its training rows, or a "
+            "penalty, a bound, the free run or the paper's pipeline changed θ. Give the "
+            "training data, or fit with the orthogonal structure one step ahead."
         )
 
 
-def _saved_covariance(began: Trained) -> Matrix | None:
-    """Cov θ of a saved model under its training measure: `K Cov(c, w) Kᵀ`, K = [I, ∂θ_aux/∂w] from the Gram matrix."""
+def _saved_covariance(began: TrainingRowsModel) -> Matrix | None:
+    """Return Cov θ of a saved model under its training measure.
+
+    `K Cov(c, w) Kᵀ`, K = [I, ∂θ_aux/∂w] from the Gram matrix.
+    """
     model, nt = began.model, len(began.model.theta)
     joint = model.statistics.joint(nt)
     if joint is None or model.structure != "orthogonal":
@@ -245,22 +296,30 @@ def _saved_covariance(began: Trained) -> Matrix | None:
 
 
 def begin(
-    began: Trained, forgetting: float, quiet: float, *, empty: bool
+    began: TrainingRowsModel, forgetting: float, quiet: float, *, empty: bool
 ) -> tuple[Recursion, Reference, Matrix | None]:
-    """The state before new rows, what residuals were like, and by what intervals are wider than `s²(ΦᵀΦ)⁻¹`."""
+    """Return the state before new rows, reference residuals, and the inflation.
+
+    The inflation is the factor by which intervals are wider than `s²(ΦᵀΦ)⁻¹`.
+    """
     phi, target, model = began.phi, began.target, began.model
     count, ny, nt = phi.shape
     residual = target - phi @ model.theta
     freedom = count * ny - nt - began.used
     if freedom < 1:
-        raise InputError(f"{count} training rows leave no degrees of freedom to tell noise from; use more data.")
+        raise InputError(
+            f"{count} training rows leave no degrees of freedom to estimate the noise; use more "
+            "data."
+        )
     noise = residual.T @ residual * (ny / freedom)
     least = (_SMALLEST * model.deviation * np.diag(model.weight)) ** 2
     noise = noise + np.diag(least)
     white = whitening(noise)
     white = np.diag(1 / np.sqrt(np.diag(noise))) if white is None else white
     level = float(np.trace(noise)) / ny
-    recursion = started(phi, target, model.theta, noise / level, level, freedom, forgetting, empty=empty)
+    recursion = started(
+        phi, target, model.theta, noise / level, level, freedom, forgetting, empty=empty
+    )
     ends = np.cumsum(began.lengths)[:-1]
     stretches = np.split(residual, ends)
     share = (nt + began.used) / (count * ny)
@@ -270,14 +329,18 @@ def begin(
     r = np.asarray(np.linalg.qr(phi.reshape(-1, nt), mode="r"))
     inflation = inflation_of(r, squared, level, began.covariance)
     if inflation is not None and len(reference.colour) and not began.robust:
-        scores = [np.einsum("kit,ki->kt", *pair) for pair in zip(np.split(phi, ends), grown, strict=True)]
-        widened = inflation_of(r, squared, level, _sandwich(r, newey_west(scores, _memory(grown, white))))
+        scores = [
+            np.einsum("kit,ki->kt", *pair) for pair in zip(np.split(phi, ends), grown, strict=True)
+        ]
+        widened = inflation_of(
+            r, squared, level, _sandwich(r, newey_west(scores, _memory(grown, white)))
+        )
         inflation = None if widened is None else _root(widened) @ inflation @ _root(widened)
     return recursion, reference, inflation
 
 
 def _sandwich(r: Matrix, middle: Matrix) -> Matrix:
-    """`(RᵀR)⁻¹ Ω (RᵀR)⁻¹`."""
+    """Return `(RᵀR)⁻¹ Ω (RᵀR)⁻¹`."""
     unit = np.linalg.norm(r, axis=0)
     inverse = np.linalg.inv(r / unit) / unit[:, None]
     return inverse @ (inverse.T @ middle @ inverse) @ inverse.T
@@ -289,9 +352,13 @@ def _root(matrix: Matrix) -> Matrix:
 
 
 def _memory(stretches: list[Matrix], white: Matrix) -> int:
-    """How many lags the colour of the errors takes: three times as many as their correlation lasts."""
+    """Return three times the correlation length of the errors, in lags."""
     longest, rows = max(map(len, stretches)), sum(map(len, stretches))
-    padded = [np.pad(stretch @ white.T, ((0, longest - len(stretch)), (0, 0))) for stretch in stretches]
+    padded = [
+        np.pad(stretch @ white.T, ((0, longest - len(stretch)), (0, 0))) for stretch in stretches
+    ]
     lasting = [correlation_length(np.stack([p[:, i] for p in padded])) for i in range(len(white))]
     most = rows // _ROWS_PER_LAG
-    return max(1, min(most, _LENGTHS * max(most if length is None else length for length in lasting)))
+    return max(
+        1, min(most, _LENGTHS * max(most if length is None else length for length in lasting))
+    )

@@ -1,4 +1,4 @@
-"""Static data as a regressor of scikit-learn: physics in the columns of X, and a learned correction."""
+"""Static data as a regressor of scikit-learn: physics in the columns of X, and a correction."""
 
 from __future__ import annotations
 
@@ -27,18 +27,19 @@ _NOW = Lags(nb=1, nk=0)  # every column, at the row itself
 class AugmentedRegressor(Augmented):
     """`y = φ(x)θ + learner(x) + e` for rows of X that have no order, as a scikit-learn regressor.
 
-    It passes on to `estimate`, with the columns of X as inputs, and gives the same numbers. By default the physics is a
-    line in every column with an intercept, and a network of 16 neurons adds what is not linear; θ is then that of
-    ordinary least squares.
+    It passes on to `estimate`, with the columns of X as inputs, and gives the same numbers. By
+    default the physics is a line in every column with an intercept, and a network of 16 neurons
+    adds what is not linear; θ is then that of ordinary least squares.
 
     Args:
-        physics: "linear"; expressions of columns such as `["speed", "sin(angle)*speed**2"]`, of parameters theta1,
-            theta2, …; a mapping `{"drag": "speed**2"}`; `Term`s; a `Baseline`, whose columns are written `speed[k]`; or
-            a JAX function of a row (n_features,), returning (n_outputs, n_parameters). Columns of an array are x0, x1,
-            …, and so are those whose names are no identifiers. With several outputs an expression has a parameter for
+        physics: "linear"; expressions of columns such as `["speed", "sin(angle)*speed**2"]`, of
+            parameters theta1, theta2, …; a mapping `{"drag": "speed**2"}`; `Term`s; a `Baseline`,
+            whose columns are written `speed[k]`; or a JAX function of a row (n_features,),
+            returning (n_outputs, n_parameters). Columns of an array are x0, x1, …, and so are those
+            whose names are no identifiers. With several outputs an expression has a parameter for
             each, `drag_y0`.
-        learner: a declaration such as `MLP(hidden=(8,), inputs=("speed",))`; "auto" for `MLP()` on all columns; None
-            for physics alone.
+        learner: a declaration such as `MLP(hidden=(8,), inputs=("speed",))`; "auto" for `MLP()` on
+            all columns; None for physics alone.
         structure: as of `estimate`; None for `Orthogonal()`.
         regularization: as of `estimate`.
         solver: as of `estimate`; None for `LevenbergMarquardt()`.
@@ -59,7 +60,8 @@ class AugmentedRegressor(Augmented):
         >>> import numpy as np
         >>> from orthaug.models.learners import MLP
         >>> x = np.linspace(-1, 1, 200)[:, None]
-        >>> fitted = AugmentedRegressor({"gain": "x0"}, learner=MLP(hidden=(4,))).fit(x, 2 * x[:, 0] + x[:, 0] ** 2)
+        >>> regressor = AugmentedRegressor({"gain": "x0"}, learner=MLP(hidden=(4,)))
+        >>> fitted = regressor.fit(x, 2 * x[:, 0] + x[:, 0] ** 2)
         >>> f"{fitted.theta_[0]:.3f}"
         '2.000'
     """
@@ -91,8 +93,9 @@ class AugmentedRegressor(Augmented):
         """Fit to X (n, n_features) and y (n,) or (n, n_outputs).
 
         Raises:
-            InputError (a ValueError): data and physics that do not fit together, a column that does not move; RankError
-                where the rows do not determine θ. TrainingError where training gives no finite model.
+            InputError (a ValueError): data and physics that do not fit together, a column that does
+                not move; RankError where the rows do not determine θ. TrainingError where training
+                gives no finite model.
         """
         given = y
         X, y = checked(self, X, y)
@@ -105,21 +108,25 @@ class AugmentedRegressor(Augmented):
         return self
 
     def predict(self, X: Any, return_std: bool = False) -> Any:
-        """ŷ, (n,) or (n, n_outputs) as y was; with `return_std` also its standard error, of the same shape.
+        """Return ŷ, (n,) or (n, n_outputs) as y was in the fit.
 
-        The standard error is that of the fitted function, as a Gaussian process without a noise kernel gives it; a new
-        measurement adds `noise_std_`.
+        With `return_std` also its standard error, of the same shape.
+
+        The standard error is that of the fitted function, as a Gaussian process without a noise
+        kernel gives it; a new measurement adds `noise_std_`.
 
         Raises:
-            InputError (a ValueError): other columns than in the fit, values that are not finite, an expression without
-                a value on a row; standard errors of a fit that has none.
+            InputError (a ValueError): other columns than in the fit, values that are not finite, an
+                expression without a value on a row; standard errors of a fit that has none.
         """
         model = self._fitted().model
         X = checked_again(self, X)
         nothing = np.zeros((len(X), len(self.output_names_)))
-        record = Record.from_arrays(X, nothing, inputs=input_names(self), outputs=self.output_names_)
+        record = Record.from_arrays(
+            X, nothing, inputs=input_names(self), outputs=self.output_names_
+        )
         response = model.predict(record).model
         check_there(response)
         if not return_std:
-            return self._shaped(response)
-        return self._shaped(response), self._shaped(prediction_std(model, record)[0])
+            return self._shape(response)
+        return self._shape(response), self._shape(prediction_std(model, record)[0])

@@ -1,13 +1,16 @@
-"""An alarm when residuals leave their band: cumulative sums of the likelihood of a doubled variance, at several scales.
+"""An alarm for residuals that leave their band, by cumulative sums at several scales.
 
-Residuals are whitened by their covariance and colour over the training rows, then summed over blocks of 1, 4, 16 and 64
-rows, since what a changed system adds is slow beside noise. Of each block's square `y²` the sum
+The sums are likelihood ratios of a doubled variance.
+
+Residuals are whitened by their covariance and colour over the training rows, then summed over
+blocks of 1, 4, 16 and 64 rows, since what a changed system adds is slow beside noise. Of each
+block's square `y²` the sum
 
     g ← max(0, g + ½ (y²/2 − ln 2))
 
-is the log-likelihood ratio of twice the variance (CUSUM, Page 1954). For independent normal blocks it exceeds h once in
-`e^h` blocks or less often (Lorden 1971). Where training residuals have heavier tails, h is larger by the exponent κ for
-which `exp(κ x)` has mean one over their increments x.
+is the log-likelihood ratio of twice the variance (CUSUM, Page 1954). For independent normal blocks
+it exceeds h once in `e^h` blocks or less often (Lorden 1971). Where training residuals have heavier
+tails, h is larger by the exponent κ for which `exp(κ x)` has mean one over their increments x.
 """
 
 from __future__ import annotations
@@ -22,7 +25,9 @@ from orthaug._base.checks import Matrix, Vector
 
 SCALES = (1, 4, 16, 64)
 _RATIO = 2.0  # of the variance that is looked for
-_LARGEST = 4.0  # deviations: what is beyond counts as that, so that no single outlier raises an alarm
+_LARGEST = (
+    4.0  # deviations: what is beyond counts as that, so that no single outlier raises an alarm
+)
 _GROSS = 10.0
 _HIGHEST = 1.2  # of the limit: so that an alarm ends soon after its cause
 _ARMED = 0.5
@@ -34,11 +39,11 @@ _LEAST_EXPONENT = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """What residuals were like in training.
+    """The statistics of residuals in training.
 
-    `white` (ny, ny) whitens whitened outputs' errors, `colour` (p, ny) are autoregressive coefficients of each, and
-    `deviation` (ny,) is that of what they leave. Of each scale `variance` is that of block sums over √rows, and `limit`
-    the threshold of g.
+    `white` (ny, ny) whitens whitened outputs' errors, `colour` (p, ny) are autoregressive
+    coefficients of each, and `deviation` (ny,) is that of what they leave. Of each scale `variance`
+    is that of block sums over √rows, and `limit` the threshold of g.
     """
 
     white: Matrix
@@ -50,22 +55,24 @@ class Reference:
 
     @classmethod
     def of(cls, stretches: Sequence[Matrix], white: Matrix, used: float, quiet: float) -> Reference:
-        """From training errors.
+        """Return the reference of training errors.
 
         Args:
             stretches: whitened outputs' errors of each experiment, (N, ny).
             white: their whitening.
-            used: share of the rows' degrees of freedom that parameters and learner have used up: by as much their
-                errors move new residuals, and slowly.
+            used: share of the rows' degrees of freedom that parameters and learner have used up: by
+                as much their errors move new residuals, and slowly.
             quiet: rows between false alarms.
         """
         given = [stretch @ white.T for stretch in stretches]
         colour = _colour(given)
-        left = [_filtered(stretch, colour) for stretch in given]
+        left = [_innovations(stretch, colour) for stretch in given]
         rows = np.concatenate(left)
         deviation = np.sqrt(np.mean(rows**2, axis=0))
         deviation = np.where(deviation > 0, deviation, 1.0)
-        scales = tuple(s for s in SCALES if s == 1 or sum(len(e) // s for e in left) >= _FEWEST_BLOCKS)
+        scales = tuple(
+            s for s in SCALES if s == 1 or sum(len(e) // s for e in left) >= _FEWEST_BLOCKS
+        )
         variances, limits = [], []
         for scale in scales:
             blocks = np.concatenate([_blocks(stretch / deviation, scale) for stretch in left])
@@ -77,7 +84,7 @@ class Reference:
 
 
 @dataclass(eq=False)
-class Watch:
+class ResidualMonitor:
     """The sums so far; `step` changes them."""
 
     reference: Reference
@@ -93,31 +100,38 @@ class Watch:
     def __post_init__(self) -> None:
         reference = self.reference
         self.totals = [0.0] * len(reference.scales)
-        self._root = [math.sqrt(v * s) for v, s in zip(reference.variance, reference.scales, strict=True)]
+        self._root = [
+            math.sqrt(v * s) for v, s in zip(reference.variance, reference.scales, strict=True)
+        ]
         self._limits = [float(limit) for limit in reference.limit]
         self.gap()
 
     def gap(self) -> None:
-        """The next row does not follow on the last one."""
+        """Note that the next row does not follow on the last one."""
         ny = len(self.reference.white)
         self.past = np.full((len(self.reference.colour), ny), np.nan)
         self.sums = np.zeros((len(self.reference.scales), ny))
         self.counts = [0] * len(self.reference.scales)
 
     def skip(self) -> None:
-        """A row whose residual says nothing about the band."""
+        """Pass over a row whose residual carries no information about the band."""
         if len(self.past):
             self.past = np.concatenate([np.full_like(self.past[:1], np.nan), self.past[:-1]])
 
     def step(self, error: Vector, spread: float) -> bool:
-        """Add whitened outputs' errors (ny,) of a row, of `spread` times training's variance: is it a new alarm?"""
+        """Add a row's errors (ny,) in whitened outputs; return whether this is a new alarm.
+
+        Their variance is `spread` times that of training.
+        """
         reference = self.reference
         residual = reference.white @ error / math.sqrt(spread)
         expected = np.sum(reference.colour * self.past, axis=0)
         left = (residual - expected) / reference.deviation
         clipped = np.minimum(np.maximum(left, -_LARGEST), _LARGEST)
         known = not math.isnan(left[0])
-        if len(reference.colour):  # no innovation is that large: an outlier is not remembered, so that it counts once
+        if len(
+            reference.colour
+        ):  # no innovation is that large: an outlier is not remembered, so that it counts once
             now = np.where(np.abs(left) > _GROSS, expected, residual) if known else residual
             self.past = np.concatenate([now[None], self.past[:-1]])
         if not known:  # the filter is not filled yet
@@ -130,20 +144,22 @@ class Watch:
                 self.totals[i] = min(max(0.0, self.totals[i] + step), _HIGHEST * self._limits[i])
                 self.counts[i] = 0
                 self.sums[i] = 0.0
-        self.level = max(total / limit for total, limit in zip(self.totals, self._limits, strict=True))
+        self.level = max(
+            total / limit for total, limit in zip(self.totals, self._limits, strict=True)
+        )
         raised = self.armed and self.level > 1
         self.armed = not raised and (self.armed or self.level < _ARMED)
         return raised
 
 
 def _steps(blocks: Matrix) -> Vector:
-    """The increments of g, summed over outputs (n,)."""
+    """Return the increments of g, summed over outputs (n,)."""
     squares = np.minimum(blocks * blocks, _LARGEST**2)
     return (0.5 * ((1 - 1 / _RATIO) * squares - math.log(_RATIO))).sum(axis=1)
 
 
 def _exponent(steps: Vector) -> float:
-    """κ with a mean of `exp(κ x)` of one, at most 1 as for normal blocks."""
+    """Return κ with mean `exp(κ x)` = 1, at most 1 as for normal blocks."""
     low, high = _LEAST_EXPONENT, 1.0
     if not len(steps) or np.mean(np.exp(steps)) <= 1:
         return high
@@ -154,14 +170,14 @@ def _exponent(steps: Vector) -> float:
 
 
 def _blocks(stretch: Matrix, scale: int) -> Matrix:
-    """Sums over blocks of rows over √rows, of clipped residuals (n, ny)."""
+    """Return sums over blocks of rows over √rows, of clipped residuals (n, ny)."""
     count = len(stretch) // scale
     clipped = np.clip(stretch[: count * scale], -_LARGEST, _LARGEST)
     return clipped.reshape(count, scale, -1).sum(axis=1) / math.sqrt(scale)
 
 
-def _filtered(stretch: Matrix, colour: Matrix) -> Matrix:
-    """What an autoregression leaves of residuals."""
+def _innovations(stretch: Matrix, colour: Matrix) -> Matrix:
+    """Return the innovations of residuals under an autoregression."""
     lags = len(colour)
     left = stretch[lags:].copy()
     for i, row in enumerate(colour, start=1):
@@ -170,7 +186,10 @@ def _filtered(stretch: Matrix, colour: Matrix) -> Matrix:
 
 
 def _colour(stretches: Sequence[Matrix]) -> Matrix:
-    """Autoregressive coefficients (p, ny); the order p by Schwarz's criterion, the same for all outputs."""
+    """Return autoregressive coefficients (p, ny).
+
+    The order p by Schwarz's criterion, the same for all outputs.
+    """
     rows = sum(max(len(stretch) - _MOST_LAGS, 0) for stretch in stretches)
     ny = stretches[0].shape[1]
     most = min(_MOST_LAGS, rows // _ROWS_PER_LAG)
@@ -181,10 +200,9 @@ def _colour(stretches: Sequence[Matrix]) -> Matrix:
     for order in range(most + 1):
         colour, cost = np.zeros((order, ny)), ny * order * math.log(rows)
         for i in range(ny):
-            past = np.concatenate(
-                [np.stack([s[_MOST_LAGS - j : len(s) - j, i] for j in range(1, order + 1)], 1) if order else
-                 np.zeros((len(s) - _MOST_LAGS, 0)) for s in long]
-            )  # fmt: skip
+            past = np.zeros((rows, order))
+            for j in range(1, order + 1):
+                past[:, j - 1] = np.concatenate([s[_MOST_LAGS - j : len(s) - j, i] for s in long])
             now = np.concatenate([s[_MOST_LAGS:, i] for s in long])
             colour[:, i] = np.linalg.lstsq(past, now, rcond=None)[0]
             cost += rows * math.log(max(float(np.mean((now - past @ colour[:, i]) ** 2)), 1e-300))

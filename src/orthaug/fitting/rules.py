@@ -1,4 +1,4 @@
-"""Rules between restarts, solver, criterion, regularization and data, and the refusal of what would cost too much."""
+"""Rules between restarts, solver, criterion, regularization and data; limits of cost."""
 
 from __future__ import annotations
 
@@ -20,12 +20,14 @@ from orthaug.physics.motion import Motion
 LONGEST_FIT = 30 * 86400.0  # s
 _RATE, _STEP = 2e10, 2e-4  # products per second and core; seconds of an iteration at least
 _MOST = 10**18  # weights or runs; more are as impossible, and would overflow
-_COPIES = 32  # of regressors and outputs, in a fit with its scores and findings; measured on 10⁶ rows
+_COPIES = (
+    32  # of regressors and outputs, in a fit with its scores and findings; measured on 10⁶ rows
+)
 _FEWEST = 50  # iterations that are counted on where more are allowed: most runs converge
 
 
 def checked_starts(restarts: int, seed: int, *, warm: bool, ensemble: bool) -> tuple[int, int]:
-    """How many starts and from which seed, as whole numbers; a `warm` start is one."""
+    """Return the number of starts and the first seed as whole numbers; `warm` means one start."""
     restarts, seed = check_count(restarts, "restarts"), check_count(seed, "seed", least=0)
     check_starts(1 if warm else restarts, seed, ensemble=ensemble)
     return restarts, seed
@@ -38,7 +40,9 @@ def check_starts(restarts: int, seed: int, *, ensemble: bool) -> None:
         raise KeyedError(f"`seed` must be below 2**63; got {shown(seed)}.", "seed", words)
     if ensemble and restarts < 2:
         words = f": found {shown(restarts)}; expected 2 or more for an ensemble"
-        raise KeyedError("an ensemble needs `restarts` of 2 or more to be the median of.", "restarts", words)
+        raise KeyedError(
+            "an ensemble needs `restarts` of 2 or more to be the median of.", "restarts", words
+        )
 
 
 def check_scored(criterion: Criterion, longest: int) -> None:
@@ -47,27 +51,28 @@ def check_scored(criterion: Criterion, longest: int) -> None:
     Args:
         longest: usable rows of the longest experiment.
     """
-    flown = criterion.flown
-    if flown is None or flown.washout < longest:
+    free_run = criterion.free_run
+    if free_run is None or free_run.washout < longest:
         return
     text = (
         f"nothing is scored: the longest experiment has {longest} usable rows, and the first "
-        f"{flown.washout} of a segment are washout; shorten it, or the horizon."
+        f"{free_run.washout} of a segment are washout; shorten it, or the horizon."
     )
     if criterion.simulates:
         rows = f"the {longest} usable rows of the longest experiment, or nothing is scored"
-        raise KeyedError(text, "washout", f": found {flown.washout}; expected less than {rows}")
+        raise KeyedError(text, "washout", f": found {free_run.washout}; expected less than {rows}")
     rows = f"the longest experiment has {longest} usable rows"
-    raise KeyedError(text, "horizon", f": found {flown.steps}; {rows}")
+    raise KeyedError(text, "horizon", f": found {free_run.steps}; {rows}")
 
 
 def check_solver(solver: Solver, criterion: Criterion, regularizations: Sequence[object]) -> None:
-    """Raise InputError where a solver without normal equations is asked for what needs them."""
+    """Raise InputError where a solver without normal equations cannot do what is asked."""
     if "ard" in regularizations and not criterion.one_step:
         raise KeyedError(
             "ard regularization is for training one step ahead; take evidence on the free run.",
             "regularization",
-            " = ard; expected none, evidence or a number on the free run, or more than one step ahead",
+            " = ard; expected none, evidence or a number on the free run, or more than one "
+            "step ahead",
         )
     if solver.gauss_newton:
         return
@@ -75,7 +80,8 @@ def check_solver(solver: Solver, criterion: Criterion, regularizations: Sequence
     able = " or ".join(kind for kind, known in SOLVERS.items() if known.gauss_newton)
     if not criterion.one_step:
         raise KeyedError(
-            "only `LevenbergMarquardt` trains on a free run or more than one step ahead; take that solver.",
+            "only `LevenbergMarquardt` trains on a free run or more than one step ahead; take "
+            "that solver.",
             "solver",
             f" = {name} trains one step ahead; expected {able} here",
         )
@@ -99,7 +105,9 @@ def tried(
     motion: bool = False,
     learner: Learner | None = None,
 ) -> tuple[Any, ...]:
-    """The regularizations of every start: those given, or what "auto" stands for (docs/design.md has the table).
+    """Return the regularizations of every start: those given, or those of "auto".
+
+    docs/design.md has the table.
 
     Args:
         linear: whether the physics is linear in θ, which is then solved.
@@ -121,32 +129,40 @@ def tried(
 
 
 def ridge_of(regularization: str | float) -> tuple[float, bool]:
-    """The ridge α that a run starts with, and whether evidence re-estimates it."""
+    """Return the ridge α that a run starts with, and whether evidence re-estimates it."""
     evidence = regularization in ("evidence", "ard")
-    return (1.0 if evidence else 0.0 if regularization == "none" else float(regularization)), evidence
+    return (
+        1.0 if evidence else 0.0 if regularization == "none" else float(regularization)
+    ), evidence
 
 
 def check_motion_choices(
-    motion: Motion, learner: Learner | None, structure: Structure, criterion: Criterion, solver: Solver
+    motion: Motion,
+    learner: Learner | None,
+    structure: Structure,
+    criterion: Criterion,
+    solver: Solver,
 ) -> None:
     """Raise InputError for choices that a motion cannot be trained with."""
     states, outputs = motion.learned
     if learner is not None and not (states or outputs):
         raise KeyedError(
-            "there is a learner, but no state and no output of the motion is learned; set `learned` where it is added.",
+            "there is a learner, but no state and no output of the motion is learned; set "
+            "`learned` where it is added.",
             "learner",
             ": no state and no output has `learned = true`; expected one, or kind none",
         )
-    if criterion.flown is None or not criterion.simulates:
+    if criterion.free_run is None or not criterion.simulates:
         raise KeyedError(
-            "a motion is trained on its free run; take `Simulation(…)`: its states are not measured, so there is no "
-            "error one step ahead.",
+            "a motion is trained on its free run; take `Simulation(…)`: its states are not "
+            "measured, so there is no error one step ahead.",
             "focus",
             " = prediction; expected simulation for a motion, whose states are not measured",
         )
     if not structure.projects:
         raise KeyedError(
-            f"a motion has the orthogonal structure: its parameters are the nearest physics; got {structure.name}.",
+            "a motion has the orthogonal structure: its parameters are the nearest physics; "
+            f"got {structure.name}.",
             "kind",
             f" = {structure.name}; expected orthogonal for a motion",
         )
@@ -159,10 +175,12 @@ def check_motion_choices(
 
 
 def check_joint(solver: Any, ridge: float, evidence: bool, *, resident: bool) -> None:
-    """Raise InputError for what needs θ to be solved, or the solver to see normal equations, one step ahead."""
+    """Raise InputError for options that need θ solved, or normal equations, one step ahead."""
     if solver.gauss_newton and (ridge or not resident):  # evidence starts with a ridge
         what = "regularization" if ridge else "training on rows that are not in memory"
-        raise InputError(f"{what} needs a solved θ; leave out `from_initial`, which trains θ from θ⁰.")
+        raise InputError(
+            f"{what} needs a solved θ; leave out `from_initial`, which trains θ from θ⁰."
+        )
     if evidence or not resident:
         what = "evidence regularization" if evidence else "training on rows that are not in memory"
         raise InputError(f"{what} needs the Gauss-Newton matrix of the levenberg-marquardt solver.")
@@ -179,15 +197,11 @@ def check_cost(
     held: int | None = None,
     room: Room | None = None,
 ) -> None:
-    """Raise InputError where the normal equations do not fit into memory, or training takes longer than a month.
+    """Raise InputError for normal equations beyond memory, or more than a month of training.
 
-    Args:
-        learner: None for physics alone, which costs nothing; one that cannot tell its `weights` is let pass.
-        rows: usable ones.
-        features, outputs: of the learner.
-        iterations: of a run at most.
-        runs: restarts times regularizations.
-        held: rows that are in memory; None for all.
+    Args: learner: None for physics alone, which costs nothing; one that does not know its `weights`
+        is let pass. rows: usable ones. features, outputs: of the learner. iterations: of a run at
+        most. runs: restarts times regularizations. held: rows that are in memory; None for all.
         room: of the workers or devices that add up; None where that is this process.
     """
     held = rows if held is None else held
@@ -198,21 +212,30 @@ def check_cost(
     runs = min(runs, _MOST)
     side_by_side = min(runs, cores)
     what = f"training a learner of {weights} weights" + (f" in {runs} runs" if runs > 1 else "")
-    check_memory(8.0 * (3 * side_by_side * weights**2 + runs * weights + held * (features + outputs)), what)
+    check_memory(
+        8.0 * (3 * side_by_side * weights**2 + runs * weights + held * (features + outputs)), what
+    )
     if room is not None and (size := 8.0 * room.matrices * weights**2) > room.size:
         raise InputError(
-            f"{what} takes {in_words(size)} on each worker or device, for {room.matrices} matrices of its weights; "
-            f"{room.place} has {in_words(room.size)}. Take a smaller learner, or larger workers."
+            f"{what} takes {in_words(size)} on each worker or device, for {room.matrices} "
+            f"matrices of its weights; {room.place} has {in_words(room.size)}. Take a smaller "
+            "learner, or larger workers."
         )
     products = rows * outputs * weights**2 + weights**3 / 3
     seconds = runs * min(iterations, _FEWEST) * max(products / _RATE, _STEP) / cores
     if seconds > LONGEST_FIT:
         raise InputError(
-            f"{what} on {rows} rows would take {_days(seconds)} or more; {_days(LONGEST_FIT)} are the limit. Take "
-            "fewer restarts, a smaller learner, or every n-th row."
+            f"{what} on {rows} rows would take {_days(seconds)} or more; {_days(LONGEST_FIT)} "
+            "are the limit. Take fewer restarts, a smaller learner, or every n-th row."
         )
 
 
 def _days(seconds: float) -> str:
     days = seconds / 86400
-    return f"{days:.0f} days" if days < 1000 else f"{days / 365.25:.3g} years" if math.isfinite(days) else "ages"
+    return (
+        f"{days:.0f} days"
+        if days < 1000
+        else f"{days / 365.25:.3g} years"
+        if math.isfinite(days)
+        else "ages"
+    )

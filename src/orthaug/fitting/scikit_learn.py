@@ -1,4 +1,4 @@
-"""What the estimators for scikit-learn share: its base classes, columns as channels, physics written in columns."""
+"""Common parts of the scikit-learn estimators: base classes, columns as channels."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ try:
 except ImportError:  # the names are there without the extra, and say so when they are used
 
     class MultiOutputMixin:
-        """Stands for the one of scikit-learn."""
+        """Replaces the class of scikit-learn where that is not installed."""
 
     class RegressorMixin:
-        """Stands for the one of scikit-learn."""
+        """Replaces the class of scikit-learn where that is not installed."""
 
     class BaseEstimator:
-        """Stands for the one of scikit-learn."""
+        """Replaces the class of scikit-learn where that is not installed."""
 
         def __new__(cls, *_: Any, **__: Any) -> Any:
-            """Refuse.
+            """Raise MissingDependency: scikit-learn is not installed.
 
             Raises:
                 InputError: scikit-learn is not there.
@@ -53,7 +53,7 @@ _TAKEN = ("time",)  # no name of an output
 
 
 class Augmented(MultiOutputMixin, RegressorMixin, BaseEstimator):
-    """Physics with a learned correction, in the manners of scikit-learn."""
+    """Physics with a learned correction, as an estimator of scikit-learn."""
 
     physics: Any
     learner: Any
@@ -66,7 +66,9 @@ class Augmented(MultiOutputMixin, RegressorMixin, BaseEstimator):
     _one_column: bool
     _ordered: ClassVar[bool]
 
-    def _estimate(self, record: Record, baseline: Baseline, lags: Lags | None, learner: Any, **more: Any) -> None:
+    def _estimate(
+        self, record: Record, baseline: Baseline, lags: Lags | None, learner: Any, **more: Any
+    ) -> None:
         """Fit, and set the attributes.
 
         Raises:
@@ -77,19 +79,31 @@ class Augmented(MultiOutputMixin, RegressorMixin, BaseEstimator):
         seed = self.random_state
         if seed is None or isinstance(seed, np.random.RandomState):
             seed = int(check_random_state(seed).randint(2**31 - 1))
-        options: dict[str, Any] = {"lags": lags, "learner": learner, "regularization": self.regularization, **more}
+        options: dict[str, Any] = {
+            "lags": lags,
+            "learner": learner,
+            "regularization": self.regularization,
+            **more,
+        }
         options |= {"restarts": self.restarts, "output_weights": self.output_weights}
         options["structure"] = Orthogonal() if self.structure is None else self.structure
         options["solver"] = LevenbergMarquardt() if self.solver is None else self.solver
         try:
-            fit = estimate(record, baseline, seed=check_count(seed, "random_state", least=0), **options)
+            fit = estimate(
+                record, baseline, seed=check_count(seed, "random_state", least=0), **options
+            )
         except InputError as error:
             if not any(f"'{name}' is constant (1)" in str(error) for name in input_names(self)):
                 raise
-            hint = "A column of ones is what PolynomialFeatures adds first: give it include_bias=False."
+            hint = (
+                "A column of ones is what PolynomialFeatures adds first: give it "
+                "include_bias=False."
+            )
             raise InputError(f"{error} {hint}") from None
         if fit.model.form.first_row and not self._ordered:
-            raise InputError("the rows of X have no order, so there are no lags of them; use an AugmentedNARX.")
+            raise InputError(
+                "the rows of X have no order, so there are no lags of them; use an AugmentedNARX."
+            )
         if not fit.status.ok:
             raise TrainingError(fit.status.message)
         self.estimate_: Estimate = fit
@@ -103,15 +117,19 @@ class Augmented(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     @property
     def noise_std_(self) -> np.ndarray | None:
-        """Standard deviation of the noise of each output (n_outputs,); None where no degrees of freedom are left."""
+        """Standard deviation of the noise of each output (n_outputs,).
+
+        None where no degrees of freedom are left.
+        """
         noise = self._fitted().model.statistics.noise
         return None if noise is None else np.sqrt(np.diag(noise))
 
     def set_params(self, **params: Any) -> Any:
-        """As of scikit-learn.
+        """Set parameters, as scikit-learn does.
 
         Raises:
-            InputError (a ValueError): a field of a declaration, which is exchanged whole: no `learner__hidden`.
+            InputError (a ValueError): a field of a declaration, which is exchanged whole: no
+                `learner__hidden`.
         """
         for name in params:
             own, field, rest = name.partition("__")
@@ -119,17 +137,17 @@ class Augmented(MultiOutputMixin, RegressorMixin, BaseEstimator):
             if field and is_dataclass(value) and not isinstance(value, type):
                 kind = type(value).__name__
                 raise InputError(
-                    f"`{name}`: {kind} is a declaration that is exchanged whole; give `{own}` itself, in a grid "
-                    f'{{"{own}": [oa.{kind}({rest}=…), …]}}.'
+                    f"`{name}`: {kind} is one object, without parameters of its own; set "
+                    f'`{own}` itself, in a grid {{"{own}": [oa.{kind}({rest}=…), …]}}.'
                 )
         return super().set_params(**params)  # type: ignore[misc]
 
-    def _shaped(self, values: np.ndarray) -> np.ndarray:
-        """Values (n, n_outputs) with as many axes as y had."""
+    def _shape(self, values: np.ndarray) -> np.ndarray:
+        """Return values (n, n_outputs) with as many axes as y had."""
         return values[:, 0] if self._one_column else values
 
     def _fitted(self) -> Estimate:
-        """The estimate; NotFittedError where there is none."""
+        """Return the estimate; NotFittedError where there is none."""
         from sklearn.utils.validation import check_is_fitted
 
         check_is_fitted(self, "estimate_")
@@ -137,7 +155,7 @@ class Augmented(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
 
 def checked(estimator: Augmented, x: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:
-    """X (n, n_features) and y (n, n_outputs) for a fit, by scikit-learn's own checks.
+    """Return X (n, n_features) and y (n, n_outputs) for a fit, by scikit-learn's checks.
 
     Raises:
         ValueError: anything but finite real numbers of two samples or more.
@@ -152,7 +170,7 @@ def checked(estimator: Augmented, x: Any, y: Any) -> tuple[np.ndarray, np.ndarra
 
 
 def checked_again(estimator: Augmented, x: Any) -> np.ndarray:
-    """X (n, n_features) with the columns that the fit had.
+    """Return X (n, n_features) with the columns that the fit had.
 
     Raises:
         ValueError: other columns, anything but finite real numbers.
@@ -166,18 +184,25 @@ def check_there(values: np.ndarray) -> None:
     """Raise InputError for a row (n, n_outputs) on which the model has no value."""
     bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
     if bad.size:
-        raise InputError(f"the model has no finite value at row {bad[0]} of X; look at the physics there.")
+        raise InputError(
+            f"the model has no finite value at row {bad[0]} of X; check the physics there."
+        )
 
 
 def input_names(estimator: Any) -> tuple[str, ...]:
-    """The columns of X as expressions name them: their own names, or x0, x1, … where they cannot be used."""
+    """Return the columns of X as expressions name them: own names, or x0, x1, ….
+
+    The latter where the own names cannot be used.
+    """
     given = getattr(estimator, "feature_names_in_", [""] * estimator.n_features_in_)
     good = [str(name) if is_name(str(name)) else "" for name in given]
     return tuple(name or _free(f"x{j}", good) for j, name in enumerate(good))
 
 
 def output_names(y: Any, columns: int, inputs: Sequence[str]) -> tuple[str, ...]:
-    """The outputs as expressions name them: those of a Series or DataFrame, or y (y0, y1, … of several).
+    """Return the outputs as expressions name them.
+
+    Names of a Series or DataFrame, or y (y0, y1, … of several).
 
     Args:
         y: as the user gave it.
@@ -186,7 +211,9 @@ def output_names(y: Any, columns: int, inputs: Sequence[str]) -> tuple[str, ...]
     """
     given = getattr(y, "columns", [getattr(y, "name", None)])
     named = [str(name) for name in given]
-    if len(set(named)) == columns and all(is_name(n) and n not in (*inputs, *_TAKEN, "None") for n in named):
+    if len(set(named)) == columns and all(
+        is_name(n) and n not in (*inputs, *_TAKEN, "None") for n in named
+    ):
         return tuple(named)
     return tuple(_free("y" if columns == 1 else f"y{j}", inputs) for j in range(columns))
 
@@ -198,7 +225,7 @@ def _free(name: str, taken: Sequence[str]) -> str:
 
 
 def at_now(text: str, names: Sequence[str]) -> str:
-    """An expression of columns as one of channels: `speed**2` becomes `speed[k]**2`."""
+    """Return an expression of columns as one of channels: `speed**2` becomes `speed[k]**2`."""
     if not names or not isinstance(text, str):  # what is no text is refused where it is read
         return text
     columns = "|".join(map(re.escape, names))
@@ -206,7 +233,10 @@ def at_now(text: str, names: Sequence[str]) -> str:
 
 
 def learner_of(given: Any, names: Sequence[str] = ()) -> Any:
-    """The learner of a parameter, "auto" for `MLP()`; the columns `names` in its expressions become channels."""
+    """Return the learner of an estimator's argument; `MLP()` for "auto".
+
+    The columns `names` in its expressions become channels.
+    """
     if isinstance(given, str) and given == "auto":
         return MLP()
     if not is_dataclass(given) or isinstance(given, type):
@@ -219,14 +249,15 @@ def learner_of(given: Any, names: Sequence[str] = ()) -> Any:
     return replace(given, **changed) if changed else given
 
 
-def baseline_of(physics: Any, layout: Layout, outputs: Sequence[str], names: Sequence[str] = ()) -> Baseline:
-    """The physics of a parameter.
+def baseline_of(
+    physics: Any, layout: Layout, outputs: Sequence[str], names: Sequence[str] = ()
+) -> Baseline:
+    """Return the physics of an estimator's argument.
 
-    Args:
-        physics: "linear", expressions, `Term`s, a mapping of parameters to expressions, a Baseline, or a JAX function.
-        layout: the regressor, for "linear" and for a function.
+    Args: physics: "linear", expressions, `Term`s, a mapping of parameters to expressions, a
+        Baseline, or a JAX function. layout: the regressor, for "linear" and for a function.
         outputs: with several, every expression has a parameter of its own for each, `gain_y0`.
-        names: columns that may stand in expressions without an instant.
+        names: columns that expressions may use without an instant.
 
     Raises:
         InputError: none of these.
@@ -242,9 +273,15 @@ def baseline_of(physics: Any, layout: Layout, outputs: Sequence[str], names: Seq
             )
         return Baseline.from_function(physics, [f"theta{i + 1}" for i in range(shape[1])])
     if isinstance(physics, str) and physics == "linear":
-        line = {(f"{lag.channel}_{lag.lag}" if lag.lag else lag.channel): str(lag) for lag in layout}
+        line = {
+            (f"{lag.channel}_{lag.lag}" if lag.lag else lag.channel): str(lag) for lag in layout
+        }
         physics = {_free("intercept", [*line]): "1"} | line
-    elif not isinstance(physics, str) and isinstance(physics, Sequence) and all(isinstance(t, str) for t in physics):
+    elif (
+        not isinstance(physics, str)
+        and isinstance(physics, Sequence)
+        and all(isinstance(t, str) for t in physics)
+    ):
         physics = {f"theta{i + 1}": text for i, text in enumerate(physics)}
     if isinstance(physics, Mapping) and all(isinstance(text, str) for text in physics.values()):
         several = len(outputs) > 1
@@ -253,10 +290,15 @@ def baseline_of(physics: Any, layout: Layout, outputs: Sequence[str], names: Seq
             for parameter, text in physics.items()
             for output in outputs
         ]
-    if isinstance(physics, str) or not isinstance(physics, Sequence) or not all(isinstance(t, Term) for t in physics):
+    if (
+        isinstance(physics, str)
+        or not isinstance(physics, Sequence)
+        or not all(isinstance(t, Term) for t in physics)
+    ):
         raise InputError(
-            "`physics` must be 'linear', a list of expressions or Terms, a mapping of parameters to expressions, a "
-            f"Baseline, or a function of a row; got {shown(physics)}."
+            "`physics` must be 'linear', a list of expressions or Terms, a mapping of "
+            "parameters to expressions, a Baseline, or a function of a row; got "
+            f"{shown(physics)}."
         )
     for term in physics:
         _check_columns(term.regressor, names)
@@ -264,11 +306,16 @@ def baseline_of(physics: Any, layout: Layout, outputs: Sequence[str], names: Seq
 
 
 def _check_columns(text: Any, names: Sequence[str]) -> None:
-    """Raise InputError for a name in an expression of columns that is none of them."""
-    found = re.findall(r"(?<![\w.])[A-Za-z_]\w*\b(?!\s*[\[(])", text) if names and isinstance(text, str) else []
+    """Raise InputError for a name in an expression that is not a column."""
+    found = (
+        re.findall(r"(?<![\w.])[A-Za-z_]\w*\b(?!\s*[\[(])", text)
+        if names and isinstance(text, str)
+        else []
+    )
     for name in found:
         if name not in (*names, *RESERVED, SAMPLING_TIME):
             known = ", ".join(names)
             raise InputError(
-                f"physics '{text}': unknown column '{name}'{nearest(name, names)}; the columns are {known}."
+                f"physics '{text}': unknown column '{name}'{nearest(name, names)}; the columns "
+                f"are {known}."
             )

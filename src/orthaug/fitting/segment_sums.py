@@ -1,8 +1,8 @@
-"""Free runs over segments that an engine keeps: what training needs of them is a sum over their chunks.
+"""Sums over chunks of segments that an engine keeps, for training on free runs.
 
-A trial is the sum of the errors' squares, a linearisation that of the normal equations from which the states of each
-segment are eliminated where the segment is. How these states follow (c, w) stays there too: n0 numbers a segment, its
-state, come back.
+A trial is the sum of the errors' squares, a linearisation that of the normal equations from which
+the states of each segment are eliminated where the segment is. How these states follow (c, w) stays
+there too: n0 numbers a segment, its state, come back.
 """
 
 from __future__ import annotations
@@ -25,32 +25,34 @@ _KEPT = 4  # layouts of a record: its own, and lengths of the segments on the wa
 
 
 class Best(NamedTuple):
-    """States of the segments of a chunk, and how the best ones follow (c, w) to first order."""
+    """States of a chunk's segments, and the derivative of the best ones by (c, w)."""
 
     values: Float[Any, "n0 m"]
     offset: Float[Any, "m n0"]
     slope: Float[Any, "m n0 n"]
 
     def moved(self, step: Any) -> Float[Array, "n0 m"]:
-        """The best states where (c, w) has moved by `step` (n,)."""
+        """Return the best states where (c, w) has moved by `step` (n,)."""
         return self.values + (self.offset - self.slope @ step).T
 
 
 class Squares(NamedTuple):
-    """Of a trial: `‖r‖²` of errors and states, and Σ e eᵀ (ny, ny) in the outputs' units."""
+    """Sums of a trial: `‖r‖²` of errors and states, and Σ e eᵀ (ny, ny) in outputs' units."""
 
     misfit: Any
     errors: Any
 
 
-def _errors(dynamics: Dynamics, numbers: Numbers, segments: Segments, states: Any) -> Float[Array, "T ny m"]:
+def _errors(
+    dynamics: Dynamics, numbers: Numbers, segments: Segments, states: Any
+) -> Float[Array, "T ny m"]:
     run = chunk_response(dynamics, dynamics.prepared(numbers), states, segments.inputs)
     return jnp.where(segments.scored[:, None], segments.target - run, 0.0)
 
 
 @dataclass(frozen=True)
-class Trying:
-    """`Squares` of one chunk, from its states or from where they moved to with (c, w)."""
+class TrialSquares:
+    """`Squares` of one chunk, from its states or from those moved with (c, w)."""
 
     dynamics: Dynamics
     moves: bool
@@ -65,13 +67,18 @@ class Trying:
 
 
 @dataclass(frozen=True)
-class Linearising:
-    """Of one chunk: how its best states follow (c, w), which it keeps, and its share of the normal equations."""
+class SegmentEquations:
+    """A chunk's share of the normal equations, and the derivative of its states.
+
+    The derivative, by (c, w), stays with the chunk.
+    """
 
     dynamics: Dynamics
     free: bool
 
-    def __call__(self, chunk: Any, numbers: Numbers, weight: Any, rows: Any) -> tuple[Any, tuple[Any, Any]]:
+    def __call__(
+        self, chunk: Any, numbers: Numbers, weight: Any, rows: Any
+    ) -> tuple[Any, tuple[Any, Any]]:
         segments, states = chunk
         numbers = self.dynamics.prepared(numbers)
         there = (states, segments.inputs, segments.target, segments.scored)
@@ -84,8 +91,8 @@ class Linearising:
 
 
 @dataclass(frozen=True)
-class Moving:
-    """The states of a chunk after a step of (c, w), and nothing to add up."""
+class MovedStates:
+    """The states of a chunk after a step of (c, w); this adds nothing to a sum."""
 
     def __call__(self, best: Best, step: Any) -> tuple[Any, Any]:
         return best.moved(step), ()
@@ -93,14 +100,16 @@ class Moving:
 
 @dataclass(frozen=True)
 class Spectra:
-    """Σ |DFT|² (ny, …) of the errors along the segments of a chunk, and how many errors of each are not 0."""
+    """Σ |DFT|² (ny, …) of the errors along a chunk's segments, and the number of nonzero errors."""
 
     dynamics: Dynamics
     size: int
 
     def __call__(self, chunk: Any, numbers: Numbers) -> tuple[Any, Any]:
         errors = _errors(self.dynamics, numbers, *chunk)
-        return jnp.sum(jnp.abs(jnp.fft.rfft(errors, self.size, axis=0)) ** 2, axis=-1).T, jnp.sum(errors != 0, (0, 2))
+        return jnp.sum(jnp.abs(jnp.fft.rfft(errors, self.size, axis=0)) ** 2, axis=-1).T, jnp.sum(
+            errors != 0, (0, 2)
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,66 +122,95 @@ class SegmentSums:
 
     @classmethod
     def of(cls, engine: Engine) -> SegmentSums | None:
-        """None where the engine's rows are in memory: then whole runs are compiled."""
+        """Return the sums of an engine; None where its rows are in memory.
+
+        Whole runs are compiled then.
+        """
         return None if engine.resident else cls(engine)
 
     def rows(self, segments: Any) -> Any:
-        """The segments where the engine keeps them."""
+        """Return the segments as the engine keeps them."""
         with self.one_at_a_time:
             known = self.placed.get(id(segments))
             if known is None:
                 while len(self.placed) >= _KEPT:
                     self.placed.pop(next(iter(self.placed)))
-                there = self.engine.place(segments) if isinstance(segments, Segments) else segments.rows
+                there = (
+                    self.engine.place(segments) if isinstance(segments, Segments) else segments.rows
+                )
                 known = self.placed[id(segments)] = (segments, there)
             return known[1]
 
     def with_states(self, segments: Any, states: Any) -> Any:
-        """The segments beside their states (k, n0, m)."""
+        """Return the segments beside their states (k, n0, m)."""
         rows = self.rows(segments)
         return self.engine.beside(rows, self.engine.place(np.asarray(states), rows))
 
     def tried(
-        self, dynamics: Dynamics, numbers: Numbers, segments: Any, start: Start, step: Vector | None, *made: Matrix
+        self,
+        dynamics: Dynamics,
+        numbers: Numbers,
+        segments: Any,
+        start: Start,
+        step: Vector | None,
+        *made: Matrix,
     ) -> tuple[float, Matrix]:
-        """`‖r‖²` and Σ e eᵀ from the states of a start, or with `step` from where they moved to.
+        """Return `‖r‖²` and Σ e eᵀ from the states of a start.
+
+        With `step`, from the states to which they moved.
 
         Args:
             made: weight (ny, ny) and L (n0, n0), of errors and of states.
         """
         if step is None:
             rows, step = self.with_states(segments, start.values), np.zeros(0)
-            trying = Trying(dynamics, moves=False)
+            trying = TrialSquares(dynamics, moves=False)
         else:
-            rows, trying = self.engine.beside(self.rows(segments), start.there), Trying(dynamics, moves=True)
+            rows, trying = (
+                self.engine.beside(self.rows(segments), start.there),
+                TrialSquares(dynamics, moves=True),
+            )
         found = self.engine.sum(trying, rows, numbers, *made, step)
         return float(found.misfit), np.asarray(found.errors)
 
     def squares(self, dynamics: Dynamics, numbers: Numbers, segments: Any) -> Matrix:
-        """Σ e eᵀ (ny, ny) from the measured states."""
+        """Return Σ e eᵀ (ny, ny) from the measured states."""
         ny, n0 = len(dynamics.outputs), dynamics.states
         start = Start(np.asarray(segments.start))
         return self.tried(dynamics, numbers, segments, start, None, np.eye(ny), np.eye(n0))[1]
 
     def moved(self, start: Start, step: Vector) -> Float[np.ndarray, "k n0 m"]:
-        """The states after a step of (c, w)."""
-        return np.asarray(self.engine.fetch(self.engine.keep(Moving(), start.there, step)[0]))
+        """Return the states after a step of (c, w)."""
+        return np.asarray(self.engine.fetch(self.engine.keep(MovedStates(), start.there, step)[0]))
 
     def linearised(
-        self, dynamics: Dynamics, numbers: Numbers, segments: Any, initial: InitialStates, states: Any, *made: Matrix
+        self,
+        dynamics: Dynamics,
+        numbers: Numbers,
+        segments: Any,
+        initial: InitialStates,
+        states: Any,
+        *made: Matrix,
     ) -> tuple[Matrix, Vector, Any]:
-        """Normal matrix and right-hand side of (c, w) with the states at their best, and `Best` where it stays."""
+        """Return the normal equations of (c, w) with the states at their best, and `Best`.
+
+        `Best` stays where the segments are.
+        """
         rows = self.with_states(segments, states)
-        kept, (hessian, gradient) = self.engine.keep(Linearising(dynamics, initial.free), rows, numbers, *made)
+        kept, (hessian, gradient) = self.engine.keep(
+            SegmentEquations(dynamics, initial.free), rows, numbers, *made
+        )
         return np.asarray(hessian), np.asarray(gradient), kept if initial.free else None
 
     def slope(self, there: Any) -> Float[np.ndarray, "k m n0 n"]:
-        """How the best states follow (c, w), brought here."""
+        """Return the derivative of the best states by (c, w), fetched from the engine."""
         return np.asarray(self.engine.fetch(there).slope)
 
     def spectra(
         self, dynamics: Dynamics, numbers: Numbers, segments: Any, states: Any, size: int
     ) -> tuple[Matrix, Vector]:
-        """`Spectra` over all segments."""
-        found = self.engine.sum(Spectra(dynamics, size), self.with_states(segments, states), numbers)
+        """Return `Spectra` over all segments."""
+        found = self.engine.sum(
+            Spectra(dynamics, size), self.with_states(segments, states), numbers
+        )
         return np.asarray(found[0]), np.asarray(found[1])

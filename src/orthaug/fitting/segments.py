@@ -1,7 +1,8 @@
 """Free runs over segments, with their sensitivities.
 
-A segment starts from a state and then lives on its own outputs. Its first steps, the washout, are not scored. One scan
-carries states, sensitivities and the Gram matrix of `[S r]`, so that nothing of size N × nw ever exists.
+A segment starts from a state and then lives on its own outputs. Its first steps, the washout, are
+not scored. One scan carries states, sensitivities and the Gram matrix of `[S r]`, so that nothing
+of size N × nw ever exists.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 
 from orthaug._base.jax import Array, jax, jnp
 from orthaug.data.record import Experiment, Record
-from orthaug.models.dynamics import Differentiated, Dynamics, Numbers
+from orthaug.models.dynamics import AutodiffDynamics, Dynamics, Numbers
 from orthaug.models.rows import gram
 
 CHUNK = 256  # segments that run side by side
@@ -23,7 +24,10 @@ _FEWEST = 8  # steps for which that pays
 
 
 class Segments(NamedTuple):
-    """Segments of T steps in chunks of m; the last axis counts segments. Steps that are not scored may be padding."""
+    """Segments of T steps in chunks of m; the last axis counts segments.
+
+    Steps that are not scored may be padding.
+    """
 
     start: Float[Any, "k n0 m"]
     """The state before the first step, as it was measured."""
@@ -42,15 +46,23 @@ class Segments(NamedTuple):
         return self.scored.shape[1]
 
 
-def lay_segments(
-    record: Record, dynamics: Dynamics, segment: int, washout: int, like: Segments | None = None, shares: int = 1
+def build_segments(
+    record: Record,
+    dynamics: Dynamics,
+    segment: int,
+    washout: int,
+    like: Segments | None = None,
+    shares: int = 1,
 ) -> Segments:
-    """Segments of `segment` steps; 0 for whole experiments. The number of chunks is a multiple of `shares`.
+    """Return segments of `segment` steps; 0 for whole experiments.
 
-    With `like` they are padded to its shape where they are fewer or shorter, so that the same programs run over them.
+    The number of chunks is a multiple of `shares`.
 
-    The scored steps of a segment begin where those of the segment before it end. So every usable row is scored once,
-    except the first `washout` of each experiment.
+    With `like` they are padded to its shape where they are fewer or shorter, so that the same
+    programs run over them.
+
+    The scored steps of a segment begin where those of the segment before it end. So every usable
+    row is scored once, except the first `washout` of each experiment.
     """
     usable = [len(experiment) - dynamics.first_row for experiment in record.experiments]
     longest = max(*usable, 0 if like is None else like.steps)
@@ -60,7 +72,9 @@ def lay_segments(
     for experiment, rows in zip(record.experiments, usable, strict=True):
         inputs = dynamics.inputs(experiment, record)
         begins = begins_of(rows, steps, washout)
-        pieces += [segment_of(experiment, inputs, begin, steps, washout, dynamics) for begin in begins]
+        pieces += [
+            segment_of(experiment, inputs, begin, steps, washout, dynamics) for begin in begins
+        ]
     count = len(pieces)
     chunks = -(-count // (CHUNK * shares)) * shares
     width = -(-count // chunks)
@@ -75,14 +89,16 @@ def lay_segments(
 
 
 def begins_of(rows: int, steps: int, washout: int) -> list[int]:
-    """Where the segments of an experiment begin."""
-    return [begin for begin in range(0, rows, steps - washout) if begin == 0 or begin + washout < rows]
+    """Return the first rows of the segments of an experiment."""
+    return [
+        begin for begin in range(0, rows, steps - washout) if begin == 0 or begin + washout < rows
+    ]
 
 
 def segment_of(
     experiment: Experiment, inputs: Any, begin: int, steps: int, washout: int, dynamics: Dynamics
 ) -> Segments:
-    """One segment. Where the experiment is shorter, its end is repeated."""
+    """Return one segment. Where the experiment is shorter, its last row is repeated."""
     rows = np.arange(begin, begin + steps)
     there = np.minimum(rows, len(inputs) - 1)
     first = dynamics.first_row + begin
@@ -95,13 +111,17 @@ def segment_of(
 def respond(
     dynamics: Dynamics, numbers: Numbers, segments: Segments, states: Float[Array, "k n0 m"]
 ) -> Float[Array, "k T ny m"]:
-    """Outputs of every segment from its state."""
+    """Return outputs of every segment from its state."""
     numbers = dynamics.prepared(numbers)
-    return jax.lax.map(lambda chunk: chunk_response(dynamics, numbers, *chunk), (states, segments.inputs))
+    return jax.lax.map(
+        lambda chunk: chunk_response(dynamics, numbers, *chunk), (states, segments.inputs)
+    )
 
 
-def chunk_response(dynamics: Dynamics, numbers: Numbers, states: Any, inputs: Any) -> Float[Array, "T ny m"]:
-    """Outputs of the segments of one chunk, of prepared numbers."""
+def chunk_response(
+    dynamics: Dynamics, numbers: Numbers, states: Any, inputs: Any
+) -> Float[Array, "T ny m"]:
+    """Return outputs of the segments of one chunk, of prepared numbers."""
     side_by_side = jax.vmap(partial(dynamics.step, numbers), in_axes=-1, out_axes=-1)
 
     def step(state: Any, inputs: Any) -> tuple[Any, Any]:
@@ -112,7 +132,10 @@ def chunk_response(dynamics: Dynamics, numbers: Numbers, states: Any, inputs: An
 
 
 class Sensitivity(NamedTuple):
-    """Gram matrices over the scored steps. Columns: the entries of the start (n0), then c and w (n), then the error."""
+    """Gram matrices over the scored steps.
+
+    Columns: the entries of the start (n0), then c and w (n), then the error.
+    """
 
     shared: Float[Array, "n+1 n+1"]
     """Of `[S_c S_w r]`, over all segments."""
@@ -128,7 +151,10 @@ def sensitivity(
     states: Float[Array, "k n0 m"],
     weight: Float[Array, "ny ny"],
 ) -> Sensitivity:
-    """Gram matrices of the sensitivities `∂ŷ/∂(start, c, w)` and the error, rows multiplied by `weight`."""
+    """Return Gram matrices of the sensitivities `∂ŷ/∂(start, c, w)` and the error.
+
+    Rows are multiplied by `weight`.
+    """
     numbers = dynamics.prepared(numbers)
     n = dynamics.unknowns
 
@@ -140,26 +166,39 @@ def sensitivity(
     return Sensitivity(*jax.lax.scan(one_chunk, jnp.zeros((n + 1, n + 1)), rows))
 
 
-def chunk_sensitivity(dynamics: Dynamics, numbers: Numbers, chunk: tuple[Any, ...], weight: Any) -> Sensitivity:
-    """The same of one chunk (states, inputs, target, scored), of prepared numbers."""
+def chunk_sensitivity(
+    dynamics: Dynamics, numbers: Numbers, chunk: tuple[Any, ...], weight: Any
+) -> Sensitivity:
+    """Return the Gram matrices of one chunk (states, inputs, target, scored)."""
     state, *rows = chunk
     n0, width = state.shape
     n = dynamics.unknowns
     at_once = _BLOCK // (width * (n0 + len(dynamics.outputs)) * (n0 + n)) if n0 else 0
-    blocks = isinstance(dynamics, Differentiated) and at_once >= _FEWEST
+    blocks = isinstance(dynamics, AutodiffDynamics) and at_once >= _FEWEST
     advance = partial(_steps_at_once, at_once) if blocks else _step_by_step
     nothing = (jnp.zeros((n + 1, n + 1)), jnp.zeros((n0, n0 + n + 1, width)))
-    return Sensitivity(*advance(dynamics, numbers, (state, dynamics.first_slopes(width), *nothing), rows, weight))
+    return Sensitivity(
+        *advance(dynamics, numbers, (state, dynamics.first_slopes(width), *nothing), rows, weight)
+    )
 
 
 def _columns(scored: Any, slope: Any, error: Any, weight: Any) -> Any:
-    """Slopes and error of scored steps side by side (ny, n0 + n + 1, …), rows multiplied by `weight`."""
+    """Return derivatives and error of scored steps side by side (ny, n0 + n + 1, …).
+
+    Rows are multiplied by `weight`.
+    """
     columns = jnp.where(scored, jnp.concatenate([slope, error[:, None]], axis=1), 0.0)
-    return jnp.einsum("oi,in...->on...", weight, columns) if len(weight) > 1 else weight[0, 0] * columns
+    return (
+        jnp.einsum("oi,in...->on...", weight, columns)
+        if len(weight) > 1
+        else weight[0, 0] * columns
+    )
 
 
-def _step_by_step(dynamics: Dynamics, numbers: Numbers, carry: Any, rows: Any, weight: Any) -> tuple[Any, Any]:
-    """Gram matrices of one chunk, for dynamics that know how to carry slopes."""
+def _step_by_step(
+    dynamics: Dynamics, numbers: Numbers, carry: Any, rows: Any, weight: Any
+) -> tuple[Any, Any]:
+    """Return Gram matrices of one chunk, for dynamics that can carry derivatives."""
     n0 = dynamics.states
 
     def step(carry: tuple[Any, ...], row: tuple[Any, ...]) -> tuple[Any, None]:
@@ -174,10 +213,15 @@ def _step_by_step(dynamics: Dynamics, numbers: Numbers, carry: Any, rows: Any, w
     return jax.lax.scan(step, carry, tuple(rows))[0][2:]
 
 
-def _steps_at_once(most: int, dynamics: Any, numbers: Numbers, carry: Any, rows: Any, weight: Any) -> tuple[Any, Any]:
-    """The same a block of steps at a time: it is run, then differentiated at all its points, which are then known.
+def _steps_at_once(
+    most: int, dynamics: Any, numbers: Numbers, carry: Any, rows: Any, weight: Any
+) -> tuple[Any, Any]:
+    """Return Gram matrices of one chunk, a block of steps at a time.
 
-    Only the product of the slopes has to go from step to step. A block is bounded, so nothing has the size of the data.
+    A block is run first, then differentiated at all its points, which are then known.
+
+    Only the product of the slopes has to go from step to step. A block is bounded, so nothing has
+    the size of the data.
     """
     n0, width = dynamics.states, carry[0].shape[-1]
     n, steps = dynamics.unknowns, len(rows[0])
@@ -188,9 +232,13 @@ def _steps_at_once(most: int, dynamics: Any, numbers: Numbers, carry: Any, rows:
     def block(carry: tuple[Any, ...], rows: tuple[Any, ...]) -> tuple[Any, None]:
         state, slopes, shared, own = carry
         inputs, target, scored = rows
-        state, states = jax.lax.scan(lambda state, row: (side_by_side(state, row), state), state, inputs)
+        state, states = jax.lax.scan(
+            lambda state, row: (side_by_side(state, row), state), state, inputs
+        )
         steps = dynamics.local(numbers, _flat(states), _flat(inputs))
-        value, to_state, to_unknowns = (part.reshape(*part.shape[:-1], size, width) for part in steps)
+        value, to_state, to_unknowns = (
+            part.reshape(*part.shape[:-1], size, width) for part in steps
+        )
         own_slopes = jnp.pad(to_unknowns, ((0, 0), (n0, 0), (0, 0), (0, 0)))
         by_step = (jnp.moveaxis(part[:n0], -2, 0) for part in (to_state, own_slopes))
 
@@ -206,7 +254,9 @@ def _steps_at_once(most: int, dynamics: Any, numbers: Numbers, carry: Any, rows:
         own = own + sum((output[:n0, None] * output[None]).sum(axis=-2) for output in columns)
         return (state, slopes, shared, own), None
 
-    rows = [jnp.pad(part, ((0, count * size - steps), *((0, 0),) * (part.ndim - 1))) for part in rows]
+    rows = [
+        jnp.pad(part, ((0, count * size - steps), *((0, 0),) * (part.ndim - 1))) for part in rows
+    ]
     cut = tuple(part.reshape(count, size, *part.shape[1:]) for part in rows)
     return jax.lax.scan(block, carry, cut)[0][2:]
 
@@ -226,7 +276,9 @@ def block_scores(
     place: Int[Array, "T"],
     blocks: int,
 ) -> Float[Array, "k blocks n0+n m"]:
-    """`Σ sᵀe` over the scored steps of every block: s the sensitivities to (start, c, w), rows times `weight`.
+    """Return `Σ sᵀe` over the scored steps of every block.
+
+    s are the sensitivities to (start, c, w), rows times `weight`.
 
     Args:
         place: the block of each step, the same in every segment.
@@ -240,7 +292,11 @@ def block_scores(
         inputs, target, scored, block = row
         state, slopes, value, slope = dynamics.tangents(numbers, state, slopes, inputs)
         columns = _columns(scored, slope, target - value, weight)
-        return (state, slopes, sums.at[block].add(jnp.sum(columns[:, :-1] * columns[:, -1:], axis=0))), None
+        return (
+            state,
+            slopes,
+            sums.at[block].add(jnp.sum(columns[:, :-1] * columns[:, -1:], axis=0)),
+        ), None
 
     def one_chunk(chunk: tuple[Any, ...]) -> Any:
         state, *rows = chunk

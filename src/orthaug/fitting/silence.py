@@ -1,9 +1,10 @@
-"""Learners that their regularization silenced: the warning, and runs with weaker regularizations beside them.
+"""Learners silenced by their regularization: the warning, and runs with weaker ones.
 
-Evidence starts from a learner that does nothing yet. A learner that first finds a constant, since the physics has no
-offset, lowers the loss by that, and evidence may then find that one weight is all it needs: dry friction is lost so.
-Such a run is made again without regularization, and with the ridge that evidence finds where that ended; held-out rows
-choose. Ard is for training one step ahead, where "auto" has compared it already.
+Evidence starts from a learner that does nothing yet. A learner that first finds a constant, since
+the physics has no offset, lowers the loss by that, and evidence may then find that one weight is
+all it needs: dry friction is lost so. Such a run is made again without regularization, and with the
+ridge that evidence finds where that ended; held-out rows choose. Ard is for training one step
+ahead, where "auto" has compared it already.
 """
 
 from __future__ import annotations
@@ -15,8 +16,8 @@ import numpy as np
 
 from orthaug._base.checks import Matrix
 from orthaug._base.errors import Warning
-from orthaug.fitting.held_out import HeldOut, mean_square
-from orthaug.fitting.learned import Learned
+from orthaug.fitting.held_out import HeldOutErrors, mean_square
+from orthaug.fitting.learned import TrainedLearner
 from orthaug.fitting.solvers.descent import evidence_ridge
 from orthaug.fitting.status import Ending
 
@@ -26,7 +27,7 @@ _FLAT = 0.01  # of the learner's RMS: a smaller standard deviation is that of a 
 
 
 def silenced(effective: float, outputs: int) -> bool:
-    """Return whether a regularization left no more than a constant of each output of the learner."""
+    """Return whether a regularization left at most a constant of each output of the learner."""
     return effective < _CONSTANT * outputs
 
 
@@ -36,7 +37,9 @@ def add_retries(
     outputs: int,
     make: Callable[[list[Any]], tuple[list[Any], list[Any]]],
 ) -> tuple[list[Any], list[Any]]:
-    """Return the planned runs with their ends, and where evidence silenced all of them those of weaker ones.
+    """Return the planned runs with their ends, and runs that were added.
+
+    The latter have weaker regularizations, where evidence silenced all others.
 
     Args:
         starts, runs: planned runs and how they ended.
@@ -51,16 +54,22 @@ def add_retries(
     usable = [end for end in ends if end.ending.usable]
     if not usable:
         return starts, runs
-    lowest = min(usable, key=lambda end: end.end.flown.loss)
-    ridge = float(f"{evidence_ridge(lowest.objective, lowest.end.flown, lowest.effective):.3g}")
+    lowest = min(usable, key=lambda end: end.end.point.loss)
+    ridge = float(f"{evidence_ridge(lowest.objective, lowest.end.point, lowest.effective):.3g}")
     more, others = make([start._replace(regularization=ridge) for start in starts])
     return starts + free + more, runs + ends + others
 
 
-def tell_retries(
-    planned: int, starts: Sequence[Any], runs: Sequence[Any], held_out: HeldOut | None, best: int
+def retry_warnings(
+    planned: int,
+    starts: Sequence[Any],
+    runs: Sequence[Any],
+    held_out: HeldOutErrors | None,
+    best: int,
 ) -> list[Warning]:
-    """Return the warning that evidence silenced the learner and what was tried then; none where nothing was.
+    """Return the warning that evidence silenced the learner, and the retries.
+
+    None where nothing was.
 
     Args:
         planned: number of the runs before any were added.
@@ -84,22 +93,28 @@ def tell_retries(
     effective = max(run.effective for run in runs[:planned])
     tried = " and ".join(_name(choice) for choice in choices[1:])
     text = (
-        f"evidence left {counted_weights(effective)} of the learner, no more than a constant, so training was tried "
-        f"again with {tried}. Errors in {held_out.where}, in deviations "
-        f"of the output: {found}, physics alone {_error(np.sqrt(mean_square(held_out.alone)))}. Kept is {kept}."
+        f"evidence left {counted_weights(effective)} of the learner, no more than a constant, "
+        f"so training was tried again with {tried}. Errors in {held_out.where}, in deviations "
+        f"of the output: {found}, physics alone {_error(np.sqrt(mean_square(held_out.alone)))}. "
+        f"The result is {kept}."
     )
     return [Warning("evidence_retried", text)]
 
 
-def learner_silent(learned: Learned, values: Matrix | None = None) -> list[Warning]:
-    """Return the warning that a learner does nothing, or no more than a constant; none otherwise.
+def learner_silent(learned: TrainedLearner, values: Matrix | None = None) -> list[Warning]:
+    """Return the warning that a learner is zero or constant; none otherwise.
 
     Args:
         learned: a trained learner.
         values: of the learner (N, ny) over the training rows, where they are known.
     """
     bound = learned.bound
-    if bound is None or not learned.ending.usable or learned.ending is Ending.SPANNED or not bound.size:
+    if (
+        bound is None
+        or not learned.ending.usable
+        or learned.ending is Ending.SPANNED
+        or not bound.size
+    ):
         return []
     if learned.effective < _SILENT or (values is not None and not values.any()):
         does = "the learner is silent: the fit is that of physics alone"
@@ -109,9 +124,10 @@ def learner_silent(learned: Learned, values: Matrix | None = None) -> list[Warni
         return []
     left = f"training left {counted_weights(learned.effective)} of {bound.size}"
     text = (
-        f"{does} ({left}). Either there is nothing to learn from what it sees, and it can be left out, or its "
-        'regularization was too strong: compare `regularization = "none"` and a small ridge such as 0.01 on held-out '
-        "data. A constant that the physics lacks belongs into the physics."
+        f"{does} ({left}). Either its inputs explain nothing more, and it can be left out, or "
+        'its regularization was too strong. Compare `regularization = "none"` and a small ridge '
+        "such as 0.01 on held-out data. A constant that the physics lacks belongs into the "
+        "physics."
     )
     return [Warning("learner_silent", text)]
 

@@ -1,4 +1,4 @@
-"""How training ends: code, cause and remedy in one place."""
+"""The endings of training: code, cause and remedy."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from enum import IntEnum
 
 
 class Ending(IntEnum):
-    """How a run ended. The number is what compiled loops carry, `code` is what programs read."""
+    """The ending of a run. Compiled loops carry the number, programs read `code`."""
 
     code: str
     cause: str
@@ -28,14 +28,16 @@ class Ending(IntEnum):
     NO_DESCENT = (
         2,
         "no_descent",
-        "no step lowered the loss; the start is already a minimum, or the learner's gradient is wrong",
+        "no step lowered the loss; the start is already a minimum, or the learner's gradient "
+        "is wrong",
         "Try another seed or another activation",
     )
     NON_FINITE = (
         3,
         "non_finite",
-        "the loss is not finite: (a) a learner input grows without bound, (b) the learner returns NaN, "
-        "(c) channels differ by many orders of magnitude, or (d) `learning_rate` is too large",
+        "the loss is not finite: (a) a learner input grows without bound, (b) the learner "
+        "returns NaN, (c) channels differ by many orders of magnitude, or (d) `learning_rate` "
+        "is too large",
         "Rescale the channels, choose other learner inputs, or lower the rate",
     )
     SPANNED = 4, "converged"
@@ -59,25 +61,30 @@ class Ending(IntEnum):
 
     @property
     def usable(self) -> bool:
-        """Whether there is a model."""
+        """True where there is a model."""
         return self is not Ending.NON_FINITE
 
 
 ALONE = {
-    Ending.NO_DESCENT: "no step of the physics' parameters lowered the loss: the start is already a minimum, or the "
-    "free run is too steep about it. Try other initial values, or a shorter `segment`",
-    Ending.NON_FINITE: "physics alone has no finite free run from its initial values. Give others, or bounds that "
-    "keep it from running away",
+    Ending.NO_DESCENT: (
+        "no step of the physics' parameters lowered the loss: the start is already a minimum, "
+        "or the free run is too sensitive there. Try other initial values, or a shorter "
+        "`segment`"
+    ),
+    Ending.NON_FINITE: (
+        "physics alone has no finite free run from its initial values. Give others, or bounds "
+        "that keep it from diverging"
+    ),
 }
 """The messages of a training without a learner, where others speak of one."""
 
 
 @dataclass(frozen=True)
 class Status:
-    """How training ended.
+    """The ending of training.
 
-    `loss` is the mean of squared errors with every output divided by its standard deviation, `start_loss` that of
-    physics alone under the same criterion.
+    `loss` is the mean of squared errors with every output divided by its standard deviation,
+    `start_loss` that of physics alone under the same criterion.
     """
 
     ending: Ending
@@ -90,7 +97,10 @@ class Status:
     """Cause and remedy, where more is known than how training ended."""
 
     def __repr__(self) -> str:
-        return f"Status({self.code}, {self.iterations} iterations, {self.seconds:.2f} s, loss {self.loss:.6g})"
+        return (
+            f"Status({self.code}, {self.iterations} iterations, {self.seconds:.2f} s, loss "
+            f"{self.loss:.6g})"
+        )
 
     @property
     def code(self) -> str:
@@ -102,11 +112,14 @@ class Status:
 
     @property
     def lines(self) -> list[str]:
-        """The lines of a fit's summary on it."""
-        ended = f"status      {self.code}, {self.iterations} iterations, {self.seconds:.2f} s, loss {self.loss:.6g}"
+        """The status as lines of a fit's summary."""
+        ended = (
+            f"status      {self.code}, {self.iterations} iterations, {self.seconds:.2f} s, "
+            f"loss {self.loss:.6g}"
+        )
         return [ended, f"            {self.message}"] if self.message else [ended]
 
     @property
     def ok(self) -> bool:
-        """Whether there is a usable model."""
+        """True where there is a usable model."""
         return self.ending.usable

@@ -1,9 +1,9 @@
 """Structures: how the fitted function `g = φc + f` is split between physics and learner (F2).
 
-Every structure spans the same functions. It decides two things only: which rows join the criterion, and
-which part of `c = θ − θ_aux` is called θ afterwards. The rows are linear in θ and in the learner's
-coordinates `QᵀF`, so θ can always be eliminated. Training sees a structure, its penalty and its bounds as
-one small quadratic in `QᵀF` (`fitting.elimination`).
+Every structure spans the same functions. It decides two things only: which rows join the criterion,
+and which part of `c = θ − θ_aux` is called θ afterwards. The rows are linear in θ and in the
+learner's coordinates `QᵀF`, so θ can always be eliminated. Training sees a structure, its penalty
+and its bounds as one small quadratic in `QᵀF` (`fitting.elimination`).
 """
 
 from __future__ import annotations
@@ -32,29 +32,35 @@ class PenaltyRows(NamedTuple):
 
 @runtime_checkable
 class Structure(Protocol):
-    """What `estimate(structure=…)` takes."""
+    """A structure as `estimate(structure=…)` accepts it."""
 
     @property
     def name(self) -> str: ...
 
     @property
     def projects(self) -> bool:
-        """Whether θ is split so that the learner is orthogonal to the physics."""
+        """True where θ is split so that the learner is orthogonal to the physics."""
         ...
 
     @property
     def identifies(self) -> bool:
-        """Whether the data alone determine θ where nothing is learned."""
+        """True where the data determine θ by themselves where nothing is learned."""
         ...
 
     @property
     def from_initial(self) -> bool:
-        """Whether one-step training takes θ from θ⁰ beside the weights; otherwise it solves θ for any weights."""
+        """True where one-step training starts θ at θ⁰ beside the weights.
+
+        Otherwise it solves θ for any weights.
+        """
         ...
 
     @property
     def shared(self) -> str:
-        """Along which directions of θ the learner is made orthogonal: "auto" for those it could imitate, or "all"."""
+        """Directions of θ along which the learner is made orthogonal.
+
+        "auto" for those it could imitate, or "all".
+        """
         ...
 
     @property
@@ -63,12 +69,18 @@ class Structure(Protocol):
         ...
 
     def penalty(self, names: Sequence[str], initial: Vector, unit: float) -> PenaltyRows:
-        """The rows that join the criterion, from θ⁰ (nθ,) and the output's unit in whitened outputs."""
+        """Return the penalty's rows of the criterion, in whitened outputs.
+
+        They depend on θ⁰ (nθ,) and on the output's unit.
+        """
         ...
 
 
-class _Solved:
-    """θ solved for any weights, without rows in the criterion; called what is left beside the learner."""
+class _SolvedTheta:
+    """θ solved for any weights, without rows in the criterion.
+
+    Called what is left beside the learner.
+    """
 
     projects = False
     identifies = True
@@ -82,14 +94,16 @@ class _Solved:
 
 
 @dataclass(frozen=True)
-class Orthogonal(_Solved):
+class Orthogonal(_SolvedTheta):
     """ŷ = φ(θ − θ_aux) + f with θ_aux = Φ_μ⁺F_μ (eq:orth_param).
 
-    Under the training measure θ̂ = Φ⁺Y for every learner that sees all lags (F1). Under another `measure` training is
-    the same; at the end the fitted function is split over the measure's points (F2).
+    Under the training measure θ̂ = Φ⁺Y for every learner that sees all lags (F1). Under another
+    `measure` training is the same; at the end the fitted function is split over the measure's
+    points (F2).
 
-    A learner that sees less can imitate only some directions of θ. `shared` "auto" projects along these alone,
-    `θ_aux = B(Φ_μB)⁺F_μ`; the others are what the fit determines beside the learner (F8). "all" is the paper.
+    A learner that sees less can imitate only some directions of θ. `shared` "auto" projects along
+    these alone, `θ_aux = B(Φ_μB)⁺F_μ`; the others are what the fit determines beside the learner
+    (F8). "all" is the paper.
 
     Examples:
         >>> from orthaug.inference.measures import Symmetrized
@@ -105,11 +119,11 @@ class Orthogonal(_Solved):
 
 
 @dataclass(frozen=True)
-class Additive(_Solved):
-    """ŷ = φθ + f (eqs:additive_struct): θ takes what this learner happens to leave, so it is not unique.
+class Additive(_SolvedTheta):
+    """ŷ = φθ + f (eqs:additive_struct). θ depends on the learner, so it is not unique.
 
-    With `from_initial` θ starts at θ⁰ and is trained with the weights, one step ahead; without, it is solved for any
-    weights and never sees θ⁰.
+    With `from_initial` θ starts at θ⁰ and is trained with the weights, one step ahead; without, it
+    is solved for any weights and never sees θ⁰.
     """
 
     from_initial: bool = False
@@ -120,8 +134,10 @@ class Additive(_Solved):
 
 
 @dataclass(frozen=True)
-class OrthogonalPenalty(_Solved):
-    """Additive with `λ‖QᵀF‖²` in the criterion (Kon 2022, Györök 2025): drives the learner out of the physics.
+class OrthogonalPenalty(_SolvedTheta):
+    """Additive with `λ‖QᵀF‖²` in the criterion (Kon 2022, Györök 2025).
+
+    The penalty drives the learner out of the physics.
 
     `weight` is λ, against the sum of squares in the output's units.
     """
@@ -138,8 +154,10 @@ class OrthogonalPenalty(_Solved):
 
 
 @dataclass(frozen=True)
-class BaselinePenalty(_Solved):
-    """Additive with `λ‖(θ − θ⁰)/θ⁰‖²` in the criterion (Bolderman 2022): keeps θ near its initial value.
+class BaselinePenalty(_SolvedTheta):
+    """Additive with `λ‖(θ − θ⁰)/θ⁰‖²` in the criterion (Bolderman 2022).
+
+    The penalty keeps θ near its initial value.
 
     `weight` is λ, against the sum of squares in the output's units.
     """
@@ -153,7 +171,7 @@ class BaselinePenalty(_Solved):
         check_fields(self)
 
     def penalty(self, names: Sequence[str], initial: Vector, unit: float) -> PenaltyRows:
-        """The rows `√λ (θ⁰ − θ)/θ⁰`.
+        """Return the rows `√λ (θ⁰ − θ)/θ⁰`.
 
         Raises:
             InputError: an initial value of 0, relative to which nothing can be penalised.
@@ -162,8 +180,13 @@ class BaselinePenalty(_Solved):
         if zero:
             start = "starts" if len(zero) == 1 else "start"
             raise InputError(
-                f"the baseline penalty is relative to the initial values, but {', '.join(zero)} {start} at 0; "
-                "give it another `initial`, or use the orthogonal structure."
+                "the baseline penalty is relative to the initial values, but "
+                f"{', '.join(zero)} {start} at 0; give it another `initial`, or use the "
+                "orthogonal structure."
             )
         root = np.sqrt(self.weight) * unit
-        return PenaltyRows(root * np.diag(1 / initial), np.zeros((len(names), len(names))), root * np.ones(len(names)))
+        return PenaltyRows(
+            root * np.diag(1 / initial),
+            np.zeros((len(names), len(names))),
+            root * np.ones(len(names)),
+        )

@@ -15,24 +15,25 @@ from orthaug._base.errors import InputError, Warning
 from orthaug._base.jax import jax
 from orthaug._base.lines import counted
 from orthaug._base.parallel import Threads, one_blas_thread
-from orthaug._base.progress import LOG, Tell
+from orthaug._base.progress import LOG, ProgressCallback
 from orthaug.data.record import Record
 from orthaug.fitting.conclusion import conclude
 from orthaug.fitting.estimates import Restart
-from orthaug.fitting.held_out import HeldOut, Pieces, blocked, mean_square, squared_errors
+from orthaug.fitting.held_out import HeldOutErrors, Pieces, blocked, mean_square, squared_errors
 from orthaug.fitting.kinds import Solver
-from orthaug.fitting.learned import Learned, Task
+from orthaug.fitting.learned import Task, TrainedLearner
 from orthaug.fitting.one_step import OneStepTask
-from orthaug.fitting.silence import add_retries, tell_retries
+from orthaug.fitting.silence import add_retries, retry_warnings
 from orthaug.fitting.status import Ending
 from orthaug.fitting.structures import Orthogonal, Structure
 from orthaug.models.learners import Bound
 
-_INFLATION = 1.4  # of the effective weights in cross-validation, against what follows the noise (Kim and Gu 2004)
-FOLD_ITERATIONS = 60  # enough to tell whether a learner helps, on every block of cross-validation
+# of the effective weights in cross-validation, against following the noise (Kim and Gu 2004)
+_INFLATION = 1.4
+FOLD_ITERATIONS = 60  # enough to see whether a learner helps, on every block of cross-validation
 
 
-Concluding = Callable[[Any, Structure, Learned], Any]
+Concluding = Callable[[Any, Structure, TrainedLearner], Any]
 """Makes the estimate of a task, a structure and what a run learned."""
 
 
@@ -45,7 +46,7 @@ class PlannedRun(NamedTuple):
 
 
 def planned(bound: Bound | None, seeds: range, choices: Sequence[str | float]) -> list[PlannedRun]:
-    """A run from every seed with every regularization; one without a learner."""
+    """Return a run from every seed with every regularization; one without a learner."""
     if bound is None:
         return [PlannedRun(seeds.start, np.zeros(0), "none")]
     keyed = {seed: bound.init(jax.random.key(seed)) for seed in seeds}
@@ -54,11 +55,15 @@ def planned(bound: Bound | None, seeds: range, choices: Sequence[str | float]) -
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """How one run is chosen: on `validation`, on held-out `blocks` of the training data, or by the lowest loss.
+    """Choice between runs by held-out errors or by the lowest loss.
 
-    With `scored` and without `validation` it is the lowest generalised cross-validation instead, one step ahead.
+    Held-out rows are a `validation` record, or `blocks` of the training data.
 
-    With `fallback` physics alone is handed over where no free run is better there. An `ensemble` takes them all.
+    With `scored` and without `validation` it is the lowest generalised cross-validation instead,
+    one step ahead.
+
+    With `fallback` the result is physics alone where no free run is better there. An `ensemble`
+    takes them all.
     """
 
     validation: Record | None = None
@@ -67,18 +72,25 @@ class Choice:
     ensemble: bool = False
     scored: bool = False
     retry: bool = False
-    """Whether runs that evidence silenced are made again with weaker regularizations, if held-out rows can choose."""
+    """Whether runs that evidence silenced are made again with weaker regularizations, if held-out
+    rows can choose.
+    """
 
     def compares(self, task: Task, starts: Sequence[PlannedRun]) -> bool:
-        """Whether there is something to choose by held-out errors: runs that fly, or several regularizations."""
+        """Return whether held-out errors choose between runs or regularizations.
+
+        They can where runs are finite, or regularizations are several.
+        """
         several = len({start.regularization for start in starts}) > 1
-        return task.bound is not None and (task.criterion.flown is not None or (several and not self.scored))
+        return task.bound is not None and (
+            task.criterion.free_run is not None or (several and not self.scored)
+        )
 
     def ranking(self, task: Task, runs: Sequence[Any], errors: Sequence[float]) -> np.ndarray:
-        """What is lowest for the best run: its held-out error, its score, or its loss.
+        """Return the value that is lowest for the best run: held-out error, score, or loss.
 
-        On blocks other runs of its kind were judged: one that ended higher on its own data than they did on what they
-        had not seen failed to train, and its loss counts.
+        On blocks other runs of its kind were judged: one that ended higher on its own data than
+        they did on what they had not seen failed to train, and its loss counts.
         """
         losses = np.array([task.loss(run) for run in runs])
         if np.isfinite(errors).any():
@@ -93,7 +105,7 @@ def train(
     structure: Structure,
     solver: Solver,
     choice: Choice,
-    progress: Tell,
+    progress: ProgressCallback,
     conclude: Concluding = conclude,
     runner: Any = Threads(),  # noqa: B008  (it holds nothing)
 ) -> Any:
@@ -106,26 +118,36 @@ def train(
     with one_blas_thread():
         task = task.prepared(solver, structure, partial(progress, 0))
     LOG.info("training: %d runs of %s, %s", len(starts), type(solver).__name__, structure.name)
-    planned, (starts, runs) = len(starts), _run_all(task, starts, structure, solver, choice, progress, runner)
+    planned, (starts, runs) = (
+        len(starts),
+        _run_all(task, starts, structure, solver, choice, progress, runner),
+    )
     losses = [task.loss(run) for run in runs]
-    concluded = cache(lambda i: _concluded(conclude, task, structure, task.learned(runs[i])))
+    concluded = cache(lambda i: _conclude(conclude, task, structure, task.learned(runs[i])))
     stopped = sum(run.ending is Ending.STOPPED for run in runs)
-    untried = bool(stopped and choice.validation is None and choice.blocks and choice.compares(task, starts))
+    untried = bool(
+        stopped and choice.validation is None and choice.blocks and choice.compares(task, starts)
+    )
     if untried:  # who asks to end does not wait for runs on held-out blocks
         choice = replace(choice, blocks=0)
     held_out = _held_out(task, starts, concluded, structure, solver, choice, conclude, runner)
-    errors = [math.nan] * len(runs) if held_out is None else [mean_square(run) for run in held_out.runs]
+    errors = (
+        [math.nan] * len(runs) if held_out is None else [mean_square(run) for run in held_out.runs]
+    )
     ranking = choice.ranking(task, runs, errors)
     usable = np.array([run.ending.usable for run in runs]) & np.isfinite(ranking)
     best = int(np.argmin(np.where(usable, ranking, np.inf)))
-    told = []
+    replacing = []
     if held_out is not None:
         held_out = replace(held_out, chosen=best)
-        runs_freely = task.criterion.flown is not None and task.start_loss is not None
+        runs_freely = task.criterion.free_run is not None and task.start_loss is not None
         if choice.fallback and runs_freely and not held_out.ratio.value < 1:
-            told, best = [_fell_back(held_out)], -1
-            LOG.info("no free run is better than physics alone where it was not fitted: physics alone is handed over")
-    LOG.info("run %d is chosen of %d; 0 is physics alone", best + 1, len(runs))
+            replacing, best = [_fell_back(held_out)], -1
+            LOG.info(
+                "no free run is better than physics alone on held-out rows: the result is "
+                "physics alone"
+            )
+    LOG.info("run %d of %d is chosen; 0 is physics alone", best + 1, len(runs))
     alike = _members(starts, ranking, best) if choice.scored else _alike(starts, best)
     shown = alike if choice.scored and held_out is None else list(range(len(starts)))
     members = [best]
@@ -133,22 +155,22 @@ def train(
         estimate = _alone(conclude, task, structure)
     elif choice.ensemble:
         members = alike
-        estimate = _concluded(conclude, task, structure, _median(task, runs, members, best))
+        estimate = _conclude(conclude, task, structure, _median(task, runs, members, best))
     else:
         estimate = concluded(best)
     scored = choice.scored and held_out is None
     scores = [_cross_validation(task, run) if scored else math.nan for run in runs]
-    told_of = list(zip(starts, runs, losses, errors, scores, strict=True))
-    restarts = tuple(_restart(*told_of[i], chosen=i in members) for i in shown)
+    results = list(zip(starts, runs, losses, errors, scores, strict=True))
+    restarts = tuple(_restart(*results[i], chosen=i in members) for i in shown)
     seconds = task.seconds + sum(run.seconds for run in runs)
     status = replace(estimate.status, seconds=seconds, start_loss=task.start_loss)
     warnings = (
         *estimate.warnings,
         *task.warnings,
-        *_replaced(starts, runs),
-        *_stopped(stopped, len(runs), untried),
-        *told,
-        *tell_retries(planned, starts, runs, held_out, best),
+        *_replacement_warnings(starts, runs),
+        *_stop_warnings(stopped, len(runs), untried),
+        *replacing,
+        *retry_warnings(planned, starts, runs, held_out, best),
     )
     beside = _beside(conclude, task, structure) if best >= 0 else None
     found = {"restarts": restarts, "status": status, "held_out": held_out, "physics_alone": beside}
@@ -156,12 +178,21 @@ def train(
 
 
 def _beside(conclude: Concluding, task: Task, structure: Structure) -> Any:
-    """The estimate of physics alone that a learner stands beside; None without one, and where it costs a pass."""
+    """Return the estimate of physics alone, to compare with that of a learner.
+
+    None without one, and where it costs a pass.
+    """
     streamed = hasattr(task.problem, "source")
-    return None if task.bound is None or streamed else _kept_physics(conclude, task, structure)
+    return (
+        None
+        if task.bound is None or streamed
+        else _physics_for_comparison(conclude, task, structure)
+    )
 
 
-def _restart(start: PlannedRun, run: Any, loss: float, error: float, score: float, *, chosen: bool) -> Restart:
+def _restart(
+    start: PlannedRun, run: Any, loss: float, error: float, score: float, *, chosen: bool
+) -> Restart:
     return Restart(
         seed=start.seed,
         loss=finite_or_none(loss),
@@ -175,19 +206,24 @@ def _restart(start: PlannedRun, run: Any, loss: float, error: float, score: floa
 
 
 def _cross_validation(task: Task, run: Any) -> float:
-    """Generalised: `N RSS / (N − nθ − 1.4 γ)²` of a run one step ahead; infinite where it uses up all rows."""
+    """Return the score `N RSS / (N − nθ − 1.4 γ)²` of a run one step ahead (generalised).
+
+    Infinite where it uses up all rows.
+    """
     samples = task.problem.samples
     left = samples - len(task.problem.baseline.names) - _INFLATION * run.effective
     return task.loss(run) * (samples / left) ** 2 if left > 0 else math.inf
 
 
 def _alike(starts: Sequence[PlannedRun], best: int) -> list[int]:
-    """The runs with the regularization of the best one."""
-    return [i for i, start in enumerate(starts) if start.regularization == starts[best].regularization]
+    """Return the runs with the regularization of the best one."""
+    return [
+        i for i, start in enumerate(starts) if start.regularization == starts[best].regularization
+    ]
 
 
 def _members(starts: Sequence[PlannedRun], ranking: np.ndarray, best: int) -> list[int]:
-    """The best run from every seed."""
+    """Return the best run from every seed."""
     seeds = dict.fromkeys(start.seed for start in starts)
     ranking = np.where(np.isfinite(ranking), ranking, np.inf)
     own = {seed: [i for i, start in enumerate(starts) if start.seed == seed] for seed in seeds}
@@ -200,35 +236,49 @@ def _run_all(
     structure: Structure,
     solver: Solver,
     choice: Choice,
-    progress: Tell,
+    progress: ProgressCallback,
     runner: Any,
 ) -> tuple[list[PlannedRun], list[Any]]:
-    """Make every planned run, and more where evidence silenced the learner and held-out rows can choose."""
+    """Make every planned run, and weaker regularizations where evidence silenced the learner.
+
+    The latter only where held-out rows can choose.
+    """
     begun, runs = _run(task, starts, structure, solver, progress, runner)
     if task.bound is None or not choice.retry or (choice.validation is None and not choice.blocks):
         return begun, runs
 
     def again(planned: list[PlannedRun]) -> tuple[list[PlannedRun], list[Any]]:
-        return _run(task, planned, structure, solver, lambda i, *at: progress(len(begun) + i, *at), runner)
+        return _run(
+            task, planned, structure, solver, lambda i, *at: progress(len(begun) + i, *at), runner
+        )
 
     return add_retries(begun, runs, task.bound.ny, again)
 
 
 def _run(
-    task: Task, starts: Sequence[PlannedRun], structure: Structure, solver: Solver, progress: Tell, runner: Any
+    task: Task,
+    starts: Sequence[PlannedRun],
+    structure: Structure,
+    solver: Solver,
+    progress: ProgressCallback,
+    runner: Any,
 ) -> tuple[list[PlannedRun], list[Any]]:
-    """Every planned run; one that fails is made again from the seeds that follow."""
+    """Return every planned run; one that fails is made again from the seeds that follow."""
     made, given = list(starts), (task, solver, structure)
     runs = list(runner.map(_one_run, given, made, progress))
     for i, (start, run) in enumerate(zip(made, runs, strict=True), 1):
-        told = (i, start.seed, run.ending.code, run.iterations, task.loss(run), run.seconds)
-        LOG.info("run %d, seed %d: %s after %d iterations, loss %.4g, %.2f s", *told)
+        figures = (i, start.seed, run.ending.code, run.iterations, task.loss(run), run.seconds)
+        LOG.info("run %d, seed %d: %s after %d iterations, loss %.4g, %.2f s", *figures)
     failed = [start for start, run in zip(made, runs, strict=True) if not run.ending.usable]
-    if task.bound is None or not failed or len(failed) == len(made):  # where all fail the data or the learner are bad
+    if (
+        task.bound is None or not failed or len(failed) == len(made)
+    ):  # where all fail the data or the learner are bad
         return made, runs
     following = max(start.seed for start in made) + 1
     bound = task.bound
-    LOG.debug("%d runs failed and are made again from the seeds after %d", len(failed), following - 1)
+    LOG.debug(
+        "%d runs failed and are made again from the seeds after %d", len(failed), following - 1
+    )
     again = [
         start._replace(seed=seed, weights=bound.init(jax.random.key(seed)))
         for seed, start in enumerate(failed, following)
@@ -237,25 +287,36 @@ def _run(
     return made + again, runs + list(more)
 
 
-def _one_run(given: tuple[Task, Solver, Structure], start: PlannedRun, tell: Callable[..., None]) -> Any:
+def _one_run(
+    given: tuple[Task, Solver, Structure], start: PlannedRun, report: Callable[..., None]
+) -> Any:
     task, solver, structure = given
-    return task.run(solver, start.weights, structure, start.regularization, tell)
+    return task.run(solver, start.weights, structure, start.regularization, report)
 
 
-def _replaced(starts: Sequence[PlannedRun], runs: Sequence[Any]) -> list[Warning]:
-    failed = [str(start.seed) for start, run in zip(starts, runs, strict=True) if not run.ending.usable]
+def _replacement_warnings(starts: Sequence[PlannedRun], runs: Sequence[Any]) -> list[Warning]:
+    failed = [
+        str(start.seed) for start, run in zip(starts, runs, strict=True) if not run.ending.usable
+    ]
     if not failed or len(failed) == len(runs):
         return []
-    text = f"training failed from seed {', '.join(failed)} and was made again from the seeds after the last one."
+    text = (
+        f"training failed from seed {', '.join(failed)} and was made again from the seeds "
+        "after the last one."
+    )
     return [Warning("start_replaced", text)]
 
 
-def _stopped(count: int, runs: int, untried: bool) -> list[Warning]:
+def _stop_warnings(count: int, runs: int, untried: bool) -> list[Warning]:
     if not count:
         return []
     text = f"training was stopped on request: {count} of {counted(runs, 'run')} had not ended"
     text += ", and none was tried on held-out blocks" if untried else ""
-    return [Warning("stopped", f"{text}; the best so far is kept, which training to the end may better.")]
+    return [
+        Warning(
+            "stopped", f"{text}; the best run so far is kept. Training to the end may improve it."
+        )
+    ]
 
 
 def _held_out(
@@ -267,8 +328,8 @@ def _held_out(
     choice: Choice,
     conclude: Concluding,
     runner: Any,
-) -> HeldOut | None:
-    """Errors where nothing was fitted: of the runs on the validation record, or of runs on folds on their blocks.
+) -> HeldOutErrors | None:
+    """Return held-out errors: of runs on the validation record, or of runs on folds.
 
     `concluded` gives the estimate of a run by its number.
     """
@@ -277,24 +338,34 @@ def _held_out(
         fits = [concluded(i) for i in range(len(starts))]
         alone = _errors(_alone(conclude, task, structure), record, unit)
         labels = ("the validation part",) * len(record.experiments)
-        return HeldOut("the validation part", labels, alone, tuple(_errors(fit, record, unit) for fit in fits))
+        return HeldOutErrors(
+            "the validation part", labels, alone, tuple(_errors(fit, record, unit) for fit in fits)
+        )
     if not choice.blocks or not choice.compares(task, starts):
         return None
     try:
         folds = blocked(task.problem.record, choice.blocks, task.problem.first_row)
     except InputError:  # too few rows to leave some out
-        LOG.debug("too few rows for %d blocks of cross-validation; the lowest loss chooses", choice.blocks)
+        LOG.debug(
+            "too few rows for %d blocks of cross-validation; the lowest loss chooses", choice.blocks
+        )
         return None
     LOG.info("cross-validation: %d folds of %d runs", len(folds), len(starts))
     given = (task, starts, structure, solver.at_most(FOLD_ITERATIONS), conclude)
     found = runner.map(_on_fold, given, folds)
     pieces = [[p for block in column for p in block] for column in zip(*found, strict=True)]
-    labels = tuple(f"block {i + 1} of {choice.blocks}" for i, (_, held) in enumerate(folds) for _ in held.experiments)
-    return HeldOut(f"blocked cross-validation ({choice.blocks} blocks)", labels, pieces[0], tuple(pieces[1:]))
+    labels = tuple(
+        f"block {i + 1} of {choice.blocks}"
+        for i, (_, held) in enumerate(folds)
+        for _ in held.experiments
+    )
+    return HeldOutErrors(
+        f"blocked cross-validation ({choice.blocks} blocks)", labels, pieces[0], tuple(pieces[1:])
+    )
 
 
-def _on_fold(given: Any, fold: tuple[Record, Record], tell: Callable[..., None]) -> list[Pieces]:
-    """Errors on a block, of physics alone and of a run from every start on the rest."""
+def _on_fold(given: Any, fold: tuple[Record, Record], report: Callable[..., None]) -> list[Pieces]:
+    """Return errors on a block of physics alone, and of runs from every start on the rest."""
     task, starts, structure, solver, conclude = given
     training, held = fold
     failed: Pieces = [None] * len(held.experiments)
@@ -302,29 +373,31 @@ def _on_fold(given: Any, fold: tuple[Record, Record], tell: Callable[..., None])
         own = task.on(training).prepared(solver, structure)
         fits = [_alone(conclude, own, structure)]
         for start in starts:
-            tell()
+            report()
             run = own.run(solver, start.weights, structure, start.regularization)
-            fits.append(_concluded(conclude, own, structure, own.learned(run)))
+            fits.append(_conclude(conclude, own, structure, own.learned(run)))
     except InputError:  # the block took away what the physics needs
         return [failed] * (1 + len(starts))
     return [_errors(fit, held, task.problem.deviation) for fit in fits]
 
 
 def _errors(fit: Any, record: Record, unit: Any) -> Pieces:
-    """Of the criterion's own response; None for a run without a model or a value."""
+    """Return errors of the criterion's own response; None for a run without model or value."""
     if not fit.status.ok:
         return [None] * len(record.experiments)
     return squared_errors(fit.criterion.response(fit.model, record), unit)
 
 
-def _fell_back(held_out: HeldOut) -> Warning:
-    model, alone = (math.sqrt(mean_square(p)) for p in (held_out.runs[held_out.chosen], held_out.alone))
+def _fell_back(held_out: HeldOutErrors) -> Warning:
+    model, alone = (
+        math.sqrt(mean_square(p)) for p in (held_out.runs[held_out.chosen], held_out.alone)
+    )
     errors = f"its error is {model:.4g} deviations of the output, that of physics alone {alone:.4g}"
     if math.isinf(model):
-        errors = "every one of its starts runs away there"
+        errors = "every one of its runs diverges there"
     text = (
-        f"in {held_out.where} the learner is not better than physics alone ({errors}), so the result is "
-        "physics alone; `fallback = false` keeps the learner."
+        f"in {held_out.where} the learner is not better than physics alone ({errors}), so the "
+        "result is physics alone; `fallback = false` keeps the learner."
     )
     return Warning("physics_alone", text)
 
@@ -334,19 +407,31 @@ def _alone(conclude: Concluding, task: Task, structure: Structure) -> Any:
     return replace(conclude(rows, structure, learned), criterion=task.criterion)
 
 
-def _kept_physics(conclude: Concluding, task: Task, structure: Structure) -> Any:
-    """Return physics alone to set beside a learner: least squares one step ahead, whatever penalty θ has beside it."""
+def _physics_for_comparison(conclude: Concluding, task: Task, structure: Structure) -> Any:
+    """Return physics alone for comparison with a learner.
+
+    It is least squares one step ahead, also where θ has a penalty.
+    """
     plain = task.criterion.one_step and not structure.projects
     return _alone(conclude, task, Orthogonal() if plain else structure)
 
 
-def _concluded(conclude: Concluding, task: Task, structure: Structure, learned: Learned) -> Any:
+def _conclude(
+    conclude: Concluding, task: Task, structure: Structure, learned: TrainedLearner
+) -> Any:
     return replace(conclude(task.rows_task, structure, learned), criterion=task.criterion)
 
 
-def _median(task: Task, runs: Sequence[Any], members: Sequence[int], best: int) -> Learned:
-    """The median of the members that have a value everywhere; the best one alone if it has none."""
+def _median(task: Task, runs: Sequence[Any], members: Sequence[int], best: int) -> TrainedLearner:
+    """Return the median of the members that have a value everywhere.
+
+    The best one alone if it has none.
+    """
     rows: OneStepTask = task.rows_task
     learned = {i: task.learned(runs[i]) for i in members}
     sound = [i for i, member in learned.items() if np.isfinite(rows.share(member).square)]
-    return task.median([learned[i] for i in sound], sound.index(best)) if best in sound else learned[best]
+    return (
+        task.median([learned[i] for i in sound], sound.index(best))
+        if best in sound
+        else learned[best]
+    )

@@ -1,8 +1,9 @@
-"""Fits whose training ended while the loss still fell noticeably: what they say of it, and no intervals of θ.
+"""Fits whose training ended while the loss still fell noticeably: no intervals of θ.
 
-Under the training measure the orthogonal structure's `θ̂ = Φ⁺Y` one step ahead is the same after every iteration (F1),
-and its intervals depend on training through the variance of the residual alone. Everywhere else θ moves with the
-weights: split along some directions only, under another measure, or trained on the free run.
+Under the training measure the orthogonal structure's `θ̂ = Φ⁺Y` one step ahead is the same after
+every iteration (F1), and its intervals depend on training through the variance of the residual
+alone. Everywhere else θ moves with the weights: split along some directions only, under another
+measure, or trained on the free run.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from dataclasses import replace
 from orthaug._base.errors import Warning
 from orthaug._base.lines import counted, percent
 from orthaug.fitting.elimination import directions
-from orthaug.fitting.learned import Learned
+from orthaug.fitting.learned import TrainedLearner
 from orthaug.fitting.solvers.limit import Tail, noticeable_in
 from orthaug.fitting.status import Ending
 from orthaug.fitting.structures import Structure
@@ -20,21 +21,24 @@ from orthaug.inference.measures import Training
 from orthaug.physics.problem import Problem
 
 NOT_CONVERGED = "not_converged"
-_SETTLED_THETA = 1e-3  # of the loss: half of that is what the standard errors of a θ that does not move change by
+# of the loss: the standard errors of a θ that does not move change by half of that
+_SETTLED_THETA = 1e-3
 
 
 def noticeable_fall(structure: Structure, decoupled: bool, samples: int) -> float:
-    """Return the fall of the loss over a window that is worth going on for, one step ahead.
+    """Return the smallest fall of the loss over a window that is worth more steps.
 
     Args:
         structure: with its measure.
         decoupled: whether θ under the training measure does not depend on the learner.
         samples: number of residuals.
     """
-    return _SETTLED_THETA if decoupled and structure.measure == Training() else noticeable_in(samples)
+    return (
+        _SETTLED_THETA if decoupled and structure.measure == Training() else noticeable_in(samples)
+    )
 
 
-def follows_training(structure: Structure, problem: Problem, learned: Learned) -> bool:
+def follows_training(structure: Structure, problem: Problem, learned: TrainedLearner) -> bool:
     """Return whether θ of a lagged model moves with the weights."""
     if learned.errors is not None or learned.coefficients is not None:
         return True
@@ -42,37 +46,46 @@ def follows_training(structure: Structure, problem: Problem, learned: Learned) -
     return not whole or structure.measure != Training()
 
 
-def unfinished(learned: Learned) -> bool:
+def unfinished(learned: TrainedLearner) -> bool:
     """Return whether training ended while the loss still fell noticeably."""
     return learned.ending.usable and learned.tail is not None and learned.tail.noticeable
 
 
-def withheld(learned: Learned) -> Learned:
-    """Return what a run left without what intervals are made of."""
+def withheld(learned: TrainedLearner) -> TrainedLearner:
+    """Return the result of a run without the parts that give intervals."""
     errors = None if learned.errors is None else learned.errors._replace(covariance=None)
     return replace(learned, gram=None, middle=None, errors=errors)
 
 
-def not_converged(learned: Learned) -> Warning:
+def not_converged(learned: TrainedLearner) -> Warning:
     """Return the warning that there are no intervals, with cause and remedy."""
     assert learned.tail is not None
     text = (
-        f"no intervals: training ended after {counted(learned.tail.done, 'iteration')} while the loss still fell "
-        f"({_fall(learned.tail)}), so the parameters may still move by more than their standard errors. "
+        f"no intervals: training ended after {counted(learned.tail.done, 'iteration')} while "
+        f"the loss still fell ({_fall(learned.tail)}), so the parameters may still move by "
+        "more than their standard errors. "
     )
     if learned.ending is Ending.STOPPED:
         return Warning(NOT_CONVERGED, f"{text}Train to the end.")
     if learned.bound is None:
-        text += "Give initial values nearer to the data, fix what the data do not determine, or allow more `iterations`"
+        text += (
+            "Give initial values nearer to the data, fix what the data do not determine, or "
+            "allow more `iterations`"
+        )
     else:
-        text += "Take a smaller learner or a stronger regularization, which settle sooner, or allow more `iterations`"
+        text += (
+            "Take a smaller learner or a stronger regularization, which settle sooner, or "
+            "allow more `iterations`"
+        )
     if not learned.tail.prolonged:
-        text += "; without the key training goes on by itself while the loss falls, up to ten times 300"
+        text += (
+            "; without the key training goes on by itself while the loss falls, up to ten times 300"
+        )
     return Warning(NOT_CONVERGED, f"{text}.")
 
 
 def ending_in_words(ending: Ending, tail: Tail | None) -> str:
-    """Return what the limit meant for a run; empty where its ending says all."""
+    """Return the meaning of the limit for a run; empty where its ending says all."""
     if tail is None or not ending.usable:
         return ""
     words = ""
@@ -82,11 +95,14 @@ def ending_in_words(ending: Ending, tail: Tail | None) -> str:
         words += "more iterations may improve it"
         if not tail.noticeable:
             words = (
-                f"training stopped at its limit of {counted(tail.done, 'iteration')}, and the loss hardly fell any "
-                f"more ({_fall(tail)})"
+                f"training stopped at its limit of {counted(tail.done, 'iteration')}, and the "
+                f"loss hardly fell any more ({_fall(tail)})"
             )
     if tail.prolonged:
-        past = f"training went on past its limit of {counted(tail.limit, 'iteration')}, for the loss still fell"
+        past = (
+            f"training went on past its limit of {counted(tail.limit, 'iteration')}, because "
+            "the loss still fell"
+        )
         words = f"{past}; {words or ending.message}".rstrip("; ")
     return words
 

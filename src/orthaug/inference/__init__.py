@@ -1,4 +1,4 @@
-"""What θ means and how surely it is known: measures, splits under them, covariances, physical parameters."""
+"""The meaning of θ and its uncertainty: measures, splits, covariances, physical parameters."""
 
 import lazy_loader
 

@@ -1,9 +1,11 @@
-"""Covariances and intervals: of θ, of θ and weights together, of predictions, robust to coloured or uneven noise.
+"""Covariances and intervals of θ, of θ and weights together, and of predictions.
 
-The calibrated form `(Σψᵀψ)⁻¹(ΣψᵀΣ_eψ)(Σψᵀψ)⁻¹` for the criterion `1/N Σ‖ε‖²` (Ljung 1999, ch. 9): the factor 2 of the
-paper's eq:cov_approx cancels against the second derivative of the criterion; for plain least squares that form gives
-twice `σ²(ΦᵀΦ)⁻¹`. Learner weights are over-parametrised, so their block is singular. Only functions of the model have
-intervals.
+Robust ones hold for coloured or uneven noise.
+
+The calibrated form `(Σψᵀψ)⁻¹(ΣψᵀΣ_eψ)(Σψᵀψ)⁻¹` for the criterion `1/N Σ‖ε‖²` (Ljung 1999, ch. 9):
+the factor 2 of the paper's eq:cov_approx cancels against the second derivative of the criterion;
+for plain least squares that form gives twice `σ²(ΦᵀΦ)⁻¹`. Learner weights are over-parametrised, so
+their block is singular. Only functions of the model have intervals.
 """
 
 from __future__ import annotations
@@ -24,7 +26,14 @@ from orthaug.data.record import Record
 from orthaug.models.dynamics import Numbers
 from orthaug.models.lagged import Lagged
 from orthaug.models.model import Model
-from orthaug.models.rows import InMemory, chunk_shape, from_chunks, in_chunks, learner_rows, projected_gram
+from orthaug.models.rows import (
+    InMemory,
+    chunk_shape,
+    from_chunks,
+    in_chunks,
+    learner_rows,
+    projected_gram,
+)
 from orthaug.models.statistics import column_units, half_inverse
 from orthaug.physics.problem import Problem
 from orthaug.physics.projection import Factor
@@ -33,7 +42,7 @@ CONVENTIONS = ("calibrated", "paper")
 
 
 def degrees_of_freedom(rows: int, physics: Vector, effective: float) -> Vector:
-    """Degrees of freedom of each output (ny,): its rows less what the fit has used up.
+    """Return the degrees of freedom of each output (ny,): its rows less what the fit has used up.
 
     The physics uses `Σ_k ‖Q_ki‖²` of output i (its share of nθ), the learner its effective weights.
     """
@@ -41,30 +50,38 @@ def degrees_of_freedom(rows: int, physics: Vector, effective: float) -> Vector:
 
 
 def noise_covariance(squares: Matrix, freedom: Vector) -> Matrix | None:
-    """Σ_e (ny, ny) in the outputs' units from Σ e eᵀ; None where the fit leaves no degree of freedom."""
+    """Return Σ_e (ny, ny) in the outputs' units from Σ e eᵀ.
+
+    None where the fit leaves no degree of freedom.
+    """
     if np.any(freedom < 0.5):
         return None
     return squares / np.sqrt(np.outer(freedom, freedom))
 
 
 def whitening(noise: Matrix) -> Matrix | None:
-    """W with `W Σ Wᵀ = I` (ny, ny); None for a covariance that is singular, as of outputs without errors."""
+    """Return W with `W Σ Wᵀ = I` (ny, ny).
+
+    None for a covariance that is singular, as of outputs without errors.
+    """
     values = np.linalg.eigvalsh(noise)
     return np.linalg.inv(np.linalg.cholesky(noise)) if values[0] > 1e-12 * values[-1] else None
 
 
 def mixing(noise: Matrix) -> Matrix:
-    """M with `MᵀM = Σ` (ny, ny), also of a singular covariance."""
+    """Return M with `MᵀM = Σ` (ny, ny), also of a singular covariance."""
     values, vectors = np.linalg.eigh(noise)
     return (vectors * np.sqrt(np.maximum(values, 0.0))).T
 
 
 def theta_covariance(factor: Factor, middle: Matrix, fixed: Collection[int] = ()) -> Matrix:
-    """Cov θ̂ (nθ, nθ) of θ̂ = Φ⁺Y. For one output this is the textbook s²(ΦᵀΦ)⁻¹.
+    """Return Cov θ̂ (nθ, nθ) of θ̂ = Φ⁺Y.
 
-    Args:
-        middle: ΣqᵀΣ_eq (nθ, nθ) over the rows q of Q, in whitened outputs; for one output s² I.
-        fixed: entries that stand at a bound. They have NaN; the others' covariance holds with them fixed there.
+    For one output this is the textbook s²(ΦᵀΦ)⁻¹.
+
+    Args: middle: ΣqᵀΣ_eq (nθ, nθ) over the rows q of Q, in whitened outputs; for one output s² I.
+        fixed: entries at a bound. They have NaN; the others' covariance holds with them
+        fixed there.
     """
     nt = len(factor.scale)
     free = [i for i in range(nt) if i not in fixed]
@@ -75,10 +92,13 @@ def theta_covariance(factor: Factor, middle: Matrix, fixed: Collection[int] = ()
 
 
 def theta_block(information: Matrix, ridge: float, nt: int, fixed: Collection[int] = ()) -> Matrix:
-    """Cov θ̂ (nθ, nθ) per unit of noise variance, from the information `[S_θ S_w]ᵀ[S_θ S_w]` of θ and weights.
+    """Return Cov θ̂ (nθ, nθ) per unit of noise variance.
 
-    The weights are eliminated: `(H_θθ − H_θw (H_ww + αI)⁺ H_wθ)⁻¹`. Directions of the weights that the data do not see
-    count as absent. Entries at a bound (`fixed`) are NaN. All are NaN where θ is not determined beside the weights.
+    It comes from the information `[S_θ S_w]ᵀ[S_θ S_w]` of θ and weights.
+
+    The weights are eliminated: `(H_θθ − H_θw (H_ww + αI)⁺ H_wθ)⁻¹`. Directions of the weights that
+    the data do not see count as absent. Entries at a bound (`fixed`) are NaN. All are NaN where θ
+    is not determined beside the weights.
     """
     free = [i for i in range(nt) if i not in fixed]
     covariance = np.full((nt, nt), np.nan)
@@ -99,24 +119,30 @@ def theta_block(information: Matrix, ridge: float, nt: int, fixed: Collection[in
 
 
 def reach(freedom: float, level: float = 0.95) -> float:
-    """Half the length of a Student-t interval, in standard errors."""
+    """Return half the length of a Student-t interval, in standard errors."""
     return float(scipy.special.stdtrit(max(freedom, 1.0), 0.5 + level / 2))
 
 
-def interval(value: Any, std: Any, freedom: float, level: float = 0.95) -> Float[np.ndarray, "*n 2"]:
-    """Student-t interval of each entry, (…, 2)."""
+def interval(
+    value: Any, std: Any, freedom: float, level: float = 0.95
+) -> Float[np.ndarray, "*n 2"]:
+    """Return the Student-t interval of each entry, (…, 2)."""
     half = reach(freedom, level) * std
     return np.stack([value - half, value + half], axis=-1)
 
 
-def joint_covariance(problem: Problem, model: Model, convention: str = "calibrated") -> Matrix:
+def joint_covariance(
+    problem: Problem, model: Model, convention: str = "calibrated", *, own_units: bool = False
+) -> Matrix:
     """Cov of θ̂ and the learner's weights in the orthogonal structure, from the raw `[Φ J̃]`, J̃ = P⊥J; (nθ + nw)².
 
-    Under the training measure the blocks between θ and weights are zero (`thm:zero_cov`), if all outputs have the same
-    noise or share no θ. One pass over the rows.
+    Under the training measure the blocks between θ and weights are zero (`thm:zero_cov`), if all
+    outputs have the same noise or share no θ. One pass over the rows.
 
-    Args:
-        convention: "paper" for eq:cov_approx divided by N, factor 2 and `Σ̂ = (1/N) Σ e eᵀ` included.
+    Args: convention: "paper" for eq:cov_approx divided by N, factor 2 and `Σ̂ = (1/N) Σ e eᵀ`
+        included. own_units: invert the weights' block by a pseudo-inverse in the weights' own
+        units: of directions whose
+            eigenvalue is rounding beside the largest, there is nothing in the result.
 
     Raises:
         InputError: an unknown convention, or a model without a learner's gradient.
@@ -124,30 +150,47 @@ def joint_covariance(problem: Problem, model: Model, convention: str = "calibrat
     check_choice(convention, CONVENTIONS, "`convention`")
     if model.numbers.tilt is not None:
         raise InputError("an ensemble has no gradient in its weights; use a single learner.")
-    residual = np.concatenate([(t.measured - t.model)[t.start :] for t in model.predict(problem.record).trajectories])
-    noise: Any = residual.T @ residual / len(residual) if convention == "paper" else model.statistics.noise
+    residual = np.concatenate(
+        [(t.measured - t.model)[t.start :] for t in model.predict(problem.record).trajectories]
+    )
+    noise: Any = (
+        residual.T @ residual / len(residual) if convention == "paper" else model.statistics.noise
+    )
     if noise is None:
         raise InputError("the fit has no noise covariance: there are no degrees of freedom left.")
     projection, nt, ny = problem.projection, len(problem.baseline.names), len(problem.outputs)
     engine = InMemory()
-    rows = learner_rows(engine, model.form, model.numbers, problem.rows.x, problem.projection.q, problem.weight.matrix)
+    rows = learner_rows(
+        engine,
+        model.form,
+        model.numbers,
+        problem.rows.x,
+        problem.projection.q,
+        problem.weight.matrix,
+    )
     whitened = problem.weight.whitened(noise)
     bound, w = model.form.bound, np.asarray(model.numbers.weights)
-    share = problem.count / len(problem.rows)  # of which the rows in memory are a witness
-    outer, middle = (share * projected_gram(engine, bound, w, rows, m) for m in (np.eye(ny), mixing(whitened)))
+    share = problem.count / len(problem.rows)  # of which the rows in memory are a subsample
+    outer, middle = (
+        share * projected_gram(engine, bound, w, rows, m) for m in (np.eye(ny), mixing(whitened))
+    )
     change = np.eye(len(outer))
     change[:nt, :nt] = projection.r / projection.scale
     outer, middle = (change.T @ gram @ change for gram in (outer, middle))
     # block by block, as in the proof: one inverse of both mixes rounding of the weights' singular block into θ's
-    half: Any = scipy.linalg.block_diag(half_inverse(outer[:nt, :nt], nt), half_inverse(outer[nt:, nt:], 0))
+    weights = half_inverse(outer[nt:, nt:], 0, own_units=own_units)
+    half: Any = scipy.linalg.block_diag(half_inverse(outer[:nt, :nt], nt), weights)
     return (2.0 if convention == "paper" else 1.0) * half @ (half.T @ middle @ half) @ half.T
 
 
 def prediction_std(model: Model, record: Record) -> list[Matrix]:
-    """Standard error of the one-step prediction on every row of every experiment, (N, ny); NaN on the first lags.
+    """Return the standard error (N, ny) of one-step predictions on every row of every experiment.
 
-    It is that of the fitted function, `√(ψ Cov(c, w) ψᵀ)`. A new measurement adds the noise, whose covariance (ny, ny)
-    is `model.statistics.noise`: its standard deviation is `√(std² + diag(noise))`.
+    NaN on the first lags.
+
+    It is that of the fitted function, `√(ψ Cov(c, w) ψᵀ)`. A new measurement adds the noise, whose
+    covariance (ny, ny) is `model.statistics.noise`: its standard deviation is `√(std² +
+    diag(noise))`.
 
     Args:
         model: with statistics, as a fit has them.
@@ -159,7 +202,7 @@ def prediction_std(model: Model, record: Record) -> list[Matrix]:
     joint = model.statistics.joint(len(model.theta))
     if joint is None or model.numbers.tilt is not None:
         raise InputError(
-            "the model has no statistics to take standard errors from (an ensemble, or trained elsewhere)."
+            "the model has no statistics for standard errors (an ensemble, or trained elsewhere)."
         )
     root = joint.root()
     record = model.fitting(record, need_outputs=True)
@@ -186,7 +229,7 @@ def _variances(
 def changes(
     form: Lagged, numbers: Numbers, x: Float[Array, "k nx m"], root: Float[Array, "n r"]
 ) -> Float[Array, "k ro m"]:
-    """How far each prediction moves along the columns of `root`."""
+    """Return how far each prediction moves along the columns of `root`."""
 
     def one_chunk(rows: Any) -> Any:
         moved = _along(form, numbers, rows, root)
@@ -196,19 +239,23 @@ def changes(
 
 
 def _along(form: Lagged, numbers: Numbers, rows: Any, root: Any) -> Float[Array, "r ny m"]:
-    """∂ŷ/∂(c, w) of a chunk of rows along the columns of `root`."""
+    """Return ∂ŷ/∂(c, w) of a chunk of rows along the columns of `root`."""
     phi = jax.vmap(lambda row: form.baseline.phi(row, form.layout, form.outputs, jnp), -1, -1)(rows)
     columns = jnp.moveaxis(phi, 1, 0)  # (nt, ny, m)
     if form.bound is not None:
         z = form.features.evaluate(rows.T, form.layout, jnp)
         z = ((z - numbers.centre) / numbers.halfwidth).T
-        gain = jnp.broadcast_to(jnp.diag(numbers.gain)[..., None], (*2 * (len(form.outputs),), rows.shape[-1]))
+        gain = jnp.broadcast_to(
+            jnp.diag(numbers.gain)[..., None], (*2 * (len(form.outputs),), rows.shape[-1])
+        )
         columns = jnp.concatenate([columns, form.bound.jacobian(numbers.weights, z, gain)[1]])
     return jnp.einsum("nom,nr->rom", columns, root)
 
 
 def newey_west(scores: Sequence[Float[np.ndarray, "N nt"]], lags: int | None = None) -> Matrix:
-    """Σ_k Σ_j w_{|k−j|} s_k s_jᵀ with Bartlett weights (Newey and West 1987), lags never across experiments.
+    """Return Σ_k Σ_j w_{|k−j|} s_k s_jᵀ with Bartlett weights (Newey and West 1987).
+
+    No lag reaches across two experiments.
 
     Args:
         scores: of every experiment, (N_i, nt).
@@ -225,8 +272,10 @@ def newey_west(scores: Sequence[Float[np.ndarray, "N nt"]], lags: int | None = N
     return np.asarray(total)
 
 
-def robust_covariance(problem: Problem, residual: Matrix, used: float, lags: int | None = None) -> Matrix:
-    """Cov θ̂ (nθ, nθ) of `θ̂ = Φ⁺Y` where the noise may be coloured or uneven (Newey-West).
+def robust_covariance(
+    problem: Problem, residual: Matrix, used: float, lags: int | None = None
+) -> Matrix:
+    """Return Cov θ̂ (nθ, nθ) of `θ̂ = Φ⁺Y` for coloured or uneven noise (Newey-West).
 
     Args:
         residual: (N, ny) in the outputs' units, rows as in the problem.
@@ -236,25 +285,41 @@ def robust_covariance(problem: Problem, residual: Matrix, used: float, lags: int
     whitened = problem.weight.rows(residual)
     scores = np.einsum("kit,ki->kt", projection.q, whitened)
     factor = projection.covariance_factor()
-    return _correction(problem, residual, used) * factor @ newey_west(by_experiment(problem, scores), lags) @ factor.T
+    return (
+        _correction(problem, residual, used)
+        * factor
+        @ newey_west(by_experiment(problem, scores), lags)
+        @ factor.T
+    )
 
 
 def robust_split_covariance(
-    problem: Problem, model: Model, slope: Matrix, residual: Matrix, used: float, lags: int | None = None
+    problem: Problem,
+    model: Model,
+    slope: Matrix,
+    residual: Matrix,
+    used: float,
+    lags: int | None = None,
 ) -> Matrix:
-    """The same of any split `θ = c + θ_aux(w)`, from the influence `[I, ∂θ_aux/∂w] M⁻¹ ψ_k e_k` of every row.
+    """Return Cov θ̂ (nθ, nθ) of a split `θ = c + θ_aux(w)` for coloured or uneven noise.
+
+    It is the sum over the influence `[I, ∂θ_aux/∂w] M⁻¹ ψ_k e_k` of every row.
 
     Args:
         slope: ∂θ_aux/∂w (nθ, nw).
     """
     statistics, nt, ny = model.statistics, len(slope), residual.shape[1]
     if statistics.gram is None or model.numbers.tilt is not None:
-        raise InputError("the fit has no statistics that robust standard errors could be made of.")
+        raise InputError(
+            "the fit has no statistics for robust standard errors; fit the data again."
+        )
     prior = np.concatenate([np.zeros(nt), np.full(len(statistics.gram) - nt, statistics.ridge)])
     half = half_inverse(statistics.gram + np.diag(prior), nt)
     root = half @ (half.T @ np.column_stack([np.eye(nt), slope]).T)
     chunks = jnp.asarray(in_chunks(problem.rows.x, chunk_shape(len(residual)), repeat=True))
-    moved = from_chunks(np.asarray(changes(model.form, model.numbers, chunks, jnp.asarray(root))), len(residual))
+    moved = from_chunks(
+        np.asarray(changes(model.form, model.numbers, chunks, jnp.asarray(root))), len(residual)
+    )
     matrix = problem.weight.matrix
     weighed = residual @ (matrix.T @ matrix)
     scores = np.einsum("kro,ko->kr", moved.reshape(len(residual), nt, ny), weighed)
@@ -262,13 +327,15 @@ def robust_split_covariance(
 
 
 def _correction(problem: Problem, residual: Matrix, used: float) -> float:
-    """For what the fit has used up."""
-    share = problem.count / len(problem.rows)  # of which the residual is a witness
+    """Return the factor that corrects for the degrees of freedom that the fit has used up."""
+    share = problem.count / len(problem.rows)  # of which the residual is a subsample
     samples = residual.size * share
     return share * samples / max(samples - len(problem.baseline.names) - used, 1.0)
 
 
 def by_experiment(problem: Problem, values: Matrix) -> list[Matrix]:
-    """What each usable row has, (N, m), in a piece per experiment."""
-    ends = np.cumsum([len(experiment) - problem.rows.start for experiment in problem.record.experiments])
+    """Return values of the usable rows (N, m) in one piece per experiment."""
+    ends = np.cumsum(
+        [len(experiment) - problem.rows.start for experiment in problem.record.experiments]
+    )
     return np.split(values, ends[:-1])

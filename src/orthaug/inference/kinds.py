@@ -1,4 +1,6 @@
-"""The measures that a spec knows by name. A new one is a file with its declaration, and an entry here.
+"""The measures that a spec refers to by name.
+
+A new one is a file with its declaration, and an entry here.
 
 Those from files become `Samples` and `Weighted`.
 """
@@ -25,7 +27,7 @@ Range = tuple[Row, Row]
 
 @dataclass(frozen=True, eq=False)
 class MeasurePlace:
-    """What a declared measure is resolved with: the folder of its files, the model's raw lags, the training data.
+    """Context that resolves a declared measure: folder of its files, raw lags, training data.
 
     `start` is the first usable row of each experiment.
     """
@@ -38,7 +40,9 @@ class MeasurePlace:
 
 @dataclass(frozen=True)
 class SampleFiles:
-    """Declares `Samples`: files with a column per raw lag, named as in expressions, and optionally `weight`.
+    """Declaration of `Samples` by files with a column per raw lag, and optionally `weight`.
+
+    Columns are named as in expressions.
 
     Args:
         files: their paths, relative to the spec.
@@ -60,7 +64,9 @@ class SampleFiles:
 
 @dataclass(frozen=True)
 class WeightFiles:
-    """Declares `Weighted`: files with a column `weight`. Together they have a row for each row of the training data.
+    """Declaration of `Weighted` by files with a column `weight`.
+
+    Together they have a row for each row of the training data.
 
     Rows before the first usable one have weights too, which are not used.
     """
@@ -72,12 +78,14 @@ class WeightFiles:
 
     def resolve(self, place: MeasurePlace) -> Weighted:
         files = [place.folder / file for file in self.files]
-        weights = np.concatenate([read_record(f, outputs=["weight"]).experiments[0].outputs[:, 0] for f in files])
+        weights = np.concatenate(
+            [read_record(f, outputs=["weight"]).experiments[0].outputs[:, 0] for f in files]
+        )
         lengths = [len(experiment) for experiment in place.record.experiments]
         if len(weights) != sum(lengths):
             raise InputError(
-                f"{', '.join(map(str, files))}: {len(weights)} weights for {sum(lengths)} rows of training data; "
-                "give one for each row, in the same order."
+                f"{', '.join(map(str, files))}: {len(weights)} weights for {sum(lengths)} rows "
+                "of training data; give one for each row, in the same order."
             )
         pieces = np.split(weights, np.cumsum(lengths)[:-1])
         return Weighted(np.concatenate([piece[place.start :] for piece in pieces]))

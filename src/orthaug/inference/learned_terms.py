@@ -1,4 +1,4 @@
-"""What a learner of terms has learned: each term with its coefficient, unit and interval, and the equation."""
+"""The terms of a learner, each with its coefficient, unit and interval, and the fitted equation."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ WRITINGS = ("text", "latex", "python")
 class LearnedTerm:
     """A term of the learner in one output, or in one equation of a motion.
 
-    `largest` is the largest contribution over the training data, in the unit of what it is added to; `std` and `ci95`
-    are None where there are no standard errors.
+    `largest` is the largest contribution over the training data, in the unit of what it is added
+    to; `std` and `ci95` are None where there are no standard errors.
     """
 
     term: str
@@ -40,11 +40,14 @@ class LearnedTerm:
 
 
 def learned_terms(model: Any) -> tuple[LearnedTerm, ...]:
-    """Of a fitted model, the largest contribution first; empty where the learner is no sum of terms."""
+    """Return the learned terms of a fitted model, the largest contribution first.
+
+    Empty where the learner is no sum of terms.
+    """
     form, numbers, statistics = model.form, model.numbers, model.statistics
     if form.bound is None or not isinstance(form.bound.learner, Terms) or numbers.tilt is not None:
         return ()
-    places, features = _added_to(model), _features(model)
+    places, features = _targets(model), _features(model)
     scale = np.asarray(numbers.gain)[:, None] / np.asarray(numbers.halfwidth)[None, :]
     values = (np.reshape(numbers.weights, scale.shape) * scale).ravel()
     nt = len(numbers.theta)
@@ -64,24 +67,31 @@ def learned_terms(model: Any) -> tuple[LearnedTerm, ...]:
                 known = {"std": float(std[n]), "ci95": (float(ci[n, 0]), float(ci[n, 1]))}
             largest = abs(values[n]) * float(numbers.halfwidth[j])
             own = coefficient_unit(unit, feature, units)
-            found.append(LearnedTerm(str(feature), place, float(values[n]), own, float(largest), **known))
+            found.append(
+                LearnedTerm(str(feature), place, float(values[n]), own, float(largest), **known)
+            )
     return tuple(sorted(found, key=lambda term: -term.largest))
 
 
 def equation(model: Any, writing: str = "text") -> str:
-    """The whole model as an equation for each output, or for each equation of a motion, with its numbers.
+    """Return the fitted model with its numbers, an equation per output or per motion equation.
 
     Args:
-        writing: "text", "latex", or "python": expressions of arrays that Python evaluates, in full precision.
+        writing: "text", "latex", or "python": expressions of arrays that Python evaluates, in full
+            precision.
 
     Raises:
-        InputError: a learner that is no sum of terms, physics that is a Python function, another writing.
+        InputError: a learner that is no sum of terms, physics that is a Python function, another
+            writing.
     """
     check_choice(writing, WRITINGS, "`writing`")
     form = model.form
     terms = learned_terms(model)
     if form.bound is not None and not terms:
-        raise InputError("only a learner of terms can be written as an equation; `explain` finds terms for another.")
+        raise InputError(
+            "only a learner of terms can be written as an equation; `explain` finds terms for "
+            "another."
+        )
     written = []
     for left, physics in _physics(model, writing):
         own = [(term.coefficient, term.term) for term in terms if term.added_to == left[0]]
@@ -101,15 +111,21 @@ def _moves(model: Any) -> bool:
     return hasattr(model.form, "motion")
 
 
-def _added_to(model: Any) -> list[tuple[str, str]]:
-    """Name and unit of what each row of weights is added to."""
+def _targets(model: Any) -> list[tuple[str, str]]:
+    """Return the name and unit of the quantity that each row of weights is added to."""
     if not _moves(model):
         return [(channel.name, channel.unit) for channel in model.outputs]
     motion = model.form.motion
     states, outputs = motion.learned
     units = {channel.name: channel.unit for channel in model.outputs}
-    rates = [(motion.states[i].name, f"({motion.states[i].unit})/s" if motion.states[i].unit else "") for i in states]
-    return [*rates, *((motion.outputs[i].name, units.get(motion.outputs[i].name, "")) for i in outputs)]
+    rates = [
+        (motion.states[i].name, f"({motion.states[i].unit})/s" if motion.states[i].unit else "")
+        for i in states
+    ]
+    return [
+        *rates,
+        *((motion.outputs[i].name, units.get(motion.outputs[i].name, "")) for i in outputs),
+    ]
 
 
 def _units(model: Any) -> dict[str, str]:
@@ -120,19 +136,31 @@ def _units(model: Any) -> dict[str, str]:
 
 
 def _physics(model: Any, writing: str) -> list[tuple[tuple[str, str], list[str]]]:
-    """Of each equation its name and left side, and the terms of the physics."""
+    """Return each equation's name and left side, and its terms of the physics."""
     if _moves(model):
         return _rates(model, writing)
     baseline = model.form.baseline
     if baseline.function is not None:
-        raise InputError("the physics is a Python function, which cannot be written as an equation.")
+        raise InputError(
+            "the physics is a Python function, which cannot be written as an equation."
+        )
     c = dict(zip(baseline.names, model.theta - model.theta_aux, strict=True))
     found = []
     for channel in model.outputs:
         own = [term for term in baseline.terms if term.output in (None, channel.name)]
-        values = [((term.initial or 0.0) if term.fixed else c[term.parameter], term.regressor) for term in own]
-        left = latex(Expression(f"{channel.name}[k]")) if writing == "latex" else f"{channel.name}[k]"
-        found.append(((channel.name, left), [_product(value, text, writing, model) for value, text in values]))
+        values = [
+            ((term.initial or 0.0) if term.fixed else c[term.parameter], term.regressor)
+            for term in own
+        ]
+        left = (
+            latex(Expression(f"{channel.name}[k]")) if writing == "latex" else f"{channel.name}[k]"
+        )
+        found.append(
+            (
+                (channel.name, left),
+                [_product(value, text, writing, model) for value, text in values],
+            )
+        )
     return found
 
 
@@ -162,7 +190,13 @@ def _product(value: float, text: str, writing: str, model: Any) -> str:
     if writing == "latex":
         number = _power_of_ten(number)
         return number if text == "1" else rf"{number}\,{latex(Expression(text))}"
-    return number if text == "1" else f"{number}*({text})" if outside_brackets(text, "+-") else f"{number}*{text}"
+    return (
+        number
+        if text == "1"
+        else f"{number}*({text})"
+        if outside_brackets(text, "+-")
+        else f"{number}*{text}"
+    )
 
 
 def _power_of_ten(number: str) -> str:
@@ -171,7 +205,7 @@ def _power_of_ten(number: str) -> str:
 
 
 def term_frame(terms: Sequence[LearnedTerm]) -> pd.DataFrame:
-    """A row per term; NaN where there is no interval."""
+    """Return a table with a row per term; NaN where there is no interval."""
     import pandas as pd
 
     nothing = (np.nan, np.nan)
@@ -191,16 +225,26 @@ def term_frame(terms: Sequence[LearnedTerm]) -> pd.DataFrame:
 
 
 def term_lines(terms: Sequence[LearnedTerm]) -> list[str]:
-    """The terms as a table of text, a heading before them; a dash where there is no interval."""
+    """Return the terms as a table in text, with a heading.
+
+    A dash where there is no interval.
+    """
     if not terms:
         return []
     width = max(4, *(len(term.term) for term in terms))
     several = len({term.added_to for term in terms}) > 1
-    lines = ["", f"{'term':<{width}}  {'coefficient':>14}  {'std':>11}  {'95 % interval':^29}  {'largest':>11}  unit"]
+    lines = [
+        "",
+        f"{'term':<{width}}  {'coefficient':>14}  {'std':>11}  {'95 % interval':^29}  "
+        f"{'largest':>11}  unit",
+    ]
     for term in terms:
         spread, reach = f"{'–':>11}", f"{'–':^29}"
         if term.std is not None and term.ci95 is not None:
             spread, reach = f"{term.std:11.4g}", f"[{term.ci95[0]:13.7g}, {term.ci95[1]:13.7g}]"
-        row = f"{term.term:<{width}}  {term.coefficient:14.8g}  {spread}  {reach}  {term.largest:11.5g}  "
+        row = (
+            f"{term.term:<{width}}  {term.coefficient:14.8g}  {spread}  {reach}  "
+            f"{term.largest:11.5g}  "
+        )
         lines.append(f"{row}{term.unit or ''}{f'  in {term.added_to}' * several}".rstrip())
     return lines

@@ -1,8 +1,8 @@
-"""Measures: the points, with weights, on which physics and learner are made orthogonal (F3), and the physics there.
+"""Measures: weighted points on which physics and learner are made orthogonal (F3).
 
-θ under a measure is `Φ_μ⁺ G_μ`, the least-squares share of the fitted function g in the physics over those points. The
-paper takes the training set. A function that is orthogonal to the physics under one measure need not be so under
-another.
+θ under a measure is `Φ_μ⁺ G_μ`, the least-squares share of the fitted function g in the physics
+over those points. The paper takes the training set. A function that is orthogonal to the physics
+under one measure need not be so under another.
 """
 
 from __future__ import annotations
@@ -34,7 +34,8 @@ from orthaug.physics.projection import Projection
 _NODES = (1 << 20, 512, 64)  # of the rule for one, two and three coordinates, in each of them
 _PANEL = 8  # Gauss-Legendre nodes of a panel
 _QUASI_RANDOM = 1 << 17  # points for more coordinates, doubled by their mirror images
-_NEIGHBOURS = 20_000  # points at most, of the data and of the measure, by which the reach of the data is judged
+# points at most, of the data and of the measure, by which the reach of the data is judged
+_NEIGHBOURS = 20_000
 
 
 class Points(NamedTuple):
@@ -46,7 +47,7 @@ class Points(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Support:
-    """What a measure may draw on: the training record, its regressor, and the lags that the model reads."""
+    """The training record, its regressor and the lags that the model reads, for measures."""
 
     record: Record
     layout: Layout
@@ -56,15 +57,17 @@ class Support:
 
     @classmethod
     def of(cls, problem: Problem) -> Support:
-        """Where a problem is posed."""
+        """Return the support of a posed problem."""
         return cls(problem.record, problem.layout, problem.used, problem.rows.x)
 
     @classmethod
     def of_motion(cls, motion: Motion, x: Matrix, u: Matrix) -> Support:
-        """Of a motion's states (M, nx) and inputs (M, nu) at the training rows."""
+        """Return the support of a motion's states (M, nx) and inputs (M, nu) at training rows."""
         layout, points = layout_of(motion), np.concatenate([x, u], axis=1)
         channels = tuple(Channel(f"c{i}") for i in range(len(layout)))
-        return cls(Record((), channels, 1.0, (Experiment(points[:, :0], points),)), layout, layout, points)
+        return cls(
+            Record((), channels, 1.0, (Experiment(points[:, :0], points),)), layout, layout, points
+        )
 
     @cached_property
     def x(self) -> Matrix:
@@ -72,10 +75,11 @@ class Support:
         return stack_rows(self.record, self.layout).x if self.stacked is None else self.stacked
 
     def share(self, points: Points) -> float:
-        """The measure's weight within reach of the training data.
+        """Return the share of the measure's weight that lies in the operating range of the data.
 
-        A point is within reach if its nearest training point is closer than a limit: twice the distance from a training
-        point to its nearest neighbour, at the 99 % quantile. Each used lag counts in units of the range of its data.
+        A point is within reach if its nearest training point is closer than a limit: twice the
+        distance from a training point to its nearest neighbour, at the 99 % quantile. Each used lag
+        counts in units of the range of its data.
         """
         columns = [j for j, lag in enumerate(self.layout) if lag in self.used]
         x = self.x[:, columns]
@@ -96,13 +100,13 @@ class Support:
 
 @runtime_checkable
 class Measure(Protocol):
-    """What `Orthogonal(measure=…)` and `fit.split(…)` take."""
+    """A measure as `Orthogonal(measure=…)` and `fit.split(…)` accept it."""
 
     @property
     def name(self) -> str: ...
 
     def points(self, support: Support) -> Points:
-        """The points over which physics and learner are made orthogonal."""
+        """Return the points over which physics and learner are made orthogonal."""
         ...
 
 
@@ -112,7 +116,10 @@ def _even(x: Matrix) -> Points:
 
 @dataclass(frozen=True)
 class Training:
-    """The training rows with equal weights: the paper's measure. `rows` (start, stop) of each experiment."""
+    """The training rows with equal weights: the paper's measure.
+
+    `rows` (start, stop) of each experiment.
+    """
 
     rows: tuple[int, int] | None = field(default=None, metadata=LIBRARY_ONLY)
     name: str = field(default="training", metadata=LIBRARY_ONLY)
@@ -128,13 +135,15 @@ class Training:
             kept.append(rows[max(start - first, 0) : max(stop - first, 0)])
         x = np.concatenate(kept)
         if not len(x):
-            raise InputError(f"rows {start}:{stop} hold no usable row; the first is at row {first}.")
+            raise InputError(
+                f"rows {start}:{stop} hold no usable row; the first is at row {first}."
+            )
         return _even(x)
 
 
 @dataclass(frozen=True)
 class Symmetrized:
-    """The training rows and their mirror images −x: the paper's sign trick without a new experiment."""
+    """The training rows and their mirror images −x: the paper's sign trick."""
 
     name: str = field(default="symmetrized", metadata=LIBRARY_ONLY)
 
@@ -145,19 +154,19 @@ class Symmetrized:
 
 @dataclass(frozen=True, eq=False)
 class Weighted:
-    """The training rows with weights of one's own, (N,), in the order of the usable rows."""
+    """The training rows with given weights (N,), in the order of the usable rows."""
 
     weights: Any
     name: str = "weighted"
 
     def points(self, support: Support) -> Points:
         x = support.x
-        return Points(x, _normalised(self.weights, len(x), "usable rows"))
+        return Points(x, _normalise(self.weights, len(x), "usable rows"))
 
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Points of one's own: a column per raw lag that the model reads, named as in expressions.
+    """Given points: a column per raw lag that the model reads, named as in expressions.
 
     Args:
         columns: values (M,) of each lag, `{"force[k-1]": …}`.
@@ -185,13 +194,21 @@ class Samples:
         missing = [str(lag) for lag in support.used if lag not in values]
         if missing:
             what = _entries(support)
-            raise InputError(f"the samples lack {', '.join(missing)}; give a column for every {what} that is used.")
+            raise InputError(
+                f"the samples lack {', '.join(missing)}; give a column for every {what} that "
+                "is used."
+            )
         lengths = {str(lag): v.shape for lag, v in values.items()}
         if len(set(lengths.values())) > 1 or any(len(shape) != 1 for shape in lengths.values()):
-            raise InputError(f"the samples' columns differ in shape: {lengths}; give one vector of a length for each.")
+            raise InputError(
+                f"the samples' columns differ in shape: {lengths}; give one vector of a length "
+                "for each."
+            )
         count = next(iter(values.values())).shape[0]
         if not count:
-            raise InputError("the samples have no rows; give at least as many as there are parameters.")
+            raise InputError(
+                "the samples have no rows; give at least as many as there are parameters."
+            )
         bad = [str(lag) for lag, v in values.items() if not np.isfinite(v).all()]
         if bad:
             raise InputError(f"the samples' column {bad[0]} holds a value that is not finite.")
@@ -199,24 +216,30 @@ class Samples:
         for j, lag in enumerate(support.layout):
             x[:, j] = values.get(lag, 0.0)
         weight = np.ones(count) if self.weights is None else self.weights
-        return Points(x, _normalised(weight, count, "samples"))
+        return Points(x, _normalise(weight, count, "samples"))
 
 
 @dataclass(frozen=True, eq=False)
 class Uniform:
-    """Uniform over a box of raw lags, integrated by a deterministic rule that is symmetric about the box's centre.
+    """Uniform over a box of raw lags.
 
-    Composite Gauss-Legendre in up to three coordinates, Sobol points with their mirror images in more.
+    A deterministic rule that is symmetric about the box's centre integrates over it.
+
+    Composite Gauss-Legendre in up to three coordinates, Sobol points with their mirror images in
+    more.
 
     Args:
-        box: limits of raw lags, `{"force[k-1]": (-200, 200)}`; lags that are not named take the data's own range.
+        box: limits of raw lags, `{"force[k-1]": (-200, 200)}`; lags that are not named take the
+            data's own range.
 
     Examples:
         >>> Uniform(box={"u[k-1]": (-2, 2)}).name  # fit.split(Uniform(…)) gives θ under it
         'uniform'
     """
 
-    box: Annotated[Mapping[str, Annotated[Sequence[float], Len(2, 2)]], Option("box")] = field(default_factory=dict)
+    box: Annotated[Mapping[str, Annotated[Sequence[float], Len(2, 2)]], Option("box")] = field(
+        default_factory=dict
+    )
     name: str = field(default="uniform", metadata=LIBRARY_ONLY)
 
     def points(self, support: Support) -> Points:
@@ -229,7 +252,7 @@ class Uniform:
         return Points(x, unit.weight)
 
     def limits(self, support: Support) -> tuple[Vector, Vector]:
-        """Lower and upper limits of every entry of the regressor, each (nx,).
+        """Return the lower and upper limits of every entry of the regressor, each (nx,).
 
         Raises:
             InputError: an unknown lag, limits that are empty or reversed.
@@ -241,7 +264,9 @@ class Uniform:
             try:
                 start, stop = (float(limit) for limit in limits)
             except (TypeError, ValueError):
-                raise InputError(f"the box of {text} must be two numbers, lower and upper; got {limits!r}.") from None
+                raise InputError(
+                    f"the box of {text} must be two numbers, lower and upper; got {limits!r}."
+                ) from None
             if not (math.isfinite(start) and math.isfinite(stop) and start < stop):
                 raise InputError(f"the box of {text} is empty or reversed: {start:g} to {stop:g}.")
             j = support.layout.index(lag)
@@ -249,7 +274,7 @@ class Uniform:
         return low, high
 
 
-def _normalised(weights: Any, count: int, what: str) -> Vector:
+def _normalise(weights: Any, count: int, what: str) -> Vector:
     try:
         values = np.asarray(weights, dtype=float)
     except (TypeError, ValueError):
@@ -262,26 +287,26 @@ def _normalised(weights: Any, count: int, what: str) -> Vector:
 
 
 def _lag_of(text: str, support: Support) -> Lag:
-    """The used lag that a text such as `force[k-1]` names."""
+    """Return the used lag that a text such as `force[k-1]` names."""
     known = {str(lag): lag for lag in support.used}
     plain = "".join(text.split())
     if plain.endswith("[k-0]"):
         plain = plain[:-3] + "]"
     if plain not in known:
         raise InputError(
-            f"'{text}' is no {_entries(support)} that this model reads{nearest(plain, known) or '.'} "
-            f"It reads {', '.join(known)}."
+            f"'{text}' is no {_entries(support)} that this model "
+            f"reads{nearest(plain, known) or '.'} It reads {', '.join(known)}."
         )
     return known[plain]
 
 
 def _entries(support: Support) -> str:
-    """What the names of a measure stand for: a motion has no lags."""
+    """Return the entries that a measure may name: a motion has no lags."""
     return "raw lag" if any("[" in str(lag) for lag in support.used) else "state or input"
 
 
 def _rule(coordinates: int) -> Points:
-    """Nodes on [−1, 1]ᵈ with weights that add up to 1, symmetric about 0."""
+    """Return nodes on [−1, 1]ᵈ with weights that add up to 1, symmetric about 0."""
     if coordinates == 0:
         return _even(np.zeros((1, 0)))
     if coordinates <= len(_NODES):
@@ -292,7 +317,10 @@ def _rule(coordinates: int) -> Points:
         share = np.tile(weight / (2 * panels), panels)
         grid = np.meshgrid(*[line] * coordinates, indexing="ij")
         shares = np.meshgrid(*[share] * coordinates, indexing="ij")
-        return Points(np.stack([g.ravel() for g in grid], axis=-1), np.prod([s.ravel() for s in shares], axis=0))
+        return Points(
+            np.stack([g.ravel() for g in grid], axis=-1),
+            np.prod([s.ravel() for s in shares], axis=0),
+        )
     import scipy.stats.qmc  # slow to import, and few boxes have so many coordinates
 
     quasi = 2 * scipy.stats.qmc.Sobol(coordinates, scramble=True, rng=0).random(_QUASI_RANDOM) - 1
@@ -300,7 +328,7 @@ def _rule(coordinates: int) -> Points:
 
 
 @dataclass(frozen=True, eq=False)
-class Weighed:
+class WeighedPhysics:
     """A measure's `points`, and the physics there with every row multiplied by `unit` (M, ny, ny).
 
     The unit is the square root of a point's weight times the matrix of the output weights.
@@ -313,37 +341,53 @@ class Weighed:
     excitation: Excitation
 
 
-def weigh(measure: Measure, support: Support, baseline: Baseline, outputs: tuple[str, ...], weight: Matrix) -> Weighed:
-    """The physics over a measure's points.
+def weigh(
+    measure: Measure, support: Support, baseline: Baseline, outputs: tuple[str, ...], weight: Matrix
+) -> WeighedPhysics:
+    """Return the physics over a measure's points.
 
     Args:
         weight: the matrix of the output weights, (ny, ny).
 
     Raises:
-        InputError: a measure that does not fit the data, or on whose points the physics is not finite.
+        InputError: a measure that does not fit the data, or on whose points the physics is not
+            finite.
     """
     points = measure.points(support)
     with np.errstate(all="ignore"):
         phi = np.asarray(baseline.phi(points.x, support.layout, outputs, np))
     if not np.isfinite(phi).all():
         point, _, column = np.argwhere(~np.isfinite(phi))[0]
-        at = ", ".join(f"{lag} = {value:.4g}" for lag, value in zip(support.layout, points.x[point], strict=True))
+        at = ", ".join(
+            f"{lag} = {value:.4g}"
+            for lag, value in zip(support.layout, points.x[point], strict=True)
+        )
         raise InputError(
-            f"the physics is not finite on all points of the {measure.name} measure: what {baseline.names[column]} "
-            f"multiplies is not at {at}. Take the training measure, or a uniform one over a box where it is."
+            f"the physics is not finite on all points of the {measure.name} measure: the "
+            f"regressor of {baseline.names[column]} is not at {at}. Take the training measure, "
+            "or a uniform one over a box where it is."
         )
     unit = np.sqrt(points.weight)[:, None, None] * weight
     projection = Projection.factor(times(unit, phi))
-    return Weighed(measure, points, unit, projection, excitation(projection.r, baseline.names))
+    return WeighedPhysics(
+        measure, points, unit, projection, excitation(projection.r, baseline.names)
+    )
 
 
-def weigh_problem(measure: Measure, problem: Problem) -> Weighed:
-    """The same for a posed problem. Under the training measure it takes the factor that the problem has."""
+def weigh_problem(measure: Measure, problem: Problem) -> WeighedPhysics:
+    """Return the physics over a measure's points for a posed problem.
+
+    Under the training measure it takes the factor that the problem has.
+    """
     if measure != Training():
-        return weigh(measure, Support.of(problem), problem.baseline, problem.outputs, problem.weight.matrix)
+        return weigh(
+            measure, Support.of(problem), problem.baseline, problem.outputs, problem.weight.matrix
+        )
     rows, own = len(problem.rows), problem.projection
     even = np.full(rows, 1 / rows)
     size = np.sqrt(even[0])
     projection = replace(own, r=own.r * size, phi=own.phi * size)
     unit = np.sqrt(even)[:, None, None] * problem.weight.matrix
-    return Weighed(measure, Points(problem.rows.x, even), unit, projection, problem.excitation)
+    return WeighedPhysics(
+        measure, Points(problem.rows.x, even), unit, projection, problem.excitation
+    )

@@ -1,11 +1,15 @@
-"""The nearest physics of a fitted motion, p̂ = argmin_p Σ_μ ‖G − f(·; p)‖², along what a learner could imitate.
+"""The nearest physics of a fitted motion, p̂ = argmin_p Σ_μ ‖G − f(·; p)‖².
 
-G = f(·; c) + g is the fitted field over points of states and inputs; only learned equations and outputs count. p̂
-depends on G and the measure alone, not on how G was put together. For f linear in p it is `θ = c + B (Φ_μ B)⁺ F_μ`.
+p̂ moves only along directions that a learner could imitate.
 
-Intervals come from the stationarity of p̂ by the implicit function theorem: with φ the sum and q the coordinates of p,
-`B'φ_qq B ds = −B'(φ_qc + φ_qq) dc − B'φ_qw dw − B' Σ φ_qx dx`. The last term counts that the points themselves are
-those of the fitted run. p̂ is unique near by only if B'φ_qq B is positive definite.
+G = f(·; c) + g is the fitted field over points of states and inputs; only learned equations and
+outputs count. p̂ depends on G and the measure alone, not on how G was put together. For f linear in
+p it is `θ = c + B (Φ_μ B)⁺ F_μ`.
+
+Intervals come from the stationarity of p̂ by the implicit function theorem: with φ the sum and q
+the coordinates of p, `B'φ_qq B ds = −B'(φ_qc + φ_qq) dc − B'φ_qw dw − B' Σ φ_qx dx`. The last term
+counts that the points themselves are those of the fitted run. p̂ is unique near by only if B'φ_qq B
+is positive definite.
 """
 
 from __future__ import annotations
@@ -21,8 +25,8 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug._base.jax import Array, jax, jnp
 from orthaug.models.dynamics import Numbers
 from orthaug.models.motion_field import MotionField
-from orthaug.models.moving import Moving
-from orthaug.physics.left_over import LeftOver, left_over
+from orthaug.models.moving import MotionDynamics
+from orthaug.physics.left_over import UnexplainedPhysics, left_over
 from orthaug.physics.motion import Motion
 from orthaug.physics.shared import Shared, agreeing, moves, spanned
 
@@ -37,7 +41,10 @@ _FEWEST = 4  # moves that succeed, for each parameter
 
 
 class Field(NamedTuple):
-    """Points (M, nx) and (M, nu) with weights (M,), and the size (nl,) of each learned equation and output."""
+    """Weighted points of states (M, nx) and inputs (M, nu), and the size of each learned equation.
+
+    `weight` is (M,); `size` (nl,) counts learned equations and outputs.
+    """
 
     x: Matrix
     u: Matrix
@@ -47,7 +54,10 @@ class Field(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class MotionSplit:
-    """q̂ (np,) of p̂ and how it follows (c, w): `slope` (np, np + nw); None where p̂ is not unique."""
+    """q̂ (np,) of p̂ and how it follows (c, w): `slope` (np, np + nw).
+
+    None where p̂ is not unique.
+    """
 
     name: str
     q: Vector
@@ -58,57 +68,75 @@ class MotionSplit:
     share: float | None
     """‖learner‖ / ‖field‖ of the learned equations over the measure, after the split."""
     curvature: float
-    """Smallest eigenvalue of the second derivative of the distance, over that of a rest that is zero."""
+    """Smallest eigenvalue of the second derivative of the distance, over that of a rest that is
+    zero.
+    """
     field: Field
     support: float = 1.0
 
     @classmethod
     def none(cls, name: str, form: MotionField, c: Vector) -> MotionSplit:
-        """Before any split: c itself, nothing shared, over no points."""
-        nothing = Field(np.zeros((0, form.states)), np.zeros((0, len(form.motion.inputs))), np.zeros(0), np.zeros(0))
+        """Return the split before any: c itself, nothing shared, over no points."""
+        nothing = Field(
+            np.zeros((0, form.states)),
+            np.zeros((0, len(form.motion.inputs))),
+            np.zeros(0),
+            np.zeros(0),
+        )
         shared = Shared(form.motion.names, np.zeros((len(c), 0)))
         return cls(name, c, shared, None, None, None, 1.0, nothing)
 
 
-def shared_of_motion(form: Moving, q: Vector, x: Matrix, u: Matrix) -> Shared:
-    """The directions of q that a learner on the form's features could imitate, at q.
+def shared_of_motion(form: MotionDynamics, q: Vector, x: Matrix, u: Matrix) -> Shared:
+    """Return the directions of q that a learner on these features could imitate, at q.
 
-    A direction is shared if it moves no equation and no output without a learner, and moves those with one by a
-    function of the features alone.
+    A direction is shared if it moves no equation and no output without a learner, and moves those
+    with one by a function of the features alone.
     """
     names, motion = form.motion.names, form.motion
     if not learned_places(motion):
         return Shared(names, np.zeros((len(names), 0)))
     if form.bound is not None and getattr(form.bound.learner, "linear", False):
-        return _spanned(form, q, x, u)
+        return _spanned_directions(form, q, x, u)
     nx = x.shape[1]
     points = np.concatenate([x, u], axis=1)
     points = points[np.isfinite(points).all(axis=1)]
     pairs = moves(lambda rows: np.asarray(form.seen(rows[:, :nx].T, rows[:, nx:].T, np)).T, points)
     some = points[:: max(1, len(points) // _POINTS)]
-    for start, end in (pairs, (some, some)):  # where hardly any move is not seen, the learner sees everything
-        slopes = [np.asarray(slopes_at(form, q, rows[:, :nx], rows[:, nx:])) for rows in (start, end)]
+    for start, end in (
+        pairs,
+        (some, some),
+    ):  # where hardly any move is not seen, the learner sees everything
+        slopes = [
+            np.asarray(slopes_at(form, q, rows[:, :nx], rows[:, nx:])) for rows in (start, end)
+        ]
         kept = np.isfinite(slopes[0]).all(axis=(1, 2)) & np.isfinite(slopes[1]).all(axis=(1, 2))
         if kept.sum() >= _FEWEST * len(names):
             break
     before, after = (part[kept] for part in slopes)  # (M, nx + ny, np)
-    after = np.where(_has_learner(motion)[:, None], after, 0.0)  # what has no learner must not move at all
+    after = np.where(
+        _has_learner(motion)[:, None], after, 0.0
+    )  # what has no learner must not move at all
     size = np.sqrt(np.mean(before**2, axis=(0, 2), keepdims=True))
     size = np.where(size > 0, size, 1.0)
-    before, after = (np.concatenate(list(np.moveaxis(part / size, 1, 0))) for part in (before, after))
+    before, after = (
+        np.concatenate(list(np.moveaxis(part / size, 1, 0))) for part in (before, after)
+    )
     return Shared(names, agreeing(before, after)).beside(_left_over(form, q, points, nx))
 
 
-def _left_over(form: Moving, q: Vector, points: Matrix, nx: int) -> LeftOver | None:
-    """What functions of the features leave of the slopes at the points."""
+def _left_over(
+    form: MotionDynamics, q: Vector, points: Matrix, nx: int
+) -> UnexplainedPhysics | None:
+    """Return the part of the slopes at the points that no function of the features follows."""
     some = points[:: max(1, -(-len(points) // _ROWS))]
     slopes = np.asarray(slopes_at(form, q, some[:, :nx], some[:, nx:]))
     features = np.asarray(form.seen(some[:, :nx].T, some[:, nx:].T, np)).T
     return left_over(slopes, features, _has_learner(form.motion))
 
 
-def _spanned(form: Moving, q: Vector, x: Matrix, u: Matrix) -> Shared:
-    """The directions that move what has a learner by linear combinations of its features, and nothing else."""
+def _spanned_directions(form: MotionDynamics, q: Vector, x: Matrix, u: Matrix) -> Shared:
+    """Return the directions that the learner's features span and that move no other equation."""
     some = slice(None, None, max(1, len(x) // _POINTS))
     slopes = np.moveaxis(np.asarray(slopes_at(form, q, x[some], u[some])), 1, 0)
     features = np.asarray(form.seen(x[some].T, u[some].T, np)).T
@@ -116,7 +144,7 @@ def _spanned(form: Moving, q: Vector, x: Matrix, u: Matrix) -> Shared:
 
 
 def learned_places(motion: Motion) -> list[int]:
-    """The numbers of the equations that have a learner, outputs after states."""
+    """Return the numbers of the equations that have a learner, outputs after states."""
     states, outputs = motion.learned
     return [*states, *(len(motion.states) + i for i in outputs)]
 
@@ -126,14 +154,16 @@ def _has_learner(motion: Motion) -> Bool[np.ndarray, "r"]:
 
 
 def nearest(
-    form: Moving,
+    form: MotionDynamics,
     numbers: Numbers,
     start: Vector,
     field: Field,
     bounds: tuple[Vector, Vector],
     basis: Matrix | None = None,
 ) -> tuple[Vector, Shared]:
-    """q̂, searched from the point nearest to `start` that differs from c along shared directions only.
+    """Return q̂, which differs from c along shared directions only.
+
+    The search begins at the point of that plane that is nearest to `start`.
 
     Args:
         start: coordinates of physics alone.
@@ -150,7 +180,7 @@ def nearest(
     shared = directions(q)
     if not shared.basis.size:
         return q, shared
-    gauss = np.asarray(_summed(_gauss_newton, form, numbers, q, field)[1])
+    gauss = np.asarray(_sum_over(_gauss_newton, form, numbers, q, field)[1])
     b, size = _unit(shared.basis, gauss), np.sqrt(np.diag(gauss))
     along = np.linalg.lstsq(size[:, None] * b, size * (start - q), rcond=None)[0]
     candidates = [np.clip(q + b @ along, *bounds), q]
@@ -158,7 +188,9 @@ def nearest(
     damping, value = 1e-6, _distance(form, numbers, q, field)
     for _ in range(_ITERATIONS):
         shared = directions(q)
-        gradient, gauss = (np.asarray(part) for part in _summed(_gauss_newton, form, numbers, q, field))
+        gradient, gauss = (
+            np.asarray(part) for part in _sum_over(_gauss_newton, form, numbers, q, field)
+        )
         b = _unit(shared.basis, gauss)
         inner, downhill = b.T @ gauss @ b, -b.T @ gradient
         along = np.linalg.lstsq(inner + damping * np.eye(len(inner)), downhill, rcond=None)[0]
@@ -177,14 +209,14 @@ def nearest(
 
 
 def _unit(basis: Matrix, gauss: Matrix) -> Matrix:
-    """The directions in such a length that each moves the learned equations by one."""
+    """Return the directions scaled so that each moves the learned equations by one."""
     size = np.sqrt(np.maximum(np.einsum("ij,ik,kj->j", basis, gauss, basis), 0.0))
     return basis / np.where(size > 0, size, 1.0)
 
 
 def split_motion(
     name: str,
-    form: Moving,
+    form: MotionDynamics,
     numbers: Numbers,
     start: Vector,
     field: Field,
@@ -193,14 +225,14 @@ def split_motion(
     everything: bool = False,
     wobble: Any = None,
 ) -> MotionSplit:
-    """p̂ of a fitted motion under a measure.
+    """Return p̂ of a fitted motion under a measure.
 
     Args:
         name: of the measure.
         start: coordinates of physics alone.
         everything: whether all directions count as shared (the paper's projection).
-        wobble: (np, np + nw) from (q̂): `Σ φ_qx dx/d(c, w)` of points that are the fitted run's; None where they
-            are fixed.
+        wobble: (np, np + nw) from (q̂): `Σ φ_qx dx/d(c, w)` of points that are the fitted run's;
+            None where they are fixed.
     """
     count = len(form.motion.parameters)
     basis = np.eye(count) if everything else None
@@ -211,7 +243,7 @@ def split_motion(
     q, shared = nearest(form, numbers, start, field, bounds, basis)
     whole = np.concatenate([np.eye(count), np.zeros((count, form.bound.size))], axis=1)
     second, to_c, to_w, gauss, gradient, learner, rest, size = (
-        np.asarray(part) for part in _summed(_second, form, numbers, q, field)
+        np.asarray(part) for part in _sum_over(_second, form, numbers, q, field)
     )
     with np.errstate(all="ignore"):
         share = float(np.sqrt(rest / size)) if size > 0 else None
@@ -225,46 +257,60 @@ def split_motion(
     curvature = lowest / max(float(np.linalg.eigvalsh(flat).min()), 1e-300)
     slope = None
     if lowest > _FLAT:
-        cross = np.concatenate([to_c + second, to_w], axis=1) + (0.0 if wobble is None else wobble(q))
+        cross = np.concatenate([to_c + second, to_w], axis=1) + (
+            0.0 if wobble is None else wobble(q)
+        )
         slope = whole - b @ np.linalg.solve(inner, b.T @ cross)
     return MotionSplit(name, q, shared, slope, defect, share, curvature, field)
 
 
-def _learned_rows(form: Moving, q: Any, x: Any, u: Any) -> Any:
-    """The physics of the learned equations and outputs (nl,) at one point."""
+def _learned_rows(form: MotionDynamics, q: Any, x: Any, u: Any) -> Any:
+    """Return the physics of the learned equations and outputs (nl,) at one point."""
     return form.learned_rows(form.motion.coordinates.physical(q, jnp), x, u)
 
 
-def rest_of(form: Moving, numbers: Numbers, q: Any, c: Any, w: Any, x: Any, u: Any, size: Any) -> Any:
-    """(G − f(q)) / size (nl,) at one point."""
+def rest_of(
+    form: MotionDynamics, numbers: Numbers, q: Any, c: Any, w: Any, x: Any, u: Any, size: Any
+) -> Any:
+    """Return (G − f(q)) / size (nl,) at one point."""
     own = numbers._replace(weights=w)
-    return (_learned_rows(form, c, x, u) + form.learned(own, x, u) - _learned_rows(form, q, x, u)) / size
+    return (
+        _learned_rows(form, c, x, u) + form.learned(own, x, u) - _learned_rows(form, q, x, u)
+    ) / size
 
 
 @partial(jax.jit, static_argnames="form")
-def slopes_at(form: Moving, q: Any, x: Float[Array, "m nx"], u: Float[Array, "m nu"]) -> Float[Array, "m r np"]:
-    """∂(f, h)/∂q at points."""
+def slopes_at(
+    form: MotionDynamics, q: Any, x: Float[Array, "m nx"], u: Float[Array, "m nu"]
+) -> Float[Array, "m r np"]:
+    """Return ∂(f, h)/∂q at points."""
 
     def both(q: Any, x: Any, u: Any) -> Any:
         p = form.motion.coordinates.physical(q, jnp)
-        return jnp.concatenate([form.motion.rates(x, u, p, jnp), form.motion.observed(x, u, p, jnp)])
+        return jnp.concatenate(
+            [form.motion.rates(x, u, p, jnp), form.motion.observed(x, u, p, jnp)]
+        )
 
     return jax.vmap(lambda x, u: jax.jacfwd(both)(q, x, u))(x, u)
 
 
-def _distance(form: Moving, numbers: Numbers, q: Vector, field: Field) -> float:
-    value = float(np.asarray(_summed(_square, form, numbers, q, field)))
+def _distance(form: MotionDynamics, numbers: Numbers, q: Vector, field: Field) -> float:
+    value = float(np.asarray(_sum_over(_square, form, numbers, q, field)))
     return value if np.isfinite(value) else np.inf
 
 
-def _summed(function: Any, form: Moving, numbers: Numbers, q: Vector, field: Field) -> Any:
-    """The sum over the points, batch by batch."""
+def _sum_over(
+    function: Any, form: MotionDynamics, numbers: Numbers, q: Vector, field: Field
+) -> Any:
+    """Return the sum over the points, batch by batch."""
     total = None
     for begin in range(0, len(field.x), _BATCH):
         x, u, weight = (part[begin : begin + _BATCH] for part in field[:3])
         padding = min(_BATCH, 1 << (len(field.x) - 1).bit_length()) - len(x)
         if padding > 0:
-            x, u = (np.concatenate([part, np.repeat(part[-1:], padding, axis=0)]) for part in (x, u))
+            x, u = (
+                np.concatenate([part, np.repeat(part[-1:], padding, axis=0)]) for part in (x, u)
+            )
             weight = np.concatenate([weight, np.zeros(padding)])
         part = function(form, numbers, q, x, u, weight, field.size)
         total = part if total is None else jax.tree.map(jnp.add, total, part)
@@ -272,14 +318,18 @@ def _summed(function: Any, form: Moving, numbers: Numbers, q: Vector, field: Fie
 
 
 @partial(jax.jit, static_argnames="form")
-def _square(form: Moving, numbers: Numbers, q: Any, x: Any, u: Any, weight: Any, size: Any) -> Any:
+def _square(
+    form: MotionDynamics, numbers: Numbers, q: Any, x: Any, u: Any, weight: Any, size: Any
+) -> Any:
     c, w = numbers.theta - numbers.theta_aux, numbers.weights
     rest = jax.vmap(lambda x, u: rest_of(form, numbers, q, c, w, x, u, size))(x, u)
     return jnp.sum(jnp.where(weight[:, None] > 0, weight[:, None] * rest**2, 0.0)) / 2
 
 
 @partial(jax.jit, static_argnames="form")
-def _gauss_newton(form: Moving, numbers: Numbers, q: Any, x: Any, u: Any, weight: Any, size: Any) -> Any:
+def _gauss_newton(
+    form: MotionDynamics, numbers: Numbers, q: Any, x: Any, u: Any, weight: Any, size: Any
+) -> Any:
     c, w = numbers.theta - numbers.theta_aux, numbers.weights
 
     def one(x: Any, u: Any) -> Any:
@@ -295,8 +345,13 @@ def _gauss_newton(form: Moving, numbers: Numbers, q: Any, x: Any, u: Any, weight
 
 
 @partial(jax.jit, static_argnames="form")
-def _second(form: Moving, numbers: Numbers, q: Any, x: Any, u: Any, weight: Any, size: Any) -> Any:
-    """Second derivatives of half the distance: in q, in q and c, in q and w; and what the rest is made of."""
+def _second(
+    form: MotionDynamics, numbers: Numbers, q: Any, x: Any, u: Any, weight: Any, size: Any
+) -> Any:
+    """Return the second derivatives of half the distance: in q, in q and c, in q and w.
+
+    And what the rest is made of.
+    """
     c, w = numbers.theta - numbers.theta_aux, numbers.weights
 
     def one(x: Any, u: Any) -> Any:
@@ -313,4 +368,7 @@ def _second(form: Moving, numbers: Numbers, q: Any, x: Any, u: Any, weight: Any,
         return second, to_c, to_w, slope.T @ slope, downhill(q, c, w), learner, rest, whole
 
     found = jax.vmap(one)(x, u)
-    return tuple(jnp.einsum("m,m...->...", weight, jnp.where(jnp.isfinite(part), part, 0.0)) for part in found)
+    return tuple(
+        jnp.einsum("m,m...->...", weight, jnp.where(jnp.isfinite(part), part, 0.0))
+        for part in found
+    )

@@ -1,8 +1,8 @@
-"""Intervals beside a learner that could nearly imitate a direction of the physics, and what is said of it.
+"""Intervals beside a learner that could nearly imitate a direction of the physics.
 
-What functions of the features leave of a direction, a share λ of its squares, is all that determines it beside *any*
-such function. So its variance is at least that of physics alone over λ, whatever the trained learner's own tangents
-say: those of other weights follow more of it.
+What functions of the features leave of a direction, a share λ of its squares, is all that
+determines it beside *any* such function. So its variance is at least that of physics alone over λ,
+whatever the trained learner's own tangents say: those of other weights follow more of it.
 """
 
 from __future__ import annotations
@@ -17,16 +17,24 @@ from orthaug._base.lines import percent
 from orthaug.models.statistics import JointCovariance, Statistics
 from orthaug.physics.shared import Shared
 
-_NOTHING = 1e-3  # share of a direction's squares below which it is split off, and has the variance of the split
+# share of a direction's squares below which it is split off, and has the variance of the split
+_NOTHING = 1e-3
 
 
-def grown(covariance: Matrix | None, statistics: Statistics, shared: Shared | None) -> Matrix | None:
-    """Return Cov θ̂ (nθ, nθ), larger along directions of which the features leave little on the rows.
+def grown(
+    covariance: Matrix | None, statistics: Statistics, shared: Shared | None
+) -> Matrix | None:
+    """Return Cov θ̂ (nθ, nθ), larger along directions that the features leave little of.
 
-    With `D = Σ v_i λ_i^(−1/2) v_iᵀW` of `L v_i = λ_i W v_i`, W the Gram matrix of the slopes and L of what is left of
-    them, the least covariance is `D C Dᵀ`, C that of physics alone.
+    With `D = Σ v_i λ_i^(−1/2) v_iᵀW` of `L v_i = λ_i W v_i`, W the Gram matrix of the slopes and L
+    of what is left of them, the least covariance is `D C Dᵀ`, C that of physics alone.
     """
-    if covariance is None or shared is None or not shared.nearly or not np.isfinite(covariance).all():
+    if (
+        covariance is None
+        or shared is None
+        or not shared.nearly
+        or not np.isfinite(covariance).all()
+    ):
         return covariance
     rest, gram, middle = shared.rest, statistics.gram, statistics.middle
     nt = len(covariance)
@@ -49,7 +57,7 @@ def grown(covariance: Matrix | None, statistics: Statistics, shared: Shared | No
 
 
 def shared_warnings(shared: Shared | None, inputs: Sequence[str]) -> list[Warning]:
-    """Return what the rows say of directions that the names call determined.
+    """Return warnings where the rows contradict directions that the names call determined.
 
     Args:
         inputs: what the learner sees.
@@ -58,25 +66,28 @@ def shared_warnings(shared: Shared | None, inputs: Sequence[str]) -> list[Warnin
         return []
     found, sees = [], ", ".join(inputs)
     remedy = (
-        "Give data in which it moves by itself, a learner that sees less, or name what the learner may add "
-        '(kind = "terms").'
+        "Give data in which it moves independently, a learner with fewer inputs, or a learner "
+        'of named terms (kind = "terms").'
     )
     if shared.on_data:
         share = dict(zip(shared.names, shared.rest.share, strict=True))
         names = " and ".join(f"{name} ({percent(share[name], 2)} left)" for name in shared.on_data)
         text = (
-            f"on these rows functions of what the learner sees ({sees}) follow the regressor of {names}, although its "
-            f"expression reads something else; of functions that the learner itself could be they leave up to "
-            f"{percent(shared.rest.limit, 2)}. The data do not tell it from the learner: it is split off as what the "
-            f"learner could imitate is, and its interval counts no share that the learner took. {remedy}"
+            f"on these rows, functions of the learner's inputs ({sees}) follow the regressor of "
+            f"{names}, although its expression reads other signals. They leave up to "
+            f"{percent(shared.rest.limit, 2)} of the learner's own functions. The data do not "
+            "separate it from the learner: it is split off as a direction that the learner "
+            f"could imitate. Its interval excludes any share that the learner took. {remedy}"
         )
         found.append(Warning("shared_on_data", text))
     nearly = {name: share for name, share in shared.nearly.items() if name not in shared.on_data}
     if nearly:
-        names = " and ".join(f"{percent(share, 2)} of the regressor of {name}" for name, share in nearly.items())
+        names = " and ".join(
+            f"{percent(share, 2)} of the regressor of {name}" for name, share in nearly.items()
+        )
         text = (
-            f"functions of what the learner sees ({sees}) leave {names} on these rows: the fit determines it from that "
-            f"part alone, and its interval is as wide as that part allows. {remedy}"
+            f"functions of the learner's inputs ({sees}) leave {names} on these rows. The fit "
+            f"determines it from that part alone, which sets the width of its interval. {remedy}"
         )
         found.append(Warning("nearly_shared", text))
     return found

@@ -1,7 +1,7 @@
 """Physical parameters p̂ from θ̂, with their statistics: the inverse of θ = h(p).
 
-p̂ minimises ‖θ̂ − h(p)‖² under W = Cov(θ̂)⁻¹. With as many θ as p it solves θ̂ = h(p); with more θ the rest tests the
-physics. Cov p̂ = (HᵀWH)⁻¹, H = dh/dp (delta method).
+p̂ minimises ‖θ̂ − h(p)‖² under W = Cov(θ̂)⁻¹. With as many θ as p it solves θ̂ = h(p); with more θ
+the rest tests the physics. Cov p̂ = (HᵀWH)⁻¹, H = dh/dp (delta method).
 """
 
 from __future__ import annotations
@@ -25,11 +25,17 @@ from orthaug.physics.parameters import PhysicsMap, magnitude, tied
 CONTRADICTION = 0.05  # p-value below which θ̂ contradicts the physics, to match the 95 % intervals
 ITERATIONS = 200  # Levenberg-Marquardt steps from one start
 _ROUNDING = 1e-14  # smallest eigenvalue of a correlation matrix that is not rounding
-_SOLVED = {True: 1e-6, False: 1e-18}  # ‖residual‖² that counts as none: in variances of θ̂; without them relative to θ̂²
+_SOLVED = {
+    True: 1e-6,
+    False: 1e-18,
+}  # ‖residual‖² that counts as none: in variances of θ̂; without them relative to θ̂²
 
 
 class Consistency(NamedTuple):
-    """Whether θ̂ obeys what the physics fixes among θ: χ² = rᵀCov⁻¹r, its degrees of freedom, p-value, a sentence."""
+    """Test of θ̂ against the relations that the physics imposes on θ.
+
+    χ² = rᵀCov⁻¹r, its degrees of freedom, its p-value, and a sentence.
+    """
 
     chi2: float
     df: int
@@ -48,17 +54,24 @@ class PhysicalEstimate:
     std: tuple[float | None, ...]
     ci95: tuple[tuple[float, float] | None, ...]
     covariance: Matrix | None
-    """Cov p̂ (np, np), NaN at parameters that stand at a bound; None where there are no standard errors."""
+    """Cov p̂ (np, np), NaN at parameters at a bound; None where there are no standard
+    errors.
+    """
     consistency: Consistency | None
     """None where θ̂ has no covariance or nothing is left over to test."""
     sensitivities: Matrix | None
-    """∂ln p̂ / ∂ln θ̂ (np, nθ): 10 says that 1 % in θ moves p by 10 %. NaN for p̂ = 0, 0 for one at a bound."""
+    """∂ln p̂ / ∂ln θ̂ (np, nθ): 10 says that 1 % in θ moves p by 10 %. NaN for p̂ = 0, 0 for one at
+    a bound.
+    """
     warnings: tuple[Warning, ...] = ()
 
     def __repr__(self) -> str:
         rows = zip(self.names, self.value, self.std, self.units, strict=True)
-        told = (f"{n} = {v:.6g}{'' if s is None else f' ± {s:.2g}'} {unit}".rstrip() for n, v, s, unit in rows)
-        return f"PhysicalEstimate({', '.join(told)})"
+        parts = (
+            f"{n} = {v:.6g}{'' if s is None else f' ± {s:.2g}'} {unit}".rstrip()
+            for n, v, s, unit in rows
+        )
+        return f"PhysicalEstimate({', '.join(parts)})"
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,27 +90,33 @@ class _Fit:
         target, names = np.asarray(theta_hat, dtype=float), physics.theta_names
         if target.shape != (len(names),):
             raise InputError(
-                f"`theta_hat` has shape {target.shape}; expected one number for each of {', '.join(names)}."
+                f"`theta_hat` has shape {target.shape}; expected one number for each of "
+                f"{', '.join(names)}."
             )
         for name, value in zip(names, target, strict=True):
             if not np.isfinite(value):
                 raise InputError(f"`theta_hat` is {value} for {name}; expected a finite estimate.")
-        whiten = None if covariance is None else _whitener(target, np.asarray(covariance, dtype=float))
+        whiten = (
+            None if covariance is None else _whitener(target, np.asarray(covariance, dtype=float))
+        )
         default = np.diag(1 / magnitude(target))
         free = tuple(range(len(physics.parameters)))
         return cls(physics, target, default if whiten is None else whiten, whiten is not None, free)
 
     def at(self, p: Vector) -> tuple[Vector, Matrix]:
-        """Whitened residual (nθ,) and its derivative (nθ, np)."""
+        """Return the whitened residual (nθ,) and its derivative (nθ, np)."""
         theta, jacobian = self.physics.linearised(p)
         with np.errstate(all="ignore"):
             return self.whiten @ (theta - self.target), self.whiten @ jacobian
 
     @np.errstate(all="ignore")  # where there is no solution p goes to infinity
     def descend(self, p: Vector) -> tuple[float, Vector]:
-        """Cost and p of the minimum that Levenberg-Marquardt finds from p; cost inf where θ has no value at p.
+        """Return cost and p of the minimum that Levenberg-Marquardt finds from p.
 
-        Every step solves its linear problem within the bounds exactly: p ends on a bound or away from it.
+        Cost inf where θ has no value at p.
+
+        Every step solves its linear problem within the bounds exactly: p ends on a bound or away
+        from it.
         """
         from scipy.optimize import lsq_linear  # slow to import
 
@@ -114,8 +133,12 @@ class _Fit:
             step = lsq_linear(rows, right, limits, method="bvls")
             new = p.copy()
             moved = np.clip(p[free] + scale * step.x, low, high)
-            new[free] = np.where(step.active_mask < 0, low, np.where(step.active_mask > 0, high, moved))
-            small = np.max(np.abs(new - p) / np.maximum(np.abs(p), 1e-3 * self.physics.size)) < 1e-11
+            new[free] = np.where(
+                step.active_mask < 0, low, np.where(step.active_mask > 0, high, moved)
+            )
+            small = (
+                np.max(np.abs(new - p) / np.maximum(np.abs(p), 1e-3 * self.physics.size)) < 1e-11
+            )
             at_new = self.at(new)
             lower = _cost(*at_new)
             if lower <= cost * (1 + 1e-9 * small):
@@ -128,30 +151,42 @@ class _Fit:
         return cost, p
 
     def solutions(self, starts: int) -> list[Vector]:
-        """The best p first, then others that explain θ̂ as well; from p⁰ and `starts` points about it."""
+        """Return the best p first, then others that explain θ̂ equally well.
+
+        From p⁰ and `starts` points about it.
+        """
         points = (self.physics.initial, *self.physics.around(starts, 4.0))
         minima = [self.descend(p) for p in points]
         least = min(cost for cost, _ in minima)
         distinct: list[Vector] = []
         for cost, p in minima:
-            near = [np.all(np.abs(p - q) <= 1e-3 * np.maximum(np.abs(q), 1e-3 * self.physics.size)) for q in distinct]
+            near = [
+                np.all(np.abs(p - q) <= 1e-3 * np.maximum(np.abs(q), 1e-3 * self.physics.size))
+                for q in distinct
+            ]
             if cost <= least * (1 + 1e-9) + _SOLVED[self.known] and not any(near):
                 distinct.append(p)
         return distinct
 
 
 def _cost(residual: Vector, jacobian: Matrix) -> float:
-    """‖residual‖², infinite where it or the derivative is not finite."""
+    """Return ‖residual‖², infinite where it or the derivative is not finite."""
     with np.errstate(over="ignore", invalid="ignore"):
         cost = float(residual @ residual)
     return cost if np.isfinite(cost) and np.isfinite(jacobian).all() else math.inf
 
 
 def _whitener(target: Vector, covariance: Matrix) -> Matrix | None:
-    """K (nθ, nθ) with KᵀK = Cov⁻¹; None where an entry of θ has no variance, as at a bound."""
+    """Return K (nθ, nθ) with KᵀK = Cov⁻¹.
+
+    None where an entry of θ has no variance, as at a bound.
+    """
     nt = len(target)
     if covariance.shape != (nt, nt):
-        raise InputError(f"`covariance` has shape {covariance.shape}; expected ({nt}, {nt}), a row for each theta.")
+        raise InputError(
+            f"`covariance` has shape {covariance.shape}; expected ({nt}, {nt}), a row for each "
+            "theta."
+        )
     if not np.isfinite(covariance).all():
         return None
     # θ̂ is rounded itself: a variance of zero becomes that of its last digit
@@ -160,25 +195,35 @@ def _whitener(target: Vector, covariance: Matrix) -> Matrix | None:
     correlation = (covariance + np.diag(rounded)) / np.outer(std, std)
     eigenvalues, vectors = np.linalg.eigh(correlation)
     if not np.allclose(correlation, correlation.T, rtol=0, atol=1e-8) or eigenvalues[0] < -1e-8:
-        raise InputError("`covariance` must be symmetric with no negative eigenvalue; expected that of theta_hat.")
-    # a combination of θ without variance is known as well as double precision can tell, not unknown
+        raise InputError(
+            "`covariance` must be symmetric with no negative eigenvalue; expected that of "
+            "theta_hat."
+        )
+    # a combination of θ without variance is known as well as double precision can show, not unknown
     return (vectors / np.sqrt(np.maximum(eigenvalues, _ROUNDING))).T / std
 
 
 def solve(
-    physics: PhysicsMap, theta_hat: Vector, covariance: Matrix | None, *, freedom: float, starts: int = 4
+    physics: PhysicsMap,
+    theta_hat: Vector,
+    covariance: Matrix | None,
+    *,
+    freedom: float,
+    starts: int = 4,
 ) -> PhysicalEstimate:
-    """p̂ = argmin (θ̂ − h(p))ᵀ Cov⁻¹ (θ̂ − h(p)) within the bounds of p, with its statistics.
+    """Return p̂ = argmin (θ̂ − h(p))ᵀ Cov⁻¹ (θ̂ − h(p)) within its bounds, with its statistics.
 
     Args:
         physics: h.
         theta_hat: θ̂ (nθ,) in the order of `physics.theta_names`.
-        covariance: Cov θ̂ (nθ, nθ); None, or one that is not finite, gives relative weights and no statistics.
+        covariance: Cov θ̂ (nθ, nθ); None, or one that is not finite, gives relative weights and no
+            statistics.
         freedom: degrees of freedom of the noise variance within it; inf where that is known.
         starts: points about p⁰ from which the solution is sought besides p⁰ itself.
 
     Raises:
-        InputError: arguments of another shape, or that are no estimate, covariance or degrees of freedom.
+        InputError: arguments of another shape, or that are no estimate, covariance or degrees of
+            freedom.
     """
     _check_freedom(freedom)
     fit = _Fit.of(physics, theta_hat, covariance)
@@ -188,21 +233,28 @@ def solve(
     chi2, df = float(residual @ residual), len(residual) - int(np.sum(~held))
     outside = df == 0 and chi2 > _SOLVED[fit.known]
     sensitivity = excitation(
-        jacobian[:, ~held], [name for name, at_bound in zip(physics.names, held, strict=True) if not at_bound]
+        jacobian[:, ~held],
+        [name for name, at_bound in zip(physics.names, held, strict=True) if not at_bound],
     )
     spread, sensitivities = (
-        _linear(fit, value, jacobian, held) if sensitivity.full_rank and not outside else (None, None)
+        _linear(fit, value, jacobian, held)
+        if sensitivity.full_rank and not outside
+        else (None, None)
     )
-    consistency = _consistency(chi2, df, freedom, bool(held.any())) if fit.known and df > 0 else None
+    consistency = (
+        _consistency(chi2, df, freedom, bool(held.any())) if fit.known and df > 0 else None
+    )
     warnings = [*_at_bounds(physics, value, held), *_elsewhere(physics, others)]
     if outside:
         warnings.append(_outside(fit, value))
     elif not sensitivity.full_rank:
-        told = f"At the solution {tied(sensitivity)}; the physical parameters have no standard errors."
-        warnings.append(Warning("physical_parameters_tied", told))
+        text = (
+            f"At the solution {tied(sensitivity)}; the physical parameters have no standard errors."
+        )
+        warnings.append(Warning("physical_parameters_tied", text))
     if not fit.known:
-        told = "theta has no finite covariance, so the physical parameters have no standard errors."
-        warnings.append(Warning("no_standard_errors", told))
+        text = "theta has no finite covariance, so the physical parameters have no standard errors."
+        warnings.append(Warning("no_standard_errors", text))
     if consistency is not None and consistency.p < CONTRADICTION:
         warnings.append(Warning("physics_contradicted", consistency.text))
     std = np.full(len(value), np.nan) if spread is None else np.sqrt(np.diag(spread))
@@ -212,7 +264,10 @@ def solve(
         initial=physics.initial,
         value=value,
         std=tuple(float(s) if np.isfinite(s) else None for s in std),
-        ci95=tuple((float(a), float(b)) if np.isfinite(b - a) else None for a, b in interval(value, std, freedom)),
+        ci95=tuple(
+            (float(a), float(b)) if np.isfinite(b - a) else None
+            for a, b in interval(value, std, freedom)
+        ),
         covariance=spread,
         consistency=consistency,
         sensitivities=sensitivities,
@@ -221,13 +276,18 @@ def solve(
 
 
 def _held(physics: PhysicsMap, value: Vector, gradient: Vector) -> Bool[np.ndarray, "n"]:
-    """Which parameters the data press against a bound, (np,)."""
+    """Return a mask (np,) of the parameters that the data press against a bound."""
     low, high = physics.bounds
     return ((value <= low) & (gradient > 0)) | ((value >= high) & (gradient < 0))
 
 
-def _linear(fit: _Fit, value: Vector, jacobian: Matrix, held: Bool[np.ndarray, "n"]) -> tuple[Matrix | None, Matrix]:
-    """Cov p̂ = (HᵀWH)⁻¹, None without Cov θ̂, and ∂ln p̂ / ∂ln θ̂ from dp̂/dθ̂ = (HᵀWH)⁻¹HᵀW, by SVD of KH."""
+def _linear(
+    fit: _Fit, value: Vector, jacobian: Matrix, held: Bool[np.ndarray, "n"]
+) -> tuple[Matrix | None, Matrix]:
+    """Return Cov p̂ = (HᵀWH)⁻¹ and ∂ln p̂ / ∂ln θ̂, by SVD of KH.
+
+    The covariance is None without Cov θ̂; dp̂/dθ̂ = (HᵀWH)⁻¹HᵀW.
+    """
     norms = np.linalg.norm(jacobian[:, ~held], axis=0)
     u, sigma, vt = np.linalg.svd(jacobian[:, ~held] / norms, full_matrices=False)
     root = vt.T / sigma / norms[:, None]
@@ -243,22 +303,47 @@ def _linear(fit: _Fit, value: Vector, jacobian: Matrix, held: Bool[np.ndarray, "
 
 
 def _check_freedom(freedom: float) -> None:
-    if isinstance(freedom, bool) or not isinstance(freedom, int | float | np.number) or not freedom > 0:
-        raise InputError(f"`freedom` must be a positive number, the residual's degrees of freedom; got {freedom!r}.")
+    if (
+        isinstance(freedom, bool)
+        or not isinstance(freedom, int | float | np.number)
+        or not freedom > 0
+    ):
+        raise InputError(
+            "`freedom` must be a positive number, the residual's degrees of freedom; got "
+            f"{freedom!r}."
+        )
 
 
 def _consistency(chi2: float, df: int, freedom: float, held: bool) -> Consistency:
-    """χ²/df is compared with F(df, freedom), as the noise variance is estimated itself; χ² itself where it is known."""
-    p = scipy.special.chdtrc(df, chi2) if math.isinf(freedom) else scipy.special.fdtrc(df, freedom, chi2 / df)
+    """Return the test of θ̂ against h(p̂), with χ²/df compared to F(df, freedom).
+
+    F, not χ², because the noise variance is estimated itself.
+
+    Χ² itself where it is known.
+    """
+    p = (
+        scipy.special.chdtrc(df, chi2)
+        if math.isinf(freedom)
+        else scipy.special.fdtrc(df, freedom, chi2 / df)
+    )
     verb = "contradict" if p < CONTRADICTION else "agree with"
-    what = ("constraint" if df == 1 else f"{df} constraints") + (", bounds included" if held else "")
-    return Consistency(chi2, df, float(p), f"The data {verb} the physics' own {what} (chi2 = {chi2:.3g}, p = {p:.2g}).")
+    what = ("constraint" if df == 1 else f"{df} constraints") + (
+        ", bounds included" if held else ""
+    )
+    return Consistency(
+        chi2,
+        df,
+        float(p),
+        f"The data {verb} the physics' own {what} (chi2 = {chi2:.3g}, p = {p:.2g}).",
+    )
 
 
 def _at_bounds(physics: PhysicsMap, value: Vector, held: Bool[np.ndarray, "n"]) -> list[Warning]:
-    told = "{} stands at its bound {:g} and has no standard error; those of the others hold with it there."
+    text = (
+        "{} is at its bound {:g} and has no standard error; those of the others hold with it there."
+    )
     return [
-        Warning("at_a_bound", told.format(name, v))
+        Warning("at_a_bound", text.format(name, v))
         for name, v, at_bound in zip(physics.names, value, held, strict=True)
         if at_bound
     ]
@@ -267,20 +352,26 @@ def _at_bounds(physics: PhysicsMap, value: Vector, held: Bool[np.ndarray, "n"]) 
 def _elsewhere(physics: PhysicsMap, others: Sequence[Vector]) -> list[Warning]:
     if not others:
         return []
-    listed = ", ".join(f"{name} = {v:.6g}" for name, v in zip(physics.names, others[0], strict=True))
-    told = f"theta is explained as well by {listed}; bounds or better initial values choose between the solutions."
-    return [Warning("several_solutions", told)]
+    listed = ", ".join(
+        f"{name} = {v:.6g}" for name, v in zip(physics.names, others[0], strict=True)
+    )
+    text = (
+        f"theta is explained equally well by {listed}; give bounds or better initial values to "
+        "choose a solution."
+    )
+    return [Warning("several_solutions", text)]
 
 
 def _outside(fit: _Fit, value: Vector) -> Warning:
     nearby = fit.physics.theta(value)
     worst = int(np.argmax(np.abs(nearby - fit.target) / magnitude(fit.target)))
-    told = (
-        f"No physical parameters give the estimated theta: nearest is {fit.physics.theta_names[worst]} = "
-        f"{nearby[worst]:.6g} instead of {fit.target[worst]:.6g}. They have no standard errors; check the expressions "
-        "of theta, and whether theta is biased."
+    text = (
+        "No physical parameters give the estimated theta: nearest is "
+        f"{fit.physics.theta_names[worst]} = {nearby[worst]:.6g} instead of "
+        f"{fit.target[worst]:.6g}. They have no standard errors; check the expressions of "
+        "theta, and whether theta is biased."
     )
-    return Warning("physics_not_met", told)
+    return Warning("physics_not_met", text)
 
 
 def profile(
@@ -293,10 +384,12 @@ def profile(
     level: float = 0.95,
     starts: int = 4,
 ) -> tuple[float, float]:
-    """Profile-likelihood interval of one physical parameter: {pᵢ : min over the others χ² ≤ least χ² + F(1, freedom)}.
+    """Return the profile-likelihood interval of one physical parameter.
 
-    Unlike p̂ ± reach·std it is asymmetric where h bends, and it ends at the parameter's bounds. A side without a limit
-    from the data is ±inf.
+    The interval is {pᵢ : min over the others χ² ≤ least χ² + F(1, freedom)}.
+
+    Unlike p̂ ± reach·std it is asymmetric where h bends, and it ends at the parameter's bounds. A
+    side without a limit from the data is ±inf.
 
     Raises:
         InputError: as for `solve`, an unknown name, a level outside (0, 1), or no covariance.
@@ -309,7 +402,9 @@ def profile(
         raise InputError(f"`level` must be between 0 and 1, such as 0.95; got {level!r}.")
     fit = _Fit.of(physics, theta_hat, covariance)
     if not fit.known:
-        raise InputError("theta has no finite covariance, so there is no interval; expected that of theta_hat.")
+        raise InputError(
+            "theta has no finite covariance, so there is no interval; expected that of theta_hat."
+        )
     best, i = fit.solutions(starts)[0], physics.names.index(name)
     residual, jacobian = fit.at(best)
     others = replace(fit, free=tuple(j for j in fit.free if j != i))
@@ -326,14 +421,24 @@ def profile(
         return float(np.clip(cost - least - limit, -limit, 1e6 * limit))
 
     slope = np.linalg.norm(jacobian[:, i])
-    step = float(1 / slope) if slope > 0 else 1e-3 * physics.size[i]  # at most one standard deviation
+    step = (
+        float(1 / slope) if slope > 0 else 1e-3 * physics.size[i]
+    )  # at most one standard deviation
     bounds = (physics.parameters[i].min, physics.parameters[i].max)
-    low, high = (_crossing(excess, best[i], sign * step, bound) for sign, bound in zip((-1, 1), bounds, strict=True))
+    low, high = (
+        _find_crossing(excess, best[i], sign * step, bound)
+        for sign, bound in zip((-1, 1), bounds, strict=True)
+    )
     return low, high
 
 
-def _crossing(excess: Callable[[float], float], start: float, step: float, bound: float) -> float:
-    """Where `excess`, negative at `start`, changes its sign on the way to `bound`; `bound` where it does not."""
+def _find_crossing(
+    excess: Callable[[float], float], start: float, step: float, bound: float
+) -> float:
+    """Return the point at which `excess`, negative at `start`, changes sign before `bound`.
+
+    `bound` where it does not.
+    """
     from scipy.optimize import brentq
 
     inner = start

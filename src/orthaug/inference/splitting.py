@@ -1,7 +1,7 @@
-"""θ of a fitted function under any measure, with its uncertainty: `θ_μ = c + Φ_μ⁺F_μ`, without training again (F2).
+"""θ of a fitted function under any measure, without new training: `θ_μ = c + Φ_μ⁺F_μ` (F2).
 
-With `Cov(c, w)` from training, `Cov θ_μ = K Cov(c, w) Kᵀ` with `K = [I, Φ_μ⁺J_μ]`. Under another measure θ depends on
-the learner, and shares its variance.
+With `Cov(c, w)` from training, `Cov θ_μ = K Cov(c, w) Kᵀ` with `K = [I, Φ_μ⁺J_μ]`. Under another
+measure θ depends on the learner, and shares its variance.
 """
 
 from __future__ import annotations
@@ -22,14 +22,17 @@ from orthaug.models.streaming import chunks_of, summed
 from orthaug.physics.excitation import require_rank
 from orthaug.physics.output_weights import times
 from orthaug.physics.projection import Projection
-from orthaug.physics.streamed import Laying, StreamedProblem
+from orthaug.physics.streamed import RowBuilder, StreamedProblem
 
 SUPPORTED = 0.9  # share of a measure within reach of the data, below which it is warned of
 
 
 @dataclass(frozen=True, eq=False)
 class MeasureSplit:
-    """θ and θ_aux under a measure, Cov θ (None without statistics), and how far the data support the measure."""
+    """θ, θ_aux and Cov θ under a measure, and the share of it that the data support.
+
+    Cov θ is None without statistics.
+    """
 
     name: str
     theta: Vector
@@ -48,13 +51,21 @@ class MeasureSplit:
     """What it was split under."""
 
     def __str__(self) -> str:
-        told = f"{self.name}, {self.points} points, {100 * self.support:.0f} % of it within reach of the data"
+        text = (
+            f"{self.name}, {self.points} points, {100 * self.support:.0f} % of it within reach "
+            "of the data"
+        )
         if self.price is None or not np.isfinite(self.price).all():
-            return told
-        return f"{told}; standard errors {', '.join(f'{r:.3g}' for r in self.price)} times the training measure's"
+            return text
+        return (
+            f"{text}; standard errors {', '.join(f'{r:.3g}' for r in self.price)} times the "
+            "training measure's"
+        )
 
 
-def split_under(measure: Measure, model: Model, support: Support, joint: JointCovariance | None) -> MeasureSplit:
+def split_under(
+    measure: Measure, model: Model, support: Support, joint: JointCovariance | None
+) -> MeasureSplit:
     """Split a model under a measure.
 
     Args:
@@ -63,7 +74,8 @@ def split_under(measure: Measure, model: Model, support: Support, joint: JointCo
         joint: Cov(c, w) from training; None for no intervals.
 
     Raises:
-        InputError: a measure that does not fit the model, or under which the physics is rank-deficient.
+        InputError: a measure that does not fit the model, or under which the physics is
+            rank-deficient.
     """
     weighed = weigh(measure, support, model.form.baseline, model.form.outputs, model.weight)
     points, unit, projection = weighed.points, weighed.unit, weighed.projection
@@ -74,7 +86,9 @@ def split_under(measure: Measure, model: Model, support: Support, joint: JointCo
         raise type(error)(f"under the {measure.name} measure {error}") from None
     raw = model.learner_at(points.x)
     if not np.isfinite(raw).all():
-        raise InputError(f"the learner is not finite on all points of the {measure.name} measure; narrow it.")
+        raise InputError(
+            f"the learner is not finite on all points of the {measure.name} measure; narrow it."
+        )
     values = times(unit, raw)
     aux = projection.solve_along(values, model.shared)
     theta = model.theta - model.theta_aux + aux
@@ -87,44 +101,59 @@ def split_under(measure: Measure, model: Model, support: Support, joint: JointCo
     left = projection.along(model.shared) @ projection.coordinates(rest)
     defect = float(np.linalg.norm(left) / size) if 0 < size < np.inf else None
     share = support.share(points)
-    reach = f"only {100 * share:.0f} % of the {measure.name} measure lies within reach of the training data"
+    reach = (
+        f"only {100 * share:.0f} % of the {measure.name} measure lies within reach of the "
+        "training data"
+    )
     learns = form.bound is not None
-    told = Warning("measure_beyond_data", f"{reach}: elsewhere θ rests on how the learner extrapolates.")
-    warnings = (told,) if share < SUPPORTED and learns else ()
+    warning = Warning(
+        "measure_beyond_data", f"{reach}: elsewhere θ depends on the learner's extrapolation."
+    )
+    warnings = (warning,) if share < SUPPORTED and learns else ()
     condition = weighed.excitation.condition
-    told_of = (share, len(points.x), condition, warnings)
-    return MeasureSplit(measure.name, theta, aux, covariance, defect, *told_of, slope=slope, measure=measure)
+    of_measure = (share, len(points.x), condition, warnings)
+    return MeasureSplit(
+        measure.name, theta, aux, covariance, defect, *of_measure, slope=slope, measure=measure
+    )
 
 
 @dataclass(frozen=True, eq=False)
-class _Overlapping:
+class _PartitionOverlap:
     """QᵀJ over the rows of a partition; picklable if the learner is."""
 
-    laying: Laying
+    row_builder: RowBuilder
     bound: Bound
     weights: Vector
 
     def __call__(self, partition: Partition) -> Matrix | None:
-        chunks = chunks_of(self.laying(partition), chunk_shape(partition.rows)[1])
+        chunks = chunks_of(self.row_builder(partition), chunk_shape(partition.rows)[1])
         found = summed(Overlaps(self.bound), chunks, (self.weights,))
         return None if found is None else np.asarray(found.jacobian)
 
 
 def streamed_slope(model: Model, problem: StreamedProblem) -> Matrix:
-    """∂θ_aux/∂w under the training measure, in one pass over all rows of a source."""
+    """Return ∂θ_aux/∂w under the training measure, in one pass over all rows of a source."""
     bound, numbers = model.form.bound, model.numbers
     nt = len(model.theta)
     if bound is None or not bound.size:
         return np.zeros((nt, 0))
     gain = problem.weight.matrix * np.asarray(numbers.gain)
-    laying = problem.laying(np.asarray(numbers.centre), np.asarray(numbers.halfwidth), 1.0, gain)
-    parts = problem.passes(_Overlapping(laying, bound, np.asarray(numbers.weights)), problem.source.partitions)
+    row_builder = problem.row_builder(
+        np.asarray(numbers.centre), np.asarray(numbers.halfwidth), 1.0, gain
+    )
+    parts = problem.passes(
+        _PartitionOverlap(row_builder, bound, np.asarray(numbers.weights)),
+        problem.source.partitions,
+    )
     overlap = sum(part for part in parts if part is not None)
     return problem.projection.from_coordinates(problem.projection.along(model.shared) @ overlap)
 
 
 def learner_slope(model: Model, points: Points, projection: Projection, unit: np.ndarray) -> Matrix:
-    """∂θ_aux/∂w, `Φ_μ⁺J_μ` or `B(Φ_μB)⁺J_μ` (nθ, nw), in one pass over the points."""
+    """Return ∂θ_aux/∂w (nθ, nw), in one pass over the points.
+
+    It is `Φ_μ⁺J_μ`, or `B(Φ_μB)⁺J_μ` along some directions.
+    """
     bound, numbers = model.form.bound, model.numbers
     nt = len(model.theta)
     if bound is None or not bound.size:
@@ -132,4 +161,6 @@ def learner_slope(model: Model, points: Points, projection: Projection, unit: np
     engine = InMemory()
     rows = learner_rows(engine, model.form, numbers, points.x, projection.q, unit)
     overlap = engine.sum(Overlaps(bound), rows, np.asarray(numbers.weights))
-    return projection.from_coordinates(projection.along(model.shared) @ np.asarray(overlap.jacobian))
+    return projection.from_coordinates(
+        projection.along(model.shared) @ np.asarray(overlap.jacobian)
+    )

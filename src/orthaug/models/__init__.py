@@ -1,4 +1,4 @@
-"""Physics with a learned correction as a function: learners, models, what they answer, how they are kept."""
+"""Physics with a learned correction: learners, models, their responses, and storage."""
 
 import lazy_loader
 

@@ -1,7 +1,10 @@
-"""The engine of a Dask cluster: partitions stay on the workers, which sum over them; n_w² numbers come back.
+"""The engine of a Dask cluster: partitions stay on the workers, which sum over them.
 
-Each partition is laid out once, on the worker that keeps it. A pass is a task for each, and a tree of sums in the order
-of the partitions: whoever computes them, and however often after a worker was lost, the sum has the same bits.
+N_w² numbers come back from a sum.
+
+Each partition is built once, on the worker that keeps it. A pass is a task for each, and a tree
+of sums in the order of the partitions: whoever computes them, and however often after a worker was
+lost, the sum has the same bits.
 """
 
 from __future__ import annotations
@@ -25,22 +28,25 @@ from orthaug._base.errors import InputError
 from orthaug._base.jax import jax
 from orthaug._base.parallel import Threads
 from orthaug.data.sources import Source
-from orthaug.models.rows import CHUNK_ROWS, Chunk, Room, chunk_shape, laid_out, together
-from orthaug.models.streaming import Laid, apart, chunks_of, folded, summed
+from orthaug.models.rows import CHUNK_ROWS, Chunk, Room, build_chunk, chunk_shape, together
+from orthaug.models.streaming import RowArrays, apart, chunks_of, folded, summed
 
 _SINGLE_THREADED = {
     "OMP_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",
     "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1",
 }
-"""Of a worker of a local cluster: there is one for each core."""
+"""Threads of a worker of a local cluster, which has a worker for each core."""
 _BRANCHES = 8  # partial sums that one task adds up
 _PATIENCE = "20 s"  # to reach a scheduler
 
 
 @dataclass(frozen=True, eq=False)
-class Held:
-    """Futures of groups of chunks, or tuples of those whose chunks stand beside each other; how many each group has."""
+class ClusterChunks:
+    """Futures of groups of chunks, or tuples of futures whose chunks belong together.
+
+    `counts` are the chunks of each group.
+    """
 
     futures: list[Any]
     counts: tuple[int, ...]
@@ -60,29 +66,38 @@ class Dask(Threads):
     limit: int = CHUNK_ROWS
     resident: bool = False
 
-    def lay(self, z: Matrix, q: Any, e: Matrix, gain: Float[np.ndarray, "N ny ny"]) -> list[Any]:
-        """Rows that are in memory here, sent to the workers."""
+    def build_rows(
+        self, z: Matrix, q: Any, e: Matrix, gain: Float[np.ndarray, "N ny ny"]
+    ) -> list[Any]:
+        """Send rows that are in memory here to the workers."""
         workers = self.shares
         shape = chunk_shape(len(z), min(self.limit, -(-len(z) // workers)))
-        chunks = apart(laid_out(z, q, e, gain, shape))
+        chunks = apart(build_chunk(z, q, e, gain, shape))
         each = -(-len(chunks) // workers)
-        with told():
+        with cluster_errors():
             groups = [chunks[i : i + each] for i in range(0, len(chunks), each)]
             return [self.client.submit(kept, group, pure=False) for group in groups]
 
-    def draw(self, source: Source, laying: Callable[[Any], Iterator[Laid]]) -> list[Any]:
-        """The partitions of a source, laid out where they will be summed."""
-        with told():
-            task = partial(_laid, laying=laying, size=self.limit)  # not scattered: what is lost can be made again
+    def draw(self, source: Source, row_builder: Callable[[Any], Iterator[RowArrays]]) -> list[Any]:
+        """Return the partitions of a source, built where they will be summed."""
+        with cluster_errors():
+            task = partial(
+                _build_chunks, row_builder=row_builder, size=self.limit
+            )  # not scattered: what is lost can be made again
             return [self._on(task, partition) for partition in source.partitions]
 
     def sum(self, function: Callable[..., Any], rows: Sequence[Any], *arguments: Any) -> Any:
         given = jax.tree.map(np.asarray, arguments)
-        with told():
-            return self._added([self.client.submit(_partial_sum, function, part, given, pure=False) for part in rows])
+        with cluster_errors():
+            return self._added(
+                [
+                    self.client.submit(_partial_sum, function, part, given, pure=False)
+                    for part in rows
+                ]
+            )
 
     def _added(self, parts: list[Any]) -> Any:
-        """The sum of partial sums, in their order."""
+        """Return the sum of partial sums, in their order."""
         while len(parts) > 1:
             groups = [parts[i : i + _BRANCHES] for i in range(0, len(parts), _BRANCHES)]
             parts = [self.client.submit(_added, group, pure=False) for group in groups]
@@ -92,62 +107,83 @@ class Dask(Threads):
     def shares(self) -> int:
         return max(len(self.client.nthreads()), 1)
 
-    def place(self, chunks: Any, like: Sequence[Any] | None = None) -> Held:
+    def place(self, chunks: Any, like: Sequence[Any] | None = None) -> ClusterChunks:
         pieces = apart(chunks)
         each = -(-len(pieces) // min(self.shares, len(pieces)))
         whole, rest = divmod(len(pieces), each)
-        counts = like.counts if isinstance(like, Held) else (*[each] * whole, *([rest] if rest else []))
+        counts = (
+            like.counts
+            if isinstance(like, ClusterChunks)
+            else (*[each] * whole, *([rest] if rest else []))
+        )
         ends = np.cumsum(counts).tolist()
-        with told():
+        with cluster_errors():
             groups = [pieces[end - count : end] for end, count in zip(ends, counts, strict=True)]
-            return Held([self.client.submit(kept, group, pure=False) for group in groups], tuple(counts))
+            return ClusterChunks(
+                [self.client.submit(kept, group, pure=False) for group in groups], tuple(counts)
+            )
 
-    def read(self, function: Callable[[Any], Any], partitions: Sequence[Any], counts: Sequence[int]) -> Held:
-        with told():
-            return Held([self._on(partial(_listed, function), partition) for partition in partitions], tuple(counts))
+    def read(
+        self, function: Callable[[Any], Any], partitions: Sequence[Any], counts: Sequence[int]
+    ) -> ClusterChunks:
+        with cluster_errors():
+            return ClusterChunks(
+                [self._on(partial(_listed, function), partition) for partition in partitions],
+                tuple(counts),
+            )
 
-    def along(self, function: Callable[[Any, Any], Any], partitions: Sequence[Any], carry: Any) -> Any:
-        with told():
+    def along(
+        self, function: Callable[[Any, Any], Any], partitions: Sequence[Any], carry: Any
+    ) -> Any:
+        with cluster_errors():
             for partition in partitions:
                 held = getattr(partition, "held", ())
                 bare = replace(partition, held=()) if held else partition
                 carry = self.client.submit(_carried, function, bare, carry, *held, pure=False)
             return self.client.gather(carry)
 
-    def beside(self, *rows: Held) -> Held:
-        return Held(list(zip(*rows, strict=True)), rows[0].counts)
+    def beside(self, *rows: ClusterChunks) -> ClusterChunks:
+        return ClusterChunks(list(zip(*rows, strict=True)), rows[0].counts)
 
-    def keep(self, function: Callable[..., Any], rows: Held, *arguments: Any) -> tuple[Held, Any]:
+    def keep(
+        self, function: Callable[..., Any], rows: ClusterChunks, *arguments: Any
+    ) -> tuple[ClusterChunks, Any]:
         given = jax.tree.map(np.asarray, arguments)
-        with told():
+        with cluster_errors():
             both = [self.client.submit(_folded, function, part, given, pure=False) for part in rows]
-            kept, parts = ([self.client.submit(itemgetter(i), one, pure=False) for one in both] for i in (0, 1))
-            return Held(kept, rows.counts), self._added(parts)
+            kept, parts = (
+                [self.client.submit(itemgetter(i), one, pure=False) for one in both] for i in (0, 1)
+            )
+            return ClusterChunks(kept, rows.counts), self._added(parts)
 
-    def fetch(self, rows: Held) -> Any:
-        with told():
+    def fetch(self, rows: ClusterChunks) -> Any:
+        with cluster_errors():
             return together([chunk for group in self.client.gather(list(rows)) for chunk in group])
 
     def passes(self, function: Callable[[Any], Any], partitions: Sequence[Any]) -> list[Any]:
-        """A function of every partition, where the workers are."""
-        with told():
+        """Return a function of every partition, where the workers are."""
+        with cluster_errors():
             return self.client.gather([self._on(function, partition) for partition in partitions])
 
     def room(self) -> Room:
-        """Of the smallest worker, which may have to add up a whole branch of the tree."""
+        """Return the room of the smallest worker, which may add up a whole branch of the tree."""
         return smallest_worker(self.client, _BRANCHES + 1)
 
     def _on(self, function: Callable[[Any], Any], partition: Any) -> Any:
-        """A task; rows that the cluster holds already go to it by their futures."""
+        """Return a task; rows that the cluster holds already go to it by their futures."""
         held = getattr(partition, "held", ())
         if not held:
             return self.client.submit(function, partition, pure=False)
-        return self.client.submit(_where_held, function, replace(partition, held=()), *held, pure=False)
+        return self.client.submit(
+            _where_held, function, replace(partition, held=()), *held, pure=False
+        )
 
 
-def _laid(partition: Any, laying: Callable[[Any], Iterator[Laid]], size: int) -> list[Chunk]:
-    """The chunks of a partition."""
-    return list(chunks_of(laying(partition), chunk_shape(partition.rows, size)[1]))
+def _build_chunks(
+    partition: Any, row_builder: Callable[[Any], Iterator[RowArrays]], size: int
+) -> list[Chunk]:
+    """Return the chunks of a partition."""
+    return list(chunks_of(row_builder(partition), chunk_shape(partition.rows, size)[1]))
 
 
 def _where_held(function: Callable[[Any], Any], partition: Any, *held: Any) -> Any:
@@ -163,22 +199,29 @@ def _carried(function: Callable[[Any, Any], Any], partition: Any, carry: Any, *h
 
 
 def kept(value: Any) -> Any:
-    """What a worker keeps; made again from what the scheduler knows where that worker is lost."""
+    """Return the value that a worker keeps.
+
+    The scheduler makes it again where that worker is lost.
+    """
     return value
 
 
 def _paired(groups: Any) -> list[Any]:
-    """The chunks of a group; of a tuple of groups, tuples of their chunks."""
+    """Return the chunks of a group; of a tuple of groups, tuples of their chunks."""
     return list(zip(*map(_paired, groups), strict=True)) if isinstance(groups, tuple) else groups
 
 
-def _folded(function: Callable[..., Any], chunks: Sequence[Any], arguments: tuple[Any, ...]) -> tuple[list[Any], Any]:
-    """What one partition keeps, and its share of a sum."""
+def _folded(
+    function: Callable[..., Any], chunks: Sequence[Any], arguments: tuple[Any, ...]
+) -> tuple[list[Any], Any]:
+    """Return the part of a partition that is kept, and its share of a sum."""
     return folded(function, _paired(chunks), arguments)
 
 
-def _partial_sum(function: Callable[..., Any], chunks: Sequence[Chunk], arguments: tuple[Any, ...]) -> Any:
-    """One partition's share of a sum, as NumPy arrays."""
+def _partial_sum(
+    function: Callable[..., Any], chunks: Sequence[Chunk], arguments: tuple[Any, ...]
+) -> Any:
+    """Return one partition's share of a sum, as NumPy arrays."""
     return jax.tree.map(np.asarray, summed(function, _paired(chunks), arguments))
 
 
@@ -190,17 +233,19 @@ def _added(parts: Sequence[Any]) -> Any:
 
 
 def smallest_worker(client: Any, matrices: int) -> Room:
-    """The worker with the least memory; without a limit it is infinite."""
-    with told():
+    """Return the worker with the least memory; without a limit it is infinite."""
+    with cluster_errors():
         workers = client.scheduler_info(n_workers=-1)["workers"]
-    limits = {address: float(worker["memory_limit"] or math.inf) for address, worker in workers.items()}
+    limits = {
+        address: float(worker["memory_limit"] or math.inf) for address, worker in workers.items()
+    }
     smallest = min(limits, key=lambda address: limits[address], default="")
     return Room(limits.get(smallest, math.inf), f"the worker {smallest}", matrices)
 
 
 @contextmanager
-def told() -> Iterator[None]:
-    """Errors of the cluster in words."""
+def cluster_errors() -> Iterator[None]:
+    """Turn errors of the cluster into messages for the user."""
     from distributed import CancelledError, KilledWorker
     from distributed.comm.core import CommClosedError
 
@@ -208,16 +253,21 @@ def told() -> Iterator[None]:
         yield
     except KilledWorker as error:
         raise InputError(
-            f"the cluster gave up on a partition: its workers died {error.allowed_failures + 1} times, most often for "
-            "want of memory. Take smaller partitions (engine.partition_rows) or larger workers."
+            "the cluster gave up on a partition: its workers died "
+            f"{error.allowed_failures + 1} times, most often for lack of memory. Take smaller "
+            "partitions (engine.partition_rows) or larger workers."
         ) from None
     except (CancelledError, CommClosedError, OSError, TimeoutError) as error:
-        told = f"the cluster is lost ({type(error).__name__}); start it again, and fit with --resume."
-        raise InputError(told) from None
+        text = (
+            f"the cluster is lost ({type(error).__name__}); start it again, and fit with --resume."
+        )
+        raise InputError(text) from None
 
 
 def connected(scheduler: str | None, workers: int | None) -> Any:
-    """A client of the scheduler at an address, or of a local cluster with a process for each core.
+    """Return a client of the scheduler at an address, or of a local cluster.
+
+    A local cluster has a process for each core.
 
     Raises:
         InputError: without Dask, where no scheduler answers, and for workers with other versions.
@@ -231,15 +281,25 @@ def connected(scheduler: str | None, workers: int | None) -> Any:
     if scheduler is None:
         count = workers or os.cpu_count() or 1
         own = f"{os.environ.get('XLA_FLAGS', '')} {_SINGLE_THREADED['XLA_FLAGS']}".strip()
-        with config.set({"distributed.nanny.pre-spawn-environ": _SINGLE_THREADED | {"XLA_FLAGS": own}}):
-            options: dict[str, Any] = {"n_workers": count, "threads_per_worker": 1, "dashboard_address": ":0"}
+        with config.set(
+            {"distributed.nanny.pre-spawn-environ": _SINGLE_THREADED | {"XLA_FLAGS": own}}
+        ):
+            options: dict[str, Any] = {
+                "n_workers": count,
+                "threads_per_worker": 1,
+                "dashboard_address": ":0",
+            }
             client = Client(LocalCluster(**options))
     else:
         try:
             client = Client(scheduler, timeout=_PATIENCE)
         except (OSError, TimeoutError, ValueError) as error:
-            raise InputError(f"no Dask scheduler answers at {scheduler} ({type(error).__name__}).") from None
-    atexit.register(_closed, client, own=scheduler is None)  # before distributed's own, which tells of what it cancels
+            raise InputError(
+                f"no Dask scheduler answers at {scheduler} ({type(error).__name__})."
+            ) from None
+    atexit.register(
+        _closed, client, own=scheduler is None
+    )  # before distributed's own, which logs what it cancels
     check_versions(client)
     return client
 
@@ -255,16 +315,25 @@ def check_versions(client: Any) -> None:
     """Raise InputError for workers with another orthaug or JAX: sums would not be the same."""
     own = versions()
     for worker, found in client.run(versions, on_error="return").items():
-        if isinstance(found, OSError):  # it died while it was asked; its scheduler lays out its rows elsewhere
+        if isinstance(
+            found, OSError
+        ):  # it died while it was asked; its scheduler rebuilds its rows elsewhere
             continue
         if found != own:
-            others = ", ".join(f"{name} {found.get(name)}" for name in own) if isinstance(found, dict) else found
+            others = (
+                ", ".join(f"{name} {found.get(name)}" for name in own)
+                if isinstance(found, dict)
+                else found
+            )
             here = ", ".join(f"{name} {version}" for name, version in own.items())
-            raise InputError(f"the worker {worker} has {others}; here is {here}. Install the same versions on both.")
+            raise InputError(
+                f"the worker {worker} has {others}; here is {here}. Install the same versions "
+                "on both."
+            )
 
 
 def versions() -> dict[str, str]:
-    """Of orthaug and JAX, in this process."""
+    """Return the versions of orthaug and JAX in this process."""
     import jax
 
     return {"orthaug": __version__, "jax": jax.__version__}

@@ -1,7 +1,7 @@
 """The engine of several devices: rows sharded over them, sums by all-reduce.
 
-It serves the GPUs of a machine, forced CPU devices, and the processes of a multi-host run, of which each makes its own
-shards.
+It serves the GPUs of a machine, forced CPU devices, and the processes of a multi-host run, of which
+each makes its own shards.
 """
 
 from __future__ import annotations
@@ -19,15 +19,27 @@ from orthaug._base.checks import Matrix
 from orthaug._base.jax import jax
 from orthaug._base.memory import available
 from orthaug._base.parallel import Heard, nobody
-from orthaug.models.rows import CHUNK_ROWS, Chunk, Here, Room, all_chunks, brought, chunk_shape, laid_out, row_fold
+from orthaug.models.rows import (
+    CHUNK_ROWS,
+    Chunk,
+    LocalEngine,
+    Room,
+    all_chunks,
+    brought,
+    build_chunk,
+    chunk_shape,
+    row_fold,
+)
 
 _ROWS = "rows"
-_ONE_AT_A_TIME = threading.Lock()  # devices that wait for each other in two programs would wait for ever
+_ONE_AT_A_TIME = (
+    threading.Lock()
+)  # devices that wait for each other in two programs would wait for ever
 _MATRICES = 3  # the sum so far, what a chunk adds, and what all devices have
 
 
 @dataclass(frozen=True)
-class Devices(Here):
+class Devices(LocalEngine):
     """All rows in the memory of the devices, in equal shares.
 
     Args:
@@ -39,12 +51,14 @@ class Devices(Here):
     limit: int = CHUNK_ROWS
     resident: bool = False
 
-    def lay(self, z: Matrix, q: Any, e: Matrix, gain: Float[np.ndarray, "N ny ny"]) -> Chunk:
-        count, size = chunk_shape(-(-len(z) // self.shares), self.limit)  # of the chunks of one share
-        return self.place(laid_out(z, q, e, gain, (count * self.shares, size)))
+    def build_rows(self, z: Matrix, q: Any, e: Matrix, gain: Float[np.ndarray, "N ny ny"]) -> Chunk:
+        count, size = chunk_shape(
+            -(-len(z) // self.shares), self.limit
+        )  # of the chunks of one share
+        return self.place(build_chunk(z, q, e, gain, (count * self.shares, size)))
 
-    def draw(self, source: Any, laying: Callable[[Any], Any]) -> Chunk:
-        return self.lay(*brought(source, laying))
+    def draw(self, source: Any, row_builder: Callable[[Any], Any]) -> Chunk:
+        return self.build_rows(*brought(source, row_builder))
 
     def sum(self, function: Callable[..., Any], rows: Chunk, *arguments: Any) -> Any:
         return self._run(function, rows, arguments, keeps=False)[1]
@@ -54,7 +68,9 @@ class Devices(Here):
         return _mesh(self.count)[1]
 
     def place(self, chunks: Any, like: Any = None) -> Any:
-        sharding = jax.sharding.NamedSharding(_mesh(self.count)[0], jax.sharding.PartitionSpec(_ROWS))
+        sharding = jax.sharding.NamedSharding(
+            _mesh(self.count)[0], jax.sharding.PartitionSpec(_ROWS)
+        )
 
         def sharded(values: Any) -> Any:
             held = np.asarray(values)
@@ -62,29 +78,47 @@ class Devices(Here):
 
         return jax.tree.map(sharded, chunks)
 
-    def read(self, function: Callable[[Any], Any], partitions: Sequence[Any], counts: Sequence[int]) -> Any:
+    def read(
+        self, function: Callable[[Any], Any], partitions: Sequence[Any], counts: Sequence[int]
+    ) -> Any:
         def even(part: Any) -> Any:
-            return np.concatenate([part, np.zeros((-len(part) % self.shares, *part.shape[1:]), part.dtype)])
+            return np.concatenate(
+                [part, np.zeros((-len(part) % self.shares, *part.shape[1:]), part.dtype)]
+            )
 
         return self.place(jax.tree.map(even, all_chunks(function, partitions)))
 
     def keep(self, function: Callable[..., Any], rows: Any, *arguments: Any) -> tuple[Any, Any]:
         return self._run(function, rows, arguments, keeps=True)
 
-    def _run(self, function: Any, rows: Any, arguments: tuple[Any, ...], *, keeps: bool) -> tuple[Any, Any]:
+    def _run(
+        self, function: Any, rows: Any, arguments: tuple[Any, ...], *, keeps: bool
+    ) -> tuple[Any, Any]:
         with _ONE_AT_A_TIME:
-            return jax.block_until_ready(_compiled(function, self.count, len(arguments), keeps)(rows, *arguments))
+            return jax.block_until_ready(
+                _compiled(function, self.count, len(arguments), keeps)(rows, *arguments)
+            )
 
-    def map(self, function: Any, given: Any, items: Sequence[Any], heard: Heard = nobody) -> Iterator[Any]:
-        """One after another: programs that share devices wait for each other, on all hosts in the same order."""
+    def map(
+        self, function: Any, given: Any, items: Sequence[Any], heard: Heard = nobody
+    ) -> Iterator[Any]:
+        """Yield the results one after another.
+
+        Programs that share devices wait for each other, on all hosts in the same order.
+        """
         for i, item in enumerate(items):
             yield function(given, item, partial(heard, i))
 
     def room(self) -> Room:
-        """Of a device: its own memory, or a share of this machine's."""
+        """Return the room of a device: its own memory, or a share of this machine's."""
         own_process = jax.process_index()
-        devices = [device for device in jax.devices()[: self.count] if device.process_index == own_process]
-        own = [(device.memory_stats() or {}).get("bytes_limit", available() / len(devices)) for device in devices]
+        devices = [
+            device for device in jax.devices()[: self.count] if device.process_index == own_process
+        ]
+        own = [
+            (device.memory_stats() or {}).get("bytes_limit", available() / len(devices))
+            for device in devices
+        ]
         smallest = min(range(len(devices)), key=lambda i: own[i])
         return Room(own[smallest], f"the device {devices[smallest]}", _MATRICES)
 
@@ -97,7 +131,10 @@ def _mesh(count: int | None) -> tuple[Any, int]:
 
 @cache
 def _compiled(function: Callable[..., Any], count: int | None, arguments: int, keeps: bool) -> Any:
-    """Each device sums over its own chunks; then all of them have the sum. With `keeps` beside what each one keeps."""
+    """Compile a sum: each device adds up its own chunks, then all of them have the total.
+
+    With `keeps` each device also returns what it keeps.
+    """
     spec = jax.sharding.PartitionSpec
 
     def share(chunks: Any, *given: Any) -> Any:

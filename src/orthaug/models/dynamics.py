@@ -1,7 +1,7 @@
 """A model as a state and a step: `x_{k+1}, ŷ_k = step(numbers, x_k, u_k)`.
 
-A free run, its training and its stability need no more. The lagged form (`models.lagged`) is the case whose state is
-the past outputs.
+A free run, its training and its stability need no more. The lagged form (`models.lagged`) is the
+case whose state is the past outputs.
 """
 
 from __future__ import annotations
@@ -31,27 +31,41 @@ class Numbers(NamedTuple):
     gain: Float[AnyArray, "ny"]
     """Unit of the learner's output, in the outputs' units."""
     tilt: Any = None
-    """(members, nθ) of an ensemble: the physics that each member adds. `weights` has a row for each; None otherwise."""
+    """(members, nθ) of an ensemble: the physics that each member adds. `weights` has a row for
+    each; None otherwise.
+    """
     scheme: Any = None
-    """What `Dynamics.prepared` makes of them for all steps of a run."""
+    """Results of `Dynamics.prepared` for all steps of a run."""
     limits: Any = None
-    """(2, nz), the range of the features over the training rows; None for a learner that goes on as it is beyond it."""
+    """(2, nz), the range of the features over the training rows; None for a learner that goes on as
+    it is beyond it.
+    """
     pull: Any = None
-    """(n, nz), by which the regressor, or states and inputs, follow the features onto that range (`models.beyond`)."""
+    """(n, nz), by which the regressor, or states and inputs, follow the features onto that range
+    (`models.beyond`).
+    """
 
     @property
     def free(self) -> Numbers:
-        """Those of the same function without limits: the learner goes on as it is beyond its training."""
+        """These numbers without limits: the learner is not restricted beyond its training range."""
         return self if self.limits is None else self._replace(limits=None, pull=None)
 
     @property
     def alone(self) -> Numbers:
-        """Those of the physics, in the shapes of a fit without a learner, whose programs then serve."""
-        return Numbers(self.theta, np.zeros_like(self.theta), *[np.zeros(0)] * 3, gain=np.ones_like(self.gain))
+        """The numbers of the physics, in the shapes of a fit without a learner.
+
+        Programs of such a fit can then be used again.
+        """
+        return Numbers(
+            self.theta, np.zeros_like(self.theta), *[np.zeros(0)] * 3, gain=np.ones_like(self.gain)
+        )
 
 
 class Parts(NamedTuple):
-    """The output of a step in parts: `baseline` = φθ + fixed terms, `learner` = f − φθ_aux, `raw` = f; each (ny,)."""
+    """The output of a step in parts, each (ny,).
+
+    `baseline` = φθ + fixed terms, `learner` = f − φθ_aux, `raw` = f.
+    """
 
     baseline: Any
     learner: Any
@@ -67,7 +81,8 @@ class Parts(NamedTuple):
 class Dynamics(Protocol):
     """A model without its numbers; hashable, so that compiled programs are reused.
 
-    The state is one vector (n0,), the parameters are θ and the learner's weights, `unknowns` numbers together.
+    The state is one vector (n0,), the parameters are θ and the learner's weights, `unknowns`
+    numbers together.
     """
 
     @property
@@ -75,12 +90,15 @@ class Dynamics(Protocol):
 
     @property
     def linear(self) -> bool:
-        """Whether the output is linear in θ where state and inputs are given: then training eliminates θ (F1)."""
+        """True if the output is linear in θ for a given state and inputs.
+
+        Training then eliminates θ (F1).
+        """
         ...
 
     @property
     def differentiable(self) -> bool:
-        """Whether JAX can differentiate `step`; differences stand in where it cannot."""
+        """True if JAX can differentiate `step`; otherwise finite differences are used."""
         ...
 
     @property
@@ -100,66 +118,84 @@ class Dynamics(Protocol):
 
     @property
     def memory(self) -> int:
-        """How many rows of measured outputs `start` reads."""
+        """Number of rows of measured outputs that `start` reads."""
         ...
 
     def start(self, outputs: Matrix, rows: Any) -> Float[np.ndarray, "r n0"]:
-        """The states at some rows, made of the outputs (N, ny) that were measured before each of them."""
+        """Return the states at some rows from the outputs (N, ny) measured before each of them."""
         ...
 
     def start_rows(self, weight: Matrix) -> Matrix:
-        """L (n0, n0): a state x that differs from the measured one costs `‖L (x − start)‖²`.
+        """Return L (n0, n0): a state x costs `‖L (x − start)‖²` about the measured one.
 
         `weight` (ny, ny) multiplies the errors of an output. Zero rows leave an entry free.
         """
         ...
 
     def inputs(self, experiment: Experiment, record: Record) -> Matrix:
-        """What the steps of an experiment read, (T, nu), from its first row with an output on; affine in its inputs."""
-        ...
+        """Return the inputs of an experiment's steps, (T, nu), from its first row with an output.
 
-    def states_at(self, numbers: Numbers, outputs: Matrix, inputs: Matrix, rows: Any) -> Float[np.ndarray, "r n0"]:
-        """The states of a free run at some rows of an experiment.
-
-        `outputs` (N, ny) are those of the run, before its first row the measured ones; `inputs` (T, nu) as its steps
-        read them, up to the last of the rows at least.
+        It is affine in the inputs.
         """
         ...
 
-    def scaled_features(self, numbers: Numbers, start: Vector, outputs: Matrix, inputs: Matrix) -> Matrix | None:
-        """The learner's features (T, nz) along a free run, in [-1, 1] over the training data; None if not known.
+    def states_at(
+        self, numbers: Numbers, outputs: Matrix, inputs: Matrix, rows: Any
+    ) -> Float[np.ndarray, "r n0"]:
+        """Return the states of a free run at some rows of an experiment.
 
-        `start` (n0,) is its first state, `outputs` (T, ny) are those of the run, `inputs` (T, nu) as its steps read
-        them.
+        `outputs` (N, ny) are those of the run, before its first row the measured ones; `inputs` (T,
+        nu) as its steps read them, up to the last of the rows at least.
+        """
+        ...
+
+    def scaled_features(
+        self, numbers: Numbers, start: Vector, outputs: Matrix, inputs: Matrix
+    ) -> Matrix | None:
+        """Return the learner's features (T, nz) along a free run; None if they are not known.
+
+        They are in [-1, 1] over the training data.
+
+        `start` (n0,) is its first state, `outputs` (T, ny) are those of the run, `inputs` (T, nu)
+        as its steps read them.
         """
         ...
 
     def describe(self, state: Vector, inputs: Vector) -> dict[str, float]:
-        """A state and the inputs of a step as a user knows them, by names."""
+        """Return a state and the inputs of a step by the names that a user knows."""
         ...
 
     def prepared(self, numbers: Numbers) -> Numbers:
-        """The numbers with what all steps of a run need of them, computed once."""
+        """Return the numbers with all that the steps of a run share, computed once."""
         ...
 
     def step(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
-        """The next state (n0,) and the output, from a state and the inputs (nu,) of one row."""
+        """Return the next state (n0,) and the output from a state and one row of inputs (nu,)."""
         ...
 
     def first_slopes(self, width: int) -> Any:
-        """∂state/∂(state at the start, c, w) at the start of `width` runs: the identity and zeros, in any layout."""
+        """Return ∂state/∂(state at the start, c, w) at the start of `width` runs.
+
+        It is the identity and zeros, in any layout.
+        """
         ...
 
-    def tangents(self, numbers: Numbers, state: Any, slopes: Any, inputs: Any) -> tuple[Any, Any, Any, Any]:
-        """A step of m runs side by side with its derivatives: (state, slopes, ŷ, ∂ŷ/∂(start, c, w)).
+    def tangents(
+        self, numbers: Numbers, state: Any, slopes: Any, inputs: Any
+    ) -> tuple[Any, Any, Any, Any]:
+        """Return a step of m runs with its derivatives: (state, slopes, ŷ, ∂ŷ/∂(start, c, w)).
 
-        Shapes: `state` (n0, m), `inputs` (nu, m), ŷ (ny, m), ∂ŷ (ny, n0 + n, m); `slopes` as in `first_slopes`.
+        Shapes: `state` (n0, m), `inputs` (nu, m), ŷ (ny, m), ∂ŷ (ny, n0 + n, m); `slopes` as in
+        `first_slopes`.
         """
         ...
 
 
 class Local(NamedTuple):
-    """Steps by themselves: next states and outputs (n0 + ny, r), and how they follow state and unknowns."""
+    """Independent steps: next states and outputs (n0 + ny, r), and their derivatives.
+
+    The derivatives are by the state and by the unknowns.
+    """
 
     value: Any
     to_state: Any
@@ -168,7 +204,10 @@ class Local(NamedTuple):
     """(n0 + ny, n, r)."""
 
     def along(self, slopes: Any, fused: bool = False) -> tuple[Any, Any, Any, Any]:
-        """As `Dynamics.tangents`, of states with the `slopes`. What is cheap to compute twice is better `fused`."""
+        """Return state, slopes, outputs and their slopes as `Dynamics.tangents`, for given slopes.
+
+        `fused` sums instead of a matrix product are faster where the slopes are cheap to compute.
+        """
         n0 = len(slopes)
         if fused:
             through = sum(self.to_state[:, i, None] * slopes[None, i] for i in range(n0))
@@ -178,8 +217,8 @@ class Local(NamedTuple):
         return self.value[:n0], slope[:n0], self.value[n0:], slope[n0:]
 
 
-class Differentiated:
-    """What follows from `step`, for dynamics that know no faster way.
+class AutodiffDynamics:
+    """Derivatives by automatic differentiation of `step`, for dynamics without a faster way.
 
     `first_slopes` and `tangents` by automatic differentiation, `states_at` by running it.
     """
@@ -189,38 +228,54 @@ class Differentiated:
     def prepared(self, numbers: Numbers) -> Numbers:
         return numbers
 
-    def scaled_features(self, numbers: Numbers, start: Vector, outputs: Matrix, inputs: Matrix) -> Matrix | None:
+    def scaled_features(
+        self, numbers: Numbers, start: Vector, outputs: Matrix, inputs: Matrix
+    ) -> Matrix | None:
         return None
 
     def states_at(
-        self: Dynamics, numbers: Numbers, outputs: Matrix, inputs: Matrix, rows: Int[np.ndarray, "r"]
+        self: Dynamics,
+        numbers: Numbers,
+        outputs: Matrix,
+        inputs: Matrix,
+        rows: Int[np.ndarray, "r"],
     ) -> Float[np.ndarray, "r n0"]:
         padded = np.zeros((padded_length(len(inputs)), inputs.shape[1]))
         padded[: len(inputs)] = inputs
         start = self.start(outputs, [self.first_row])[0]
-        return np.asarray(_states(self, numbers, start, padded))[np.asarray(rows, dtype=int) - self.first_row]
+        return np.asarray(_states(self, numbers, start, padded))[
+            np.asarray(rows, dtype=int) - self.first_row
+        ]
 
     def first_slopes(self: Dynamics, width: int) -> Any:
         n0 = self.states
-        return jnp.broadcast_to(jnp.eye(n0, n0 + self.unknowns)[..., None], (n0, n0 + self.unknowns, width))
+        return jnp.broadcast_to(
+            jnp.eye(n0, n0 + self.unknowns)[..., None], (n0, n0 + self.unknowns, width)
+        )
 
     def local(self: Dynamics, numbers: Numbers, states: Any, inputs: Any) -> Local:
-        """Steps from r states (n0, r) and inputs (nu, r), each by itself."""
+        """Return steps from r states (n0, r) and inputs (nu, r), each by itself."""
         nt = len(numbers.theta)
 
-        def both(state: Any, unknowns: Any, inputs: Any) -> Any:
+        def both(state: Any, unknowns: Any, inputs: Any) -> tuple[Any, Any]:
             own = numbers._replace(theta=unknowns[:nt], weights=unknowns[nt:])
             following, parts = self.step(own, state, inputs)
-            return jnp.concatenate([following, parts.total])
+            value = jnp.concatenate([following, parts.total])
+            return (
+                value,
+                value,
+            )  # to differentiate, and as it is: the step stands once in the program
 
         unknowns = jnp.concatenate([jnp.asarray(numbers.theta), jnp.asarray(numbers.weights)])
-        value = jax.vmap(both, (-1, None, -1), -1)(states, unknowns, inputs)
-        slopes = jax.vmap(jax.jacrev(both, (0, 1)), (-1, None, -1), -1)(states, unknowns, inputs)
+        differentiated = jax.jacrev(both, (0, 1), has_aux=True)
+        slopes, value = jax.vmap(differentiated, (-1, None, -1), -1)(states, unknowns, inputs)
         # a kink without a derivative, such as sqrt(max(y, 0)) at 0, counts as flat
         return Local(value, *(jnp.where(jnp.isfinite(d), d, 0.0) for d in slopes))
 
-    def tangents(self: Any, numbers: Numbers, state: Any, slopes: Any, inputs: Any) -> tuple[Any, Any, Any, Any]:
-        """`S⁺ = A S + [0 B]` with A = ∂x⁺/∂x and B = ∂x⁺/∂(c, w), and the same for the output."""
+    def tangents(
+        self: Any, numbers: Numbers, state: Any, slopes: Any, inputs: Any
+    ) -> tuple[Any, Any, Any, Any]:
+        """Propagate `S⁺ = A S + [0 B]` with A = ∂x⁺/∂x and B = ∂x⁺/∂(c, w); the output alike."""
         return self.local(numbers, state, inputs).along(slopes)
 
 
@@ -228,5 +283,7 @@ class Differentiated:
 def _states(
     form: Dynamics, numbers: Numbers, state: Float[Array, "n0"], inputs: Float[Array, "T nu"]
 ) -> Float[Array, "T n0"]:
-    """The state at every row of a free run."""
-    return jax.lax.scan(lambda state, row: (form.step(numbers, state, row)[0], state), state, inputs)[1]
+    """Return the state at every row of a free run."""
+    return jax.lax.scan(
+        lambda state, row: (form.step(numbers, state, row)[0], state), state, inputs
+    )[1]

@@ -1,4 +1,7 @@
-"""Fitted models as filters: of a lagged model the noise of its equation disturbs, of a motion that of its rates."""
+"""Fitted models as Kalman filters.
+
+Noise disturbs the equation of a lagged model, and the rates of a motion.
+"""
 
 from __future__ import annotations
 
@@ -12,18 +15,29 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug._base.jax import jax, jnp
 from orthaug.data.record import Experiment, Record
 from orthaug.models.dynamics import Numbers, Parts
-from orthaug.models.kalman import Belief, Filter, Noise, Told, corrected, slope, without_gaps
+from orthaug.models.kalman import (
+    Filter,
+    FilterRow,
+    Noise,
+    StateEstimate,
+    corrected,
+    slope,
+    without_gaps,
+)
 from orthaug.models.lagged import Lagged
-from orthaug.models.moving import Moving
+from orthaug.models.moving import MotionDynamics
 from orthaug.models.stepping import Memory
 
 
 @dataclass(frozen=True)
 class LaggedFilter:
-    """A lagged model without its numbers as a filter: `Filter`. Its state is what its regressor remembers.
+    """A lagged model without its numbers as a filter: `Filter`.
 
-    `y_k = g(x_k) + e_k` with Cov e = Q goes on in the lags, and `y_k + v_k` with Cov v = R is measured. With R = 0 the
-    estimate of a measured output is what was measured, and the prediction that of `predict`.
+    Its state is what its regressor remembers.
+
+    `y_k = g(x_k) + e_k` with Cov e = Q goes on in the lags, and `y_k + v_k` with Cov v = R is
+    measured. With R = 0 the estimate of a measured output is what was measured, and the prediction
+    that of `predict`.
     """
 
     form: Lagged
@@ -46,8 +60,14 @@ class LaggedFilter:
     def inputs(self, experiment: Experiment, record: Record) -> Matrix:
         return experiment.inputs[self.first_row :]
 
-    def start(self, experiment: Experiment, record: Record, row: int, noise: Noise, size: Vector) -> Belief:
-        """The lags before a row: outputs with the sensors' noise, or unknown by their `size` (ny,) where missing."""
+    def start(
+        self, experiment: Experiment, record: Record, row: int, noise: Noise, size: Vector
+    ) -> StateEstimate:
+        """Return the lags before a row and their covariance.
+
+        Outputs have the sensors' noise, or are unknown by their `size` (ny,) where they are
+        missing.
+        """
         outputs, lags = list(self.form.outputs), self.memory.lags
         before = Experiment(experiment.inputs[:row], without_gaps(experiment.outputs[:row]))
         mean = self.memory.at(before, record, row)
@@ -61,26 +81,36 @@ class LaggedFilter:
                 continue
             for j, other in enumerate(lags):
                 if other.lag == lag.lag and other.channel in outputs:
-                    there = np.isfinite(experiment.outputs[row - lag.lag, outputs.index(other.channel)])
-                    variance[i, j] = noise.output[own, outputs.index(other.channel)] if there else 0.0
-        return Belief(mean, variance)
+                    there = np.isfinite(
+                        experiment.outputs[row - lag.lag, outputs.index(other.channel)]
+                    )
+                    variance[i, j] = (
+                        noise.output[own, outputs.index(other.channel)] if there else 0.0
+                    )
+        return StateEstimate(mean, variance)
 
     def step(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
         parts = self.form.at(numbers, jnp.concatenate([state, inputs])[self.memory.read])
         return jnp.concatenate([parts.total, inputs, state])[self.memory.following], parts
 
-    def row(self, numbers: Numbers, noise: Noise, belief: Belief, inputs: Any, measured: Any) -> tuple[Belief, Told]:
+    def row(
+        self, numbers: Numbers, noise: Noise, belief: StateEstimate, inputs: Any, measured: Any
+    ) -> tuple[StateEstimate, FilterRow]:
         n, ny = len(self.memory.lags), len(self.form.outputs)
         value, derivative = slope(_both(self, numbers, inputs), belief.state)
         enters = jnp.concatenate([jnp.asarray(self._newest), jnp.eye(ny)])
         covariance = derivative @ belief.covariance @ derivative.T + enters @ noise.state @ enters.T
-        mean, after, spread, square, likelihood = corrected(value, covariance, noise.output, measured)
-        told = Told(value[n:], spread, mean[n:], after[n:, n:], mean[:n], after[:n, :n], square, likelihood)
-        return Belief(told.state, told.state_covariance), told
+        mean, after, spread, square, likelihood = corrected(
+            value, covariance, noise.output, measured
+        )
+        estimated = FilterRow(
+            value[n:], spread, mean[n:], after[n:, n:], mean[:n], after[:n, :n], square, likelihood
+        )
+        return StateEstimate(estimated.state, estimated.state_covariance), estimated
 
     @property
     def _newest(self) -> Matrix:
-        """Where an output goes in the next state, (n, ny)."""
+        """Positions of the outputs in the next state, (n, ny)."""
         place = np.zeros((len(self.memory.lags), len(self.form.outputs)))
         for i, lag in enumerate(self.memory.lags):
             if lag.channel in self.form.outputs and lag.lag == 1:
@@ -88,11 +118,14 @@ class LaggedFilter:
         return place
 
     def unit(self, noise: Matrix, size: Vector) -> Matrix:
-        """A disturbance (ny, ny) in proportion to the error of the outputs."""
+        """Return a disturbance (ny, ny) in proportion to the error of the outputs."""
         return noise
 
     def linearised(self, numbers: Numbers) -> tuple[Matrix, Matrix, Matrix, Matrix]:
-        """A (n, n), C (ny, n) at the origin, and how a disturbance enters state (n, ny) and outputs (ny, ny)."""
+        """Return A (n, n) and C (ny, n) at the origin, and the gains of a disturbance.
+
+        The gains are those of the state (n, ny) and of the outputs (ny, ny).
+        """
         slopes = _at_origin(self, numbers, np.zeros(len(self.memory.inputs)), len(self.memory.lags))
         return *slopes, self._newest, np.eye(len(self.form.outputs))
 
@@ -101,7 +134,7 @@ class LaggedFilter:
 class MotionFilter:
     """A motion without its numbers as a filter: `Filter`."""
 
-    form: Moving
+    form: MotionDynamics
 
     first_row = 0
     hidden = True
@@ -116,46 +149,74 @@ class MotionFilter:
 
     @property
     def alone(self) -> MotionFilter:
-        """That of the motion without its learner."""
+        """The filter of the motion without its learner."""
         return MotionFilter(self.form.alone)
 
     def inputs(self, experiment: Experiment, record: Record) -> Matrix:
         return self.form.inputs(experiment, record)
 
-    def start(self, experiment: Experiment, record: Record, row: int, noise: Noise, size: Vector) -> Belief:
-        """The state as it is guessed from what is measured about a row, unknown by the `size` (nx,) of all."""
-        return Belief(self.form.start(without_gaps(experiment.outputs), [row])[0], np.diag(size**2))
+    def start(
+        self, experiment: Experiment, record: Record, row: int, noise: Noise, size: Vector
+    ) -> StateEstimate:
+        """Return the state guessed from the samples about a row.
+
+        It is unknown by the `size` (nx,) of all states.
+        """
+        return StateEstimate(
+            self.form.start(without_gaps(experiment.outputs), [row])[0], np.diag(size**2)
+        )
 
     def step(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
         return self.form.step(numbers, state, inputs)
 
-    def row(self, numbers: Numbers, noise: Noise, belief: Belief, inputs: Any, measured: Any) -> tuple[Belief, Told]:
+    def row(
+        self, numbers: Numbers, noise: Noise, belief: StateEstimate, inputs: Any, measured: Any
+    ) -> tuple[StateEstimate, FilterRow]:
         n = self.form.states
         value, seen = slope(lambda x: self.step(numbers, x, inputs)[1].total, belief.state)
         both = jnp.concatenate([jnp.eye(n), seen])
         covariance = both @ belief.covariance @ both.T
         mean = jnp.concatenate([belief.state, value])
-        mean, after, spread, square, likelihood = corrected(mean, covariance, noise.output, measured)
+        mean, after, spread, square, likelihood = corrected(
+            mean, covariance, noise.output, measured
+        )
         following, moved = slope(lambda x: self.step(numbers, x, inputs)[0], mean[:n])
         own = after[:n, :n]
-        told = Told(value, spread, mean[n:], after[n:, n:], mean[:n], own, square, likelihood)
-        return Belief(following, moved @ own @ moved.T + noise.state), told
+        estimated = FilterRow(
+            value, spread, mean[n:], after[n:, n:], mean[:n], own, square, likelihood
+        )
+        return StateEstimate(following, moved @ own @ moved.T + noise.state), estimated
 
     def unit(self, noise: Matrix, size: Vector) -> Matrix:
-        """A disturbance (nx, nx) as large as the states; none where a rate is another state: that is exact."""
-        known = [state.derivative in self.names and not state.learned for state in self.form.motion.states]
+        """Return a disturbance (nx, nx) as large as the states.
+
+        None where a rate is another state: that is exact.
+        """
+        known = [
+            state.derivative in self.names and not state.learned
+            for state in self.form.motion.states
+        ]
         return np.diag(np.where(known, 0.0, size**2))
 
     def linearised(self, numbers: Numbers) -> tuple[Matrix, Matrix, Matrix, Matrix]:
-        """A (nx, nx), C (ny, nx) at the origin, and how a disturbance enters state (nx, nx) and outputs (ny, nx)."""
+        """Return A (nx, nx) and C (ny, nx) at the origin, and the gains of a disturbance.
+
+        The gains are those of the state (nx, nx) and of the outputs (ny, nx).
+        """
         n = self.form.states
-        nothing = Experiment(np.zeros((4, len(self.form.motion.inputs))), np.zeros((4, len(self.form.outputs))))
+        nothing = Experiment(
+            np.zeros((4, len(self.form.motion.inputs))), np.zeros((4, len(self.form.outputs)))
+        )
         inputs = np.zeros(self.form.inputs(nothing, None).shape[1])  # type: ignore[arg-type]
-        return *_at_origin(self, numbers, inputs, n), np.eye(n), np.zeros((len(self.form.outputs), n))
+        return (
+            *_at_origin(self, numbers, inputs, n),
+            np.eye(n),
+            np.zeros((len(self.form.outputs), n)),
+        )
 
 
 def _both(form: Filter, numbers: Numbers, inputs: Any) -> Callable[[Any], Any]:
-    """The next state and the outputs as one function of the state."""
+    """Return the next state and the outputs as one function of the state."""
 
     def both(state: Any) -> Any:
         following, parts = form.step(numbers, state, inputs)
@@ -165,7 +226,7 @@ def _both(form: Filter, numbers: Numbers, inputs: Any) -> Callable[[Any], Any]:
 
 
 def _at_origin(form: Filter, numbers: Numbers, inputs: Vector, n: int) -> tuple[Matrix, Matrix]:
-    """A (n, n) and C (ny, n)."""
+    """Return A (n, n) and C (ny, n) at the origin."""
     both = _both(form, numbers, inputs)
     derivative = np.asarray(jax.jit(lambda x: slope(both, x)[1])(np.zeros(n)))
     return derivative[:n], derivative[n:]

@@ -1,6 +1,9 @@
-"""Several hosts as one machine: the same command runs on each, JAX joins their devices, the first one writes.
+"""Several hosts as one machine: JAX joins their devices, and the first one writes.
 
-Every process reads all rows and takes every step; only the sums over rows are shared (`models.devices`).
+The same command runs on each host.
+
+Every process reads all rows and takes every step; only the sums over rows are shared
+(`models.devices`).
 """
 
 from __future__ import annotations
@@ -22,7 +25,9 @@ _PATIENCE = 60  # s, to wait for the others
 
 
 def join(environment: Mapping[str, str] = os.environ) -> None:
-    """Join the processes of a run over several hosts, where the environment names their coordinator.
+    """Join the processes of a run over several hosts.
+
+    Does nothing unless the environment names their coordinator.
 
     Their number, and which one this is, may be left to what JAX finds out of SLURM and Open MPI.
 
@@ -45,11 +50,16 @@ def join(environment: Mapping[str, str] = os.environ) -> None:
         jax.distributed.initialize(address, **numbers, initialization_timeout=_PATIENCE)
     except (RuntimeError, ValueError) as error:
         first = str(error).splitlines()[0]
-        raise InputError(f"the processes of {COORDINATOR}={address} do not find each other ({first}).") from None
+        raise InputError(
+            f"the processes of {COORDINATOR}={address} do not find each other ({first})."
+        ) from None
 
 
 def _await(address: str) -> None:
-    """Wait until the first process listens; JAX itself would end the program without a word of ours."""
+    """Wait until the first process listens.
+
+    JAX itself would end the program without a word of ours.
+    """
     host, _, port = address.rpartition(":")
     end = time.monotonic() + _PATIENCE
     while True:
@@ -58,13 +68,16 @@ def _await(address: str) -> None:
             return
         except (OSError, ValueError, OverflowError) as error:
             if time.monotonic() > end or not isinstance(error, OSError):
-                told = f"{COORDINATOR}={address}: no first process answers there ({type(error).__name__})."
-                raise InputError(told) from None
+                text = (
+                    f"{COORDINATOR}={address}: no first process answers there "
+                    f"({type(error).__name__})."
+                )
+                raise InputError(text) from None
         time.sleep(0.2)
 
 
 def several() -> bool:
-    """Whether this process is one of several."""
+    """Return whether this process is one of several."""
     return bool(jax.distributed.is_initialized()) and jax.process_count() > 1
 
 
@@ -75,11 +88,16 @@ def check_alike(fingerprint: str) -> None:
     own = np.frombuffer(bytes.fromhex(fingerprint), dtype=np.uint8)
     for number, other in enumerate(np.asarray(process_allgather(own))):
         if not np.array_equal(other, own):
-            raise InputError(f"process {number} has another spec, other data or another version of orthaug.")
+            raise InputError(
+                f"process {number} has another spec, other data or another version of orthaug."
+            )
 
 
 def waits() -> str | None:
-    """What a process that writes nothing says; None for the one that writes."""
+    """Return the message of a process that writes nothing; None for the one that writes."""
     if not several() or jax.process_index() == 0:
         return None
-    return f"process {jax.process_index()} of {jax.process_count()}: done; process 0 writes the result."
+    return (
+        f"process {jax.process_index()} of {jax.process_count()}: done; process 0 writes the "
+        "result."
+    )

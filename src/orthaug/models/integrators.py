@@ -1,8 +1,9 @@
 """One sample of a motion: from x(t) to x(t + Ts), with the input held as declared between samples.
 
-`rk4` is the classical Runge-Kutta method. `exact` is exponential time differencing (Cox and Matthews 2002, ETDRK4): the
-part of the motion that is linear at the origin goes by its matrix exponential, so a linear motion has no error under a
-zero-order or first-order hold. Both take several substeps in a sample.
+`rk4` is the classical Runge-Kutta method. `exact` is exponential time differencing (Cox and
+Matthews 2002, ETDRK4): the part of the motion that is linear at the origin goes by its matrix
+exponential, so a linear motion has no error under a zero-order or first-order hold. Both take
+several substeps in a sample.
 """
 
 from __future__ import annotations
@@ -23,10 +24,10 @@ Field = Callable[[Any, Any], Any]
 
 
 def held(inputs: Matrix, hold: str, substeps: int) -> Matrix:
-    """What the steps of a run read of its inputs (N, nu): the input at points of each sample, (N, points nu).
+    """Return the inputs (N, nu) at the points of each sample that a step reads, (N, points nu).
 
-    One point under a zero-order hold, both ends under a first-order hold, and under a spline hold the ends and middles
-    of all substeps, on a cubic spline through the record.
+    One point under a zero-order hold, both ends under a first-order hold, and under a spline hold
+    the ends and middles of all substeps, on a cubic spline through the record.
     """
     rows, nu = inputs.shape
     if hold == "zero-order" or not nu:
@@ -36,7 +37,9 @@ def held(inputs: Matrix, hold: str, substeps: int) -> Matrix:
     from scipy.interpolate import CubicSpline  # slow to import, and few runs need it
 
     spline, k = CubicSpline(np.arange(rows), inputs), np.arange(rows)
-    return _stacked(*(spline(np.minimum(k + i / (2 * substeps), rows - 1)) for i in range(2 * substeps + 1)))
+    return _stacked(
+        *(spline(np.minimum(k + i / (2 * substeps), rows - 1)) for i in range(2 * substeps + 1))
+    )
 
 
 def _stacked(*points: Matrix) -> Matrix:
@@ -44,7 +47,7 @@ def _stacked(*points: Matrix) -> Matrix:
 
 
 def input_at(row: Any, nu: int) -> Callable[[Any, int], Any]:
-    """u (nu,) as a function of the half substep i of a sample and of how many it has."""
+    """Return u (nu,) as a function of the half substep i of a sample and of their number."""
     points = row.reshape(-1, nu) if nu else row.reshape(1, 0)
     if len(points) == 1:
         return lambda i, halves: points[0]
@@ -54,7 +57,10 @@ def input_at(row: Any, nu: int) -> Callable[[Any, int], Any]:
 
 
 class Exponentials(NamedTuple):
-    """Of the linear part A of a motion, over a substep h: e^{Ah}, φ₁ to φ₃ of Ah, and e^{Ah/2}, (h/2) φ₁ of Ah/2."""
+    """Exponentials of the linear part A of a motion over a substep h.
+
+    They are e^{Ah}, φ₁ to φ₃ of Ah, and e^{Ah/2}, (h/2) φ₁ of Ah/2.
+    """
 
     linear: Any
     whole: Any
@@ -67,23 +73,35 @@ class Exponentials(NamedTuple):
     @classmethod
     def of(cls, linear: Any, h: float) -> Exponentials:
         """Of A (nx, nx)."""
-        whole, phi1, phi2, phi3 = _phi(linear * h, 3)
-        half, half1 = _phi(linear * h / 2, 1)
+        both = jax.vmap(lambda a: _phi(a, 3))(
+            jnp.stack([linear * h, linear * h / 2])
+        )  # at once: less to compile
+        (whole, half), (phi1, half1), (phi2, _), (phi3, _) = both
         return cls(linear, whole, phi1, phi2, phi3, half, half1 * h / 2)
 
 
-def advance(field: Field, scheme: Any, x: Any, row: Any, nu: int, step: float, substeps: int, integrator: str) -> Any:
-    """x one sample later.
+def advance(
+    field: Field,
+    scheme: Any,
+    x: Any,
+    row: Any,
+    nu: int,
+    step: float,
+    substeps: int,
+    integrator: str,
+    *,
+    looped: bool = False,
+) -> Any:
+    """Return x one sample later.
 
-    Args:
-        field: ẋ = F(x, u).
-        scheme: the `Exponentials` of its linear part; None for `rk4`.
-        row: the input as `held` lays it out.
-        step: the sampling time.
+    Args: field: ẋ = F(x, u). scheme: the `Exponentials` of its linear part; None for `rk4`. row:
+        the input as `held` lays it out. step: the sampling time. looped: write the field once into
+        a program, and not for every stage: of a large one that compiles faster.
     """
     at, halves, h = input_at(row, nu), 2 * substeps, step / substeps
-    one = _exponential(field, scheme, h) if integrator == "exact" else runge_kutta(field, h)
-    if substeps <= UNROLLED:
+    stages = _stages_in_a_loop if looped else runge_kutta
+    one = _exponential(field, scheme, h) if integrator == "exact" else stages(field, h)
+    if substeps <= UNROLLED and not (looped and substeps > 1):
         for j in range(substeps):
             x = one(x, at(2 * j, halves), at(2 * j + 1, halves), at(2 * j + 2, halves))
         return x
@@ -92,7 +110,10 @@ def advance(field: Field, scheme: Any, x: Any, row: Any, nu: int, step: float, s
 
 
 def runge_kutta(field: Field, h: float) -> Callable[..., Any]:
-    """A step of length h under inputs at its begin, middle and end, of JAX or NumPy arrays alike."""
+    """Return a step of length h under inputs at its begin, middle and end.
+
+    The arrays may be JAX's or NumPy's.
+    """
 
     def one(x: Any, first: Any, middle: Any, last: Any) -> Any:
         k1 = field(x, first)
@@ -100,6 +121,25 @@ def runge_kutta(field: Field, h: float) -> Callable[..., Any]:
         k3 = field(x + h / 2 * k2, middle)
         k4 = field(x + h * k3, last)
         return x + h / 6 * (k1 + 2 * (k2 + k3) + k4)
+
+    return one
+
+
+def _stages_in_a_loop(field: Field, h: float) -> Callable[..., Any]:
+    """`runge_kutta` of JAX arrays with a loop over the stages."""
+    ahead, share = jnp.array([0.0, 0.5, 0.5, 1.0]), jnp.array([1.0, 2.0, 2.0, 1.0]) / 6
+
+    def one(x: Any, first: Any, middle: Any, last: Any) -> Any:
+        def stage(
+            sums: tuple[Any, Any], given: tuple[Any, Any, Any]
+        ) -> tuple[tuple[Any, Any], None]:
+            (k, total), (a, b, u) = sums, given
+            k = field(x + a * h * k, u)
+            return (k, total + b * k), None
+
+        inputs = jnp.stack([first, middle, middle, last])
+        nothing = jnp.zeros_like(x)
+        return x + h * jax.lax.scan(stage, (nothing, nothing), (ahead, share, inputs))[0][1]
 
     return one
 
@@ -124,7 +164,7 @@ def _exponential(field: Field, scheme: Exponentials, h: float) -> Callable[..., 
 
 
 def _phi(a: Any, order: int) -> list[Any]:
-    """e^A, φ₁(A) … φ_order(A), of one exponential of a block matrix (Sidje 1998)."""
+    """Return e^A, φ₁(A) … φ_order(A), from one exponential of a block matrix (Sidje 1998)."""
     n = len(a)
     size = (order + 1) * n
     block = jnp.zeros((size, size)).at[:n, :n].set(a)
@@ -134,13 +174,18 @@ def _phi(a: Any, order: int) -> list[Any]:
 
 
 def _exponential_less_one(a: Any) -> Any:
-    """e^A − I by scaling and squaring: `E ← 2E + E²` keeps the digits that squaring e^A would lose.
+    """Return e^A − I by scaling and squaring.
 
-    The number of squarings is fixed, so that it compiles to a few products; it is right for ‖A‖ up to some thousand.
+    `E ← 2E + E²` keeps the digits that squaring e^A would lose.
+
+    The number of squarings is fixed, so that it compiles to a few products; it is right for ‖A‖ up
+    to some thousand.
     """
     a = a / 2**_SQUARINGS
-    term = total = a
-    for i in range(2, _TERMS + 1):
-        term = term @ a / i
-        total = total + term
+
+    def further(i: Any, sums: tuple[Any, Any]) -> tuple[Any, Any]:
+        term = sums[0] @ a / i
+        return term, sums[1] + term
+
+    _, total = jax.lax.fori_loop(2, _TERMS + 1, further, (a, a))
     return jax.lax.fori_loop(0, _SQUARINGS, lambda _, e: 2 * e + e @ e, total)

@@ -1,8 +1,9 @@
-"""An extended Kalman filter over the rows of a record: where a model stands, told by what is measured.
+"""An extended Kalman filter over the rows of a record: the state of a model from measurements.
 
-`x_{k+1} = f(x_k, u_k) + w_k`, `y_k = h(x_k, u_k) + v_k` with Cov w = Q and Cov v = R (Anderson and Moore 1979). A
-lagged model has its disturbance in the equation of its newest output, a motion in the rates of its states
-(`models.filters`). Outputs that are NaN are missing: they tell nothing, and the estimate runs free.
+`x_{k+1} = f(x_k, u_k) + w_k`, `y_k = h(x_k, u_k) + v_k` with Cov w = Q and Cov v = R (Anderson and
+Moore 1979). A lagged model has its disturbance in the equation of its newest output, a motion in
+the rates of its states (`models.filters`). Outputs that are NaN are missing: they add nothing, and
+the estimate runs free.
 """
 
 from __future__ import annotations
@@ -21,7 +22,10 @@ _SIDE_BY_SIDE = 1024  # starts of predictions
 
 
 class Noise(NamedTuple):
-    """`state` Q: what disturbs the outputs of a lagged model (ny, ny), or the states of a motion in a sample (nx, nx).
+    """Covariances Q and R of the noise of a filter.
+
+    `state` Q disturbs the outputs of a lagged model (ny, ny), or the states of a motion over a
+    sample (nx, nx).
 
     `output` R (ny, ny) is added by the sensors; both in squared units of what they disturb.
     """
@@ -30,15 +34,15 @@ class Noise(NamedTuple):
     output: Matrix
 
 
-class Belief(NamedTuple):
+class StateEstimate(NamedTuple):
     """The state (n,) before a row, and its covariance (n, n)."""
 
     state: Any
     covariance: Any
 
 
-class Told(NamedTuple):
-    """What a row tells: the outputs as they were expected, and outputs and state (n,) once they are measured."""
+class FilterRow(NamedTuple):
+    """Estimates of one row: predicted outputs, and outputs and state (n,) after the measurement."""
 
     predicted: Any
     """(ny,), from the rows before."""
@@ -66,7 +70,7 @@ class Filter(Protocol):
 
     @property
     def hidden(self) -> bool:
-        """Whether states are more than past outputs, so that some rows must tell them."""
+        """True if the state is more than past outputs, so that some rows must determine it."""
         ...
 
     @property
@@ -78,26 +82,32 @@ class Filter(Protocol):
         ...
 
     def inputs(self, experiment: Experiment, record: Record) -> Matrix:
-        """What the steps read (T, nu), from the first row on."""
+        """Return the inputs of the steps (T, nu), from the first row on."""
         ...
 
     def step(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
-        """One step without noise."""
+        """Return one step without noise."""
         ...
 
-    def row(self, numbers: Numbers, noise: Noise, belief: Belief, inputs: Any, measured: Any) -> tuple[Belief, Told]:
-        """A row: what its outputs (ny,) tell, and the belief before the next one."""
+    def row(
+        self, numbers: Numbers, noise: Noise, belief: StateEstimate, inputs: Any, measured: Any
+    ) -> tuple[StateEstimate, FilterRow]:
+        """Return the estimates of a row from its outputs (ny,), and of the next row's state."""
         ...
 
 
 def slope(function: Any, at: Any) -> tuple[Any, Any]:
-    """A function's value (m,) and derivative (m, n); a kink without one counts as flat."""
+    """Return a function's value (m,) and derivative (m, n); a kink without one counts as flat."""
     value, derivative = function(at), jax.jacfwd(function)(at)
     return value, jnp.where(jnp.isfinite(derivative), derivative, 0.0)
 
 
-def corrected(mean: Any, covariance: Any, noise: Any, measured: Any) -> tuple[Any, Any, Any, Any, Any]:
-    """Mean (n + ny,) and covariance of (state, outputs) once the outputs are measured with `noise` (ny, ny).
+def corrected(
+    mean: Any, covariance: Any, noise: Any, measured: Any
+) -> tuple[Any, Any, Any, Any, Any]:
+    """Return mean (n + ny,) and covariance of (state, outputs) after a measurement.
+
+    `noise` (ny, ny) is the covariance of the measured outputs' noise.
 
     By Joseph's form, which stays positive where R is zero. Also S, `νᵀS⁻¹ν` and the log likelihood.
     """
@@ -118,67 +128,91 @@ def corrected(mean: Any, covariance: Any, noise: Any, measured: Any) -> tuple[An
 
 @partial(jax.jit, static_argnames="form")
 def one_row(
-    form: Filter, numbers: Numbers, noise: Noise, belief: Belief, inputs: Any, measured: Any
-) -> tuple[Belief, Told]:
-    """One row of a filter."""
+    form: Filter, numbers: Numbers, noise: Noise, belief: StateEstimate, inputs: Any, measured: Any
+) -> tuple[StateEstimate, FilterRow]:
+    """Compute one row of a filter."""
     return form.row(numbers, noise, belief, inputs, measured)
 
 
 @partial(jax.jit, static_argnames="form")
 def _all_rows(
-    form: Filter, numbers: Numbers, noise: Noise, belief: Belief, inputs: Any, measured: Any
-) -> tuple[Belief, Told]:
-    """What is believed before the rows, and what they tell."""
+    form: Filter, numbers: Numbers, noise: Noise, belief: StateEstimate, inputs: Any, measured: Any
+) -> tuple[StateEstimate, FilterRow]:
+    """Return the estimates before the rows, and those of the rows."""
 
-    def row(belief: Belief, given: tuple[Any, Any]) -> tuple[Belief, tuple[Belief, Told]]:
-        following, told = form.row(numbers, noise, belief, *given)
-        return following, (belief, told)
+    def row(
+        belief: StateEstimate, given: tuple[Any, Any]
+    ) -> tuple[StateEstimate, tuple[StateEstimate, FilterRow]]:
+        following, estimated = form.row(numbers, noise, belief, *given)
+        return following, (belief, estimated)
 
     return jax.lax.scan(row, belief, (inputs, measured))[1]
 
 
 @partial(jax.jit, static_argnames="form")
-def _likelihood(form: Filter, numbers: Numbers, noise: Noise, belief: Belief, inputs: Any, measured: Any) -> Any:
-    def row(carry: tuple[Belief, Any], given: tuple[Any, Any]) -> tuple[tuple[Belief, Any], None]:
-        following, told = form.row(numbers, noise, carry[0], *given)
-        return (following, carry[1] + told.log_likelihood), None
+def _likelihood(
+    form: Filter, numbers: Numbers, noise: Noise, belief: StateEstimate, inputs: Any, measured: Any
+) -> Any:
+    def row(
+        carry: tuple[StateEstimate, Any], given: tuple[Any, Any]
+    ) -> tuple[tuple[StateEstimate, Any], None]:
+        following, estimated = form.row(numbers, noise, carry[0], *given)
+        return (following, carry[1] + estimated.log_likelihood), None
 
     return jax.lax.scan(row, (belief, jnp.zeros(())), (inputs, measured))[0][1]
 
 
 def filtered(
-    form: Filter, numbers: Numbers, noise: Noise, belief: Belief, inputs: Matrix, measured: Matrix
-) -> tuple[Belief, Told]:
-    """A filter over all rows (T): what is believed before them, and what they tell."""
+    form: Filter,
+    numbers: Numbers,
+    noise: Noise,
+    belief: StateEstimate,
+    inputs: Matrix,
+    measured: Matrix,
+) -> tuple[StateEstimate, FilterRow]:
+    """Run a filter over all rows (T).
+
+    Return the estimates before the rows, and those of the rows.
+    """
     rows = len(inputs)
     found = _all_rows(form, numbers, noise, belief, *_padded(inputs, measured))
-    before, told = ([np.asarray(part)[:rows] for part in one] for one in found)
-    return Belief(*before), Told(*told)
+    before, rows_of = ([np.asarray(part)[:rows] for part in one] for one in found)
+    return StateEstimate(*before), FilterRow(*rows_of)
 
 
 def log_likelihood(
-    form: Filter, numbers: Numbers, noise: Noise, belief: Belief, inputs: Matrix, measured: Matrix
+    form: Filter,
+    numbers: Numbers,
+    noise: Noise,
+    belief: StateEstimate,
+    inputs: Matrix,
+    measured: Matrix,
 ) -> float:
-    """Of the innovations (Schweppe 1965)."""
+    """Return the log-likelihood of the innovations (Schweppe 1965)."""
     return float(_likelihood(form, numbers, noise, belief, *_padded(inputs, measured)))
 
 
 def _padded(inputs: Matrix, measured: Matrix) -> tuple[Matrix, Matrix]:
-    """Rows behind the last are copies of it with nothing measured: they add nothing."""
+    """Pad the rows with copies of the last one in which nothing is measured: they add nothing."""
     more = padded_length(len(inputs)) - len(inputs)
     behind = np.full((more, measured.shape[1]), np.nan)
-    return np.concatenate([inputs, np.repeat(inputs[-1:], more, axis=0)]), np.concatenate([measured, behind])
+    return np.concatenate([inputs, np.repeat(inputs[-1:], more, axis=0)]), np.concatenate(
+        [measured, behind]
+    )
 
 
 @partial(jax.jit, static_argnames="form")
 def _ahead(
-    form: Filter, numbers: Numbers, noise: Noise, beliefs: Belief, inputs: Any, horizon: Any
+    form: Filter, numbers: Numbers, noise: Noise, beliefs: StateEstimate, inputs: Any, horizon: Any
 ) -> tuple[Parts, Any]:
-    """The outputs of the last of `horizon` steps from each of m beliefs, under inputs (m, h, nu), and their S."""
+    """Return the outputs after `horizon` steps from each of m estimates, and their covariances S.
+
+    The inputs are (m, h, nu).
+    """
     unknown = jnp.full(len(noise.output), jnp.nan)
 
-    def one(belief: Belief, rows: Any) -> tuple[Parts, Any]:
-        def step(i: Any, belief: Belief) -> Belief:
+    def one(belief: StateEstimate, rows: Any) -> tuple[Parts, Any]:
+        def step(i: Any, belief: StateEstimate) -> StateEstimate:
             return form.row(numbers, noise, belief, rows[i], unknown)[0]
 
         belief = jax.lax.fori_loop(0, horizon - 1, step, belief)
@@ -189,9 +223,16 @@ def _ahead(
 
 
 def ahead(
-    form: Filter, numbers: Numbers, noise: Noise, beliefs: Belief, inputs: Matrix, horizon: int
+    form: Filter,
+    numbers: Numbers,
+    noise: Noise,
+    beliefs: StateEstimate,
+    inputs: Matrix,
+    horizon: int,
 ) -> tuple[Parts, Matrix]:
-    """The outputs `horizon` steps on from what is believed before the rows (T), and their deviations; (T − h + 1, ny).
+    """Return the outputs `horizon` steps after each row's estimate (T), and their deviations.
+
+    Both have the shape (T − h + 1, ny).
 
     The deviations are those of what would be measured.
     """
@@ -201,22 +242,34 @@ def ahead(
         rows = slice(begin, min(begin + _SIDE_BY_SIDE, len(windows)))
         count = len(windows[rows])
         more = _SIDE_BY_SIDE - count
-        chosen = [np.concatenate([a[rows], np.repeat(a[rows][-1:], more, axis=0)]) for a in (*beliefs, windows)]
-        parts, spread = _ahead(form, numbers, noise, Belief(*chosen[:2]), chosen[2], horizon)
+        chosen = [
+            np.concatenate([a[rows], np.repeat(a[rows][-1:], more, axis=0)])
+            for a in (*beliefs, windows)
+        ]
+        parts, spread = _ahead(form, numbers, noise, StateEstimate(*chosen[:2]), chosen[2], horizon)
         pieces.append([np.asarray(part)[:count] for part in parts])
         deviations.append(spread_of(np.asarray(spread)[:count]))
-    return Parts(*(np.concatenate(piece) for piece in zip(*pieces, strict=True))), np.concatenate(deviations)
+    return Parts(*(np.concatenate(piece) for piece in zip(*pieces, strict=True))), np.concatenate(
+        deviations
+    )
 
 
 def without_gaps(outputs: Matrix) -> Matrix:
-    """Outputs with missing samples by straight lines between those that are there; zero where there are none."""
+    """Return outputs whose missing samples are interpolated linearly between the measured ones.
+
+    Zero where there are none.
+    """
     filled = outputs.copy()
     for column in filled.T:
         there = np.isfinite(column)
-        column[~there] = np.interp(np.flatnonzero(~there), np.flatnonzero(there), column[there]) if there.any() else 0.0
+        column[~there] = (
+            np.interp(np.flatnonzero(~there), np.flatnonzero(there), column[there])
+            if there.any()
+            else 0.0
+        )
     return filled
 
 
 def spread_of(covariance: Any) -> Vector:
-    """Standard deviations, of one covariance or of many."""
+    """Return standard deviations, of one covariance or of many."""
     return np.sqrt(np.maximum(np.diagonal(covariance, axis1=-2, axis2=-1), 0.0))

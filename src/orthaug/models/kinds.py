@@ -1,4 +1,7 @@
-"""The learners that a spec knows by name. A new one is a file with its declaration, and an entry here."""
+"""The learners that a spec knows by name.
+
+A new one is a file with its declaration, and an entry here.
+"""
 
 from __future__ import annotations
 
@@ -6,5 +9,7 @@ from orthaug._base.registry import Registry
 from orthaug.models.learners import MLP, PhysicsAlone
 from orthaug.models.terms import Terms
 
-LEARNERS = Registry("learner", {"mlp": MLP, "terms": Terms, "none": PhysicsAlone}, reserved=("kind", "nz", "ny"))
-"""`nz` and `ny` stand beside a saved learner's own fields."""
+LEARNERS = Registry(
+    "learner", {"mlp": MLP, "terms": Terms, "none": PhysicsAlone}, reserved=("kind", "nz", "ny")
+)
+"""`nz` and `ny` are saved next to a learner's own fields."""

@@ -1,6 +1,9 @@
-"""The lagged form: ŷ_k = φ(x_k)θ + f(x_k) − φ(x_k)θ_aux of a regressor x of past outputs and inputs (eq:orth_param).
+"""The lagged form: ŷ_k = φ(x_k)θ + f(x_k) − φ(x_k)θ_aux (eq:orth_param).
 
-As dynamics its state is the past outputs, newest first, and a step puts its own output in front of them.
+The regressor x holds past outputs and inputs.
+
+As dynamics its state is the past outputs, newest first, and a step puts its own output in front of
+them.
 """
 
 from __future__ import annotations
@@ -26,7 +29,7 @@ from orthaug.physics.baseline import Baseline
 
 @dataclass(frozen=True)
 class Lagged:
-    """What a model of lagged signals computes, without its numbers: `Dynamics`."""
+    """Computations of a model of lagged signals, without its numbers: `Dynamics`."""
 
     baseline: Baseline
     features: Features
@@ -36,7 +39,7 @@ class Lagged:
 
     @property
     def alone(self) -> Lagged:
-        """The same physics without a learner."""
+        """These dynamics without the learner."""
         return replace(self, features=Features(()), bound=None)
 
     @property
@@ -45,7 +48,7 @@ class Lagged:
 
     @property
     def beyond(self) -> str:
-        """What the learner's correction does beyond the range of its training."""
+        """Behaviour of the learner's correction beyond its training range."""
         return "free" if self.bound is None else beyond_of(self.bound.learner, "hold")
 
     @property
@@ -67,7 +70,11 @@ class Lagged:
     @property
     def fed_back(self) -> tuple[tuple[int, int], ...]:
         """(lag, number of the output) of every past output in the regressor, in its order."""
-        return tuple((lag.lag, self.outputs.index(lag.channel)) for lag in self.layout if lag.channel in self.outputs)
+        return tuple(
+            (lag.lag, self.outputs.index(lag.channel))
+            for lag in self.layout
+            if lag.channel in self.outputs
+        )
 
     @property
     def memory(self) -> int:
@@ -78,61 +85,77 @@ class Lagged:
     def used(self) -> tuple[Lag, ...]:
         """The raw lags that the physics or the learner reads."""
         read = {*self.baseline.lags, *self.features.lags}
-        return tuple(lag for lag in self.layout if lag in read or self.baseline.function is not None)
+        return tuple(
+            lag for lag in self.layout if lag in read or self.baseline.function is not None
+        )
 
     @property
     def input_layout(self) -> Layout:
         """The lagged inputs of the regressor, in its order."""
         return tuple(lag for lag in self.layout if lag.channel not in self.outputs)
 
-    def start(self, outputs: Matrix, rows: Sequence[int] | Int[np.ndarray, "r"]) -> Float[np.ndarray, "r n0"]:
+    def start(
+        self, outputs: Matrix, rows: Sequence[int] | Int[np.ndarray, "r"]
+    ) -> Float[np.ndarray, "r n0"]:
         before = np.asarray(rows)[:, None] - 1 - np.arange(self.memory)
         return outputs[before].reshape(len(before), self.states)
 
     def start_rows(self, weight: Matrix) -> Matrix:
-        """A past output has the same errors as all others."""
+        """Return weights under which a past output has the same errors as all others."""
         return np.kron(np.eye(self.memory), weight)
 
     def inputs(self, experiment: Experiment, record: Record) -> Matrix:
         return lag_matrix(experiment, self.input_layout, record, self.first_row)
 
     def states_at(
-        self, numbers: Numbers, outputs: Matrix, inputs: Matrix, rows: Sequence[int] | Int[np.ndarray, "r"]
+        self,
+        numbers: Numbers,
+        outputs: Matrix,
+        inputs: Matrix,
+        rows: Sequence[int] | Int[np.ndarray, "r"],
     ) -> Float[np.ndarray, "r n0"]:
-        """The run's own past outputs: nothing needs to run again."""
+        """Return the run's own past outputs, so that no step is computed again."""
         return self.start(outputs, rows)
 
     def scaled_features(
         self, numbers: Numbers, start: Vector, outputs: Matrix, inputs: Matrix
     ) -> Float[np.ndarray, "T nz"] | None:
-        """The learner's features along a free run, in [-1, 1] over the training data.
+        """Return the learner's features along a free run, in [-1, 1] over the training data.
 
-        None without a learner, and of a function from another toolbox, whose features are not scaled.
+        None without a learner, and of a function from another toolbox, whose features are not
+        scaled.
         """
         if self.bound is None or not self.bound.differentiable:
             return None
         before = start.reshape(self.memory, len(self.outputs))[::-1]
-        states = self.start(np.concatenate([before, outputs]), self.memory + np.arange(len(outputs)))
+        states = self.start(
+            np.concatenate([before, outputs]), self.memory + np.arange(len(outputs))
+        )
         x = self.regressor(states.T, inputs.T, np).T
-        return (np.asarray(self.features.evaluate(x, self.layout, np)) - numbers.centre) / numbers.halfwidth
+        return (
+            np.asarray(self.features.evaluate(x, self.layout, np)) - numbers.centre
+        ) / numbers.halfwidth
 
     def describe(self, state: Vector, inputs: Vector) -> dict[str, float]:
-        """The entries of the regressor."""
+        """Return the entries of the regressor."""
         x = self.regressor(state, inputs, np)
         return {str(lag): float(value) for lag, value in zip(self.layout, x, strict=True)}
 
     def regressors(self, experiment: Experiment, record: Record, row: int | None = None) -> Matrix:
-        """Measured regressors x (T, nx) of an experiment, from a row on, by default the first that has one."""
+        """Return measured regressors x (T, nx) of an experiment from a row on.
+
+        By default it is the first row that has one.
+        """
         return lag_matrix(experiment, self.layout, record, self.first_row if row is None else row)
 
     def regressor(self, state: Any, inputs: Any, xp: Any = jnp) -> Any:
-        """x (nx, …) of a state (n0, …) and a row of lagged inputs (nu, …)."""
+        """Return x (nx, …) of a state (n0, …) and a row of lagged inputs (nu, …)."""
         past = state.reshape(self.memory, len(self.outputs), *state.shape[1:])
         lag, output = np.array(self.fed_back, dtype=int).reshape(-1, 2).T
         return xp.concatenate([past[lag - 1, output], inputs])
 
     def at(self, numbers: Numbers, x: Float[Array, "nx"]) -> Parts:
-        """The prediction at one regressor x (nx,), in parts."""
+        """Return the prediction at one regressor x (nx,), in parts."""
         phi = self.baseline.phi(x, self.layout, self.outputs, jnp)
         known = self.baseline.known(x, self.layout, self.outputs, jnp)
         physics = known + phi @ numbers.theta
@@ -149,7 +172,7 @@ class Lagged:
         return Parts(physics, share * (raw - phi @ numbers.theta_aux), raw)
 
     def prepared(self, numbers: Numbers) -> Numbers:
-        """Nothing is common to all steps."""
+        """Return the numbers unchanged: nothing is common to all steps."""
         return numbers
 
     def step(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
@@ -157,18 +180,25 @@ class Lagged:
         return self._push(state, parts.total), parts
 
     def _push(self, state: Any, y: Any) -> Any:
-        """The state (n0, …) one step later, when y (ny, …) is the newest output."""
+        """Return the state (n0, …) one step later, when y (ny, …) is the newest output."""
         return jnp.concatenate([y, state[: -len(self.outputs)]]) if self.memory else state
 
     def first_slopes(self, width: int) -> Any:
-        """One block (ny, n0 + n, m) for each past output, newest first."""
+        """Return one block (ny, n0 + n, m) for each past output, newest first."""
         n0, n, ny = self.states, self.unknowns, len(self.outputs)
         blocks = jnp.eye(n0, n0 + n).reshape(self.memory, ny, n0 + n, 1)
         return tuple(jnp.broadcast_to(blocks, (self.memory, ny, n0 + n, width)))
 
-    def tangents(self, numbers: Numbers, state: Any, slopes: Any, inputs: Any) -> tuple[Any, Any, Any, Any]:
-        """`S_k = G_k + Σ_i A_{k,i} S_{k−i}` with G_k = ∂g/∂(c, w) and A_{k,i} = ∂g/∂ŷ_{k−i}."""
-        value, slope, feedback = jax.vmap(partial(self._derivatives, numbers), in_axes=-1, out_axes=-1)(state, inputs)
+    def tangents(
+        self, numbers: Numbers, state: Any, slopes: Any, inputs: Any
+    ) -> tuple[Any, Any, Any, Any]:
+        """Propagate `S_k = G_k + Σ_i A_{k,i} S_{k−i}`.
+
+        G_k = ∂g/∂(c, w) and A_{k,i} = ∂g/∂ŷ_{k−i}.
+        """
+        value, slope, feedback = jax.vmap(
+            partial(self._derivatives, numbers), in_axes=-1, out_axes=-1
+        )(state, inputs)
         slope = jnp.pad(slope, ((0, 0), (self.states, 0), (0, 0)))
         for i, (lag, output) in enumerate(self.fed_back):
             slope = slope + feedback[:, i, None] * slopes[lag - 1][output]
@@ -176,27 +206,37 @@ class Lagged:
         return self._push(state, value), following, value, slope
 
     def _derivatives(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Any, Any]:
-        """Value (ny,), ∂g/∂(c, w) (ny, n) and ∂g/∂ŷ of every lag that is fed back (ny, lags), at one step."""
+        """Return the value (ny,), ∂g/∂(c, w) (ny, n) and ∂g/∂ŷ (ny, lags) of every fed-back lag."""
         leaves = [] if self.bound is None else self.bound.leaves(numbers.weights)
         past = state.reshape(self.memory, len(self.outputs))
 
         def predict(c: Any, leaves: list[Any], past: Any) -> Any:
-            return self.step(numbers._replace(theta=c, weights=leaves), past.reshape(-1), inputs)[1].total
+            return self.step(numbers._replace(theta=c, weights=leaves), past.reshape(-1), inputs)[
+                1
+            ].total
 
         value, pullback = jax.vjp(predict, numbers.theta, leaves, past)
         slopes, feedback = [], []
         for seed in jnp.eye(len(self.outputs)):
             to_c, to_leaves, to_past = pullback(seed)
             slopes.append(jnp.concatenate([to_c, *(jnp.ravel(leaf) for leaf in to_leaves)]))
-            feedback.append(jnp.stack([to_past[lag - 1, output] for lag, output in self.fed_back] or [jnp.zeros(())]))
+            feedback.append(
+                jnp.stack(
+                    [to_past[lag - 1, output] for lag, output in self.fed_back] or [jnp.zeros(())]
+                )
+            )
         # a kink without a derivative, such as sqrt(max(y, 0)) at 0, counts as flat
-        slope, back = (jnp.where(jnp.isfinite(d), d, 0.0) for d in (jnp.stack(slopes), jnp.stack(feedback)))
+        slope, back = (
+            jnp.where(jnp.isfinite(d), d, 0.0) for d in (jnp.stack(slopes), jnp.stack(feedback))
+        )
         return value, slope, back
 
 
 def _learned(bound: Bound, numbers: Numbers, z: Any, phi: Any) -> Any:
-    """f (ny,) at scaled features z; of an ensemble the median of `f_i + φ tilt_i`."""
+    """Return f (ny,) at scaled features z; of an ensemble the median of `f_i + φ tilt_i`."""
     if numbers.tilt is None:
         return numbers.gain * bound.values(numbers.weights, z)
-    each = jax.vmap(lambda w, tilt: numbers.gain * bound.values(w, z) + phi @ tilt)(numbers.weights, numbers.tilt)
+    each = jax.vmap(lambda w, tilt: numbers.gain * bound.values(w, z) + phi @ tilt)(
+        numbers.weights, numbers.tilt
+    )
     return jnp.median(each, axis=0)

@@ -19,13 +19,15 @@ from orthaug.physics.baseline import Baseline, Parameter, Term
 
 
 def declare(model: Model) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """What a file says of a model, and its arrays."""
+    """Return the declaration of a model, and its arrays."""
     form = model.form
     baseline = form.baseline
     declared = {
         **said_of(model),
         "layout": [list(lag) for lag in form.layout],
-        "features": [{"text": e.text, "constants": dict(e.constants)} for e in form.features.entries],
+        "features": [
+            {"text": e.text, "constants": dict(e.constants)} for e in form.features.entries
+        ],
         "baseline": {
             "kind": "terms" if baseline.function is None else "callable",
             "parameters": [asdict(parameter) for parameter in baseline.parameters],
@@ -45,20 +47,28 @@ def rebuild(
     learner: Learner | None,
     path: Path,
 ) -> Model:
-    """The model that a file declares.
+    """Return the model that a file declares.
 
     Raises:
         InputError: a callable is asked for.
     """
     physics = declared["baseline"]
     if physics["kind"] == "terms":
-        baseline = Baseline.from_terms([Term(**term) for term in physics["terms"]], physics["constants"])
+        baseline = Baseline.from_terms(
+            [Term(**term) for term in physics["terms"]], physics["constants"]
+        )
     elif baseline is None:
-        raise InputError(f"{path}: the baseline was a Python function; give it again, load(…, baseline=…).")
+        raise InputError(
+            f"{path}: the baseline was a Python function; give it again, load(…, baseline=…)."
+        )
     else:
-        baseline = replace(baseline, parameters=tuple(Parameter(**p) for p in physics["parameters"]))
+        baseline = replace(
+            baseline, parameters=tuple(Parameter(**p) for p in physics["parameters"])
+        )
     bound = bound_of(declared["learner"], arrays.get("numbers.weights", np.zeros(0)), learner, path)
-    entries = tuple(Expression(e["text"], tuple(e["constants"].items())) for e in declared["features"])
+    entries = tuple(
+        Expression(e["text"], tuple(e["constants"].items())) for e in declared["features"]
+    )
     features = Features(entries, bound is not None and getattr(bound.learner, "linear", False))
     names = tuple(channel["name"] for channel in declared["outputs"])
     form = Lagged(baseline, features, tuple(Lag(*lag) for lag in declared["layout"]), names, bound)

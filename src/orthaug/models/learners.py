@@ -1,8 +1,8 @@
 """Learners: the trainable correction f(z; w) of scaled features z (nz,), giving (ny,) values.
 
 A learner is a frozen declaration with `init` and `apply` on a pytree of weights. `Bound` fixes the
-numbers of features and outputs. From there on the weights are one flat vector w; only the methods of
-`Bound` know the tree.
+numbers of features and outputs. From there on the weights are one flat vector w; only the methods
+of `Bound` know the tree.
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ ACTIVATIONS: dict[str, Callable[[Any], Any]] = {
     "softplus": lambda a: jax.nn.softplus(a),
     "identity": lambda a: a,
 }
-"""By name. They call JAX only when they are called, so that a spec is read without it."""
+"""Activations by name. They call JAX only when they are called, so that a spec is read without it.
+"""
 MOST_LAYERS = 10  # hidden ones; ten take half a minute to compile
 _PROBES = 16  # points at which a silenced learner is looked at
 _GAIN = {"tanh": 5 / 3, "relu": math.sqrt(2.0)}  # Xavier gains; 1 for the others
@@ -43,7 +44,7 @@ _GAIN = {"tanh": 5 / 3, "relu": math.sqrt(2.0)}  # Xavier gains; 1 for the other
 
 @runtime_checkable
 class Learner(Protocol):
-    """What `estimate(learner=…)` takes: hashable, with `inputs` and these two methods.
+    """Interface of `estimate(learner=…)`: hashable, with `inputs` and these two methods.
 
     A learner that JAX cannot differentiate has also `differentiable = False`.
 
@@ -54,11 +55,14 @@ class Learner(Protocol):
     def inputs(self) -> tuple[str, ...] | None: ...
 
     def init(self, key: Array, nz: int, ny: int) -> Tree:
-        """Initial weights, any pytree of float arrays, for `nz` features and `ny` outputs."""
+        """Return initial weights, any pytree of float arrays.
+
+        nz is the number of features, ny that of outputs.
+        """
         ...
 
     def apply(self, tree: Tree, z: Float[Array, "nz"]) -> Float[Array, "ny"]:
-        """f(z; w) for one row."""
+        """Return f(z; w) for one row."""
         ...
 
 
@@ -66,14 +70,16 @@ class Learner(Protocol):
 class MLP:
     """Fully connected feedforward network with a linear output layer.
 
-    Initialised as in Sect. 5.1 (Xavier): weights uniform on (-a, a), `a = gain √(6 / (fan_in + fan_out))`, biases 0.
+    Initialised as in Sect. 5.1 (Xavier): weights uniform on (-a, a), `a = gain √(6 / (fan_in +
+    fan_out))`, biases 0.
 
     Args:
         hidden: neurons of each hidden layer; () is a linear learner.
         activation: one of tanh, relu, gelu, sigmoid, silu, elu, softplus, identity.
         inputs: what it sees, as expressions or raw lags; None for all lags.
-        beyond: what the correction does beyond the range of its training: "hold", "fade" within a quarter of the
-            half-range, or "free"; "auto" holds it beside lagged physics and lets it fade in a motion.
+        beyond: what the correction does beyond the range of its training: "hold", "fade" within a
+            quarter of the half-range, or "free"; "auto" holds it beside lagged physics and lets it
+            fade in a motion.
 
     Examples:
         >>> MLP(hidden=(8, 8), inputs=("v[k-1]", "x[k-1] - x[k-2]"))
@@ -87,29 +93,46 @@ class MLP:
 
     def __post_init__(self) -> None:
         if not isinstance(self.hidden, tuple | list):
-            raise InputError(f"`hidden` must be a tuple of neurons per layer, such as (16,); got {shown(self.hidden)}.")
+            raise InputError(
+                "`hidden` must be a tuple of neurons per layer, such as (16,); got "
+                f"{shown(self.hidden)}."
+            )
         if isinstance(self.inputs, str):
-            raise InputError(f"`inputs` must be a tuple of expressions, such as ('{self.inputs}',); got one text.")
-        if not isinstance(self.inputs, list | tuple | None) or any(not isinstance(i, str) for i in self.inputs or ()):
+            raise InputError(
+                f"`inputs` must be a tuple of expressions, such as ('{self.inputs}',); got one "
+                "text."
+            )
+        if not isinstance(self.inputs, list | tuple | None) or any(
+            not isinstance(i, str) for i in self.inputs or ()
+        ):
             got = shown(self.inputs)
-            raise InputError(f"`inputs` must be a tuple of expressions, or None for all lags; got {got}.")
+            raise InputError(
+                f"`inputs` must be a tuple of expressions, or None for all lags; got {got}."
+            )
         object.__setattr__(self, "hidden", tuple(self.hidden))
         object.__setattr__(self, "inputs", None if self.inputs is None else tuple(self.inputs))
         if any(isinstance(n, bool) or not isinstance(n, int) or n < 1 for n in self.hidden):
-            raise InputError(f"`hidden` must be whole numbers of neurons, 1 or more; got {shown(self.hidden)}.")
+            raise InputError(
+                f"`hidden` must be whole numbers of neurons, 1 or more; got {shown(self.hidden)}."
+            )
         if len(self.hidden) > MOST_LAYERS:
             has = f"`hidden` has {len(self.hidden)} layers"
-            raise InputError(f"{has}; at most {MOST_LAYERS} are taken: more compile for minutes.")
+            raise InputError(
+                f"{has}; at most {MOST_LAYERS} are allowed, since more take minutes to compile."
+            )
         check_fields(self)
 
     def silent(self, tree: Tree) -> Tree:
-        """The same hidden layers with an output layer of zeros."""
+        """Return the same hidden layers with an output layer of zeros."""
         return [*tree[:-1], tuple(np.zeros_like(part) for part in tree[-1])]
 
     def groups(self, tree: Tree) -> Tree:
-        """Of every weight the neuron that it belongs to: hidden ones by what comes in, the last also by what goes out.
+        """Return the number of the neuron that every weight belongs to.
 
-        So a neuron that is not needed can be silenced as one. The output's biases are a group of their own.
+        A hidden neuron has the weights that come in, the last ones also those that go out.
+
+        So a neuron that is not needed can be silenced as one. The output's biases are a group of
+        their own.
         """
         labels, first = [], 0
         for weight, bias in tree[:-1]:
@@ -121,15 +144,19 @@ class MLP:
         return [*labels, (outward, np.full(np.shape(bias), first + 1))]
 
     def weights(self, nz: int, ny: int) -> int:
-        """How many weights it has for `nz` features and `ny` outputs."""
+        """Return the number of weights for `nz` features and `ny` outputs."""
         sizes = (nz, *self.hidden, ny)
-        return sum((fan_in + 1) * fan_out for fan_in, fan_out in zip(sizes, sizes[1:], strict=False))
+        return sum(
+            (fan_in + 1) * fan_out for fan_in, fan_out in zip(sizes, sizes[1:], strict=False)
+        )
 
     def init(self, key: Array, nz: int, ny: int) -> Tree:
         sizes = (nz, *self.hidden, ny)
         shapes = list(zip(sizes[1:], sizes[:-1], strict=True))
         gains = [_GAIN.get(self.activation, 1.0)] * len(self.hidden) + [1.0]
-        reach = np.array([gain * math.sqrt(6.0 / sum(shape)) for gain, shape in zip(gains, shapes, strict=True)])
+        reach = np.array(
+            [gain * math.sqrt(6.0 / sum(shape)) for gain, shape in zip(gains, shapes, strict=True)]
+        )
         drawn = _uniform(key, reach, max(map(math.prod, shapes)))
         return [
             (values[: math.prod(shape)].reshape(shape), np.zeros(shape[0]))
@@ -137,7 +164,7 @@ class MLP:
         ]
 
     def layers(self, tree: Tree) -> list[tuple[Any, Any, str]]:
-        """Weight, bias and activation of each layer: what is written where the learner is exported."""
+        """Return weight, bias and activation of each layer, for export."""
         names = [self.activation] * len(self.hidden) + ["identity"]
         return [(weight, bias, name) for (weight, bias), name in zip(tree, names, strict=True)]
 
@@ -148,10 +175,10 @@ class MLP:
 
 
 def _uniform(key: Array, reach: Vector, count: int) -> Any:
-    """Rows of `count` numbers or more, uniform on [−a, a] for each a of `reach`.
+    """Return rows of at least `count` numbers, uniform on [−a, a] for each a of `reach`.
 
-    They are drawn in multiples of 1024: one compiled program for layers of all sizes. JAX makes each number from its
-    place alone, so they are those that would be drawn at the layer's own size.
+    They are drawn in multiples of 1024: one compiled program for layers of all sizes. JAX makes
+    each number from its place alone, so they are those that would be drawn at the layer's own size.
     """
     drawn = _drawn(key, reach, -(-count // 1024) * 1024)
     return drawn if is_traced(drawn) else np.asarray(drawn)
@@ -160,12 +187,14 @@ def _uniform(key: Array, reach: Vector, count: int) -> Any:
 @partial(jax.jit, static_argnames="count")
 def _drawn(key: Array, reach: Float[Array, "r"], count: int) -> Float[Array, "r count"]:
     one = partial(jax.random.uniform, shape=(count,), dtype=float)
-    return jax.vmap(lambda key, a: one(key, minval=-a, maxval=a))(jax.random.split(key, len(reach)), reach)
+    return jax.vmap(lambda key, a: one(key, minval=-a, maxval=a))(
+        jax.random.split(key, len(reach)), reach
+    )
 
 
 @dataclass(frozen=True)
 class PhysicsAlone:
-    """Declares that nothing is learned: the learner of a spec's `kind = "none"`, which is None in Python."""
+    """Declaration that nothing is learned: `kind = "none"` in a spec, None in Python."""
 
     def resolve(self, context: Any) -> None:
         return None
@@ -233,9 +262,12 @@ class EquinoxModule:
 
 @dataclass(frozen=True)
 class External:
-    """A model trained elsewhere: `function(x)` on NumPy rows (N, nx) → (N, ny), with nothing left to train.
+    """A model trained elsewhere: `function(x)` on NumPy rows (N, nx) → (N, ny).
 
-    It is called back from compiled code, so it may come from any toolbox. `inputs` as of `MLP`, `ny` outputs.
+    It has nothing left to train.
+
+    It is called back from compiled code, so it may come from any toolbox. `inputs` as of `MLP`,
+    `ny` outputs.
     """
 
     differentiable = False
@@ -253,14 +285,16 @@ class External:
         return jax.pure_callback(self.values, shape, z, vmap_method="expand_dims")
 
     def values(self, z: Any) -> np.ndarray:
-        """The function's values (…, ny) of features (…, nz).
+        """Return the function's values (…, ny) of features (…, nz).
 
         Raises:
             InputError: the function returns another shape.
         """
         z = np.asarray(z)
         every = z.reshape(-1, z.shape[-1])
-        finite = np.isfinite(every).all(axis=1)  # a run that diverged ends as NaN, not in the toolbox's own error
+        finite = np.isfinite(every).all(
+            axis=1
+        )  # a run that diverged ends as NaN, not in the toolbox's own error
         result = np.full((len(every), self.ny), np.nan)
         if finite.any():
             result[finite] = self._evaluate(every[finite])
@@ -269,20 +303,23 @@ class External:
     def _evaluate(self, rows: np.ndarray) -> np.ndarray:
         values = np.asarray(self.function(rows), dtype=float)
         if values.shape != (len(rows), self.ny) and (values.shape, self.ny) != ((len(rows),), 1):
-            raise InputError(f"the external model returned shape {values.shape}; expected ({len(rows)}, {self.ny}).")
+            raise InputError(
+                f"the external model returned shape {values.shape}; expected ({len(rows)}, "
+                f"{self.ny})."
+            )
         return values.reshape(len(rows), self.ny)
 
 
 @dataclass(frozen=True, eq=False)
 class Scaling:
-    """Affine map of each feature: `(z - centre) / halfwidth` lies in [-1, 1] over the training data."""
+    """Affine map `(z - centre) / halfwidth` of each feature to [-1, 1] over the training data."""
 
     centre: Float[np.ndarray, "nz"]
     halfwidth: Float[np.ndarray, "nz"]
 
     @classmethod
     def fit(cls, features: Matrix) -> Scaling:
-        """From training rows (N, nz); a feature that never moves keeps its unit."""
+        """Fit the map to training rows (N, nz); a feature that never moves keeps its unit."""
         low, high = features.min(axis=0), features.max(axis=0)
         halfwidth = (high - low) / 2
         return cls((low + high) / 2, np.where(halfwidth > 0, halfwidth, 1.0))
@@ -293,7 +330,10 @@ class Scaling:
 
 @dataclass(frozen=True)
 class Bound:
-    """A learner with its numbers of features and outputs; hashable, so compiled programs are reused."""
+    """A learner with its numbers of features and outputs.
+
+    Hashable, so compiled programs are reused.
+    """
 
     learner: Learner
     nz: int
@@ -313,13 +353,13 @@ class Bound:
         out = jax.eval_shape(self.learner.apply, tree, jax.ShapeDtypeStruct((self.nz,), float))
         if getattr(out, "shape", None) != (self.ny,):
             raise InputError(
-                f"the learner returned shape {getattr(out, 'shape', type(out).__name__)} for one row; "
-                f"expected (ny,) = ({self.ny},)."
+                f"the learner returned shape {getattr(out, 'shape', type(out).__name__)} for "
+                f"one row; expected (ny,) = ({self.ny},)."
             )
 
     @property
     def differentiable(self) -> bool:
-        """Whether JAX differentiates the learner; otherwise differences have to do."""
+        """True if JAX differentiates the learner; otherwise finite differences are used."""
         return getattr(self.learner, "differentiable", True)
 
     @property
@@ -328,28 +368,34 @@ class Bound:
         return sum(math.prod(shape) for shape in self._shape[1])
 
     def init(self, key: Array) -> Float[Array, "nw"]:
-        """Initial weights as one vector."""
+        """Return initial weights as one vector."""
         return self.ravel(jax.tree.leaves(self.learner.init(key, self.nz, self.ny)))
 
     def silent(self, w: Float[Array | np.ndarray, "nw"]) -> np.ndarray | None:
-        """The same weights with the output silenced, so that f = 0 everywhere and training can go on from there.
+        """Return the same weights with the output layer at zero.
 
-        A learner says how by a method `silent(tree)`; of others the last arrays are set to zero, as few as it takes.
-        None where that does not silence it.
+        Then f = 0 everywhere, and training can continue from there.
+
+        A learner says how by a method `silent(tree)`; of others the last arrays are set to zero, as
+        few as it takes. None where that does not silence it.
         """
         leaves = self.leaves(np.asarray(w))
         declared = getattr(self.learner, "silent", None)
         if declared is not None:
             return np.asarray(self.ravel(jax.tree.leaves(declared(self.tree(leaves)))))
         for count in range(1, len(leaves) + 1):
-            tried = np.asarray(self.ravel([*leaves[:-count], *(jnp.zeros_like(leaf) for leaf in leaves[-count:])]))
+            tried = np.asarray(
+                self.ravel([*leaves[:-count], *(jnp.zeros_like(leaf) for leaf in leaves[-count:])])
+            )
             values, slopes = _probed(self, tried)
             if not np.any(values) and np.any(slopes) and np.isfinite(slopes).all():
                 return tried
         return None
 
     def groups(self) -> Int[np.ndarray, "nw"]:
-        """Which weights share a prior under automatic relevance determination, by number from 0.
+        """Return the group of each weight under automatic relevance determination.
+
+        Groups are numbered from 0; the weights of a group share a prior.
 
         A learner says it by a method `groups(tree)`; of others each array is one group.
         """
@@ -359,7 +405,9 @@ class Bound:
             leaves = jax.tree.leaves(declared(self.tree(leaves)))
         else:
             leaves = [np.full(np.shape(leaf), i) for i, leaf in enumerate(leaves)]
-        labels = np.concatenate([np.zeros(0, int), *(np.ravel(np.asarray(leaf)) for leaf in leaves)])
+        labels = np.concatenate(
+            [np.zeros(0, int), *(np.ravel(np.asarray(leaf)) for leaf in leaves)]
+        )
         return np.unique(labels, return_inverse=True)[1]
 
     @staticmethod
@@ -370,7 +418,7 @@ class Bound:
         return jax.device_put(np.concatenate([np.zeros(0), *flat]))
 
     def leaves(self, w: Float[Array | np.ndarray, "nw"]) -> list[Float[Array, "..."]]:
-        """The weight arrays that the vector holds, in the tree's order."""
+        """Return the weight arrays that the vector holds, in the tree's order."""
         pieces, offset = [], 0
         for shape in self._shape[1]:
             size = math.prod(shape)
@@ -378,25 +426,27 @@ class Bound:
             offset += size
         return pieces
 
-    def values(self, w: Float[Array | np.ndarray, "nw"] | list[Any], z: Float[Array, "nz"]) -> Float[Array, "ny"]:
-        """f(z; w) for one row, of the weights as one vector or as leaves."""
+    def values(
+        self, w: Float[Array | np.ndarray, "nw"] | list[Any], z: Float[Array, "nz"]
+    ) -> Float[Array, "ny"]:
+        """Return f(z; w) for one row; the weights are one vector or leaves."""
         return self.from_leaves(w if isinstance(w, list) else self.leaves(w), z)
 
     def from_leaves(self, leaves: list[Any], z: Float[Array, "nz"]) -> Float[Array, "ny"]:
-        """f(z; w) for one row, of the weight arrays."""
+        """Return f(z; w) for one row, of the weight arrays."""
         return self.learner.apply(self.tree(leaves), z)
 
     def tree(self, leaves: list[Any]) -> Tree:
-        """The learner's own weights, of the weight arrays."""
+        """Return the learner's own weights, of the weight arrays."""
         return jax.tree.unflatten(self._shape[0], leaves)
 
     def jacobian(
         self, w: Float[Array, "nw"], z: Float[Array, "nz m"], gain: Float[Array, "ny ny m"]
     ) -> tuple[Float[Array, "ny m"], Float[Array, "nw ny m"]]:
-        """`G f` and `G ∂f/∂w` for a batch of rows, G the `gain` of each.
+        """Return `G f` and `G ∂f/∂w` for a batch of rows, G the `gain` of each.
 
-        Reverse mode per row, one pass per output. The batch is the *last* axis: every entry of the Jacobian is
-        then contiguous over rows, which is 2.5 times faster here than rows first.
+        Reverse mode per row, one pass per output. The batch is the *last* axis: every entry of the
+        Jacobian is then contiguous over rows, which is 2.5 times faster here than rows first.
         """
 
         def one_row(leaves: list[Any], z_row: Any, gain_row: Any) -> tuple[Any, list[Any]]:
@@ -404,15 +454,23 @@ class Bound:
             scaled = sum(gain_row[:, i] * value[i] for i in range(self.ny))
             return scaled, [pullback(gain_row[i])[0] for i in range(self.ny)]
 
-        values, per_output = jax.vmap(one_row, in_axes=(None, -1, -1), out_axes=-1)(self.leaves(w), z, gain)
+        values, per_output = jax.vmap(one_row, in_axes=(None, -1, -1), out_axes=-1)(
+            self.leaves(w), z, gain
+        )
         batch = z.shape[-1]
         none = jnp.zeros((0, batch))  # a learner may have no weights
-        columns = [jnp.concatenate([none, *(g.reshape(-1, batch) for g in grads)]) for grads in per_output]
+        columns = [
+            jnp.concatenate([none, *(g.reshape(-1, batch) for g in grads)]) for grads in per_output
+        ]
         return values, jnp.stack(columns, axis=1) if len(columns) > 1 else columns[0][:, None, :]
 
 
 @partial(jax.jit, static_argnames="bound")
-def _probed(bound: Bound, w: Float[Array, "nw"]) -> tuple[Float[Array, "ny m"], Float[Array, "nw ny m"]]:
-    """f and ∂f/∂w at some points of the scaled box."""
+def _probed(
+    bound: Bound, w: Float[Array, "nw"]
+) -> tuple[Float[Array, "ny m"], Float[Array, "nw ny m"]]:
+    """Return f and ∂f/∂w at some points of the scaled box."""
     z = jnp.asarray(np.random.default_rng(0).uniform(-1, 1, (bound.nz, _PROBES)))
-    return bound.jacobian(w, z, jnp.broadcast_to(jnp.eye(bound.ny)[..., None], (bound.ny, bound.ny, _PROBES)))
+    return bound.jacobian(
+        w, z, jnp.broadcast_to(jnp.eye(bound.ny)[..., None], (bound.ny, bound.ny, _PROBES))
+    )

@@ -1,4 +1,4 @@
-"""A lagged model along a source: scores from running sums, the free run carried from piece to piece."""
+"""A lagged model along a source: scores from running sums, a free run from piece to piece."""
 
 from __future__ import annotations
 
@@ -18,8 +18,11 @@ from orthaug.models.response import Response, Scores, scores_of
 from orthaug.physics.problem import Moments
 
 
-class Flight(NamedTuple):
-    """A piece, the free run over its rows behind the history (m, ny) in parts, and the state it began in."""
+class RunPiece(NamedTuple):
+    """A piece, the free run (m, ny) over its rows behind the history, and the initial state.
+
+    The run is in parts.
+    """
 
     piece: Experiment
     state: Any
@@ -27,44 +30,57 @@ class Flight(NamedTuple):
 
 
 def pieces_of(model: Model, source: Source) -> Iterator[Experiment]:
-    """The pieces of a source that have rows behind the history that the model needs."""
+    """Return the pieces of a source that have rows behind the history that the model needs."""
     first = model.form.first_row
-    return (piece for partition in source.partitions for piece in partition.pieces(first) if len(piece) > first)
+    return (
+        piece
+        for partition in source.partitions
+        for piece in partition.pieces(first)
+        if len(piece) > first
+    )
 
 
-def flights(model: Model, source: Source) -> Iterator[Flight]:
-    """The free run along every experiment of a source, from the measured outputs of each."""
+def run_pieces(model: Model, source: Source) -> Iterator[RunPiece]:
+    """Yield the free run along every experiment of a source, from the measured outputs of each."""
     record, first = as_record(source, (_nothing(source),)), model.form.first_row
     state: Any = None
     ended: tuple[str, int] = ("", -1)
     for piece in pieces_of(model, source):
         if ended != (piece.source, piece.offset + first):
             state = model.form.start(piece.outputs[:first], [first])[0]
-        run = model.fly(state, model.form.inputs(piece, record))
-        yield Flight(piece, state, run)
+        run = model.run_parts(state, model.form.inputs(piece, record))
+        yield RunPiece(piece, state, run)
         state = _after(model, state, np.asarray(run.total))
         ended = piece.source, piece.offset + len(piece)
 
 
 def responses(model: Model, source: Source, *, free: bool) -> Iterator[tuple[Experiment, Response]]:
-    """One-step predictions or free runs of a source, piece by piece; a run that left all bounds has no more values."""
+    """Yield one-step predictions or free runs of a source, piece by piece.
+
+    A run that left all bounds has no more values.
+    """
     record = as_record(source, (_nothing(source),))
     if not free:
         for piece in pieces_of(model, source):
             yield piece, model.predict(replace(record, experiments=(piece,)))
         return
     lost: tuple[str, int] | None = None
-    for piece, state, run in flights(model, source):
-        told = model.flown(state, run, piece, record)
+    for piece, state, run in run_pieces(model, source):
+        run_piece = model.as_trajectory(state, run, piece, record)
         before = lost == (piece.source, piece.offset + model.form.first_row)
         if before:
-            told = replace(told, baseline=told.baseline * np.nan, learner=told.learner * np.nan, diverged=None)
-        lost = (piece.source, piece.offset + len(piece)) if before or told.diverged else None
-        yield piece, Response((told,), None, model.outputs, source.sampling_time)
+            run_piece = replace(
+                run_piece,
+                baseline=run_piece.baseline * np.nan,
+                learner=run_piece.learner * np.nan,
+                diverged=None,
+            )
+        lost = (piece.source, piece.offset + len(piece)) if before or run_piece.diverged else None
+        yield piece, Response((run_piece,), None, model.outputs, source.sampling_time)
 
 
 def _after(model: Model, state: Any, outputs: Matrix) -> Any:
-    """The state after outputs (m, ny) of a run that began in a state."""
+    """Return the state after outputs (m, ny) of a run that began in a state."""
     before = state.reshape(model.form.memory, len(model.outputs))[::-1]
     past = np.concatenate([before, outputs])
     return model.form.start(past, [len(past)])[0]
@@ -83,7 +99,7 @@ class RunningScores:
     rows: int = 0
 
     def add(self, measured: Matrix, model: Matrix) -> None:
-        """More rows (m, ny)."""
+        """Add more rows (m, ny)."""
         with np.errstate(all="ignore"):
             self.squares = self.squares + np.sum((measured - model) ** 2, axis=0)
         seen = Moments.of(measured)
@@ -91,7 +107,7 @@ class RunningScores:
         self.rows += len(measured)
 
     def scores(self) -> Scores:
-        """RMSE, NRMSE and FIT of all of them."""
+        """Return RMSE, NRMSE and FIT of all rows."""
         assert self.moments is not None and self.rows, "no row was scored"
         with np.errstate(all="ignore"):
             rmse = np.sqrt(self.squares / self.rows)
@@ -99,7 +115,9 @@ class RunningScores:
 
 
 Watch = Callable[[Experiment, int, Matrix], None]
-"""Is shown a piece, its first row with a prediction, and the one-step residual from there on (m, ny)."""
+"""Called with a piece, its first row with a prediction, and the one-step residual from there on
+(m, ny).
+"""
 
 
 class LongScores(NamedTuple):
@@ -110,11 +128,16 @@ class LongScores(NamedTuple):
     diverged: tuple[str, int, str] | None
 
 
-def scores_along(model: Model, source: Source, skip: int = 0, watch: Watch | None = None) -> LongScores:
-    """Scores of the one-step prediction and the free run, without the first `skip` rows of each recording."""
+def scores_along(
+    model: Model, source: Source, skip: int = 0, watch: Watch | None = None
+) -> LongScores:
+    """Return scores of the one-step prediction and the free run over a source.
+
+    The first `skip` rows of each recording are left out.
+    """
     record, first = as_record(source, (_nothing(source),)), model.form.first_row
     one_step, free, diverged = RunningScores(), RunningScores(), None
-    for piece, _, parts in flights(model, source):
+    for piece, _, parts in run_pieces(model, source):
         kept = slice(max(skip - piece.offset - first, 0), None)
         measured, run = piece.outputs[first:], np.asarray(parts.total)
         ahead = np.asarray(model.parts_at(model.form.regressors(piece, record)).total)
@@ -126,7 +149,9 @@ def scores_along(model: Model, source: Source, skip: int = 0, watch: Watch | Non
     return LongScores(one_step.scores(), free.scores(), diverged)
 
 
-def _runaway(model: Model, piece: Experiment, first: int, run: Matrix) -> tuple[str, int, str] | None:
+def _runaway(
+    model: Model, piece: Experiment, first: int, run: Matrix
+) -> tuple[str, int, str] | None:
     with np.errstate(all="ignore"):
         wild = ~(np.abs(run) <= RUNAWAY * model.largest_output)
     if not wild.any():

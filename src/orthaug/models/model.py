@@ -1,4 +1,4 @@
-"""The fitted model ŷ_k = φ(x_k)θ + (f(x_k) − φ(x_k)θ_aux): prediction, free run and its two parts."""
+"""The fitted model ŷ_k = φ(x_k)θ + (f(x_k) − φ(x_k)θ_aux): prediction, free run, parts."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from jaxtyping import Float
 from orthaug._base.checks import Matrix, Vector, as_signal, check_count
 from orthaug._base.errors import InputError
 from orthaug._base.jax import Array, jax, jnp
-from orthaug._base.views import Shown
+from orthaug._base.views import NotebookView
 from orthaug.data.record import Channel, Experiment, Prepared, Record
 from orthaug.models.beyond import outside
 from orthaug.models.dynamics import Dynamics, Numbers, Parts
 from orthaug.models.filters import LaggedFilter
 from orthaug.models.lagged import Lagged
-from orthaug.models.on_records import WITHIN, OnRecords, trajectory
+from orthaug.models.on_records import WITHIN, RecordModel, trajectory
 from orthaug.models.response import Response, Trajectory
 from orthaug.models.statistics import Statistics
 from orthaug.models.stepping import Memory, checked_row, one_experiment, step_lagged
@@ -38,15 +38,22 @@ def _predict_rows(form: Lagged, numbers: Numbers, x: Float[Array, "m nx"]) -> Pa
 def _free_run(
     form: Dynamics, numbers: Numbers, state: Float[Array, "n0"], inputs: Float[Array, "T nu"]
 ) -> tuple[Float[Array, "n0"], Parts]:
-    """One scan over the rows, from the state at the first one; with the state after the last."""
+    """Return one scan over the rows, from the state at the first one.
+
+    The state after the last row is the second result.
+    """
     return jax.lax.scan(lambda state, row: form.step(numbers, state, row), state, inputs)
 
 
 @partial(jax.jit, static_argnames="form")
 def _ahead(
-    form: Dynamics, numbers: Numbers, states: Float[Array, "m n0"], inputs: Float[Array, "m T nu"], horizon: Any
+    form: Dynamics,
+    numbers: Numbers,
+    states: Float[Array, "m n0"],
+    inputs: Float[Array, "m T nu"],
+    horizon: Any,
 ) -> Parts:
-    """The last of `horizon` free-run steps from each of m starts."""
+    """Return the last of `horizon` free-run steps from each of m starts."""
     side_by_side = jax.vmap(lambda state, row: form.step(numbers, state, row))
 
     def step(i: Any, carry: tuple[Any, Parts]) -> tuple[Any, Parts]:
@@ -57,20 +64,22 @@ def _ahead(
 
 
 @dataclass(frozen=True, eq=False)
-class Model(OnRecords, Shown):
+class Model(RecordModel, NotebookView):
     """A fitted model; `estimate` makes it, `orthaug.save` and `orthaug.load` keep it.
 
-    `weight` (ny, ny) is the inner product of criterion and measure: rows multiplied by it are whitened. `deviation`
-    (ny,) is that of the training outputs. From the `statistics` every function of the model has an interval.
+    `weight` (ny, ny) is the inner product of criterion and measure: rows multiplied by it are
+    whitened. `deviation` (ny,) is that of the training outputs. From the `statistics` every
+    function of the model has an interval.
 
     Examples:
         >>> import orthaug as oa
         >>> u = [1.0, 2.0, 0.0, 3.0, 1.0, 0.0]
-        >>> record = oa.Record.from_arrays(u=u, y=[0.0, 0.5, 1.25, 0.625, 1.8125, 1.40625])  # 0.5 (y[k-1] + u[k-1])
+        >>> y = [0.0, 0.5, 1.25, 0.625, 1.8125, 1.40625]  # 0.5 (y[k-1] + u[k-1])
+        >>> record = oa.Record.from_arrays(u=u, y=y)
         >>> physics = oa.Baseline.from_terms([oa.Term("a", "y[k-1]"), oa.Term("b", "u[k-1]")])
         >>> model = oa.estimate(record, physics, learner=None).model
         >>> other = oa.Record.from_arrays(u=[1.0, 1.0, 1.0], y=[4.0, 0.0, 0.0])
-        >>> model.simulate(other).trajectories[0].model.T.round(6)  # from the first output on its own
+        >>> model.simulate(other).trajectories[0].model.T.round(6)  # from the first output
         array([[ nan, 2.5 , 1.75]])
         >>> model.predict(other).trajectories[0].model.T.round(6)  # from the measured ones
         array([[nan, 2.5, 0.5]])
@@ -91,11 +100,14 @@ class Model(OnRecords, Shown):
     time_column: str | None = None
     statistics: Statistics = Statistics()  # noqa: RUF009  (frozen)
     prepared: tuple[Prepared, ...] = field(default=(), kw_only=True, repr=False)
-    """What the training data went through before."""
+    """Preparation of the training data."""
 
     def __repr__(self) -> str:
         learner = self.form.bound.learner if self.form.bound else "none"
-        return f"Model({self.structure}, θ: {', '.join(self.form.baseline.names) or 'none'}, learner: {learner})"
+        return (
+            f"Model({self.structure}, θ: {', '.join(self.form.baseline.names) or 'none'}, "
+            f"learner: {learner})"
+        )
 
     @property
     def theta(self) -> Vector:
@@ -109,16 +121,20 @@ class Model(OnRecords, Shown):
 
     @property
     def alone(self) -> Model:
-        """Its physics without the learner."""
+        """The model without its learner."""
         return replace(self, form=self.form.alone, numbers=self.numbers.alone)
 
     def learner_at(self, x: Float[np.ndarray, "M nx"]) -> Float[np.ndarray, "M ny"]:
-        """f, before any split, at regressors of the form's layout; in the outputs' units.
+        """Return f, before any split, at regressors of the form's layout, in the outputs' units.
 
-        It is the learner itself, also beyond the range of its training, where the model holds the correction.
+        It is the learner itself, also beyond the range of its training, where the model holds the
+        correction.
         """
         limits = self.numbers.limits
-        if limits is not None and outside(limits, self.form.features.evaluate(x, self.form.layout, np)).any():
+        if (
+            limits is not None
+            and outside(limits, self.form.features.evaluate(x, self.form.layout, np)).any()
+        ):
             return replace(self, numbers=self.numbers.free).parts_at(x).raw
         return self.parts_at(x).raw
 
@@ -128,7 +144,7 @@ class Model(OnRecords, Shown):
         return np.asarray(self.numbers.theta_aux)
 
     def components(self, record: Record) -> Response:
-        """One-step prediction of every row in its parts, before and after projection."""
+        """Return one-step prediction of every row in its parts, before and after projection."""
         return self.predict(record, horizon=1)
 
     def predict(self, record: Record, horizon: int = 1) -> Response:
@@ -155,12 +171,14 @@ class Model(OnRecords, Shown):
         return Response(tuple(trajectories), horizon, self.outputs, record.sampling_time)
 
     def simulate(self, record: Record, initial: str | Any = "measured") -> Response:
-        """Free run: the outputs' past is the model's own, from the first usable row on.
+        """Simulate the free run from the first usable row on.
+
+        Past outputs in the regressor are the model's own.
 
         Args:
             record: inputs, and outputs where they are measured.
-            initial: the outputs on the rows before the first usable one: "measured" (from the record),
-                "zero", or an array (rows, ny) that holds them.
+            initial: the outputs on the rows before the first usable one: "measured" (from the
+                record), "zero", or an array (rows, ny) that holds them.
 
         Raises:
             InputError: other channels, too few rows, or initial values that are not there.
@@ -171,19 +189,26 @@ class Model(OnRecords, Shown):
             self.check_rows(experiment, self.form.first_row)
             measured = experiment.outputs if record.outputs else None
             start = self._start(initial, measured)
-            parts = self.fly(start, self.form.inputs(experiment, record))
-            trajectories.append(self.flown(start, parts, experiment, record))
+            parts = self.run_parts(start, self.form.inputs(experiment, record))
+            trajectories.append(self.as_trajectory(start, parts, experiment, record))
         return Response(tuple(trajectories), None, self.outputs, record.sampling_time)
 
-    def flown(self, start: Vector, parts: Parts, experiment: Experiment, record: Record) -> Trajectory:
-        """A free run from a state, cut where it left all bounds."""
+    def as_trajectory(
+        self, start: Vector, parts: Parts, experiment: Experiment, record: Record
+    ) -> Trajectory:
+        """Return a free run from a state, cut where it left all bounds."""
         outside = self._outside(start, parts, experiment, record)
-        return replace(self.bounded(parts, experiment, experiment.outputs if record.outputs else None), outside=outside)
+        return replace(
+            self.bounded(parts, experiment, experiment.outputs if record.outputs else None),
+            outside=outside,
+        )
 
     @cached_property
     def memory(self) -> Memory:
-        """What a step remembers."""
-        return Memory.of(self.form.layout, self.form.outputs, [channel.name for channel in self.inputs])
+        """Past samples that a step remembers."""
+        return Memory.of(
+            self.form.layout, self.form.outputs, [channel.name for channel in self.inputs]
+        )
 
     @property
     def state_names(self) -> tuple[str, ...]:
@@ -192,34 +217,40 @@ class Model(OnRecords, Shown):
 
     @property
     def step_inputs(self) -> tuple[str, ...]:
-        """What a step takes: the inputs at its sample."""
+        """Inputs of a step: those at its sample."""
         return self.memory.inputs
 
     def start(self, record: Record, row: int | None = None) -> Vector:
-        """The state before a row of a record of one experiment, by default the first that has a prediction.
+        """Return the state before a row of a record of one experiment.
+
+        By default it is the first row that has a prediction.
 
         Raises:
             InputError: other channels, several experiments, a row that is not there.
         """
         record = self.fitting(record, need_outputs=False)
         experiment = one_experiment(record)
-        return self.memory.at(experiment, record, checked_row(row, self.form.first_row, len(experiment)))
+        return self.memory.at(
+            experiment, record, checked_row(row, self.form.first_row, len(experiment))
+        )
 
     def step(self, state: Any, inputs: Any) -> tuple[Array, Array]:
-        """One sample of a free run: the next state (n,) and the outputs (ny,), from a state and the inputs (nu,).
+        """Return one sample of a free run: the next state (n,) and the outputs (ny,).
 
-        A pure function of JAX arrays, so that `jax.jit`, `jax.vmap` and `jax.grad` take it; to go on from a measured
-        output, put that in the place of the model's own.
+        It starts from a state and the inputs (nu,).
+
+        A pure function of JAX arrays, so that `jax.jit`, `jax.vmap` and `jax.grad` take it; to go
+        on from a measured output, put that in the place of the model's own.
         """
         return step_lagged(self.form, self.numbers, self.memory, state, inputs)
 
     @property
     def filtering(self) -> tuple[LaggedFilter, Numbers, Vector]:
-        """The model as a filter: its dynamics, its numbers, and how large an unknown output is (ny,)."""
+        """The model as a filter: its dynamics, its numbers, and the size of an unknown output."""
         return LaggedFilter(self.form, self.memory), self.numbers, self.deviation
 
     def check_initial(self, initial: Any) -> Matrix:
-        """Outputs before the first usable row, (rows, ny).
+        """Return outputs before the first usable row, (rows, ny).
 
         Raises:
             InputError: too few rows, or not one column per output.
@@ -228,15 +259,18 @@ class Model(OnRecords, Shown):
             raise InputError(f"`initial` must be 'measured', 'zero' or an array; got '{initial}'.")
         rows, ny = as_signal(initial, "initial"), len(self.outputs)
         if rows.shape[1] != ny:
-            raise InputError(f"`initial` has {rows.shape[1]} columns; expected one per output, {ny}.")
+            raise InputError(
+                f"`initial` has {rows.shape[1]} columns; expected one per output, {ny}."
+            )
         if len(rows) < self.form.memory:
             raise InputError(
-                f"`initial` has {len(rows)} rows; expected the first {self.form.first_row} outputs of the record."
+                f"`initial` has {len(rows)} rows; expected the first {self.form.first_row} "
+                "outputs of the record."
             )
         return rows
 
-    def fly(self, state: Vector, inputs: Matrix) -> Parts:
-        """The free run from a state along lagged inputs (T, nu), in parts."""
+    def run_parts(self, state: Vector, inputs: Matrix) -> Parts:
+        """Return the free run from a state along lagged inputs (T, nu), in parts."""
         if not self.form.states:
             return self.parts_at(inputs)
         pieces = []
@@ -249,7 +283,7 @@ class Model(OnRecords, Shown):
         return Parts(*(np.concatenate(piece) for piece in zip(*pieces, strict=True)))
 
     def parts_at(self, x: Matrix) -> Parts:
-        """The prediction at measured regressors (T, nx), in parts."""
+        """Return the prediction at measured regressors (T, nx), in parts."""
         return _in_batches(lambda rows: _predict_rows(self.form, self.numbers, rows), (x,))
 
     def _predict_ahead(self, experiment: Experiment, record: Record, horizon: int) -> Parts:
@@ -257,21 +291,26 @@ class Model(OnRecords, Shown):
         inputs = self.form.inputs(experiment, record)
         windows = np.lib.stride_tricks.sliding_window_view(inputs, horizon, axis=0).swapaxes(1, 2)
         states = self.form.start(experiment.outputs, np.arange(first, first + len(windows)))
-        largest = max(1, _WINDOW_CELLS // max(1, windows[0].size))  # windows overlap: they are copied batch by batch
-        return _in_batches(lambda s, u: _ahead(self.form, self.numbers, s, u, horizon), (states, windows), largest)
+        largest = max(
+            1, _WINDOW_CELLS // max(1, windows[0].size)
+        )  # windows overlap: they are copied batch by batch
+        return _in_batches(
+            lambda s, u: _ahead(self.form, self.numbers, s, u, horizon), (states, windows), largest
+        )
 
     def first_state(self, experiment: Experiment, record: Record) -> Vector:
-        """Return the state at the first row of the free run that starts from the measured outputs."""
+        """Return the state at the first row of the free run from the measured outputs."""
         return self._start("measured", experiment.outputs)
 
     def _start(self, initial: Any, measured: Matrix | None) -> Vector:
-        """The state at the first row with an output."""
+        """Return the state at the first row with an output."""
         if isinstance(initial, str) and initial == "zero":
             return np.zeros(self.form.states)
         if isinstance(initial, str) and initial == "measured":
             if measured is None:
                 raise InputError(
-                    "the record has no measured outputs to start from; use initial='zero' or give the values."
+                    "the record has no measured outputs to start from; use initial='zero' or "
+                    "give the values."
                 )
             rows = measured[: self.form.first_row]
         else:
@@ -279,7 +318,7 @@ class Model(OnRecords, Shown):
         return self.form.start(rows, [len(rows)])[0]
 
     def _outside(self, start: Vector, parts: Parts, experiment: Experiment, record: Record) -> Any:
-        """Where along a free run the learner's features lie outside those of training, (N,)."""
+        """Return the rows of a free run where a feature is outside its training range, (N,)."""
         inputs = self.form.inputs(experiment, record)
         with np.errstate(all="ignore"):
             z = self.form.scaled_features(self.numbers, start, np.asarray(parts.total), inputs)
@@ -289,14 +328,18 @@ class Model(OnRecords, Shown):
         return np.concatenate([np.zeros(self.form.first_row, dtype=bool), beyond])
 
 
-def _in_batches(function: Callable[..., Parts], rows: tuple[np.ndarray, ...], largest: int = _BATCH) -> Parts:
-    """`function` over batches of rows, padded to one shape, its results concatenated."""
+def _in_batches(
+    function: Callable[..., Parts], rows: tuple[np.ndarray, ...], largest: int = _BATCH
+) -> Parts:
+    """Call `function` on batches of rows, padded to one shape, and concatenate its results."""
     count = len(rows[0])
     size, pieces = min(_BATCH, largest), []
     for begin in range(0, count, size):
         batch = [array[begin : begin + size] for array in rows]
         padding = size - len(batch[0])
-        padded = [np.concatenate([b, np.repeat(b[-1:], padding, axis=0)]) if padding else b for b in batch]
+        padded = [
+            np.concatenate([b, np.repeat(b[-1:], padding, axis=0)]) if padding else b for b in batch
+        ]
         parts = function(*padded)
         pieces.append([np.asarray(part)[: size - padding] for part in parts])
     return Parts(*(np.concatenate(piece) for piece in zip(*pieces, strict=True)))

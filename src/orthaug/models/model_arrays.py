@@ -1,6 +1,6 @@
-"""What every saved model has: its channels, its numbers, what training left of statistics, and its learner.
+"""Contents of every saved model: channels, numbers, statistics of training, learner.
 
-Of a registered learner a file holds kind and fields, of a Python callable neither.
+A file holds kind and fields of a registered learner, and neither of a Python callable.
 """
 
 from __future__ import annotations
@@ -23,15 +23,24 @@ _SAID = ("structure", "measure", "sampling_time", "time_column")
 
 
 def said_of(model: Any) -> dict[str, Any]:
-    """What a file says of every model, whatever its physics."""
-    channels = {kind: [asdict(channel) for channel in getattr(model, kind)] for kind in ("outputs", "inputs")}
+    """Return the declaration that every model has, whatever its physics."""
+    channels = {
+        kind: [asdict(channel) for channel in getattr(model, kind)]
+        for kind in ("outputs", "inputs")
+    }
     kept = model.statistics
-    said = {name: getattr(model, name) for name in _SAID} | channels | {"flown": kept.flown, "verdict": kept.verdict}
-    return said | ({"prepared": [asdict(step) for step in model.prepared]} if model.prepared else {})
+    said = (
+        {name: getattr(model, name) for name in _SAID}
+        | channels
+        | {"flown": kept.simulated, "verdict": kept.verdict}
+    )
+    return said | (
+        {"prepared": [asdict(step) for step in model.prepared]} if model.prepared else {}
+    )
 
 
 def fields_from(declared: dict[str, Any], arrays: dict[str, np.ndarray]) -> dict[str, Any]:
-    """The fields that every model has, from its file."""
+    """Return the fields that every model has, from its file."""
     channels = {kind: tuple(Channel(**c) for c in declared[kind]) for kind in ("outputs", "inputs")}
     numbers = {"numbers": numbers_from(arrays), "statistics": statistics_from(arrays, declared)}
     fields = {name: declared[name] for name in _SAID} | channels | numbers
@@ -40,7 +49,7 @@ def fields_from(declared: dict[str, Any], arrays: dict[str, np.ndarray]) -> dict
 
 
 def arrays_of(model: Any) -> dict[str, np.ndarray]:
-    """By the names that files give them; what is None is left out."""
+    """Return the arrays by the names that files give them; None is left out."""
     kept = model.statistics
     arrays = {f"numbers.{name}": value for name, value in model.numbers._asdict().items()}
     arrays |= {
@@ -59,19 +68,21 @@ def arrays_of(model: Any) -> dict[str, np.ndarray]:
 
 
 def numbers_from(arrays: dict[str, np.ndarray]) -> Numbers:
-    """The model's numbers."""
-    return Numbers(**{name: arrays.get(f"numbers.{name}") for name in Numbers._fields})  # type: ignore[arg-type]
+    """Return the model's numbers."""
+    return Numbers(
+        **{n: arrays.get(f"numbers.{n}") for n in Numbers._fields}  # type: ignore[arg-type]
+    )
 
 
 def statistics_from(arrays: dict[str, np.ndarray], declared: dict[str, Any]) -> Statistics:
-    """What training left."""
+    """Return the statistics of training."""
     return Statistics(
         gram=arrays.get("gram"),
         middle=arrays.get("middle"),
         noise=arrays.get("noise"),
         ridge=arrays["ridge"] if "ridge" in arrays else float(arrays["scalars"][0]),
         freedom=float(arrays["scalars"][1]),
-        flown=bool(declared.get("flown", declared.get("kind") == "motion")),
+        simulated=bool(declared.get("flown", declared.get("kind") == "motion")),
         verdict=str(declared.get("verdict", "")),
         disturbance=arrays.get("disturbance"),
         sensor=arrays.get("sensor"),
@@ -79,14 +90,14 @@ def statistics_from(arrays: dict[str, np.ndarray], declared: dict[str, Any]) -> 
 
 
 def declaration_of(bound: Bound | None) -> dict[str, Any] | None:
-    """What a file says of a learner; None without one."""
+    """Return the declaration of a learner; None without one."""
     if bound is None:
         return None
     return declare_learner(bound.learner) | {"nz": bound.nz, "ny": bound.ny}
 
 
 def declare_learner(learner: Learner) -> dict[str, Any]:
-    """Kind and fields of a learner."""
+    """Return kind and fields of a learner."""
     kind = LEARNERS.kind_of(learner)
     if kind is None:
         return {"kind": "callable"}
@@ -94,27 +105,36 @@ def declare_learner(learner: Learner) -> dict[str, Any]:
 
 
 def rebuilt_learner(kept: dict[str, Any], given: Learner | None, path: Path) -> Learner:
-    """The learner that a file declares. For a callable it is the given one."""
+    """Return the learner that a file declares.
+
+    For a callable it is the given one.
+    """
     kind = kept["kind"]
     if kind in LEARNERS:
         learner = LEARNERS[kind]
-        return learner(**{name: frozen(kept[name]) for name in _field_names(learner) if name in kept})
+        return learner(
+            **{name: frozen(kept[name]) for name in _field_names(learner) if name in kept}
+        )
     if given is not None:
         return given
     if kind != "callable":
         raise InputError(
-            f"{path}: its learner is of the kind '{kind}', which is not registered here; register it, or give the "
-            "learner, load(…, learner=…)."
+            f"{path}: its learner is of the kind '{kind}', which is not registered here; "
+            "register it, or give the learner, load(…, learner=…)."
         )
-    raise InputError(f"{path}: the learner was a Python callable; give it again, load(…, learner=…).")
+    raise InputError(
+        f"{path}: the learner was a Python callable; give it again, load(…, learner=…)."
+    )
 
 
 def _field_names(learner: type) -> list[str]:
     return [field.name for field in fields(learner) if field.init]
 
 
-def bound_of(kept: dict[str, Any] | None, weights: np.ndarray, given: Learner | None, path: Path) -> Bound | None:
-    """The learner that a file declares with its sizes; None for physics alone.
+def bound_of(
+    kept: dict[str, Any] | None, weights: np.ndarray, given: Learner | None, path: Path
+) -> Bound | None:
+    """Return the learner that a file declares with its sizes; None for physics alone.
 
     Raises:
         InputError: a learner that is not known here, or has another number of weights.
@@ -124,5 +144,8 @@ def bound_of(kept: dict[str, Any] | None, weights: np.ndarray, given: Learner | 
     bound = Bound(rebuilt_learner(kept, given, path), kept["nz"], kept["ny"])
     saved = weights.shape[-1]
     if bound.size != saved:
-        raise InputError(f"{path}: the learner has {bound.size} weights, the saved one {saved}; give the same one.")
+        raise InputError(
+            f"{path}: the learner has {bound.size} weights, the saved one {saved}; give the "
+            "same one."
+        )
     return bound

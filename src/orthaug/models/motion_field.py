@@ -1,8 +1,8 @@
 """The field of a motion with a learner: ẋ = f(x, u; c) + E g(z; w), y = h(x, u; c) + g(z; w).
 
-g is the learner on features z of states and inputs. Its values go to the learned equations first, then to the learned
-outputs. The unknowns are the coordinates c of the physical parameters, and the weights. `parts_at` tells what physics
-and learner add at many points.
+g is the learner on features z of states and inputs. Its values go to the learned equations first,
+then to the learned outputs. The unknowns are the coordinates c of the physical parameters, and the
+weights. `parts_at` returns what physics and learner add at many points.
 """
 
 from __future__ import annotations
@@ -26,9 +26,10 @@ from orthaug.physics.motion import Motion
 
 @dataclass(frozen=True)
 class MotionField:
-    """What a motion with a learner computes at a point, without its numbers.
+    """A motion with a learner at a point, without its numbers.
 
-    `features` are expressions of states and inputs; `substeps` the integrator's in a sample of `sampling_time` s.
+    `features` are expressions of states and inputs; `substeps` the integrator's in a sample of
+    `sampling_time` s.
     """
 
     motion: Motion
@@ -46,33 +47,40 @@ class MotionField:
         return len(self.motion.parameters) + (self.bound.size if self.bound else 0)
 
     def now(self, inputs: Any) -> Any:
-        """u (…, nu) at the sample itself, of the rows that steps read."""
+        """Return u (…, nu) at the sample itself, of the rows that steps read."""
         return inputs[..., : len(self.motion.inputs)]
 
     def seen(self, x: Any, u: Any, xp: Any = jnp) -> Any:
-        """The learner's features z (nz, …) of states (nx, …) and inputs (nu, …)."""
+        """Return the learner's features z (nz, …) of states (nx, …) and inputs (nu, …)."""
         values: Mapping[str, Any] = self.motion.values(x, u, self.motion.initial, xp)
         columns = [xp.asarray(entry.value(values, xp), dtype=float) for entry in self.features]
         return xp.stack([xp.broadcast_to(column, x.shape[1:]) for column in columns])
 
     def learned(self, numbers: Numbers, x: Any, u: Any) -> Any:
-        """g (learned equations and outputs,) in their units, at one point, also beyond the range of training."""
+        """Return g (learned equations and outputs,) in their units, at one point.
+
+        The point may be beyond the range of training.
+        """
         return self._values(numbers, self.seen(x, u))
 
     def _values(self, numbers: Numbers, z: Any) -> Any:
         assert self.bound is not None
-        return numbers.gain * self.bound.values(numbers.weights, (z - numbers.centre) / numbers.halfwidth)
+        return numbers.gain * self.bound.values(
+            numbers.weights, (z - numbers.centre) / numbers.halfwidth
+        )
 
     @property
     def beyond(self) -> str:
-        """What the learner's correction does beyond the range of its training."""
+        """Behaviour of the learner's correction beyond its training range."""
         return "free" if self.bound is None else beyond_of(self.bound.learner, "fade")
 
     def added(self, numbers: Numbers, x: Any, u: Any) -> Any:
-        """What is added to the physics at c, learned equations and outputs first, at one point.
+        """Return the learner's addition to the physics at c, at one point.
 
-        Within the range of training it is g. Beyond it the physics at p̂ goes on, and what it left there at x̄ is held
-        or fades: `f(x; p̂) − f(x; c) + a (f(x̄; c) − f(x̄; p̂) + g(z̄))`.
+        Learned equations come first, then outputs.
+
+        Within the range of training it is g. Beyond it the physics at p̂ goes on, and what it left
+        there at x̄ is held or fades: `f(x; p̂) − f(x; c) + a (f(x̄; c) − f(x̄; p̂) + g(z̄))`.
         """
         if numbers.limits is None:
             return self.learned(numbers, x, u)
@@ -82,20 +90,28 @@ class MotionField:
         share = remaining(self.beyond, numbers.limits, z)
         x_in, u_in = x + moved[: len(x)], u + moved[len(x) :]
         split, own = (
-            self.motion.coordinates.physical(q, jnp) for q in (numbers.theta, numbers.theta - numbers.theta_aux)
+            self.motion.coordinates.physical(q, jnp)
+            for q in (numbers.theta, numbers.theta - numbers.theta_aux)
         )
-        held = self.learned_rows(own, x_in, u_in) - self.learned_rows(split, x_in, u_in) + self._values(numbers, inside)
+        held = (
+            self.learned_rows(own, x_in, u_in)
+            - self.learned_rows(split, x_in, u_in)
+            + self._values(numbers, inside)
+        )
         beyond = self.learned_rows(split, x, u) - self.learned_rows(own, x, u) + share * held
         return jnp.where(jnp.all(inside == z), self._values(numbers, inside), beyond)
 
     def learned_rows(self, p: Any, x: Any, u: Any) -> Any:
-        """The physics (nl,) of the learned equations, then of the learned outputs, with the parameters p."""
+        """Return the physics of the learned equations (nl,), then of the learned outputs.
+
+        p are the parameters.
+        """
         states, outputs = (np.array(rows, dtype=int) for rows in self.motion.learned)
         rates, observed = self.motion.rates(x, u, p, jnp), self.motion.observed(x, u, p, jnp)
         return jnp.concatenate([rates[states], observed[outputs]])
 
     def rates(self, numbers: Numbers, x: Any, u: Any) -> tuple[Any, Any]:
-        """The equations' right-hand sides of physics and learner, each (nx,)."""
+        """Return the equations' right-hand sides of physics and learner, each (nx,)."""
         physics = self.motion.rates(x, u, self.parameters(numbers), jnp)
         learned = jnp.zeros(self.states)
         states, _ = self.motion.learned
@@ -104,7 +120,7 @@ class MotionField:
         return physics, learned
 
     def observed(self, numbers: Numbers, x: Any, u: Any) -> Any:
-        """y (ny,)."""
+        """Return y (ny,)."""
         y = self.motion.observed(x, u, self.parameters(numbers), jnp)
         states, outputs = self.motion.learned
         if self.bound is not None and outputs:
@@ -112,30 +128,37 @@ class MotionField:
         return y
 
     def parameters(self, numbers: Numbers) -> Any:
-        """The physical parameters (np,) beside the learner, before any split."""
+        """Return the physical parameters (np,) beside the learner, before any split."""
         return self.motion.coordinates.physical(numbers.theta - numbers.theta_aux, jnp)
 
     def linear_part(self, numbers: Numbers) -> Any:
-        """∂f/∂x of the physics at the origin; 0 where it has none."""
+        """Return ∂f/∂x of the physics at the origin; 0 where it has none."""
         p, rest = self.parameters(numbers), jnp.zeros(len(self.motion.inputs))
         slope = jax.jacfwd(lambda x: self.motion.rates(x, rest, p, jnp))(jnp.zeros(self.states))
         return jnp.where(jnp.isfinite(slope), slope, 0.0)
 
 
 def parts_at(form: MotionField, numbers: Numbers, x: Matrix, u: Matrix) -> tuple[Matrix, Matrix]:
-    """Physics f(x, u; p̂) and what is learned beside it, each (M, nl): learned equations, then learned outputs.
+    """Return the physics f(x, u; p̂) and the learner, each (M, nl).
+
+    Learned equations come first, then learned outputs.
 
     Args:
         x: states (M, nx); `u` inputs (M, nu) at the same instants.
     """
     count = len(x)
-    x, u = (np.pad(part, ((0, padded_length(count) - count), (0, 0)), mode="edge") for part in (x, u))
+    x, u = (
+        np.pad(part, ((0, padded_length(count) - count), (0, 0)), mode="edge") for part in (x, u)
+    )
     physics, learner = _parts(form, numbers, x, u)
     return np.asarray(physics)[:count], np.asarray(learner)[:count]
 
 
 def labels_of(form: MotionField) -> tuple[tuple[str, str], ...]:
-    """Name and unit of each learned equation and output: `v` in m/s has a rate in m/s²."""
+    """Return name and unit of each learned equation and output.
+
+    For example `v` in m/s has a rate in m/s².
+    """
     motion = form.motion
     states, outputs = motion.learned
     rates = []

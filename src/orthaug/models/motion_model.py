@@ -1,7 +1,8 @@
-"""The fitted motion ẋ = f(x, u; p) + learner, y = h(x, u; p): free runs, predictions, and what acts in it.
+"""The fitted motion ẋ = f(x, u; p) + learner, y = h(x, u; p): free runs and predictions.
 
-A run starts from a state that was not measured. It is estimated from the first rows of the record or, for a prediction,
-from a window of rows before it: the state from which a free run over the window follows the measured outputs best.
+A run starts from a state that was not measured. It is estimated from the first rows of the record
+or, for a prediction, from a window of rows before it: the state from which a free run over the
+window follows the measured outputs best.
 """
 
 from __future__ import annotations
@@ -17,33 +18,39 @@ from jaxtyping import Float
 from orthaug._base.checks import Matrix, Vector, as_signal, check_count
 from orthaug._base.errors import InputError
 from orthaug._base.jax import Array, jax, padded_length
-from orthaug._base.views import Shown
+from orthaug._base.views import NotebookView
 from orthaug.data.record import Channel, Experiment, Prepared, Record
 from orthaug.models.dynamics import Numbers, Parts
 from orthaug.models.filters import MotionFilter
 from orthaug.models.learners import Scaling
 from orthaug.models.motion_field import parts_at
-from orthaug.models.moving import Moving
-from orthaug.models.on_records import RUNAWAY, OnRecords, trajectory
+from orthaug.models.moving import MotionDynamics
+from orthaug.models.on_records import RUNAWAY, RecordModel, trajectory
 from orthaug.models.response import Response, Trajectory
 from orthaug.models.settling import LOOSE, Windows, padded_steps, settle
 from orthaug.models.statistics import Statistics
-from orthaug.models.stepping import checked_row, one_experiment, step_arguments, step_inputs, with_scheme
+from orthaug.models.stepping import (
+    checked_row,
+    one_experiment,
+    step_arguments,
+    step_inputs,
+    with_scheme,
+)
 from orthaug.physics.parameters import PhysicalParameter
 
 if TYPE_CHECKING:
     import pandas as pd
 
-FIRST_ROWS = 64  # that tell where a free run starts
+FIRST_ROWS = 64  # from which the start of a free run is estimated
 _SIDE_BY_SIDE = 256  # windows of predictions
 _GUESS_ITERATIONS, _WINDOW_ITERATIONS = 30, 6
 
 
 @partial(jax.jit, static_argnames="form")
 def _run(
-    form: Moving, numbers: Numbers, state: Float[Array, "n0"], inputs: Float[Array, "T nu"]
+    form: MotionDynamics, numbers: Numbers, state: Float[Array, "n0"], inputs: Float[Array, "T nu"]
 ) -> tuple[Float[Array, "T n0"], Float[Array, "T ny"]]:
-    """States and outputs of a free run."""
+    """Return states and outputs of a free run."""
     numbers = form.prepared(numbers)
 
     def step(state: Any, row: Any) -> tuple[Any, tuple[Any, Any]]:
@@ -55,20 +62,27 @@ def _run(
 
 @partial(jax.jit, static_argnames="form")
 def _last(
-    form: Moving, numbers: Numbers, states: Float[Array, "n0 m"], inputs: Float[Array, "T nu m"], steps: Any
+    form: MotionDynamics,
+    numbers: Numbers,
+    states: Float[Array, "n0 m"],
+    inputs: Float[Array, "T nu m"],
+    steps: Any,
 ) -> Float[Array, "ny m"]:
-    """The last output of `steps` of runs side by side."""
+    """Return the last output of `steps` of runs side by side."""
     numbers = form.prepared(numbers)
     side_by_side = jax.vmap(lambda state, row: form.step(numbers, state, row), -1, -1)
-    states = jax.lax.fori_loop(0, steps - 1, lambda i, states: side_by_side(states, inputs[i])[0], states)
+    states = jax.lax.fori_loop(
+        0, steps - 1, lambda i, states: side_by_side(states, inputs[i])[0], states
+    )
     return side_by_side(states, inputs[steps - 1])[1].total
 
 
-class Trained(NamedTuple):
-    """What a later split under a measure needs beside the training data: how segments lay, and where they started.
+class TrainedSegments(NamedTuple):
+    """Training segments and their initial states, for a later split under a measure.
 
-    `rows` counts the rows that were scored, `alone` (np,) are the coordinates of physics alone; `slope` (k, m, nx, n)
-    is how the starts `states` (k, nx, m) follow the unknowns, less its sign; None where that is not known.
+    `rows` counts the rows that were scored, `alone` (np,) are the coordinates of physics alone;
+    `slope` (k, m, nx, n) is how the starts `states` (k, nx, m) follow the unknowns, less its sign;
+    None where that is not known.
     """
 
     segment: int
@@ -80,14 +94,15 @@ class Trained(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class MotionModel(OnRecords, Shown):
+class MotionModel(RecordModel, NotebookView):
     """A fitted motion; `estimate` makes it, `orthaug.save` and `orthaug.load` keep it.
 
-    `window` rows tell a state from which to predict. `weight` (ny, ny) is the inner product of the outputs; `loose`
-    (nx,) how far a state may be from its guess. `deviation` (ny,) is that of the training outputs.
+    `window` rows give a state to predict from. `weight` (ny, ny) is the inner product of the
+    outputs; `loose` (nx,) how far a state may be from its guess. `deviation` (ny,) is that of the
+    training outputs.
     """
 
-    form: Moving
+    form: MotionDynamics
     numbers: Numbers
     """θ are the coordinates of the physical parameters, θ − θ_aux those beside the learner."""
     outputs: tuple[Channel, ...]
@@ -101,16 +116,20 @@ class MotionModel(OnRecords, Shown):
     window: int
     measure: str = field(default="training", kw_only=True)
     time_column: str | None = None
-    trained: Trained | None = field(default=None, repr=False)
+    trained: TrainedSegments | None = field(default=None, repr=False)
     seen: Matrix | None = field(default=None, kw_only=True, repr=False)
-    """Least and largest (2, nz) of the learner's features over the fitted run of the training data."""
+    """Least and largest (2, nz) of the learner's features over the fitted run of the training data.
+    """
     statistics: Statistics = Statistics()  # noqa: RUF009  (frozen)
     prepared: tuple[Prepared, ...] = field(default=(), kw_only=True, repr=False)
-    """What the training data went through before."""
+    """Preparation of the training data."""
 
     def __repr__(self) -> str:
         learner = self.form.bound.learner if self.form.bound else "none"
-        return f"MotionModel({', '.join(f'{k} = {v:.5g}' for k, v in self.parameters.items())}, learner: {learner})"
+        return (
+            f"MotionModel({', '.join(f'{k} = {v:.5g}' for k, v in self.parameters.items())}, "
+            f"learner: {learner})"
+        )
 
     @property
     def theta(self) -> Vector:
@@ -121,7 +140,9 @@ class MotionModel(OnRecords, Shown):
     def parameters(self) -> dict[str, float]:
         """The physical parameters by name."""
         values = self.form.motion.coordinates.physical(self.theta)
-        return {name: float(value) for name, value in zip(self.form.motion.names, values, strict=True)}
+        return {
+            name: float(value) for name, value in zip(self.form.motion.names, values, strict=True)
+        }
 
     @property
     def estimated(self) -> tuple[Sequence[PhysicalParameter], Vector]:
@@ -131,28 +152,34 @@ class MotionModel(OnRecords, Shown):
 
     @property
     def alone(self) -> MotionModel:
-        """Its physics without the learner."""
-        return replace(self, form=self.form.alone, numbers=self.numbers.alone._replace(gain=np.ones(0)))
+        """The model without its learner."""
+        return replace(
+            self, form=self.form.alone, numbers=self.numbers.alone._replace(gain=np.ones(0))
+        )
 
     def simulate(self, record: Record, initial: str | Any = "measured") -> Response:
-        """Free run from the first row on.
+        """Simulate the free run from the first row on.
 
         `baseline` is the output of the physics alone from the same start, `learner` the difference.
 
         Args:
             record: inputs, and outputs where they are measured.
-            initial: "measured" (the state by which a free run follows the first rows of the record best), "zero", or an
-                array (rows, ny) of outputs to follow instead.
+            initial: "measured" (the state by which a free run follows the first rows of the record
+                best), "zero", or an array (rows, ny) of outputs to follow instead.
 
         Raises:
             InputError: other channels, no rows, or initial values that are not there.
         """
         record = self.fitting(record, need_outputs=False)
-        trajectories = [self._free_run(experiment, record, initial) for experiment in record.experiments]
+        trajectories = [
+            self._free_run(experiment, record, initial) for experiment in record.experiments
+        ]
         return Response(tuple(trajectories), None, self.outputs, record.sampling_time)
 
     def predict(self, record: Record, horizon: int = 1) -> Response:
-        """Predict each row from a state that was estimated over the `window` rows up to `horizon` samples before it.
+        """Predict each row from a state estimated over earlier rows.
+
+        The state is estimated over the `window` rows up to `horizon` samples before the row.
 
         Where an experiment is shorter than that, over fewer.
 
@@ -161,17 +188,21 @@ class MotionModel(OnRecords, Shown):
         """
         horizon = check_count(horizon, "horizon", of="steps")
         record = self.fitting(record, need_outputs=True)
-        trajectories = [self._ahead(experiment, record, horizon) for experiment in record.experiments]
+        trajectories = [
+            self._ahead(experiment, record, horizon) for experiment in record.experiments
+        ]
         return Response(tuple(trajectories), horizon, self.outputs, record.sampling_time)
 
     def components(self, record: Record) -> Response:
-        """The free run in its parts."""
+        """Return the free run in its parts."""
         return self.simulate(record)
 
     def states(self, record: Record, initial: str | Any = "measured") -> pd.DataFrame:
-        """The states of a free run; of each learned equation its rate by the physics, and what is learned beside it.
+        """Return the states of a free run.
 
-        Of a learned output likewise.
+        The table also has the rate of each learned equation by the physics, and by the learner.
+
+        Learned outputs have the same columns.
         """
         import pandas as pd
 
@@ -183,7 +214,9 @@ class MotionModel(OnRecords, Shown):
             states, _ = self._follow(self.form, self.numbers, start, inputs)
             physics, learner = parts_at(self.form, self.numbers, states, experiment.inputs)
             time = experiment.start_time + np.arange(len(states)) * self.sampling_time
-            columns = {"time": time} | {name: states[:, i] for i, name in enumerate(motion.names_of_states)}
+            columns = {"time": time} | {
+                name: states[:, i] for i, name in enumerate(motion.names_of_states)
+            }
             learned = [motion.names_of_states[i] for i in motion.learned[0]]
             learned += [motion.outputs[i].name for i in motion.learned[1]]
             for i, name in enumerate(learned):
@@ -198,7 +231,10 @@ class MotionModel(OnRecords, Shown):
 
     @property
     def step_inputs(self) -> tuple[str, ...]:
-        """What a step takes: the inputs at its sample, under a first-order hold those at the next one behind them."""
+        """Inputs of a step: those at its sample.
+
+        Under a first-order hold those at the next sample follow behind them.
+        """
         return step_inputs(self.form)
 
     @cached_property
@@ -206,7 +242,9 @@ class MotionModel(OnRecords, Shown):
         return with_scheme(self.form, self.numbers)
 
     def start(self, record: Record, row: int | None = None) -> Vector:
-        """The state at a row of the free run on a record of one experiment, by default at the first row.
+        """Return the state at a row of the free run on a record of one experiment.
+
+        By default it is the first row.
 
         Raises:
             InputError: other channels, several experiments, a row that is not there.
@@ -217,10 +255,14 @@ class MotionModel(OnRecords, Shown):
         state = self._start(experiment, "measured", record)
         if not row:
             return state
-        return self._follow(self.form, self.numbers, state, self.form.inputs(experiment, record))[0][row]
+        return self._follow(self.form, self.numbers, state, self.form.inputs(experiment, record))[
+            0
+        ][row]
 
     def step(self, state: Any, inputs: Any) -> tuple[Array, Array]:
-        """One sample: the next state (nx,) and the outputs (ny,) at this one, from a state and `step_inputs`.
+        """Return one sample: the next state (nx,) and the outputs (ny,) at this one.
+
+        It starts from a state and `step_inputs`.
 
         A pure function of JAX arrays, so that `jax.jit`, `jax.vmap` and `jax.grad` take it.
 
@@ -233,23 +275,26 @@ class MotionModel(OnRecords, Shown):
 
     @property
     def filtering(self) -> tuple[MotionFilter, Numbers, Vector]:
-        """The model as a filter: its dynamics, its numbers, and how large an unknown state is (nx,)."""
+        """The model as a filter: its dynamics, its numbers, and the size of an unknown state."""
         return MotionFilter(self.form), self._stepping, np.asarray(self.loose) / LOOSE
 
     @property
     def reached(self) -> Scaling:
-        """What training reached of the learner's features; of a model saved without it, what physics alone did."""
+        """Range of the learner's features in training.
+
+        For a model saved without it, it is the range of physics alone.
+        """
         return super().reached if self.seen is None else Scaling.fit(self.seen)
 
     def reach(self, record: Record) -> Matrix:
-        """The states and inputs (N, nx + nu) of the free run on a record, where they are finite."""
+        """Return the finite states and inputs (N, nx + nu) of the free run on a record."""
         states = self.states(record)[list(self.form.motion.names_of_states)].to_numpy()
         inputs = [e.inputs for e in self.fitting(record, need_outputs=False).experiments]
         points = np.concatenate([states, np.concatenate(inputs)], axis=1)
         return points[np.isfinite(points).all(axis=1)]
 
     def check_initial(self, initial: Any) -> Matrix:
-        """Outputs of the first rows (rows, ny).
+        """Return outputs of the first rows (rows, ny).
 
         Raises:
             InputError: no rows, or not one column per output.
@@ -258,7 +303,10 @@ class MotionModel(OnRecords, Shown):
             raise InputError(f"`initial` must be 'measured', 'zero' or an array; got '{initial}'.")
         rows = as_signal(initial, "initial")
         if rows.shape[1] != len(self.outputs):
-            raise InputError(f"`initial` has {rows.shape[1]} columns; expected one per output, {len(self.outputs)}.")
+            raise InputError(
+                f"`initial` has {rows.shape[1]} columns; expected one per output, "
+                f"{len(self.outputs)}."
+            )
         return rows
 
     def _free_run(self, experiment: Experiment, record: Record, initial: str | Any) -> Trajectory:
@@ -271,42 +319,58 @@ class MotionModel(OnRecords, Shown):
         if self.form.bound is None:
             return bounded
         alone = self.alone
-        told = self._with_physics(bounded, self._follow(alone.form, alone.numbers, start, inputs)[1])
-        return told if told.diverged else replace(told, outside=self._outside(states, self.form.now(inputs)))
+        run = self._with_physics(bounded, self._follow(alone.form, alone.numbers, start, inputs)[1])
+        return (
+            run
+            if run.diverged
+            else replace(run, outside=self._outside(states, self.form.now(inputs)))
+        )
 
     def _with_physics(self, run: Trajectory, physics: Matrix) -> Trajectory:
-        """A run of the whole model with the output of the physics alone; no value from where that left all bounds."""
+        """Return a run of the whole model with the output of the physics alone.
+
+        There is no value from where that output left all bounds.
+        """
         with np.errstate(all="ignore"):
             wild = ~(np.abs(physics) <= RUNAWAY * self.largest_output).all(axis=1)
-        known = np.where(np.logical_or.accumulate(wild)[:, None] | np.isnan(run.model), np.nan, physics)
+        known = np.where(
+            np.logical_or.accumulate(wild)[:, None] | np.isnan(run.model), np.nan, physics
+        )
         learner = run.model - known
-        return replace(run, baseline=known, learner=learner, learner_before=learner, whole=run.model)
+        return replace(
+            run, baseline=known, learner=learner, learner_before=learner, whole=run.model
+        )
 
-    def _follow(self, form: Moving, numbers: Numbers, start: Vector, inputs: Matrix) -> tuple[Matrix, Matrix]:
+    def _follow(
+        self, form: MotionDynamics, numbers: Numbers, start: Vector, inputs: Matrix
+    ) -> tuple[Matrix, Matrix]:
         rows = len(inputs)
-        padded = np.concatenate([inputs, np.repeat(inputs[-1:], padded_length(rows) - rows, axis=0)])
+        padded = np.concatenate(
+            [inputs, np.repeat(inputs[-1:], padded_length(rows) - rows, axis=0)]
+        )
         states, outputs = _run(form, numbers, start, padded)
         return np.asarray(states)[:rows], np.asarray(outputs)[:rows]
 
     def _outside(self, states: Matrix, inputs: Matrix) -> Any:
-        """Where the learner's features lie outside those of training, (N,)."""
+        """Return where the learner's features are outside those of training, (N,)."""
         if self.form.bound is None:
             return None
         with np.errstate(all="ignore"):
             return self.beyond(np.asarray(self.form.seen(states.T, inputs.T, np)).T)
 
     def first_state(self, experiment: Experiment, record: Record) -> Vector:
-        """Return the state at the first row of the free run that starts from the measured outputs."""
+        """Return the state at the first row of the free run from the measured outputs."""
         return self._start(experiment, "measured", record)
 
     def _start(self, experiment: Experiment, initial: str | Any, record: Record) -> Vector:
-        """The state at the first row."""
+        """Return the state at the first row."""
         if isinstance(initial, str) and initial == "zero":
             return np.zeros(self.form.states)
         if isinstance(initial, str) and initial == "measured":
             if not record.outputs:
                 raise InputError(
-                    "the record has no measured outputs to start from; use initial='zero' or give the values."
+                    "the record has no measured outputs to start from; use initial='zero' or "
+                    "give the values."
                 )
             rows = experiment.outputs
         else:
@@ -315,14 +379,20 @@ class MotionModel(OnRecords, Shown):
         inputs = self.form.inputs(experiment, record)[: len(rows)]
         rows = rows[: len(inputs)]
         size = max(FIRST_ROWS, self.window)
-        windows = Windows(_padded(inputs, size), _padded(rows, size), (np.arange(size) < len(rows))[:, None])
+        windows = Windows(
+            _padded(inputs, size), _padded(rows, size), (np.arange(size) < len(rows))[:, None]
+        )
         guess = self.form.start(rows, [0]).T
-        settled = settle(self.form, self.numbers, guess, windows, self.weight, self.loose, _GUESS_ITERATIONS)[0]
+        settled = settle(
+            self.form, self.numbers, guess, windows, self.weight, self.loose, _GUESS_ITERATIONS
+        )[0]
         return settled[:, 0]
 
     def _ahead(self, experiment: Experiment, record: Record, horizon: int) -> Trajectory:
         self.check_rows(experiment, horizon)
-        window = min(self.window, len(experiment) - horizon)  # short recordings have at least one prediction
+        window = min(
+            self.window, len(experiment) - horizon
+        )  # short recordings have at least one prediction
         first = window + horizon - 1
         outputs, physics = self._predicted(experiment, record, horizon, window)
         nothing = np.zeros_like(outputs)
@@ -330,15 +400,22 @@ class MotionModel(OnRecords, Shown):
         known = np.full(experiment.outputs.shape, np.nan)
         known[first:] = np.where(np.isfinite(physics), physics, np.nan)
         learner = ahead.model - known
-        return replace(ahead, baseline=known, learner=learner, learner_before=learner, whole=ahead.model)
+        return replace(
+            ahead, baseline=known, learner=learner, learner_before=learner, whole=ahead.model
+        )
 
     def _predicted(
         self, experiment: Experiment, record: Record, horizon: int, window: int
     ) -> tuple[Float[np.ndarray, "r ny"], Float[np.ndarray, "r ny"]]:
-        """The outputs from row `window + horizon - 1` on, each `horizon` steps after a window; and by physics alone."""
+        """Return the outputs `horizon` steps after each window, of the model and by physics alone.
+
+        The first row is `window + horizon - 1`.
+        """
         steps = window + horizon
         inputs = self.form.inputs(experiment, record)
-        run = self._follow(self.form, self.numbers, self._start(experiment, "measured", record), inputs)[0]
+        run = self._follow(
+            self.form, self.numbers, self._start(experiment, "measured", record), inputs
+        )[0]
         begins = np.arange(len(inputs) - steps + 1)
         states = self.form.start(experiment.outputs, begins)
         hidden = [i for i, state in enumerate(self.form.motion.states) if state.from_output is None]
@@ -352,13 +429,26 @@ class MotionModel(OnRecords, Shown):
             rows = np.minimum(padded[None, :] + np.arange(length)[:, None], len(inputs) - 1)
             following = np.moveaxis(inputs[rows], -1, 1)
             target = np.moveaxis(experiment.outputs[rows[:window]], -1, 1)
-            windows = Windows(following[:window], target, np.ones((window, len(padded)), dtype=bool))
+            windows = Windows(
+                following[:window], target, np.ones((window, len(padded)), dtype=bool)
+            )
             settled = settle(
-                self.form, self.numbers, states[padded].T, windows, self.weight, self.loose, _WINDOW_ITERATIONS
+                self.form,
+                self.numbers,
+                states[padded].T,
+                windows,
+                self.weight,
+                self.loose,
+                _WINDOW_ITERATIONS,
             )[0]
             ends = [(self.form, self.numbers)]
             ends += [(self.alone.form, self.alone.numbers)] if self.form.bound is not None else []
-            pieces.append([np.asarray(_last(*end, settled, following, steps)).T[: len(chosen)] for end in ends])
+            pieces.append(
+                [
+                    np.asarray(_last(*end, settled, following, steps)).T[: len(chosen)]
+                    for end in ends
+                ]
+            )
         outputs, physics = (np.concatenate([piece[i] for piece in pieces]) for i in (0, -1))
         return outputs, physics
 

@@ -13,17 +13,17 @@ from orthaug._base.errors import InputError
 from orthaug.data.expressions import parse_named
 from orthaug.models.learners import Learner
 from orthaug.models.model_arrays import arrays_of, bound_of, declaration_of, fields_from, said_of
-from orthaug.models.motion_model import MotionModel, Trained
-from orthaug.models.moving import Moving
+from orthaug.models.motion_model import MotionModel, TrainedSegments
+from orthaug.models.moving import MotionDynamics
 from orthaug.physics.motion import Motion, Output, State
 from orthaug.physics.parameters import PhysicalParameter
 
 _LIMITS = {"min": -math.inf, "max": math.inf}
-_LAID = ("segment", "washout", "rows")  # of `Trained`
+_SEGMENTATION = ("segment", "washout", "rows")  # of `Trained`
 
 
 def declare(model: MotionModel) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """What a file says of a model, and its arrays."""
+    """Return the declaration of a model, and its arrays."""
     form, trained = model.form, model.trained
     declared = {
         "kind": "motion",
@@ -33,38 +33,51 @@ def declare(model: MotionModel) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         "learner": declaration_of(form.bound),
         "substeps": form.substeps,
         "window": model.window,
-        "trained": None if trained is None else {key: getattr(trained, key) for key in _LAID},
+        "trained": None
+        if trained is None
+        else {key: getattr(trained, key) for key in _SEGMENTATION},
     }
     arrays = arrays_of(model) | {"loose": np.asarray(model.loose)}
     arrays |= {} if model.seen is None else {"seen": np.asarray(model.seen)}
     if trained is not None:
-        arrays |= {"trained.states": np.asarray(trained.states), "trained.alone": np.asarray(trained.alone)}
+        arrays |= {
+            "trained.states": np.asarray(trained.states),
+            "trained.alone": np.asarray(trained.alone),
+        }
         arrays |= {} if trained.slope is None else {"trained.slope": np.asarray(trained.slope)}
     return declared, arrays
 
 
 def rebuild(
-    declared: dict[str, Any], arrays: dict[str, np.ndarray], baseline: Any, learner: Learner | None, path: Path
+    declared: dict[str, Any],
+    arrays: dict[str, np.ndarray],
+    baseline: Any,
+    learner: Learner | None,
+    path: Path,
 ) -> MotionModel:
-    """The model that a file declares.
+    """Return the model that a file declares.
 
     Raises:
         InputError: a callable is asked for.
     """
     motion = _rebuilt_motion(declared["motion"], baseline, path)
-    form = Moving(
+    form = MotionDynamics(
         motion=motion,
-        features=tuple(parse_named(text, motion.known, "learner input") for text in declared["features"]),
-        bound=bound_of(declared["learner"], arrays.get("numbers.weights", np.zeros(0)), learner, path),
+        features=tuple(
+            parse_named(text, motion.known, "learner input") for text in declared["features"]
+        ),
+        bound=bound_of(
+            declared["learner"], arrays.get("numbers.weights", np.zeros(0)), learner, path
+        ),
         sampling_time=float(declared["sampling_time"]),
         substeps=int(declared["substeps"]),
     )
     kept = declared["trained"]
     trained = None
     if kept is not None:
-        laid = {key: int(kept[key]) for key in _LAID}
+        layout = {key: int(kept[key]) for key in _SEGMENTATION}
         own = {key: arrays.get(f"trained.{key}") for key in ("states", "slope", "alone")}
-        trained = Trained(**laid, **own)  # type: ignore[arg-type]
+        trained = TrainedSegments(**layout, **own)  # type: ignore[arg-type]
     return MotionModel(
         form=form,
         **fields_from(declared, arrays),
@@ -97,7 +110,10 @@ def _declared_motion(motion: Motion) -> dict[str, Any]:
 
 
 def _rebuilt_motion(kept: dict[str, Any], given: Any, path: Path) -> Motion:
-    """The motion that a file declares. Of functions it is the given one, with the saved parameters."""
+    """Return the motion that a file declares.
+
+    For functions it is the given one, with the saved parameters.
+    """
     parameters = [
         PhysicalParameter(**(p | {k: limit for k, limit in _LIMITS.items() if p[k] is None}))
         for p in kept["parameters"]
@@ -106,14 +122,27 @@ def _rebuilt_motion(kept: dict[str, Any], given: Any, path: Path) -> Motion:
     options = {name: kept[name] for name in ("integrator", "substeps", "hold")}
     if kept["kind"] == "equations":
         named = {"constants": kept["constants"], "define": kept["define"]}
-        return Motion.from_equations(states, outputs, parameters, kept["inputs"], **named, **options)
+        return Motion.from_equations(
+            states, outputs, parameters, kept["inputs"], **named, **options
+        )
     if not isinstance(given, Motion) or given.functions is None:
-        raise InputError(f"{path}: the motion was two Python functions; give them again, load(…, baseline=Motion…).")
-    if given.names_of_states != tuple(s.name for s in states) or given.names != tuple(p.name for p in parameters):
         raise InputError(
-            f"{path}: the saved motion has the states {', '.join(s.name for s in states)} and the parameters "
-            f"{', '.join(p.name for p in parameters)}; give the same one."
+            f"{path}: the motion was two Python functions; give them again, load(…, "
+            "baseline=Motion…)."
+        )
+    if given.names_of_states != tuple(s.name for s in states) or given.names != tuple(
+        p.name for p in parameters
+    ):
+        raise InputError(
+            f"{path}: the saved motion has the states {', '.join(s.name for s in states)} and "
+            f"the parameters {', '.join(p.name for p in parameters)}; give the same one."
         )
     constants = tuple(kept["constants"].items())
-    kept_parts = {"states": tuple(states), "outputs": tuple(outputs), "inputs": tuple(kept["inputs"])}
-    return replace(given, parameters=tuple(parameters), constants=constants, **kept_parts, **options)
+    kept_parts = {
+        "states": tuple(states),
+        "outputs": tuple(outputs),
+        "inputs": tuple(kept["inputs"]),
+    }
+    return replace(
+        given, parameters=tuple(parameters), constants=constants, **kept_parts, **options
+    )

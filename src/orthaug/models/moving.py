@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -14,15 +14,145 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug._base.jax import jax, jnp
 from orthaug.data.expressions import Lag
 from orthaug.data.record import Experiment, Record
-from orthaug.models.dynamics import Differentiated, Local, Numbers, Parts
-from orthaug.models.integrators import UNROLLED, Exponentials, advance, held
+from orthaug.models.dynamics import AutodiffDynamics, Local, Numbers, Parts
+from orthaug.models.integrators import UNROLLED, Exponentials, advance, held, input_at
 from orthaug.models.motion_field import MotionField
-from orthaug.models.motion_tangents import output_slopes, sample_slopes
 from orthaug.physics.motion_problem import guess, layout_of
+
+_FEW = 8  # states and parameters; programs of more are slow to compile
+
+
+class Slopes(NamedTuple):
+    """Value of a map from (x, c, w), and ∂/∂x, ∂/∂c, ∂/∂w."""
+
+    value: Any
+    to_x: Any
+    to_c: Any
+    to_w: Any
+
+
+def sample_slopes(form: MotionField, numbers: Numbers, state: Any, row: Any) -> Slopes:
+    """Return x one sample later with its slopes, at one state (nx,) and input row, under `rk4`."""
+    at, halves = input_at(row, len(form.motion.inputs)), 2 * form.substeps
+    h, identity = form.sampling_time / form.substeps, jnp.eye(form.states)
+    through, x = [], state
+    for j in range(form.substeps):
+        u = [at(2 * j + i, halves) for i in range(3)]
+        first = field_slopes(form, numbers, x, u[0])
+        second = field_slopes(form, numbers, x + h / 2 * first.value, u[1])
+        third = field_slopes(form, numbers, x + h / 2 * second.value, u[1])
+        fourth = field_slopes(form, numbers, x + h * third.value, u[2])
+        x = x + h / 6 * (first.value + 2 * (second.value + third.value) + fourth.value)
+        psi4 = h / 6 * identity
+        psi3 = h / 3 * identity + h * psi4 @ fourth.to_x
+        psi2 = h / 3 * identity + h / 2 * psi3 @ third.to_x
+        psi1 = h / 6 * identity + h / 2 * psi2 @ second.to_x
+        through.append(
+            list(zip((psi1, psi2, psi3, psi4), (first, second, third, fourth), strict=True))
+        )
+    to_x, to_c, to_w = identity, 0.0, 0.0
+    learned = np.array(form.motion.learned[0], dtype=int)
+    for stages in reversed(through):  # `to_x` is what follows this substep
+        to_c = to_c + to_x @ sum(psi @ stage.to_c for psi, stage in stages)
+        if form.bound is not None:
+            to_w = to_w + sum((to_x @ psi)[:, learned] @ stage.to_w for psi, stage in stages)
+        to_x = to_x @ (identity + sum(psi @ stage.to_x for psi, stage in stages))
+    return Slopes(x, to_x, to_c, to_w)
+
+
+@partial(jax.jit, static_argnames="form")  # for the stages of all substeps it is traced once
+def field_slopes(form: MotionField, numbers: Numbers, x: Any, u: Any) -> Slopes:
+    """Return F and its slopes at one point.
+
+    ∂/∂w is that of the learned equations only, (nl, nw).
+    """
+    c = numbers.theta - numbers.theta_aux
+    coordinates = form.motion.coordinates
+
+    def physics(x: Any, c: Any) -> Any:
+        return form.motion.rates(x, u, coordinates.physical(c, jnp), jnp)
+
+    value, to_x, to_c = _differentiated(physics, x, c)
+    to_x, to_c = _finite(to_x), _finite(to_c)
+    states, _ = form.motion.learned
+    if form.bound is None or not states:
+        return Slopes(value, to_x, to_c, jnp.zeros((len(states), form.unknowns - len(c))))
+    learner = learner_slopes(form, numbers, x, u)
+    rows = np.array(states)
+    count = len(states)
+    value = value.at[rows].add(learner.value[:count])
+    return Slopes(value, to_x.at[rows].add(learner.to_x[:count]), to_c, learner.to_w[:count])
+
+
+def learner_slopes(form: MotionField, numbers: Numbers, x: Any, u: Any) -> Slopes:
+    """Return g and its slopes at one point: learned equations first, then learned outputs."""
+    bound = form.bound
+    assert bound is not None
+
+    def features(x: Any) -> Any:
+        return (form.seen(x, u) - numbers.centre) / numbers.halfwidth
+
+    z, to_z = features(x), _finite(jax.jacfwd(features)(x))
+    value, pull = jax.vjp(
+        lambda leaves, z: bound.from_leaves(leaves, z), bound.leaves(numbers.weights), z
+    )
+    gain = jnp.broadcast_to(jnp.asarray(numbers.gain), (bound.ny,))
+    pulled = [pull(row) for row in jnp.diag(gain)]
+    to_w = jnp.stack(
+        [jnp.concatenate([jnp.ravel(leaf) for leaf in leaves]) for leaves, _ in pulled]
+    )
+    to_x = jnp.stack([of_z @ to_z for _, of_z in pulled])
+    return Slopes(gain * value, _finite(to_x), jnp.zeros((bound.ny, 0)), _finite(to_w))
+
+
+def output_slopes(form: MotionField, numbers: Numbers, x: Any, u: Any) -> Slopes:
+    """Return y and its slopes at one point."""
+    c = numbers.theta - numbers.theta_aux
+
+    def physics(x: Any, c: Any) -> Any:
+        return form.motion.observed(x, u, form.motion.coordinates.physical(c, jnp), jnp)
+
+    value, to_x, to_c = _differentiated(physics, x, c)
+    to_w = jnp.zeros((len(value), form.unknowns - len(c)))
+    states, outputs = form.motion.learned
+    if form.bound is not None and outputs:
+        learner, rows, count = learner_slopes(form, numbers, x, u), np.array(outputs), len(states)
+        value = value.at[rows].add(learner.value[count:])
+        to_x = to_x.at[rows].add(learner.to_x[count:])
+        to_w = to_w.at[rows].set(learner.to_w[count:])
+    return Slopes(value, _finite(to_x), _finite(to_c), to_w)
+
+
+def _differentiated(function: Any, x: Any, c: Any) -> tuple[Any, Any, Any]:
+    """Return the value and its slopes by x and c.
+
+    Few entries are differentiated one at a time, without what an entry does not touch.
+    """
+    entries, n0 = [*x, *c], len(x)
+    if len(entries) > _FEW:
+        return function(x, c), *jax.jacfwd(function, (0, 1))(x, c)
+
+    def along(i: int) -> Any:
+        def of(entry: Any) -> Any:
+            moved = [*entries[:i], entry, *entries[i + 1 :]]
+            return function(jnp.stack(moved[:n0]), jnp.stack(moved[n0:]))
+
+        return jax.jvp(of, (entries[i],), (jnp.ones_like(entries[i]),))[1]
+
+    slopes = [along(i) for i in range(len(entries))]
+    return function(x, c), jnp.stack(slopes[:n0], axis=-1), jnp.stack(slopes[n0:], axis=-1)
+
+
+def _finite(slope: Any) -> Any:
+    """Return slopes with 0 for a derivative that does not exist, as of sqrt(max(x, 0)) at 0."""
+    return jnp.where(jnp.isfinite(slope), slope, 0.0)
+
+
+_LARGE = 150  # operations in the expressions of a motion: beyond, compiling its stages one by one takes a minute
 
 
 @dataclass(frozen=True)
-class Moving(MotionField, Differentiated):
+class MotionDynamics(MotionField, AutodiffDynamics):
     """A motion with a learner as dynamics, without its numbers: `Dynamics`."""
 
     linear = False
@@ -43,24 +173,33 @@ class Moving(MotionField, Differentiated):
         return layout_of(self.motion)
 
     @property
-    def alone(self) -> Moving:
-        """The same motion without a learner."""
+    def alone(self) -> MotionDynamics:
+        """These dynamics without the learner."""
         return replace(self, features=(), bound=None)
 
-    def start(self, outputs: Matrix, rows: Sequence[int] | Int[np.ndarray, "r"]) -> Float[np.ndarray, "r n0"]:
-        """States as they are declared to start, by local polynomials through the measured outputs about the rows."""
+    def start(
+        self, outputs: Matrix, rows: Sequence[int] | Int[np.ndarray, "r"]
+    ) -> Float[np.ndarray, "r n0"]:
+        """Return the states as declared to start.
+
+        Local polynomials through the measured outputs about the rows determine them.
+        """
         return guess(self.motion, outputs, rows, self.sampling_time)
 
     def start_rows(self, weight: Matrix) -> Matrix:
-        """A start costs nothing: the outputs from there on tell it."""
+        """Return zero weights: a start costs nothing, for the outputs after it determine it."""
         return np.zeros((self.states, self.states))
 
     def inputs(self, experiment: Experiment, record: Record) -> Matrix:
         return held(np.asarray(experiment.inputs), self.motion.hold, self.substeps)
 
     def describe(self, state: Vector, inputs: Vector) -> dict[str, float]:
-        """States and inputs by name."""
-        named = zip((*self.motion.names_of_states, *self.motion.inputs), (*state, *self.now(inputs)), strict=True)
+        """Return states and inputs by name."""
+        named = zip(
+            (*self.motion.names_of_states, *self.motion.inputs),
+            (*state, *self.now(inputs)),
+            strict=True,
+        )
         return {name: float(value) for name, value in named}
 
     def step(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
@@ -81,11 +220,15 @@ class Moving(MotionField, Differentiated):
             self.sampling_time,
             self.substeps,
             self.motion.integrator,
+            looped=self._large,
         )
         return following, parts
 
     def prepared(self, numbers: Numbers) -> Numbers:
-        """With the exponentials of an exact integrator and their derivatives by the coordinates of p."""
+        """Return the numbers with the exponentials of an exact integrator.
+
+        Their derivatives are by the coordinates of p.
+        """
         if self.motion.integrator != "exact":
             return numbers
 
@@ -96,42 +239,64 @@ class Moving(MotionField, Differentiated):
         return numbers._replace(scheme=(of(theta), jax.jacfwd(of)(theta)))
 
     def exponentials(self, numbers: Numbers) -> Exponentials | None:
-        """Of the linear part over a substep; None where the integrator needs none."""
+        """Return the exponentials of the linear part over a substep.
+
+        None where the integrator needs none.
+        """
         if self.motion.integrator != "exact":
             return None
         return Exponentials.of(self.linear_part(numbers), self.sampling_time / self.substeps)
 
     @property
-    def _by_stages(self) -> bool:
-        return self.motion.integrator == "rk4" and self.substeps <= UNROLLED and self.differentiable
+    def _large(self) -> bool:
+        return self.motion.size > _LARGE
 
-    def tangents(self, numbers: Numbers, state: Any, slopes: Any, inputs: Any) -> tuple[Any, Any, Any, Any]:
+    @property
+    def _by_stages(self) -> bool:
+        few = self.substeps <= UNROLLED and not self._large
+        return self.motion.integrator == "rk4" and few and self.differentiable
+
+    def tangents(
+        self, numbers: Numbers, state: Any, slopes: Any, inputs: Any
+    ) -> tuple[Any, Any, Any, Any]:
         return self.local(numbers, state, inputs).along(slopes, fused=self._by_stages)
 
     def local(self, numbers: Numbers, states: Any, inputs: Any) -> Local:
-        """Of a few Runge-Kutta substeps by the adjoint of their stages; otherwise by automatic differentiation."""
+        """Return the slopes of a few Runge-Kutta substeps by the adjoint of their stages.
+
+        Other schemes are differentiated automatically.
+        """
         if numbers.scheme is not None:
             value, to_state, to_unknowns = super().local(numbers, states, inputs)
             return Local(value, to_state, to_unknowns + self._by_scheme(numbers, states, inputs))
         if not self._by_stages or numbers.limits is not None:
             return super().local(numbers, states, inputs)
         following = jax.vmap(partial(sample_slopes, self, numbers), -1, -1)(states, inputs)
-        output = jax.vmap(lambda x, row: output_slopes(self, numbers, x, self.now(row)), -1, -1)(states, inputs)
+        output = jax.vmap(lambda x, row: output_slopes(self, numbers, x, self.now(row)), -1, -1)(
+            states, inputs
+        )
         known = 4 if self.bound is not None else 3  # there are no weights otherwise
-        value, to_x, *own = (jnp.concatenate(both) for both in zip(following[:known], output[:known], strict=True))
+        value, to_x, *own = (
+            jnp.concatenate(both) for both in zip(following[:known], output[:known], strict=True)
+        )
         return Local(value, to_x, jnp.concatenate(own, axis=1))
 
     def _by_scheme(self, numbers: Numbers, state: Any, inputs: Any) -> Any:
-        """How states and outputs (n0 + ny, n, r) follow p through the exponentials, which a step takes as given."""
+        """Return the derivatives of states and outputs by p through the exponentials.
+
+        They are (n0 + ny, n, r). A step takes the exponentials as given.
+        """
         scheme, by_theta = numbers.scheme
 
         def following(scheme: Any, state: Any, row: Any) -> Any:
             return self.step(numbers._replace(scheme=(scheme, None)), state, row)[0]
 
         def along(moved: Any) -> Any:
-            return jax.vmap(lambda x, row: jax.jvp(lambda s: following(s, x, row), (scheme,), (moved,))[1], -1, -1)(
-                state, inputs
-            )
+            return jax.vmap(
+                lambda x, row: jax.jvp(lambda s: following(s, x, row), (scheme,), (moved,))[1],
+                -1,
+                -1,
+            )(state, inputs)
 
         moved = jax.vmap(along, -1, 1)(by_theta)  # a tangent for each parameter: (nx, np, m)
         after = self.unknowns - moved.shape[1]
@@ -139,11 +304,14 @@ class Moving(MotionField, Differentiated):
 
 
 @partial(jax.jit, static_argnames="form")
-def _step(form: Moving, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
-    """A step. It is traced once, whatever programs it stands in; so is the field in it."""
+def _step(form: MotionDynamics, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
+    """Return a step.
+
+    It is traced once, whatever programs contain it; so is the field in it.
+    """
     return form._stepped(numbers, state, inputs)
 
 
 @partial(jax.jit, static_argnames="form")
-def _field(form: Moving, numbers: Numbers, x: Any, u: Any) -> Any:
+def _field(form: MotionDynamics, numbers: Numbers, x: Any, u: Any) -> Any:
     return sum(form.rates(numbers, x, u))

@@ -1,4 +1,4 @@
-"""What every fitted model does with a record: match its channels and rows, and cut a run that left all bounds."""
+"""Records of fitted models: match channels and rows, and cut a run that left all bounds."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ RUNAWAY = 1e6  # times the largest training output: a free run beyond this has d
 WITHIN = 1e-9  # of a feature's half width: the largest of training is no extrapolation
 
 
-class OnRecords:
+class RecordModel:
     """A model of some channels at a sampling time."""
 
     form: Dynamics
@@ -34,20 +34,22 @@ class OnRecords:
 
     @property
     def preparation(self) -> tuple[Any, ...]:
-        """The steps that the training data went through, for `prepare` and `read_record` of other data."""
-        return steps_again(self.prepared, [c.name for c in (*self.inputs, *self.outputs)], self.sampling_time)[0]
+        """Preparation of the training data, for `prepare` and `read_record` of other data."""
+        return steps_again(
+            self.prepared, [c.name for c in (*self.inputs, *self.outputs)], self.sampling_time
+        )[0]
 
     @property
     def reached(self) -> Scaling:
-        """What training reached of the learner's features."""
+        """Range of the learner's features in training."""
         return Scaling(np.asarray(self.numbers.centre), np.asarray(self.numbers.halfwidth))
 
     def beyond(self, features: Matrix) -> Bool[np.ndarray, "N"]:
-        """Where one of the learner's features (N, nz) lies outside of what training reached."""
+        """Return where a feature of the learner (N, nz) is outside its range in training."""
         return ~(np.abs(self.reached(features)) <= 1 + WITHIN).all(axis=1)
 
     def bounded(self, parts: Parts, experiment: Experiment, measured: Matrix | None) -> Trajectory:
-        """A free run cut where it left all bounds."""
+        """Return a free run cut where it left all bounds."""
         whole = trajectory(parts, experiment, measured, self.form.first_row)
         with np.errstate(all="ignore"):
             wild = ~(np.abs(whole.model[self.form.first_row :]) <= RUNAWAY * self.largest_output)
@@ -55,39 +57,46 @@ class OnRecords:
             return whole
         step = int(np.argmax(wild.any(axis=1)))
         output = self.outputs[int(np.argmax(wild[step]))].name
-        cut = Parts(*(np.where(np.arange(len(part))[:, None] < step, part, np.nan) for part in parts))
+        cut = Parts(
+            *(np.where(np.arange(len(part))[:, None] < step, part, np.nan) for part in parts)
+        )
         bounded = trajectory(cut, experiment, measured, self.form.first_row)
         return replace(bounded, diverged=(step + self.form.first_row, output))
 
     def check_rows(self, experiment: Experiment, first: int) -> None:
-        """Raises InputError where an experiment ends before the row `first`."""
+        """Raise InputError where an experiment ends before the row `first`."""
         if len(experiment) <= first:
             name = experiment.source or "the record"
-            raise InputError(f"{name} has {len(experiment)} rows, too few: the first value is at row {shown(first)}.")
+            raise InputError(
+                f"{name} has {len(experiment)} rows, too few: the first value is at row "
+                f"{shown(first)}."
+            )
 
     def _wanted(self, with_outputs: bool) -> str:
-        """A record of the model's channels, in the words of Python."""
+        """Describe a record of the model's channels in Python."""
         given = {
             "u": ("inputs", self.inputs),
             "y": ("outputs", self.outputs if with_outputs or not self.inputs else ()),
         }
         arrays = [f"{name}={name}" for name, (_, channels) in given.items() if channels]
-        names = [f"{kind}={[c.name for c in channels]}" for kind, channels in given.values() if channels]
+        names = [
+            f"{kind}={[c.name for c in channels]}" for kind, channels in given.values() if channels
+        ]
         arguments = ", ".join([*arrays, *names, f"sampling_time={self.sampling_time:g}"])
         return f"a Record, such as Record.from_arrays({arguments})"
 
     def fitting(self, record: Record, *, need_outputs: bool, gaps: bool = False) -> Record:
-        """The record's channels in the model's order, by name.
+        """Return the record's channels in the model's order, by name.
 
         Raises:
-            InputError: a channel is missing, the sampling time differs by more than 0.1 %, or outputs are missing
-                samples and `gaps` are not allowed.
+            InputError: a channel is missing, the sampling time differs by more than 0.1 %, or
+                outputs are missing samples and `gaps` are not allowed.
         """
         check_type(record, Record, "record", self._wanted(need_outputs))
         if not same_step(record.sampling_time, self.sampling_time):
             raise InputError(
-                f"the record is sampled every {record.sampling_time:g} s, the model every {self.sampling_time:g} s; "
-                "resample the record."
+                f"the record is sampled every {record.sampling_time:g} s, the model every "
+                f"{self.sampling_time:g} s; resample the record."
             )
         with_outputs = need_outputs or bool(record.outputs)
         names = {kind: [c.name for c in getattr(record, kind)] for kind in ("inputs", "outputs")}
@@ -96,8 +105,13 @@ class OnRecords:
             missing = [c.name for c in channels if c.name not in names[kind]]
             if missing:
                 there = ", ".join(names[kind]) or "none"
-                raise InputError(f"the record lacks the {kind[:-1]} {', '.join(missing)} of the model; it has {there}.")
-        order = {kind: [names[kind].index(c.name) for c in channels] for kind, channels in wanted.items()}
+                raise InputError(
+                    f"the record lacks the {kind[:-1]} {', '.join(missing)} of the model; it "
+                    f"has {there}."
+                )
+        order = {
+            kind: [names[kind].index(c.name) for c in channels] for kind, channels in wanted.items()
+        }
         experiments = tuple(
             replace(e, inputs=e.inputs[:, order["inputs"]], outputs=e.outputs[:, order["outputs"]])
             for e in record.experiments
@@ -108,8 +122,10 @@ class OnRecords:
         return fitting
 
 
-def trajectory(parts: Parts, experiment: Experiment, measured: Matrix | None, first: int) -> Trajectory:
-    """Parts from a row on as a trajectory of the whole experiment."""
+def trajectory(
+    parts: Parts, experiment: Experiment, measured: Matrix | None, first: int
+) -> Trajectory:
+    """Return parts from a row on as a trajectory of the whole experiment."""
 
     def whole(values: Any) -> Matrix:
         padded = np.full((len(experiment), values.shape[1]), np.nan)
@@ -117,5 +133,10 @@ def trajectory(parts: Parts, experiment: Experiment, measured: Matrix | None, fi
         return padded
 
     return Trajectory(
-        whole(parts.baseline), whole(parts.learner), whole(parts.raw), measured, first, experiment.start_time
+        whole(parts.baseline),
+        whole(parts.learner),
+        whole(parts.raw),
+        measured,
+        first,
+        experiment.start_time,
     )

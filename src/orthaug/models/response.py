@@ -24,9 +24,13 @@ BAND = 1.959963984540054  # standard deviations: 95 % of a normal distribution
 
 @dataclass(frozen=True, eq=False)
 class Scores:
-    """Per output: `rmse` in the output's unit, `nrmse` = RMSE / std(y), `fit` = 100 (1 − NRMSE) in %, not clipped.
+    """Root-mean-square error and fit of each output.
 
-    Entries are NaN where a score does not exist (a run that diverged, an output that does not move).
+    `rmse` is in the output's unit, `nrmse` = RMSE / std(y), `fit` = 100 (1 − NRMSE) in %, not
+    clipped.
+
+    Entries are NaN where a score does not exist (a run that diverged, an output that does not
+    move).
     """
 
     rmse: Vector
@@ -35,13 +39,18 @@ class Scores:
     samples: int
 
     def __repr__(self) -> str:
-        kinds = ((name, [f"{value:.6g}" for value in getattr(self, name)]) for name in ("rmse", "nrmse", "fit"))
-        told = ", ".join(f"{name} = {' | '.join(values)}" for name, values in kinds)
-        return f"Scores({told} %, {self.samples} samples)"
+        kinds = (
+            (name, [f"{value:.6g}" for value in getattr(self, name)])
+            for name in ("rmse", "nrmse", "fit")
+        )
+        scores = ", ".join(f"{name} = {' | '.join(values)}" for name, values in kinds)
+        return f"Scores({scores} %, {self.samples} samples)"
 
 
 def scores(measured: Matrix, model: Matrix) -> Scores:
-    """RMSE, NRMSE (population standard deviation of the scored samples) and FIT of each column.
+    """Return RMSE, NRMSE and FIT of each column.
+
+    NRMSE has the population standard deviation of the scored samples.
 
     Args:
         measured: (N, ny); what is NaN is not scored.
@@ -60,7 +69,7 @@ def scores(measured: Matrix, model: Matrix) -> Scores:
 
 
 def scores_of(rmse: Vector, deviation: Vector, samples: int) -> Scores:
-    """Scores from the RMSE and the standard deviation of each output (ny,)."""
+    """Return scores from the RMSE and the standard deviation of each output (ny,)."""
     rmse = np.where(np.isfinite(rmse), rmse, np.nan)
     moves = (deviation > 0) & np.isfinite(deviation)
     nrmse = np.where(moves, rmse / np.where(moves, deviation, 1.0), np.nan)
@@ -69,14 +78,17 @@ def scores_of(rmse: Vector, deviation: Vector, samples: int) -> Scores:
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """A model along one experiment; arrays (N, ny) are NaN on rows without a value (the first lags).
+    """A model along one experiment.
 
-    `baseline + learner` is the model's output. `learner_before` is f, before θ_aux moved its share in the physics to θ.
-    `diverged` is the row and output at which a free run left all bounds; None where it did not. `outside` (N,) marks
-    the rows of a free run on which the learner's features lie outside those of training: there it extrapolates. None
-    without a learner, and where the features of training are not known. `whole` (N, ny) is the model's output where its
-    parts may lack a value: a motion whose physics alone runs away; None where it is their sum. `std` (N, ny) is the
-    standard deviation of measured less model where an observer predicts.
+    Arrays (N, ny) are NaN on rows without a value (the first lags).
+
+    `baseline + learner` is the model's output. `learner_before` is f, before θ_aux moved its share
+    in the physics to θ. `diverged` is the row and output at which a free run left all bounds; None
+    where it did not. `outside` (N,) marks the rows of a free run on which the learner's features
+    lie outside those of training: there it extrapolates. None without a learner, and where the
+    features of training are not known. `whole` (N, ny) is the model's output where its parts may
+    lack a value: a motion whose physics alone runs away; None where it is their sum. `std` (N, ny)
+    is the standard deviation of measured less model where an observer predicts.
     """
 
     baseline: Matrix
@@ -93,8 +105,15 @@ class Trajectory:
     def __repr__(self) -> str:
         samples, outputs = self.baseline.shape
         measured = "" if self.measured is not None else ", not measured"
-        ended = "" if self.diverged is None else f", diverged in {self.diverged[1]} at row {self.diverged[0]}"
-        return f"Trajectory({samples} samples of {outputs} output{'s' * (outputs > 1)}{measured}{ended})"
+        ended = (
+            ""
+            if self.diverged is None
+            else f", diverged in {self.diverged[1]} at row {self.diverged[0]}"
+        )
+        return (
+            f"Trajectory({samples} samples of {outputs} "
+            f"output{'s' * (outputs > 1)}{measured}{ended})"
+        )
 
     @property
     def model(self) -> Matrix:
@@ -102,13 +121,16 @@ class Trajectory:
 
     @property
     def baseline_before(self) -> Matrix:
-        """φ(θ − θ_aux): what goes with `learner_before`."""
+        """φ(θ − θ_aux), the baseline that belongs to `learner_before`."""
         return self.model - self.learner_before
 
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """Trajectories of every experiment of a record; `horizon` in steps, None for a free run (simulation)."""
+    """Trajectories of every experiment of a record.
+
+    `horizon` in steps, None for a free run (simulation).
+    """
 
     trajectories: tuple[Trajectory, ...]
     horizon: int | None
@@ -123,17 +145,26 @@ class Response:
     def __repr__(self) -> str:
         kind = "simulation" if self.horizon is None else f"{self.horizon}-step prediction"
         count, names = len(self.trajectories), ", ".join(channel.name for channel in self.outputs)
-        return f"Response({kind} of {names}, {count} experiment{'s' * (count > 1)}, {len(self.model)} samples)"
+        return (
+            f"Response({kind} of {names}, {count} experiment{'s' * (count > 1)}, "
+            f"{len(self.model)} samples)"
+        )
 
     def scores(self, skip: int | tuple[int, ...] = 0) -> Scores:
-        """Scores over all experiments, without the first `skip` samples of each; a tuple has one number per experiment.
+        """Return scores over all experiments, without the first `skip` samples of each.
+
+        A tuple has one number per experiment.
 
         Raises:
             InputError: no measured outputs, or no sample left to score.
         """
-        skips = (skip,) * len(self.trajectories) if isinstance(skip, int | np.integer) else tuple(skip)
+        skips = (
+            (skip,) * len(self.trajectories) if isinstance(skip, int | np.integer) else tuple(skip)
+        )
         if len(skips) != len(self.trajectories):
-            raise InputError(f"`skip` has {len(skips)} numbers for {len(self.trajectories)} experiments.")
+            raise InputError(
+                f"`skip` has {len(skips)} numbers for {len(self.trajectories)} experiments."
+            )
         measured, model = [], []
         for trajectory, first in zip(self.trajectories, skips, strict=True):
             if trajectory.measured is None:
@@ -147,18 +178,25 @@ class Response:
 
     @property
     def physics_alone(self) -> Response:
-        """Of the free run of a motion that of its physics alone; of other responses the physics' part."""
+        """Response of the physics alone, for the free run of a motion.
+
+        For other responses it is the physics' part.
+        """
         found = []
         for t in self.trajectories:
             lost = np.isnan(t.baseline) & ~np.isnan(t.model)
             row = int(np.argmax(lost.any(axis=1)))
             diverged = (row, self.outputs[int(np.argmax(lost[row]))].name) if lost.any() else None
             nothing = np.zeros_like(t.baseline)
-            found.append(replace(t, learner=nothing, learner_before=nothing, diverged=diverged, whole=None))
+            found.append(
+                replace(t, learner=nothing, learner_before=nothing, diverged=diverged, whole=None)
+            )
         return replace(self, trajectories=tuple(found))
 
     def to_frame(self, experiment: int = 0) -> pd.DataFrame:
-        """A table with `time` and, per output, measured, model, baseline and learner; of a free run `extrapolates`.
+        """Return a table with `time` and, per output, measured, model, baseline and learner.
+
+        A free run also has `extrapolates`.
 
         Of an observer's prediction also the 95 % band of what is measured.
         """
@@ -173,8 +211,12 @@ class Response:
                 columns[channel.name] = trajectory.measured[:, i]
             columns[f"{channel.name}_model"] = trajectory.model[:, i]
             if trajectory.std is not None:
-                columns[f"{channel.name}_model_low"] = trajectory.model[:, i] - BAND * trajectory.std[:, i]
-                columns[f"{channel.name}_model_high"] = trajectory.model[:, i] + BAND * trajectory.std[:, i]
+                columns[f"{channel.name}_model_low"] = (
+                    trajectory.model[:, i] - BAND * trajectory.std[:, i]
+                )
+                columns[f"{channel.name}_model_high"] = (
+                    trajectory.model[:, i] + BAND * trajectory.std[:, i]
+                )
             columns[f"{channel.name}_baseline"] = trajectory.baseline[:, i]
             columns[f"{channel.name}_learner"] = trajectory.learner[:, i]
         if trajectory.outside is not None:

@@ -1,8 +1,10 @@
-"""Sums over rows, and the engine that makes them. Training and its statistics need no more of the data (F4).
+"""Sums over rows, and the engine that makes them.
 
-Chunks hold the rows, with the row index last, padded with zero weights to one shape. So one compiled program serves any
-number of rows, and nothing of size N × nw ever exists. What is summed is a function of one chunk. The function does not
-know where the rows are.
+Training and its statistics need no more of the data (F4).
+
+Chunks hold the rows, with the row index last, padded with zero weights to one shape. So one
+compiled program serves any number of rows, and nothing of size N × nw ever exists. What is summed
+is a function of one chunk. The function does not know where the rows are.
 """
 
 from __future__ import annotations
@@ -23,20 +25,26 @@ from orthaug.models.lagged import Lagged
 from orthaug.models.learners import Bound
 
 CHUNK_ROWS = 5000  # fastest of 500 … 10000 at 10⁴×81 and 10⁵×257, see benchmarks/
-_FEW, _SHARED = 1024, 256  # rows: so few take less time than to compile for their number, or for that of a fold
+_FEW, _SHARED = (
+    1024,
+    256,
+)  # rows: so few take less time than to compile for their number, or for that of a fold
 
 
 class Chunk(NamedTuple):
-    """Some rows (…, m), or in memory all of them (k, …, m); zero gain and zero entries are padding."""
+    """Some rows (…, m), or in memory all of them (k, …, m).
+
+    Zero gain and zero entries are padding.
+    """
 
     z: Float[Array, "*k nz m"]
-    """Scaled learner features."""
+    """Scaled features of the learner."""
     q: Float[Array, "*k ny nt m"]
     """Orthonormal basis of the physics."""
     e: Float[Array, "*k ny m"]
     """P⊥Y, what the physics cannot express."""
     gain: Float[Array, "*k ny ny m"]
-    """What turns the learner's outputs into whitened rows."""
+    """Matrices that turn the learner's outputs into whitened rows."""
 
 
 class Overlap(NamedTuple):
@@ -54,81 +62,101 @@ class Room(NamedTuple):
     size: float
     """Its memory in bytes."""
     place: str
-    """What it is called: "the worker tcp://…"."""
+    """Name in messages: "the worker tcp://…"."""
     matrices: int
     """Gram matrices that it holds at once, where sums are made and added."""
 
 
 @runtime_checkable
 class Engine(Protocol):
-    """Where rows are, and who adds up over them."""
+    """Sums over rows, wherever the rows are."""
 
     @property
     def resident(self) -> bool:
-        """Whether all rows are one `Chunk` on the device, so that a whole training run may be compiled around a sum."""
+        """True if all rows are one `Chunk` on the device.
+
+        A whole training run can then be compiled around a sum.
+        """
         ...
 
-    def lay(self, z: Matrix, q: Any, e: Matrix, gain: Float[np.ndarray, "N ny ny"]) -> Any:
-        """Rows (N, …) as this engine keeps them."""
+    def build_rows(self, z: Matrix, q: Any, e: Matrix, gain: Float[np.ndarray, "N ny ny"]) -> Any:
+        """Keep rows (N, …) in the engine's memory."""
         ...
 
-    def draw(self, source: Any, laying: Callable[[Any], Any]) -> Any:
-        """Rows of a source (`data.sources.Source`), laid out by `laying` of each of its partitions."""
+    def draw(self, source: Any, row_builder: Callable[[Any], Any]) -> Any:
+        """Return rows of a `data.sources.Source`, which `row_builder` makes of each partition."""
         ...
 
     def passes(self, function: Callable[[Any], Any], partitions: Sequence[Any]) -> list[Any]:
-        """`[function(partition) for partition in partitions]`, wherever the partitions are read."""
+        """Return `[function(p) for p in partitions]`, where the partitions are read."""
         ...
 
     def sum(self, function: Callable[..., Any], rows: Any, *arguments: Any) -> Any:
-        """Σ function(chunk, *arguments) over all chunks; `function` is hashable, its result any pytree of arrays."""
+        """Return Σ function(chunk, *arguments) over all chunks.
+
+        `function` is hashable, its result any pytree of arrays.
+        """
         ...
 
     @property
     def shares(self) -> int:
-        """How many can sum at a time: chunks that are placed should be a multiple."""
+        """Number of simultaneous sums; the number of placed chunks should be a multiple of it."""
         ...
 
     def place(self, chunks: Any, like: Any = None) -> Any:
-        """Chunks of any pytree, (k, …) each, as rows; where those of `like` are, which are as many."""
+        """Place chunks of any pytree, (k, …) each, as rows.
+
+        They go where those of `like` are, which are as many.
+        """
         ...
 
-    def read(self, function: Callable[[Any], Any], partitions: Sequence[Any], counts: Sequence[int]) -> Any:
-        """Rows of the chunks, `counts` of each, that `function(partition)` gives one by one."""
+    def read(
+        self, function: Callable[[Any], Any], partitions: Sequence[Any], counts: Sequence[int]
+    ) -> Any:
+        """Return rows from the chunks that `function(partition)` yields, `counts` of each."""
         ...
 
-    def along(self, function: Callable[[Any, Any], Any], partitions: Sequence[Any], carry: Any) -> Any:
-        """`carry = function(partition, carry)` over all partitions in their order."""
+    def along(
+        self, function: Callable[[Any, Any], Any], partitions: Sequence[Any], carry: Any
+    ) -> Any:
+        """Compute `carry = function(partition, carry)` over all partitions in their order."""
         ...
 
     def beside(self, *rows: Any) -> Any:
-        """Rows whose chunks are tuples of the chunks of others."""
+        """Return rows whose chunks are tuples of the chunks of others."""
         ...
 
     def keep(self, function: Callable[..., Any], rows: Any, *arguments: Any) -> tuple[Any, Any]:
-        """Of `function(chunk, *arguments)`, a pair: the first as rows that stay where they are, Σ of the second."""
+        """Return two results of `function(chunk, *arguments)`: kept rows, and a sum.
+
+        The first of each pair stays where it is, the second is summed.
+        """
         ...
 
     def fetch(self, rows: Any) -> Any:
-        """What was placed or kept, (k, …) each, in NumPy."""
+        """Return placed or kept rows, (k, …) each, in NumPy."""
         ...
 
-    def map(self, function: Any, given: Any, items: Sequence[Any], heard: Heard = nobody) -> Iterator[Any]:
-        """Independent runs, `function(given, item, tell)` each; as `Threads.map`."""
+    def map(
+        self, function: Any, given: Any, items: Sequence[Any], heard: Heard = nobody
+    ) -> Iterator[Any]:
+        """Yield results of independent runs, `function(given, item, report)`; as `Threads.map`."""
         ...
 
     def room(self) -> Room | None:
-        """Where memory may be short beside this process; None where all sums are made here."""
+        """Return the smallest memory outside this process; None where all sums are made here."""
         ...
 
 
-class Here(Threads):
-    """What engines share that read partitions in this process, and keep the chunks of rows in one array."""
+class LocalEngine(Threads):
+    """Engine that reads partitions in this process and keeps the chunks of rows in one array."""
 
     def passes(self, function: Callable[[Any], Any], partitions: Sequence[Any]) -> list[Any]:
         return in_threads(function, partitions)
 
-    def along(self, function: Callable[[Any, Any], Any], partitions: Sequence[Any], carry: Any) -> Any:
+    def along(
+        self, function: Callable[[Any, Any], Any], partitions: Sequence[Any], carry: Any
+    ) -> Any:
         return reduce(lambda carry, partition: function(partition, carry), partitions, carry)
 
     def beside(self, *rows: Any) -> Any:
@@ -139,17 +167,17 @@ class Here(Threads):
 
 
 @dataclass(frozen=True)
-class InMemory(Here):
+class InMemory(LocalEngine):
     """All rows on the device, summed by one compiled loop over chunks."""
 
     limit: int = CHUNK_ROWS
     resident: bool = True
 
-    def lay(self, z: Matrix, q: Any, e: Matrix, gain: Float[np.ndarray, "N ny ny"]) -> Chunk:
-        return self.place(laid_out(z, q, e, gain, chunk_shape(len(z), self.limit)))
+    def build_rows(self, z: Matrix, q: Any, e: Matrix, gain: Float[np.ndarray, "N ny ny"]) -> Chunk:
+        return self.place(build_chunk(z, q, e, gain, chunk_shape(len(z), self.limit)))
 
-    def draw(self, source: Any, laying: Callable[[Any], Any]) -> Chunk:
-        return self.lay(*brought(source, laying))
+    def draw(self, source: Any, row_builder: Callable[[Any], Any]) -> Chunk:
+        return self.build_rows(*brought(source, row_builder))
 
     def sum(self, function: Callable[..., Any], rows: Chunk, *arguments: Any) -> Any:
         return _compiled_sum(function, rows, arguments)
@@ -161,7 +189,9 @@ class InMemory(Here):
     def place(self, chunks: Any, like: Any = None) -> Any:
         return jax.tree.map(jax.device_put, chunks)
 
-    def read(self, function: Callable[[Any], Any], partitions: Sequence[Any], counts: Sequence[int]) -> Any:
+    def read(
+        self, function: Callable[[Any], Any], partitions: Sequence[Any], counts: Sequence[int]
+    ) -> Any:
         return self.place(all_chunks(function, partitions))
 
     def keep(self, function: Callable[..., Any], rows: Any, *arguments: Any) -> tuple[Any, Any]:
@@ -172,7 +202,9 @@ class InMemory(Here):
 
 
 @partial(jax.jit, static_argnames="function")
-def _compiled_fold(function: Callable[..., Any], rows: Any, arguments: tuple[Any, ...]) -> tuple[Any, Any]:
+def _compiled_fold(
+    function: Callable[..., Any], rows: Any, arguments: tuple[Any, ...]
+) -> tuple[Any, Any]:
     return row_fold(lambda chunk: function(chunk, *arguments), rows)
 
 
@@ -182,28 +214,31 @@ def _compiled_sum(function: Callable[..., Any], rows: Chunk, arguments: tuple[An
 
 
 def all_chunks(function: Callable[[Any], Any], partitions: Sequence[Any]) -> Any:
-    """The chunks that a function gives of every partition, (k, …) each."""
+    """Return the chunks that a function makes of every partition, (k, …) each."""
     return together([chunk for partition in partitions for chunk in function(partition)])
 
 
 def together(chunks: Sequence[Any]) -> Any:
-    """Chunks of any pytree as one, (k, …) each."""
+    """Join chunks of any pytree into one, (k, …) each."""
     return jax.tree.map(lambda *parts: np.stack(parts), *chunks)
 
 
-def brought(source: Any, laying: Callable[[Any], Any]) -> tuple[np.ndarray, ...]:
-    """All rows of a source laid out: features, Q, P⊥Y and gain, (N, …) each."""
-    pieces = [laid for partition in source.partitions for laid in laying(partition)]
+def brought(source: Any, row_builder: Callable[[Any], Any]) -> tuple[np.ndarray, ...]:
+    """Return all rows of a source: features, Q, P⊥Y and gain, (N, …) each."""
+    pieces = [arrays for partition in source.partitions for arrays in row_builder(partition)]
     return tuple(np.concatenate(parts) for parts in zip(*pieces, strict=True))
 
 
 def row_sum(function: Callable[[Any], Any], rows: Any) -> Any:
-    """Σ function(chunk) over the leading axis of every array in `rows`; any pytree in, any pytree out."""
+    """Return Σ function(chunk) over the leading axis of every array in `rows`.
+
+    Any pytree in, any pytree out.
+    """
     return row_fold(lambda chunk: (None, function(chunk)), rows)[1]
 
 
 def row_fold(function: Callable[[Any], tuple[Any, Any]], rows: Any) -> tuple[Any, Any]:
-    """Of function(chunk), a pair: the first ones (k, …), and Σ of the second."""
+    """Return the first results of function(chunk), (k, …), and the sum of the second."""
     function = jax.jit(function)  # traced once for its shape and the sum
     first = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), rows)
     zero = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(function, first)[1])
@@ -217,7 +252,10 @@ def row_fold(function: Callable[[Any], tuple[Any, Any]], rows: Any) -> tuple[Any
 
 
 def chunk_shape(rows: int, limit: int = CHUNK_ROWS) -> tuple[int, int]:
-    """(number of chunks, rows in each) for `rows` rows in equal chunks of about `limit`; few rows in few sizes."""
+    """Return (number of chunks, rows in each) for `rows` rows in equal chunks of about `limit`.
+
+    Few rows have few sizes, so that few programs are compiled.
+    """
     count = max(1, -(-rows // limit))
     size = -(-rows // count)
     unit = _SHARED if rows <= _FEW <= limit else 8
@@ -227,7 +265,7 @@ def chunk_shape(rows: int, limit: int = CHUNK_ROWS) -> tuple[int, int]:
 def in_chunks(
     values: Float[np.ndarray, "N ..."], shape: tuple[int, int], *, repeat: bool = False
 ) -> Float[np.ndarray, "k ... m"]:
-    """Rows (N, …) as chunks (k, …, m) with zeros behind the last row, or `repeat`s of it."""
+    """Return rows (N, …) as chunks (k, …, m), padded with zeros or `repeat`s of the last row."""
     count, size = shape
     padded = np.zeros((count, *values.shape[1:], size))
     for i in range(count):
@@ -238,30 +276,39 @@ def in_chunks(
     return padded
 
 
-def laid_out(z: Matrix, q: Any, e: Matrix, gain: Any, shape: tuple[int, int]) -> Chunk:
-    """Rows (N, …) as a chunk (k, …, m) of NumPy arrays."""
+def build_chunk(z: Matrix, q: Any, e: Matrix, gain: Any, shape: tuple[int, int]) -> Chunk:
+    """Return rows (N, …) as a chunk (k, …, m) of NumPy arrays."""
     padded = in_chunks(z, shape, repeat=True)  # zeros may be where the learner has no value
     pieces: Any = (padded, *(in_chunks(piece, shape) for piece in (q, e, gain)))
     return Chunk(*pieces)
 
 
 def from_chunks(chunks: Float[np.ndarray, "k ... m"], rows: int) -> Float[np.ndarray, "N ..."]:
-    """The inverse of `in_chunks`."""
+    """Return the rows of chunks: the inverse of `in_chunks`."""
     moved = np.moveaxis(np.asarray(chunks), -1, 1)
     return moved.reshape(moved.shape[0] * moved.shape[1], *moved.shape[2:])[:rows]
 
 
 def gram(columns: Float[Array, "n rows"]) -> Float[Array, "n n"]:
-    """A Aᵀ of named columns laid out as rows of A; one matrix product."""
+    """Return A Aᵀ of named columns as the rows of A; one matrix product."""
     return columns @ columns.T
 
 
-def learner_rows(engine: Engine, form: Lagged, numbers: Numbers, x: Matrix, q: Any, weight: Any) -> Any:
-    """Regressors x (N, nx) as rows of the engine, their outputs multiplied by `weight`, (ny, ny) or (N, ny, ny)."""
+def learner_rows(
+    engine: Engine, form: Lagged, numbers: Numbers, x: Matrix, q: Any, weight: Any
+) -> Any:
+    """Return regressors x (N, nx) as rows of the engine.
+
+    Outputs are multiplied by `weight`, (ny, ny) or (N, ny, ny).
+    """
     z = np.asarray(form.features.evaluate(x, form.layout, np))
-    scaled = (z - np.asarray(numbers.centre)) / np.asarray(numbers.halfwidth) if form.bound else np.zeros((len(x), 0))
+    scaled = (
+        (z - np.asarray(numbers.centre)) / np.asarray(numbers.halfwidth)
+        if form.bound
+        else np.zeros((len(x), 0))
+    )
     gain = np.broadcast_to(weight * np.asarray(numbers.gain), (len(x), *2 * (len(form.outputs),)))
-    return engine.lay(scaled, q, np.zeros(gain.shape[:2]), gain)
+    return engine.build_rows(scaled, q, np.zeros(gain.shape[:2]), gain)
 
 
 @dataclass(frozen=True)
@@ -272,14 +319,19 @@ class Overlaps:
 
     def __call__(self, chunk: Chunk, w: Any) -> Overlap:
         values, jacobian = self.bound.jacobian(w, chunk.z, chunk.gain)
-        return Overlap(jnp.einsum("otm,wom->tw", chunk.q, jacobian), jnp.einsum("otm,om->t", chunk.q, values))
+        return Overlap(
+            jnp.einsum("otm,wom->tw", chunk.q, jacobian), jnp.einsum("otm,om->t", chunk.q, values)
+        )
 
 
 @dataclass(frozen=True)
 class MixedGram:
-    """Gram matrix of `[Q J]` with the outputs of every row multiplied by `mix`: `ΣψᵀΣ_eψ` for `Σ_e = mixᵀ mix`.
+    """Gram matrix of `[Q J]` with the outputs of every row multiplied by `mix`.
 
-    J is taken without its `overlaps` with Q, if any are given. Without a learner the matrix is that of Q.
+    It is `ΣψᵀΣ_eψ` for `Σ_e = mixᵀ mix`.
+
+    J is taken without its `overlaps` with Q, if any are given. Without a learner the matrix is that
+    of Q.
     """
 
     bound: Bound | None
@@ -299,17 +351,24 @@ class _LeftOver:
         return jnp.einsum("tom,wom->tw", *_columns(self.bound, chunk, w, overlaps))
 
 
-def _columns(bound: Bound | None, chunk: Chunk, w: Any, overlaps: tuple[Any, ...]) -> tuple[Any, Any]:
-    """Q (nt, ny, m) and J (nw, ny, m) of a chunk, J less its overlaps with Q."""
+def _columns(
+    bound: Bound | None, chunk: Chunk, w: Any, overlaps: tuple[Any, ...]
+) -> tuple[Any, Any]:
+    """Return Q (nt, ny, m) and J (nw, ny, m) of a chunk, J less its overlaps with Q."""
     q = jnp.moveaxis(chunk.q, 1, 0)
-    jacobian = jnp.zeros((0, *q.shape[1:])) if bound is None else bound.jacobian(w, chunk.z, chunk.gain)[1]
+    jacobian = (
+        jnp.zeros((0, *q.shape[1:])) if bound is None else bound.jacobian(w, chunk.z, chunk.gain)[1]
+    )
     for overlap in overlaps:
         jacobian = jacobian - jnp.einsum("tw,tom->wom", overlap, q)
     return q, jacobian
 
 
 def projected_gram(engine: Engine, bound: Bound | None, w: Any, rows: Any, mix: Any) -> Matrix:
-    """Gram matrix of `[Q P⊥J]`, outputs multiplied by `mix`; J is projected twice, so that Q and it are orthogonal."""
+    """Return the Gram matrix of `[Q P⊥J]`, outputs multiplied by `mix`.
+
+    J is projected twice, so that Q and it are orthogonal.
+    """
     overlaps: tuple[Any, ...] = ()
     for _ in range(2):
         overlaps = (*overlaps, engine.sum(_LeftOver(bound), rows, w, overlaps))
@@ -317,14 +376,19 @@ def projected_gram(engine: Engine, bound: Bound | None, w: Any, rows: Any, mix: 
 
 
 @partial(jax.jit, static_argnames="bound")
-def row_values(bound: Bound, w: Float[Array, "nw"], z: Float[Array, "k nz m"]) -> Float[Array, "k ny m"]:
-    """f at every row, in the learner's unit."""
+def row_values(
+    bound: Bound, w: Float[Array, "nw"], z: Float[Array, "k nz m"]
+) -> Float[Array, "k ny m"]:
+    """Return f at every row, in the learner's unit."""
     one_chunk = jax.vmap(lambda row: bound.values(w, row), in_axes=-1, out_axes=-1)
     return jax.lax.map(one_chunk, z)
 
 
 def _values(bound: Bound | None, chunk: Chunk, w: Any, tilt: Any) -> Float[Array, "ny m"]:
-    """F of one chunk; of an ensemble the median of its members, each with the physics that it adds."""
+    """Return F of one chunk.
+
+    For an ensemble it is the median of the members, each with the physics that it adds.
+    """
     if bound is None:
         return jnp.zeros_like(chunk.e)
 
@@ -356,5 +420,9 @@ class ResidualGram:
     bound: Bound | None
 
     def __call__(self, chunk: Chunk, w: Any, tilt: Any, physics: Any) -> Any:
-        residual = chunk.e - _values(self.bound, chunk, w, tilt) + jnp.einsum("otm,t->om", chunk.q, physics)
+        residual = (
+            chunk.e
+            - _values(self.bound, chunk, w, tilt)
+            + jnp.einsum("otm,t->om", chunk.q, physics)
+        )
         return residual @ residual.T

@@ -1,6 +1,7 @@
-"""States by which runs follow what was measured: least squares on the starts alone, of many windows side by side.
+"""Initial states by least squares on the measured outputs, of many windows side by side.
 
-A damped Gauss-Newton iteration on every start by itself. Starts that a window does not show stay near the guess.
+A damped Gauss-Newton iteration on every start by itself. Starts that a window does not show stay
+near the guess.
 """
 
 from __future__ import annotations
@@ -15,33 +16,42 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug._base.jax import Array, jax, jnp
 from orthaug.models.dynamics import Dynamics, Numbers
 
-LOOSE = 1e3  # times the size of a state: how far a start may be from its guess before that counts as one error
+# Times the size of a state: the distance of a start from its guess that counts as one error
+LOOSE = 1e3
 _FIRST_DAMPING = 1e-3
 _SHORTEST, _LANES = 64, 16  # steps, and windows side by side
 _SETTLED = 1e-10  # relative decrease that is not worth a step
 
 
 class Windows(NamedTuple):
-    """Stretches of measured rows side by side; the last axis counts them. Only rows that are scored count."""
+    """Stretches of measured rows side by side; the last axis counts them.
+
+    Only rows that are scored count.
+    """
 
     inputs: Float[Any, "T nu m"]
     target: Float[Any, "T ny m"]
     scored: Any
-    """(T, m)."""
+    """Inputs of each window, (T, m)."""
 
     def padded(self) -> tuple[Windows, int]:
-        """Longer and more, for few shapes have programs of their own, on the device; and T."""
+        """Return longer and more windows on the device, and T.
+
+        Few shapes have programs of their own.
+        """
         steps, count = np.shape(self.scored)
         more = padded_steps(steps) - steps, -count % _LANES
 
         def repeated(part: Any) -> Any:
-            return np.pad(part, ((0, more[0]), *((0, 0),) * (part.ndim - 2), (0, more[1])), mode="edge")
+            return np.pad(
+                part, ((0, more[0]), *((0, 0),) * (part.ndim - 2), (0, more[1])), mode="edge"
+            )
 
         return Windows(*(jax.device_put(repeated(np.asarray(part))) for part in self)), steps
 
 
 def padded_steps(steps: int) -> int:
-    """What to pad the steps of a window to."""
+    """Return the length that the steps of a window are padded to."""
     return max(_SHORTEST, 1 << (steps - 1).bit_length())
 
 
@@ -54,9 +64,10 @@ def settle(
     loose: Vector,
     iterations: int = 12,
 ) -> tuple[Float[np.ndarray, "n0 m"], Vector]:
-    """The states at the windows' first rows that lower `‖weight e‖²` most, and its value (m,).
+    """Return the states at the windows' first rows that minimise `‖weight e‖²`, and its value (m,).
 
-    A window ends where a step promises to lower it by less than a 10⁻¹⁰th part: that is a 10⁻⁵th of its own noise.
+    A window ends where a step promises to lower it by less than a 10⁻¹⁰th part: that is a 10⁻⁵th of
+    its own noise.
 
     Args:
         states: where to begin.
@@ -66,9 +77,9 @@ def settle(
     begun = np.pad(np.asarray(states, dtype=float), ((0, 0), (0, -count % _LANES)), mode="edge")
     with np.errstate(over="ignore"):  # a start beyond all others has no prior
         prior = 1 / np.asarray(loose, dtype=float) ** 2
-    laid = windows.padded()  # once for all iterations
+    layout = windows.padded()  # once for all iterations
     best, damping = begun, np.full(begun.shape[1], _FIRST_DAMPING)
-    matrix, right, misfit = _linearised(form, numbers, begun, laid, weight, begun, prior)
+    matrix, right, misfit = _linearised(form, numbers, begun, layout, weight, begun, prior)
     for _ in range(iterations):
         step = _steps(matrix, right, damping)
         with np.errstate(all="ignore"):
@@ -76,7 +87,7 @@ def settle(
         if ended.all():
             break
         trial = np.where(ended, best, best + step)
-        there = _linearised(form, numbers, trial, laid, weight, begun, prior)
+        there = _linearised(form, numbers, trial, layout, weight, begun, prior)
         lower = there[2] < misfit
         best = np.where(lower, trial, best)
         matrix = np.where(lower[:, None, None], there[0], matrix)
@@ -95,15 +106,26 @@ def _steps(
     right = np.where(sound[:, None], right, 0.0)
     try:
         return np.linalg.solve(damped, right[..., None])[..., 0].T
-    except np.linalg.LinAlgError:  # states beyond what double precision tells apart: there is no step to take
+    except (
+        np.linalg.LinAlgError
+    ):  # the matrix is singular in double precision: there is no step to take
         return np.zeros_like(right).T
 
 
 def _linearised(
-    form: Dynamics, numbers: Numbers, states: Matrix, laid: Any, weight: Matrix, begun: Matrix, prior: Vector
+    form: Dynamics,
+    numbers: Numbers,
+    states: Matrix,
+    layout: Any,
+    weight: Matrix,
+    begun: Matrix,
+    prior: Vector,
 ) -> tuple[Any, Any, Any]:
-    """Normal matrix (m, n0, n0), right-hand side (m, n0) and misfit (m,), infinite where a run is not finite."""
-    gram, square = (np.asarray(part) for part in _gram(form, numbers, states, *laid, weight))
+    """Return normal matrix (m, n0, n0), right-hand side (m, n0) and misfit (m,).
+
+    The misfit is infinite where a run is not finite.
+    """
+    gram, square = (np.asarray(part) for part in _gram(form, numbers, states, *layout, weight))
     n0, gone = len(states), begun - states
     matrix = np.moveaxis(gram[:, :n0], -1, 0) + np.diag(prior)
     right = np.moveaxis(gram[:, n0], -1, 0) + (prior[:, None] * gone).T
@@ -121,9 +143,9 @@ def _gram(
     steps: Any,
     weight: Float[Array, "ny ny"],
 ) -> tuple[Float[Array, "n0 n0+1 m"], Float[Array, "m"]]:
-    """Gram matrix of the sensitivities to the start with themselves and the error, and the error's square.
+    """Return the Gram matrix of the sensitivities to the start and of the error.
 
-    Of the first `steps` of the windows.
+    The sums are over the first `steps` of the windows.
     """
     numbers = form.prepared(numbers)
     n0, m = states.shape
@@ -134,8 +156,10 @@ def _gram(
         return jnp.concatenate([following, parts.total])
 
     def sloped(state: Any, row: Any) -> tuple[Any, Any]:
-        """A step and its slopes (n0 + ny, n0)."""
-        along = jax.vmap(lambda moved: jax.jvp(lambda x: both(x, row), (state,), (moved,)), out_axes=(None, -1))
+        """Return a step and its slopes (n0 + ny, n0)."""
+        along = jax.vmap(
+            lambda moved: jax.jvp(lambda x: both(x, row), (state,), (moved,)), out_axes=(None, -1)
+        )
         return along(directions)
 
     def step(i: Any, carry: tuple[Any, ...]) -> tuple[Any, ...]:

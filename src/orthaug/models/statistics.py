@@ -1,4 +1,4 @@
-"""What training leaves for later intervals: the Gram matrix of the model's derivatives, and Cov(c, w) from it."""
+"""Statistics of training for intervals: Gram matrix of the derivatives, Cov(c, w) from it."""
 
 from __future__ import annotations
 
@@ -9,22 +9,32 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
 
-_ROUNDING = 1e-13  # of the largest eigenvalue of a Gram matrix with unit columns: what is below is rounding
+_ROUNDING = (
+    1e-13  # of the largest eigenvalue of a Gram matrix with unit columns: what is below is rounding
+)
 
 
 def column_units(gram: Matrix, nt: int) -> Vector:
-    """One over the norm of each column, θ first. Learner columns that are rounding beside the largest stay small."""
+    """Return one over the norm of each column, θ first.
+
+    Learner columns that are rounding beside the largest stay small.
+    """
     size = np.sqrt(np.maximum(np.diag(gram), 0.0))
     size[nt:] = np.maximum(size[nt:], np.sqrt(np.finfo(float).eps) * size[nt:].max(initial=0.0))
     return 1 / np.where(size > 1e-150, size, 1.0)
 
 
-def half_inverse(gram: Matrix, nt: int) -> Float[np.ndarray, "n r"]:
+def half_inverse(gram: Matrix, nt: int, *, own_units: bool = False) -> Float[np.ndarray, "n r"]:
     """H with `H Hᵀ` the inverse of the Gram matrix of `[S_c S_w]` on the directions that the data see.
 
-    Products with the inverse are formed from H on both sides: the inverse itself has entries up to 1e13.
+    Products with the inverse are formed from H on both sides: the inverse itself has entries up to
+    1e13.
+
+    Args: own_units: ask which directions the data see in the units that the columns have, as a
+        pseudo-inverse does;
+            otherwise after each column was divided by its norm, so that units do not matter.
     """
-    unit = column_units(gram, nt)
+    unit = np.ones(len(gram)) if own_units else column_units(gram, nt)
     values, vectors = np.linalg.eigh(gram * np.outer(unit, unit))
     kept = values > _ROUNDING * values.max(initial=0.0)
     return unit[:, None] * vectors[:, kept] / np.sqrt(values[kept])
@@ -34,19 +44,21 @@ def half_inverse(gram: Matrix, nt: int) -> Float[np.ndarray, "n r"]:
 class JointCovariance:
     """Cov of all that training estimated, p = (c, w): `σ² M⁻¹` with `M = G + ridge` on the weights.
 
-    G is the Gram matrix of ∂ŷ/∂p in whitened outputs. Only functions of the fitted model have a variance. A direction
-    of p that changes no prediction on the training rows counts as absent.
+    G is the Gram matrix of ∂ŷ/∂p in whitened outputs. Only functions of the fitted model have a
+    variance. A direction of p that changes no prediction on the training rows counts as absent.
     """
 
     gram: Matrix
     ridge: float | Vector
-    """Of all weights, or of each (nw,)."""
+    """Ridge of all weights, or of each (nw,)."""
     middle: Matrix
     """ΣψᵀΣ_eψ in whitened outputs, `σ² G` for one output."""
     nt: int
 
     def root(self) -> Float[np.ndarray, "n r"]:
-        """S with `Cov p = S Sᵀ = M⁻¹ (ΣψᵀΣ_eψ + σ² ridge) M⁻¹`, the ridge counted as the prior that it is.
+        """Return S with `Cov p = S Sᵀ = M⁻¹ (ΣψᵀΣ_eψ + σ² ridge) M⁻¹`.
+
+        The ridge is counted as the prior that it is.
 
         Variances are then sums of squares, which no rounding makes negative.
         """
@@ -58,18 +70,19 @@ class JointCovariance:
         return half @ (vectors * np.sqrt(np.maximum(values, 0.0)))
 
     def of(self, k: Float[np.ndarray, "m n"]) -> Matrix:
-        """Cov of `K p`, (m, m)."""
+        """Return Cov of `K p`, (m, m)."""
         reach = k @ self.root()
         return reach @ reach.T
 
 
 @dataclass(frozen=True, eq=False)
 class Statistics:
-    """What training leaves behind; None where it left nothing.
+    """Statistics of training; None where it has none.
 
-    `gram` (nθ + nw)² is the Gram matrix of ∂ŷ/∂(c, w) over the training rows in whitened outputs, `[Φ J]` one step
-    ahead; `ridge` the weights' prior precision beside it, of all or of each (nw,); `middle` = ΣψᵀΣ_eψ; `noise` (ny, ny)
-    the noise covariance in the outputs' units; `freedom` its degrees of freedom.
+    `gram` (nθ + nw)² is the Gram matrix of ∂ŷ/∂(c, w) over the training rows in whitened outputs,
+    `[Φ J]` one step ahead; `ridge` the weights' prior precision beside it, of all or of each (nw,);
+    `middle` = ΣψᵀΣ_eψ; `noise` (ny, ny) the noise covariance in the outputs' units; `freedom` its
+    degrees of freedom.
     """
 
     gram: Matrix | None = None
@@ -77,16 +90,18 @@ class Statistics:
     noise: Matrix | None = None
     ridge: float | Vector = 0.0
     freedom: float = np.inf
-    flown: bool = False
+    simulated: bool = False
     """Whether `noise` is of a free run's errors, and not of those one step ahead."""
     verdict: str = ""
-    """What the residual says of the noise (`analysis.Diagnosis`); empty where nobody asked."""
+    """Diagnosis of the residual (`analysis.Diagnosis`); empty where none was asked for."""
     disturbance: Matrix | None = None
-    """Q of an observer by the likelihood of the training data, and with it R, `sensor`; where nobody tuned it."""
+    """Q of an observer by the likelihood of the training data, and with it R, `sensor`; where
+    nobody tuned it.
+    """
     sensor: Matrix | None = None
 
     def joint(self, nt: int) -> JointCovariance | None:
-        """Cov(c, w), θ in front with nt entries."""
+        """Return Cov(c, w), the nt entries of θ first."""
         if self.gram is None or self.middle is None:
             return None
         return JointCovariance(self.gram, self.ridge, self.middle, nt)

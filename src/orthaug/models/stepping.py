@@ -1,7 +1,7 @@
-"""A fitted model one sample at a time: `state, outputs = model.step(state, inputs)`, a state with names.
+"""A fitted model one sample at a time: `state, outputs = model.step(state, inputs)`.
 
-The state of a lagged model is what its regressor remembers of outputs and inputs, so that a step takes the inputs of
-its own sample alone; that of a motion is its state.
+The state of a lagged model is what its regressor remembers of outputs and inputs, so that a step
+takes the inputs of its own sample alone; that of a motion is its state.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from orthaug.data.record import Experiment, Record
 from orthaug.data.regressors import Layout
 from orthaug.models.dynamics import Numbers
 from orthaug.models.lagged import Lagged
-from orthaug.models.moving import Moving
+from orthaug.models.moving import MotionDynamics
 
 
 @dataclass(frozen=True)
 class Memory:
-    """What a lagged model remembers: of each channel, outputs first, its last samples, newest first.
+    """Past samples that a lagged model remembers: outputs first, newest first.
 
     Examples:
         >>> memory = Memory.of((Lag("y", 2), Lag("u", 0), Lag("u", 1)), ["y"], ["u"])
@@ -41,9 +41,12 @@ class Memory:
 
     @classmethod
     def of(cls, layout: Layout, outputs: Sequence[str], inputs: Sequence[str]) -> Memory:
-        """Of a regressor's layout."""
+        """Return the memory of a regressor's layout."""
         names = dict.fromkeys((*outputs, *inputs))
-        deepest = ((name, max((lag.lag for lag in layout if lag.channel == name), default=0)) for name in names)
+        deepest = (
+            (name, max((lag.lag for lag in layout if lag.channel == name), default=0))
+            for name in names
+        )
         return cls(tuple(deepest), layout, tuple(inputs))
 
     @cached_property
@@ -58,26 +61,28 @@ class Memory:
 
     @cached_property
     def read(self) -> Int[np.ndarray, "nx"]:
-        """Where the regressor's entries are among state and inputs."""
-        place = {lag: i for i, lag in enumerate((*self.lags, *(Lag(name, 0) for name in self.inputs)))}
+        """Positions of the regressor's entries among state and inputs."""
+        place = {
+            lag: i for i, lag in enumerate((*self.lags, *(Lag(name, 0) for name in self.inputs)))
+        }
         return np.array([place[lag] for lag in self.layout], dtype=int)
 
     @cached_property
     def following(self) -> Int[np.ndarray, "n"]:
-        """Where the next state's entries are among outputs, inputs and state."""
+        """Positions of the next state's entries among outputs, inputs and state."""
         now = [Lag(name, 0) for name, _ in self.depths]  # outputs, then inputs
         place = {lag: i for i, lag in enumerate((*now, *self.lags))}
         return np.array([place[Lag(lag.channel, lag.lag - 1)] for lag in self.lags], dtype=int)
 
     def at(self, experiment: Experiment, record: Record, row: int) -> Vector:
-        """The state before a row of an experiment."""
+        """Return the state before a row of an experiment."""
         column = {c.name: experiment.outputs[:, i] for i, c in enumerate(record.outputs)}
         column |= {c.name: experiment.inputs[:, i] for i, c in enumerate(record.inputs)}
         return np.array([column[lag.channel][row - lag.lag] for lag in self.lags], dtype=float)
 
 
 def step_arguments(state: Any, inputs: Any, states: int, count: int) -> tuple[Any, Any]:
-    """A step's arguments as arrays of JAX, which takes wrong lengths in silence.
+    """Return a step's arguments as arrays of JAX, which takes wrong lengths in silence.
 
     Raises:
         InputError: vectors of other lengths, or no numbers.
@@ -85,24 +90,30 @@ def step_arguments(state: Any, inputs: Any, states: int, count: int) -> tuple[An
     try:
         state, inputs = jnp.asarray(state, dtype=float), jnp.asarray(inputs, dtype=float)
     except (TypeError, ValueError):
-        raise InputError(f"a step takes two vectors of numbers; got {shown(state)} and {shown(inputs)}.") from None
+        raise InputError(
+            f"a step takes two vectors of numbers; got {shown(state)} and {shown(inputs)}."
+        ) from None
     if state.shape != (states,) or inputs.shape != (count,):
         raise InputError(
-            f"a step takes a state of {states} and inputs of {count} numbers; got the shapes {state.shape} and "
-            f"{inputs.shape}."
+            f"a step takes a state of {states} and inputs of {count} numbers; got the shapes "
+            f"{state.shape} and {inputs.shape}."
         )
     return state, inputs
 
 
-def step_lagged(form: Lagged, numbers: Numbers, memory: Memory, state: Any, inputs: Any) -> tuple[Any, Any]:
-    """The next state and the outputs (ny,) of one sample."""
+def step_lagged(
+    form: Lagged, numbers: Numbers, memory: Memory, state: Any, inputs: Any
+) -> tuple[Any, Any]:
+    """Return the next state and the outputs (ny,) of one sample."""
     state, inputs = step_arguments(state, inputs, len(memory.lags), len(memory.inputs))
     y = form.at(numbers, jnp.concatenate([state, inputs])[memory.read]).total
     return jnp.concatenate([y, inputs, state])[memory.following], y
 
 
-def step_inputs(form: Moving) -> tuple[str, ...]:
-    """What a step of a motion takes: its inputs, and under a first-order hold those of the next sample behind them.
+def step_inputs(form: MotionDynamics) -> tuple[str, ...]:
+    """Return the input vector of a step of a motion.
+
+    Under a first-order hold the inputs of the next sample follow behind those of this one.
 
     Raises:
         InputError: a hold that needs the whole record.
@@ -110,22 +121,25 @@ def step_inputs(form: Moving) -> tuple[str, ...]:
     motion = form.motion
     if motion.hold == "spline" and motion.inputs:
         raise InputError(
-            "a step knows no spline through the whole record; fit the motion with hold = 'zero-order' or "
-            "'first-order' to step or export it."
+            "a step cannot interpolate by a spline over the whole record; fit the motion with "
+            "hold = 'zero-order' or 'first-order' to step or export it."
         )
     after = tuple(f"{name}[k+1]" for name in motion.inputs) if motion.hold == "first-order" else ()
     return (*motion.inputs, *after)
 
 
-def with_scheme(form: Moving, numbers: Numbers) -> Numbers:
-    """The numbers with the exponentials of an exact integrator, whose derivatives a step does not need."""
+def with_scheme(form: MotionDynamics, numbers: Numbers) -> Numbers:
+    """Return the numbers with the exponentials of an exact integrator.
+
+    A step does not need their derivatives.
+    """
     with jax.ensure_compile_time_eval():
         scheme = form.exponentials(numbers)
     return numbers if scheme is None else numbers._replace(scheme=(scheme, None))
 
 
 def checked_row(row: Any, first: int, rows: int) -> int:
-    """`row` where a state can be told, by default the first.
+    """Return `row` if a state can be determined there; by default the first such row.
 
     Raises:
         InputError: no whole number, or outside of the record.
@@ -133,23 +147,26 @@ def checked_row(row: Any, first: int, rows: int) -> int:
     if row is None:
         row = first
     if isinstance(row, bool) or not isinstance(row, int | np.integer) or not first <= row <= rows:
-        raise InputError(f"`row` must be a whole number from {first} to {rows} in this record; got {shown(row)}.")
+        raise InputError(
+            f"`row` must be a whole number from {first} to {rows} in this record; got {shown(row)}."
+        )
     return int(row)
 
 
 def one_experiment(record: Record) -> Experiment:
-    """The record's only experiment, with outputs.
+    """Return the record's only experiment, with outputs.
 
     Raises:
         InputError: several experiments, or no outputs to start from.
     """
     if len(record.experiments) != 1:
         raise InputError(
-            f"the record has {len(record.experiments)} experiments; a state starts in one: give a record of one."
+            f"the record has {len(record.experiments)} experiments; give "
+            "a record of one, in which the state starts."
         )
     if not record.outputs:
         raise InputError(
-            "the record has no measured outputs to start from; give some, or a state of your own: one number for "
-            "each of `state_names`."
+            "the record has no measured outputs to start from; give some, or a state of your "
+            "own: one number for each of `state_names`."
         )
     return record.experiments[0]

@@ -1,4 +1,6 @@
-"""Models on disk: `model.json` for what a model is, `arrays.safetensors` for its numbers; nothing executable.
+"""Models on disk: `model.json` for what a model is, `arrays.safetensors` for its numbers.
+
+The files hold nothing executable.
 
 The JSON carries checksums of itself and of the arrays. A file that was cut or altered is refused.
 `pack` writes other content the same way.
@@ -9,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -20,16 +22,112 @@ from safetensors.numpy import load as load_arrays
 from safetensors.numpy import save as save_arrays
 
 from orthaug import __version__
-from orthaug._base.checks import check_type
-from orthaug._base.errors import InputError
+from orthaug._base.checks import check_type, is_number
+from orthaug._base.errors import InputError, shown
 from orthaug._base.folders import whole_folder
+from orthaug._base.jax import jax
 from orthaug.models import lagged_storage, motion_storage
 from orthaug.models.learners import Learner
-from orthaug.models.loaded import check_loaded
 from orthaug.models.model import Model
 from orthaug.models.motion_model import MotionModel
 from orthaug.physics.baseline import Baseline
 from orthaug.physics.motion import Motion
+
+_LONGEST_LAG = 1_000_000  # rows: a state has an entry for each
+
+
+def check_loaded(model: Any, path: Path) -> None:
+    """Refuse a model whose numbers have other sizes than its form, or are not finite.
+
+    Raises:
+        InputError: the first part that does not fit.
+    """
+    if not is_number(model.sampling_time) or model.sampling_time <= 0:
+        raise InputError(
+            f"{path}: its sampling time is {shown(model.sampling_time)}; expected a positive "
+            "number."
+        )
+    for name in ("structure", "measure", "time_column"):
+        if not isinstance(getattr(model, name), str | None):
+            raise InputError(
+                f"{path}: its {name} is {shown(getattr(model, name))}; expected a word."
+            )
+    for name, value, shape in _expected(model):
+        if value is None:
+            raise InputError(f"{path}: the model has no {name}; it was not written by orthaug.")
+        array = np.asarray(value)
+        if shape is not None and array.shape != shape:
+            raise InputError(
+                f"{path}: {name} has the shape {array.shape}; the model's form needs {shape}."
+            )
+        if not np.isfinite(array).all():
+            raise InputError(
+                f"{path}: {name} holds a number that is not finite; fit again, or copy the "
+                "model again."
+            )
+    for name, value in (("deviation", model.deviation), ("halfwidth", model.numbers.halfwidth)):
+        if (np.asarray(value) < 0).any():
+            raise InputError(f"{path}: {name} is negative; it was not written by orthaug.")
+    for entry in getattr(model.form.features, "entries", model.form.features):
+        if not isinstance(entry.text, str):
+            raise InputError(
+                f"{path}: a learner's input is {shown(entry.text)}; expected an expression."
+            )
+    for lag in getattr(model.form, "layout", ()):
+        if type(lag.lag) is not int or not 0 <= lag.lag <= _LONGEST_LAG:
+            raise InputError(
+                f"{path}: its layout has a lag of {shown(lag.lag)}; expected 0 to "
+                f"{_LONGEST_LAG} rows."
+            )
+    if model.form.differentiable:
+        _check_step(model, path)
+
+
+def _check_step(model: Any, path: Path) -> None:
+    """Trace one step, which computes nothing, to check the shapes.
+
+    Expressions, layout and learner must fit the channels and the state.
+    """
+    state, row = np.zeros(len(model.state_names)), np.zeros(len(model.step_inputs))
+    following, outputs = jax.eval_shape(model.step, state, row)
+    shapes = tuple(following.shape), tuple(outputs.shape)
+    if shapes != (state.shape, (len(model.outputs),)):
+        raise InputError(
+            f"{path}: a step of the model makes {shapes}; its state and outputs need other shapes."
+        )
+
+
+def _expected(model: Any) -> Iterator[tuple[str, Any, tuple[int, ...] | None]]:
+    """Return names, values and shapes of all arrays that a model computes with.
+
+    The shape is None where something else has checked it.
+    """
+    form, numbers, kept = model.form, model.numbers, model.statistics
+    outputs, parameters = len(model.outputs), len(model.estimated[0])
+    yield "theta", numbers.theta, (parameters,)
+    yield "theta_aux", numbers.theta_aux, (parameters,)
+    yield "largest_output", model.largest_output, (outputs,)
+    yield "deviation", model.deviation, (outputs,)
+    yield "output_weight", model.weight, (outputs, outputs)
+    if form.bound is not None:
+        yield "centre", numbers.centre, (form.bound.nz,)
+        yield "halfwidth", numbers.halfwidth, (form.bound.nz,)
+        yield "gain", numbers.gain, (form.bound.ny,)
+        yield "weights", numbers.weights, None
+    for name in ("tilt", "pull"):
+        if getattr(numbers, name) is not None:
+            yield name, getattr(numbers, name), None
+    square = (outputs, outputs)
+    for name, value, shape in (
+        ("noise", kept.noise, square),
+        ("gram", kept.gram, None),
+        ("middle", kept.middle, None if kept.gram is None else np.shape(kept.gram)),
+        ("disturbance", kept.disturbance, None),
+        ("sensor", kept.sensor, square),
+    ):
+        if value is not None:
+            yield name, value, shape
+
 
 FORMAT = 2
 _DECLARATION, _ARRAYS = "model.json", "arrays.safetensors"
@@ -37,10 +135,12 @@ _KINDS: dict[type, ModuleType] = {Model: lagged_storage, MotionModel: motion_sto
 
 
 def save(model: Model | MotionModel, folder: str | Path, *, force: bool = False) -> None:
-    """Write a model to a folder of its own, whole or not at all. A model that `save` wrote there before is replaced.
+    """Write a model to a folder of its own, whole or not at all.
 
-    A baseline, motion or learner that is a Python callable cannot be written. Its numbers can; `load` asks for the
-    callable.
+    A model that `save` wrote there before is replaced.
+
+    A baseline, motion or learner that is a Python callable cannot be written. Its numbers can;
+    `load` asks for the callable.
 
     Args:
         model: what to write.
@@ -55,7 +155,8 @@ def save(model: Model | MotionModel, folder: str | Path, *, force: bool = False)
         >>> import numpy as np
         >>> import orthaug as oa
         >>> record = oa.Record.from_arrays(u=np.sin(np.arange(50.0)), y=2 * np.sin(np.arange(50.0)))
-        >>> fit = oa.estimate(record, oa.Baseline.from_terms([oa.Term("gain", "u[k]")]), learner=None)
+        >>> physics = oa.Baseline.from_terms([oa.Term("gain", "u[k]")])
+        >>> fit = oa.estimate(record, physics, learner=None)
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     save(fit.model, Path(folder, "model"))
         ...     load(Path(folder, "model"))
@@ -71,12 +172,12 @@ def write(model: Model | MotionModel, folder: Path) -> None:
 
 
 def digest(model: Model | MotionModel) -> str:
-    """The sha256 that tells a model from others: `checksum` in the file that this version writes of it."""
+    """Return the sha256 that identifies a model: `checksum` in the file of this version."""
     return _packed(model)[0]["checksum"]
 
 
 def _packed(model: Model | MotionModel) -> tuple[dict[str, Any], bytes]:
-    """What the two files hold."""
+    """Return the contents of the two files."""
     kind = _KINDS[type(model)]
     declared, arrays = kind.declare(model)
     return pack(FORMAT, declared, arrays)
@@ -89,7 +190,8 @@ def load(
 
     Args:
         folder: the model's folder, or the result folder that holds it as `model/`.
-        baseline, learner: the Python callables again, where the saved model had such; a motion counts as a baseline.
+        baseline, learner: the Python callables again, where the saved model had such; a motion
+            counts as a baseline.
 
     Raises:
         InputError: no model there; a file that is cut, altered, or from a newer version.
@@ -117,13 +219,21 @@ def load(
         return model
     except InputError:
         raise
-    except Exception as error:  # the checksum holds, so someone made it: there is no list of what that can hold
-        raise InputError(f"{path}: not a model of this version (missing or misplaced: {error}).") from None
+    except (
+        Exception
+    ) as error:  # the checksum holds, so someone made it: there is no list of what that can hold
+        raise InputError(
+            f"{path}: not a model of this version (missing or misplaced: {error})."
+        ) from None
 
 
-def pack(number: int, declared: Mapping[str, Any], arrays: Mapping[str, Any]) -> tuple[dict[str, Any], bytes]:
-    """What the two files hold, in the format of this `number`."""
-    packed = save_arrays({name: np.ascontiguousarray(value, dtype=np.float64) for name, value in arrays.items()})
+def pack(
+    number: int, declared: Mapping[str, Any], arrays: Mapping[str, Any]
+) -> tuple[dict[str, Any], bytes]:
+    """Return the contents of the two files in the format of this `number`."""
+    packed = save_arrays(
+        {name: np.ascontiguousarray(value, dtype=np.float64) for name, value in arrays.items()}
+    )
     declaration = {"format": number, "orthaug": __version__, **declared} | {
         "arrays_sha256": hashlib.sha256(packed).hexdigest()
     }
@@ -139,7 +249,7 @@ def write_packed(packed: tuple[dict[str, Any], bytes], path: Path, arrays: Path)
 def read_packed(
     path: Path, arrays: Path, number: int, what: str, again: str
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """What was declared, and the arrays.
+    """Read the declaration and the arrays.
 
     Args:
         number: the newest format that is read.
@@ -157,17 +267,24 @@ def read_packed(
         raise InputError(f"{path.parent}: cannot be read ({error.strerror}).") from None
     except (ValueError, RecursionError):
         raise InputError(f"{path}: the file is cut or altered (no JSON); {again}.") from None
-    if not isinstance(declared, dict) or type(declared.get("format")) is not int or declared["format"] < 1:
+    if (
+        not isinstance(declared, dict)
+        or type(declared.get("format")) is not int
+        or declared["format"] < 1
+    ):
         raise InputError(f"{path}: not a {what} of orthaug.")
     if declared["format"] > number:
         raise InputError(
-            f"{path}: written by orthaug {declared.get('orthaug')} in format {declared['format']}; this version "
-            f"({__version__}) reads up to {number}. Update orthaug."
+            f"{path}: written by orthaug {declared.get('orthaug')} in format "
+            f"{declared['format']}; this version ({__version__}) reads up to {number}. Update "
+            "orthaug."
         )
     if given != checksum:
         raise InputError(f"{path}: the file was altered (its checksum differs); {again}.")
     if hashlib.sha256(packed).hexdigest() != declared.get("arrays_sha256"):
-        raise InputError(f"{arrays}: the file is cut or altered (its checksum differs); copy it again.")
+        raise InputError(
+            f"{arrays}: the file is cut or altered (its checksum differs); copy it again."
+        )
     try:
         return declared, load_arrays(packed)
     except SafetensorError as error:

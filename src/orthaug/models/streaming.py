@@ -1,6 +1,9 @@
-"""The engine of rows that do not fit into memory: they are read, laid out and summed chunk by chunk, at every pass.
+"""The engine of rows that do not fit into memory.
 
-A thread reads ahead while the chunk before it is summed. All chunks have one shape, so one compiled program serves.
+They are read, built and summed chunk by chunk, at every pass.
+
+A thread reads ahead while the chunk before it is summed. All chunks have one shape, so one compiled
+program serves.
 """
 
 from __future__ import annotations
@@ -18,39 +21,48 @@ from jaxtyping import Float
 from orthaug._base.checks import Matrix
 from orthaug._base.jax import jax
 from orthaug.data.sources import Source, rows_of
-from orthaug.models.rows import CHUNK_ROWS, Chunk, Here, chunk_shape, laid_out, together
+from orthaug.models.rows import CHUNK_ROWS, Chunk, LocalEngine, build_chunk, chunk_shape, together
 
 _AHEAD = 3  # chunks that wait to be summed
 
-Laid = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+RowArrays = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 """Features (m, nz), Q (m, ny, nθ), P⊥Y (m, ny) and gain (m, ny, ny) of some rows."""
 
 
 @dataclass(frozen=True, eq=False)
-class Drawn:
-    """Rows of a source: where they are, how they are laid out, and in chunks of how many."""
+class SourceRows:
+    """Rows of a source: its place, the function that builds them, and the rows in a chunk."""
 
     source: Source
-    laying: Callable[[Any], Iterator[Laid]]
+    row_builder: Callable[[Any], Iterator[RowArrays]]
     size: int
 
     def __iter__(self) -> Iterator[Chunk]:
-        return chunks_of((laid for partition in self.source.partitions for laid in self.laying(partition)), self.size)
+        return chunks_of(
+            (
+                arrays
+                for partition in self.source.partitions
+                for arrays in self.row_builder(partition)
+            ),
+            self.size,
+        )
 
 
 @dataclass(frozen=True)
-class Stream(Here):
+class Stream(LocalEngine):
     """Rows stay in their files; memory holds a few chunks of them, of `limit` rows."""
 
     limit: int = CHUNK_ROWS
     resident: bool = False
 
-    def lay(self, z: Matrix, q: Any, e: Matrix, gain: Float[np.ndarray, "N ny ny"]) -> list[Chunk]:
-        """Rows that are in memory, in chunks."""
-        return apart(laid_out(z, q, e, gain, chunk_shape(len(z), self.limit)))
+    def build_rows(
+        self, z: Matrix, q: Any, e: Matrix, gain: Float[np.ndarray, "N ny ny"]
+    ) -> list[Chunk]:
+        """Keep rows that are in memory as chunks."""
+        return apart(build_chunk(z, q, e, gain, chunk_shape(len(z), self.limit)))
 
-    def draw(self, source: Source, laying: Callable[[Any], Iterator[Laid]]) -> Drawn:
-        return Drawn(source, laying, chunk_shape(rows_of(source), self.limit)[1])
+    def draw(self, source: Source, row_builder: Callable[[Any], Iterator[RowArrays]]) -> SourceRows:
+        return SourceRows(source, row_builder, chunk_shape(rows_of(source), self.limit)[1])
 
     def sum(self, function: Callable[..., Any], rows: Iterable[Chunk], *arguments: Any) -> Any:
         return summed(function, rows, arguments)
@@ -62,24 +74,28 @@ class Stream(Here):
     def place(self, chunks: Any, like: Any = None) -> list[Any]:
         return apart(chunks)
 
-    def read(self, function: Callable[[Any], Any], partitions: Sequence[Any], counts: Sequence[int]) -> Read:
-        return Read(function, partitions)
+    def read(
+        self, function: Callable[[Any], Any], partitions: Sequence[Any], counts: Sequence[int]
+    ) -> PartitionChunks:
+        return PartitionChunks(function, partitions)
 
-    def beside(self, *rows: Iterable[Any]) -> Beside:
-        return Beside(rows)
+    def beside(self, *rows: Iterable[Any]) -> PairedChunks:
+        return PairedChunks(rows)
 
-    def keep(self, function: Callable[..., Any], rows: Iterable[Any], *arguments: Any) -> tuple[list[Any], Any]:
+    def keep(
+        self, function: Callable[..., Any], rows: Iterable[Any], *arguments: Any
+    ) -> tuple[list[Any], Any]:
         return folded(function, rows, arguments)
 
     def fetch(self, rows: Iterable[Any]) -> Any:
         return together(list(rows))
 
     def room(self) -> None:
-        """None: all sums are made here."""
+        """Return None, since all sums are made here."""
 
 
 @dataclass(frozen=True, eq=False)
-class Read:
+class PartitionChunks:
     """Chunks of partitions, read at every pass."""
 
     function: Callable[[Any], Any]
@@ -90,7 +106,7 @@ class Read:
 
 
 @dataclass(frozen=True, eq=False)
-class Beside:
+class PairedChunks:
     """Chunks of several rows, as tuples."""
 
     rows: tuple[Iterable[Any], ...]
@@ -100,13 +116,15 @@ class Beside:
 
 
 def apart(chunks: Any) -> list[Any]:
-    """The inverse of `together`."""
+    """Return the rows of each: the inverse of `together`."""
     leaves, form = jax.tree.flatten(jax.tree.map(np.asarray, chunks))
     return [jax.tree.unflatten(form, parts) for parts in zip(*leaves, strict=True)]
 
 
-def folded(function: Callable[..., Any], rows: Iterable[Any], arguments: tuple[Any, ...]) -> tuple[list[Any], Any]:
-    """Of function(chunk, *arguments), a pair: the first ones on the host, and Σ of the second."""
+def folded(
+    function: Callable[..., Any], rows: Iterable[Any], arguments: tuple[Any, ...]
+) -> tuple[list[Any], Any]:
+    """Return the first results of function(chunk, *arguments) on the host, and the second's sum."""
     arguments = jax.tree.map(jax.numpy.asarray, arguments)
     first, _ = _compiled(function)
     kept, total = [], None
@@ -118,7 +136,7 @@ def folded(function: Callable[..., Any], rows: Iterable[Any], arguments: tuple[A
 
 
 def summed(function: Callable[..., Any], rows: Iterable[Chunk], arguments: tuple[Any, ...]) -> Any:
-    """Σ function(chunk, *arguments), in the order of the rows."""
+    """Return Σ function(chunk, *arguments), in the order of the rows."""
     arguments = jax.tree.map(jax.numpy.asarray, arguments)
     first, more = _compiled(function)
     total = None
@@ -130,7 +148,7 @@ def summed(function: Callable[..., Any], rows: Iterable[Chunk], arguments: tuple
 
 @cache
 def _compiled(function: Callable[..., Any]) -> tuple[Any, Any]:
-    """The function, and what adds it to a sum."""
+    """Compile the function, and the addition of its result to a sum."""
 
     def more(total: Any, chunk: Chunk, *arguments: Any) -> Any:
         return jax.tree.map(jax.numpy.add, total, function(chunk, *arguments))
@@ -138,8 +156,11 @@ def _compiled(function: Callable[..., Any]) -> tuple[Any, Any]:
     return jax.jit(function), jax.jit(more, donate_argnums=0)
 
 
-def chunks_of(pieces: Iterable[Laid], size: int) -> Iterator[Chunk]:
-    """Rows in chunks of one size, the row index last; the last one is padded with rows that count for nothing."""
+def chunks_of(pieces: Iterable[RowArrays], size: int) -> Iterator[Chunk]:
+    """Return rows in chunks of one size, the row index last.
+
+    The last one is padded with rows that count for nothing.
+    """
     parts: list[Any] = []
     held = 0
     for piece in pieces:
@@ -154,12 +175,17 @@ def chunks_of(pieces: Iterable[Laid], size: int) -> Iterator[Chunk]:
                 yield Chunk(*parts)
                 parts, held = [], 0
     if parts:
-        parts[0][..., held:] = parts[0][..., held - 1 : held]  # zeros may be where the learner has no value
+        parts[0][..., held:] = parts[0][
+            ..., held - 1 : held
+        ]  # zeros may be where the learner has no value
         yield Chunk(*parts)
 
 
 def read_ahead(items: Iterable[Any], ahead: int = _AHEAD) -> Iterator[Any]:
-    """The items in order, made by a thread of their own while the caller works; its errors are raised here."""
+    """Yield the items in order, made by a thread of their own while the caller works.
+
+    Its errors are raised here.
+    """
     ready: queue.Queue[tuple[bool, Any]] = queue.Queue(ahead)
     given_up = threading.Event()
 

@@ -1,7 +1,9 @@
-"""Independent runs as tasks of a Dask cluster: restarts, held-out blocks, candidates of a selection, cases of a study.
+"""Independent runs as tasks of a Dask cluster.
 
-What all runs share is sent once and goes from worker to worker; each run is whole at one place. A task that a lost
-worker had is made again elsewhere, so results do not depend on who made them.
+Restarts, held-out blocks, candidates of a selection and cases of a study are such runs.
+
+What all runs share is sent once and goes from worker to worker; each run is whole at one place. A
+task that a lost worker had is made again elsewhere, so results do not depend on who made them.
 """
 
 from __future__ import annotations
@@ -15,13 +17,15 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from orthaug._base.jax import jax
-from orthaug._base.parallel import Heard, Stopped, each, nobody, one_blas_thread, one_core
-from orthaug.models.cluster import Dask, kept, smallest_worker, told
+from orthaug._base.parallel import Heard, RunCancelled, each, nobody, one_blas_thread, one_core
+from orthaug.models.cluster import Dask, cluster_errors, kept, smallest_worker
 from orthaug.models.rows import InMemory, Room
 
 _MATRICES = 3  # of a run in memory
-_WAIT = 0.5  # s between two looks at whether a run is still wanted, and two tellings of a run
-_ANY_SIZE = {"distributed.admin.large-graph-warning-threshold": "1 PB"}  # rows are sent on purpose, and once
+_WAIT = 0.5  # s between two looks at whether a run is still wanted, and two reports of a run
+_ANY_SIZE = {
+    "distributed.admin.large-graph-warning-threshold": "1 PB"
+}  # rows are sent on purpose, and once
 
 
 @dataclass(frozen=True)
@@ -44,7 +48,10 @@ class Tasks(InMemory):
         items: Sequence[Any],
         heard: Heard = nobody,
     ) -> Iterator[Any]:
-        """As `Threads.map`; the function, its arguments and results are pickled, `given` once while it is the same."""
+        """Yield the results of independent runs, as `Threads.map`.
+
+        The function, its arguments and results are pickled, `given` once while it is the same.
+        """
         shared = self._shared(given)
         with _heard_on(self.client) as (topic, said):
 
@@ -56,40 +63,50 @@ class Tasks(InMemory):
                     while said[i]:
                         heard(i, *said[i].popleft())
 
-                return ask(self.client, look, _made, shared, Sealed((function, item)), topic, i)
+                return ask(
+                    self.client, look, _made, shared, DoublePrecision((function, item)), topic, i
+                )
 
             yield from each(one, list(enumerate(items)), places(self.client))
 
     def room(self) -> Room:
-        """Of the smallest worker, which makes whole runs."""
+        """Return the memory of the smallest worker, which makes whole runs."""
         return smallest_worker(self.client, _MATRICES)
 
     def _shared(self, given: Any) -> Any:
-        """What the workers know `given` by."""
+        """Return the reference by which workers know `given`."""
         from dask import config
 
         if id(given) not in self._sent:
             self._sent.clear()
-            with told(), config.set(_ANY_SIZE):
-                self._sent[id(given)] = given, self.client.submit(kept, Sealed(given), pure=False)
+            with cluster_errors(), config.set(_ANY_SIZE):
+                self._sent[id(given)] = (
+                    given,
+                    self.client.submit(kept, DoublePrecision(given), pure=False),
+                )
         return self._sent[id(given)][1]
 
 
 def runs_on(engine: Any) -> Any:
-    """The engine for several runs over rows in memory: with a cluster they are its tasks."""
+    """Return the engine for several runs over rows in memory: with a cluster they are its tasks."""
     return Tasks(client=engine.client) if isinstance(engine, Dask) else engine
 
 
 def places(client: Any) -> int:
-    """How many tasks the workers take at a time."""
+    """Return the number of tasks that the workers take at a time."""
     return max(sum(client.nthreads().values()), 1)
 
 
-def ask(client: Any, check: Callable[[], None], function: Callable[..., Any], *args: Any, **named: Any) -> Any:
-    """The result of a function that a worker computes; `check` is called now and then, and may raise to give it up."""
+def ask(
+    client: Any, check: Callable[[], None], function: Callable[..., Any], *args: Any, **named: Any
+) -> Any:
+    """Return the result of a function that a worker computes.
+
+    `check` is called now and then, and may raise to give it up.
+    """
     from distributed import wait
 
-    with told():
+    with cluster_errors():
         future = client.submit(function, *args, pure=False, **named)
         try:
             while not future.done():
@@ -104,14 +121,14 @@ def ask(client: Any, check: Callable[[], None], function: Callable[..., Any], *a
 
 @contextmanager
 def _heard_on(client: Any) -> Iterator[tuple[str, dict[int, deque[Any]]]]:
-    """A topic on which tasks tell, and what each of them told."""
+    """Yield a topic on which tasks report, and the reports of each task."""
     topic, said = f"orthaug-{uuid.uuid4().hex}", defaultdict[int, deque[Any]](deque)
 
     def hear(event: tuple[Any, Any]) -> None:
         i, what = event[1]
         said[i].append(what)
 
-    with told():
+    with cluster_errors():
         client.subscribe_topic(topic, hear)
     try:
         yield topic, said
@@ -120,8 +137,11 @@ def _heard_on(client: Any) -> Iterator[tuple[str, dict[int, deque[Any]]]]:
 
 
 @dataclass(frozen=True, eq=False)
-class Sealed:
-    """A value that reaches a worker in double precision: JAX would cut its arrays where that is not turned on yet."""
+class DoublePrecision:
+    """A value that reaches a worker in double precision.
+
+    JAX would cut its arrays where double precision is not turned on yet.
+    """
 
     value: Any
 
@@ -130,7 +150,7 @@ class Sealed:
 
 
 class _Double:
-    """Turns on double precision where it arrives."""
+    """Switch that turns on double precision where it arrives."""
 
     def __reduce__(self) -> Any:
         return _in_double, ()
@@ -140,27 +160,30 @@ def _in_double() -> None:
     _ = jax.config  # what turns it on
 
 
-def _sealed(_: None, value: Any) -> Sealed:
-    return Sealed(value)
+def _sealed(_: None, value: Any) -> DoublePrecision:
+    return DoublePrecision(value)
 
 
-def _made(shared: Sealed, asked: Sealed, topic: str, number: int) -> Any:
-    """A run on a worker. What it tells goes to the client, from time to time."""
+def _made(shared: DoublePrecision, asked: DoublePrecision, topic: str, number: int) -> Any:
+    """Make a run on a worker.
+
+    Its reports go to the client from time to time.
+    """
     from dask.context import thread_state
     from distributed import get_worker
 
     worker, key, last = get_worker(), thread_state.key, time.monotonic()
 
-    def tell(*what: Any) -> None:
+    def report(*what: Any) -> None:
         nonlocal last
         if time.monotonic() - last < _WAIT:
             return
         last = time.monotonic()
         task = worker.state.tasks.get(key)
         if task is None or task.state == "cancelled":
-            raise Stopped
+            raise RunCancelled
         worker.log_event(topic, (number, tuple(float(value) for value in what)))
 
     with one_blas_thread(), one_core():
         function, item = asked.value
-        return function(shared.value, item, tell)
+        return function(shared.value, item, report)

@@ -28,18 +28,19 @@ Names = tuple[str, ...]
 
 @dataclass(frozen=True)
 class Terms:
-    """`f = Σ w_j t_j`: linear in its weights, so that its training, its intervals and the split are exact.
+    """`f = Σ w_j t_j`, linear in its weights: training, intervals and the split are exact.
 
-    Terms given by hand are what it sees. A `degree` adds all products of so many of its inputs, and `functions` of
-    them, when the lags or the states are known (`over`).
+    Terms given by hand are what it sees. A `degree` adds all products of so many of its inputs, and
+    `functions` of them, when the lags or the states are known (`over`).
 
     Args:
         terms: expressions such as `v[k-1]**3`, of a motion of states and inputs.
         degree: of the products, the constant included; 0 for none.
-        functions: abs, sign, sqrt (of the size), tanh, sin, cos, exp; one in a product, times up to `degree − 1`
-            signals.
+        functions: abs, sign, sqrt (of the size), tanh, sin, cos, exp; one in a product, times up to
+            `degree − 1` signals.
         exclude: terms of the library to leave out.
-        inputs: the signals that the library is made of; None for all lags, or all states and inputs of a motion.
+        inputs: the signals that the library is made of; None for all lags, or all states and inputs
+            of a motion.
         beyond: as of `MLP`; "auto" is "free", for terms are an equation that goes on as it is.
 
     Examples:
@@ -61,12 +62,21 @@ class Terms:
             given = getattr(self, name)
             if given is None and name == "inputs":
                 continue
-            if isinstance(given, str) or not isinstance(given, Sequence) or any(not isinstance(t, str) for t in given):
-                raise InputError(f"`{name}` must be a tuple of texts, such as ('v[k-1]**3',); got {shown(given)}.")
+            if (
+                isinstance(given, str)
+                or not isinstance(given, Sequence)
+                or any(not isinstance(t, str) for t in given)
+            ):
+                raise InputError(
+                    f"`{name}` must be a tuple of texts, such as ('v[k-1]**3',); got "
+                    f"{shown(given)}."
+                )
             object.__setattr__(self, name, tuple(given))
         check_fields(self)
         if self.functions and not self.degree:
-            raise InputError("`functions` are factors of products, so they need a `degree` of 1 or more.")
+            raise InputError(
+                "`functions` are factors of products, so they need a `degree` of 1 or more."
+            )
         if not self.degree:
             if not self.terms:
                 raise InputError("a learner of terms needs `terms`, or a `degree` of 1 or more.")
@@ -77,14 +87,18 @@ class Terms:
         TermLibrary.of((), 0, self.functions)  # refuses unknown functions before there are signals
 
     def __str__(self) -> str:
-        named = ", ".join(self.terms[:_NAMED]) + (f" and {len(self.terms) - _NAMED} more" * (len(self.terms) > _NAMED))
+        named = ", ".join(self.terms[:_NAMED]) + (
+            f" and {len(self.terms) - _NAMED} more" * (len(self.terms) > _NAMED)
+        )
         return f"terms {named}" if not self.degree else f"all terms to the degree {self.degree}"
 
     linear = True
-    """Combinations of its features are all that it can be."""
+    """Its values are linear combinations of its features."""
 
     def over(self, signals: Sequence[str]) -> Terms:
-        """The same with its library written out over signals: `terms` are then all that it sees.
+        """Return a learner whose library is written out over signals.
+
+        `terms` are then all that it sees.
 
         Raises:
             InputError: too many terms, or an excluded one that is none.
@@ -92,33 +106,36 @@ class Terms:
         return self if not self.degree else replace(self, **_written(self.library(signals)))
 
     def library(self, signals: Sequence[str]) -> TermLibrary:
-        """The terms as products of few factors."""
+        """Return the terms as products of few factors."""
         own = signals if self.inputs is None or not self.degree else self.inputs
         return TermLibrary.of(own, self.degree, self.functions, self.terms, self.exclude)
 
     def among(self, kept: Sequence[str]) -> Terms:
-        """The same with some of its terms."""
+        """Return a learner with some of its terms."""
         return Terms(tuple(kept), beyond=self.beyond)
 
     def scaling(self, features: Matrix) -> Scaling:
-        """Each term by its largest size, without an offset: coefficients stay those of the terms."""
+        """Return a scaling of each term by its largest size, without an offset.
+
+        Coefficients stay those of the terms.
+        """
         size = np.abs(features).max(axis=0, initial=0.0)
         return Scaling(np.zeros(len(size)), np.where(size > 0, size, 1.0))
 
     def weights(self, nz: int, ny: int) -> int:
-        """How many weights it has for `nz` features and `ny` outputs."""
+        """Return the number of weights for `nz` features and `ny` outputs."""
         return nz * ny
 
     def silent(self, tree: Tree) -> Tree:
-        """All coefficients zero."""
+        """Return zeros for all coefficients."""
         return np.zeros_like(tree)
 
     def groups(self, tree: Tree) -> Tree:
-        """Each term by itself."""
+        """Return a group for each term."""
         return np.broadcast_to(np.arange(np.shape(tree)[1]), np.shape(tree))
 
     def layers(self, tree: Tree) -> list[tuple[Any, Any, str]]:
-        """One layer without bias."""
+        """Return one layer without bias."""
         return [(tree, None, "identity")]
 
     def init(self, key: Array, nz: int, ny: int) -> Tree:
@@ -129,21 +146,38 @@ class Terms:
 
 
 def _written(library: TermLibrary) -> dict[str, Any]:
-    return {"terms": library.texts, "degree": 0, "functions": (), "exclude": (), "inputs": library.texts}
+    return {
+        "terms": library.texts,
+        "degree": 0,
+        "functions": (),
+        "exclude": (),
+        "inputs": library.texts,
+    }
 
 
-def over_lags(learner: Any, baseline: Baseline, lags: Lags | None, outputs: Names, inputs: Names) -> Any:
-    """A learner whose library waits for the lags, written out; any other as it is."""
+def over_lags(
+    learner: Any, baseline: Baseline, lags: Lags | None, outputs: Names, inputs: Names
+) -> Any:
+    """Return a learner whose library is written out over the lags.
+
+    Other learners are returned unchanged.
+    """
     if not hasattr(learner, "over"):
         return learner
-    return learner.over([str(lag) for lag in regressor_of(baseline, lags, None, outputs, inputs)[0]])
+    return learner.over(
+        [str(lag) for lag in regressor_of(baseline, lags, None, outputs, inputs)[0]]
+    )
 
 
 def over_states(learner: Any, motion: Motion) -> Any:
-    """The same for a motion, with its states and inputs."""
-    return learner.over([*motion.names_of_states, *motion.inputs]) if hasattr(learner, "over") else learner
+    """Return a learner whose library is written out over a motion's states and inputs."""
+    return (
+        learner.over([*motion.names_of_states, *motion.inputs])
+        if hasattr(learner, "over")
+        else learner
+    )
 
 
 def scaling_of(learner: Any, features: Matrix) -> Scaling:
-    """How a learner's features (N, nz) are scaled: its own way, or into [-1, 1]."""
+    """Return the scaling of a learner's features (N, nz): its own, or into [-1, 1]."""
     return learner.scaling(features) if hasattr(learner, "scaling") else Scaling.fit(features)

@@ -1,4 +1,7 @@
-"""The physics, linear in θ: φ, its projection, what the data say about θ, and what θ is made of. No JAX."""
+"""The physics, linear in θ: φ, its projection, its excitation by data, and physical parameters.
+
+No JAX.
+"""
 
 import lazy_loader
 

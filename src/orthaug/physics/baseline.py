@@ -13,8 +13,16 @@ import numpy as np
 
 from orthaug._base.checks import check_label, check_type, check_unique, is_number
 from orthaug._base.errors import LONGEST, InputError, shown
-from orthaug._base.views import Shown
-from orthaug.data.expressions import RESERVED, SAMPLING_TIME, Expression, Lag, is_identifier, is_name, parse
+from orthaug._base.views import NotebookView
+from orthaug.data.expressions import (
+    RESERVED,
+    SAMPLING_TIME,
+    Expression,
+    Lag,
+    is_identifier,
+    is_name,
+    parse,
+)
 from orthaug.data.record import Channel, same_step
 from orthaug.data.regressors import Layout, in_order
 from orthaug.data.writing import coefficient_unit
@@ -34,7 +42,10 @@ class Parameter:
         check_parameter_name(self.name)
         check_label(self.unit, f"the unit of '{self.name}'")
         if not is_number(self.initial):
-            raise InputError(f"the initial value of '{self.name}' must be a finite number; got {shown(self.initial)}.")
+            raise InputError(
+                f"the initial value of '{self.name}' must be a finite number; got "
+                f"{shown(self.initial)}."
+            )
         check_bounds(self.name, self.min, self.max)
 
 
@@ -42,8 +53,8 @@ def check_parameter_name(name: Any) -> None:
     """Raise InputError unless `name` is an identifier."""
     if not is_identifier(name):
         raise InputError(
-            f"{shown(name)} cannot name a parameter; use letters, digits and underscores, at most {LONGEST}, not "
-            "starting with a digit."
+            f"{shown(name)} cannot name a parameter; use letters, digits and underscores, at "
+            f"most {LONGEST}, not starting with a digit."
         )
 
 
@@ -52,30 +63,38 @@ def check_sampling_constant(constants: Sequence[tuple[str, float]], sampling_tim
     declared = dict(constants).get(SAMPLING_TIME, sampling_time)
     if not same_step(declared, sampling_time):
         raise InputError(
-            f"the constant '{SAMPLING_TIME}' is {declared:g}, but the data are sampled every {sampling_time:g} s. "
-            f"{SAMPLING_TIME} is the sampling time without being declared: leave it out, or rename it if it is another "
-            "quantity."
+            f"the constant '{SAMPLING_TIME}' is {declared:g}, but the data are sampled every "
+            f"{sampling_time:g} s. {SAMPLING_TIME} is the sampling time without being "
+            "declared: leave it out, or rename it if it is another quantity."
         )
 
 
 def check_bounds(name: str, low: Any, high: Any) -> None:
     """Raise InputError for bounds of a parameter that are no numbers, empty or reversed."""
     if any(isinstance(b, bool) or not isinstance(b, int | float | np.number) for b in (low, high)):
-        raise InputError(f"the bounds of '{name}' must be numbers; got min = {shown(low)}, max = {shown(high)}.")
+        raise InputError(
+            f"the bounds of '{name}' must be numbers; got min = {shown(low)}, max = {shown(high)}."
+        )
     if not low < high:
-        raise InputError(f"the bounds of '{name}' are empty or reversed: min = {low:g}, max = {high:g}.")
+        raise InputError(
+            f"the bounds of '{name}' are empty or reversed: min = {low:g}, max = {high:g}."
+        )
 
 
 @dataclass(frozen=True)
 class Term:
-    """`parameter * regressor`, a summand of one output; the same parameter in several terms shares θ.
+    """`parameter * regressor`, a summand of one output.
 
-    `initial`, `unit` and the bounds `min` and `max` belong to the parameter: one of its terms gives them, or none
-    (0, no unit, no bounds). `fixed` keeps `initial` as a known coefficient: the term is subtracted from the output
-    first, and the learner is not made orthogonal to it. `output` may be left out where there is only one.
+    The same parameter in several terms shares θ.
+
+    `initial`, `unit` and the bounds `min` and `max` belong to the parameter: one of its terms gives
+    them, or none (0, no unit, no bounds). `fixed` keeps `initial` as a known coefficient: the term
+    is subtracted from the output first, and the learner is not made orthogonal to it. `output` may
+    be left out where there is only one.
 
     Examples:
-        >>> Baseline.from_terms([Term("one", "y[k-1]", initial=1.0, fixed=True), Term("b", "Ts*u[k-1]", unit="m/N")])
+        >>> kept = Term("one", "y[k-1]", initial=1.0, fixed=True)
+        >>> Baseline.from_terms([kept, Term("b", "Ts*u[k-1]", unit="m/N")])
         Baseline(1*y[k-1] + b*(Ts*u[k-1]))
     """
 
@@ -90,7 +109,7 @@ class Term:
 
 
 @dataclass(frozen=True)
-class Baseline(Shown):
+class Baseline(NotebookView):
     """φ and the parameters it multiplies; make one with `from_terms` or `from_function`.
 
     Examples:
@@ -115,26 +134,34 @@ class Baseline(Shown):
             alone = re.fullmatch(r"\w+\[[^][]*\]", term.regressor)
             regressor = term.regressor if alone else f"({term.regressor})"
             sums.setdefault(term.output or "", []).append(f"{factor}*{regressor}")
-        return f"Baseline({'; '.join(f'{name} = ' * bool(name) + ' + '.join(terms) for name, terms in sums.items())})"
+        outputs = (f"{name} = " * bool(name) + " + ".join(terms) for name, terms in sums.items())
+        return f"Baseline({'; '.join(outputs)})"
 
     @classmethod
-    def from_terms(cls, terms: Sequence[Term], constants: Mapping[str, float] | None = None) -> Baseline:
-        """One term per summand; expressions may use the names in `constants`, and `Ts` for the sampling time.
+    def from_terms(
+        cls, terms: Sequence[Term], constants: Mapping[str, float] | None = None
+    ) -> Baseline:
+        """Return a baseline with one term per summand.
+
+        Expressions may use the names in `constants`, and `Ts` for the sampling time.
 
         Args:
-            terms: the same parameter may stand in several.
+            terms: several may have the same parameter.
             constants: numbers by name.
 
         Raises:
-            InputError: an expression that is not arithmetic on lagged channels, or terms of one parameter
-                that disagree on its initial value, unit or being fixed.
+            InputError: an expression that is not arithmetic on lagged channels, or terms of one
+                parameter that disagree on its initial value, unit or being fixed.
 
         Examples:
             >>> Baseline.from_terms([Term("g", "c*u[k]**2")], constants={"c": 0.5}).names
             ('g',)
         """
         if not isinstance(terms, Sequence) or not all(isinstance(term, Term) for term in terms):
-            raise InputError(f"`terms` must be a list of Terms, such as [Term('a', 'y[k-1]')]; got {shown(terms)}.")
+            raise InputError(
+                "`terms` must be a list of Terms, such as [Term('a', 'y[k-1]')]; got "
+                f"{shown(terms)}."
+            )
         if not terms:
             raise InputError("the baseline has no terms; give at least one, such as y[k-1].")
         check_type(constants, Mapping | None, "constants", "numbers by name")
@@ -142,29 +169,43 @@ class Baseline(Shown):
         for name, value in constants.items():
             if not is_name(name):
                 raise InputError(
-                    f"{shown(name)} cannot name a constant; use letters, digits and underscores, not starting with a "
-                    f"digit, and no keyword; {', '.join(sorted(RESERVED))} are taken."
+                    f"{shown(name)} cannot name a constant; use letters, digits and "
+                    "underscores, not starting with a digit, and no keyword; "
+                    f"{', '.join(sorted(RESERVED))} are taken."
                 )
             if not is_number(value):
-                raise InputError(f"the constant '{name}' must be a finite number; got {shown(value)}.")
-        terms = _agreed(terms)
+                raise InputError(
+                    f"the constant '{name}' must be a finite number; got {shown(value)}."
+                )
+        terms = _unify(terms)
         parameters = {t.parameter: _parameter(t) for t in terms if not t.fixed}
         baseline = cls(tuple(parameters.values()), tuple(terms), tuple(sorted(constants.items())))
         _ = baseline.expressions  # report what does not parse here, not at first use
         return baseline
 
     @classmethod
-    def from_function(cls, function: Callable[[Any], Any], parameters: Sequence[str | Parameter]) -> Baseline:
-        """From a JAX function φ(x) of the regressor x (nx,) in `Lags` order, returning (ny, nθ)."""
-        if not callable(function) or isinstance(parameters, str) or not isinstance(parameters, Sequence):
-            raise InputError("`from_function` takes a function of the regressor and a list of parameter names.")
+    def from_function(
+        cls, function: Callable[[Any], Any], parameters: Sequence[str | Parameter]
+    ) -> Baseline:
+        """Return a baseline of a JAX function φ(x) that returns (ny, nθ).
+
+        x (nx,) is the regressor in the order of `Lags`.
+        """
+        if (
+            not callable(function)
+            or isinstance(parameters, str)
+            or not isinstance(parameters, Sequence)
+        ):
+            raise InputError(
+                "`from_function` takes a function of the regressor and a list of parameter names."
+            )
         entries = tuple(p if isinstance(p, Parameter) else Parameter(p) for p in parameters)
         check_unique((p.name for p in entries), "parameter")
         return cls(entries, function=function)
 
     @property
     def linear(self) -> bool:
-        """Whether the output is linear in θ: here always, by its form."""
+        """Always true: φ(x) θ is linear in θ by its form."""
         return True
 
     @property
@@ -182,14 +223,16 @@ class Baseline(Shown):
         for p in self.parameters:
             if not p.min <= p.initial <= p.max:
                 raise InputError(
-                    f"the initial value of '{p.name}' is {p.initial:g}; its bounds are {p.min:g} and {p.max:g}. Give "
-                    "an `initial` between them."
+                    f"the initial value of '{p.name}' is {p.initial:g}; its bounds are "
+                    f"{p.min:g} and {p.max:g}. Give an `initial` between them."
                 )
 
     @property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper bounds of θ, each (nθ,); infinite where there are none."""
-        return np.array([p.min for p in self.parameters]), np.array([p.max for p in self.parameters])
+        return np.array([p.min for p in self.parameters]), np.array(
+            [p.max for p in self.parameters]
+        )
 
     @cached_property
     def expressions(self) -> tuple[Expression, ...]:
@@ -205,10 +248,12 @@ class Baseline(Shown):
     @property
     def lags(self) -> tuple[Lag, ...]:
         """The raw lags that the expressions read (none known for a function)."""
-        return tuple(dict.fromkeys(lag for expression in self.expressions for lag in expression.lags))
+        return tuple(
+            dict.fromkeys(lag for expression in self.expressions for lag in expression.lags)
+        )
 
     def sampled(self, sampling_time: float) -> Baseline:
-        """The baseline with this value [s] of `Ts`, where its expressions read that without declaring it.
+        """Return the baseline with `Ts` [s] given, where its expressions read it undeclared.
 
         Raises:
             InputError: a constant `Ts` of another value.
@@ -216,18 +261,24 @@ class Baseline(Shown):
         check_sampling_constant(self.constants, sampling_time)
         if not any(expression.unsampled for expression in self.expressions):
             return self
-        return replace(self, constants=tuple(sorted((*self.constants, (SAMPLING_TIME, float(sampling_time))))))
+        return replace(
+            self, constants=tuple(sorted((*self.constants, (SAMPLING_TIME, float(sampling_time)))))
+        )
 
     def check_channels(self, outputs: Sequence[str], inputs: Sequence[str]) -> None:
-        """Raise InputError for a term that uses an unknown channel, an output at lag 0 or an unknown output."""
+        """Raise InputError for a term with an unknown channel or output, or an output at lag 0."""
         for name, _ in self.constants:
             if name in (*outputs, *inputs):
-                raise InputError(f"'{name}' is a constant and a channel; give one of them another name.")
+                raise InputError(
+                    f"'{name}' is a constant and a channel; give one of them another name."
+                )
         for term, expression in zip(self.terms, self.expressions, strict=True):
             try:
                 in_order(expression.lags, outputs, inputs)
             except InputError as error:
-                raise InputError(f"baseline term '{term.parameter}' = {term.regressor}: {error}") from None
+                raise InputError(
+                    f"baseline term '{term.parameter}' = {term.regressor}: {error}"
+                ) from None
             if term.output is None and len(outputs) != 1:
                 raise InputError(
                     f"baseline term '{term.parameter}' = {term.regressor}: `output` is missing; "
@@ -235,29 +286,36 @@ class Baseline(Shown):
                 )
             if term.output is not None and term.output not in outputs:
                 raise InputError(
-                    f"baseline term '{term.parameter}' = {term.regressor}: unknown output '{term.output}'; "
-                    f"known are {', '.join(outputs)}."
+                    f"baseline term '{term.parameter}' = {term.regressor}: unknown output "
+                    f"'{term.output}'; known are {', '.join(outputs)}."
                 )
 
     def phi(self, x: Any, layout: Layout, outputs: Sequence[str], xp: Any) -> Any:
-        """φ(x), (…, ny, nθ), of regressors x (…, nx); several terms of a parameter and output add up."""
+        """Return φ(x), (…, ny, nθ), of regressors x (…, nx).
+
+        Several terms of a parameter and output add up.
+        """
         if self.function is not None:
             return self._call(x, len(outputs), xp)
         return self._matrix([p.name for p in self.parameters], x, layout, outputs, xp)
 
     def known(self, x: Any, layout: Layout, outputs: Sequence[str], xp: Any) -> Any:
-        """The sum of the fixed terms, (…, ny)."""
+        """Return the sum of the fixed terms, (…, ny)."""
         fixed = {term.parameter: term.initial or 0.0 for term in self.terms if term.fixed}
         if not fixed:
             return xp.zeros((*x.shape[:-1], len(outputs)))
         return self._matrix(list(fixed), x, layout, outputs, xp) @ xp.asarray(list(fixed.values()))
 
     def on(self, x: Any, layout: Layout, outputs: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-        """`phi` and `known` by NumPy; not finite where an expression has no value."""
+        """Return `phi` and `known` by NumPy; not finite where an expression has no value."""
         with np.errstate(all="ignore"):
-            return np.asarray(self.phi(x, layout, outputs, np)), np.asarray(self.known(x, layout, outputs, np))
+            return np.asarray(self.phi(x, layout, outputs, np)), np.asarray(
+                self.known(x, layout, outputs, np)
+            )
 
-    def _matrix(self, names: list[str], x: Any, layout: Layout, outputs: Sequence[str], xp: Any) -> Any:
+    def _matrix(
+        self, names: list[str], x: Any, layout: Layout, outputs: Sequence[str], xp: Any
+    ) -> Any:
         columns = {lag: x[..., j] for j, lag in enumerate(layout)}
         entries = [[xp.zeros(x.shape[:-1]) for _ in names] for _ in outputs]
         for term, expression in zip(self.terms, self.expressions, strict=True):
@@ -267,7 +325,9 @@ class Baseline(Shown):
                 entries[row][column] = entries[row][column] + expression.evaluate(columns, xp)
         if not names:
             return xp.zeros((*x.shape[:-1], len(outputs), 0))
-        return xp.moveaxis(xp.stack([xp.stack(row) for row in entries]), (0, 1), (-2, -1))  # a column in one piece
+        return xp.moveaxis(
+            xp.stack([xp.stack(row) for row in entries]), (0, 1), (-2, -1)
+        )  # a column in one piece
 
     def _call(self, x: Any, ny: int, xp: Any) -> Any:
         assert self.function is not None
@@ -289,28 +349,46 @@ class Baseline(Shown):
 _SHARED = ("initial", "unit", "fixed", "min", "max")  # what the terms of one parameter share
 
 
-def _agreed(terms: Sequence[Term]) -> list[Term]:
-    """The terms; what one of them says about a parameter, all of its terms say."""
+def _unify(terms: Sequence[Term]) -> list[Term]:
+    """Return the terms with their parameters' attributes made common.
+
+    An attribute that one term gives to a parameter holds in all of its terms.
+    """
     said: dict[tuple[str, str], Any] = {}
     for term in terms:
         check_parameter_name(term.parameter)
         check_label("" if term.unit is None else term.unit, f"the unit of '{term.parameter}'")
         check_type(term.fixed, bool, f"fixed of '{term.parameter}'", "true or false")
-        check_type(term.output, str | None, f"output of '{term.parameter}'", "the name of an output")
-        for what, value in (("initial value", term.initial), ("lower bound", term.min), ("upper bound", term.max)):
+        check_type(
+            term.output, str | None, f"output of '{term.parameter}'", "the name of an output"
+        )
+        for what, value in (
+            ("initial value", term.initial),
+            ("lower bound", term.min),
+            ("upper bound", term.max),
+        ):
             if value is not None and not is_number(value):
-                raise InputError(f"the {what} of '{term.parameter}' must be a finite number; got {shown(value)}.")
+                raise InputError(
+                    f"the {what} of '{term.parameter}' must be a finite number; got {shown(value)}."
+                )
         for attribute in _SHARED:
             value = getattr(term, attribute)
             if value is not None and said.setdefault((term.parameter, attribute), value) != value:
                 first = said[term.parameter, attribute]
                 raise InputError(
-                    f"the terms of '{term.parameter}' disagree on `{attribute}`: {shown(first)} and {shown(value)}."
+                    f"the terms of '{term.parameter}' disagree on `{attribute}`: "
+                    f"{shown(first)} and {shown(value)}."
                 )
     for term in terms:
         if term.fixed and (term.parameter, "initial") not in said:
-            raise InputError(f"the term of '{term.parameter}' is fixed but gives no `initial`: its known coefficient.")
-    return [replace(term, **{a: said.get((term.parameter, a), getattr(term, a)) for a in _SHARED}) for term in terms]
+            raise InputError(
+                f"the term of '{term.parameter}' is fixed but gives no `initial`: its known "
+                "coefficient."
+            )
+    return [
+        replace(term, **{a: said.get((term.parameter, a), getattr(term, a)) for a in _SHARED})
+        for term in terms
+    ]
 
 
 def _parameter(term: Term) -> Parameter:
@@ -319,19 +397,26 @@ def _parameter(term: Term) -> Parameter:
     return Parameter(term.parameter, float(term.initial or 0.0), term.unit or "", low, high)
 
 
-def derived_units(baseline: Baseline, outputs: Sequence[Channel], inputs: Sequence[Channel]) -> dict[str, str]:
-    """The unit of each parameter by its name, "1" where it has none; without those that the channels do not tell.
+def derived_units(
+    baseline: Baseline, outputs: Sequence[Channel], inputs: Sequence[Channel]
+) -> dict[str, str]:
+    """Return the unit of each parameter by its name, "1" where it has none.
+
+    Units that do not follow from those of the channels are left out.
 
     Examples:
         >>> spring = Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "u[k-1]")])
         >>> derived_units(spring, [Channel("y", "mm")], [Channel("u", "N")])
         {'a': '1', 'b': 'mm/N'}
     """
-    units, constants = {channel.name: channel.unit for channel in (*outputs, *inputs)}, dict(baseline.constants)
+    units, constants = (
+        {channel.name: channel.unit for channel in (*outputs, *inputs)},
+        dict(baseline.constants),
+    )
     found: dict[str, set[str | None]] = {}
     for term in baseline.terms:
         own = units[term.output or outputs[0].name]
-        told = coefficient_unit(own, parse(term.regressor, constants), units) if own else None
-        found.setdefault(term.parameter, set()).add("1" if told == "" else told)
-    agreed = {name: next(iter(told)) for name, told in found.items() if len(told) == 1}
+        unit = coefficient_unit(own, parse(term.regressor, constants), units) if own else None
+        found.setdefault(term.parameter, set()).add("1" if unit == "" else unit)
+    agreed = {name: next(iter(given)) for name, given in found.items() if len(given) == 1}
     return {name: unit for name, unit in agreed.items() if unit is not None}

@@ -1,7 +1,8 @@
 """Excitation and identifiability: do the data, and could any data, determine θ?
 
-Identifiability is the rank of φ at random regressor points, a property of the physics alone; excitation
-is the rank of φ on the measured rows (assumption `assum:phi_full_rank`). The first can hold without the second.
+Identifiability is the rank of φ at random regressor points, a property of the physics alone;
+excitation is the rank of φ on the measured rows (assumption `assum:phi_full_rank`). The first can
+hold without the second.
 """
 
 from __future__ import annotations
@@ -18,12 +19,11 @@ from orthaug.physics.baseline import Baseline
 from orthaug.physics.projection import Factor
 
 RANK_TOLERANCE = 1e-13  # σmin/σmax of the unit-norm columns below which Φ counts as rank-deficient
-ILL_CONDITIONED = 1e8  # condition number above which half of the digits of θ are lost: a warning
 
 
 @dataclass(frozen=True, eq=False)
 class Excitation:
-    """How well rows of φ determine θ: rank, condition number, and which columns depend on each other."""
+    """Rank and condition number of rows of φ, and the columns that depend on each other."""
 
     rank: int
     columns: int
@@ -40,10 +40,11 @@ GRAM_TOLERANCE = 3e-6
 
 
 def excitation(r: Matrix, names: Sequence[str], tolerance: float = RANK_TOLERANCE) -> Excitation:
-    """Rank and condition of a matrix from its R factor (or itself), columns scaled to unit norm.
+    """Return rank and condition of a matrix from its R factor (or itself), columns scaled to 1.
 
-    The condition number is σmax/σmin of the scaled columns, None where it is infinite. A group holds the columns that
-    a null direction ties: nothing in the data can tell their parameters apart.
+    The condition number is σmax/σmin of the scaled columns, None where it is infinite. A group
+    holds the columns that a null direction ties: nothing in the data can separate their
+    parameters.
     """
     columns = len(names)
     if columns == 0:
@@ -54,22 +55,34 @@ def excitation(r: Matrix, names: Sequence[str], tolerance: float = RANK_TOLERANC
     sigma = np.concatenate([sigma, np.zeros(columns - len(sigma))])
     rank = int(np.sum(sigma > tolerance * sigma[0])) if sigma[0] > 0 else 0
     condition = float(sigma[0] / sigma[-1]) if rank == columns else None
-    return Excitation(rank, columns, condition, _groups(vt[rank:], names))
+    return Excitation(
+        rank,
+        columns,
+        condition,
+        tuple(tuple(names[i] for i in group) for group in tied_columns(vt[rank:])),
+    )
 
 
 def of_gram(gram: Matrix, names: Sequence[str]) -> Excitation:
-    """`excitation` from the Gram matrix of the columns."""
+    """Return `excitation` from the Gram matrix of the columns."""
     norms = np.sqrt(np.maximum(np.diag(gram), 0.0))
     unit = np.where(norms > 0, norms, 1.0)
     values, vectors = np.linalg.eigh(gram / np.outer(unit, unit))
-    return excitation(np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T * unit, names, GRAM_TOLERANCE)
+    return excitation(
+        np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T * unit, names, GRAM_TOLERANCE
+    )
 
 
-def _groups(null_space: Matrix, names: Sequence[str]) -> tuple[tuple[str, ...], ...]:
-    """Sets of columns tied by null directions: connected components of the null-space projector."""
-    tied = np.abs(null_space.T @ null_space) > 1e-6
+def tied_columns(directions: Matrix, part: float = 1e-6) -> list[list[int]]:
+    """Return sets of columns tied by some orthonormal directions: connected components of their projector.
+
+    Args:
+        directions: one a row.
+        part: entry of the projector above which columns are tied.
+    """
+    tied = np.abs(directions.T @ directions) > part
     groups, seen = [], set()
-    for start in range(len(names)):
+    for start in range(len(tied)):
         if start in seen or not tied[start, start]:
             continue
         group, frontier = {start}, [start]
@@ -78,15 +91,16 @@ def _groups(null_space: Matrix, names: Sequence[str]) -> tuple[tuple[str, ...], 
             group |= new
             frontier.extend(new)
         seen |= group
-        groups.append(tuple(names[i] for i in sorted(group)))
-    return tuple(groups)
+        groups.append(sorted(group))
+    return groups
 
 
 def require_rank(excited: Excitation, rows: int) -> None:
-    """Raise RankError where θ is not determined, naming the parameters that cannot be told apart."""
+    """Raise RankError where θ is not determined, naming the parameters that no data separate."""
     if rows < excited.columns:
         raise RankError(
-            f"{rows} usable rows for {excited.columns} parameters; give at least as many rows as parameters."
+            f"{rows} usable rows for {excited.columns} parameters; give at least as many rows "
+            "as parameters."
         )
     if excited.full_rank:
         return
@@ -97,13 +111,18 @@ def require_rank(excited: Excitation, rows: int) -> None:
         for group in excited.collinear
     )
     raise RankError(
-        f"the physics is rank-deficient on the data (rank {excited.rank} of {excited.columns}): {groups}. "
-        "Remove or fix one of them, or use data that excite them separately."
+        f"the physics is rank-deficient on the data (rank {excited.rank} of "
+        f"{excited.columns}): {groups}. Remove or fix one of them, or use data that excite "
+        "them separately."
     )
 
 
-def identifiability(baseline: Baseline, layout: Layout, outputs: Sequence[str], x: Matrix) -> Excitation:
-    """Rank of φ at random points of a box twice as wide as the data's (width 1 where the data do not move).
+def identifiability(
+    baseline: Baseline, layout: Layout, outputs: Sequence[str], x: Matrix
+) -> Excitation:
+    """Return the rank of φ at random points of a box twice as wide as the data's.
+
+    Where the data do not move, the box has width 1.
 
     Args:
         baseline: φ and the names of θ.
@@ -115,7 +134,8 @@ def identifiability(baseline: Baseline, layout: Layout, outputs: Sequence[str], 
         >>> from orthaug.data.regressors import Lags
         >>> from orthaug.physics.baseline import Term
         >>> twice = Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "2*y[k-1]")])
-        >>> identifiability(twice, Lags(na=1).layout(["y"], []), ["y"], np.array([[0.0], [1.0]])).rank
+        >>> layout = Lags(na=1).layout(["y"], [])
+        >>> identifiability(twice, layout, ["y"], np.array([[0.0], [1.0]])).rank
         1
     """
     nt = len(baseline.names)
@@ -123,7 +143,9 @@ def identifiability(baseline: Baseline, layout: Layout, outputs: Sequence[str], 
         return excitation(np.zeros((0, 0)), ())
     low, high = x.min(axis=0), x.max(axis=0)
     halfwidth = np.where(high > low, high - low, 1.0)
-    points = (low + high) / 2 + halfwidth * np.random.default_rng(0).uniform(-1, 1, (50 * nt + 200, len(layout)))
+    points = (low + high) / 2 + halfwidth * np.random.default_rng(0).uniform(
+        -1, 1, (50 * nt + 200, len(layout))
+    )
     with np.errstate(all="ignore"):
         phi = np.asarray(baseline.phi(points, layout, outputs, np))
     finite = np.isfinite(phi).all(axis=(1, 2))  # a logarithm or a root has no value at some of them

@@ -1,12 +1,14 @@
-"""How much of each direction of the physics no function of the learner's features can follow, on measured rows.
+"""The share of each direction of the physics that no function of the learner's features follows.
 
-Names show that a term reads what the learner does not see. They do not show a column that was computed from it, such as
-the sign of a speed. So the rows are asked: `L = Σ_k r_k r_kᵀ / N` with `r = (I − M) φ`, the part of φ that is left
-after the mean M given the features, estimated on rows that it does not predict. The share of a direction a is
-`aᵀLa / aᵀGa`, G the same Gram matrix less only what is linear in the features: that part any learner follows exactly.
+Names show that a term reads what the learner does not see. They do not show a column that was
+computed from it, such as the sign of a speed. So the rows are asked: `L = Σ_k r_k r_kᵀ / N` with `r
+= (I − M) φ`, the part of φ that is left after the mean M given the features, estimated on rows that
+it does not predict. The share of a direction a is `aᵀLa / aᵀGa`, G the same Gram matrix less only
+what is linear in the features: that part any learner follows exactly.
 
-What M leaves of *known* functions of the features on the same rows (steps, kinks, products, waves) is what such a share
-must exceed: below it, what is left of φa is what a learner leaves of any function, and says nothing about a.
+What M leaves of *known* functions of the features on the same rows (steps, kinks, products, waves)
+is what such a share must exceed: below it, what is left of φa is what a learner leaves of any
+function, and says nothing about a.
 """
 
 from __future__ import annotations
@@ -24,7 +26,10 @@ from orthaug._base.parallel import one_blas_thread
 
 _ROWS = 2000  # that are used, spread over the record
 _FEWEST = 60  # rows; of fewer no mean given the features is known
-_FOLDS, _BLOCKS = 5, 40  # rows of a block are predicted by those of other folds: neighbours in time are alike
+_FOLDS, _BLOCKS = (
+    5,
+    40,
+)  # rows of a block are predicted by those of other folds: neighbours in time are alike
 _WAVES = 60
 _STEPS = 15  # of each feature, at its quantiles
 _STEEPEST = 30.0  # slope of a wave, in units of 1 / half of the range
@@ -33,17 +38,19 @@ _RIDGES = (1e-8, 1e-5, 1e-2)  # of the mean square of a function
 _MARGIN = 1.5  # times what M leaves of known functions
 _LEAST, _MOST = 1e-4, 0.1  # between which that limit is taken
 _PROBES = 6  # of each kind
-_SMALL = 0.1  # of a direction's size: entries below it are left out where the direction stays shared
+_SMALL = (
+    0.1  # of a direction's size: entries below it are left out where the direction stays shared
+)
 _SEED = 20_261_124
 
 
 @dataclass(frozen=True, eq=False)
-class LeftOver:
-    """What functions of the learner's features leave of the physics on the rows.
+class UnexplainedPhysics:
+    """The part of the physics that functions of the learner's features leave on the rows.
 
-    `share` (nθ,) is that of each parameter's own slope, between 0 and 1, and `limit` the share below which a direction
-    counts as one that the learner could imitate. `left` and `whole` are Gram matrices (nθ, nθ) of the slopes, a row's
-    mean: less what such functions follow, and of all.
+    `share` (nθ,) is that of each parameter's own slope, between 0 and 1, and `limit` the share
+    below which a direction counts as one that the learner could imitate. `left` and `whole` are
+    Gram matrices (nθ, nθ) of the slopes, a row's mean: less what such functions follow, and of all.
     """
 
     share: Vector
@@ -53,13 +60,16 @@ class LeftOver:
     whole: Matrix
 
     def share_of(self, direction: Vector) -> float:
-        """Return the share of a direction; 1 where even a linear function of the features leaves nothing."""
+        """Return the share of a direction that functions of the features leave.
+
+        1 where even a linear function of the features leaves nothing.
+        """
         size = float(direction @ self.linear @ direction)
         least = 1e-12 * float(direction @ self.whole @ direction)
         return min(float(direction @ self.left @ direction) / size, 1.0) if size > least else 1.0
 
     def imitated(self, basis: Matrix) -> Matrix:
-        """Return the directions (nθ, s) beyond `basis` that the rows do not tell from functions of the features.
+        """Return the directions (nθ, s) beyond `basis` that functions of the features imitate.
 
         Single parameters first, then what remains of the others together.
         """
@@ -69,14 +79,16 @@ class LeftOver:
         found = [np.eye(nt)[j] for j in alone]
         others = [j for j in range(nt) if j not in alone and np.diag(self.linear)[j] > 0]
         for _ in range(len(others)):
-            direction = self._smallest(np.column_stack([basis, *found]) if found or basis.size else basis, others)
+            direction = self._smallest(
+                np.column_stack([basis, *found]) if found or basis.size else basis, others
+            )
             if direction is None:
                 break
             found.append(direction)
         return np.column_stack(found) if found else np.zeros((nt, 0))
 
     def _smallest(self, known: Matrix, others: Sequence[int]) -> Vector | None:
-        """Return the direction of the least share beside those known, where that is below the limit."""
+        """Return the direction of least share beside the known ones, if below the limit."""
         root, size = self._beside(known)
         if not root.shape[1]:
             return None
@@ -92,10 +104,15 @@ class LeftOver:
         return direction
 
     def _beside(self, known: Matrix) -> tuple[Matrix, Vector]:
-        """Return coordinates in which slopes, beside those along known directions, have unit size; and the sizes."""
+        """Return coordinates in which slopes beside known directions have unit size, and sizes.
+
+        And the sizes.
+        """
         size = np.sqrt(np.maximum(np.diag(self.linear), 0.0))
         unit = np.where(
-            size > 1e-9 * np.sqrt(np.maximum(np.diag(self.whole), 1e-300)), 1 / np.maximum(size, 1e-300), 0.0
+            size > 1e-9 * np.sqrt(np.maximum(np.diag(self.whole), 1e-300)),
+            1 / np.maximum(size, 1e-300),
+            0.0,
         )
         scaled = self.linear * np.outer(unit, unit)
         values, vectors = np.linalg.eigh(scaled)
@@ -114,8 +131,10 @@ def left_over(
     slopes: Float[np.ndarray, "N m nt"],
     features: Float[np.ndarray, "N nz"],
     learned: Bool[np.ndarray, "m"] | None = None,
-) -> LeftOver | None:
-    """Measure what functions of the features leave of each direction; None where there are too few rows.
+) -> UnexplainedPhysics | None:
+    """Measure what functions of the features leave of each direction.
+
+    None where there are too few rows.
 
     Args:
         slopes: ∂(equation)/∂θ at the rows, in the order of time.
@@ -139,15 +158,20 @@ def left_over(
     fixed = slopes[:, ~learned].reshape(n, -1)
 
     def gram(learned_part: Matrix) -> Matrix:
-        parts = [*np.moveaxis(learned_part.reshape(n, -1, nt), 1, 0), *np.moveaxis(fixed.reshape(n, -1, nt), 1, 0)]
+        parts = [
+            *np.moveaxis(learned_part.reshape(n, -1, nt), 1, 0),
+            *np.moveaxis(fixed.reshape(n, -1, nt), 1, 0),
+        ]
         return np.asarray(sum(part.T @ part for part in parts)) / n
 
     whole, among, left = gram(flat), gram(linear), gram(rest[:, : flat.shape[1]])
     own = np.diag(among)
     share = np.where(own > 1e-12 * np.diag(whole), np.diag(left) / np.maximum(own, 1e-300), 1.0)
-    known = np.mean(rest[:, flat.shape[1] :] ** 2, axis=0) / np.maximum(np.mean(probes**2, axis=0), 1e-300)
+    known = np.mean(rest[:, flat.shape[1] :] ** 2, axis=0) / np.maximum(
+        np.mean(probes**2, axis=0), 1e-300
+    )
     limit = float(np.clip(_MARGIN * np.quantile(known, 0.9), _LEAST, _MOST))
-    return LeftOver(np.clip(share, 0.0, 1.0), limit, left, among, whole)
+    return UnexplainedPhysics(np.clip(share, 0.0, 1.0), limit, left, among, whole)
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,29 +190,39 @@ class _Smoother:
         n, scaled = len(z), (z - (low + high) / 2) / half
         rng = np.random.default_rng(_SEED)
         slopes = rng.normal(size=(_WAVES, z.shape[1]))
-        slopes *= np.exp(rng.uniform(0, np.log(_STEEPEST), (_WAVES, 1))) / np.linalg.norm(slopes, axis=1)[:, None]
+        slopes *= (
+            np.exp(rng.uniform(0, np.log(_STEEPEST), (_WAVES, 1)))
+            / np.linalg.norm(slopes, axis=1)[:, None]
+        )
         centres = scaled[rng.integers(n, size=_WAVES)]
         parts = [np.tanh(scaled @ slopes.T - np.sum(slopes * centres, axis=1))]
         nz = z.shape[1]
         for j in range(nz):
             at = np.quantile(z[:, j], np.linspace(0, 1, _STEPS + 2)[1:-1])
-            steps = (z[:, j, None] > np.append(at, 0.0)).astype(float)  # most jumps of physics are at zero
+            steps = (z[:, j, None] > np.append(at, 0.0)).astype(
+                float
+            )  # most jumps of physics are at zero
             parts += [steps, scaled[:, j, None] ** np.arange(2, 5), np.abs(z[:, j, None])]
             parts += [scaled[:, [j]] * scaled[:, [i]] for i in range(j)]
         fold = (np.arange(n) * min(_BLOCKS, n) // n) % _FOLDS
         return cls(scaled, np.concatenate(parts, axis=1), fold)
 
     def beyond_linear(self, values: Matrix) -> Matrix:
-        """Return what linear functions of the features, and a constant, leave of columns."""
+        """Return the residuals of columns after a linear fit of the features and a constant."""
         plain = np.column_stack([np.ones(len(self.z)), self.z])
         q, sigma, _ = np.linalg.svd(plain, full_matrices=False)
         q = q[:, sigma > 1e-12 * sigma[0]]
         rest = values - q @ (q.T @ values)
         rest = rest - q @ (q.T @ rest)
-        return np.where(np.linalg.norm(rest, axis=0) > 1e-9 * np.linalg.norm(values, axis=0), rest, 0.0)
+        return np.where(
+            np.linalg.norm(rest, axis=0) > 1e-9 * np.linalg.norm(values, axis=0), rest, 0.0
+        )
 
     def probes(self) -> Matrix:
-        """Return functions of the features that a learner follows as well as another one: steps, kinks, waves."""
+        """Return typical functions of the features: steps, kinks, waves.
+
+        A learner follows these as well as any other function.
+        """
         rng = np.random.default_rng(_SEED + 1)
         n, nz = self.z.shape
         found = []
@@ -201,18 +235,23 @@ class _Smoother:
         return np.column_stack(found)
 
     def left(self, values: Matrix, probes: int) -> Matrix:
-        """Return what is left of columns where they are predicted from other stretches; the last ones are probes."""
+        """Return the residuals of columns that are predicted from other stretches.
+
+        The last ones are probes.
+        """
         best, least = values, np.inf
         for ridge in _RIDGES:
             rest = self._by_functions(values, ridge)
             for tried in (rest, self._by_neighbours(rest)):
-                known = np.mean(tried[:, -probes:] ** 2) / max(np.mean(values[:, -probes:] ** 2), 1e-300)
+                known = np.mean(tried[:, -probes:] ** 2) / max(
+                    np.mean(values[:, -probes:] ** 2), 1e-300
+                )
                 if known < least:
                     best, least = tried, known
         return best
 
     def _by_functions(self, values: Matrix, ridge: float) -> Matrix:
-        """By least squares on many functions of the features."""
+        """Return predictions by least squares on many functions of the features."""
         plain = np.column_stack([np.ones(len(self.z)), self.z, self.functions])
         plain = plain / np.maximum(np.sqrt(np.mean(plain**2, axis=0)), 1e-300)
         rest = np.empty_like(values)
@@ -225,7 +264,10 @@ class _Smoother:
         return rest
 
     def _by_neighbours(self, rest: Matrix) -> Matrix:
-        """By the mean of the nearest rows of other stretches; the error of that mean itself is taken out."""
+        """Return predictions by the mean of the nearest rows of other stretches.
+
+        The error of that mean itself is taken out.
+        """
         found = np.empty_like(rest)
         for fold in range(_FOLDS):
             here = self.fold == fold

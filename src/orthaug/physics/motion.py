@@ -1,24 +1,31 @@
-"""Equations of motion `ẋ = f(x, u; p)`, `y = h(x, u; p)`: physics whose parameters may stand anywhere.
+"""Equations of motion `ẋ = f(x, u; p)`, `y = h(x, u; p)`, with parameters anywhere in them.
 
-A learner may be added to some of the equations and outputs. `derivative` is that of a state in time; of a `discrete`
-motion it is the state one sample later. No JAX.
+A learner may be added to some of the equations and outputs. `derivative` is that of a state in
+time; of a `discrete` motion it is the state one sample later. No JAX.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import ast
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from graphlib import CycleError, TopologicalSorter
 from typing import Any
 
 import numpy as np
 
 from orthaug._base.checks import Vector, check_choice, check_label, check_unique, is_number, nearest
 from orthaug._base.errors import InputError, shown
-from orthaug._base.views import Shown
+from orthaug._base.views import NotebookView
 from orthaug.data.expressions import FUNCTIONS, SAMPLING_TIME, Expression, is_name, parse_named
 from orthaug.physics.baseline import check_sampling_constant
-from orthaug.physics.parameters import Coordinates, PhysicalParameter, check_not_sampling_time, check_parameters
+from orthaug.physics.parameters import (
+    Coordinates,
+    PhysicalParameter,
+    check_not_sampling_time,
+    check_parameters,
+)
 
 INTEGRATORS = ("rk4", "exact", "discrete")
 HOLDS = ("zero-order", "first-order", "spline")
@@ -28,12 +35,15 @@ _DERIVATIVE = "derivative of "
 
 @dataclass(frozen=True)
 class State:
-    """A state and its equation, such as `State("v", "(force - c*v)/m", start="derivative of position", unit="m/s")`.
+    """A state and its equation: `State("v", "(force - c*v)/m", start="derivative of position")`.
 
     Args:
-        derivative: in time, of a discrete motion the state one sample later; None where the motion is a function.
-        start: a first guess, for starts are always estimated: a number, an output, "derivative of" one, or None.
+        derivative: in time, of a discrete motion the state one sample later; None where the motion
+            is a function.
+        start: a first guess, for starts are always estimated: a number, an output, "derivative of"
+            one, or None.
         learned: whether the learner is added to this equation.
+        unit: of the state, such as "m/s".
     """
 
     name: str
@@ -44,10 +54,14 @@ class State:
 
     @property
     def from_output(self) -> tuple[str, int] | None:
-        """The output that it starts from, and how often that is differentiated."""
+        """The output that the state starts from, and how often that is differentiated."""
         if not isinstance(self.start, str):
             return None
-        return (self.start[len(_DERIVATIVE) :].strip(), 1) if self.start.startswith(_DERIVATIVE) else (self.start, 0)
+        return (
+            (self.start[len(_DERIVATIVE) :].strip(), 1)
+            if self.start.startswith(_DERIVATIVE)
+            else (self.start, 0)
+        )
 
 
 @dataclass(frozen=True)
@@ -56,7 +70,8 @@ class Output:
 
     Args:
         expression: of states, inputs and parameters; None where the motion is a function.
-        learned: whether the learner is added to it: a sensor's curve, rather than a force that is missing.
+        learned: whether the learner is added to it: a sensor's curve, rather than a force that is
+            missing.
     """
 
     name: str
@@ -65,13 +80,19 @@ class Output:
 
 
 @dataclass(frozen=True)
-class Motion(Shown):
-    """Equations of motion; `from_equations` or `from_functions` make one and tell of its fields. Hashable.
+class Motion(NotebookView):
+    """Equations of motion; make one with `from_equations` or `from_functions`.
+
+    Hashable.
 
     Examples:
         >>> motion = Motion.from_equations(
-        ...     states=[State("v", "(force - c*v)/m", start=0.0)], outputs=[Output("speed", "v")], inputs=["force"],
-        ...     parameters=[PhysicalParameter("m", 2.0, "kg", min=0), PhysicalParameter("c", 1.0, "N s/m")])
+        ...     states=[State("v", "(force - c*v)/m", start=0.0)],
+        ...     outputs=[Output("speed", "v")], inputs=["force"],
+        ...     parameters=[
+        ...         PhysicalParameter("m", 2.0, "kg", min=0), PhysicalParameter("c", 1.0, "N s/m")
+        ...     ],
+        ... )
         >>> motion.rates(np.array([3.0]), np.array([1.0]), motion.initial, np)
         array([-1.])
     """
@@ -104,26 +125,46 @@ class Motion(Shown):
         substeps: int | None = None,
         hold: str = "zero-order",
     ) -> Motion:
-        """Of expressions on the names of states, inputs, parameters, constants and definitions.
+        """Return a motion of expressions.
+
+        They use the names of states, inputs, parameters, constants and definitions.
 
         Args:
             inputs: names of the input channels, in the record's order.
             define: names for longer expressions.
-            integrator: "rk4" (Runge-Kutta of order 4), "exact" (the linear part by matrix exponential), or "discrete".
-            substeps: steps of the integrator in a sample, 1 to 256; None to choose them by the data.
-            hold: inputs between samples: "zero-order" (a value is held), "first-order" (straight) or "spline".
+            integrator: "rk4" (Runge-Kutta of order 4), "exact" (the linear part by matrix
+                exponential), or "discrete".
+            substeps: steps of the integrator in a sample, 1 to 256; None to choose them by the
+                data.
+            hold: inputs between samples: "zero-order" (a value is held), "first-order" (straight)
+                or "spline".
 
         Raises:
-            InputError: names or expressions that cannot be, definitions that need each other, parameters that
-                no equation uses, an output that no state enters.
+            InputError: names or expressions that cannot be, definitions that need each other,
+                parameters that no equation uses, an output that no state enters.
         """
         constants, define = dict(constants or {}), dict(define or {})
-        plain = cls._declared(states, outputs, inputs, parameters, constants, integrator, substeps, hold, tuple(define))
-        known = dict.fromkeys((*plain.names_of_states, *plain.inputs, *plain.names), 1.0) | constants
+        plain = cls._declared(
+            states,
+            outputs,
+            inputs,
+            parameters,
+            constants,
+            integrator,
+            substeps,
+            hold,
+            tuple(define),
+        )
+        known = (
+            dict.fromkeys((*plain.names_of_states, *plain.inputs, *plain.names), 1.0) | constants
+        )
         known.setdefault(SAMPLING_TIME, 1.0)
         everything = known | dict.fromkeys(define, 1.0)
-        parsed = {name: parse_named(text, everything, f"motion.define '{name}'") for name, text in define.items()}
-        motion = replace(plain, definitions=tuple((name, parsed[name]) for name in _ordered(parsed)))
+        parsed = {
+            name: parse_named(text, everything, f"motion.define '{name}'")
+            for name, text in define.items()
+        }
+        motion = replace(plain, definitions=tuple((name, parsed[name]) for name in _order(parsed)))
         for state in plain.states:
             if state.derivative is None:
                 what = "next" if integrator == "discrete" else "derivative"
@@ -131,7 +172,9 @@ class Motion(Shown):
             parse_named(state.derivative, everything, f"the equation of '{state.name}'")
         for output in plain.outputs:
             if output.expression is None:
-                raise InputError(f"the output '{output.name}' has no expression; give it in terms of the states.")
+                raise InputError(
+                    f"the output '{output.name}' has no expression; give it in terms of the states."
+                )
             parse_named(output.expression, everything, f"the output '{output.name}'")
         motion._check_used()
         return motion
@@ -150,14 +193,18 @@ class Motion(Shown):
         substeps: int | None = None,
         hold: str = "zero-order",
     ) -> Motion:
-        """Of JAX functions f(x, u, p) → (nx,) and h(x, u, p) → (ny,) on vectors of states, inputs and parameters.
+        """Return a motion of JAX functions f(x, u, p) → (nx,) and h(x, u, p) → (ny,).
+
+        The vectors are states, inputs and parameters.
 
         Raises:
             InputError: names that cannot be, or what is no function.
         """
         for name, function in (("f", f), ("h", h)):
             if not callable(function):
-                raise InputError(f"`{name}` must be a function {name}(x, u, p); got {shown(function)}.")
+                raise InputError(
+                    f"`{name}` must be a function {name}(x, u, p); got {shown(function)}."
+                )
         states = [State(state) if isinstance(state, str) else state for state in states]
         outputs = [Output(output) if isinstance(output, str) else output for output in outputs]
         plain = cls._declared(states, outputs, inputs, parameters, {}, integrator, substeps, hold)
@@ -180,13 +227,19 @@ class Motion(Shown):
         check_choice(hold, HOLDS, "`hold`")
         whole = isinstance(substeps, int | np.integer) and not isinstance(substeps, bool)
         if substeps is not None and not (whole and 1 <= substeps <= MOST_SUBSTEPS):
-            raise InputError(f"`substeps` must be a whole number from 1 to {MOST_SUBSTEPS}; got {shown(substeps)}.")
+            raise InputError(
+                f"`substeps` must be a whole number from 1 to {MOST_SUBSTEPS}; got "
+                f"{shown(substeps)}."
+            )
         if integrator == "discrete" and hold != "zero-order":
             raise InputError("a discrete motion has no input between samples; leave `hold` out.")
         if not states:
             raise InputError("the motion has no states; give at least one with its equation.")
         if not outputs:
-            raise InputError("the motion has no outputs; say how the measured channels follow from the states.")
+            raise InputError(
+                "the motion has no outputs; give an expression of the states for each measured "
+                "channel."
+            )
         check_parameters(parameters, constants, FUNCTIONS)
         motion = cls(
             states=tuple(states),
@@ -219,11 +272,14 @@ class Motion(Shown):
                     check_not_sampling_time(name, what)
                 if not is_name(name, FUNCTIONS):
                     raise InputError(
-                        f"{shown(name)} cannot name {what}; use letters, digits and underscores, not starting with a "
-                        f"digit, and none of {', '.join(sorted(FUNCTIONS))}."
+                        f"{shown(name)} cannot name {what}; use letters, digits and "
+                        "underscores, not starting with a digit, and none of "
+                        f"{', '.join(sorted(FUNCTIONS))}."
                     )
                 if name in owner:
-                    raise InputError(f"'{name}' is {owner[name]} and {what}; give one of them another name.")
+                    raise InputError(
+                        f"'{name}' is {owner[name]} and {what}; give one of them another name."
+                    )
                 owner[name] = what
         check_unique((output.name for output in self.outputs), "output")
 
@@ -235,15 +291,17 @@ class Motion(Shown):
             if source[0] not in known:
                 hint = nearest(source[0], known) or ";"
                 raise InputError(
-                    f"the state '{state.name}' starts from '{start}'{hint} expected a number, an output "
-                    f"({', '.join(known)}), "
-                    "or 'derivative of' one."
+                    f"the state '{state.name}' starts from '{start}'{hint} expected a number, "
+                    f"an output ({', '.join(known)}), or 'derivative of' one."
                 )
         elif start is not None and not is_number(start):
-            raise InputError(f"the start of '{state.name}' must be a finite number or an output; got {shown(start)}.")
+            raise InputError(
+                f"the start of '{state.name}' must be a finite number or an output; got "
+                f"{shown(start)}."
+            )
 
     def _check_used(self) -> None:
-        """Every parameter is used, and every output follows from a state."""
+        """Raise InputError unless every parameter is used and every output depends on a state."""
         used: set[str] = set()
         for state in self.states:
             used |= self._names_in(self.equations[state.name])
@@ -252,23 +310,25 @@ class Motion(Shown):
             used |= there
             if not there & set(self.names_of_states):
                 raise InputError(
-                    f"the output '{output.name}' = {expression} is no expression of a state; expected one of "
-                    f"{', '.join(self.names_of_states)} in it."
+                    f"the output '{output.name}' = {expression} is no expression of a state; "
+                    f"expected one of {', '.join(self.names_of_states)} in it."
                 )
         for name in self.names:
             if name not in used:
-                raise InputError(f"the parameter '{name}' is in no equation and no output; use or remove it.")
+                raise InputError(
+                    f"the parameter '{name}' is in no equation and no output; use or remove it."
+                )
 
-    def _names_in(self, expression: Expression) -> set[str]:
-        """The names of an expression, and those of the definitions that it uses."""
-        reach = {name: set(given.names) for name, given in self.definitions}
-        for name, given in self.definitions:  # each after those that it uses
-            for other in given.names:
-                reach[name] |= reach.get(other, set())
-        return set(expression.names).union(*(reach.get(name, set()) for name in expression.names))
+    def _names_in(self, *expressions: Expression) -> set[str]:
+        """Return the names of expressions, and those of the definitions that they use."""
+        found = {name for expression in expressions for name in expression.names}
+        for name, given in reversed(self.definitions):  # each after those that it uses
+            if name in found:
+                found |= set(given.names)
+        return found
 
     def parameters_in(self, state: str) -> tuple[str, ...]:
-        """The parameters of a state's equation; of a motion that has expressions."""
+        """Return the parameters in a state's equation, for a motion with expressions."""
         there = self._names_in(self.equations[state])
         return tuple(name for name in self.names if name in there)
 
@@ -284,18 +344,24 @@ class Motion(Shown):
 
     @property
     def learned(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
-        """The numbers of the states whose equations, and of the outputs that a learner is added to."""
+        """The numbers of the states and of the outputs that a learner is added to."""
         states = tuple(i for i, state in enumerate(self.states) if state.learned)
         return states, tuple(i for i, output in enumerate(self.outputs) if output.learned)
 
     @property
     def known(self) -> dict[str, float]:
         """Every name that expressions may use."""
-        named = dict.fromkeys((*self.names_of_states, *self.inputs, *self.names), 1.0) | dict(self.constants)
-        return {SAMPLING_TIME: 1.0} | named | dict.fromkeys((name for name, _ in self.definitions), 1.0)
+        named = dict.fromkeys((*self.names_of_states, *self.inputs, *self.names), 1.0) | dict(
+            self.constants
+        )
+        return (
+            {SAMPLING_TIME: 1.0}
+            | named
+            | dict.fromkeys((name for name, _ in self.definitions), 1.0)
+        )
 
     def sampled(self, sampling_time: float) -> Motion:
-        """The motion with this value [s] of `Ts`.
+        """Return the motion with this value [s] of `Ts`.
 
         Raises:
             InputError: a constant `Ts` of another value.
@@ -303,46 +369,90 @@ class Motion(Shown):
         check_sampling_constant(self.constants, sampling_time)
         if SAMPLING_TIME in dict(self.constants):
             return self
-        return replace(self, constants=tuple(sorted((*self.constants, (SAMPLING_TIME, float(sampling_time))))))
+        return replace(
+            self, constants=tuple(sorted((*self.constants, (SAMPLING_TIME, float(sampling_time)))))
+        )
 
     @cached_property
     def equations(self) -> dict[str, Expression]:
         """The parsed equation of each state."""
-        return {s.name: parse_named(s.derivative, self.known, f"the equation of '{s.name}'") for s in self.states}
+        return {
+            s.name: parse_named(s.derivative, self.known, f"the equation of '{s.name}'")
+            for s in self.states
+        }
 
     @cached_property
     def observations(self) -> tuple[Expression, ...]:
         """The parsed expression of each output."""
-        return tuple(parse_named(o.expression, self.known, f"the output '{o.name}'") for o in self.outputs)
+        return tuple(
+            parse_named(o.expression, self.known, f"the output '{o.name}'") for o in self.outputs
+        )
 
-    def values(self, x: Any, u: Any, p: Any, xp: Any) -> dict[str, Any]:
-        """What every name stands for; x (nx, …), u (nu, …), p (np,)."""
+    @cached_property
+    def size(self) -> int:
+        """Return how many operations its expressions have; 0 of a motion of functions."""
+        if self.functions is not None:
+            return 0
+        every = (
+            *self.equations.values(),
+            *self.observations,
+            *(given for _, given in self.definitions),
+        )
+        return sum(
+            isinstance(node, ast.BinOp | ast.UnaryOp | ast.Call)
+            for e in every
+            for node in ast.walk(e.tree)
+        )
+
+    @cached_property
+    def _read(self) -> tuple[set[str], set[str]]:
+        """Return what the equations need of the names, and what the outputs do."""
+        return self._names_in(*self.equations.values()), self._names_in(*self.observations)
+
+    def values(
+        self, x: Any, u: Any, p: Any, xp: Any, needed: Collection[str] | None = None
+    ) -> dict[str, Any]:
+        """Return what every name stands for; x (nx, …), u (nu, …), p (np,).
+
+        Of the definitions only those that are needed.
+        """
         values = dict(self.constants)
         values |= dict(zip(self.names, p, strict=True))
         values |= dict(zip(self.names_of_states, x, strict=True))
         values |= dict(zip(self.inputs, u, strict=True))
         for name, expression in self.definitions:
-            values[name] = expression.value(values, xp)
+            if needed is None or name in needed:
+                values[name] = expression.value(values, xp)
         return values
 
     def rates(self, x: Any, u: Any, p: Any, xp: Any) -> Any:
-        """f(x, u; p) (nx, …) by `xp` (numpy or jax.numpy); of a discrete motion the next state."""
+        """Return f(x, u; p) (nx, …) by `xp` (numpy or jax.numpy).
+
+        Of a discrete motion this is the next state.
+        """
         if self.functions is not None:
             return xp.asarray(self.functions[0](x, u, p))
-        values = self.values(x, u, p, xp)
+        values = self.values(x, u, p, xp, self._read[0])
         rates = [self.equations[state.name].value(values, xp) for state in self.states]
-        return xp.stack([xp.broadcast_to(xp.asarray(rate, dtype=float), x.shape[1:]) for rate in rates])
+        return xp.stack(
+            [xp.broadcast_to(xp.asarray(rate, dtype=float), x.shape[1:]) for rate in rates]
+        )
 
     def observed(self, x: Any, u: Any, p: Any, xp: Any) -> Any:
-        """h(x, u; p) (ny, …)."""
+        """Return h(x, u; p) (ny, …)."""
         if self.functions is not None:
             return xp.asarray(self.functions[1](x, u, p))
-        values = self.values(x, u, p, xp)
+        values = self.values(x, u, p, xp, self._read[1])
         outputs = [expression.value(values, xp) for expression in self.observations]
-        return xp.stack([xp.broadcast_to(xp.asarray(output, dtype=float), x.shape[1:]) for output in outputs])
+        return xp.stack(
+            [xp.broadcast_to(xp.asarray(output, dtype=float), x.shape[1:]) for output in outputs]
+        )
 
     def term_without_value(self, i: int, x: Vector, u: Vector) -> str:
-        """What is not finite in equation i, outputs after states, at a point (nx,) and (nu,), in words; or nothing."""
+        """Return the name and value of a term of equation i that is not finite, or nothing.
+
+        Outputs are counted after states; the point is (nx,) and (nu,).
+        """
         if self.functions is not None:
             return ""
         with np.errstate(all="ignore"):
@@ -361,7 +471,7 @@ class Motion(Shown):
 
     @property
     def coordinates(self) -> Coordinates:
-        """What is estimated of p."""
+        """The map from p to the coordinates that are estimated."""
         return Coordinates(self.parameters)
 
     def check_channels(self, inputs: Sequence[str], outputs: Sequence[str]) -> None:
@@ -369,36 +479,38 @@ class Motion(Shown):
         given = [output.name for output in self.outputs]
         for name in outputs:
             if name not in given:
-                raise InputError(f"the output '{name}' has no expression in the motion; it gives {', '.join(given)}.")
+                raise InputError(
+                    f"the output '{name}' has no expression in the motion; it gives "
+                    f"{', '.join(given)}."
+                )
         for name in given:
             if name not in outputs:
                 hint = nearest(name, outputs) or f"; its outputs are {', '.join(outputs)}"
-                raise InputError(f"the motion gives the output '{name}', which the data do not have{hint}.")
+                raise InputError(
+                    f"the motion gives the output '{name}', which the data do not have{hint}."
+                )
         if tuple(inputs) != self.inputs or [*outputs] != given:
             raise InputError(
-                f"the motion has the inputs {', '.join(self.inputs) or 'none'} and the outputs {', '.join(given)}; the "
-                f"record has {', '.join(inputs) or 'none'} and {', '.join(outputs)}. Give them in one order."
+                f"the motion has the inputs {', '.join(self.inputs) or 'none'} and the outputs "
+                f"{', '.join(given)}; the record has {', '.join(inputs) or 'none'} and "
+                f"{', '.join(outputs)}. Give them in one order."
             )
 
 
-def _ordered(definitions: Mapping[str, Expression]) -> list[str]:
-    """The names so that each stands after those that it uses.
+def _order(definitions: Mapping[str, Expression]) -> list[str]:
+    """Return the names in an order in which each follows those that it uses.
 
     Raises:
         InputError: definitions that need each other.
     """
-    done: list[str] = []
-
-    def visit(name: str, above: tuple[str, ...]) -> None:
-        if name in above:
-            loop = " → ".join((*above[above.index(name) :], name))
-            raise InputError(f"motion.define: an algebraic loop, {loop}; no definition may need itself.")
-        if name not in done:
-            for used in definitions[name].names:
-                if used in definitions:
-                    visit(used, (*above, name))
-            done.append(name)
-
-    for name in definitions:
-        visit(name, ())
-    return done
+    uses = {
+        name: [other for other in given.names if other in definitions]
+        for name, given in definitions.items()
+    }
+    try:
+        return list(TopologicalSorter(uses).static_order())
+    except CycleError as error:
+        loop = " → ".join(reversed(error.args[1]))
+        raise InputError(
+            f"motion.define: an algebraic loop, {loop}; no definition may need itself."
+        ) from None

@@ -1,7 +1,8 @@
-"""The estimation problem of a motion: its record, what the learner sees, and what can be said before any training.
+"""The estimation problem of a motion: its record, learner inputs, and checks before training.
 
-Where it may start: states as they are declared, from what is measured about a row. An output and its derivative are
-those of a local polynomial (Savitzky and Golay 1964), what nothing is said of starts at zero. Training and simulation
+Where it may start: states as they are declared, from what is measured about a row. An output and
+its derivative are those of a local polynomial (Savitzky and Golay 1964), what nothing is said of
+starts at zero. Training and simulation
 go on from there: a start is an unknown.
 """
 
@@ -13,7 +14,7 @@ from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Complex, Float, Int
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
@@ -23,14 +24,26 @@ from orthaug.physics.motion import MOST_SUBSTEPS, Motion
 from orthaug.physics.output_weights import OutputWeights, check_output_weights, weigh_outputs
 
 _LOOKED_AT = 200  # rows at which the equations are looked at
-_ANGLE = 0.35  # of the fastest mode in a substep [rad]: Runge-Kutta errs by about 1e-3 of it in a period
+_ANGLE = (
+    0.35  # of the fastest mode in a substep [rad]: Runge-Kutta errs by about 1e-3 of it in a period
+)
+_TURNED = (
+    100.0  # [rad] in a sample, of a mode that lasts: beyond, every start is in another minimum
+)
+_GONE = (
+    -5.0
+)  # real part times the sampling time: of an oscillation less than 1 % is left at the next sample
+_FASTEST = 4096  # |eigenvalue| times the substep: the exponential of a motion has no digits beyond
 _STEP = 1e-6  # relative, of differences
 _ROWS, _DEGREE = 9, 2  # of a local polynomial
 
 
 @dataclass(frozen=True, eq=False)
 class MotionProblem:
-    """A record with its motion. `features` are what a learner sees; `deviation` (ny,) is that of the outputs."""
+    """A record with its motion.
+
+    `features` are what a learner sees; `deviation` (ny,) is that of the outputs.
+    """
 
     record: Record
     motion: Motion
@@ -42,14 +55,17 @@ class MotionProblem:
 
     def __repr__(self) -> str:
         motion = self.motion
-        return f"MotionProblem({len(self.record)} rows of {', '.join(self.outputs)}, states {motion.names_of_states})"
+        return (
+            f"MotionProblem({len(self.record)} rows of {', '.join(self.outputs)}, states "
+            f"{motion.names_of_states})"
+        )
 
     @property
     def outputs(self) -> tuple[str, ...]:
         return tuple(channel.name for channel in self.record.outputs)
 
     def on(self, record: Record) -> MotionProblem:
-        """The same motion on another record."""
+        """Return the motion's problem on another record."""
         return replace(self, record=record)
 
     @cached_property
@@ -64,7 +80,9 @@ class MotionProblem:
         return np.concatenate(states).T, np.concatenate(inputs).T
 
     def without_value(self, over: Callable[[Any], Any]) -> str:
-        """The first equation or output that has no value at the start, in words, at all guessed states or at any.
+        """Return the first equation or output that is not finite at the start, as text.
+
+        Either at all guessed states, or at any of them.
 
         Args:
             over: np.all or np.any.
@@ -81,21 +99,29 @@ class MotionProblem:
             (self.outputs, outputs, "the output", len(rates)),
         ):
             if values.shape != (len(names), x.shape[1]):
-                raise InputError(f"the motion's functions return shape {values.shape}; expected ({len(names)}, …).")
+                raise InputError(
+                    f"the motion's functions return shape {values.shape}; expected "
+                    f"({len(names)}, …)."
+                )
             for i, name in enumerate(names):
                 lost = ~np.isfinite(values[i])
                 if over(lost):
                     k = int(np.argmax(lost))
-                    at = zip((*motion.names_of_states, *motion.inputs), (*x[:, k], *u[:, k]), strict=True)
+                    at = zip(
+                        (*motion.names_of_states, *motion.inputs), (*x[:, k], *u[:, k]), strict=True
+                    )
                     where = ", ".join(f"{n} = {v:.4g}" for n, v in at)
                     term = motion.term_without_value(first + i, x[:, k], u[:, k])
-                    told = f": {term}" if term else ""
-                    return f"{what} '{name}' is not finite at the start ({where}, initial parameters){told}"
+                    reason = f": {term}" if term else ""
+                    return (
+                        f"{what} '{name}' is not finite at the start ({where}, initial "
+                        f"parameters){reason}"
+                    )
         return ""
 
     @cached_property
-    def fastest(self) -> float:
-        """The largest |eigenvalue| of ∂f/∂x at the initial parameters [1/s], over the guessed states."""
+    def modes(self) -> Complex[np.ndarray, "m nx"]:
+        """The eigenvalues of ∂f/∂x at the initial parameters [1/s], at the guessed states where they are finite."""
         x, u = self.looked_at
         size = np.maximum(np.abs(x).max(axis=1), 1e-6 * np.abs(x).max(initial=1e-6))
         columns = []
@@ -103,15 +129,23 @@ class MotionProblem:
             for i, h in enumerate(_STEP * size):
                 moved = np.zeros_like(x)
                 moved[i] = h
-                ends = (np.asarray(self.motion.rates(x + s * moved, u, self.motion.initial, np)) for s in (1, -1))
+                ends = (
+                    np.asarray(self.motion.rates(x + s * moved, u, self.motion.initial, np))
+                    for s in (1, -1)
+                )
                 columns.append((next(ends) - next(ends)) / (2 * h))
         slopes = np.moveaxis(np.stack(columns, axis=1), -1, 0)
         slopes = slopes[np.isfinite(slopes).all(axis=(1, 2))]
-        return float(np.abs(np.linalg.eigvals(slopes)).max(initial=0.0))
+        return np.linalg.eigvals(slopes).astype(complex)
+
+    @property
+    def fastest(self) -> float:
+        """The largest |eigenvalue| of ∂f/∂x at the initial parameters [1/s], over the guessed states."""
+        return float(np.abs(self.modes).max(initial=0.0))
 
     @property
     def substeps(self) -> int:
-        """With how many substeps training begins."""
+        """Substeps per sample with which training begins."""
         motion = self.motion
         if motion.integrator == "discrete":
             return 1
@@ -131,11 +165,13 @@ def pose_motion(
     """Check record and motion against each other.
 
     Args:
-        learner_inputs: expressions of states and inputs that the learner sees; None for all of them.
+        learner_inputs: expressions of states and inputs that the learner sees; None for all of
+            them.
 
     Raises:
-        InputError: other channels, outputs that do not move, learner inputs that cannot be, equations that have no
-            value at the start, a sampling time too long for the fastest mode.
+        InputError: other channels, outputs that do not move, learner inputs that cannot be,
+            equations that have no value at the start, a sampling time too long for the fastest
+            mode.
     """
     inputs, outputs = (tuple(c.name for c in group) for group in (record.inputs, record.outputs))
     motion = motion.sampled(record.sampling_time)
@@ -148,11 +184,18 @@ def pose_motion(
             == max(np.ptp(e.outputs[:, i]) for e in record.experiments)
             == 0.0
         ):
-            raise InputError(f"channel '{name}' is constant over all training data; nothing can be learned from it.")
+            raise InputError(
+                f"channel '{name}' is constant over all training data; nothing can be learned "
+                "from it."
+            )
     deviation = np.concatenate([e.outputs for e in record.experiments]).std(axis=0)
     deviation = np.where(deviation > 0, deviation, 1.0)
     problem = MotionProblem(
-        record, motion, _features(motion, learner_inputs), deviation, weigh_outputs(output_weights, deviation)
+        record,
+        motion,
+        _features(motion, learner_inputs),
+        deviation,
+        weigh_outputs(output_weights, deviation),
     )
     _check_start(problem)
     return problem
@@ -160,37 +203,72 @@ def pose_motion(
 
 def _features(motion: Motion, texts: Sequence[str] | None) -> tuple[Expression, ...]:
     known = {name: value for name, value in motion.known.items() if name not in motion.names}
-    reach = {name for name, expression in motion.definitions if set(expression.names) & set(motion.names)}
+    reach = {
+        name for name, expression in motion.definitions if set(expression.names) & set(motion.names)
+    }
     texts = (*motion.names_of_states, *motion.inputs) if texts is None else tuple(texts)
     if not texts:
-        raise InputError("the learner sees nothing; give `inputs` such as a state's name, or leave it out for all.")
+        raise InputError(
+            "the learner has no inputs; give `inputs` such as a state's name, or leave the key "
+            "out for all."
+        )
     found = []
     for text in texts:
         expression = parse_named(text, known, "learner input")
         hidden = [name for name in expression.names if name in reach]
         if hidden:
-            raise InputError(f"learner input = {text}: '{hidden[0]}' contains parameters; use states and inputs.")
+            raise InputError(
+                f"learner input = {text}: '{hidden[0]}' contains parameters; use states and inputs."
+            )
         found.append(expression)
     return tuple(found)
 
 
 def _check_start(problem: MotionProblem) -> None:
-    """Raise InputError where the equations have no value at the initial parameters, or modes that are too fast."""
+    """Raise InputError where equations have no value at the start, or a mode is too fast."""
     motion, where = problem.motion, problem.without_value(np.all)
     if where:
-        raise InputError(f"{where}; mend it, or start elsewhere.")
+        raise InputError(f"{where}; correct it, or change the initial values.")
     if motion.integrator == "rk4" and problem.substeps > MOST_SUBSTEPS:
         raise InputError(
-            f"the sampling time of {problem.record.sampling_time:g} s is too long for the fastest mode of the motion, "
-            f"{problem.fastest:.3g} 1/s: it would take {problem.substeps} substeps, at most {MOST_SUBSTEPS} are made. "
-            'Use `integrator = "exact"`, check units and initial values, or leave the fast mode out.'
+            f"the sampling time of {problem.record.sampling_time:g} s is too long for the "
+            f"fastest mode of the motion, {problem.fastest:.3g} 1/s: it needs "
+            f"{problem.substeps} substeps, but at most {MOST_SUBSTEPS} are allowed. Use "
+            '`integrator = "exact"`, check units and initial values, or leave the fast mode out.'
+        )
+    if motion.integrator == "exact":
+        _check_exact(problem)
+
+
+def _check_exact(problem: MotionProblem) -> None:
+    """Raise InputError for modes that samples do not show, or whose exponential has no digits."""
+    sampling_time = problem.record.sampling_time
+    modes: Any = problem.modes
+    lasting = modes[modes.real * sampling_time > _GONE]
+    turned = float(np.abs(lasting.imag).max(initial=0.0)) * sampling_time
+    fast = problem.fastest * sampling_time / problem.substeps
+    if turned > _TURNED:
+        raise InputError(
+            "at the initial parameters a mode of the motion oscillates with "
+            f"{turned / sampling_time:.3g} rad/s, {turned / (2 * np.pi):.3g} periods in a "
+            f"sample of {sampling_time:g} s: the data cannot determine it. Check units and "
+            "initial values, sample faster, or leave the fast mode out."
+        )
+    if fast > _FASTEST:
+        raise InputError(
+            f"the sampling time of {sampling_time:g} s is too long for the fastest mode of the motion, "
+            f'{problem.fastest:.3g} 1/s, also of `integrator = "exact"`: {fast:.3g} in a substep, at most {_FASTEST}. '
+            f"Give `substeps` (at most {MOST_SUBSTEPS}), check units and initial values, or leave the fast mode out."
         )
 
 
 def guess(
-    motion: Motion, outputs: Matrix, rows: Sequence[int] | Int[np.ndarray, "r"], sampling_time: float
+    motion: Motion,
+    outputs: Matrix,
+    rows: Sequence[int] | Int[np.ndarray, "r"],
+    sampling_time: float,
 ) -> Float[np.ndarray, "r n0"]:
-    """The states at some rows, made of the outputs (N, ny) that were measured about them."""
+    """Return states at some rows, estimated from the outputs (N, ny) measured about them."""
     rows = np.asarray(rows, dtype=int)
     width = min(_ROWS, len(outputs))
     begin = np.clip(rows - width // 2, 0, len(outputs) - width)
@@ -212,18 +290,18 @@ def guess(
 
 @cache
 def _polynomials(width: int) -> Float[np.ndarray, "width degree+1 width"]:
-    """What gives the coefficients of a local polynomial about each of its rows from the values of all."""
+    """Return a map from the values of all rows to a local polynomial about each row."""
     offset = np.arange(width)[None, :] - np.arange(width)[:, None]
     return np.linalg.pinv(offset[..., None] ** np.arange(min(_DEGREE, width - 1) + 1))
 
 
-class Named(Lag):
+class SignalName(Lag):
     """A state or an input as a measure names it: at the present instant, without an index."""
 
     def __str__(self) -> str:
         return self.channel
 
 
-def layout_of(motion: Motion) -> tuple[Named, ...]:
-    """States, then inputs."""
-    return tuple(Named(name, 0) for name in (*motion.names_of_states, *motion.inputs))
+def layout_of(motion: Motion) -> tuple[SignalName, ...]:
+    """Return the names of states, then inputs."""
+    return tuple(SignalName(name, 0) for name in (*motion.names_of_states, *motion.inputs))

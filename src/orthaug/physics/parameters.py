@@ -1,6 +1,7 @@
-"""Physical parameters p (m, ks, cd …), what is estimated of them, and the baseline's θ: θ = h(p), and dh/dp.
+"""Physical parameters p (m, ks, cd …), their coordinates, and θ = h(p) with dh/dp.
 
-Estimated is p itself, or log p where p is positive: that keeps it so without a bound, and steps of it are relative.
+Estimated is p itself, or log p where p is positive: that keeps it so without a bound, and steps of
+it are relative.
 """
 
 from __future__ import annotations
@@ -32,9 +33,10 @@ def _complex_arctan2(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.arctan2(np.real(a), np.real(b)) + 1j * slope / (np.real(a) ** 2 + np.real(b) ** 2)
 
 
-# What `Expression.evaluate` asks of numpy, on p + ih: Im θ / h is dθ/dp by the complex step (Squire & Trapp 1998),
-# exact up to rounding whatever the scales of p are. The functions of numpy are analytic, these seven are not. They take
-# the branch of the real part: at a kink that is the slope of one side.
+# The functions that `Expression.evaluate` uses of numpy, on p + ih: Im θ / h is dθ/dp by the complex
+# step (Squire & Trapp 1998), exact up to rounding whatever the scales of p are. The functions of
+# numpy are analytic, these seven are not. They take the branch of the real part: at a kink that is
+# the slope of one side.
 _COMPLEX = SimpleNamespace(
     asarray=lambda x, dtype=None: np.asarray(x, dtype=complex),
     abs=lambda x: np.where(np.real(x) < 0, -1.0, 1.0) * x,
@@ -52,7 +54,8 @@ _COMPLEX = SimpleNamespace(
 class PhysicalParameter:
     """One entry of p: name, initial value, unit and bounds.
 
-    A `min` of 0 says that it is positive: it is then estimated as a logarithm, and its interval is positive too.
+    A `min` of 0 says that it is positive: it is then estimated as a logarithm, and its interval is
+    positive too.
 
     Examples:
         >>> PhysicalParameter("m", 1.2, "kg", min=0)
@@ -68,13 +71,16 @@ class PhysicalParameter:
 
 @dataclass(frozen=True)
 class Coordinates:
-    """The map between parameters p (np,) and what is estimated q (np,)."""
+    """The map between parameters p (np,) and their estimated coordinates q (np,)."""
 
     parameters: tuple[PhysicalParameter, ...]
 
     @property
     def positive(self) -> Bool[np.ndarray, "np"]:
-        """Which are estimated as logarithms: those that cannot be negative and start above zero."""
+        """Mask of the parameters that are estimated as logarithms.
+
+        These cannot be negative and start above zero.
+        """
         return np.array([p.min >= 0 and p.initial > 0 for p in self.parameters], dtype=bool)
 
     @property
@@ -83,17 +89,19 @@ class Coordinates:
         return self.of(np.array([p.initial for p in self.parameters], dtype=float))
 
     def of(self, p: Any) -> Vector:
-        """q of p; logarithms end at the smallest value that counts."""
+        """Return q of p; logarithms end at the smallest value that counts."""
         least = np.array([_SMALLEST * abs(parameter.initial) for parameter in self.parameters])
         p = np.asarray(p, dtype=float)
-        return np.where(self.positive, np.log(np.maximum(np.where(self.positive, p, 1.0), least + 1e-300)), p)
+        return np.where(
+            self.positive, np.log(np.maximum(np.where(self.positive, p, 1.0), least + 1e-300)), p
+        )
 
     def physical(self, q: Any, xp: Any = np) -> Any:
-        """p of q, by `xp` (numpy or jax.numpy)."""
+        """Return p of q, by `xp` (numpy or jax.numpy)."""
         return xp.where(self.positive, xp.exp(xp.where(self.positive, q, 0.0)), q)
 
     def slopes(self, q: Vector) -> Vector:
-        """∂p/∂q (np,)."""
+        """Return ∂p/∂q (np,)."""
         return np.where(self.positive, self.physical(q), 1.0)
 
     @property
@@ -107,7 +115,8 @@ class PhysicsMap:
     """θ = h(p); make one with `of`.
 
     Examples:
-        >>> physics = PhysicsMap.of([PhysicalParameter("m", 2.0, "kg")], {"theta1": "Ts / m"}, {"Ts": 0.1})
+        >>> mass = PhysicalParameter("m", 2.0, "kg")
+        >>> physics = PhysicsMap.of([mass], {"theta1": "Ts / m"}, {"Ts": 0.1})
         >>> physics.initial_theta(), physics.jacobian(np.array([2.0]))
         (array([0.05]), array([[-0.025]]))
     """
@@ -119,7 +128,10 @@ class PhysicsMap:
 
     def __repr__(self) -> str:
         given = zip(self.theta_names, self.expressions, strict=True)
-        return f"PhysicsMap({'; '.join(f'{name} = {text}' for name, text in given)}; p: {', '.join(self.names)})"
+        return (
+            f"PhysicsMap({'; '.join(f'{name} = {text}' for name, text in given)}; p: "
+            f"{', '.join(self.names)})"
+        )
 
     @classmethod
     def of(
@@ -128,25 +140,33 @@ class PhysicsMap:
         theta: Mapping[str, str],
         constants: Mapping[str, float] | None = None,
     ) -> PhysicsMap:
-        """`theta[name]` is an expression of the parameters' names and the `constants`.
+        """Return the map in which `theta[name]` is an expression of parameters and `constants`.
 
         Raises:
-            InputError: a name, value or bound that cannot be; an expression that is not arithmetic on
-                parameters and constants, uses no parameter, or is not finite at the initial values;
-                parameters that θ does not determine, at any point near the initial values.
+            InputError: a name, value or bound that cannot be; an expression that is not arithmetic
+                on parameters and constants, uses no parameter, or is not finite at the initial
+                values; parameters that θ does not determine, at any point near the initial values.
         """
         constants = dict(constants or {})
         check_parameters(parameters, constants)
         if not theta:
-            raise InputError("the physics gives no theta; give one expression for each parameter of the baseline.")
+            raise InputError(
+                "the physics gives no theta; give one expression for each parameter of the "
+                "baseline."
+            )
         names = [p.name for p in parameters]
         known = constants | {p.name: float(p.initial) for p in parameters}
-        expressions = tuple(_parsed(name, text, known, names) for name, text in theta.items())
+        expressions = tuple(_parse(name, text, known, names) for name, text in theta.items())
         used = {name for expression in expressions for name, _ in expression.constants}
         for name in names:
             if name not in used:
-                raise InputError(f"the physical parameter '{name}' is in no expression of theta; use or remove it.")
-        physics = cls(tuple(parameters), tuple(theta), expressions, tuple(sorted(constants.items())))
+                raise InputError(
+                    f"the physical parameter '{name}' is in no expression of theta; use or "
+                    "remove it."
+                )
+        physics = cls(
+            tuple(parameters), tuple(theta), expressions, tuple(sorted(constants.items()))
+        )
         physics._check_start()
         _check_identifiable(physics)
         return physics
@@ -164,52 +184,71 @@ class PhysicsMap:
     @property
     def bounds(self) -> tuple[Vector, Vector]:
         """Lower and upper bounds of p, each (np,); infinite where there are none."""
-        return np.array([p.min for p in self.parameters], float), np.array([p.max for p in self.parameters], float)
+        return np.array([p.min for p in self.parameters], float), np.array(
+            [p.max for p in self.parameters], float
+        )
 
     def theta(self, p: Vector) -> Vector:
-        """h(p), (nθ,) in the order of `theta_names`; not finite where an expression has no value."""
+        """Return h(p), (nθ,) in the order of `theta_names`.
+
+        Not finite where an expression has no value.
+        """
         return self.linearised(p)[0]
 
     def jacobian(self, p: Vector) -> Matrix:
-        """dh/dp, (nθ, np)."""
+        """Return dh/dp, (nθ, np)."""
         return self.linearised(p)[1]
 
     def initial_theta(self) -> Vector:
-        """θ⁰ = h(p⁰), (nθ,)."""
+        """Return θ⁰ = h(p⁰), (nθ,)."""
         return self.theta(self.initial)
 
     def linearised(self, p: Vector) -> tuple[Vector, Matrix]:
-        """h(p) (nθ,) and dh/dp (nθ, np) in one pass.
+        """Return h(p) (nθ,) and dh/dp (nθ, np) in one pass.
 
         Raises:
             InputError: p has not one entry for each parameter.
         """
         p = np.asarray(p, dtype=float)
         if p.shape != (len(self.parameters),):
-            raise InputError(f"`p` has shape {p.shape}; expected one value for each of {', '.join(self.names)}.")
+            raise InputError(
+                f"`p` has shape {p.shape}; expected one value for each of {', '.join(self.names)}."
+            )
         step = _STEP * np.where(p != 0, np.abs(p), 1.0)
         reals = {**dict(self.constants), **dict(zip(self.names, p, strict=True))}
-        lifted: dict[str, Any] = reals | dict(zip(self.names, p[:, None] + 1j * np.diag(step), strict=True))
+        lifted: dict[str, Any] = reals | dict(
+            zip(self.names, p[:, None] + 1j * np.diag(step), strict=True)
+        )
         theta, jacobian = np.empty(len(self.expressions)), np.empty((len(self.expressions), len(p)))
         with np.errstate(all="ignore"):  # the caller says what has no value
             for i, expression in enumerate(self.expressions):
                 theta[i] = expression.value(reals, np)
                 jacobian[i] = np.imag(expression.value(lifted, _COMPLEX))
             # a root at 0 gives h^½, not h, and has no slope; nor has what has no value
-            none = (np.abs(jacobian) > 1e-60 * np.maximum(np.abs(theta), 1.0)[:, None]) | ~np.isfinite(theta)[:, None]
+            none = (
+                np.abs(jacobian) > 1e-60 * np.maximum(np.abs(theta), 1.0)[:, None]
+            ) | ~np.isfinite(theta)[:, None]
             return theta, np.where(none, np.inf, jacobian / step)
 
     @cached_property
     def size(self) -> Vector:
-        """The magnitude of each p, (np,), for scaling: |p⁰|. Where p⁰ = 0, that of its bounds, or what moves θ."""
+        """The magnitude |p⁰| (np,) of each p, for scaling.
+
+        Where p⁰ = 0, that of its bounds, or of a change that moves θ.
+        """
         theta, jacobian = self.linearised(self.initial)
         change = np.max(np.abs(jacobian) / magnitude(theta)[:, None], axis=0)
         reach = np.max(np.abs(self.bounds), axis=0)
         moving = 1 / np.where((change > 0) & np.isfinite(change), change, 1.0)
-        return np.where(self.initial != 0, np.abs(self.initial), np.where(np.isfinite(reach), reach, moving))
+        return np.where(
+            self.initial != 0, np.abs(self.initial), np.where(np.isfinite(reach), reach, moving)
+        )
 
     def around(self, count: int, factor: float) -> Matrix:
-        """`count` points within the bounds, (count, np): p⁰ times 1/`factor` to `factor`, the same at every call."""
+        """Return `count` points within the bounds, (count, np), the same at every call.
+
+        They lie between p⁰ times 1/`factor` and p⁰ times `factor`.
+        """
         exponent = np.random.default_rng(0).uniform(-1, 1, (count, len(self.parameters)))
         points = np.where(self.initial != 0, self.initial * factor**exponent, self.size * exponent)
         return np.clip(points, *self.bounds)
@@ -222,20 +261,26 @@ class PhysicsMap:
                 what = f"is {value}" if not np.isfinite(value) else "has no finite derivative"
                 raise InputError(
                     f"physics.theta '{name}' = {expression} {what} at the initial values of "
-                    f"{', '.join(self.names)}; expected a finite one: start elsewhere."
+                    f"{', '.join(self.names)}; expected a finite value: change the initial "
+                    "values."
                 )
 
 
 def magnitude(values: Vector) -> Vector:
-    """|values|. A zero takes the largest of them; where all are zero, each is 1."""
+    """Return |values|.
+
+    A zero takes the largest of them; where all are zero, each is 1.
+    """
     size = np.abs(values)
     return np.where(size > 0, size, size.max(initial=0.0) or 1.0)
 
 
 def check_parameters(
-    parameters: Sequence[PhysicalParameter], constants: Mapping[str, float], taken: Collection[str] = RESERVED
+    parameters: Sequence[PhysicalParameter],
+    constants: Mapping[str, float],
+    taken: Collection[str] = RESERVED,
 ) -> None:
-    """Raise InputError for names, values, units or bounds of parameters and constants that cannot be."""
+    """Raise InputError for invalid names, values, units or bounds of parameters and constants."""
     if not parameters:
         raise InputError("the physics has no parameters; give at least one, such as m.")
     check_unique((p.name for p in parameters), "physical parameter")
@@ -243,8 +288,9 @@ def check_parameters(
         if not is_name(name, taken):
             index = " (k is the time index)" if "k" in taken else ""
             raise InputError(
-                f"'{name}' cannot name a physical parameter or constant; use letters, digits and underscores, not "
-                f"starting with a digit, and no keyword; {', '.join(sorted(taken))} are taken{index}."
+                f"'{name}' cannot name a physical parameter or constant; use letters, digits "
+                "and underscores, not starting with a digit, and no keyword; "
+                f"{', '.join(sorted(taken))} are taken{index}."
             )
     for name, value in constants.items():
         if not is_number(value):
@@ -252,14 +298,19 @@ def check_parameters(
     for p in parameters:
         check_not_sampling_time(p.name, "a parameter")
         if p.name in constants:
-            raise InputError(f"'{p.name}' is a physical parameter and a constant; give one of them another name.")
+            raise InputError(
+                f"'{p.name}' is a physical parameter and a constant; give one of them another name."
+            )
         if not is_number(p.initial):
-            raise InputError(f"the initial value of '{p.name}' must be a finite number; got {shown(p.initial)}.")
+            raise InputError(
+                f"the initial value of '{p.name}' must be a finite number; got {shown(p.initial)}."
+            )
         check_label(p.unit, f"the unit of '{p.name}'")
         check_bounds(p.name, p.min, p.max)
         if not p.min <= p.initial <= p.max:
             raise InputError(
-                f"the initial value of '{p.name}' is {p.initial:g}; its bounds are {p.min:g} and {p.max:g}."
+                f"the initial value of '{p.name}' is {p.initial:g}; its bounds are {p.min:g} "
+                f"and {p.max:g}."
             )
 
 
@@ -267,25 +318,30 @@ def check_not_sampling_time(name: str, what: str) -> None:
     """Raise InputError for a name that expressions read as the sampling time."""
     if name == SAMPLING_TIME:
         raise InputError(
-            f"'{SAMPLING_TIME}' cannot name {what}: expressions read it as the sampling time of the data, in s. Give "
-            f"{what[2:].strip()} another name."
+            f"'{SAMPLING_TIME}' cannot name {what}: expressions read it as the sampling time "
+            f"of the data, in s. Give {what[2:].strip()} another name."
         )
 
 
-def _parsed(name: str, text: str, known: Mapping[str, float], parameters: Sequence[str]) -> Expression:
+def _parse(
+    name: str, text: str, known: Mapping[str, float], parameters: Sequence[str]
+) -> Expression:
     where = f"physics.theta '{name}'"
     declare = {SAMPLING_TIME: "; give it in `constants`, {'Ts': record.sampling_time}"}
     expression = parse_named(text, known, where, declare)
     if not any(used in parameters for used in expression.names):
         raise InputError(
-            f"{where} = {text} depends on no physical parameter; use one of {', '.join(parameters)}, "
-            "or make it a fixed term of the baseline."
+            f"{where} = {text} depends on no physical parameter; use one of "
+            f"{', '.join(parameters)}, or make it a fixed term of the baseline."
         )
     return expression
 
 
 def _check_identifiable(physics: PhysicsMap) -> None:
-    """Raise InputError where θ does not determine p at p⁰ nor at any of twenty points within a factor 2 of it."""
+    """Raise InputError where θ does not determine p near p⁰.
+
+    p⁰ itself and twenty points within a factor 2 of it are tried.
+    """
     best: Excitation | None = None
     for p in (physics.initial, *physics.around(20, 2.0)):
         jacobian = physics.jacobian(p) * physics.size
@@ -297,49 +353,63 @@ def _check_identifiable(physics: PhysicsMap) -> None:
             best = sensitivity
     if best is not None and not best.full_rank:
         raise InputError(
-            f"theta does not determine the physical parameters: {tied(best)} ({len(physics.theta_names)} theta, "
-            f"rank {best.rank} of {best.columns}). Make one of them a constant, or add a term that tells them apart."
+            f"theta does not determine the physical parameters: {tied(best)} "
+            f"({len(physics.theta_names)} theta, rank {best.rank} of {best.columns}). Make one "
+            "of them a constant, or add a term that distinguishes them."
         )
 
 
 def tied(sensitivity: Excitation) -> str:
-    """Which parameters θ does not tell apart, in words."""
+    """Return the parameters that θ does not separate, in words."""
     return "; ".join(
-        f"{group[0]} has no effect" if len(group) == 1 else f"{', '.join(group)} cannot be told apart"
+        f"{group[0]} has no effect"
+        if len(group) == 1
+        else f"{', '.join(group)} cannot be distinguished"
         for group in sensitivity.collinear
     )
 
 
 def check_baseline(physics: PhysicsMap, baseline: Baseline) -> None:
-    """Raise InputError unless the map gives exactly the baseline's θ, and no term's `initial` differs from it."""
+    """Raise InputError unless the map gives exactly the baseline's θ, with its initial values."""
     fixed = {term.parameter for term in baseline.terms if term.fixed}
     for name in physics.theta_names:
         if name in fixed:
             raise InputError(
-                f"physics.theta '{name}' is a fixed term of the baseline; leave out the expression, or `fixed`."
+                f"physics.theta '{name}' is a fixed term of the baseline; leave out the "
+                "expression, or `fixed`."
             )
         if name not in baseline.names:
-            hint = nearest(name, baseline.names) or f"; its parameters are {', '.join(baseline.names)}"
+            hint = (
+                nearest(name, baseline.names) or f"; its parameters are {', '.join(baseline.names)}"
+            )
             raise InputError(f"physics.theta '{name}' is no parameter of the baseline{hint}.")
     given = dict(zip(physics.theta_names, physics.initial_theta(), strict=True))
     for name in baseline.names:
         if name not in given:
-            raise InputError(f"the physics gives no '{name}'; expected an expression for every theta of the baseline.")
+            raise InputError(
+                f"the physics gives no '{name}'; expected an expression for every theta of the "
+                "baseline."
+            )
     for term in baseline.terms:
         if not term.fixed and term.initial is not None:
             value = given[term.parameter]
             if not math.isclose(term.initial, value, rel_tol=AGREEMENT):
                 raise InputError(
-                    f"{term.parameter}: initial {term.initial:.7g} but the physics gives {value:.7g}; leave one out."
+                    f"{term.parameter}: initial {term.initial:.7g} but the physics gives "
+                    f"{value:.7g}; leave one out."
                 )
 
 
 def with_initial(physics: PhysicsMap, baseline: Baseline) -> Baseline:
-    """The baseline with θ⁰ = h(p⁰), after `check_baseline`."""
+    """Return the baseline with θ⁰ = h(p⁰), after `check_baseline`."""
     check_baseline(physics, baseline)
-    given = {name: float(v) for name, v in zip(physics.theta_names, physics.initial_theta(), strict=True)}
+    given = {
+        name: float(v) for name, v in zip(physics.theta_names, physics.initial_theta(), strict=True)
+    }
     return replace(
         baseline,
         parameters=tuple(replace(p, initial=given[p.name]) for p in baseline.parameters),
-        terms=tuple(t if t.fixed else replace(t, initial=given[t.parameter]) for t in baseline.terms),
+        terms=tuple(
+            t if t.fixed else replace(t, initial=given[t.parameter]) for t in baseline.terms
+        ),
     )

@@ -1,4 +1,4 @@
-"""The estimation problem: rows, physics matrix and projection of a record, checked before any training.
+"""The estimation problem: rows, physics matrix and projection of a record, checked.
 
 Everything that can be wrong with data and physics together is found here, without JAX.
 """
@@ -18,20 +18,30 @@ from orthaug._base.errors import InputError
 from orthaug._base.parallel import one_blas_thread
 from orthaug.data.expressions import Lag, parse
 from orthaug.data.record import Record
-from orthaug.data.regressors import Features, Lags, Layout, UsableRows, in_order, lag_matrix, stack_rows
+from orthaug.data.regressors import (
+    Features,
+    Lags,
+    Layout,
+    UsableRows,
+    in_order,
+    lag_matrix,
+    stack_rows,
+)
 from orthaug.physics.baseline import Baseline
 from orthaug.physics.excitation import Excitation, excitation, require_rank
 from orthaug.physics.output_weights import OutputWeights, check_output_weights, weigh_outputs
 from orthaug.physics.projection import Projection
 from orthaug.physics.shared import Shared, shared_directions
 
-_LARGEST = 1e120  # size of outputs and regressors whose squares still add up; 1 / _LARGEST is the smallest
+_LARGEST = (
+    1e120  # size of outputs and regressors whose squares still add up; 1 / _LARGEST is the smallest
+)
 
 _SMALLEST_RESIDUAL = 1e-10  # of an output's deviation: the physics leaves at least rounding
 
 
 class Extent(NamedTuple):
-    """Smallest and largest value of some columns, (n,) each; parts of the rows add up by `|`."""
+    """Smallest and largest value of some columns, (n,) each; `|` joins those of two parts."""
 
     low: Vector
     high: Vector
@@ -45,7 +55,7 @@ class Extent(NamedTuple):
 
 
 class Moments(NamedTuple):
-    """Count, mean and scatter `Σ (v − v̄)(v − v̄)ᵀ` of some columns; parts add up too."""
+    """Count, mean and scatter `Σ (v − v̄)(v − v̄)ᵀ` of columns; `|` joins those of two parts."""
 
     count: int
     mean: Vector
@@ -57,12 +67,16 @@ class Moments(NamedTuple):
         return cls(len(values), mean, (values - mean).T @ (values - mean))
 
     def __or__(self, other: Moments) -> Moments:
-        """Of both together (Chan, Golub and LeVeque 1983)."""
+        """Return the moments of both together (Chan, Golub and LeVeque 1983)."""
         count = self.count + other.count
         if not count:
             return self
         apart = other.mean - self.mean
-        scatter = self.scatter + other.scatter + np.outer(apart, apart) * (self.count * other.count / count)
+        scatter = (
+            self.scatter
+            + other.scatter
+            + np.outer(apart, apart) * (self.count * other.count / count)
+        )
         return Moments(count, self.mean + apart * (other.count / count), scatter)
 
     @property
@@ -77,11 +91,11 @@ class Moments(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Usable rows of a record with everything that does not depend on the learner's weights.
+    """Usable rows of a record, and all quantities that do not depend on the learner's weights.
 
-    `weight` weighs the outputs, for criterion and measure alike: so F1 holds for several outputs too. Rows multiplied
-    by it are called whitened. `target` is the outputs without the fixed terms, `deviation` (ny,) the standard
-    deviation of the outputs themselves.
+    `weight` weighs the outputs, for criterion and measure alike: so F1 holds for several outputs
+    too. Rows multiplied by it are called whitened. `target` is the outputs without the fixed terms,
+    `deviation` (ny,) the standard deviation of the outputs themselves.
     """
 
     record: Record
@@ -97,7 +111,10 @@ class Problem:
 
     def __repr__(self) -> str:
         lags = ", ".join(str(lag) for lag in self.layout)
-        return f"Problem({len(self.rows)} rows of {', '.join(self.outputs)}, x: {lags}, {self.baseline!r})"
+        return (
+            f"Problem({len(self.rows)} rows of {', '.join(self.outputs)}, x: {lags}, "
+            f"{self.baseline!r})"
+        )
 
     @property
     def outputs(self) -> tuple[str, ...]:
@@ -110,7 +127,7 @@ class Problem:
 
     @property
     def count(self) -> int:
-        """How many rows there are."""
+        """Number of rows."""
         return len(self.rows)
 
     @property
@@ -130,7 +147,7 @@ class Problem:
 
     @cached_property
     def least_squares(self) -> Vector:
-        """Φ⁺Y (nθ,): θ̂ of physics alone, and of the orthogonal structure whatever the learner does (F1)."""
+        """Φ⁺Y (nθ,): θ̂ of physics alone, and of the orthogonal structure with any learner (F1)."""
         return self.projection.solve(self.whitened_target)
 
     @cached_property
@@ -140,16 +157,19 @@ class Problem:
 
     @cached_property
     def unexplained(self) -> Float[np.ndarray, "N ny"]:
-        """P⊥Y, what the physics cannot express of the whitened outputs."""
+        """P⊥Y, the part of the whitened outputs that the physics cannot express."""
         return self.projection.orthogonal_part(self.whitened_target)
 
     @cached_property
     def unexplained_moments(self) -> Moments:
-        """Of `unexplained`."""
+        """Moments of `unexplained`."""
         return Moments.of(self.unexplained)
 
     def unexplained_sizes(self, *, centred: bool) -> tuple[Vector, Vector]:
-        """How large what the physics leaves is in each output (ny,), whitened and not: its deviation, or its RMS."""
+        """Return the size (ny,) of the residual of the physics, whitened and not.
+
+        The size is its deviation, or its RMS.
+        """
         moments, back = self.unexplained_moments, np.linalg.inv(self.weight.matrix)
         found = []
         for change, least in ((np.eye(len(back)), np.ones(len(back))), (back, self.deviation)):
@@ -170,30 +190,45 @@ class Problem:
     @cached_property
     def shared(self) -> Shared:
         """The directions of θ that a learner on these features could imitate."""
-        return shared_directions(self.baseline, self.features, self.layout, self.outputs, self.rows.x)
+        return shared_directions(
+            self.baseline, self.features, self.layout, self.outputs, self.rows.x
+        )
 
     @cached_property
     def freedom_used(self) -> Vector:
-        """Degrees of freedom that the physics uses up in each output (ny,): the output's share `Σ_k ‖Q_ki‖²` of nθ."""
+        """Degrees of freedom (ny,) that the physics uses up in each output.
+
+        An output has the share `Σ_k ‖Q_ki‖²` of nθ.
+        """
         return np.sum(self.projection.q**2, axis=(0, 2))
 
     def seen_linearly(self) -> Problem:
-        """The same for a learner that is a linear combination of its features."""
-        return self if self.features.linear else replace(self, features=replace(self.features, linear=True))
+        """Return the problem for a learner that is a linear combination of its features."""
+        return (
+            self
+            if self.features.linear
+            else replace(self, features=replace(self.features, linear=True))
+        )
 
     def physics_alone(self) -> Problem:
-        """The problem without a learner. It is posed anew where the learner's lags took rows from the physics."""
+        """Return the problem without a learner.
+
+        It is posed anew where the learner's lags took rows from the physics.
+        """
         outputs, inputs = self.outputs, tuple(channel.name for channel in self.record.inputs)
-        if self.baseline.function is not None or in_order(self.baseline.lags, outputs, inputs) == self.layout:
+        if (
+            self.baseline.function is not None
+            or in_order(self.baseline.lags, outputs, inputs) == self.layout
+        ):
             return replace(self, features=Features(()))
         return pose(self.record, self.baseline, output_weights=self.weight.choice)
 
     def on(self, record: Record) -> Problem:
-        """The same physics and features on another record."""
-        return _posed(record, self.baseline, self.layout, self.features, self.weight.choice)
+        """Return the problem with the same physics and features on another record."""
+        return _pose(record, self.baseline, self.layout, self.features, self.weight.choice)
 
     def weighed(self, weight: OutputWeights) -> Problem:
-        """The same problem with other output weights."""
+        """Return the problem with other output weights."""
         if weight is self.weight:
             return self
         projection = Projection.factor(weight.rows(self.weight.outputs(self.projection.phi)))
@@ -201,7 +236,7 @@ class Problem:
         return replace(self, weight=weight, projection=projection, excitation=excited)
 
     def feature_rows(self) -> Matrix:
-        """The learner's features (N, nz).
+        """Return the learner's features (N, nz).
 
         Raises:
             InputError: a feature that is not finite on some row.
@@ -234,9 +269,9 @@ def pose(
         require_full_rank: raise where the data do not determine θ; `check` reports it instead.
 
     Raises:
-        InputError: unknown channels, outputs at lag 0, constant channels, values that are not finite,
-            too few rows, initial values beyond their bounds, a constant `Ts` that is not the sampling time;
-            RankError for linearly dependent physics.
+        InputError: unknown channels, outputs at lag 0, constant channels, values that are not
+            finite, too few rows, initial values beyond their bounds, a constant `Ts` that is not
+            the sampling time; RankError for linearly dependent physics.
     """
     outputs, inputs = (tuple(c.name for c in group) for group in (record.outputs, record.inputs))
     if not outputs:
@@ -248,10 +283,12 @@ def pose(
     baseline.check_channels(outputs, inputs)
     layout, features = regressor_of(baseline, lags, learner_inputs, outputs, inputs)
     features = features.sampled(record.sampling_time)
-    return _posed(record, baseline, layout, features, output_weights, require_full_rank=require_full_rank)
+    return _pose(
+        record, baseline, layout, features, output_weights, require_full_rank=require_full_rank
+    )
 
 
-def _posed(
+def _pose(
     record: Record,
     baseline: Baseline,
     layout: Layout,
@@ -260,7 +297,7 @@ def _posed(
     *,
     require_full_rank: bool = True,
 ) -> Problem:
-    """Rows, physics matrix and factor of a record whose channels were checked."""
+    """Return rows, physics matrix and factor of a record whose channels were checked."""
     outputs = tuple(channel.name for channel in record.outputs)
     rows = stack_rows(record, layout)
     signals = [np.concatenate([e.outputs, e.inputs], axis=1) for e in record.experiments]
@@ -277,22 +314,26 @@ def _posed(
     excited = excitation(projection.r, baseline.names)
     if require_full_rank:
         require_rank(excited, rows.y.size)
-    return Problem(record, baseline, features, layout, rows, target, deviation, weight, projection, excited)
+    return Problem(
+        record, baseline, features, layout, rows, target, deviation, weight, projection, excited
+    )
 
 
 def check_defined(problem: Problem, record: Record) -> None:
-    """Raise InputError where physics or learner inputs are not finite on another record's measured rows."""
+    """Raise InputError where physics or learner inputs are not finite on another record."""
     layout, outputs, start = problem.layout, problem.outputs, problem.rows.start
     for experiment in record.experiments:
         alone = replace(record, experiments=(experiment,))
-        rows = UsableRows(lag_matrix(experiment, layout, record, start), experiment.outputs[start:], layout, start)
+        rows = UsableRows(
+            lag_matrix(experiment, layout, record, start), experiment.outputs[start:], layout, start
+        )
         phi, known = problem.baseline.on(rows.x, layout, outputs)
         check_physics(phi, known, problem.baseline, rows, alone)
         feature_rows(problem.features, rows, layout, alone)
 
 
 def feature_rows(features: Features, rows: UsableRows, layout: Layout, record: Record) -> Matrix:
-    """The learner's features (N, nz) of some rows; InputError where one is not finite."""
+    """Return the learner's features (N, nz) of some rows; InputError where one is not finite."""
     with np.errstate(all="ignore"):
         z = np.asarray(features.evaluate(rows.x, layout, np))
     for j, entry in enumerate(features.entries):
@@ -307,12 +348,14 @@ def regressor_of(
     outputs: tuple[str, ...],
     inputs: tuple[str, ...],
 ) -> tuple[Layout, Features]:
-    """The regressor of the whole model, and what the learner sees of it.
+    """Return the regressor of the whole model, and the learner's features of it.
 
     Raises:
         InputError: unknown channels, outputs at lag 0, learner inputs that cannot be read.
     """
-    chosen = in_order(baseline.lags, outputs, inputs) if lags is None else lags.layout(outputs, inputs)
+    chosen = (
+        in_order(baseline.lags, outputs, inputs) if lags is None else lags.layout(outputs, inputs)
+    )
     features = Features.of(chosen)
     if learner_inputs is not None:
         constants = dict(baseline.constants)
@@ -323,18 +366,27 @@ def regressor_of(
         except InputError as error:
             raise InputError(f"learner input: {error}") from None
         features = Features(tuple(expressions))
-    if baseline.function is not None:  # it takes the regressor exactly as `lags` lays it out
+    if baseline.function is not None:  # it takes the regressor exactly as `lags` orders it
         if lags is None:
-            raise InputError("a baseline function needs `lags`: they define the regressor x that it is called with.")
+            raise InputError(
+                "a baseline function needs `lags`: they define the regressor x that it is "
+                "called with."
+            )
         missing = set(features.lags) - set(chosen)
         if missing:
-            raise InputError(f"the learner inputs use {', '.join(map(str, missing))}, which `lags` does not contain.")
+            raise InputError(
+                f"the learner inputs use {', '.join(map(str, missing))}, which `lags` does not "
+                "contain."
+            )
         return chosen, features
     return in_order((*chosen, *features.lags, *baseline.lags), outputs, inputs), features
 
 
 def check_moving(extent: Extent, record: Record, layout: Layout) -> None:
-    """Raise InputError for a channel of the model that is constant; `extent` is that of outputs, then inputs."""
+    """Raise InputError for a channel of the model that is constant.
+
+    `extent` is that of outputs, then inputs.
+    """
     used = {lag.channel for lag in layout} | {channel.name for channel in record.outputs}
     for channel, low, high in zip(record.channels, *extent, strict=True):
         if channel.name in used and low == high:
@@ -345,25 +397,35 @@ def check_moving(extent: Extent, record: Record, layout: Layout) -> None:
 
 
 def check_sizes(deviation: Vector, moved: Vector) -> None:
-    """Raise InputError for outputs of such a deviation (ny,) that move by `moved`, if their squares do not add up."""
+    """Raise InputError for outputs whose squares double precision cannot represent.
+
+    `moved` is the range of each output (ny,).
+    """
     moves = moved > 0
-    if not np.all(np.isfinite(deviation)) or np.any(moves & ((deviation > _LARGEST) | (deviation < 1 / _LARGEST))):
+    if not np.all(np.isfinite(deviation)) or np.any(
+        moves & ((deviation > _LARGEST) | (deviation < 1 / _LARGEST))
+    ):
         raise InputError(
             f"the outputs move by {np.max(moved):.3g}, too large or too small for double precision "
             "arithmetic; scale them (`scale` of the channel)."
         )
 
 
-def check_physics(phi: np.ndarray, known: np.ndarray, baseline: Baseline, rows: UsableRows, record: Record) -> None:
-    """Raise InputError where Φ (N, ny, nθ) or the fixed terms (N, ny) are not finite, or their squares not."""
+def check_physics(
+    phi: np.ndarray, known: np.ndarray, baseline: Baseline, rows: UsableRows, record: Record
+) -> None:
+    """Raise InputError where Φ (N, ny, nθ), the fixed terms (N, ny) or their squares overflow."""
     for j, name in enumerate(baseline.names):
-        texts = ", ".join(t.regressor for t in baseline.terms if t.parameter == name) or "the baseline function"
+        texts = (
+            ", ".join(t.regressor for t in baseline.terms if t.parameter == name)
+            or "the baseline function"
+        )
         _check_finite(phi[:, :, j], f"the regressor of {name} ({texts})", rows, record)
         size = np.abs(phi[:, :, j]).max()
         if size > _LARGEST or 0 < size < 1 / _LARGEST:
             raise InputError(
-                f"the regressor of {name} ({texts}) is of size {size:.3g}, beyond double precision arithmetic; "
-                "scale its channels (`scale`)."
+                f"the regressor of {name} ({texts}) is of size {size:.3g}, beyond double "
+                "precision arithmetic; scale its channels (`scale`)."
             )
     _check_finite(known, "the sum of the fixed terms", rows, record)
 

@@ -19,10 +19,10 @@ _ROUNDING = 1e-13  # of the size of what is summed: below it a direction moves n
 
 @dataclass(frozen=True, eq=False)
 class Factor:
-    """R of Φ, for where the rows of Φ are not kept: `Φ scale = q r` with orthonormal q.
+    """R of Φ, for rows of Φ that are not kept: `Φ scale = q r` with orthonormal q.
 
-    `r` (nθ, nθ) is upper triangular. `scale` (nθ,) multiplies the columns; its entries are powers of two, which is
-    exact.
+    `r` (nθ, nθ) is upper triangular. `scale` (nθ,) multiplies the columns; its entries are powers
+    of two, which is exact.
     """
 
     r: Float[np.ndarray, "nt nt"]
@@ -30,10 +30,15 @@ class Factor:
 
     @classmethod
     def of_blocks(cls, blocks: Iterable[Float[np.ndarray, "n ny nt"]]) -> Factor:
-        """From blocks of rows, one at a time: R of the blocks before is stacked upon the next block (tree QR)."""
+        """Return the factor of blocks of rows, one at a time (tree QR).
+
+        R of the blocks before is stacked upon the next block.
+        """
         r = scale = None
         for block in blocks:
-            rows = block.reshape(block.shape[0] * block.shape[1], block.shape[2])  # −1 has no meaning without columns
+            rows = block.reshape(
+                block.shape[0] * block.shape[1], block.shape[2]
+            )  # −1 has no meaning without columns
             if scale is None or r is None:
                 scale, r = _scale(rows), np.zeros((0, rows.shape[1]))
             r = np.asarray(np.linalg.qr(np.concatenate([r, rows * scale]), mode="r"))
@@ -46,49 +51,66 @@ class Factor:
         """The matrix that takes θ to its coordinates in the basis Q, `R / scale` (nθ, nθ)."""
         return self.r / self.scale if self.scale.size else self.r
 
-    def from_coordinates(self, coordinates: Float[np.ndarray, "nt *m"]) -> Float[np.ndarray, "nt *m"]:
-        """θ of coordinates in the basis Q: `R⁻¹q`, one vector or several as columns."""
+    def from_coordinates(
+        self, coordinates: Float[np.ndarray, "nt *m"]
+    ) -> Float[np.ndarray, "nt *m"]:
+        """Return θ of coordinates in the basis Q: `R⁻¹q`, one vector or several as columns."""
         if not coordinates.size:
             return coordinates
-        return (self.scale * scipy.linalg.solve_triangular(self.r, coordinates, check_finite=False).T).T
+        return (
+            self.scale * scipy.linalg.solve_triangular(self.r, coordinates, check_finite=False).T
+        ).T
 
     def along(self, directions: Float[np.ndarray, "nt s"] | None) -> Matrix:
-        """The projector (nθ, nθ) onto some directions of θ, in coordinates of Q; None for all of them."""
+        """Return the projector (nθ, nθ) onto some directions of θ, in coordinates of Q.
+
+        None for all of them.
+        """
         if directions is None:
             return np.eye(len(self.r))
         basis = np.linalg.qr(self.to_coordinates @ directions)[0]
         return basis @ basis.T
 
-    def told_of(self, directions: Float[np.ndarray, "nt s"]) -> Float[np.ndarray, "nt r"]:
-        """A basis of some directions of θ without what Φ takes to zero; the directions as they are where that is none.
+    def without_null(self, directions: Float[np.ndarray, "nt s"]) -> Float[np.ndarray, "nt r"]:
+        """Return a basis of some directions of θ without those that Φ takes to zero.
 
-        A parameter that stands in none of the rows has a column of zeros.
+        Without such directions, they are returned unchanged. A parameter that appears in none of
+        the rows has a column of zeros.
         """
         moved = self.to_coordinates @ directions
         size = np.linalg.norm(moved, axis=0)
-        told = size > _ROUNDING * np.linalg.norm(np.abs(self.to_coordinates) @ np.abs(directions), axis=0)
-        unit = directions[:, told] / size[told]
+        seen = size > _ROUNDING * np.linalg.norm(
+            np.abs(self.to_coordinates) @ np.abs(directions), axis=0
+        )
+        unit = directions[:, seen] / size[seen]
         _, sigma, vt = np.linalg.svd(self.to_coordinates @ unit)
         rank = int(np.sum(sigma > _ROUNDING * sigma.max(initial=0.0)))
         return directions if rank == directions.shape[1] else unit @ vt[:rank].T
 
     def covariance_factor(self, free: Sequence[int] | None = None) -> Float[np.ndarray, "nf nt"]:
-        """A factor L with `L Lᵀ = (Φ_fᵀΦ_f)⁻¹` for the free columns, all by default; `L = Φ_f⁺Q`."""
+        """Return a factor L with `L Lᵀ = (Φ_fᵀΦ_f)⁻¹` for the free columns, all by default.
+
+        `L = Φ_f⁺Q`.
+        """
         chosen = list(range(len(self.scale))) if free is None else list(free)
         basis, r = np.linalg.qr(self.r[:, chosen])
-        return self.scale[chosen, None] * scipy.linalg.solve_triangular(r, basis.T) if chosen else basis.T
+        return (
+            self.scale[chosen, None] * scipy.linalg.solve_triangular(r, basis.T)
+            if chosen
+            else basis.T
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class Projection(Factor):
-    """A factor with its rows, weighted per output: `phi` and the orthonormal `q`, both (N, ny, nθ)."""
+    """A factor with its rows weighted per output: `phi` and orthonormal `q`, both (N, ny, nθ)."""
 
     phi: Float[np.ndarray, "N ny nt"]
     q: Float[np.ndarray, "N ny nt"]
 
     @classmethod
     def factor(cls, phi: Float[np.ndarray, "N ny nt"]) -> Projection:
-        """Householder QR of the stacked (N·ny, nθ) matrix."""
+        """Return the projection by Householder QR of the stacked (N·ny, nθ) matrix."""
         rows, ny, nt = phi.shape
         if nt == 0:
             return cls(np.zeros((0, 0)), np.zeros(0), phi, phi)
@@ -100,34 +122,43 @@ class Projection(Factor):
         return cls(r, scale, phi, np.ascontiguousarray(q).reshape(rows, ny, -1))
 
     def coordinates(self, values: Float[np.ndarray, "N ny"]) -> Vector:
-        """Qᵀv, (nθ,): the part of stacked outputs that the physics can express."""
+        """Return Qᵀv, (nθ,): the part of stacked outputs that the physics can express."""
         return np.tensordot(self.q, values, axes=([0, 1], [0, 1]))
 
     def solve(self, values: Float[np.ndarray, "N ny"]) -> Vector:
-        """Φ⁺v, (nθ,), refined once: θ̂ for outputs (F1), θ_aux for a learner's values (eq:theta_aux)."""
+        """Return Φ⁺v, (nθ,), refined once.
+
+        This is θ̂ for outputs (F1), and θ_aux for a learner's values (eq:theta_aux).
+        """
         theta = self.from_coordinates(self.coordinates(values))
         return theta + self.from_coordinates(self.coordinates(values - self.phi @ theta))
 
-    def solve_along(self, values: Float[np.ndarray, "N ny"], directions: Float[np.ndarray, "nt s"] | None) -> Vector:
-        """B(ΦB)⁺v, (nθ,): least squares along some directions of θ only, refined once; None for all of them.
+    def solve_along(
+        self, values: Float[np.ndarray, "N ny"], directions: Float[np.ndarray, "nt s"] | None
+    ) -> Vector:
+        """Return B(ΦB)⁺v, (nθ,): least squares along some directions only, refined once.
 
-        Φ itself need not have full rank: what no row tells stays zero.
+        None for all of them.
+
+        Φ itself need not have full rank: what no row determines stays zero.
         """
         if directions is None:
             return self.solve(values)
-        told = self.told_of(directions)
-        if not told.shape[1]:
+        directions = self.without_null(directions)
+        if not directions.shape[1]:
             return np.zeros(len(directions))
-        basis, r = np.linalg.qr(self.to_coordinates @ told)
+        basis, r = np.linalg.qr(self.to_coordinates @ directions)
 
         def along(rest: Float[np.ndarray, "N ny"]) -> Vector:
-            return told @ scipy.linalg.solve_triangular(r, basis.T @ self.coordinates(rest), check_finite=False)
+            return directions @ scipy.linalg.solve_triangular(
+                r, basis.T @ self.coordinates(rest), check_finite=False
+            )
 
         theta = along(values)
         return theta + along(values - self.phi @ theta)
 
     def orthogonal_part(self, values: Float[np.ndarray, "N ny"]) -> Float[np.ndarray, "N ny"]:
-        """P⊥v = v − QQᵀv, projected twice so that what is left is orthogonal to rounding."""
+        """Return P⊥v = v − QQᵀv, projected twice to be orthogonal to rounding."""
         for _ in range(2):
             values = values - self.q @ self.coordinates(values)
         return values
@@ -138,6 +169,11 @@ def _scale(rows: Matrix) -> Vector:
 
 
 def powers_of_two(largest: Vector) -> Vector:
-    """Those that bring the largest entry of each column (nθ,) near 1; 1 for a column of zeros."""
+    """Return the powers of two that bring the largest entry of each column (nθ,) near 1.
+
+    1 for a column of zeros.
+    """
     moves = largest > 0
-    return np.where(moves, 2.0 ** np.clip(-np.round(np.log2(np.where(moves, largest, 1.0))), -1000, 1000), 1.0)
+    return np.where(
+        moves, 2.0 ** np.clip(-np.round(np.log2(np.where(moves, largest, 1.0))), -1000, 1000), 1.0
+    )

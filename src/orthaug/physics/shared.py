@@ -1,11 +1,15 @@
-"""Which directions of θ could the learner imitate? Only along these does it have to be made orthogonal to the physics.
+"""The directions of θ that the learner could imitate.
 
-A direction a of θ is shared if φ(x)a is a function of the learner's features z(x) alone. A change of θ along it can be
-undone by the learner, so there θ is arbitrary until it is split off. Every other direction is determined by the fit
-itself, as in a partially linear regression. A learner that sees all lags shares everything: that is the paper.
+Only along these the learner has to be made orthogonal to the physics.
 
-Found by moves: pairs of regressors x, x′ with z(x) = z(x′) that differ otherwise. A direction is shared where φ(x)a and
-φ(x′)a agree on all of them. Finite moves, not derivatives, so that a jump such as sign(v) counts too.
+A direction a of θ is shared if φ(x)a is a function of the learner's features z(x) alone. A change
+of θ along it can be undone by the learner, so there θ is arbitrary until it is split off. Every
+other direction is determined by the fit itself, as in a partially linear regression. A learner that
+sees all lags shares everything: that is the paper.
+
+Found by moves: pairs of regressors x, x′ with z(x) = z(x′) that differ otherwise. A direction is
+shared where φ(x)a and φ(x′)a agree on all of them. Finite moves, not derivatives, so that a jump
+such as sign(v) counts too.
 """
 
 from __future__ import annotations
@@ -22,7 +26,7 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug.data.expressions import Lag
 from orthaug.data.regressors import Features, Layout
 from orthaug.physics.baseline import Baseline
-from orthaug.physics.left_over import LeftOver, left_over
+from orthaug.physics.left_over import UnexplainedPhysics, left_over
 
 _MOVES = 400
 _FEWEST = 4  # moves that succeed, for each parameter
@@ -38,59 +42,82 @@ NEARLY = 0.5
 class Shared:
     """The shared directions of θ.
 
-    `basis` (nθ, s) spans them, in reduced form: each column has an entry of one that is zero in all others.
+    `basis` (nθ, s) spans them, in reduced form: each column has an entry of one that is zero in all
+    others.
     """
 
     names: tuple[str, ...]
     basis: Matrix
     on_data: tuple[str, ...] = ()
-    """Parameters that only the rows show to be shared: their regressors read what the learner does not see."""
-    rest: LeftOver | None = None
-    """What functions of the features leave of the physics on the rows; None where that was not asked."""
+    """Parameters that only the rows show to be shared: their regressors read what the learner does
+    not see.
+    """
+    rest: UnexplainedPhysics | None = None
+    """What functions of the features leave of the physics on the rows; None where that was not
+    asked.
+    """
 
     @property
     def nearly(self) -> dict[str, float]:
-        """The parameters of which the features leave little on the rows, but more than nothing, with that share."""
+        """Parameters that the learner could nearly imitate, with the share that is left.
+
+        The features leave little of them on the rows, but more than nothing.
+        """
         if self.rest is None:
             return {}
         shares = zip(self.names, self.basis, self.rest.share, strict=True)
-        return {name: float(share) for name, row, share in shares if not row.any() and share < NEARLY}
+        return {
+            name: float(share) for name, row, share in shares if not row.any() and share < NEARLY
+        }
 
-    def beside(self, rest: LeftOver | None) -> Shared:
-        """Return these directions and those that the rows do not tell from functions of the features."""
+    def beside(self, rest: UnexplainedPhysics | None) -> Shared:
+        """Return these directions and those that the rows do not separate from the features."""
         if rest is None:
             return self
         more = rest.imitated(self.basis)
         if not more.shape[1]:
             return replace(self, rest=rest)
         moved = [
-            name for name, row, own in zip(self.names, more, self.basis, strict=True) if row.any() and not own.any()
+            name
+            for name, row, own in zip(self.names, more, self.basis, strict=True)
+            if row.any() and not own.any()
         ]
         size = np.sqrt(np.maximum(np.diag(rest.whole), 1e-300))[:, None]
-        basis = _reduced(np.column_stack([self.basis, more]) * size, 1 / size[:, 0]) / size
+        basis = _reduce(np.column_stack([self.basis, more]) * size, 1 / size[:, 0]) / size
         return Shared(self.names, basis, tuple(moved), rest)
 
     @property
     def all(self) -> bool:
-        """Whether the learner could imitate all of the physics."""
+        """True where the learner could imitate all of the physics."""
         return self.basis.shape[1] == len(self.names)
 
     @property
     def untouched(self) -> tuple[str, ...]:
-        """Parameters that no shared direction moves: the fit determines them beside any learner."""
-        return tuple(name for name, row in zip(self.names, self.basis, strict=True) if not row.any())
+        """Parameters that no shared direction moves: the fit determines them with any learner."""
+        return tuple(
+            name for name, row in zip(self.names, self.basis, strict=True) if not row.any()
+        )
 
     @property
     def directions(self) -> tuple[dict[str, float], ...]:
-        """Each direction by the parameters that it moves, the first one by one."""
-        told = []
+        """Each direction as weights of the parameters that it moves, the first one being 1."""
+        described = []
         for column in self.basis.T:
             first = column[np.flatnonzero(column)[0]]
-            told.append({name: float(f"{a / first:.12g}") for name, a in zip(self.names, column, strict=True) if a})
-        return tuple(told)
+            described.append(
+                {
+                    name: float(f"{a / first:.12g}")
+                    for name, a in zip(self.names, column, strict=True)
+                    if a
+                }
+            )
+        return tuple(described)
 
     def leaving(self, held: Iterable[int]) -> Shared:
-        """The shared directions that leave some entries of θ where they are; in reduced form too."""
+        """Return the shared directions that leave some entries of θ unchanged.
+
+        In reduced form too.
+        """
         basis = self.basis
         for i in held:
             if not basis[i].any():
@@ -104,9 +131,13 @@ class Shared:
 
 
 def shared_directions(
-    baseline: Baseline, features: Features, layout: Layout, outputs: Sequence[str], x: Float[np.ndarray, "N nx"]
+    baseline: Baseline,
+    features: Features,
+    layout: Layout,
+    outputs: Sequence[str],
+    x: Float[np.ndarray, "N nx"],
 ) -> Shared:
-    """The directions of θ that a learner on these features could imitate.
+    """Return the directions of θ that a learner on these features could imitate.
 
     Args:
         x: measured regressors, where the moves begin.
@@ -124,12 +155,16 @@ def shared_directions(
     with np.errstate(all="ignore"):
         phi = [np.asarray(baseline.phi(rows, layout, tuple(outputs), np)) for rows in (start, end)]
     kept = np.isfinite(phi[0]).all(axis=(1, 2)) & np.isfinite(phi[1]).all(axis=(1, 2))
-    if np.sum(kept) < _FEWEST * len(names):  # nothing is known: the paper's projection is right for any learner
+    if np.sum(kept) < _FEWEST * len(
+        names
+    ):  # nothing is known: the paper's projection is right for any learner
         return everything
     before, after = (part[kept].reshape(-1, len(names)) for part in phi)
     with np.errstate(all="ignore"):
         own = np.asarray(baseline.phi(x, layout, tuple(outputs), np))
-        return Shared(names, agreeing(before, after)).beside(left_over(own, _values(features, layout)(x)))
+        return Shared(names, agreeing(before, after)).beside(
+            left_over(own, _values(features, layout)(x))
+        )
 
 
 def spanned(
@@ -138,7 +173,7 @@ def spanned(
     features: Float[np.ndarray, "N nz"],
     learned: Any = True,
 ) -> Shared:
-    """The directions along which all slopes are linear combinations of features, on the same points.
+    """Return the directions along which all slopes are linear combinations of features.
 
     Args:
         learned: which slopes have a learner; the others must not move at all.
@@ -158,14 +193,16 @@ def seen(
     x: Float[np.ndarray, "N nx"],
     values: Callable[[Float[np.ndarray, "M nx"]], Float[np.ndarray, "M k"]],
 ) -> Bool[np.ndarray, "k"]:
-    """Which columns of `values` are functions of what the learner sees: moves that it does not see leave them alone.
+    """Return a mask of the columns of `values` that are functions of the learner's inputs.
+
+    A change that the learner does not see leaves such a column unchanged.
 
     Args:
         x: measured regressors, where the moves begin.
         values: of rows of the regressor, a column for each function in question.
     """
     if features.linear:
-        return _combined(values(x), _values(features, layout)(x))
+        return _are_combinations(values(x), _values(features, layout)(x))
     if _sees(features, layout):
         return np.ones(values(x[:1]).shape[1], dtype=bool)
     start, end = moves(_values(features, layout), x)
@@ -178,8 +215,10 @@ def seen(
     return still & (np.sum(there, axis=0) >= _FEWEST)
 
 
-def _combined(values: Float[np.ndarray, "N k"], features: Float[np.ndarray, "N nz"]) -> Bool[np.ndarray, "k"]:
-    """Which columns are linear combinations of features on the same points."""
+def _are_combinations(
+    values: Float[np.ndarray, "N k"], features: Float[np.ndarray, "N nz"]
+) -> Bool[np.ndarray, "k"]:
+    """Return a mask of the columns that are linear combinations of features at the same points."""
     kept = np.isfinite(values).all(axis=1) & np.isfinite(features).all(axis=1)
     values, q = values[kept], _basis(features[kept])
     left = np.linalg.norm(values - q @ (q.T @ values), axis=0)
@@ -187,19 +226,19 @@ def _combined(values: Float[np.ndarray, "N k"], features: Float[np.ndarray, "N n
 
 
 def _basis(features: Float[np.ndarray, "N nz"]) -> Float[np.ndarray, "N r"]:
-    """An orthonormal basis of what features span."""
+    """Return an orthonormal basis of the span of the features."""
     size = np.sqrt(np.mean(features**2, axis=0))
     q, sigma, _ = np.linalg.svd(features / np.where(size > 0, size, 1.0), full_matrices=False)
     return q[:, sigma > _ROUNDING * sigma.max(initial=0.0)]
 
 
 def _sees(features: Features, lags: Iterable[Lag]) -> bool:
-    """Whether all of these lags are features as they stand."""
+    """Return whether all of these lags are themselves features."""
     return {str(lag) for lag in lags} <= {str(entry) for entry in features.entries}
 
 
 def agreeing(before: Matrix, after: Matrix) -> Matrix:
-    """The directions a with `before a = after a`, relative to the size of `before a`, in reduced form."""
+    """Return the directions a with `before a = after a`, relative to `before a`, reduced."""
     if not before.size:  # of no points at all, as of a run that diverged
         return np.zeros((before.shape[1], 0))
     scale = np.sqrt(np.mean(before**2 + after**2, axis=0))
@@ -210,11 +249,14 @@ def agreeing(before: Matrix, after: Matrix) -> Matrix:
     root = vt[seen].T / sigma[seen]
     _, change, directions = np.linalg.svd((after - before) * unit @ root, full_matrices=False)
     agreeing = root @ directions[change <= _TOLERANCE].T
-    return unit[:, None] * _reduced(agreeing, unit)
+    return unit[:, None] * _reduce(agreeing, unit)
 
 
-def _reduced(basis: Matrix, unit: Vector) -> Matrix:
-    """The same span in reduced column echelon form, in θ's own units times `1/unit`."""
+def _reduce(basis: Matrix, unit: Vector) -> Matrix:
+    """Return a basis of the same span in reduced column echelon form.
+
+    In θ's own units times `1/unit`.
+    """
     if not basis.size:
         return basis
     q = np.linalg.qr(basis)[0]
@@ -233,10 +275,11 @@ def _values(features: Features, layout: Layout) -> Callable[[Matrix], Matrix]:
 def moves(
     seen: Callable[[Matrix], Matrix], x: Float[np.ndarray, "N nx"]
 ) -> tuple[Float[np.ndarray, "M nx"], Float[np.ndarray, "M nx"]]:
-    """Pairs of points with equal features, of the size of the data's spread.
+    """Return pairs of points with equal features, as far apart as the data spread.
 
-    A step towards another row, or in any direction, is led back to the features' values by Newton's method; every other
-    one along the null space of ∂z/∂x first. The free ones find other branches: −u beside u where the learner sees u².
+    A step towards another row, or in any direction, is led back to the features' values by Newton's
+    method; every other one along the null space of ∂z/∂x first. The free ones find other branches:
+    −u beside u where the learner sees u².
 
     Args:
         seen: the features (M, nz) of points (M, nx).
@@ -258,7 +301,9 @@ def moves(
         for j in range(rows.shape[1]):
             small = np.zeros(rows.shape[1])
             small[j] = 1e-6 * spread[j]
-            columns.append((values(rows + small) - values(rows - small)) / 2e-6)  # in units of the spread
+            columns.append(
+                (values(rows + small) - values(rows - small)) / 2e-6
+            )  # in units of the spread
         return np.nan_to_num(np.stack(columns, axis=-1))
 
     target, size = values(start), np.maximum(np.nanstd(values(x), axis=0), 1e-300)

@@ -1,8 +1,9 @@
-"""A problem whose rows stay in a source: what training needs of them comes from passes over its partitions.
+"""A problem whose rows stay in a source: training passes over its partitions.
 
-Three passes: a survey of sizes and ranges, a tree QR of `[Φ Y]`, and a second QR of the rows that the first one gives.
-The second makes Q orthonormal to rounding however ill-conditioned Φ is, as Householder's does in memory. A `witness` of
-the rows stays in memory for everything that only looks at the data.
+Three passes: a survey of sizes and ranges, a tree QR of `[Φ Y]`, and a second QR of the rows that
+the first one gives. The second makes Q orthonormal to rounding however ill-conditioned Φ is, as
+Householder's does in memory. A subsample of the rows stays in memory for everything that only looks
+at the data.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ Passes = Callable[[Callable[[Partition], Any], Sequence[Partition]], list[Any]]
 
 @dataclass(frozen=True, eq=False)
 class Form:
-    """How a piece of a source becomes rows; picklable if the baseline is."""
+    """Rules by which a piece of a source becomes rows; picklable if the baseline is."""
 
     baseline: Baseline
     features: Features
@@ -59,8 +60,10 @@ class Form:
         """Rows of history that a row needs."""
         return largest_lag(self.layout)
 
-    def posed(self, partition: Partition) -> Iterator[tuple[Experiment, UsableRows, np.ndarray, np.ndarray]]:
-        """Pieces with their rows, Φ (m, ny, nθ) and the sum of the fixed terms (m, ny)."""
+    def posed(
+        self, partition: Partition
+    ) -> Iterator[tuple[Experiment, UsableRows, np.ndarray, np.ndarray]]:
+        """Return the pieces with their rows, Φ (m, ny, nθ) and sums of the fixed terms (m, ny)."""
         for piece in partition.pieces(self.lead):
             if len(piece) <= self.lead:
                 continue
@@ -68,8 +71,10 @@ class Form:
             rows = UsableRows(x, piece.outputs[self.lead :], self.layout, self.lead)
             yield piece, rows, *self.baseline.on(x, self.layout, self.outputs)
 
-    def checked(self, piece: Experiment, rows: UsableRows, phi: np.ndarray, known: np.ndarray) -> Matrix:
-        """The learner's features (m, nz), after everything was found to be finite."""
+    def checked(
+        self, piece: Experiment, rows: UsableRows, phi: np.ndarray, known: np.ndarray
+    ) -> Matrix:
+        """Return the learner's features (m, nz), after a check that all values are finite."""
         alone = replace(self.empty, experiments=(piece,))
         check_physics(phi, known, self.baseline, rows, alone)
         return feature_rows(self.features, rows, self.layout, alone)
@@ -98,7 +103,7 @@ class Survey(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Surveying:
+class PartitionSurvey:
     """The survey of a partition; everything in it is checked to be finite."""
 
     form: Form
@@ -136,8 +141,8 @@ class Factoring:
         return r
 
 
-class Refined(NamedTuple):
-    """What the second QR tells: R of `[Q₁ e₁]`, the moments of e₁ and `Σ ‖q_ki‖²` of each output."""
+class SecondQR(NamedTuple):
+    """Result of the second QR: R of `[Q₁ e₁]`, the moments of e₁, `Σ ‖q_ki‖²` of each output."""
 
     r: Matrix
     errors: Moments
@@ -162,48 +167,59 @@ class Basis:
         return np.moveaxis(self.turn.T @ (self.inverse.T @ columns), -1, 0)
 
     def left(self, target: Matrix, q: np.ndarray, coordinates: Vector) -> Matrix:
-        """What is left of a target (m, ny) by rows of Q at these coordinates, in whitened outputs."""
+        """Return the residual of a target (m, ny) after the rows of Q at these coordinates.
+
+        In whitened outputs.
+        """
         return self.weight.rows(target) - (coordinates @ np.moveaxis(q, 0, -1)).T
 
 
 @dataclass(frozen=True, eq=False)
-class Refining:
-    """The second QR, and what the physics leaves."""
+class PartitionQR:
+    """The second QR of a partition, and the residual of the physics."""
 
     basis: Basis
     coordinates: Vector
 
-    def __call__(self, partition: Partition) -> Refined | None:
+    def __call__(self, partition: Partition) -> SecondQR | None:
         basis, found, nt = self.basis, None, len(self.coordinates)
         for _, rows, phi, known in basis.form.posed(partition):
             q = basis.rows(phi)
             e = basis.left(rows.y - known, q, self.coordinates)
             r = _triangle([np.concatenate([q.reshape(-1, nt), e.reshape(-1, 1)], axis=1)])
-            seen = Refined(r, Moments.of(e), np.sum(q**2, axis=(0, 2)))
+            seen = SecondQR(r, Moments.of(e), np.sum(q**2, axis=(0, 2)))
             found = seen if found is None else _both(found, seen)
         return found
 
 
-def _both(one: Refined, other: Refined) -> Refined:
-    return Refined(_triangle([one.r, other.r]), one.errors | other.errors, one.freedom + other.freedom)
+def _both(one: SecondQR, other: SecondQR) -> SecondQR:
+    return SecondQR(
+        _triangle([one.r, other.r]), one.errors | other.errors, one.freedom + other.freedom
+    )
 
 
 def _triangle(blocks: Sequence[Matrix]) -> Matrix:
-    """R of blocks of rows upon each other, its diagonal not negative."""
+    """Return R of stacked blocks of rows, its diagonal not negative."""
     r = np.asarray(np.linalg.qr(np.concatenate(blocks), mode="r"))
     return r * np.where(np.diag(r) < 0, -1.0, 1.0)[:, None] if len(r) == r.shape[1] else r
 
 
-def _merged(parts: Sequence[Any], merge: Callable[[Any, Any], Any]) -> Any:
-    """Neighbours two by two, and so on: an order that does not depend on who was ready first."""
+def _merge(parts: Sequence[Any], merge: Callable[[Any, Any], Any]) -> Any:
+    """Return the sum of neighbours two by two, and so on.
+
+    This order does not depend on which part was ready first.
+    """
     parts = [part for part in parts if part is not None]
     while len(parts) > 1:
-        parts = [merge(*parts[i : i + 2]) if i + 1 < len(parts) else parts[i] for i in range(0, len(parts), 2)]
+        parts = [
+            merge(*parts[i : i + 2]) if i + 1 < len(parts) else parts[i]
+            for i in range(0, len(parts), 2)
+        ]
     return parts[0] if parts else None
 
 
 @dataclass(frozen=True, eq=False)
-class Laying:
+class RowBuilder:
     """Rows of a piece for training: scaled features, Q, P⊥Y and the learner's gain, (m, …) each."""
 
     basis: Basis
@@ -213,20 +229,34 @@ class Laying:
     rms: float
     gain: Matrix
 
-    def __call__(self, partition: Partition) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
+    def __call__(
+        self, partition: Partition
+    ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
         form = self.basis.form
         for _, rows, phi, known in form.posed(partition):
             q = self.basis.rows(phi)
             e = self.basis.left(rows.y - known, q, self.coordinates) / self.rms
-            z = np.asarray(form.features.evaluate(rows.x, form.layout, np)) if len(self.centre) else rows.x[:, :0]
-            yield (z - self.centre) / self.halfwidth, q, e, np.broadcast_to(self.gain, (*e.shape, e.shape[1]))
+            z = (
+                np.asarray(form.features.evaluate(rows.x, form.layout, np))
+                if len(self.centre)
+                else rows.x[:, :0]
+            )
+            yield (
+                (z - self.centre) / self.halfwidth,
+                q,
+                e,
+                np.broadcast_to(self.gain, (*e.shape, e.shape[1])),
+            )
 
 
 @dataclass(frozen=True, eq=False)
 class StreamedProblem(Problem):
-    """A problem of a source. `record`, `rows` and the rows of `projection` are those of its witness.
+    """A problem of a source.
 
-    `passes` makes passes over the source. `moments` are those of what the physics leaves, in whitened outputs.
+    `record`, `rows` and the rows of `projection` are those of its subsample.
+
+    `passes` makes passes over the source. `moments` are those of what the physics leaves, in
+    whitened outputs.
     """
 
     source: Source
@@ -278,27 +308,35 @@ class StreamedProblem(Problem):
             extent = _survey(form, self.source, self.passes).features
         return np.stack(extent)
 
-    def laying(self, centre: Vector, halfwidth: Vector, rms: float, gain: Matrix) -> Laying:
-        """How its rows are laid out for training."""
+    def row_builder(
+        self, centre: Vector, halfwidth: Vector, rms: float, gain: Matrix
+    ) -> RowBuilder:
+        """Return the builder of its rows for training."""
         basis = replace(self.basis, form=replace(self.basis.form, features=self.features))
-        return Laying(basis, self.target_coordinates, centre, halfwidth, rms, gain)
+        return RowBuilder(basis, self.target_coordinates, centre, halfwidth, rms, gain)
 
     def physics_alone(self) -> Problem:
         alone = super().physics_alone()
-        return alone if isinstance(alone, StreamedProblem) else streamed(alone, self.source, self.passes)
+        return (
+            alone
+            if isinstance(alone, StreamedProblem)
+            else streamed(alone, self.source, self.passes)
+        )
 
     def weighed(self, weight: OutputWeights) -> Problem:
         if weight is self.weight:
             return self
-        return _factored(replace(self, weight=weight), self.source, self.passes, self.survey, self.basis.form)
+        return _factorise(
+            replace(self, weight=weight), self.source, self.passes, self.survey, self.basis.form
+        )
 
 
 def _survey(form: Form, source: Source, passes: Passes) -> Survey:
-    found = _merged(passes(Surveying(form), source.partitions), Survey.__or__)
+    found = _merge(passes(PartitionSurvey(form), source.partitions), Survey.__or__)
     if found is None:
         raise InputError(
-            f"no experiment has enough rows for a single prediction: the largest lag is {form.lead}, so at least "
-            f"{form.lead + 1} are needed."
+            "no experiment has enough rows for a single prediction: the largest lag is "
+            f"{form.lead}, so at least {form.lead + 1} are needed."
         )
     return found
 
@@ -306,7 +344,9 @@ def _survey(form: Form, source: Source, passes: Passes) -> Survey:
 def pose_streamed(
     source: Source, record: Record, passes: Passes, baseline: Baseline, *args: Any, **options: Any
 ) -> Problem:
-    """`pose` for a source, with a witness `record` of it in memory; the arguments are those of `pose`.
+    """Return the problem of a source, with a subsample `record` of it in memory.
+
+    The arguments are those of `pose`.
 
     Raises:
         InputError: as `pose`, wherever in the source it is; RankError.
@@ -320,7 +360,7 @@ def pose_streamed(
 
 
 def streamed(seen: Problem, source: Source, passes: Passes) -> StreamedProblem:
-    """The problem of a source, from that of a witness of it."""
+    """Return the problem of a source, from the problem of a subsample of it."""
     empty = replace(seen.record, experiments=(seen.record.experiments[0].rows(0, 0),))
     form = Form(seen.baseline, seen.features, seen.layout, empty)
     survey = _survey(form, source, passes)
@@ -331,29 +371,38 @@ def streamed(seen: Problem, source: Source, passes: Passes) -> StreamedProblem:
     weight = seen.weight
     if weight.kind != "covariance":
         weight = weigh_outputs("none" if weight.kind == "none" else weight.choice, deviation)
-    return _factored(replace(seen, deviation=deviation, weight=weight), source, passes, survey, form)
+    return _factorise(
+        replace(seen, deviation=deviation, weight=weight), source, passes, survey, form
+    )
 
 
-def _factored(seen: Problem, source: Source, passes: Passes, survey: Survey, form: Form) -> StreamedProblem:
-    """Two passes: R of `[Φ Y]`, and again of what it gives."""
+def _factorise(
+    seen: Problem, source: Source, passes: Passes, survey: Survey, form: Form
+) -> StreamedProblem:
+    """Return the factor in two passes: R of `[Φ Y]`, then R of the resulting Q."""
     weight, nt = seen.weight, len(seen.baseline.names)
     scale = powers_of_two(survey.columns * np.abs(weight.matrix).max())
-    first = _merged(passes(Factoring(form, weight, scale), source.partitions), lambda a, b: _triangle([a, b]))
+    first = _merge(
+        passes(Factoring(form, weight, scale), source.partitions), lambda a, b: _triangle([a, b])
+    )
     r, coordinates = first[:nt, :nt], first[:nt, nt]
     excited = excitation(r, seen.baseline.names)
     ready = excited.full_rank and len(r) == nt
-    if not ready:  # `check` tells; nothing can be solved
+    if not ready:  # `check` raises; nothing can be solved
         r, coordinates = np.eye(nt), np.zeros(nt)
     inverse = scale[:, None] * scipy.linalg.solve_triangular(r, np.eye(nt)) if nt else r
     basis = Basis(form, weight, inverse, np.eye(nt))
-    second = _merged(passes(Refining(basis, coordinates), source.partitions), _both)
+    second = _merge(passes(PartitionQR(basis, coordinates), source.partitions), _both)
     turn, rest = (second.r[:nt, :nt], second.r[:nt, nt]) if ready else (np.eye(nt), np.zeros(nt))
     back = np.linalg.inv(turn)
     basis = replace(basis, turn=back)
     theta = inverse @ (coordinates + back @ rest)
     phi, _ = seen.baseline.on(seen.rows.x, seen.layout, seen.outputs)
     fields = {name: getattr(seen, name) for name in Problem.__dataclass_fields__}
-    fields |= {"projection": Projection(turn @ r, scale, weight.rows(phi), basis.rows(phi)), "excitation": excited}
+    fields |= {
+        "projection": Projection(turn @ r, scale, weight.rows(phi), basis.rows(phi)),
+        "excitation": excited,
+    }
     return StreamedProblem(
         **fields,
         source=source,

@@ -1,4 +1,7 @@
-"""Parameters by what biases them; which biases by suspected terms a heat map shows, and how its cells are written."""
+"""Table of the parameters' biases, by their causes.
+
+It selects the biases for a heat map, and formats its cells.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,7 @@ from orthaug.reports.result import ParameterResult
 
 _MOST_COLUMNS = 12  # more cells beside each other are too narrow for their numbers on paper
 _MOST_CELLS = 200
-_LEAST = 0.01  # per cent: of less only that it is less is told, for a cell is narrow
+_LEAST = 0.01  # per cent: a smaller bias is written as "less", since a cell is narrow
 _ZERO = 1e-7
 
 
@@ -22,19 +25,19 @@ _ZERO = 1e-7
 class BiasMap:
     """The part of a bias table that is drawn, with a number in every cell.
 
-    `shares` (suspects, parameters) are in per cent, NaN where there is none; `colours` are their signed logarithms,
-    so that biases of 0.1 % and of 100 % both show, and lie within ± `reach`.
+    `shares` (suspects, parameters) are in per cent, NaN where there is none; `colours` are their
+    signed logarithms, so that biases of 0.1 % and of 100 % both show, and lie within ± `reach`.
     """
 
     parameters: tuple[str, ...]
     suspects: tuple[str, ...]
     shares: Matrix
     left_out: str
-    """A sentence on what the map leaves out; empty where it has all."""
+    """A sentence on what the map leaves out; empty where it is complete."""
 
     @property
     def colours(self) -> Matrix:
-        """What the colours stand for."""
+        """Values that the colours show."""
         return np.sign(self.shares) * np.log10(1 + np.abs(self.shares))
 
     @property
@@ -44,12 +47,12 @@ class BiasMap:
 
     @property
     def cells(self) -> list[list[str]]:
-        """What is written in them."""
+        """Texts of the cells."""
         return [[_cell(value) for value in row] for row in self.shares]
 
 
 def biased_by(rows: Sequence[ParameterResult]) -> dict[tuple[str, float], list[ParameterResult]]:
-    """Parameters with a bias, by its cause and the share that this explains."""
+    """Return the parameters with a bias, by its cause and the share that this explains."""
     found: dict[tuple[str, float], list[ParameterResult]] = {}
     for row in rows:
         if row.bias:
@@ -58,22 +61,36 @@ def biased_by(rows: Sequence[ParameterResult]) -> dict[tuple[str, float], list[P
 
 
 def bias_map(suspects: Sequence[SuspectResult]) -> BiasMap:
-    """All biases, or those of the suspects and parameters with the largest ones, in the order of the result."""
+    """Return all biases, or the largest, in the order of the result.
+
+    Where there are too many, it has the suspects and parameters with the largest ones.
+    """
     names = list(suspects[0].percent)
-    shares = np.array([[suspect.percent[name] for name in names] for suspect in suspects], dtype=float)
+    shares = np.array(
+        [[suspect.percent[name] for name in names] for suspect in suspects], dtype=float
+    )
     shares = np.where(np.abs(shares) < _ZERO, 0.0, shares)
     size = np.nan_to_num(np.abs(shares))
     columns = _largest(size.max(axis=0), _MOST_COLUMNS)
     rows = _largest(size[:, columns].max(axis=1, initial=0.0), _MOST_CELLS // max(len(columns), 1))
     shown = [suspects[i].name for i in rows]
-    parts = [(len(rows), counted(len(suspects), "suspect")), (len(columns), counted(len(names), "parameter"))]
-    fewer = " and ".join(f"{count} of {whole}" for count, whole in parts if count < int(whole.partition(" ")[0]))
-    told = f"Shown are those with the largest biases, {fewer}; result.json has all." if fewer else ""
-    return BiasMap(tuple(names[j] for j in columns), tuple(shown), shares[np.ix_(rows, columns)], told)
+    parts = [
+        (len(rows), counted(len(suspects), "suspect")),
+        (len(columns), counted(len(names), "parameter")),
+    ]
+    fewer = " and ".join(
+        f"{count} of {whole}" for count, whole in parts if count < int(whole.partition(" ")[0])
+    )
+    text = (
+        f"Shown are those with the largest biases, {fewer}; result.json has all." if fewer else ""
+    )
+    return BiasMap(
+        tuple(names[j] for j in columns), tuple(shown), shares[np.ix_(rows, columns)], text
+    )
 
 
 def _largest(size: np.ndarray, most: int) -> list[int]:
-    """The places of the largest values, in their order."""
+    """Return the indices of the largest values, in their order."""
     return sorted(np.argsort(-size, kind="stable")[:most].tolist())
 
 

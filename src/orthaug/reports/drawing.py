@@ -1,4 +1,4 @@
-"""The style of all figures: panels at fixed places, labels, colours, and how a figure is written."""
+"""The style of all figures: fixed panels, labels, colours, and the formats of files."""
 
 from __future__ import annotations
 
@@ -22,9 +22,11 @@ try:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 except UnicodeDecodeError:
-    raise InputError("matplotlibrc: found letters that are not UTF-8; mend that file, or remove it.") from None
+    raise InputError(
+        "matplotlibrc: found letters that are not UTF-8; correct that file, or remove it."
+    ) from None
 
-# Okabe-Ito: told apart by every reader
+# Okabe-Ito: distinguishable for every reader
 BLACK, GREY, BLUE, ORANGE, GREEN = "#000000", "#B8B8B8", "#0072B2", "#E69F00", "#009E73"
 CYCLE = (BLUE, ORANGE, GREEN, BLACK)
 SIZE = (7.0, 2.4)  # inches per panel
@@ -33,19 +35,24 @@ _LEFT, _GAP = 0.95, 0.32
 _WINDOW = 250  # samples of a long record that are shown, so that single swings can be seen
 _TITLE, _YLABEL, _XLABEL = 0.1, 0.72, 0.26  # inches from the figure's edge or the panel's
 _SHARPNESS = 160  # pixels per inch
-_COLUMNS = round(SIZE[0] * _SHARPNESS)  # more points than these cannot be told apart
+_COLUMNS = round(SIZE[0] * _SHARPNESS)  # more points than these cannot be distinguished
 Drawn = ParamSpec("Drawn")
 
 
 def _own_style() -> AbstractContextManager[None]:
-    """Figures look the same whatever the user's own settings of matplotlib are; a `$` in a unit begins no formula."""
-    own: dict[Any, Any] = {key: value for key, value in rcParamsDefault.items() if not key.startswith("backend")}
+    """Return a context in which the user's own settings of matplotlib do not change the figures.
+
+    A `$` in a unit does not begin a formula.
+    """
+    own: dict[Any, Any] = {
+        key: value for key, value in rcParamsDefault.items() if not key.startswith("backend")
+    }
     own |= {"text.parse_math": False}
     return rc_context({key: value for key, value in own.items() if rcParams[key] != value})
 
 
 def plain(draw: Callable[Drawn, Figure]) -> Callable[Drawn, Figure]:
-    """Figures in our own style."""
+    """Return a function that draws in the style of this package."""
 
     @wraps(draw)
     def drawn(*arguments: Drawn.args, **options: Drawn.kwargs) -> Figure:
@@ -56,7 +63,7 @@ def plain(draw: Callable[Drawn, Figure]) -> Callable[Drawn, Figure]:
 
 
 def axes_for(ax: Axes | None) -> Axes:
-    """The given axes, or new ones: of pyplot where that is in use, so that a notebook shows them.
+    """Return the given axes, or new ones: of pyplot where that is in use, for notebooks to show.
 
     Raises:
         InputError: something else.
@@ -74,14 +81,14 @@ def axes_for(ax: Axes | None) -> Axes:
 
 
 def ruled(axis: Axes) -> Axes:
-    """Axes with a faint grid, and no frame above and beside it."""
+    """Return axes with a faint grid, and no frame above and beside it."""
     axis.grid(alpha=0.25)
     axis.spines[["top", "right"]].set_visible(False)
     return axis
 
 
 def panels(response: Response, title: str, heights: tuple[int, ...] = (1,)) -> tuple[Figure, list]:
-    """Stacked axes, `len(heights)` per output."""
+    """Return a figure with stacked axes, `len(heights)` per output."""
     ratios = heights * len(response.outputs)
     figure = Figure(figsize=(SIZE[0], TOP + SIZE[1] * sum(ratios) / max(heights)))
     axes = grid(figure, len(ratios), 1, sharex=True, height_ratios=ratios)[:, 0]
@@ -99,14 +106,21 @@ def grid(
     bottom: float = BOTTOM,
     **options: Any,
 ) -> np.ndarray:
-    """Panels (rows, columns) at fixed places; a layout found from the sizes of all texts takes longer than drawing.
+    """Return panels (rows, columns) at fixed places.
+
+    A layout found from the sizes of all texts takes longer than drawing.
 
     Args:
         gap: inches between rows and columns; `left` and `bottom` those beside and below them.
     """
     width, height = figure.get_size_inches()
     high, wide = height - TOP - bottom, width - left - RIGHT
-    place = {"left": left / width, "right": 1 - RIGHT / width, "bottom": bottom / height, "top": 1 - TOP / height}
+    place = {
+        "left": left / width,
+        "right": 1 - RIGHT / width,
+        "bottom": bottom / height,
+        "top": 1 - TOP / height,
+    }
     place["hspace"] = gap[0] * rows / max(high - gap[0] * (rows - 1), 0.1)
     place["wspace"] = gap[1] * columns / max(wide - gap[1] * (columns - 1), 0.1)
     axes = figure.subplots(rows, columns, squeeze=False, gridspec_kw=place, **options)
@@ -116,12 +130,14 @@ def grid(
 
 
 def headline(figure: Figure, title: str) -> None:
-    """The title above all panels."""
+    """Write the title above all panels."""
     figure.suptitle(title, fontsize=10, y=1 - _TITLE / figure.get_size_inches()[1], va="top")
 
 
-def label(axis: Axes, *, x: str | None = None, y: str | None = None, title: str | None = None) -> None:
-    """Labels at a fixed distance from the panel."""
+def label(
+    axis: Axes, *, x: str | None = None, y: str | None = None, title: str | None = None
+) -> None:
+    """Label an axis at a fixed distance from the panel."""
     figure = axis.get_figure(root=True)
     assert figure is not None
     wide, high = axis.get_position().size * figure.get_size_inches()
@@ -136,7 +152,7 @@ def label(axis: Axes, *, x: str | None = None, y: str | None = None, title: str 
 
 
 def outline(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A curve to draw: of a long one the least and the largest value in every column of pixels."""
+    """Return a curve to draw; of a long one the extremes in every column of pixels."""
     if len(values) <= 4 * _COLUMNS:
         return time, values
     starts = np.linspace(0, len(values), _COLUMNS, endpoint=False).astype(int)
@@ -145,23 +161,33 @@ def outline(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def extent(response: Response, rows: slice) -> str:
-    """Which samples of the record are drawn, in words."""
+    """Return a text on which samples of the record are drawn."""
     whole = len(response.trajectories[0].model)
     text = f"samples {rows.start} to {rows.stop - 1} of {whole}"
-    return text + (f", first of {len(response.trajectories)} experiments" if len(response.trajectories) > 1 else "")
+    return text + (
+        f", first of {len(response.trajectories)} experiments"
+        if len(response.trajectories) > 1
+        else ""
+    )
 
 
 def window(response: Response) -> tuple[np.ndarray, slice]:
-    """The instants [s] and the rows that a figure shows of the first experiment."""
+    """Return the instants [s] and the rows that a figure shows of the first experiment."""
     trajectory = response.trajectories[0]
     rows = slice(trajectory.start, min(trajectory.start + _WINDOW, len(trajectory.model)))
     return np.arange(rows.start, rows.stop) * response.sampling_time, rows
 
 
 def legend(axis: Axes, *shown: Any) -> None:
-    """What the lines are, above the panel: its own, or the handles and labels that are `shown`."""
+    """Draw the legend above the panel: of its own lines, or of those in `shown`."""
     axis.legend(
-        *shown, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.2, fontsize=8, frameon=False, ncols=3
+        *shown,
+        loc="lower right",
+        bbox_to_anchor=(1.0, 1.0),
+        borderaxespad=0.2,
+        fontsize=8,
+        frameon=False,
+        ncols=3,
     )
 
 
@@ -171,6 +197,8 @@ def save(figure: Figure, path: Path, kind: str = "png") -> None:
         warnings.simplefilter("ignore")  # such as a unit in letters that the font lacks
         figure.set_dpi(_SHARPNESS)
         if kind == "png":
-            FigureCanvasAgg(figure).print_png(path, pil_kwargs={"compress_level": 2})  # `savefig` would draw it twice
+            FigureCanvasAgg(figure).print_png(
+                path, pil_kwargs={"compress_level": 2}
+            )  # `savefig` would draw it twice
         else:
             figure.savefig(path, format=kind)

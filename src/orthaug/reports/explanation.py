@@ -1,11 +1,11 @@
-"""What `orthaug explain` tells, and its text."""
+"""Result of `orthaug explain`, and its text."""
 
 from __future__ import annotations
 
 from orthaug._base.lines import fold, percent, table
 from orthaug.reports.fields import Content, Flag, Number, WarningResult, Whole
 from orthaug.reports.findings import MemoryResult
-from orthaug.reports.result import Headed
+from orthaug.reports.result import ResultHeader
 
 _MEMORY = 5  # terms with memory that the text lists
 
@@ -45,8 +45,8 @@ class MovedParameterResult(Content):
     value_with: Number
 
 
-class ExplainResult(Headed):
-    """What `orthaug explain` tells."""
+class ExplainResult(ResultHeader):
+    """The result of `orthaug explain`."""
 
     found: Flag
     share: Number
@@ -63,10 +63,13 @@ class ExplainResult(Headed):
 
 
 def explain_text(result: ExplainResult) -> str:
-    """What the learner has found, the terms alone, θ with them in the physics, and what to write into the spec."""
+    """Return the terms that were found, their effect on θ, and the lines for the spec, as text."""
     blocks = [[_capital(result.text)]]
     if result.noise is not None:
-        blocks[0] += [f"Of what it adds, {percent(result.noise)} are its own errors, as far as training tells."]
+        blocks[0] += [
+            f"Of what it adds, {percent(result.noise)} are its own errors, as far as training "
+            "shows."
+        ]
     if result.terms:
         blocks += [_term_lines(result), _parameter_lines(result)]
     if result.singles:
@@ -74,7 +77,7 @@ def explain_text(result: ExplainResult) -> str:
         rows += [[_percent(one.share), one.added_to, one.expression] for one in result.singles]
         blocks.append(table(rows))
     if result.memory:
-        rows = [["share", "equation", "term with memory of what the free run leaves"]]
+        rows = [["share", "equation", "term with memory in the free run's residual"]]
         rows += [[_percent(one.share), one.equation, one.name] for one in result.memory[:_MEMORY]]
         blocks.append(table(rows))
     if result.spec is not None:
@@ -82,7 +85,9 @@ def explain_text(result: ExplainResult) -> str:
     elif result.terms:
         blocks.append(["The physics is a Python function: add the terms there, and fit again."])
     blocks.append([f"warning: {warning.text}" for warning in result.warnings])
-    blocks = [lines if "" in lines else fold(lines) for lines in blocks]  # what is to be copied stays as it is
+    blocks = [
+        lines if "" in lines else fold(lines) for lines in blocks
+    ]  # what is to be copied stays as it is
     return "\n\n".join("\n".join(lines) for lines in blocks if lines)
 
 
@@ -90,7 +95,13 @@ def _term_lines(result: ExplainResult) -> list[str]:
     rows = [["term", "coefficient", "std", "unit", "share", "alone", "added to"]]
     for term in result.terms:
         std = "–" if term.std is None else f"{term.std:.2g}"
-        numbers = (f"{term.coefficient:.6g}", std, term.unit or "–", _percent(term.share), _percent(term.alone))
+        numbers = (
+            f"{term.coefficient:.6g}",
+            std,
+            term.unit or "–",
+            _percent(term.share),
+            _percent(term.alone),
+        )
         rows.append([term.expression, *numbers, term.added_to])
     lines = table(rows)
     for term in result.terms:
@@ -110,6 +121,6 @@ def _percent(share: float | None) -> str:
 
 
 def _capital(text: str) -> str:
-    """A sentence; one that begins with an expression stays as it is."""
+    """Return a sentence with a capital first letter, unless it begins with an expression."""
     first = text.split(" ", 1)[0]
     return text[:1].upper() + text[1:] if first.isalpha() else text

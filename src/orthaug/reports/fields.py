@@ -1,4 +1,4 @@
-"""The fields of results: plain numbers and lists that JSON can hold, read from the library's objects."""
+"""Fields of results: plain numbers and lists for JSON, read from the objects of the library."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from orthaug._base.checks import finite_or_none
 
 
 def _number(value: Any) -> Any:
-    """A float, or None for what is not finite: JSON has no NaN."""
+    """Return a float, or None where it is not finite: JSON has no NaN."""
     if isinstance(value, float | int | np.number):
         return finite_or_none(float(value))
     return value
 
 
 def _plain(value: Any) -> Any:
-    """Python's own numbers and lists for NumPy's."""
+    """Return NumPy's values as Python's own numbers and lists."""
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
 
 
@@ -47,15 +47,26 @@ class Content(BaseModel):
 
     @model_serializer(mode="wrap")
     def _without_absent(self, handler: SerializerFunctionWrapHandler):
-        return {key: value for key, value in handler(self).items() if value is not None or key not in self.absent}
+        return {
+            key: value
+            for key, value in handler(self).items()
+            if value is not None or key not in self.absent
+        }
 
     def content(self) -> dict[str, Any]:
-        """Dictionaries, lists, text, numbers and None."""
+        """Return the result as dictionaries, lists, text, numbers and None."""
         return self.model_dump(mode="json", by_alias=True)
 
     def to_json(self) -> str:
-        """The content as text; never NaN."""
+        """Return the content as text; never NaN."""
         return json.dumps(self.content(), indent=1, ensure_ascii=False, allow_nan=False)
+
+
+class IntervalsResult(Content):
+    """Source of the intervals of a fit of chosen terms, in a word and in a sentence."""
+
+    source: str
+    text: str
 
 
 class WarningResult(Content):

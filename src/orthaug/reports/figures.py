@@ -1,4 +1,4 @@
-"""Figures from Python: those of the result folders, and `fit.plot` on matplotlib axes of one's own."""
+"""Figures from Python: those of the result folders, and `fit.plot` on given matplotlib axes."""
 
 from __future__ import annotations
 
@@ -34,26 +34,31 @@ def plot(
     title: str | None = None,
     path: str | os.PathLike | None = None,
 ) -> Figure:
-    """A matplotlib figure; also written as a PNG where there is a `path`.
+    """Return a matplotlib figure; also written as a PNG where there is a `path`.
 
     Args:
-        what: a response, of `model.simulate` or `model.predict`; what `linearize` returns; a `Recursive`, for θ over
-            time; or the `result` of `fit_spec` or `compare`.
-        kind: of a response "output" (measured and model; the default), "residual" or "components" (physics and
-            learner); of linear views "bode" (the default) or "poles". A result has one figure: the biases by suspected
-            terms of a fit, or the comparison.
+        what: a response, of `model.simulate` or `model.predict`; what `linearize` returns; a
+            `Recursive`, for θ over time; or the `result` of `fit_spec` or `compare`.
+        kind: of a response "output" (measured and model; the default), "residual" or "components"
+            (physics and learner); of linear views "bode" (the default) or "poles". A result has one
+            figure: the biases by suspected terms of a fit, or the comparison.
         title: of the figure of a response or of a `Recursive`; by default what kind it is.
         path: PNG file to write; a file of that name is replaced.
 
     Raises:
-        InputError: nothing that has a figure, an unknown kind, outputs that were not measured, a path that cannot be
-            written.
+        InputError: nothing that has a figure, an unknown kind, outputs that were not measured, a
+            path that cannot be written.
     """
     wanted = (
-        "a Response, such as model.simulate(record), what linearize gives, a Recursive, or the `result` of fit_spec or "
-        "compare"
+        "a Response, such as model.simulate(record), what linearize gives, a Recursive, or the "
+        "`result` of fit_spec or compare"
     )
-    check_type(what, Response | Linearization | Recursive | FitResult | CheckResult | CompareResult, "what", wanted)
+    check_type(
+        what,
+        Response | Linearization | Recursive | FitResult | CheckResult | CompareResult,
+        "what",
+        wanted,
+    )
     kinds = _OF_VIEWS if isinstance(what, Linearization) else _OF_RESPONSES
     kind = check_choice(kinds[0] if kind is None else kind, kinds, "`kind`")
     check_type(title, str | None, "title", "text")
@@ -76,21 +81,31 @@ def _drawn(what: Any, kind: str, title: str | None) -> Figure:
 
     if isinstance(what, Linearization):
         if kind == "bode" and not what[0].inputs:
-            raise InputError("the model has no inputs, so that it has no frequency response to draw.")
+            raise InputError(
+                "the model has no inputs, so that it has no frequency response to draw."
+            )
         return linear_plots.bode_figure(what) if kind == "bode" else linear_plots.poles_figure(what)
     if isinstance(what, Recursive):
         alarms = [alarm.time for alarm in what.alarms]
-        return plots.tracking_figure(what.history, what.fitted.form.baseline.parameters, alarms, title)
+        return plots.tracking_figure(
+            what.history, what.fitted.form.baseline.parameters, alarms, title
+        )
     if isinstance(what, CompareResult):
         return plots.comparison_figure(what.comparison)
     if not isinstance(what, Response):
         if not what.bias:
-            raise InputError("this result has no suspects, so that there is no figure of their biases.")
+            raise InputError(
+                "this result has no suspects, so that there is no figure of their biases."
+            )
         return finding_plots.bias_figure(what.bias)
     if kind == "residual" and any(trajectory.measured is None for trajectory in what.trajectories):
         raise InputError("the outputs of this response were not measured; it has no residual.")
     horizon = "free run" if what.horizon is None else f"{what.horizon}-step prediction"
-    draw = {"output": plots.output_figure, "residual": plots.residual_figure, "components": plots.components_figure}
+    draw = {
+        "output": plots.output_figure,
+        "residual": plots.residual_figure,
+        "components": plots.components_figure,
+    }
     return draw[kind](what, horizon if title is None else title)
 
 
@@ -98,7 +113,8 @@ def _drawn(what: Any, kind: str, title: str | None) -> Figure:
 class FitPlots:
     """Figures of `fit`. Each draws on `ax`, or on new axes, and returns the axes.
 
-    Settings of matplotlib stay as they are. New axes belong to pyplot where that is in use, as in notebooks.
+    Settings of matplotlib stay as they are. New axes belong to pyplot where that is in use, as in
+    notebooks.
     """
 
     fit: Estimate | MotionEstimate
@@ -108,9 +124,14 @@ class FitPlots:
         return f"FitPlots({', '.join(f'{verb}()' for verb in verbs)})"
 
     def free_run(
-        self, record: Record | None = None, *, output: str | None = None, experiment: int = 0, ax: Axes | None = None
+        self,
+        record: Record | None = None,
+        *,
+        output: str | None = None,
+        experiment: int = 0,
+        ax: Axes | None = None,
     ) -> Axes:
-        """Measured output, free run of the model, and that of the model without its learner, over time [s].
+        """Draw measured output, free run, and free run without the learner, over time [s].
 
         Args:
             record: any with the model's channels; None for that of training.
@@ -127,15 +148,25 @@ class FitPlots:
             limits = axis.get_ylim()
             time = np.arange(len(alone.model)) * response.sampling_time
             drawn = outline(time, alone.model[:, i])
-            axis.plot(*drawn, color=ORANGE, linewidth=0.9, zorder=1.5, label="model without its learner")
-            axis.set_ylim(*limits)  # physics that runs away hides nothing
+            axis.plot(
+                *drawn, color=ORANGE, linewidth=0.9, zorder=1.5, label="model without its learner"
+            )
+            axis.set_ylim(*limits)  # a diverging run of physics does not set the limits
             axis.legend(fontsize="small", frameon=False)
         return axis
 
     def one_step(
-        self, record: Record | None = None, *, output: str | None = None, experiment: int = 0, ax: Axes | None = None
+        self,
+        record: Record | None = None,
+        *,
+        output: str | None = None,
+        experiment: int = 0,
+        ax: Axes | None = None,
     ) -> Axes:
-        """Measured output and the prediction one step ahead, over time [s]; arguments as `free_run`."""
+        """Draw measured output and the prediction one step ahead, over time [s].
+
+        Arguments as `free_run`.
+        """
         response, i = self._response("predict", record, output, experiment)
         return self._outputs(response, i, experiment, "one step ahead", ax)
 
@@ -148,7 +179,9 @@ class FitPlots:
         experiment: int = 0,
         ax: Axes | None = None,
     ) -> Axes:
-        """Measured less model over time [s]; `kind` is one_step or free_run. Other arguments as `free_run`.
+        """Draw measured less model over time [s]; `kind` is one_step or free_run.
+
+        Other arguments as `free_run`.
 
         Raises:
             InputError: as `free_run`; outputs that were not measured.
@@ -161,50 +194,85 @@ class FitPlots:
             raise InputError("the outputs of this record were not measured; there is no residual.")
         axis = axes_for(ax)
         error = trajectory.measured[:, i] - trajectory.model[:, i]
-        axis.plot(*outline(np.arange(len(error)) * response.sampling_time, error), color=BLUE, linewidth=0.7)
+        axis.plot(
+            *outline(np.arange(len(error)) * response.sampling_time, error),
+            color=BLUE,
+            linewidth=0.7,
+        )
         axis.axhline(0.0, color=GREY, linewidth=0.8)
-        axis.set(xlabel="time [s]", ylabel=f"residual of {channel.label}", title=f"residual, {_words(kind)}")
+        axis.set(
+            xlabel="time [s]",
+            ylabel=f"residual of {channel.label}",
+            title=f"residual, {_words(kind)}",
+        )
         return axis
 
-    def learned(self, feature: str | None = None, *, output: str | None = None, ax: Axes | None = None) -> Axes:
-        """What was learned, over one of the learner's inputs: means of the data with the cloud, or the curve itself.
+    def learned(
+        self, feature: str | None = None, *, output: str | None = None, ax: Axes | None = None
+    ) -> Axes:
+        """Draw the learned part over one input of the learner: means with the cloud, or the curve.
 
-        The curve, all else at its median, is drawn where the data can move the input alone; a band is its 95 %
-        interval, dashed is where the training data do not reach.
+        The curve, all else at its median, is drawn where the data can move the input alone; a band
+        is its 95 % interval, dashed outside of the range of the training data.
 
         Args:
-            feature: one of the learner's inputs; None for the most telling one.
+            feature: one of the learner's inputs; None for the one that explains most.
             output: which learned part; None for the first.
 
         Raises:
             InputError: a fit without a learner; names that it does not have.
         """
         part = self._learned()
-        feature = check_choice(part.ranked()[0] if feature is None else feature, part.features, "`feature`")
+        feature = check_choice(
+            part.ranked()[0] if feature is None else feature, part.features, "`feature`"
+        )
         bare = [name.partition(" [")[0] for name in part.names]
         i = 0 if output is None else bare.index(check_choice(output, bare, "`output`"))
         own, axis = part.seen[:, part.features.index(feature)], axes_for(ax)
-        axis.plot(own, part.values[:, i], ".", color=GREY, markersize=2, alpha=0.6, label="at the training data")
+        axis.plot(
+            own,
+            part.values[:, i],
+            ".",
+            color=GREY,
+            markersize=2,
+            alpha=0.6,
+            label="at the training data",
+        )
         curve = None if part.tied(feature) else part.curve(feature)
         if curve is None:
             centres, means = part.means(feature)
-            axis.plot(centres, means[:, i], "o-", color=GREEN, markersize=3, linewidth=1.0, label="mean")
+            axis.plot(
+                centres, means[:, i], "o-", color=GREEN, markersize=3, linewidth=1.0, label="mean"
+            )
         else:
             values = curve.learned[:, i]
             axis.plot(curve.along, values, "--", color=GREEN, linewidth=0.9)
             inside = np.where(curve.inside, values, np.nan)
-            axis.plot(curve.along, inside, color=GREEN, linewidth=1.6, label="learned, all else at its median")
+            axis.plot(
+                curve.along,
+                inside,
+                color=GREEN,
+                linewidth=1.6,
+                label="learned, all else at its median",
+            )
             if curve.half is not None:
                 half = curve.half[:, i]
-                axis.fill_between(curve.along, values - half, values + half, color=GREEN, alpha=0.2, linewidth=0)
+                axis.fill_between(
+                    curve.along, values - half, values + half, color=GREEN, alpha=0.2, linewidth=0
+                )
             axis.set_ylim(*curve_limits(curve, i, part.values[:, i]))
         unit = part.units[part.features.index(feature)]
-        axis.set(xlabel=f"{feature} [{unit}]" if unit else feature, ylabel=f"learned part of {part.names[i]}")
+        axis.set(
+            xlabel=f"{feature} [{unit}]" if unit else feature,
+            ylabel=f"learned part of {part.names[i]}",
+        )
         axis.legend(fontsize="small", frameon=False)
         return axis
 
     def parameters(self, *, ax: Axes | None = None) -> Axes:
-        """The 95 % interval of every parameter, in per cent of the estimate; values and limits are written above.
+        """Draw the 95 % interval of every parameter, in per cent of the estimate.
+
+        Values and limits are written above.
 
         A parameter without an interval, or with the estimate 0, is a hollow point.
         """
@@ -217,9 +285,17 @@ class FitPlots:
                 share = 100 * (ends - row["value"]) / abs(row["value"])
                 axis.plot(share, [y, y], "|-", color=GREEN, markersize=10, linewidth=2)
             reach = f"  [{ends[0]:.5g}, {ends[1]:.5g}]" if known else ", no interval"
-            told = f"{name} = {row['value']:.6g}{' ' * bool(row['unit'])}{row['unit']}{reach}"
-            axis.plot([0.0], [y], "o", color=GREEN, markerfacecolor=GREEN if known and row["value"] else "none")
-            axis.annotate(told, (0.0, y), (0, 9), textcoords="offset points", ha="center", fontsize="small")
+            label = f"{name} = {row['value']:.6g}{' ' * bool(row['unit'])}{row['unit']}{reach}"
+            axis.plot(
+                [0.0],
+                [y],
+                "o",
+                color=GREEN,
+                markerfacecolor=GREEN if known and row["value"] else "none",
+            )
+            axis.annotate(
+                label, (0.0, y), (0, 9), textcoords="offset points", ha="center", fontsize="small"
+            )
         axis.axvline(0.0, color=GREY, linewidth=0.8, zorder=0)
         axis.set_yticks(place, [str(name) for name in table.index])
         axis.set(xlabel="distance from the estimate [%]", title="parameters, 95 % intervals")
@@ -229,55 +305,92 @@ class FitPlots:
         return axis
 
     def bode(
-        self, *, input: str | None = None, output: str | None = None, phase: bool = False, ax: Axes | None = None
+        self,
+        *,
+        input: str | None = None,
+        output: str | None = None,
+        phase: bool = False,
+        ax: Axes | None = None,
     ) -> Axes:
-        """Gain over frequency [Hz] about a point of rest, with its 95 % band; with `phase` the phase in degrees.
+        """Draw the gain over frequency [Hz] about an operating point, with its 95 % band.
+
+        With `phase` the phase in degrees.
 
         Raises:
-            InputError: a model without inputs or without a point of rest, names that it does not have.
+            InputError: a model without inputs or without a point of rest, names that it does not
+                have.
         """
         from orthaug.analysis.linearization import linearize
 
         view = linearize(self.fit)[0]
         if view.bode is None:
-            raise InputError("the model has no inputs, so that it has no frequency response to draw.")
+            raise InputError(
+                "the model has no inputs, so that it has no frequency response to draw."
+            )
         i = _place(output, view.outputs, "`output`")
         j = _place(input, view.inputs, "`input`")
         value, band = (
-            (view.bode.phase, view.bode.phase_ci95) if phase else (view.bode.magnitude, view.bode.magnitude_ci95)
+            (view.bode.phase, view.bode.phase_ci95)
+            if phase
+            else (view.bode.magnitude, view.bode.magnitude_ci95)
         )
         axis = axes_for(ax)
         axis.plot(view.bode.frequency, value[:, i, j], color=BLUE, linewidth=1.2)
         if band is not None:
-            axis.fill_between(view.bode.frequency, *band[:, i, j].T, color=BLUE, alpha=0.25, linewidth=0)
+            axis.fill_between(
+                view.bode.frequency, *band[:, i, j].T, color=BLUE, alpha=0.25, linewidth=0
+            )
         axis.set_xscale("log")
         if not phase:
             axis.set_yscale("log")
         unit = gain_unit(view, i, j)
         what = "phase [°]" if phase else f"gain [{unit}]" if unit else "gain"
-        axis.set(xlabel="frequency [Hz]", ylabel=what, title=f"from {view.inputs[j]} to {view.outputs[i]}")
+        axis.set(
+            xlabel="frequency [Hz]",
+            ylabel=what,
+            title=f"from {view.inputs[j]} to {view.outputs[i]}",
+        )
         return axis
 
     def _record(self, record: Record | None) -> Record:
         check_type(record, Record | None, "record", "a Record, or None for that of training")
         return self.fit.problem.record if record is None else record
 
-    def _response(self, verb: str, record: Record | None, output: str | None, experiment: int) -> tuple[Response, int]:
-        """The response on a record, and which of its outputs is drawn."""
+    def _response(
+        self, verb: str, record: Record | None, output: str | None, experiment: int
+    ) -> tuple[Response, int]:
+        """Return the response on a record, and the index of the output that is drawn."""
         given = self._record(record)
         if not self.fit.status.ok:
             raise InputError(f"training failed ({self.fit.status.code}); there is nothing to draw.")
         count = len(given.experiments)
-        if isinstance(experiment, bool) or not isinstance(experiment, int) or not 0 <= experiment < count:
-            raise InputError(f"`experiment` must be a number from 0 to {count - 1}; got {experiment!r}.")
+        if (
+            isinstance(experiment, bool)
+            or not isinstance(experiment, int)
+            or not 0 <= experiment < count
+        ):
+            raise InputError(
+                f"`experiment` must be a number from 0 to {count - 1}; got {experiment!r}."
+            )
         i = _place(output, [channel.name for channel in self.fit.model.outputs], "`output`")
         return getattr(self.fit.model, verb)(given), i
 
-    def _outputs(self, response: Response, i: int, experiment: int, what: str, ax: Axes | None) -> Axes:
-        trajectory, channel, axis = response.trajectories[experiment], response.outputs[i], axes_for(ax)
+    def _outputs(
+        self, response: Response, i: int, experiment: int, what: str, ax: Axes | None
+    ) -> Axes:
+        trajectory, channel, axis = (
+            response.trajectories[experiment],
+            response.outputs[i],
+            axes_for(ax),
+        )
         time = np.arange(len(trajectory.model)) * response.sampling_time
         if trajectory.measured is not None:
-            axis.plot(*outline(time, trajectory.measured[:, i]), color=GREY, linewidth=2.4, label="measured")
+            axis.plot(
+                *outline(time, trajectory.measured[:, i]),
+                color=GREY,
+                linewidth=2.4,
+                label="measured",
+            )
         axis.plot(*outline(time, trajectory.model[:, i]), color=BLUE, linewidth=0.9, label="model")
         if trajectory.measured is not None:  # the measured range, for a run that leaves all bounds
             span = [np.nanmin(trajectory.measured[:, i]), np.nanmax(trajectory.measured[:, i])]

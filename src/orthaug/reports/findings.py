@@ -11,7 +11,7 @@ from orthaug.reports.residual_tests import ResidualTestResult
 
 
 class AlternativeResult(Content):
-    """Other learner inputs, and what is determined beside a learner of these."""
+    """Other learner inputs, and the parameters determined beside a learner of these."""
 
     inputs: list[str]
     shared: Whole
@@ -20,7 +20,7 @@ class AlternativeResult(Content):
 
 
 class SharedResult(Content):
-    """What the learner could imitate of the physics: there θ is split off."""
+    """Physics that the learner could imitate: θ is split off along these directions."""
 
     absent = frozenset({"alternatives", "withdrawn", "doubt"})
 
@@ -32,12 +32,12 @@ class SharedResult(Content):
     text: str
     alternatives: list[AlternativeResult] | None = None
     withdrawn: list[str] | None = None
-    """Parameters that the fit would determine, were it not for the `doubt`."""
+    """Parameters that the fit would determine without the `doubt`."""
     doubt: str | None = None
 
 
 class MemoryResult(Content):
-    """A term in an equation that predicts what the free run leaves, and the parameters with it."""
+    """A term in an equation that predicts the free run's residual, and the parameters with it."""
 
     absent = frozenset({"parameters"})
 
@@ -53,7 +53,7 @@ class MemoryResult(Content):
 
 
 class StructureResult(Content):
-    """What the free run leaves beside noise: the best function of a state or an input, and terms with memory."""
+    """Structure in the free run's residual: a function of a signal, and terms with memory."""
 
     hidden_state: Flag
     static: MemoryResult | None
@@ -61,7 +61,7 @@ class StructureResult(Content):
 
 
 class CertificateResult(Content):
-    """Whether some weighting of the points leaves no bias."""
+    """Test of whether some weighting of the points leaves no bias."""
 
     verdict: str
     direction: ByName | None
@@ -72,24 +72,24 @@ class CertificateResult(Content):
 
 
 class BiasResult(Content):
-    """The bias of a parameter by what the learner found: estimate less truth, its cause, the cause's share of it."""
+    """The bias of a parameter by the learned part: estimate less truth, its cause and share."""
 
     value: Number
     cause: str
     share: Number
     determined: Flag = True
-    """Whether the causes that noise cannot tell apart agree enough for an interval to be of use."""
+    """Whether the causes that noise cannot distinguish agree enough for a useful interval."""
 
 
 class PhysicalBias(Content):
-    """What the guessed coefficient does to a physical parameter."""
+    """The change of a physical parameter by the guessed coefficient."""
 
     bias: Number
     relative: Number
 
 
-class ToldResult(Content):
-    """What the residual of a motion's free run tells of a term."""
+class ResidualStepResult(Content):
+    """Evidence for a term in the residual of a motion's free run."""
 
     coefficient: Number
     std: Number
@@ -99,7 +99,7 @@ class ToldResult(Content):
 
 
 class SuspectResult(Content):
-    """What a term that may be missing does to θ."""
+    """The change of θ by a term that may be missing."""
 
     absent = frozenset({"equation", "unit", "residual"})
 
@@ -122,26 +122,33 @@ class SuspectResult(Content):
     expected_physical_bias: dict[str, PhysicalBias] | None
     equation: str | None = None
     unit: str | None = None
-    residual: ToldResult | None = None
+    residual: ResidualStepResult | None = None
 
     @property
     def percent(self) -> dict[str, float | None]:
-        """The bias of every θ and physical parameter, in per cent of its value.
+        """Bias of every θ and physical parameter, in per cent of its value.
 
-        With a guess it is the bias by the guessed coefficient. Without one the term counts as 1 % of the outputs'
-        deviation over the measure.
+        With a guess it is the bias by the guessed coefficient. Without one the term counts as 1 %
+        of the outputs' deviation over the measure.
         """
         coefficient = self.coefficient
         if coefficient is None:
             coefficient = 0.01 / self.size if self.size else None
         relative = {**(self.relative_bias or {}), **(self.relative_physical_bias or {})}
-        shares = {k: None if v is None or coefficient is None else 100 * v * coefficient for k, v in relative.items()}
-        exact = {k: 100 * e.relative for k, e in (self.expected_physical_bias or {}).items() if e.relative}
+        shares = {
+            k: None if v is None or coefficient is None else 100 * v * coefficient
+            for k, v in relative.items()
+        }
+        exact = {
+            k: 100 * e.relative
+            for k, e in (self.expected_physical_bias or {}).items()
+            if e.relative
+        }
         return shares | exact
 
 
 class PredictableResult(Content):
-    """What could be predicted of an output's error."""
+    """The predictable part of an output's error."""
 
     name: str
     rms: Number
@@ -161,7 +168,7 @@ class ChangeResult(Content):
 
 
 class MissingTermResult(Content):
-    """A term that an equation of a motion could lack."""
+    """A term that an equation of a motion may lack."""
 
     equation: str
     variable: str | None
@@ -172,7 +179,7 @@ class MissingTermResult(Content):
 
 
 class MissingResult(Content):
-    """The test of terms that the equations of a motion could lack."""
+    """The test of terms that the equations of a motion may lack."""
 
     p: Number
     freedom: list[int]
@@ -181,7 +188,7 @@ class MissingResult(Content):
 
 
 class DiagnosisResult(Content):
-    """What the residuals say about the noise, and which change would help."""
+    """Diagnosis of the residuals: the kind of noise, and the change that would help."""
 
     absent = frozenset({"steps"})
 
@@ -206,7 +213,7 @@ class LagResult(Content):
 
 
 class MissingLagsResult(Content):
-    """Whether what the physics lacks is a function of what the learner sees."""
+    """Test of whether the missing physics is a function of the learner's inputs."""
 
     level: Number
     tests: list[LagResult]
@@ -293,7 +300,7 @@ class StabilityResult(Content):
 
 
 class TrialResult(Content):
-    """Free-run errors on data that were not fitted."""
+    """Free-run errors on validation data."""
 
     where: str
     physics_alone: Number = Field(validation_alias="alone")
@@ -309,7 +316,7 @@ class RatioResult(Content):
 
 
 class ExtrapolationResult(Content):
-    """How far a part leaves the training data."""
+    """Distance of a part from the training data."""
 
     part: str
     regressor: str = Field(validation_alias="lag")
@@ -319,7 +326,7 @@ class ExtrapolationResult(Content):
 
 
 class ValidationResult(Content):
-    """Whether the learner earns its place."""
+    """Verdict on the learner: is it useful?"""
 
     verdict: str = Field(validation_alias="code")
     text: str
@@ -329,7 +336,7 @@ class ValidationResult(Content):
 
 
 class HoldResult(Content):
-    """What physics alone leaves under a hold, in deviations of the outputs."""
+    """Residual of physics alone under a hold, in deviations of the outputs."""
 
     hold: str
     residual: Number
@@ -338,10 +345,10 @@ class HoldResult(Content):
 
 
 class AdviceResult(Content):
-    """A change of the spec that was tried and bettered the free run where nothing was fitted.
+    """A change of the spec that lowered the free run's validation error in a trial.
 
-    `change` has the new values by their keys, `before` and `after` the RMS errors in standard deviations of the
-    training output; `before` is None where the model as it is diverges.
+    `change` has the new values by their keys, `before` and `after` the RMS errors in standard
+    deviations of the training output; `before` is None where the model as it is diverges.
     """
 
     change: dict[str, Any]
@@ -351,7 +358,7 @@ class AdviceResult(Content):
 
 
 class AdviceTrialsResult(Content):
-    """How many changes of the spec were tried, and how many were left out to spare time."""
+    """Number of changes of the spec that were tried, and of those left out to save time."""
 
     text: str
     tried: Whole
@@ -359,7 +366,7 @@ class AdviceTrialsResult(Content):
 
 
 class MotionCheckResult(Content):
-    """What can be said of a motion before training."""
+    """Findings on a motion before training."""
 
     states: list[str]
     integrator: str
@@ -372,7 +379,7 @@ class MotionCheckResult(Content):
 
 
 class EquationPartsResult(Content):
-    """RMS of what physics and learner add to a learned equation or output along the training run, in its unit."""
+    """RMS of physics and learner in an equation or output along the training run, in its unit."""
 
     equation: str
     unit: str
@@ -382,7 +389,7 @@ class EquationPartsResult(Content):
 
 
 class MotionFitResult(Content):
-    """How a fitted motion is integrated, and the rows that a prediction starts from.
+    """Integration of a fitted motion, and the rows that a prediction starts from.
 
     `substep_bias`: the parameters less what a fit with twice the substeps would give.
     """

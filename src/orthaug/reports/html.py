@@ -1,4 +1,4 @@
-"""How notebooks show records, physics, fits and models: a title, a few facts, a table."""
+"""Display of records, physics, fits and models in notebooks: a title, a few facts, a table."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Card:
-    """What is shown of an object."""
+    """The content that is shown of an object."""
 
     title: str
     facts: Mapping[str, str] = field(default_factory=dict)
@@ -62,11 +62,15 @@ class Card:
 
 
 def html_of(shown: Any) -> str:
-    """The object, or a card, as HTML, escaped."""
-    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
+    """Return the object, or a card, as HTML, escaped."""
+    environment = jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True
+    )
     card = shown if isinstance(shown, Card) else card_of(shown)
     tables = [Table(t.columns, _shortened(t)) for t in card.tables]
-    return environment.from_string(_TEMPLATE).render(card=Card(card.title, card.facts, tables, card.notes))
+    return environment.from_string(_TEMPLATE).render(
+        card=Card(card.title, card.facts, tables, card.notes)
+    )
 
 
 def _shortened(table: Table) -> Sequence[Sequence[str]]:
@@ -78,7 +82,7 @@ def _shortened(table: Table) -> Sequence[Sequence[str]]:
 
 @singledispatch
 def card_of(shown: Any) -> Card:
-    """What is shown of an object."""
+    """Return the card of an object."""
     return Card(repr(shown))
 
 
@@ -92,11 +96,25 @@ def _record(record: Record) -> Card:
     rows = []
     for role, channels in (("input", record.inputs), ("output", record.outputs)):
         for i, channel in enumerate(channels):
-            values = np.concatenate([np.asarray(getattr(e, role + "s"))[:, i] for e in record.experiments])
+            values = np.concatenate(
+                [np.asarray(getattr(e, role + "s"))[:, i] for e in record.experiments]
+            )
             there = values[np.isfinite(values)]
-            numbers = (there.min(), there.max(), there.mean(), there.std()) if len(there) else (np.nan,) * 4
+            numbers = (
+                (there.min(), there.max(), there.mean(), there.std())
+                if len(there)
+                else (np.nan,) * 4
+            )
             missing = len(values) - len(there)
-            rows.append([channel.name, role, channel.unit or "–", *map(_number, numbers), str(missing or "–")])
+            rows.append(
+                [
+                    channel.name,
+                    role,
+                    channel.unit or "–",
+                    *map(_number, numbers),
+                    str(missing or "–"),
+                ]
+            )
     columns = ["channel", "role", "unit", "least", "largest", "mean", "deviation", "missing"]
     return Card("Record", facts, [Table(columns, rows)])
 
@@ -106,12 +124,14 @@ def _baseline(baseline: Baseline) -> Card:
     facts = {"constants": ", ".join(f"{k} = {v:g}" for k, v in dict(baseline.constants).items())}
     if baseline.function is not None:
         facts["terms"] = "a function of the regressor"
-    rows = [[f"{t.parameter} (fixed)" if t.fixed else t.parameter, t.regressor] for t in baseline.terms]
+    rows = [
+        [f"{t.parameter} (fixed)" if t.fixed else t.parameter, t.regressor] for t in baseline.terms
+    ]
     columns = ["parameter", "regressor"]
     if any(t.output for t in baseline.terms):  # else there is only one
         columns = ["output", *columns]
         rows = [[t.output or "–", *row] for t, row in zip(baseline.terms, rows, strict=True)]
-    return Card("Baseline", _told(facts), [Table(columns, rows), _declared(baseline.parameters)])
+    return Card("Baseline", _facts(facts), [Table(columns, rows), _declared(baseline.parameters)])
 
 
 @card_of.register
@@ -123,11 +143,20 @@ def _motion(motion: Motion) -> Card:
     }
     if motion.functions is not None:
         facts["equations"] = "functions of states, inputs and parameters"
-    rows = [[f"d/dt {s.name}", s.derivative or "–", s.unit or "–", "yes" if s.learned else "–"] for s in motion.states]
-    rows += [[o.name, o.expression or "–", "–", "yes" if o.learned else "–"] for o in motion.outputs]
+    rows = [
+        [f"d/dt {s.name}", s.derivative or "–", s.unit or "–", "yes" if s.learned else "–"]
+        for s in motion.states
+    ]
+    rows += [
+        [o.name, o.expression or "–", "–", "yes" if o.learned else "–"] for o in motion.outputs
+    ]
     defined = [[name, str(expression)] for name, expression in motion.definitions]
     equations = Table(["", "equation", "unit of the state", "learned beside it"], rows)
-    return Card("Motion", _told(facts), [equations, Table(["defined", "as"], defined), _declared(motion.parameters)])
+    return Card(
+        "Motion",
+        _facts(facts),
+        [equations, Table(["defined", "as"], defined), _declared(motion.parameters)],
+    )
 
 
 @card_of.register(Estimate)
@@ -138,7 +167,8 @@ def _fit(fit: Estimate | MotionEstimate) -> Card:
         "structure": fit.model.structure,
         "learner": "none" if bound is None else f"{bound.learner}, {bound.size} weights",
         "data": repr(fit.problem.record),
-        "status": f"{status.code}, {status.iterations} iterations, {status.seconds:.2f} s, loss {status.loss:.6g}",
+        "status": f"{status.code}, {status.iterations} iterations, {status.seconds:.2f} s, loss "
+        f"{status.loss:.6g}",
         "": status.message or "",
     }
     rows = [
@@ -152,14 +182,19 @@ def _fit(fit: Estimate | MotionEstimate) -> Card:
         for name, row in fit.parameters.to_dict("index").items()
     ]
     parameters = Table(["parameter", "value", "std", "95 % interval", "unit"], rows)
-    return Card(type(fit).__name__, _told(facts), [parameters], [warning.text for warning in fit.warnings])
+    return Card(
+        type(fit).__name__, _facts(facts), [parameters], [warning.text for warning in fit.warnings]
+    )
 
 
 def card_of_result(fit: Estimate | MotionEstimate, result: FitResult) -> Card:
-    """A fit with what its result tells of every parameter, and all of the result's warnings."""
+    """Return the card of a fit with the findings on every parameter, and all warnings."""
     parameters = [*result.parameters, *(result.physical_parameters or ())]
     columns = ["parameter", "value", "std", "95 % interval", "unit"]
-    rows = [[row.name, _number(row.value), _number(row.std, 3), _ends(row.ci95), row.shown_unit] for row in parameters]
+    rows = [
+        [row.name, _number(row.value), _number(row.std, 3), _ends(row.ci95), row.shown_unit]
+        for row in parameters
+    ]
     if any(row.bias for row in parameters):
         columns += ["bias", "95 % interval with it"]
         for cells, row in zip(rows, parameters, strict=True):
@@ -182,28 +217,30 @@ def _model(model: Model | MotionModel) -> Card:
         "sampling time": f"{model.sampling_time:g} s",
     }
     parameters, values = model.estimated
-    rows = [[p.name, _number(value), p.unit or "–"] for p, value in zip(parameters, values, strict=True)]
-    return Card(type(model).__name__, _told(facts), [Table(["parameter", "value", "unit"], rows)])
+    rows = [
+        [p.name, _number(value), p.unit or "–"] for p, value in zip(parameters, values, strict=True)
+    ]
+    return Card(type(model).__name__, _facts(facts), [Table(["parameter", "value", "unit"], rows)])
 
 
 def _declared(parameters: Sequence[Any]) -> Table:
-    """Parameters as they were declared."""
+    """Return the parameters as they were declared."""
     rows = []
     for p in parameters:
         rows.append([p.name, _number(p.initial), p.unit or "–", _bounds(p.min, p.max)])
     return Table(["parameter", "initial", "unit", "bounds"], rows)
 
 
-def _told(facts: Mapping[str, str]) -> dict[str, str]:
-    """Without what is empty; a sentence without a name goes on with the fact before it."""
-    told: dict[str, str] = {}
+def _facts(facts: Mapping[str, str]) -> dict[str, str]:
+    """Return the facts without empty ones; a value without a name continues the fact before it."""
+    named: dict[str, str] = {}
     for name, value in facts.items():
-        if value and not name and told:
-            last = list(told)[-1]
-            told[last] += f"; {value}"
+        if value and not name and named:
+            last = list(named)[-1]
+            named[last] += f"; {value}"
         elif value:
-            told[name] = value
-    return told
+            named[name] = value
+    return named
 
 
 def _number(value: Any, digits: int = 6) -> str:

@@ -1,4 +1,4 @@
-"""What was learned beside the physics, as a function: along the training data, over one input, and over two."""
+"""The learned part as a function: along the training data, over one input, and over two."""
 
 from __future__ import annotations
 
@@ -23,14 +23,16 @@ if TYPE_CHECKING:
 _MOST_POINTS = 2000  # of a cloud
 _BATCH = 512  # points of a compiled call
 _CURVE = 200  # points of a curve
-_BEYOND = 0.2  # of the data's reach, drawn at each side of it
+_BEYOND = 0.2  # of the data's range, drawn at each side of it
 _BINS = 24  # of means over a feature
 _CELLS = 36  # of a surface, in each direction, in which data are looked for
 _FINER = 2  # times as many in which the learned part is drawn
 _IN_A_CELL = 3  # points of the data on average, where their means are drawn
-_TIED = 0.95  # correlation with another feature from which others at their medians are no state of the system
+_TIED = 0.95  # correlation of features from which medians of the others are no possible state
 Reach = Callable[[Matrix], Matrix | None]
-"""Half the length of 95 % intervals of the learned part (M, nl) at points (M, n); None where there are none."""
+"""Half the length of 95 % intervals of the learned part (M, nl) at points (M, n); None where there
+are none.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +41,7 @@ class Curve:
 
     along: Vector
     inside: Bool[np.ndarray, "n"]
-    """Where the data reach."""
+    """The range of the data."""
     learned: Matrix
     half: Matrix | None
     """Half the length of 95 % intervals."""
@@ -47,7 +49,10 @@ class Curve:
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """The learned part over two variables, all others at their medians; NaN where no data are near."""
+    """The learned part over two variables, all others at their medians.
+
+    It is NaN where no data are near.
+    """
 
     across: Vector
     along: Vector
@@ -56,16 +61,18 @@ class Surface:
 
 @dataclass(frozen=True, eq=False)
 class LearnedPart:
-    """The learned part of a model on training data: points (M, n) of the `variables`, and `at` any other of them.
+    """The learned part of a model on training data: its points, and its values at any others.
 
-    `seen` (M, nz) are the learner's `features` at the points, `values` (M, nl) the learned part, named `names` with
-    their units.
+    Points are (M, n) of the `variables`.
+
+    `seen` (M, nz) are the learner's `features` at the points, `values` (M, nl) the learned part,
+    named `names` with their units.
     """
 
     names: tuple[str, ...]
     features: tuple[str, ...]
     units: tuple[str, ...]
-    """Of the features; empty for expressions."""
+    """Units of the features; empty for expressions."""
     variables: tuple[str, ...]
     points: Matrix
     seen: Matrix
@@ -74,8 +81,10 @@ class LearnedPart:
     reach: Reach | None = None
 
     @classmethod
-    def of_motion(cls, model: MotionModel, record: Record, reach: Reach | None = None) -> LearnedPart:
-        """Of a motion, along the free run of the first experiment."""
+    def of_motion(
+        cls, model: MotionModel, record: Record, reach: Reach | None = None
+    ) -> LearnedPart:
+        """Return the learned part of a motion, along the free run of the first experiment."""
         states, inputs = trajectory_of(model, record)
         chosen = spread(len(states))
         points, size = np.concatenate([states, inputs], axis=1)[chosen], states.shape[1]
@@ -83,7 +92,10 @@ class LearnedPart:
         def at(x: Matrix) -> Matrix:
             padded = x[np.minimum(np.arange(-(-len(x) // _BATCH) * _BATCH), len(x) - 1)]
             batches = np.split(padded, len(padded) // _BATCH)
-            found = [parts_at(model.form, model.numbers, *np.split(b, [size], axis=1))[1] for b in batches]
+            found = [
+                parts_at(model.form, model.numbers, *np.split(b, [size], axis=1))[1]
+                for b in batches
+            ]
             return np.concatenate(found)[: len(x)]
 
         with np.errstate(all="ignore"):
@@ -104,16 +116,18 @@ class LearnedPart:
 
     @classmethod
     def of_lagged(cls, model: Model, record: Record) -> LearnedPart:
-        """Of a lagged model, at the measured regressors of all experiments: `f − φ θ_aux`."""
+        """Return the learned part `f − φ θ_aux` of a lagged model, at all measured regressors."""
         form, record = model.form, model.fitting(record, need_outputs=True)
-        rows = np.concatenate([form.regressors(experiment, record) for experiment in record.experiments])
+        rows = np.concatenate(
+            [form.regressors(experiment, record) for experiment in record.experiments]
+        )
         points = rows[spread(len(rows))]
         of_channel = {channel.name: channel.unit for channel in (*model.outputs, *model.inputs)}
         units = {str(lag): of_channel.get(lag.channel, "") for lag in form.layout}
         features = tuple(str(entry) for entry in form.features.entries)
 
         def at(x: Matrix) -> Matrix:
-            """Of as many rows as the points at least, for which there is a program."""
+            """Return the learned part at any points."""
             rows = np.minimum(np.arange(max(len(x), len(points))), len(x) - 1)
             return np.asarray(model.parts_at(x[rows]).learner)[: len(x)]
 
@@ -129,7 +143,7 @@ class LearnedPart:
         )
 
     def curve(self, feature: str) -> Curve | None:
-        """Over a variable, a fifth of the data's reach beyond them; None of an expression."""
+        """Return the curve over a variable, a fifth beyond the data; None of an expression."""
         if feature not in self.variables:
             return None
         place = self.variables.index(feature)
@@ -142,7 +156,10 @@ class LearnedPart:
         return Curve(along, (along >= low) & (along <= high), self.at(rows), half)
 
     def telling_pair(self) -> tuple[str, str]:
-        """The most telling feature, and of those that do not move along with it the next; of at least two features."""
+        """Return the feature that explains most, and of those that are not tied to it the next.
+
+        There are at least two features.
+        """
         first, *others = self.ranked()
         own = self.seen[:, self.features.index(first)]
         for name in others:
@@ -152,41 +169,55 @@ class LearnedPart:
         return first, others[0]
 
     def tied(self, feature: str, but: str = "") -> bool:
-        """Whether the data move another feature along with it, `but` one: then they hold nothing with that at rest."""
-        moving = [name for name, spread in zip(self.features, self.seen.std(axis=0), strict=True) if spread > 0]
+        """Return whether the data move another feature along with it, except the feature `but`.
+
+        Then no data show its effect with the other at rest.
+        """
+        moving = [
+            name
+            for name, spread in zip(self.features, self.seen.std(axis=0), strict=True)
+            if spread > 0
+        ]
         own = self.seen[:, self.features.index(feature)]
         others = [self.seen[:, self.features.index(n)] for n in moving if n not in (feature, but)]
-        return feature in moving and any(abs(np.corrcoef(own, other)[0, 1]) > _TIED for other in others)
+        return feature in moving and any(
+            abs(np.corrcoef(own, other)[0, 1]) > _TIED for other in others
+        )
 
     def alone(self, across: str, along: str) -> bool:
-        """Whether two features are variables that can be moved with all else at rest."""
+        """Return whether two features are variables that can be varied with all else at rest."""
         known = across in self.variables and along in self.variables
         return known and not self.tied(across, along) and not self.tied(along, across)
 
     def means(self, feature: str) -> tuple[Vector, Matrix]:
-        """Means of feature and learned part over bins of the feature of equally many points, (k,) and (k, nl)."""
+        """Return means of feature (k,) and learned part (k, nl) in bins of equally many points."""
         order = np.argsort(self.seen[:, self.features.index(feature)], kind="stable")
         bins = np.array_split(order, min(_BINS, max(len(order) // 8, 1)))
         centres = np.array([self.seen[b, self.features.index(feature)].mean() for b in bins])
         return centres, np.array([self.values[b].mean(axis=0) for b in bins])
 
     def shares(self) -> Matrix:
-        """Share of the learned part's variance that the means over each feature explain, (nz, nl)."""
+        """Return the share of variance that the means over each feature explain, (nz, nl)."""
         total = np.maximum(self.values.var(axis=0), 1e-300)
         return np.array([self.means(feature)[1].var(axis=0) / total for feature in self.features])
 
     def ranked(self) -> Sequence[str]:
-        """Features, the one that explains most of the learned part first."""
+        """Return the features, the one that explains most of the learned part first."""
         order = np.argsort(-self.shares().max(axis=1), kind="stable")
         return [self.features[j] for j in order]
 
     def surface(self, across: str, along: str) -> Surface:
-        """Over two features where data are near; of such that do not move alone the mean of the data in each cell."""
+        """Return the surface over two features where there are data near.
+
+        For features that do not vary alone, it is the mean of the data in each cell.
+        """
         pair = self.seen[:, [self.features.index(across), self.features.index(along)]]
         low, high = pair.min(axis=0), pair.max(axis=0)
         width = np.maximum(high - low, 1e-300)
         alone = self.alone(across, along)
-        count = _CELLS if alone else min(max(int(np.sqrt(len(pair) / _IN_A_CELL)), _CELLS // 4), _CELLS)
+        count = (
+            _CELLS if alone else min(max(int(np.sqrt(len(pair) / _IN_A_CELL)), _CELLS // 4), _CELLS)
+        )
         cells = np.minimum((count * (pair - low) / width).astype(int), count - 1)
         size = _FINER * count if alone else count
         first, second = (low[k] + width[k] * (np.arange(size) + 0.5) / size for k in (0, 1))
@@ -205,7 +236,10 @@ class LearnedPart:
 
 
 def learned_of(fit: Estimate | MotionEstimate, record: Record) -> LearnedPart | None:
-    """What a fit learned along a record, with intervals where it has some; None where nothing was learned."""
+    """Return the learned part of a fit along a record, with intervals where it has them.
+
+    None where nothing was learned.
+    """
     if fit.model.form.bound is None:
         return None
     if isinstance(fit, Estimate):
@@ -219,7 +253,7 @@ def learned_of(fit: Estimate | MotionEstimate, record: Record) -> LearnedPart | 
 
 
 def _near(cells: np.ndarray) -> Bool[np.ndarray, "a b"]:
-    """Cells with data, and those beside them."""
+    """Return the cells with data, and those beside them."""
     there = np.zeros((_CELLS + 2, _CELLS + 2), dtype=bool)
     for i in (0, 1, 2):
         for j in (0, 1, 2):
@@ -235,12 +269,12 @@ def _mean_in_cells(cells: np.ndarray, values: Matrix, size: int) -> Float[np.nda
 
 
 def spread(count: int, most: int = _MOST_POINTS) -> np.ndarray:
-    """Places of at most so many points, spread evenly over `count`."""
+    """Return at most so many indices, spread evenly over `count`."""
     return np.linspace(0, count - 1, min(count, most)).astype(int)
 
 
 def trajectory_of(model: MotionModel, record: Record) -> tuple[Matrix, Matrix]:
-    """States and inputs of the free run of the first experiment, as far as it is finite."""
+    """Return states and inputs of the free run of the first experiment, as far as it is finite."""
     record = model.fitting(record, need_outputs=False)
     frame = model.states(record)
     first = record.experiments[0]
@@ -251,18 +285,20 @@ def trajectory_of(model: MotionModel, record: Record) -> tuple[Matrix, Matrix]:
 
 
 def labels_with_units(model: MotionModel) -> list[str]:
-    """Of learned equations and outputs."""
+    """Return the labels of learned equations and outputs, with their units."""
     units = {channel.name: channel.unit for channel in model.outputs}
     return [with_unit(name, unit or units.get(name)) for name, unit in labels_of(model.form)]
 
 
 def units_of(model: MotionModel) -> dict[str, str]:
-    """Of states and inputs by name."""
-    return {s.name: s.unit for s in model.form.motion.states} | {c.name: c.unit for c in model.inputs}
+    """Return the units of states and inputs by name."""
+    return {s.name: s.unit for s in model.form.motion.states} | {
+        c.name: c.unit for c in model.inputs
+    }
 
 
 def curve_limits(curve: Curve, k: int, cloud: Vector) -> tuple[float, float]:
-    """What a panel of a curve's output k shows: the cloud and the curve within reach, not all that it is beyond."""
+    """Return the limits of the panel of output k: of the cloud, and the curve within the data."""
     both = np.concatenate([curve.learned[curve.inside, k], cloud])
     low, high = float(np.nanmin(both)), float(np.nanmax(both))
     margin = 0.15 * max(high - low, 1e-12)

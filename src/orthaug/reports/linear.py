@@ -1,4 +1,4 @@
-"""What `orthaug linearize` tells."""
+"""Results of `orthaug linearize`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from orthaug.analysis.linear_view import Linearization, LinearView, Pole, phase_of
 from orthaug.analysis.measured_response import MeasuredResponse
 from orthaug.reports.fields import ByName, Content, Flag, Number, Numbers, WarningResult, Whole
-from orthaug.reports.result import Headed
+from orthaug.reports.result import ResultHeader
 
 Rows = list[Numbers]
 Intervals = list[list[Numbers]]
@@ -34,10 +34,12 @@ class PoleResult(Content):
 
     @classmethod
     def of(cls, pole: Pole) -> PoleResult:
-        """Of a view's pole."""
+        """Return the result of a view's pole."""
         s = pole.s
         own = {name: getattr(pole, name) for name in cls.model_fields if hasattr(pole, name)}
-        own = {name: list(value) if isinstance(value, tuple) else value for name, value in own.items()}
+        own = {
+            name: list(value) if isinstance(value, tuple) else value for name, value in own.items()
+        }
         parts = {"real": pole.z.real, "imaginary": pole.z.imag}
         parts |= {
             "continuous_real": None if s is None else s.real,
@@ -117,7 +119,7 @@ class LinearPointResult(Content):
 
 
 class MeasuredPairResult(Content):
-    """What data alone say of one pair."""
+    """The frequency response of one pair from the data."""
 
     output: str
     input: str
@@ -127,7 +129,7 @@ class MeasuredPairResult(Content):
 
 
 class MeasuredResponseResult(Content):
-    """The frequency response from data alone."""
+    """The frequency response from the data, without the model."""
 
     method: str
     averages: Number
@@ -135,8 +137,8 @@ class MeasuredResponseResult(Content):
     response: list[MeasuredPairResult]
 
 
-class LinearizeResult(Headed):
-    """What `orthaug linearize` tells."""
+class LinearizeResult(ResultHeader):
+    """The result of `orthaug linearize`."""
 
     sampling_time: Number
     inputs: list[str]
@@ -148,7 +150,7 @@ class LinearizeResult(Headed):
 
     @classmethod
     def of(cls, found: Linearization) -> LinearizeResult:
-        """Of what `linearize` returns."""
+        """Return the result of what `linearize` returns."""
         first = found[0]
         return cls.model_validate(
             {
@@ -164,7 +166,7 @@ class LinearizeResult(Headed):
 
 
 def gain_unit(view: LinearView, i: int, j: int) -> str:
-    """The unit of output i over that of input j."""
+    """Return the unit of output i over that of input j."""
     upper, lower = view.units.get(view.outputs[i], ""), view.units.get(view.inputs[j], "")
     if not lower:
         return upper
@@ -186,7 +188,9 @@ def _point(view: LinearView, found: Linearization) -> dict[str, Any]:
         "static_gain": [_gain(view, i, j) for i, j in np.ndindex(*view.d.shape)],
         "continuous": _continuous(view),
         "frequency": [] if view.bode is None else view.bode.frequency,
-        "response": [] if view.bode is None else [_response(view, i, j) for i, j in np.ndindex(*view.d.shape)],
+        "response": []
+        if view.bode is None
+        else [_response(view, i, j) for i, j in np.ndindex(*view.d.shape)],
         "median_difference_db": None if agreement is None else agreement.decibel,
         "median_difference_deg": None if agreement is None else agreement.degrees,
         "warnings": list(view.warnings),
@@ -198,7 +202,9 @@ def _matrices(view: LinearView) -> dict[str, Any]:
     parts = {"a": np.s_[:n, :n], "b": np.s_[:n, n:], "c": np.s_[n:, :n], "d": np.s_[n:, n:]}
     for name, part in parts.items():
         found[name] = view.system.matrix[part].tolist()
-        found[f"{name}_ci95"] = None if view.matrix_ci95 is None else view.matrix_ci95[part].tolist()
+        found[f"{name}_ci95"] = (
+            None if view.matrix_ci95 is None else view.matrix_ci95[part].tolist()
+        )
     return found
 
 
@@ -229,12 +235,12 @@ def _continuous(view: LinearView) -> dict[str, Any]:
 def _response(view: LinearView, i: int, j: int) -> dict[str, Any]:
     bode = view.bode
     assert bode is not None
-    told = _pair(view, i, j)
+    fields = _pair(view, i, j)
     for name, band in (("magnitude", bode.magnitude_ci95), ("phase", bode.phase_ci95)):
-        told[name] = getattr(bode, name)[:, i, j]
-        told[f"{name}_low"] = None if band is None else band[:, i, j, 0]
-        told[f"{name}_high"] = None if band is None else band[:, i, j, 1]
-    return told
+        fields[name] = getattr(bode, name)[:, i, j]
+        fields[f"{name}_low"] = None if band is None else band[:, i, j, 0]
+        fields[f"{name}_high"] = None if band is None else band[:, i, j, 1]
+    return fields
 
 
 def _measured(measured: MeasuredResponse, view: LinearView) -> dict[str, Any]:

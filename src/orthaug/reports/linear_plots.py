@@ -35,7 +35,7 @@ _WIDE = 4.2  # inches of a column of several
 
 @plain
 def bode_figure(found: Linearization) -> Figure:
-    """Magnitude and phase from every input to every output, with 95 % bands; grey: data alone.
+    """Draw magnitude and phase from every input to every output, with 95 % bands; grey: from data.
 
     Points of rest outside of the training data are drawn where there is no other.
     """
@@ -53,33 +53,50 @@ def bode_figure(found: Linearization) -> Figure:
         label(upper, y=f"gain [{unit}]" if unit else "gain")
         label(lower, y="phase [°]", x="frequency [Hz]" if i == ny - 1 else None)
         if ny * nu > 1:
-            upper.set_title(f"{first.outputs[i]} / {first.inputs[j]}", fontsize=9, loc="left", y=1.0)
+            upper.set_title(
+                f"{first.outputs[i]} / {first.inputs[j]}", fontsize=9, loc="left", y=1.0
+            )
         if (i, j) == (0, 0) and ny * nu > 1:
             upper.legend(loc="lower left", fontsize=8, frameon=False)
         elif (i, j) == (0, 0):
             legend(upper)
     pair = f" from {first.inputs[0]} to {first.outputs[0]}" if ny * nu == 1 else ""
-    banded = ", 95 % bands" if first.bode is not None and first.bode.magnitude_ci95 is not None else ""
+    banded = (
+        ", 95 % bands" if first.bode is not None and first.bode.magnitude_ci95 is not None else ""
+    )
     headline(figure, f"frequency response{pair}{banded}")
     return figure
 
 
 def _draw_pair(
-    found: Linearization, views: dict[int, LinearView], upper: Any, lower: Any, pair: tuple[int, int]
+    found: Linearization,
+    views: dict[int, LinearView],
+    upper: Any,
+    lower: Any,
+    pair: tuple[int, int],
 ) -> None:
-    """One input and output; bands that leave all bounds do not hide the curves."""
+    """Draw one input and output; bands that leave all bounds do not hide the curves."""
     place = (slice(None), *pair)
     curves, turns = [], []
     for number, view in views.items():
         bode, colour = view.bode, _COLOURS[(number - 1) % len(_COLOURS)]
         assert bode is not None
         size, phase = bode.magnitude[place], bode.phase[place]
-        turn = 360 * np.round((turns[0][0] - phase[0]) / 360) if turns and np.isfinite(phase[0]) else 0.0
+        turn = (
+            360 * np.round((turns[0][0] - phase[0]) / 360)
+            if turns and np.isfinite(phase[0])
+            else 0.0
+        )
         phase = phase + turn
-        upper.plot(bode.frequency, size, color=colour, linewidth=1.2, label=f"model{_at(found, number)}")
+        upper.plot(
+            bode.frequency, size, color=colour, linewidth=1.2, label=f"model{_at(found, number)}"
+        )
         lower.plot(bode.frequency, phase, color=colour, linewidth=1.2)
         if bode.magnitude_ci95 is not None and bode.phase_ci95 is not None:
-            for axis, band in ((upper, bode.magnitude_ci95[place]), (lower, bode.phase_ci95[place] + turn)):
+            for axis, band in (
+                (upper, bode.magnitude_ci95[place]),
+                (lower, bode.phase_ci95[place] + turn),
+            ):
                 axis.fill_between(bode.frequency, *band.T, color=colour, alpha=0.3, linewidth=0)
         curves.append(size)
         turns.append(phase)
@@ -93,7 +110,9 @@ def _draw_pair(
         upper.set_ylim(low, high * 1.6)
         _log_labels(upper.yaxis, sparse=high / low > _DECADES)
     if len(phase):
-        lower.set_ylim(*(end([*turned, end(phase)]) + more for end, more in ((min, -15), (max, 15))))
+        lower.set_ylim(
+            *(end([*turned, end(phase)]) + more for end, more in ((min, -15), (max, 15)))
+        )
     _log_labels(lower.xaxis, sparse=True)
 
 
@@ -104,7 +123,7 @@ def _at(found: Linearization, number: int) -> str:
 def _draw_measured(
     found: Linearization, upper: Any, lower: Any, pair: tuple[int, int], model: Vector
 ) -> tuple[Vector, Vector]:
-    """What data alone say of gain and phase, on the turn that the model's phase is on."""
+    """Draw gain and phase from the data, on the turn that the model's phase is on; return both."""
     measured, bode = found.measured, found[0].bode
     if measured is None or bode is None:
         return np.zeros(0), np.zeros(0)
@@ -112,22 +131,29 @@ def _draw_measured(
     shown = (measured.coherence[:, i] >= COHERENT) & np.isfinite(measured.value[:, i, j])
     frequency, value = measured.frequency[shown], measured.value[shown, i, j]
     how = "periods" if measured.method == "periods" else "Welch"
-    upper.plot(frequency, np.abs(value), ".", color=GREY, markersize=3, zorder=1, label=f"data ({how})")
-    phase, near = np.degrees(np.angle(value)), np.interp(frequency, bode.frequency, np.nan_to_num(model))
+    upper.plot(
+        frequency, np.abs(value), ".", color=GREY, markersize=3, zorder=1, label=f"data ({how})"
+    )
+    phase, near = (
+        np.degrees(np.angle(value)),
+        np.interp(frequency, bode.frequency, np.nan_to_num(model)),
+    )
     phase = phase + 360 * np.round((near - phase) / 360)
     lower.plot(frequency, phase, ".", color=GREY, markersize=3, zorder=1)
     return np.abs(value), phase
 
 
 def _log_labels(axis: Any, *, sparse: bool) -> None:
-    """Numbers as they are written in text; of a short axis those between powers of ten too."""
+    """Write numbers as in text; on a short axis also those between powers of ten."""
     axis.set_major_formatter(lambda value, _: f"{value:g}")
-    axis.set_minor_formatter(lambda value, _: "" if sparse or f"{value:.0e}"[0] not in "235" else f"{value:g}")
+    axis.set_minor_formatter(
+        lambda value, _: "" if sparse or f"{value:.0e}"[0] not in "235" else f"{value:g}"
+    )
 
 
 @plain
 def poles_figure(found: Linearization) -> Figure:
-    """The poles of all points of rest beside the unit circle, with 95 % intervals of their magnitudes."""
+    """Draw the poles of all operating points in the unit circle, with 95 % intervals."""
     figure = Figure(figsize=(5.2, 5.2 + TOP - 0.3))
     ((axis,),) = grid(figure, 1, 1)
     turn = np.linspace(0, 2 * np.pi, 400)
@@ -139,13 +165,22 @@ def poles_figure(found: Linearization) -> Figure:
         for pole in view.poles:
             if pole.magnitude_ci95 is not None and pole.magnitude > 0:
                 ends = np.array(pole.magnitude_ci95) * pole.z / pole.magnitude
-                axis.plot(ends.real, ends.imag, color=colour, linewidth=2.5, alpha=0.4, solid_capstyle="butt")
+                axis.plot(
+                    ends.real,
+                    ends.imag,
+                    color=colour,
+                    linewidth=2.5,
+                    alpha=0.4,
+                    solid_capstyle="butt",
+                )
         z: Any = np.array([pole.z for pole in view.poles], dtype=complex)
         name = "poles" if len(found) == 1 else f"point {number + 1}"
         axis.plot(z.real, z.imag, "x", color=colour, markersize=7, label=name)
         if view.at_zero:
             axis.plot([0.0], [0.0], "x", color=colour, markersize=7)
-            axis.annotate(f"{view.at_zero} at 0", (0.0, 0.0), (4, 4), textcoords="offset points", fontsize=8)
+            axis.annotate(
+                f"{view.at_zero} at 0", (0.0, 0.0), (4, 4), textcoords="offset points", fontsize=8
+            )
     reach = max([1.08, *(1.08 * pole.magnitude for view in found for pole in view.poles)])
     axis.set_xlim(-reach, reach)
     axis.set_ylim(-reach, reach)

@@ -1,4 +1,4 @@
-"""Linear views in words: what `orthaug linearize` prints."""
+"""Linear views as text: what `orthaug linearize` prints."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from orthaug.analysis.linear_view import COHERENT, Linearization, LinearView, Po
 from orthaug.reports.linear import gain_unit
 
 _MOST = 8  # states of matrices that are printed; result.json has all
-_FEWEST = 10  # frequencies of data alone that a median is told of
+_FEWEST = 10  # frequencies from data that a median needs
 _HELD = {
     "zero": "inputs that --at does not name are held at 0",
     "mean": "inputs that --at does not name are held at their means over the data",
@@ -21,7 +21,10 @@ _HELD = {
 
 
 def linear_text(found: Linearization) -> str:
-    """All points of rest, each with gains, poles and matrices; then what data alone say, and warnings."""
+    """Return all operating points as text, each with gains, poles and matrices.
+
+    The response from data, and warnings, follow.
+    """
     blocks = []
     for i, view in enumerate(found):
         head = "operating point" if len(found) == 1 else f"operating point {i + 1} of {len(found)}"
@@ -29,10 +32,21 @@ def linear_text(found: Linearization) -> str:
         blocks.append([f"{head}: {_at(view)} ({_stability(view)}{outside})"])
         if i == 0 and found.held in _HELD:
             blocks[0].append(_HELD[found.held])
-        blocks += [_gains(view), _poles(view), *_matrices(view), _continuous(view), _agreement(found, view)]
+        blocks += [
+            _gains(view),
+            _poles(view),
+            *_matrices(view),
+            _continuous(view),
+            _agreement(found, view),
+        ]
         blocks.append([f"warning: {warning.text}" for warning in view.warnings])
     if all(view.system.moved is not None for view in found):
-        blocks.append(["Numbers after ± and in brackets are 95 % (delta method, joint covariance of θ and weights)."])
+        blocks.append(
+            [
+                "Numbers after ± and in brackets are 95 % (delta method, joint covariance of θ "
+                "and weights)."
+            ]
+        )
     blocks.append([f"warning: {warning.text}" for warning in found.warnings])
     return "\n\n".join("\n".join(fold(lines)) for lines in blocks if lines)
 
@@ -64,7 +78,9 @@ def _gains(view: LinearView) -> list[str]:
     for i, j in np.ndindex(*view.gain.shape):
         interval = _interval(None if view.gain_ci95 is None else view.gain_ci95[i, j])
         unit = gain_unit(view, i, j)
-        rows.append([f"{view.outputs[i]} / {view.inputs[j]}", f"{view.gain[i, j]:.6g}", interval, unit])
+        rows.append(
+            [f"{view.outputs[i]} / {view.inputs[j]}", f"{view.gain[i, j]:.6g}", interval, unit]
+        )
     return table(rows)
 
 
@@ -73,13 +89,19 @@ def _poles(view: LinearView) -> list[str]:
     rows = [["pole z", "magnitude", between, "frequency", between, "", "damping", between]]
     for pole in view.poles:
         if pole.z.imag < 0:
-            continue  # its conjugate is told
+            continue  # its conjugate is listed
         hertz = "–" if pole.hertz is None else f"{pole.hertz:.5g} Hz"
         rate = "–" if pole.natural_frequency is None else f"{pole.natural_frequency:.5g} 1/s"
         damping = "–" if pole.damping is None else f"{pole.damping:.4g}"
-        spans = [_interval(span) for span in (pole.magnitude_ci95, pole.hertz_ci95, pole.damping_ci95)]
-        last = spans[2] if pole.time_constant is None else f"time constant {pole.time_constant:.5g} s"
-        rows.append([_z(pole), f"{pole.magnitude:.6g}", spans[0], hertz, spans[1], rate, damping, last])
+        spans = [
+            _interval(span) for span in (pole.magnitude_ci95, pole.hertz_ci95, pole.damping_ci95)
+        ]
+        last = (
+            spans[2] if pole.time_constant is None else f"time constant {pole.time_constant:.5g} s"
+        )
+        rows.append(
+            [_z(pole), f"{pole.magnitude:.6g}", spans[0], hertz, spans[1], rate, damping, last]
+        )
     lines = table(rows) if len(rows) > 1 else []
     if view.at_zero:
         times = "once" if view.at_zero == 1 else f"{view.at_zero} times"
@@ -103,7 +125,10 @@ def _matrices(view: LinearView) -> list[list[str]]:
     rows = [["sampled", *names]]
     for i, name in enumerate((*view.states, *view.outputs)):
         label = f"δ{name} next" if i < n else f"δ{name}"
-        cells = [_cell(view.system.matrix[i, j], None if half is None else half[i, j]) for j in range(n + nu)]
+        cells = [
+            _cell(view.system.matrix[i, j], None if half is None else half[i, j])
+            for j in range(n + nu)
+        ]
         rows.append([label, *cells])
     return [[f"Ts = {view.sampling_time:.6g} s; rows of [A B] and [C D]:", *table(rows)]]
 
@@ -116,7 +141,11 @@ def _continuous(view: LinearView) -> list[str]:
     found = view.continuous
     if not isinstance(found, Continuous):
         return [f"no system in continuous time: {found}"]
-    how = {"equations": "from the equations", "zoh": "by the matrix logarithm", "tustin": "by Tustin's rule"}
+    how = {
+        "equations": "from the equations",
+        "zoh": "by the matrix logarithm",
+        "tustin": "by Tustin's rule",
+    }
     if view.inputs:
         how["zoh"] = "for inputs held between samples"
     n, (ny, nu) = found.system.states, found.system.d.shape
@@ -128,7 +157,11 @@ def _continuous(view: LinearView) -> list[str]:
         label = f"d/dt δ{name}" if i < n else f"δ{name}"
         rows.append([label, *(f"{value:.6g}" for value in found.system.matrix[i])])
     lines += table(rows)
-    late = [f"{name} {dead:.6g} s" for name, dead in zip(view.inputs, found.dead_time, strict=True) if dead > 0]
+    late = [
+        f"{name} {dead:.6g} s"
+        for name, dead in zip(view.inputs, found.dead_time, strict=True)
+        if dead > 0
+    ]
     return [*lines, *([f"dead time of inputs: {', '.join(late)}"] if late else [])]
 
 
@@ -139,10 +172,14 @@ def _agreement(found: Linearization, view: LinearView) -> list[str]:
     agreement = found.agreement(view)
     if agreement is None or agreement.points < _FEWEST:
         few = "no" if agreement is None else f"only {agreement.points}"
-        return [f"data alone ({how}) tell {few} points of the response with a coherence of {COHERENT} or more"]
+        return [
+            f"data alone ({how}) give {few} points of the response with a coherence of "
+            f"{COHERENT} or more"
+        ]
     return [
-        f"against data alone ({how}, {agreement.points} points of coherence {COHERENT} or more): median difference "
-        f"{agreement.decibel:.2g} dB and {agreement.degrees:.2g} degrees"
+        f"against data alone ({how}, {agreement.points} points of coherence {COHERENT} or "
+        f"more): median difference {agreement.decibel:.2g} dB and {agreement.degrees:.2g} "
+        "degrees"
     ]
 
 

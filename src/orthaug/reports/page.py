@@ -27,10 +27,12 @@ _TOLD_ELSEWHERE = ("witness", "free_run_diverged", "residual_not_analysed")
 
 
 def fit_page(page: FitPage) -> str:
-    """The page of a fit."""
+    """Return the page of a fit."""
     result = page.result
     title = _title("Model", page.outputs, result.spec, page.origin)
-    kind = f"{result.structure} structure" + (f", {result.measure} measure" if result.measure else "")
+    kind = f"{result.structure} structure" + (
+        f", {result.measure} measure" if result.measure else ""
+    )
     warnings = [w for w in result.warnings if w.code not in _TOLD_ELSEWHERE]
     return _page(
         title,
@@ -44,17 +46,21 @@ def fit_page(page: FitPage) -> str:
 
 
 def compare_page(page: ComparePage) -> str:
-    """The page of a comparison."""
-    title = _title(f"{len(page.result.comparison)} models", page.outputs, page.result.spec, page.origin)
+    """Return the page of a comparison."""
+    title = _title(
+        f"{len(page.result.comparison)} models", page.outputs, page.result.spec, page.origin
+    )
     verdict = compare_verdict(page.result)
-    return _page(title, "comparison", verdict, page.result.warnings, compare_sections(page), page.origin, "")
+    return _page(
+        title, "comparison", verdict, page.result.warnings, compare_sections(page), page.origin, ""
+    )
 
 
 def _title(what: str, outputs: Sequence[str], spec: Mapping[str, Any], origin: Origin) -> str:
-    """What a page is about; a spec that is called just that adds nothing."""
+    """Return the title of a page; it omits a spec that is called just that."""
     inputs = spec.get("data", {}).get("inputs") or []
-    told = f"{what} of {_listed(outputs)}" + (f" from {_listed(inputs)}" if inputs else "")
-    return told if origin.name == "spec" else f"{told}: {origin.name}"
+    title = f"{what} of {_listed(outputs)}" + (f" from {_listed(inputs)}" if inputs else "")
+    return title if origin.name == "spec" else f"{title}: {origin.name}"
 
 
 def _listed(names: Sequence[str]) -> str:
@@ -95,7 +101,7 @@ def _page(
 
 
 def _ticked(text: str) -> Markup:
-    """Text in which what stands between backticks is code, and minus signs are those of the tables."""
+    """Return markup with code for text between backticks, and the minus signs of the tables."""
     parts = [
         Markup("<code>{}</code>").format(part) if i % 2 else escape(prose(part))
         for i, part in enumerate(text.split("`"))
@@ -114,13 +120,13 @@ def _figure(plot: Plot) -> dict[str, Any]:
 
 
 def _embedded(content: Any) -> str:
-    """JSON that stands in a script element: finite, and without anything that would end it."""
+    """Return JSON for a script element: finite, and without anything that would end the element."""
     text = json.dumps(_finite(content), ensure_ascii=False, allow_nan=False, separators=(",", ":"))
     return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
 
 
 def _finite(content: Any) -> Any:
-    """None for numbers that JSON does not have."""
+    """Return the content with None for numbers that JSON does not have."""
     if isinstance(content, float):
         return content if math.isfinite(content) else None
     if isinstance(content, dict):
@@ -134,7 +140,10 @@ def _template(name: str) -> str:
 
 @cache
 def _plotly() -> str:
-    """Plotly's script of its package, compressed, for the page to unpack; the package itself is not imported."""
+    """Return Plotly's script from its package, compressed, for the page to unpack.
+
+    The package itself is not imported.
+    """
     found = importlib.util.find_spec("plotly")
     assert found is not None and found.submodule_search_locations
     script = Path(found.submodule_search_locations[0]) / "package_data" / "plotly.min.js"

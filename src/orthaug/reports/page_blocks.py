@@ -1,4 +1,7 @@
-"""What a page is made of: sections of paragraphs, tables and plots; and how numbers are written in cells."""
+"""Building blocks of a page: sections of paragraphs, tables and plots.
+
+And the format of numbers in cells.
+"""
 
 from __future__ import annotations
 
@@ -15,13 +18,13 @@ from orthaug.reports.result import ParameterResult
 
 _LARGE = 7  # digits before the point from which a power of ten is written
 _RAISED = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
-_ROUNDING = 1e-12  # of its scale: a number below is rounding of zero
+_ROUNDING = 1e-12  # of its scale: a smaller number is the rounding error of zero
 _MOST_DIGITS = 15
-_MINUS = re.compile(r"(?<![\w\])}.-])-(?=[\d.])")  # before a number that stands by itself
+_MINUS = re.compile(r"(?<![\w\])}.-])-(?=[\d.])")  # before a number of its own
 
 
 def number(value: float | None, digits: int = 5, scale: float | None = None) -> str:
-    """A cell; 0 for what is rounding beside a `scale`, a dash where there is no number."""
+    """Return the text of a number; 0 for rounding error beside a `scale`, a dash for no number."""
     if value is None:
         return "–"
     if value == 0 or (scale is not None and abs(value) <= _ROUNDING * abs(scale)):
@@ -36,7 +39,10 @@ def number(value: float | None, digits: int = 5, scale: float | None = None) -> 
 
 
 def interval(ends: Sequence[float | None] | None, digits: int = 5) -> str:
-    """The two ends of an interval, of so many digits at least that they are told apart; a dash where there is none."""
+    """Return the two ends of an interval, with at least as many digits as show their difference.
+
+    A dash where there is none.
+    """
     if ends is None:
         return "–"
     known = [end for end in ends if end is not None]
@@ -45,14 +51,16 @@ def interval(ends: Sequence[float | None] | None, digits: int = 5) -> str:
     decimals = None if not scale else digits - 1 - math.floor(math.log10(scale))
     if decimals is None or not 0 < decimals <= _MOST_DIGITS or None in ends:
         return " … ".join(number(end, digits, scale) for end in ends)
-    texts = [f"{0.0 if abs(end) <= _ROUNDING * (scale or 0.0) else end:.{decimals}f}" for end in known]
+    texts = [
+        f"{0.0 if abs(end) <= _ROUNDING * (scale or 0.0) else end:.{decimals}f}" for end in known
+    ]
     while all(text.endswith("0") for text in texts) and "." in texts[0]:
         texts = [text[:-1].removesuffix(".") for text in texts]
     return " … ".join(texts).replace("-", "−")
 
 
 def digits_for(value: float | None, spread: float | None, least: int) -> int:
-    """Digits of a value that show two of its spread, but `least`.
+    """Return the digits of a value that show two of its spread, but at least `least`.
 
     Examples:
         >>> digits_for(1.45951, 9e-6, 5), digits_for(1.45951, 0.1, 5)
@@ -64,28 +72,30 @@ def digits_for(value: float | None, spread: float | None, least: int) -> int:
 
 
 def percent(share: float | None, digits: int = 2, *, signed: bool = False) -> str:
-    """A share in per cent."""
+    """Return a share in per cent."""
     if share is None:
         return "–"
     shown = 0.0 if abs(share) < _ROUNDING else 100 * share
     if shown and abs(shown) < 10**-3:
         return "< 0.001 %"
-    told = (
-        lines.percent(shown / 100, digits, sign="+") if signed and shown else lines.percent(shown / 100, max(digits, 3))
+    text = (
+        lines.percent(shown / 100, digits, sign="+")
+        if signed and shown
+        else lines.percent(shown / 100, max(digits, 3))
     )
-    mantissa, power, rest = told.partition("e")
+    mantissa, power, rest = text.partition("e")
     if power:
-        told = f"{mantissa}·10{str(int(rest.removesuffix(' %'))).translate(_RAISED)} %"
-    return told.replace("-", "−")
+        text = f"{mantissa}·10{str(int(rest.removesuffix(' %'))).translate(_RAISED)} %"
+    return text.replace("-", "−")
 
 
 def chance(p: float | None) -> str:
-    """A p-value; a small one is as good as a smaller one."""
+    """Return a p-value; a small one is as good as a smaller one."""
     return "< 10⁻⁶" if p is not None and p < 1e-6 else number(p, 2)
 
 
 def prose(text: str) -> str:
-    """A sentence with the minus signs that tables have.
+    """Return a sentence with the minus signs of the tables.
 
     Examples:
         >>> prose("moves y[k-1] by -0.015, from -2 to 3")
@@ -95,17 +105,17 @@ def prose(text: str) -> str:
 
 
 def with_unit(name: str, unit: str | None) -> str:
-    """A name with its unit in brackets."""
+    """Return a name with its unit in brackets."""
     return f"{name} [{unit}]" if unit else name
 
 
 def regressor_label(name: str, units: Mapping[str, str]) -> str:
-    """A channel, or a lag of one, with its unit; units by channel."""
+    """Return a channel, or a lag of one, with its unit; units by channel."""
     return with_unit(name, units.get(name.partition("[")[0]))
 
 
 def parameter_label(row: ParameterResult) -> str:
-    """A parameter with its unit, or with the one that the channels ask for where the spec gives none."""
+    """Return a parameter with its unit, or with the implied one where the spec gives none."""
     return with_unit(row.name, row.unit or ("" if row.derived_unit == "1" else row.derived_unit))
 
 
@@ -114,20 +124,23 @@ CATEGORIES = {"autorange": "reversed", "automargin": True, "type": "category"}
 
 
 def titled(x: str, y: str) -> dict[str, Any]:
-    """Plotly's layout of two axes with titles and no legend."""
+    """Return Plotly's layout of two axes with titles and no legend."""
     return {"xaxis": {"title": {"text": x}}, "yaxis": {"title": {"text": y}}, "showlegend": False}
 
 
 def area(color: str, **place: Any) -> dict[str, Any]:
-    """Plotly's rectangle behind the curves."""
+    """Return Plotly's rectangle behind the curves."""
     return {"type": "rect", **place, "fillcolor": color, "line": {"width": 0}, "layer": "below"}
 
 
 def rounded(values: Any, digits: int = 6) -> list[Any]:
-    """Numbers, or rows of them, that are drawn only; None for what is not finite."""
+    """Return numbers, or rows of them, rounded for drawing; None for what is not finite."""
     if np.ndim(values) > 1:
         return [rounded(row, digits) for row in values]
-    return [float(f"{v:.{digits}g}") if math.isfinite(v) else None for v in np.asarray(values, dtype=float).tolist()]
+    return [
+        float(f"{v:.{digits}g}") if math.isfinite(v) else None
+        for v in np.asarray(values, dtype=float).tolist()
+    ]
 
 
 @dataclass(frozen=True)
@@ -149,7 +162,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Code:
-    """Text as it is, such as a spec; folded where it is `long`."""
+    """Verbatim text, such as a spec; folded where it is `long`."""
 
     text: str
     label: str
@@ -158,7 +171,10 @@ class Code:
 
 @dataclass(frozen=True)
 class Plot:
-    """A Plotly figure that the page draws; `label` is read aloud in its place, `caption` stands below."""
+    """A Plotly figure that the page draws.
+
+    `label` is for screen readers, `caption` is shown below.
+    """
 
     label: str
     caption: str
@@ -167,7 +183,7 @@ class Plot:
     height: int = 320
     small: bool = False
     series: Mapping[str, Any] = field(default_factory=dict)
-    """Long curves by a name that traces give."""
+    """Long curves by the name that traces refer to."""
 
 
 @dataclass(frozen=True)
@@ -187,7 +203,7 @@ class Section:
 
 
 def plots_of(sections: Sequence[Section]) -> list[Plot]:
-    """All plots in their order."""
+    """Return all plots in their order."""
     blocks = [block for section in sections for block in section.blocks]
     return [
         plot

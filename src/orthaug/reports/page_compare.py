@@ -20,12 +20,16 @@ from orthaug.reports.page_fit import (
 from orthaug.reports.page_runs import compared_plots
 from orthaug.reports.result import CompareResult
 
-_WORDS = {"helps": "the learner helps", "no_help": "the learner does not help", "hurts": "the learner hurts"}
+_WORDS = {
+    "helps": "the learner helps",
+    "no_help": "the learner does not help",
+    "hurts": "the learner hurts",
+}
 
 
 @dataclass(frozen=True, eq=False)
 class ComparePage:
-    """What a page tells of a comparison beside its result."""
+    """Additions to a comparison's result on its page."""
 
     origin: Origin
     result: CompareResult
@@ -34,13 +38,13 @@ class ComparePage:
 
     @property
     def outputs(self) -> tuple[str, ...]:
-        """Their names."""
+        """Names of the outputs."""
         runs = next(iter(self.responses.values()), {})
         return tuple(c.name for c in next(iter(runs.values())).outputs) if runs else ()
 
 
 def compare_sections(page: ComparePage) -> list[Section]:
-    """All of them; what a result does not have is left out."""
+    """Return all sections; those without content in the result are left out."""
     result = page.result
     scores = {row.name: row.scores for row in result.comparison}
     found = [
@@ -51,7 +55,11 @@ def compare_sections(page: ComparePage) -> list[Section]:
         Section(
             "residuals",
             "Residual tests",
-            [Text(f"{row.name}: {row.residuals.text}") for row in result.comparison if row.residuals is not None],
+            [
+                Text(f"{row.name}: {row.residuals.text}")
+                for row in result.comparison
+                if row.residuals is not None
+            ],
         ),
         Section(
             "warnings",
@@ -72,8 +80,14 @@ def _models(result: CompareResult) -> list[Any]:
     rows = []
     for row in result.comparison:
         defect = row.orthogonality_defect
-        shown = "–" if defect is None else "0 up to rounding" if defect < 1e-10 else number(defect, 2)
-        verdict = "–" if row.validation is None else _WORDS.get(row.validation.verdict, row.validation.verdict)
+        shown = (
+            "–" if defect is None else "0 up to rounding" if defect < 1e-10 else number(defect, 2)
+        )
+        verdict = (
+            "–"
+            if row.validation is None
+            else _WORDS.get(row.validation.verdict, row.validation.verdict)
+        )
         chosen = " (chosen)" if row.name == result.chosen else ""
         rows.append(
             [
@@ -86,20 +100,35 @@ def _models(result: CompareResult) -> list[Any]:
                 verdict,
             ]
         )
-    head = ["model", "ended", "weights", "learner over physics", "overlap ‖QᵀF̃‖/‖F‖", "time [s]", "verdict"]
+    head = [
+        "model",
+        "ended",
+        "weights",
+        "learner over physics",
+        "overlap ‖QᵀF̃‖/‖F‖",
+        "time [s]",
+        "verdict",
+    ]
     caption = "Physics alone and every structure on the same data and seeds."
     if result.chosen:
-        caption += " The chosen one has the lowest error on the validation part, unless its learner does not help."
+        caption += (
+            " The chosen one has the lowest error on the validation part, unless its learner "
+            "does not help."
+        )
     blocks: list[Any] = [Table(caption, head, rows)]
-    blocks += [Text(f"{row.name}: {row.validation.text}") for row in result.comparison if row.validation]
-    return blocks + [Text(f"Left out: {kind}: {why}", "note") for kind, why in result.left_out.items()]
+    blocks += [
+        Text(f"{row.name}: {row.validation.text}") for row in result.comparison if row.validation
+    ]
+    return blocks + [
+        Text(f"Left out: {kind}: {why}", "note") for kind, why in result.left_out.items()
+    ]
 
 
 def _parameters(result: CompareResult) -> list[Any]:
     if not result.comparison or not result.comparison[0].parameters:
         return []
-    told = [(row.name, parameter) for row in result.comparison for parameter in row.parameters]
-    biased = any(parameter.bias for _, parameter in told)
+    rows = [(row.name, parameter) for row in result.comparison for parameter in row.parameters]
+    biased = any(parameter.bias for _, parameter in rows)
     rows = [
         [
             name,
@@ -110,8 +139,16 @@ def _parameters(result: CompareResult) -> list[Any]:
             interval(p.ci95),
             *([bias_cell(p)] if biased else []),
         ]
-        for name, p in told
+        for name, p in rows
     ]
-    head = ["model", "parameter", "value", "unit", "standard error", "95 % interval", *(["bias"] if biased else [])]
+    head = [
+        "model",
+        "parameter",
+        "value",
+        "unit",
+        "standard error",
+        "95 % interval",
+        *(["bias"] if biased else []),
+    ]
     caption = f"What each model estimates.{BIAS_TOLD if biased else ''}"
     return [Grid(parameter_comparison(result.comparison)), Table(caption, head, rows)]

@@ -25,24 +25,33 @@ from orthaug.reports.residual_tests import RegressorResult, ResidualTestResult
 from orthaug.reports.result import ParameterResult, PartScores, RestartResult, RowResult
 
 _ROW = 62  # pixels of a parameter
-_NAMED = 0.8  # height of its name on an axis from -1 to 1: above the numbers of its axis, and below those of the last
-_FAR = 6.0  # widths of an interval from which the initial value is not drawn: the interval would be a point
+_NAMED = (
+    0.8  # height of its name on an axis from -1 to 1: between the numbers of its axis and the last
+)
+_FAR = 6.0  # widths of an interval from which the initial value is not drawn
 _DECADES = 20.0  # ratio of scores from which their axis is logarithmic
 _BAD = 1.0  # NRMSE of the mean, from which it is too
 _KINDS = {"prediction": ("one step", "@physics"), "simulation": ("free run", "@model")}
 
 
 def interval_plot(rows: Sequence[ParameterResult]) -> Plot | None:
-    """Every parameter on an axis of its own unit: value, intervals, and the initial value where it is near."""
+    """Return a plot of every parameter on an axis of its own unit, with its intervals.
+
+    It shows the initial value too, where that is near.
+    """
     drawn = [row for row in rows if row.value is not None and row.ci95 and None not in row.ci95]
     if not drawn:
         return None
     traces: list[dict[str, Any]] = []
     layout: dict[str, Any] = {"shapes": []}
-    told = any(row.ci95_with_bias for row in drawn)
+    biased = any(row.ci95_with_bias for row in drawn)
     for i, row in enumerate(drawn):
         number = str(i + 1) if i else ""
-        first = {"95 % interval": i == 0, "estimate": i == 0, "initial value": i == _first(drawn, _near)}
+        first = {
+            "95 % interval": i == 0,
+            "estimate": i == 0,
+            "initial value": i == _first(drawn, _near),
+        }
         first["95 % interval less the bias"] = i == _first(drawn, lambda r: bool(r.ci95_with_bias))
         for trace in _interval_traces(row):
             own = {"xaxis": f"x{number}", "yaxis": f"y{number}", "legendgroup": trace["name"]}
@@ -58,52 +67,94 @@ def interval_plot(rows: Sequence[ParameterResult]) -> Plot | None:
             "showgrid": False,
             "zeroline": False,
         }
-        layout[f"xaxis{number}"] = {"anchor": f"y{number}", "nticks": 6, "zeroline": False, "range": _reach(row)}
+        layout[f"xaxis{number}"] = {
+            "anchor": f"y{number}",
+            "nticks": 6,
+            "zeroline": False,
+            "range": _reach(row),
+        }
     caption = (
-        "Every parameter on an axis of its own: the circle is the estimate, the thick bar its 95 % interval"
+        "Every parameter has its own axis: the circle is the estimate, the thick bar its 95 % "
+        "interval"
         + (
-            "; the thin bar is its 95 % interval once the bias is taken out, which need not hold the estimate."
-            if told
+            "; the thin bar is its 95 % interval once the bias is taken out, which need not "
+            "hold the estimate."
+            if biased
             else "."
         )
         + " A diamond is the initial value, where it is near enough to be shown."
     )
-    label = "Intervals of " + ", ".join(row.name for row in drawn) + "; the table above has their numbers."
+    label = (
+        "Intervals of "
+        + ", ".join(row.name for row in drawn)
+        + "; the table above has their numbers."
+    )
     return Plot(label, caption, traces, layout, height=70 + _ROW * len(drawn))
 
 
 def _interval_traces(row: ParameterResult) -> list[dict[str, Any]]:
-    """Bars of the intervals, the circle of the estimate, and the diamond of the initial value where it is near."""
+    """Return the traces of a parameter: bars of its intervals, a circle, a diamond.
+
+    The circle is the estimate, the diamond the initial value where it is near.
+    """
     bars = {"95 % interval": (row.ci95, "@model", 7)}
     if row.ci95_with_bias and None not in row.ci95_with_bias:
         bars = {"95 % interval less the bias": (row.ci95_with_bias, "@bias", 3), **bars}
     found: list[dict[str, Any]] = [
-        {"name": name, "x": ends, "y": [0, 0], "mode": "lines", "line": {"color": color, "width": width}}
+        {
+            "name": name,
+            "x": ends,
+            "y": [0, 0],
+            "mode": "lines",
+            "line": {"color": color, "width": width},
+        }
         for name, (ends, color, width) in bars.items()
     ]
     circle = {"color": "@paper", "size": 9, "line": {"color": "@ink", "width": 2}}
-    found.append({"name": "estimate", "x": [row.value], "y": [0], "mode": "markers", "marker": circle})
+    found.append(
+        {"name": "estimate", "x": [row.value], "y": [0], "mode": "markers", "marker": circle}
+    )
     if _near(row):
         diamond = {"color": "@measured", "size": 9, "symbol": "diamond"}
-        found.append({"name": "initial value", "x": [row.initial], "y": [0], "mode": "markers", "marker": diamond})
+        found.append(
+            {
+                "name": "initial value",
+                "x": [row.initial],
+                "y": [0],
+                "mode": "markers",
+                "marker": diamond,
+            }
+        )
     return found
 
 
 def _first(rows: Sequence[ParameterResult], holds: Callable[[ParameterResult], bool]) -> int:
-    """The number of the first row of which something holds."""
+    """Return the number of the first row for which a condition holds."""
     return next((i for i, row in enumerate(rows) if holds(row)), 0)
 
 
 def _tick(row: ParameterResult) -> str:
-    """The name of a parameter, and half its interval in per cent of it."""
+    """Return the name of a parameter, and half its interval in per cent of it."""
     low, high = row.ci95 or (None, None)
-    half = None if low is None or high is None or not row.value else abs((high - low) / (2 * row.value))
+    half = (
+        None
+        if low is None or high is None or not row.value
+        else abs((high - low) / (2 * row.value))
+    )
     return f"<b>{parameter_label(row)}</b>" + ("" if half is None else f"<br>± {percent(half)}")
 
 
 def _reach(row: ParameterResult) -> list[float]:
-    """What the axis of a parameter shows: its intervals with a margin, and the initial value where it is near."""
-    ends = [row.value, *(row.ci95 or ()), *(row.ci95_with_bias or ()), row.initial if _near(row) else None]
+    """Return the limits of a parameter's axis: its intervals with a margin.
+
+    They include the initial value where it is near.
+    """
+    ends = [
+        row.value,
+        *(row.ci95 or ()),
+        *(row.ci95_with_bias or ()),
+        row.initial if _near(row) else None,
+    ]
     known = [end for end in ends if end is not None]
     margin = 0.35 * max(max(known) - min(known), 1e-300)
     return [min(known) - margin, max(known) + margin]
@@ -116,8 +167,12 @@ def _near(row: ParameterResult) -> bool:
     return abs(row.initial - row.value) <= _FAR * max(high - low, 1e-300)
 
 
-def score_plot(scores: Mapping[str, Mapping[str, PartScores]], outputs: Sequence[str]) -> Plot | None:
-    """NRMSE of every part, or of every way of modelling; logarithmic where some are bad or far apart.
+def score_plot(
+    scores: Mapping[str, Mapping[str, PartScores]], outputs: Sequence[str]
+) -> Plot | None:
+    """Return a plot of the NRMSE of every part, or of every model.
+
+    Logarithmic where some are bad or far apart.
 
     Args:
         scores: by the name of a row, by the name of a part.
@@ -139,15 +194,27 @@ def score_plot(scores: Mapping[str, Mapping[str, PartScores]], outputs: Sequence
         values += x
         symbol = "circle" if kind == "simulation" else "diamond"
         traces.append(
-            {"x": x, "y": y, "mode": "markers", "name": name, "marker": {"color": color, "size": 11, "symbol": symbol}}
+            {
+                "x": x,
+                "y": y,
+                "mode": "markers",
+                "name": name,
+                "marker": {"color": color, "size": 11, "symbol": symbol},
+            }
         )
     if not values:
         return None
     logarithmic = max(values) > _BAD or max(values) > _DECADES * min(values)
-    caption = "NRMSE of every part, the error over the output's deviation: 0 is perfect, 1 as bad as the mean"
+    caption = (
+        "NRMSE of every part, the error over the output's deviation: 0 is perfect, 1 as bad as "
+        "the mean"
+    )
     caption += "; the axis is logarithmic." if logarithmic else "."
     if lost:
-        caption += f" There is none of {', '.join(dict.fromkeys(lost))}: the run diverged, or the output does not move."
+        caption += (
+            f" There is none of {', '.join(dict.fromkeys(lost))}: the run diverged, or the "
+            "output does not move."
+        )
     count = len({place for trace in traces for place in trace["y"]})
     axis: dict[str, Any] = (
         {"title": {"text": "NRMSE"}, "type": "log"}
@@ -180,21 +247,50 @@ def score_plot(scores: Mapping[str, Mapping[str, PartScores]], outputs: Sequence
         "yaxis": CATEGORIES,
         "shapes": shapes,
     }
-    return Plot("NRMSE of every part; the table has the numbers.", caption, traces, layout, height=110 + 30 * count)
+    return Plot(
+        "NRMSE of every part; the table has the numbers.",
+        caption,
+        traces,
+        layout,
+        height=110 + 30 * count,
+    )
 
 
 def residual_plots(test: ResidualTestResult, what: str, units: Mapping[str, str]) -> list[Plot]:
-    """Autocorrelation, correlation with the inputs, and means over the most telling regressor; units by channel."""
+    """Return plots of autocorrelation, correlation with the inputs, and means over a regressor.
+
+    The regressor is the one that explains most of the residual.
+
+    Units by channel.
+    """
     plots = []
     if test.acf is not None and test.acf_band is not None:
         lags = list(range(1, len(test.acf)))
-        bars = {"type": "bar", "x": lags, "y": test.acf[1:], "name": "autocorrelation", "marker": {"color": "@model"}}
-        told = (
-            f"Autocorrelation of the {what} of {test.name}; the band holds 99 % of the values that noise gives."
-            f" The largest in size is {number(test.strongest_acf, 2)}."
+        bars = {
+            "type": "bar",
+            "x": lags,
+            "y": test.acf[1:],
+            "name": "autocorrelation",
+            "marker": {"color": "@model"},
+        }
+        caption = (
+            f"Autocorrelation of the {what} of {test.name}; the band holds 99 % of the values "
+            f"that noise gives. The largest in size is {number(test.strongest_acf, 2)}."
         )
-        layout = titled("lag [samples]", "autocorrelation") | {"shapes": [_band(test.acf_band)], "showlegend": True}
-        plots.append(Plot(f"Autocorrelation of the {what} of {test.name}.", told, [bars], layout, 280, small=True))
+        layout = titled("lag [samples]", "autocorrelation") | {
+            "shapes": [_band(test.acf_band)],
+            "showlegend": True,
+        }
+        plots.append(
+            Plot(
+                f"Autocorrelation of the {what} of {test.name}.",
+                caption,
+                [bars],
+                layout,
+                280,
+                small=True,
+            )
+        )
     if test.crossed:
         traces = []
         for (name, cross), color in zip(
@@ -211,18 +307,25 @@ def residual_plots(test: ResidualTestResult, what: str, units: Mapping[str, str]
                     "marker": {"color": color, "size": 4},
                 }
             )
-        told = f"Correlation of the {what} of {test.name} with the inputs; beyond the band it is more than noise."
-        layout = titled("lag behind the input [samples]", "correlation") | {"shapes": [_band(test.cross_band)]}
+        caption = (
+            f"Correlation of the {what} of {test.name} with the inputs; beyond the band it is "
+            "more than noise."
+        )
+        layout = titled("lag behind the input [samples]", "correlation") | {
+            "shapes": [_band(test.cross_band)]
+        }
         layout["showlegend"] = True
         label = f"Correlation of the {what} of {test.name} with the inputs."
-        plots.append(Plot(label, told, traces, layout, 280, small=True))
-    return plots + [_means_plot(test, name, curve, what, units) for name, curve in test.most_telling.items()]
+        plots.append(Plot(label, caption, traces, layout, 280, small=True))
+    return plots + [
+        _means_plot(test, name, curve, what, units) for name, curve in test.most_telling.items()
+    ]
 
 
 def _means_plot(
     test: ResidualTestResult, name: str, curve: RegressorResult, what: str, units: Mapping[str, str]
 ) -> Plot:
-    """Means over a regressor."""
+    """Return a plot of the means over a regressor."""
     errors = [None if e is None else 2.576 * e for e in curve.errors]
     dots = {
         "x": curve.centres,
@@ -233,18 +336,21 @@ def _means_plot(
         "marker": {"color": "@learner"},
     }
     surely = chance(curve.p)
-    told = (
-        f"Mean of the {what} of {test.name}, less that of all rows, over {name} with 99 % intervals, both with its "
-        f"autocorrelation taken into account as in the test: that it is flat has p "
-        f"{'' if surely.startswith('<') else '= '}{surely}. Plain means explain {percent(curve.share)} of its variance."
+    caption = (
+        f"Mean of the {what} of {test.name}, less that of all rows, over {name}, with 99 % "
+        "intervals. Both take its autocorrelation into account, as in the test: that it is flat "
+        f"has p {'' if surely.startswith('<') else '= '}{surely}. Plain means explain "
+        f"{percent(curve.share)} of its variance."
     )
     label = f"Mean of the {what} of {test.name} over {name}."
-    layout = titled(regressor_label(name, units), with_unit(f"residual of {test.name}", units.get(test.name)))
-    return Plot(label, told, [dots], layout, 280, small=True)
+    layout = titled(
+        regressor_label(name, units), with_unit(f"residual of {test.name}", units.get(test.name))
+    )
+    return Plot(label, caption, [dots], layout, 280, small=True)
 
 
 def bias_plot(suspects: Sequence[SuspectResult]) -> Plot:
-    """Heat map of the bias of each parameter by each suspect, in per cent; of many the largest."""
+    """Return a heat map of the bias of each parameter by each suspect, in per cent."""
     shown = bias_map(suspects)
     heat = {
         "type": "heatmap",
@@ -266,8 +372,9 @@ def bias_plot(suspects: Sequence[SuspectResult]) -> Plot:
         "showlegend": False,
     }
     caption = (
-        "Bias of each parameter (columns) by each term that may be missing from the physics (rows), in per cent of "
-        "its value; a term without a guessed size counts as 1 % of the output. Colours are logarithmic."
+        "Bias of each parameter (columns) by each term that may be missing from the physics "
+        "(rows), in per cent of its value; a term without a guessed size counts as 1 % of the "
+        "output. Colours are logarithmic."
     )
     caption += f" {shown.left_out}" if shown.left_out else ""
     height = 90 + 28 * len(shown.suspects)
@@ -275,7 +382,7 @@ def bias_plot(suspects: Sequence[SuspectResult]) -> Plot:
 
 
 def restart_plot(restarts: Sequence[RestartResult]) -> Plot | None:
-    """The loss that every start came to."""
+    """Return a plot of the loss that every start reached."""
     if len([run for run in restarts if run.loss is not None]) < 3:
         return None
     place = [f"{run.seed}, {run.regularization}" for run in restarts]
@@ -297,13 +404,13 @@ def restart_plot(restarts: Sequence[RestartResult]) -> Plot | None:
     shown = range(0, len(restarts), 1 + len(restarts) // 12)
     layout["xaxis"] |= {"tickvals": [i + 1 for i in shown], "ticktext": [names[i] for i in shown]}
     layout["yaxis"] = {"title": {"text": "loss"}, "type": "log" if wide else "linear"}
-    caption = "The loss that every start came to; the large dot is the chosen one. "
-    caption += "Where several starts end at the same loss, it is hardly a poor minimum."
-    return Plot("Loss that every start came to.", caption, [dots], layout, 260)
+    caption = "The loss that every start reached; the large dot is the chosen one. "
+    caption += "Where several starts reach the same loss, a poor local minimum is unlikely."
+    return Plot("Loss that every start reached.", caption, [dots], layout, 260)
 
 
 def parameter_comparison(rows: Sequence[RowResult]) -> list[Plot]:
-    """Of every parameter its value and 95 % interval in each way of modelling."""
+    """Return plots of every parameter's value and 95 % interval in each model."""
     plots = []
     for parameter in rows[0].parameters:
         x, y, arms = [], [], []
@@ -312,8 +419,17 @@ def parameter_comparison(rows: Sequence[RowResult]) -> list[Plot]:
             if entry is not None and entry.value is not None:
                 x.append(entry.value)
                 y.append(row.name)
-                ends = entry.ci95 if entry.ci95 and None not in entry.ci95 else (entry.value, entry.value)
-                arms.append((max((ends[1] or 0.0) - entry.value, 0.0), max(entry.value - (ends[0] or 0.0), 0.0)))
+                ends = (
+                    entry.ci95
+                    if entry.ci95 and None not in entry.ci95
+                    else (entry.value, entry.value)
+                )
+                arms.append(
+                    (
+                        max((ends[1] or 0.0) - entry.value, 0.0),
+                        max(entry.value - (ends[0] or 0.0), 0.0),
+                    )
+                )
         dots = {
             "x": x,
             "y": y,
@@ -334,11 +450,11 @@ def parameter_comparison(rows: Sequence[RowResult]) -> list[Plot]:
             "yaxis": CATEGORIES,
             "showlegend": False,
         }
-        told = f"{parameter.name} by every way of modelling, with its 95 % interval where it has one."
-        plots.append(Plot(told, told, [dots], layout, 120 + 30 * len(rows), small=True))
+        caption = f"{parameter.name} in every model, with its 95 % interval where it has one."
+        plots.append(Plot(caption, caption, [dots], layout, 120 + 30 * len(rows), small=True))
     return plots
 
 
 def _band(half: float) -> dict[str, Any]:
-    told = {"name": "99 % of what noise gives", "showlegend": True}
-    return area("@reach", xref="paper", x0=0, x1=1, y0=-half, y1=half, **told)
+    style = {"name": "99 % of what noise gives", "showlegend": True}
+    return area("@reach", xref="paper", x0=0, x1=1, y0=-half, y1=half, **style)

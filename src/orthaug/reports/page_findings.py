@@ -1,4 +1,4 @@
-"""The findings of a fit on its page: residual tests, stability, excitation and suspects, restarts."""
+"""The findings of a fit on its page: residual tests, stability, excitation, suspects, restarts."""
 
 from __future__ import annotations
 
@@ -12,27 +12,42 @@ from orthaug.reports.result import FitResult
 
 
 def residuals_blocks(result: FitResult, units: Mapping[str, str]) -> list[Any]:
-    """What the residuals tell, output by output; units by channel."""
+    """Return the residual tests, output by output; units by channel."""
     blocks: list[Any] = []
     found = result.residuals
     if found is None:
-        told = next((w.text for w in result.warnings if w.code == "residual_not_analysed"), "")
-        blocks += [Text(told)] if told else []
+        reason = next((w.text for w in result.warnings if w.code == "residual_not_analysed"), "")
+        blocks += [Text(reason)] if reason else []
     else:
         blocks.append(Text(found.text))
-        tests = [("one-step residual", found.one_step), ("error of the free run", found.free_run or [])]
+        tests = [
+            ("one-step residual", found.one_step),
+            ("error of the free run", found.free_run or []),
+        ]
         rows = [_test_cells(what, test, units) for what, group in tests for test in group]
-        head = ["residual", "RMS", "mean", "white", "Ljung-Box p", "largest autocorrelation", "follows", "curved over"]
+        head = [
+            "residual",
+            "RMS",
+            "mean",
+            "white",
+            "Ljung-Box p",
+            "largest autocorrelation",
+            "follows",
+            "curved over",
+        ]
         blocks.append(
             Table(
-                "Tests of the residuals on the training data, at the levels that the result tells; RMS and mean are in "
-                "the output's unit.",
+                "Tests of the residuals on the training data, at the levels that the result "
+                "gives; RMS and mean are in the output's unit.",
                 head,
                 rows,
             )
         )
         blocks += [
-            Grid(plots) for what, group in tests for test in group if (plots := residual_plots(test, what, units))
+            Grid(plots)
+            for what, group in tests
+            for test in group
+            if (plots := residual_plots(test, what, units))
         ]
     blocks += [Text(result.missing_lags.text)] if result.missing_lags else []
     return blocks
@@ -53,21 +68,21 @@ def _test_cells(what: str, test: ResidualTestResult, units: Mapping[str, str]) -
 
 
 def stability_blocks(result: FitResult) -> list[Any]:
-    """What is known of the free run's stability."""
+    """Return the findings on the free run's stability."""
     found = result.stability
     if found is None:
         return []
     blocks: list[Any] = [Text(line) for line in found.text.splitlines() if line.strip()]
-    told: list[list[str]] = []
+    rows: list[list[str]] = []
     if found.feedback:
         f = found.feedback
-        told += [
+        rows += [
             ["local spectral radius, largest", number(f.largest, 4)],
             ["its median", number(f.median, 4)],
             ["steps on which it is above 1", percent(f.share_above_one)],
         ]
     if found.contraction:
-        told.append(["rate of the best norm", number(found.contraction.rate, 4)])
+        rows.append(["rate of the best norm", number(found.contraction.rate, 4)])
     if found.modes:
         m = found.modes
         slow, fast = number(m.slowest, 3), number(m.fastest, 3)
@@ -76,46 +91,73 @@ def stability_blocks(result: FitResult) -> list[Any]:
             if slow == fast
             else ["slowest and fastest mode [1/s]", f"{slow} and {fast}"]
         )
-        told += [
+        rows += [
             ["rightmost eigenvalue, real part [1/s]", number(m.rightmost, 4, m.fastest)],
             modes,
-            *([["integrators, which are not among these", str(m.integrators)]] if m.integrators else []),
+            *(
+                [["integrators, which are not among these", str(m.integrators)]]
+                if m.integrators
+                else []
+            ),
             ["points with a growing mode", percent(m.growing)],
         ]
     if found.diverges_at is not None or found.searched is not None:
         at = "none found" if found.diverges_at is None else number(found.diverges_at, 4)
-        told.append([f"factor on the inputs at which the run diverges (searched to {number(found.searched, 4)})", at])
-    return [*blocks, Table("Evidence on the free run's stability.", ["measure", "value"], told)] if told else blocks
+        rows.append(
+            [
+                "factor on the inputs at which the run diverges (searched to "
+                f"{number(found.searched, 4)})",
+                at,
+            ]
+        )
+    return (
+        [*blocks, Table("Evidence on the free run's stability.", ["measure", "value"], rows)]
+        if rows
+        else blocks
+    )
 
 
 def excitation_blocks(result: FitResult) -> list[Any]:
-    """How well the data tell the parameters apart, and what each suspected term does to them."""
+    """Return how well the data identify the parameters, and the bias by each suspected term."""
     seen = result.excitation
-    told = f"The data tell {seen.rank} of {seen.columns} parameters apart; "
-    told += f"the condition number is {number(seen.condition, 3)}."
+    text = f"The data identify {seen.rank} of {seen.columns} parameters; "
+    text += f"the condition number is {number(seen.condition, 3)}."
     if result.orthogonality_defect is not None:
         small = result.orthogonality_defect < 1e-10
         shown = "0 up to rounding" if small else number(result.orthogonality_defect, 2)
-        told += f" The overlap of physics and learner, ‖QᵀF̃‖/‖F‖, is {shown}."
-    blocks: list[Any] = [Text(told)]
+        text += f" The overlap of physics and learner, ‖QᵀF̃‖/‖F‖, is {shown}."
+    blocks: list[Any] = [Text(text)]
     if result.measure_detail:
         detail = result.measure_detail
         blocks.append(
             Text(
                 f"θ was split under the {detail.kind} measure, {detail.points} points"
-                + ("." if detail.support is None else f", {percent(detail.support)} within reach of the data.")
+                + (
+                    "."
+                    if detail.support is None
+                    else f", {percent(detail.support)} within the range of the data."
+                )
             )
         )
     if result.bias:
         head = ["suspect", "expression", "explains of the learner", "cosine with the physics"]
-        rows = [[s.name, s.expression, percent(s.explained), number(s.cosine, 3, 1.0)] for s in result.bias]
+        rows = [
+            [s.name, s.expression, percent(s.explained), number(s.cosine, 3, 1.0)]
+            for s in result.bias
+        ]
         caption = "Terms that may be missing from the physics."
         if any(s.removed_by for s in result.bias):
-            caption = "Terms that may be missing from the physics, and what takes their bias from the parameters."
+            caption = (
+                "Terms that may be missing from the physics, and what takes their bias from "
+                "the parameters."
+            )
             head = [*head, "removed by"]
             rows = [[*row, s.removed_by or "–"] for row, s in zip(rows, result.bias, strict=True)]
         else:
-            caption += " Whether a measure takes their bias from the parameters is told by `orthaug check`."
+            caption += (
+                " Whether a measure takes their bias from the parameters is shown by `orthaug "
+                "check`."
+            )
         blocks.append(Table(caption, head, rows))
         if result.bias[0].percent:
             blocks.append(bias_plot(result.bias))
@@ -127,30 +169,39 @@ def _sentence(text: str) -> str:
 
 
 _CHOOSES = {
-    "score": "score, generalised cross-validation: the loss, raised by how many weights a run uses for it",
+    "score": "score, generalised cross-validation: the loss, raised by how many weights a run uses "
+    "for it",
     "validation": "error on data that were not fitted",
 }
 
 
 def restarts_blocks(result: FitResult) -> list[Any]:
-    """How training ended, from every start."""
+    """Return how training ended, from every start."""
     status = result.status
-    told = (
-        f"Training ended with “{status.code.replace('_', ' ')}” after {status.iterations} iterations and "
-        f"{number(status.seconds, 3)} s. {_sentence(status.message)}"
+    text = (
+        f"Training ended with “{status.code.replace('_', ' ')}” after {status.iterations} "
+        f"iterations and {number(status.seconds, 3)} s. {_sentence(status.message)}"
     )
-    fall = f" The loss is {number(status.loss, 4)}; that of physics alone was {number(status.start_loss, 4)}."
+    fall = (
+        f" The loss is {number(status.loss, 4)}; that of physics alone was "
+        f"{number(status.start_loss, 4)}."
+    )
     runs, caption = result.restarts, "Every run from its own initial weights."
     by = [name for name in _CHOOSES if any(getattr(r, name) is not None for r in runs)]
     if by and sum(r.chosen for r in runs) == 1 < len(runs):
         caption += f" The chosen one has the lowest {_CHOOSES[by[0]]}."
     head = ["seed", "regularization", "loss", *by, "iterations", "ended", "chosen"]
     rows = [
-        [str(r.seed), str(r.regularization), number(r.loss), *(number(getattr(r, name)) for name in by)]
+        [
+            str(r.seed),
+            str(r.regularization),
+            number(r.loss),
+            *(number(getattr(r, name)) for name in by),
+        ]
         + [str(r.iterations), r.code.replace("_", " "), "yes" if r.chosen else "no"]
         for r in runs
     ]
-    blocks: list[Any] = [Text(told + fall)]
+    blocks: list[Any] = [Text(text + fall)]
     plot = restart_plot(result.restarts)
     blocks += [plot] if plot else []
     return blocks + ([Table(caption, head, rows)] if rows else [])

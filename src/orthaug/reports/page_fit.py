@@ -26,17 +26,25 @@ from orthaug.reports.page_blocks import (
     with_unit,
 )
 from orthaug.reports.page_figures import interval_plot, score_plot
-from orthaug.reports.page_findings import excitation_blocks, residuals_blocks, restarts_blocks, stability_blocks
+from orthaug.reports.page_findings import (
+    excitation_blocks,
+    residuals_blocks,
+    restarts_blocks,
+    stability_blocks,
+)
 from orthaug.reports.page_learned import learned_blocks
 from orthaug.reports.page_runs import Run, error_band, run_plots
 from orthaug.reports.result import CompareResult, DataResult, FitResult, ParameterResult, PartScores
 
-BIAS_TOLD = " The bias is estimate less truth, as far as one suspected term explains what the learner found."
+BIAS_TOLD = (
+    " The bias is estimate less truth, as far as one suspected term explains what the learner "
+    "found."
+)
 
 
 @dataclass(frozen=True, eq=False)
 class Origin:
-    """Where a result comes from: name and text of its spec, the command, when and on what it was made."""
+    """The origin of a result: name and text of its spec, the command, date and versions."""
 
     name: str
     toml: str
@@ -49,7 +57,7 @@ class Origin:
 
 @dataclass(frozen=True, eq=False)
 class FitPage:
-    """What a page tells of a fit beside its result."""
+    """Additions to a fit's result on its page."""
 
     origin: Origin
     result: FitResult
@@ -61,12 +69,14 @@ class FitPage:
 
     @property
     def outputs(self) -> tuple[str, ...]:
-        """Their names."""
-        return tuple(channel.name for _, free in self.responses.values() for channel in free.outputs)[: self._count]
+        """Names of the outputs."""
+        return tuple(
+            channel.name for _, free in self.responses.values() for channel in free.outputs
+        )[: self._count]
 
     @property
     def units(self) -> dict[str, str]:
-        """Of channels and states, by name."""
+        """Units of channels and states, by name."""
         return units_of_result(self.result) | {
             c.name: c.unit for _, free in self.responses.values() for c in free.outputs
         }
@@ -77,14 +87,14 @@ class FitPage:
 
 
 def units_of_result(result: FitResult | CompareResult) -> dict[str, str]:
-    """Of channels and states by name, as the spec declares them."""
+    """Return the units of channels and states by name, as the spec declares them."""
     states = (result.spec.get("motion") or {}).get("states") or {}
     channels = (result.spec.get("data") or {}).get("channels") or {}
     return {name: given.get("unit") or "" for name, given in {**states, **channels}.items()}
 
 
 def fit_sections(page: FitPage) -> list[Section]:
-    """All of them; what a result does not have is left out."""
+    """Return all sections; those without content in the result are left out."""
     result = page.result
     found = [
         Section("parameters", "Parameters", _parameters(result)),
@@ -104,8 +114,8 @@ def fit_sections(page: FitPage) -> list[Section]:
 def _parameters(result: FitResult) -> list[Any]:
     rows = [*result.parameters, *(result.physical_parameters or [])]
     if not rows:
-        return [Text("The physics has no parameters: all of the model was learned.")]
-    told = {
+        return [Text("The physics has no parameters: the whole model was learned.")]
+    text = {
         "robust": "Standard errors are robust against a coloured residual.",
         "plain": "Standard errors are those of a white residual.",
         None: "There are no standard errors.",
@@ -116,28 +126,47 @@ def _parameters(result: FitResult) -> list[Any]:
     columns += ["bias", "95 % interval with it"] if biased else []
     shared = any(row.shared is not None for row in rows)
     columns += ["learner could imitate it"] if shared else []
-    caption = f"What was estimated. {told[result.standard_errors]}"
+    caption = f"What was estimated. {text[result.standard_errors]}"
     if result.standard_errors_by is not None:
         caption = f"What was estimated. Standard errors: {STD_KINDS[result.standard_errors_by]}."
+    if result.intervals is not None and result.intervals.source != "none":
+        caption += f" {result.intervals.text[0].upper()}{result.intervals.text[1:]}"
     if result.noise_only:
-        caption += " Intervals count noise only: the model leaves more than noise, which may have moved the parameters."
+        caption += (
+            " Intervals count noise only: the model leaves more than noise, which may have "
+            "moved the parameters."
+        )
     if result.standard_errors is not None:
-        caption += " Intervals hold for the inputs that were applied; under others the bias is another one."
+        caption += (
+            " Intervals hold for the inputs that were applied; under other inputs the bias differs."
+        )
     if any(row.derived_unit for row in rows):
-        caption += " A unit in brackets is not the spec's: the channels' units ask for it."
+        caption += (
+            " A unit in brackets is not in the spec: it follows from the units of the channels."
+        )
     if biased:
         caption += f"{BIAS_TOLD[:-1]};"
-        caption += " the interval with it is the hull over all causes that noise cannot tell apart."
-    blocks: list[Any] = [Table(caption, columns, [_parameter_cells(row, biased, shared) for row in rows])]
+        caption += (
+            " the interval with it is the hull over all causes that noise cannot distinguish."
+        )
+    blocks: list[Any] = [
+        Table(caption, columns, [_parameter_cells(row, biased, shared) for row in rows])
+    ]
     plot = interval_plot(rows)
     blocks += [plot] if plot else []
     causes = [f"{percent(share)} is {cause}" for cause, share in biased_by(rows)]
     if causes:
-        told, more = f"{' in one equation' if len(causes) > 1 else ''} {', in another '.join(causes)}", ""
+        text, more = (
+            f"{' in one equation' if len(causes) > 1 else ''} {', in another '.join(causes)}",
+            "",
+        )
         if result.learns:
-            more = ", once what the physics can imitate is taken out of both; drawn over one input it may tell less"
-        what = "what the learner found" if result.learns else "the squares that the free run leaves"
-        blocks.append(Text(f"The bias budget: of {what}{told}{more}."))
+            more = (
+                ", once what the physics can imitate is taken out of both; drawn over one "
+                "input it may explain less"
+            )
+        what = "what the learner found" if result.learns else "the squared residual of the free run"
+        blocks.append(Text(f"The bias budget: of {what}{text}{more}."))
     if result.physical_consistency:
         blocks.append(Text(result.physical_consistency.text))
     if result.shared is not None:
@@ -146,7 +175,7 @@ def _parameters(result: FitResult) -> list[Any]:
 
 
 def bias_cell(row: ParameterResult) -> str:
-    """The bias by what the learner found."""
+    """Return the bias by the learned part."""
     return number(row.bias.value, 2, row.value) if row.bias else "–"
 
 
@@ -162,12 +191,15 @@ def _parameter_cells(row: ParameterResult, biased: bool, shared: bool) -> list[s
     ]
     if biased:
         known = row.bias is None or row.bias.determined
-        cells += [bias_cell(row), interval(row.ci95_with_bias) if known else "not determined by these data"]
+        cells += [
+            bias_cell(row),
+            interval(row.ci95_with_bias) if known else "not determined by these data",
+        ]
     return cells + ([{True: "yes", False: "no", None: "–"}[row.shared]] if shared else [])
 
 
 def _equations(result: FitResult) -> list[Any]:
-    """The equations of a motion, and the terms that were learned."""
+    """Return the equations of a motion, and the terms that were learned."""
     blocks: list[Any] = []
     declared = result.spec.get("motion")
     if result.motion is not None and declared:
@@ -181,13 +213,23 @@ def _equations(result: FitResult) -> list[Any]:
             ]
             for state, given in declared["states"].items()
         ]
-        told = result.motion
+        text = result.motion
         caption = (
-            f"The equations of motion, {told.integrator} with {told.substeps} substep{'s' * (told.substeps > 1)} in "
-            f"a sample and a {told.hold} hold; a prediction starts from a state estimated over {told.window} rows."
+            f"The equations of motion, {text.integrator} with {text.substeps} "
+            f"substep{'s' * (text.substeps > 1)} in a sample and a {text.hold} hold; a "
+            f"prediction starts from a state estimated over {text.window} rows."
         )
         blocks.append(
-            Table(caption, ["state", "unit", "next value" if next_value else "derivative", "learner beside it"], rows)
+            Table(
+                caption,
+                [
+                    "state",
+                    "unit",
+                    "next value" if next_value else "derivative",
+                    "learner beside it",
+                ],
+                rows,
+            )
         )
     if result.terms:
         rows = [
@@ -202,7 +244,15 @@ def _equations(result: FitResult) -> list[Any]:
             ]
             for t in result.terms
         ]
-        head = ["term", "added to", "coefficient", "unit", "standard error", "95 % interval", "largest contribution"]
+        head = [
+            "term",
+            "added to",
+            "coefficient",
+            "unit",
+            "standard error",
+            "95 % interval",
+            "largest contribution",
+        ]
         blocks.append(Table("The learned terms, the largest first.", head, rows))
     if result.equation:
         blocks.append(Code(result.equation.text, "The fitted equations"))
@@ -212,31 +262,52 @@ def _equations(result: FitResult) -> list[Any]:
 def _runs(page: FitPage) -> list[Any]:
     runs = [Run(part, free, page.alone.get(part)) for part, (_, free) in page.responses.items()]
     train = next(iter(page.responses.values()))[1]
-    notes = [Text(w.text, "warning") for w in page.result.warnings if w.code in ("witness", "free_run_diverged")]
+    notes = [
+        Text(w.text, "warning")
+        for w in page.result.warnings
+        if w.code in ("witness", "free_run_diverged")
+    ]
     band, alone = error_band(train), bool(page.alone)
-    told = "A model in free run sees the inputs alone and lives on its own past; the residual is measured less model."
+    text = (
+        "In free run a model uses the inputs and its own past outputs only; the residual is "
+        "measured less model."
+    )
     if alone:
-        told += " The model without its learner has the same parameters and the learner switched off; it is not the"
-        told += " physics alone of the verdict, which is fitted by itself."
-    told += " Between the limits of the band lie 95 % of the errors on the training data." if band else ""
+        text += (
+            " The model without its learner has the same parameters and the learner switched "
+            "off; it is not the"
+        )
+        text += " physics alone of the verdict, which is fitted by itself."
+    text += (
+        " Between the limits of the band lie 95 % of the errors on the training data."
+        if band
+        else ""
+    )
     how = Text(
-        "Drag over a stretch to zoom, double-click for the whole record; with the keyboard the arrows move, "
-        "+ and − zoom, 0 shows all.",
+        "Drag to zoom, double-click for the whole record; on the keyboard the arrows move, + "
+        "and − zoom, 0 shows all.",
         "hint",
     )
-    return [*notes, Text(told), how, *run_plots(runs, band)]
+    return [*notes, Text(text), how, *run_plots(runs, band)]
 
 
 def _shares(page: FitPage) -> list[Any]:
-    """How much of the model's output, or of each equation, is physics and how much the learner."""
+    """Return the shares of physics and learner in the model's output, or in each equation."""
     result = page.result
     if result.motion is not None:
-        rows = [(part.equation, part.physics, part.learner, part.share, part.unit) for part in result.motion.parts]
+        rows = [
+            (part.equation, part.physics, part.learner, part.share, part.unit)
+            for part in result.motion.parts
+        ]
         what = "each learned equation along the training run"
     else:
         if page.learned is None:
             return []
-        rows = [row for part, (one_step, _) in page.responses.items() for row in _part_shares(part, one_step)]
+        rows = [
+            row
+            for part, (one_step, _) in page.responses.items()
+            for row in _part_shares(part, one_step)
+        ]
         what = "the one-step prediction's deviation from its mean"
     if not rows:
         return []
@@ -245,8 +316,11 @@ def _shares(page: FitPage) -> list[Any]:
         for name, physics, learner, share, unit in rows
     ]
     head = ["part", "physics", "learner", "unit", "share of the learner"]
-    caption = f"RMS of what physics and learner add to {what}. The share is the learner's RMS over that of their sum; "
-    caption += "it need not fit to the two RMS, for the parts may cancel or follow each other."
+    caption = (
+        f"RMS of what physics and learner add to {what}. The share is the learner's RMS over "
+        "that of their sum; "
+    )
+    caption += "it need not match the two RMS, because the parts may cancel or add up."
     bars = {
         "type": "bar",
         "orientation": "h",
@@ -257,14 +331,19 @@ def _shares(page: FitPage) -> list[Any]:
     largest = max((x for x in bars["x"] if x is not None), default=0.0)
     axis = {"title": {"text": "share of the learner [%]"}, "range": [0, max(100.0, 1.05 * largest)]}
     layout = {"xaxis": axis, "yaxis": CATEGORIES, "showlegend": False}
-    told = "The learner's RMS over that of physics and learner together."
+    text = "The learner's RMS over that of physics and learner together."
     if result.structure == "orthogonal":
-        told += " The learner holds only what the physics cannot: its overlap with the physics is split off."
+        text += (
+            " The learner has only what the physics cannot explain: its overlap with the "
+            "physics is split off."
+        )
     label = "Share of the learner; the table has the numbers."
-    return [Table(caption, head, cells), Plot(label, told, [bars], layout, 90 + 34 * len(rows))]
+    return [Table(caption, head, cells), Plot(label, text, [bars], layout, 90 + 34 * len(rows))]
 
 
-def _part_shares(part: str, response: Response) -> list[tuple[str, float, float, float | None, str]]:
+def _part_shares(
+    part: str, response: Response
+) -> list[tuple[str, float, float, float | None, str]]:
     found = []
     for i, channel in enumerate(response.outputs):
         both = [
@@ -272,7 +351,9 @@ def _part_shares(part: str, response: Response) -> list[tuple[str, float, float,
             for name in ("baseline", "learner")
         ]
         with np.errstate(all="ignore"):
-            physics, learner, total = (float(np.nanstd(values)) for values in (*both, both[0] + both[1]))
+            physics, learner, total = (
+                float(np.nanstd(values)) for values in (*both, both[0] + both[1])
+            )
         name = part if len(response.outputs) == 1 else f"{part}, {channel.name}"
         found.append((name, physics, learner, learner / total if total else None, channel.unit))
     return found
@@ -287,14 +368,17 @@ def _learned(page: FitPage) -> list[Any]:
 def score_blocks(
     scores: Mapping[str, Mapping[str, PartScores]], outputs: Sequence[str], units: Mapping[str, str]
 ) -> list[Any]:
-    """Scores as a plot and a table; of one model, or of several by their names."""
+    """Return the scores as a plot and a table; of one model, or of several by their names."""
     rows = []
     named = any(scores)
     for row, parts in scores.items():
         for part, both in parts.items():
             for kind, score in both.kinds.items():
                 for j, output in enumerate(outputs):
-                    cells = [None if v is None or j >= len(v) else v[j] for v in (score.rmse, score.nrmse, score.fit)]
+                    cells = [
+                        None if v is None or j >= len(v) else v[j]
+                        for v in (score.rmse, score.nrmse, score.fit)
+                    ]
                     horizon = "one step" if kind == "prediction" else "free run"
                     rows.append(
                         [
@@ -310,22 +394,35 @@ def score_blocks(
     head = [*(["model"] if named else []), "part", "horizon", "output", "RMSE", "NRMSE", "FIT %"]
     plot = score_plot(scores, outputs)
     table = Table(
-        "Scores; RMSE is in the output's unit, FIT is 100 (1 − NRMSE), a dash where there is none.", head, rows
+        "Scores; RMSE is in the output's unit, FIT is 100 (1 − NRMSE), a dash where there is none.",
+        head,
+        rows,
     )
     return [*([plot] if plot else []), table]
 
 
 def origin_blocks(origin: Origin, result: FitResult | CompareResult) -> list[Any]:
-    """Command, versions, files with their checksums, and the spec as it was written."""
-    rows = [["command", origin.command], ["seed", str(origin.seed)], ["date", origin.date], ["machine", origin.machine]]
+    """Return command, versions, files with their checksums, and the spec as it was written."""
+    rows = [
+        ["command", origin.command],
+        ["seed", str(origin.seed)],
+        ["date", origin.date],
+        ["machine", origin.machine],
+    ]
     rows += [[name, version] for name, version in origin.versions.items()]
     return [
-        Table("How this result was made; the same versions, files and seed give the same numbers.", ["what", ""], rows),
+        Table(
+            "How this result was made; the same versions, files and seed give the same numbers.",
+            ["what", ""],
+            rows,
+        ),
         _files(result.data),
         Code(origin.toml, "The spec as it was written", long=True),
     ]
 
 
 def _files(data: DataResult) -> Table:
-    rows = [[part, f.file, str(f.rows), f.sha256] for part, files in data.parts.items() for f in files]
+    rows = [
+        [part, f.file, str(f.rows), f.sha256] for part, files in data.parts.items() for f in files
+    ]
     return Table("The data files and their checksums.", ["part", "file", "rows", "sha256"], rows)

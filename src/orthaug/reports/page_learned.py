@@ -1,4 +1,4 @@
-"""What was learned, on a page: a curve over each input of the learner, and a surface over the two that matter most."""
+"""The learned part on a page: a curve over each input, and a surface over the two main ones."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from orthaug.reports.page_blocks import Grid, Plot, Text, area, percent, rounded
 _MOST_CURVES = 12
 _CLOUD = 600  # points of a cloud
 _COLOURED = 0.98  # of the cells of a surface have a colour of their own
-_LEVEL = 0.02  # share of the learned part below which an input is told to do next to nothing
+_LEVEL = 0.02  # share of the learned part below which an input is said to explain next to nothing
 
 
 def learned_blocks(part: LearnedPart, measure: str) -> list[Text | Grid | Plot]:
-    """Curves over the inputs, the most telling first, and the surface."""
+    """Return the curves over the inputs, by the share that each explains, and the surface."""
     shares = part.shares()
     ranked = list(part.ranked())
-    blocks: list[Text | Grid | Plot] = [Text(_told(part, ranked, shares, measure))]
+    blocks: list[Text | Grid | Plot] = [Text(_introduction(part, ranked, shares, measure))]
     plots = [
         _curve_plot(part, k, feature, shares[part.features.index(feature), k])
         for k in range(len(part.names))
@@ -27,25 +27,32 @@ def learned_blocks(part: LearnedPart, measure: str) -> list[Text | Grid | Plot]:
     ]
     blocks.append(Grid(plots))
     if len(ranked) > _MOST_CURVES:
-        blocks.append(Text(f"The {_MOST_CURVES} most telling of {len(ranked)} inputs are drawn.", "note"))
+        blocks.append(
+            Text(
+                f"The {_MOST_CURVES} inputs that explain most, of {len(ranked)}, are drawn.", "note"
+            )
+        )
     if len(ranked) > 1:
         blocks += [_surface_plot(part, k, *part.telling_pair()) for k in range(len(part.names))]
     return blocks
 
 
-def _told(part: LearnedPart, ranked: list[str], shares: Any, measure: str) -> str:
+def _introduction(part: LearnedPart, ranked: list[str], shares: Any, measure: str) -> str:
     explained = shares.max(axis=1)
-    told = f"The learner sees {', '.join(part.features)}, and adds to {', '.join(part.names)}"
-    told += f" what the {measure} measure does not give to the physics" if measure else ""
+    text = f"The learner sees {', '.join(part.features)}, and adds to {', '.join(part.names)}"
+    text += f" what the {measure} measure does not assign to the physics" if measure else ""
     if len(ranked) == 1:
-        return f"{told}. The curve shows what it adds over that input."
-    told += ". The curves show what it adds over each input, the one first that tells most: the share of its variance"
-    told += " that its means over bins of the input have."
+        return f"{text}. The curve shows what it adds over that input."
+    text += (
+        ". The curves show what it adds over each input, the one that explains most first: the "
+        "share of its variance"
+    )
+    text += " that its means over bins of the input have."
     idle = [name for name in ranked[1:] if explained[part.features.index(name)] < _LEVEL]
     if idle:
-        itself, tells = ("itself", "tells") if len(idle) == 1 else ("themselves", "tell")
-        told += f" By {itself} {', '.join(idle)} {tells} next to nothing of it."
-    return told
+        itself, explains = ("itself", "explains") if len(idle) == 1 else ("themselves", "explain")
+        text += f" By {itself} {', '.join(idle)} {explains} next to nothing of it."
+    return text
 
 
 def _curve_plot(part: LearnedPart, k: int, feature: str, share: float) -> Plot:
@@ -62,9 +69,13 @@ def _curve_plot(part: LearnedPart, k: int, feature: str, share: float) -> Plot:
             "marker": {"color": "@measured", "size": 4},
         }
     ]
-    layout: dict[str, Any] = {"xaxis": {"title": {"text": axis}}, "yaxis": {"title": {"text": name}}, "shapes": []}
+    layout: dict[str, Any] = {
+        "xaxis": {"title": {"text": axis}},
+        "yaxis": {"title": {"text": name}},
+        "shapes": [],
+    }
     curve = None if part.tied(feature) else part.curve(feature)
-    told, one = f"Over {feature}", len(part.features) == 1
+    text, one = f"Over {feature}", len(part.features) == 1
     if curve is not None:
         traces += _curve_traces(curve, k)
         layout["yaxis"]["range"] = list(curve_limits(curve, k, cloud[1]))
@@ -72,9 +83,13 @@ def _curve_plot(part: LearnedPart, k: int, feature: str, share: float) -> Plot:
         told_as = {"name": "reach of the data", "showlegend": True}
         ends = {"xref": "x", "x0": float(reach[0]), "x1": float(reach[-1])}
         layout["shapes"].append(area("@reach", **ends, yref="paper", y0=0, y1=1, **told_as))
-        told += (", the one input of the learner" if one else ", all else at its median") + ": solid within the shaded"
-        told += " reach of the data, dashed beyond; the dots are what it adds along the training data"
-        told += ", and the band is its 95 % interval." if curve.half is not None else "."
+        text += (
+            ", the one input of the learner" if one else ", all else at its median"
+        ) + ": solid within the shaded"
+        text += (
+            " range of the data, dashed beyond; the dots are what it adds along the training data"
+        )
+        text += ", and the band is its 95 % interval." if curve.half is not None else "."
     else:
         centres, means = part.means(feature)
         traces.append(
@@ -87,9 +102,11 @@ def _curve_plot(part: LearnedPart, k: int, feature: str, share: float) -> Plot:
                 "marker": {"color": "@learner", "size": 5},
             }
         )
-        told += ": the mean along the training data, on which other inputs move with it."
-    told += "" if one else f" Its means over {feature} have {percent(share)} of its variance."
-    return Plot(f"Learned part of {name} over {feature}.", told, traces, layout, height=300, small=True)
+        text += ": the mean along the training data, on which other inputs move with it."
+    text += "" if one else f" Its means over {feature} have {percent(share)} of its variance."
+    return Plot(
+        f"Learned part of {name} over {feature}.", text, traces, layout, height=300, small=True
+    )
 
 
 def _curve_traces(curve: Curve, k: int) -> list[dict[str, Any]]:
@@ -102,7 +119,14 @@ def _curve_traces(curve: Curve, k: int) -> list[dict[str, Any]]:
             "line": {"width": 0, "color": "@band"},
             "hoverinfo": "skip",
         }
-        found.append({**edge, "y": rounded(learned - curve.half[:, k]), "showlegend": False, "name": "lower limit"})
+        found.append(
+            {
+                **edge,
+                "y": rounded(learned - curve.half[:, k]),
+                "showlegend": False,
+                "name": "lower limit",
+            }
+        )
         found.append(
             {
                 **edge,
@@ -125,7 +149,13 @@ def _curve_traces(curve: Curve, k: int) -> list[dict[str, Any]]:
     )
     inside = curve.inside
     found.append(
-        {"x": rounded(along[inside]), "y": rounded(learned[inside]), "mode": "lines", "name": "learner", "line": line}
+        {
+            "x": rounded(along[inside]),
+            "y": rounded(learned[inside]),
+            "mode": "lines",
+            "name": "learner",
+            "line": line,
+        }
     )
     return found
 
@@ -156,10 +186,21 @@ def _surface_plot(part: LearnedPart, k: int, across: str, along: str) -> Plot:
         "hoverinfo": "skip",
         "marker": {"color": "@ink", "size": 2, "opacity": 0.45},
     }
-    how = "all else at its median" if part.alone(across, along) else "the mean of the training data in each cell"
+    how = (
+        "all else at its median"
+        if part.alone(across, along)
+        else "the mean of the training data in each cell"
+    )
     caption = (
-        f"What the learner adds to {part.names[k]} over {across} and {along}, two inputs that tell much of it, "
-        f"{how}. It is drawn where training data are near; the dots are these data."
+        f"What the learner adds to {part.names[k]} over {across} and {along}, two inputs that "
+        f"explain much of it, {how}. It is drawn where training data are near; the dots are these "
+        "data."
     )
     layout = titled(with_unit(across, units[across]), with_unit(along, units[along]))
-    return Plot(f"Learned part of {part.names[k]} over {across} and {along}.", caption, [heat, points], layout, 420)
+    return Plot(
+        f"Learned part of {part.names[k]} over {across} and {along}.",
+        caption,
+        [heat, points],
+        layout,
+        420,
+    )

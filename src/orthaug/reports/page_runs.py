@@ -1,6 +1,6 @@
-"""Free runs on a page: whole records with the residual below, packed as numbers of four bytes for the page to draw.
+"""Free runs on a page: whole records with the residual below, packed as four-byte numbers.
 
-The page draws of every curve the least and the largest value in each column of pixels, anew whenever it is zoomed.
+The page draws the minimum and maximum of every curve in each column of pixels, anew at every zoom.
 """
 
 from __future__ import annotations
@@ -19,18 +19,24 @@ from orthaug.reports.page_blocks import Plot, area, number, percent
 
 MOST_POINTS = 100_000  # of a curve
 _BUDGET = 560_000  # points of a page: three million letters
-_UPPER, _GAP = 0.64, 0.05  # share of a pair of panels that is the upper one, and what lies between panels
+_UPPER, _GAP = (
+    0.64,
+    0.05,
+)  # share of a pair of panels that is the upper one, and what lies between panels
 _MOST_SHADES = 200  # areas of a plot
 _PANEL = 330  # pixels of a pair of panels
 _DASHES = ("dash", "solid", "dot", "dashdot")
 _MOST_BREAKS = 40  # between experiments that are marked
 _FAR = 3.0  # times the measured range: a curve that leaves it is cut off at the edge of the panel
-WITHOUT = "model without its learner"  # its name where it is drawn: the physics that is fitted by itself is another
+WITHOUT = "model without its learner"  # its label: it is not the physics fitted alone
 
 
 @dataclass(frozen=True)
 class Run:
-    """A free run on a part; `alone` that of the model without its learner, None where nothing was learned."""
+    """A free run on a part.
+
+    `alone` that of the model without its learner, None where nothing was learned.
+    """
 
     part: str
     response: Response
@@ -38,24 +44,39 @@ class Run:
 
 
 def run_plots(runs: Sequence[Run], band: Mapping[str, tuple[float, float]]) -> list[Plot]:
-    """A plot for every part: measured, model, the model without its learner, and the residual.
+    """Return a plot for every part: measured, model, the model without its learner, residual.
 
     Args:
-        band: of each output the two limits between which 95 % of the errors on the training data lie.
+        band: limits of 95 % of the errors on the training data, for each output.
     """
-    lengths = [_length(run) for run in runs for _ in run.response.outputs for _ in range(2 + (run.alone is not None))]
-    most = _fair(lengths, _BUDGET)
+    lengths = [
+        _length(run)
+        for run in runs
+        for _ in run.response.outputs
+        for _ in range(2 + (run.alone is not None))
+    ]
+    most = _points_per_curve(lengths, _BUDGET)
     return [_plot(run, band, most) for run in runs]
 
 
 def compared_plots(responses: Mapping[str, Mapping[str, Response]]) -> list[Plot]:
-    """A plot for every part: measured, and the free run of every model."""
+    """Return a plot for every part: measured, and the free run of every model."""
     parts = list(dict.fromkeys(part for runs in responses.values() for part in runs))
-    count = sum(len(t.model) + 1 for runs in responses.values() for r in runs.values() for t in r.trajectories)
+    count = sum(
+        len(t.model) + 1
+        for runs in responses.values()
+        for r in runs.values()
+        for t in r.trajectories
+    )
     outputs = max((len(r.outputs) for runs in responses.values() for r in runs.values()), default=1)
-    most = min(MOST_POINTS, max(_BUDGET // max(2 * len(parts) * (len(responses) + 1) * outputs, 1), 1000))
+    most = min(
+        MOST_POINTS, max(_BUDGET // max(2 * len(parts) * (len(responses) + 1) * outputs, 1), 1000)
+    )
     most = MOST_POINTS if 2 * count * outputs < _BUDGET else most
-    return [_compared(part, {k: runs[part] for k, runs in responses.items() if part in runs}, most) for part in parts]
+    return [
+        _compared(part, {k: runs[part] for k, runs in responses.items() if part in runs}, most)
+        for part in parts
+    ]
 
 
 def _compared(part: str, runs: Mapping[str, Response], most: int) -> Plot:
@@ -66,7 +87,14 @@ def _compared(part: str, runs: Mapping[str, Response], most: int) -> Plot:
         own = {"yaxis": f"y{2 * i + 1}", "showlegend": i == 0}
         if panels.measured is not None:
             key = panels.keep("measured", i, panels.measured)
-            panels.traces.append({**own, "series": key, "name": "measured", "line": {"color": "@measured", "width": 3}})
+            panels.traces.append(
+                {
+                    **own,
+                    "series": key,
+                    "name": "measured",
+                    "line": {"color": "@measured", "width": 3},
+                }
+            )
         colors = ("@physics", "@model", "@learner", "@bias") * 9
         for (name, model), color, dash in zip(models.items(), colors, _DASHES * 9, strict=False):
             line = {"color": color, "width": 1.3, "dash": dash}
@@ -78,23 +106,32 @@ def _compared(part: str, runs: Mapping[str, Response], most: int) -> Plot:
     lost = [name for name, run in runs.items() if any(t.diverged for t in run.trajectories)]
     samples = sum(len(t.model) for t in first.trajectories)
     caption = (
-        f"The free runs of {', '.join(runs)} on {part}, all {samples} samples, with what each leaves of the measured "
-        "output under them."
+        f"The free runs of {', '.join(runs)} on {part}, all {samples} samples, with their "
+        "residuals below."
     )
     caption += f" The run of {', '.join(lost)} diverges." if lost else ""
-    return panels.plot(f"Free runs of every model on {part}, with their residuals below.", caption, "time [s]")
+    return panels.plot(
+        f"Free runs of every model on {part}, with their residuals below.", caption, "time [s]"
+    )
 
 
 def error_band(response: Response) -> dict[str, tuple[float, float]]:
-    """Of each output the limits between which 95 % of the errors of a run lie; none of one that diverged."""
+    """Return for each output the limits between which 95 % of the errors of a run are.
+
+    None for a run that diverged.
+    """
     found = {}
     if any(t.measured is None or t.diverged for t in response.trajectories):
         return found
     for i, channel in enumerate(response.outputs):
-        errors = np.concatenate([(t.measured - t.model)[t.start :, i] for t in response.trajectories])  # type: ignore
+        errors = np.concatenate(
+            [(t.measured - t.model)[t.start :, i] for t in response.trajectories]
+        )  # type: ignore
         errors = errors[np.isfinite(errors)]
         if len(errors) >= 40:
-            found[channel.name] = tuple(float(limit) for limit in np.quantile(errors, [0.025, 0.975]))
+            found[channel.name] = tuple(
+                float(limit) for limit in np.quantile(errors, [0.025, 0.975])
+            )
     return found
 
 
@@ -102,8 +139,8 @@ def _length(run: Run) -> int:
     return sum(len(t.model) + 1 for t in run.response.trajectories)
 
 
-def _fair(lengths: Sequence[int], budget: int) -> int:
-    """How many points a curve may have, so that short ones stay whole and all fit into the budget."""
+def _points_per_curve(lengths: Sequence[int], budget: int) -> int:
+    """Return how many points a curve may have: short ones are whole, all fit the budget."""
     left, ordered = budget, sorted(lengths)
     for i, length in enumerate(ordered):
         share = left // (len(ordered) - i)
@@ -114,33 +151,45 @@ def _fair(lengths: Sequence[int], budget: int) -> int:
 
 
 def packed(values: Vector, x0: float, dx: float, most: int = MOST_POINTS) -> dict[str, Any]:
-    """A curve at even steps as the page reads it; of a longer one the least and the largest value of each stretch."""
+    """Return a curve at even steps as the page reads it.
+
+    A longer one is kept as the minimum and maximum of each stretch.
+    """
     step = dx
     if len(values) > most:
         stride = -(-len(values) // (most // 2))
         filled = np.full(-(-len(values) // stride) * stride, np.nan)
         filled[: len(values)] = values
         cells = filled.reshape(-1, stride)
-        values = np.stack([np.fmin.reduce(cells, axis=1), np.fmax.reduce(cells, axis=1)], axis=1).ravel()
+        values = np.stack(
+            [np.fmin.reduce(cells, axis=1), np.fmax.reduce(cells, axis=1)], axis=1
+        ).ravel()
         dx = dx * stride / 2
     finite = values[np.isfinite(values)]
     shift = float(finite.mean()) if len(finite) else 0.0
     with np.errstate(over="ignore"):
         bare = (values - shift).astype("<f4")
-    return {"x0": x0, "dx": dx, "step": step, "shift": shift, "f4": base64.b64encode(bare.tobytes()).decode()}
+    return {
+        "x0": x0,
+        "dx": dx,
+        "step": step,
+        "shift": shift,
+        "f4": base64.b64encode(bare.tobytes()).decode(),
+    }
 
 
 def joined(response: Response, values: Sequence[Matrix | None]) -> Matrix:
-    """Experiments one after another, with a gap between."""
+    """Return the experiments one after another, with a gap between."""
     gap = np.full((1, len(response.outputs)), np.nan)
     pieces = [np.asarray(piece, dtype=float) for piece in values if piece is not None]
     return np.concatenate([part for piece in pieces for part in (piece, gap)][:-1])
 
 
 class _Panels:
-    """A plot of runs as it is drawn: of each output a panel of curves, and the residuals below.
+    """A plot of runs while it is drawn: for each output a panel of curves, and the residuals below.
 
-    `measured` (N, ny) are the measured outputs, experiments one after another; None where there are none.
+    `measured` (N, ny) are the measured outputs, experiments one after another; None where there are
+    none.
     """
 
     def __init__(self, response: Response, most: int) -> None:
@@ -153,25 +202,27 @@ class _Panels:
         self.traces: list[dict[str, Any]] = []
         self.layout: dict[str, Any] = {"shapes": [], "annotations": []}
         self.series: dict[str, Any] = {}
-        self._left: list[Left] = []
+        self._left: list[PanelExit] = []
 
     def keep(self, name: str, i: int, values: Matrix) -> str:
-        """The name by which traces find the curve of output i."""
+        """Return the name by which traces find the curve of output i."""
         self.series[f"{name} {i}"] = packed(values[:, i], self.start, self.step, self.most)
         return f"{name} {i}"
 
     def add_residual(self, name: str, i: int, model: Matrix, drawn: Mapping[str, Any]) -> None:
-        """Measured less a curve that is kept: their difference, or of thinned curves one of its own."""
+        """Draw measured less a curve that is kept, as their difference or as a curve of its own."""
         assert self.measured is not None
         own: dict[str, Any] = {"minus": [f"measured {i}", f"{name} {i}"]}
         if len(model) > self.most:
             key = f"measured {i} − {name} {i}"
-            self.series[key] = packed(self.measured[:, i] - model[:, i], self.start, self.step, self.most)
+            self.series[key] = packed(
+                self.measured[:, i] - model[:, i], self.start, self.step, self.most
+            )
             own = {"series": key}
         self.traces.append({**own, **drawn, "yaxis": f"y{2 * i + 2}", "showlegend": False})
 
     def finish(self, i: int, drawn: Mapping[str, Matrix]) -> None:
-        """The axes of output i, and where what is `drawn` leaves them."""
+        """Draw the axes of output i, and mark where the curves in `drawn` leave them."""
         curves = {name: curve[:, i] for name, curve in drawn.items()}
         limits = None if self.measured is None else frame_of(self.measured[:, i], curves.values())
         if limits is not None:
@@ -179,11 +230,14 @@ class _Panels:
         self.layout |= _axes(i, 2 * len(self.outputs), self.outputs[i], limits)
 
     def plot(self, label: str, caption: str, time: str) -> Plot:
-        """All of it; `time` stands at the axis that the panels share."""
+        """Return the whole plot; `time` is the title of the axis that the panels share."""
         for one in self._left:
             channel = self.outputs[one.output]
             reached = f"{number(one.farthest, 3)} {channel.unit}".strip()
-            caption += f" At {number(one.time, 4)} s {channel.name} of {one.name} leaves the panel, at the triangle;"
+            caption += (
+                f" At {number(one.time, 4)} s {channel.name} of {one.name} leaves the panel, "
+                "at the triangle;"
+            )
             caption += f" it goes to {reached}."
         self.layout["xaxis"] = {
             "title": {"text": time},
@@ -191,12 +245,14 @@ class _Panels:
             "anchor": f"y{2 * len(self.outputs)}",
         }
         traces = [*self.traces, *(one.marker() for one in self._left)]
-        return Plot(label, caption, traces, self.layout, 60 + _PANEL * len(self.outputs), series=self.series)
+        return Plot(
+            label, caption, traces, self.layout, 60 + _PANEL * len(self.outputs), series=self.series
+        )
 
 
 @dataclass(frozen=True)
-class Left:
-    """A curve that leaves its panel: the output, the instant [s], the edge it leaves by, and the value farthest out."""
+class PanelExit:
+    """A curve that leaves its panel: output, instant [s], edge, and the value farthest out."""
 
     name: str
     output: int
@@ -206,7 +262,7 @@ class Left:
     farthest: float
 
     def marker(self) -> dict[str, Any]:
-        """A triangle at the edge."""
+        """Return a triangle at the edge."""
         return {
             "x": [self.time],
             "y": [self.edge],
@@ -216,40 +272,53 @@ class Left:
             "name": f"{self.name} leaves the panel",
             "cliponaxis": False,
             "showlegend": False,
-            "marker": {"color": "@bad", "size": 12, "symbol": "triangle-up" if self.above else "triangle-down"},
+            "marker": {
+                "color": "@bad",
+                "size": 12,
+                "symbol": "triangle-up" if self.above else "triangle-down",
+            },
         }
 
 
 def frame_of(measured: Vector, curves: Iterable[Vector]) -> list[float] | None:
-    """What the upper panel shows where a curve leaves what was measured by far; None for all of it."""
+    """Return the limits of the upper panel where a curve leaves the measured range by far.
+
+    None for the whole range.
+    """
     low, high = float(np.nanmin(measured)), float(np.nanmax(measured))
     width = max(high - low, 1e-300)
     for curve in curves:
         inside = curve[np.isfinite(curve)]
-        if len(inside) and (inside.min() < low - _FAR * width or inside.max() > high + _FAR * width):
+        if len(inside) and (
+            inside.min() < low - _FAR * width or inside.max() > high + _FAR * width
+        ):
             return [low - width, high + width]
     return None
 
 
 def curves_left(
     curves: Mapping[str, Vector], limits: Sequence[float], output: int, start: float, step: float
-) -> list[Left]:
-    """The curves that are cut off at the edge of a panel, in the order of the drawing."""
-    found: list[Left] = []
+) -> list[PanelExit]:
+    """Return the curves that are cut off at the edge of a panel, in the order of the drawing."""
+    found: list[PanelExit] = []
     for name, curve in curves.items():
         with np.errstate(invalid="ignore"):
             outside = np.flatnonzero((curve < limits[0]) | (curve > limits[1]))
         if len(outside):
             row, above = int(outside[0]), bool(curve[outside[0]] > limits[1])
             farthest = curve[outside][np.argmax(np.abs(curve[outside] - np.mean(limits)))]
-            found.append(Left(name, output, start + step * row, limits[above], above, float(farthest)))
+            found.append(
+                PanelExit(name, output, start + step * row, limits[above], above, float(farthest))
+            )
     return found
 
 
 def _plot(run: Run, band: Mapping[str, tuple[float, float]], most: int) -> Plot:
     response, panels = run.response, _Panels(run.response, most)
     model = joined(response, [t.model for t in response.trajectories])
-    alone = None if run.alone is None else joined(response, [t.model for t in run.alone.trajectories])
+    alone = (
+        None if run.alone is None else joined(response, [t.model for t in run.alone.trajectories])
+    )
     curves = {"measured": panels.measured, "physics": alone, "model": model}
     drawn = {"the model": model} | ({} if alone is None else {f"the {WITHOUT}": alone})
     for i, channel in enumerate(response.outputs):
@@ -257,10 +326,12 @@ def _plot(run: Run, band: Mapping[str, tuple[float, float]], most: int) -> Plot:
             if curve is not None:
                 panels.keep(name, i, curve)
         limits = band.get(channel.name)
-        panels.traces += _upper([name for name, curve in curves.items() if curve is not None], i, limits)
+        panels.traces += _upper(
+            [name for name, curve in curves.items() if curve is not None], i, limits
+        )
         if panels.measured is not None:
-            told = {"name": "measured − model", "line": {"color": "@residual", "width": 1}}
-            panels.add_residual("model", i, model, told)
+            sentences = {"name": "measured − model", "line": {"color": "@residual", "width": 1}}
+            panels.add_residual("model", i, model, sentences)
             if limits is not None:
                 low, high = limits
                 place = {"xref": "paper", "x0": 0, "x1": 1, "yref": f"y{2 * i + 2}"}
@@ -268,31 +339,44 @@ def _plot(run: Run, band: Mapping[str, tuple[float, float]], most: int) -> Plot:
         panels.finish(i, drawn)
     _mark(panels.layout, run, panels.start, panels.step)
     panels.layout["shapes"] += _shades(response, panels.start, panels.step)
-    time = "time [s]" if len(response.trajectories) == 1 else "time, experiments one after another [s]"
+    time = (
+        "time [s]" if len(response.trajectories) == 1 else "time, experiments one after another [s]"
+    )
     return panels.plot(_label(run), _caption(run, most), time)
 
 
 def _upper(curves: Sequence[str], i: int, limits: tuple[float, float] | None) -> list[dict]:
-    """Measured, band, the model without its learner and with it, of output i; the legend tells of the first."""
+    """Return the traces of output i: measured, band, the model without its learner and with it.
+
+    The legend has the first.
+    """
     found = []
     if "measured" in curves:
         line = {"color": "@measured", "width": 3}
         found.append({"series": f"measured {i}", "name": "measured", "line": line})
     if limits is not None:
-        edge: dict[str, Any] = {"series": f"model {i}", "line": {"width": 0, "color": "@band"}, "hoverinfo": "skip"}
+        edge: dict[str, Any] = {
+            "series": f"model {i}",
+            "line": {"width": 0, "color": "@band"},
+            "hoverinfo": "skip",
+        }
         fill = {"fill": "tonexty", "fillcolor": "@band"}
-        found.append({**edge, "edge": "min", "plus": limits[0], "name": "lower limit", "showlegend": False})
+        found.append(
+            {**edge, "edge": "min", "plus": limits[0], "name": "lower limit", "showlegend": False}
+        )
         found.append({**edge, **fill, "edge": "max", "plus": limits[1], "name": "95 % band"})
     if "physics" in curves:
         line = {"color": "@physics", "width": 1.3, "dash": "dash"}
         found.append({"series": f"physics {i}", "name": WITHOUT, "line": line})
-    found.append({"series": f"model {i}", "name": "model", "line": {"color": "@model", "width": 1.3}})
+    found.append(
+        {"series": f"model {i}", "name": "model", "line": {"color": "@model", "width": 1.3}}
+    )
     own = {"yaxis": f"y{2 * i + 1}", "showlegend": i == 0}
     return [{**own, "legendgroup": trace["name"], **trace} for trace in found]
 
 
 def _axes(i: int, panels: int, channel: Channel, limits: list[float] | None) -> dict[str, Any]:
-    """The two panels of an output from the top down, on the x axis that all share."""
+    """Return the axes of the two panels of an output, from the top down, on a shared x axis."""
     high = 2 / panels
     top = 1 - i * high
     middle = top - (high - _GAP) * _UPPER
@@ -307,20 +391,20 @@ def _axes(i: int, panels: int, channel: Channel, limits: list[float] | None) -> 
 
 
 def _stacked(name: str, unit: str) -> str:
-    """A title on two lines: the panels are too low on paper for name and unit behind each other."""
+    """Return a title on two lines: the panels are too low on paper for name and unit on one."""
     return f"{name}<br>[{unit}]" if unit else name
 
 
 def _mark(layout: dict[str, Any], run: Run, start: float, step: float) -> None:
-    """Lines where an experiment begins, and where a run left all bounds."""
+    """Mark where an experiment begins, and where a run diverged."""
     row, breaks = 0, len(run.response.trajectories) <= _MOST_BREAKS
     for i, trajectory in enumerate(run.response.trajectories):
         if i and breaks:
             layout["shapes"].append(_line(start + step * (row - 0.5), "@grid", "dot"))
         alone = None if run.alone is None else run.alone.trajectories[i]
-        for name, told in (("free run", trajectory), (f"the {WITHOUT}", alone)):
-            if told is not None and told.diverged:
-                at = start + step * (row + told.diverged[0])
+        for name, sentences in (("free run", trajectory), (f"the {WITHOUT}", alone)):
+            if sentences is not None and sentences.diverged:
+                at = start + step * (row + sentences.diverged[0])
                 layout["shapes"].append(_line(at, "@bad", "solid"))
                 layout["annotations"].append(
                     {
@@ -330,8 +414,10 @@ def _mark(layout: dict[str, Any], run: Run, start: float, step: float) -> None:
                         "yref": "paper",
                         "yanchor": "top",
                         "showarrow": False,
-                        "xanchor": "right" if row + told.diverged[0] > _length(run) / 2 else "left",
-                        "text": f"{name} diverges in {told.diverged[1]}",
+                        "xanchor": "right"
+                        if row + sentences.diverged[0] > _length(run) / 2
+                        else "left",
+                        "text": f"{name} diverges in {sentences.diverged[1]}",
                         "font": {"color": "@bad"},
                     }
                 )
@@ -358,41 +444,64 @@ def _label(run: Run) -> str:
 
 
 def _caption(run: Run, most: int) -> str:
-    """What is drawn, in sentences."""
+    """Return sentences on what is drawn."""
     response = run.response
     rows, count = sum(len(t.model) for t in response.trajectories), len(response.trajectories)
     files = f" of {count} experiments" if count > 1 else ""
-    told = [f"The free run on {run.part}, all {rows} samples{files}, and the residual under it on the same time axis."]
+    sentences = [
+        f"The free run on {run.part}, all {rows} samples{files}, and the residual under it on "
+        "the same time axis."
+    ]
     if rows > most:
-        told.append(
-            f"Of each curve {number(most, 3)} points are kept, the least and the largest value of every stretch."
+        sentences.append(
+            f"Each curve is drawn by {number(most, 3)} points, the minimum and maximum of "
+            "every stretch."
         )
     for t in response.trajectories:
         if t.diverged:
-            told.append(f"The run leaves all bounds in {t.diverged[1]} at row {t.diverged[0]}, where it is cut off.")
+            sentences.append(
+                f"The run diverges in {t.diverged[1]} at row {t.diverged[0]}, where it is cut off."
+            )
     outside = [t.outside for t in response.trajectories if t.outside is not None]
     beyond = float(np.concatenate(outside).mean()) if outside else 0.0
     if beyond > 0:
-        told.append(
-            f"On {percent(beyond)} of the samples, shaded, the learner is outside what it was trained on; "
-            "`learner.beyond` says what its correction does there."
+        sentences.append(
+            f"On {percent(beyond)} of the samples, shaded, the learner is outside its training "
+            "data; `learner.beyond` sets its correction there."
         )
-    return " ".join(told)
+    return " ".join(sentences)
 
 
 def _shades(response: Response, start: float, step: float) -> list[dict[str, Any]]:
-    """Return areas over the stretches on which the learner is outside its training, close ones as one."""
+    """Return areas over stretches where the learner extrapolates; close ones are merged."""
     rows, flags = 0, []
     for t in response.trajectories:
-        flags.append(np.zeros(len(t.model)) if t.outside is None else np.asarray(t.outside, dtype=float))
+        flags.append(
+            np.zeros(len(t.model)) if t.outside is None else np.asarray(t.outside, dtype=float)
+        )
         flags.append(np.zeros(1))  # the gap between experiments
         rows += len(t.model) + 1
     edges = np.diff(np.concatenate([[0.0], *flags, [0.0]]))
     first, after = np.flatnonzero(edges > 0), np.flatnonzero(edges < 0)
     apart = np.flatnonzero(first[1:] - after[:-1] > rows // _MOST_SHADES)
-    first, after = first[np.concatenate([[0], apart + 1])[: len(first)]], after[np.append(apart, -1)[: len(after)]]
-    place = {"yref": "paper", "y0": 0, "y1": 1, "name": "outside of training", "legendgroup": "outside"}
+    first, after = (
+        first[np.concatenate([[0], apart + 1])[: len(first)]],
+        after[np.append(apart, -1)[: len(after)]],
+    )
+    place = {
+        "yref": "paper",
+        "y0": 0,
+        "y1": 1,
+        "name": "outside of training",
+        "legendgroup": "outside",
+    }
     return [
-        area("@reach", **place, x0=start + step * (a - 0.5), x1=start + step * (b - 0.5), showlegend=not i)
+        area(
+            "@reach",
+            **place,
+            x0=start + step * (a - 0.5),
+            x1=start + step * (b - 0.5),
+            showlegend=not i,
+        )
         for i, (a, b) in enumerate(zip(first.tolist(), after.tolist(), strict=True))
     ]

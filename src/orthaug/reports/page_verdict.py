@@ -1,4 +1,4 @@
-"""The verdict that a page begins with, in three sentences: is the model to be trusted, for what, what comes next."""
+"""The verdict at the top of a page: is the model reliable, for what use, what to do next."""
 
 from __future__ import annotations
 
@@ -22,19 +22,25 @@ from orthaug.reports.result import (
 )
 
 _GOOD, _POOR = 0.2, 0.5  # NRMSE of a free run up to which it is close, and from which it is far
-_ALIKE = 1.1  # ratio of errors up to which models are told to be as good as each other
-_SURE = 0.1  # standard error over value up to which a parameter is told to be known
-_NAMED = 0.5  # share of what was learned from which its cause is what to do first
-_FAR = 5.0  # standard errors from which the size of a bias is told in figures
-_MOST_DOUBTS = 3  # that are told in the first sentence
-_WORSE = 1.5  # times the error on the training data: a Gaussian error then leaves the 95 % band on a fifth of the rows
+_ALIKE = 1.1  # ratio of errors up to which models are called equally good
+_SURE = 0.1  # standard error over value up to which a parameter counts as known
+_NAMED = 0.5  # share of the learned part from which its cause is the first advice
+_FAR = 5.0  # standard errors from which the size of a bias is given in figures
+_MOST_DOUBTS = 3  # in the first sentence
+_WORSE = 1.5  # times the error on training data: then 1/5 of a Gaussian error is outside the band
 _STOPPED = ("iteration_limit", "no_descent", "stopped")
 _RAN_AWAY = "free_run_diverged"
-_TIED = ("orthogonal", "physics alone")  # of models that are as good as each other these are taken first
+_TIED = (
+    "orthogonal",
+    "physics alone",
+)  # of models that are as good as each other these are taken first
 
 
 class PageVerdict(NamedTuple):
-    """`level` is good, care or bad; the sentences say whether to trust the model, for what, and what to do next."""
+    """`level` is good, care or bad.
+
+    The sentences state its reliability, its use, and the next step.
+    """
 
     level: str
     trust: str
@@ -43,44 +49,58 @@ class PageVerdict(NamedTuple):
 
     @property
     def sentences(self) -> tuple[str, str, str]:
-        """In the order in which they are read."""
+        """The three sentences, in the order in which they are read."""
         return self.trust, self.use, self.then
 
 
 def fit_verdict(result: FitResult) -> PageVerdict:
-    """Of a fit, from its own findings."""
+    """Return the verdict of a fit, from its own findings."""
     doubts = list(_doubts(result, result.data))
     error, part = _worst(result.scores)
-    bad = _warned(result, _RAN_AWAY) or (error is not None and error > _POOR) or _code(result) == "hurts"
+    bad = (
+        _warned(result, _RAN_AWAY)
+        or (error is not None and error > _POOR)
+        or _code(result) == "hurts"
+    )
     level = "bad" if bad else "care" if doubts else "good"
     opening = {
-        "good": "The model is to be trusted",
-        "care": "The model is to be trusted with care",
-        "bad": "Do not trust the model as it is",
+        "good": "The model is reliable",
+        "care": "Use the model with care",
+        "bad": "Do not use the model as it is",
     }[level]
-    shown = "" if error is None else f": {_told_error(error, part)}"
-    because = f"{', but ' if level == 'care' else '; '}{_joined(doubts[:_MOST_DOUBTS])}" if doubts else ""
+    shown = "" if error is None else f": {_error_text(error, part)}"
+    because = (
+        f"{', but ' if level == 'care' else '; '}{_join(doubts[:_MOST_DOUBTS])}" if doubts else ""
+    )
     first = next((f"{w.text.split(':')[0][0].upper()}{w.text.split(':')[0][1:]}. " for w in result.warnings
                   if w.code == "one_step_only"), "")  # fmt: skip
-    return PageVerdict(level, f"{first}{opening}{shown}{because}.", _use(result, level), _then(result))
+    return PageVerdict(
+        level, f"{first}{opening}{shown}{because}.", _use_text(result, level), _next_step(result)
+    )
 
 
 def compare_verdict(result: CompareResult) -> PageVerdict:
-    """Of a comparison: which model to take."""
+    """Return the verdict of a comparison: which model to use."""
     rows = [row for row in result.comparison if _worst(row.scores)[0] is not None]
     if not rows:
         return PageVerdict(
             "bad",
             "No model has a free run that could be scored.",
-            "None of them is of use as it is.",
+            "None of them can be used as it is.",
             "Look at the warnings below, and fit again.",
         )
     errors = {row.name: _worst(row.scores)[0] or 0.0 for row in rows}
-    best = result.chosen or _taken(rows, errors)
+    best = result.chosen or _best_model(rows, errors)
     row = next(row for row in result.comparison if row.name == best)
     error, part = _worst(row.scores)
     doubts = list(_doubts(row, result.data))
-    level = "good" if error is not None and error <= _GOOD else "care" if error is None or error <= _POOR else "bad"
+    level = (
+        "good"
+        if error is not None and error <= _GOOD
+        else "care"
+        if error is None or error <= _POOR
+        else "bad"
+    )
     level = "care" if level == "good" and doubts else level
     near = [name for name in errors if name != best and errors[name] <= _ALIKE * (error or 0.0)]
     same = [name for name in near if percent(errors[name]) == percent(errors[best])]
@@ -88,24 +108,32 @@ def compare_verdict(result: CompareResult) -> PageVerdict:
     least = all(errors[best] <= other for name, other in errors.items() if name not in same)
     less = f", as {'does' if len(same) == 1 else 'do'} {_quoted(same)}" if same else ""
     less += (", and no other leaves less" if same else ", less than of any other") if least else ""
-    how = f"it has the lowest error on the validation part, and {_told_error(error or 0.0, part)}"
-    trust = f"Take “{best}”: {how if result.chosen else _told_error(error or 0.0, part) + less}"
+    how = f"it has the lowest error on the validation part, and {_error_text(error or 0.0, part)}"
+    trust = f"Take “{best}”: {how if result.chosen else _error_text(error or 0.0, part) + less}"
     trust += f"; {_quoted(near)} {_is(near)} as good within 10 %." if near else "."
     if doubts:
-        trust = f"{trust[:-1]}. But {_joined(doubts[:_MOST_DOUBTS])}."
+        trust = f"{trust[:-1]}. But {_join(doubts[:_MOST_DOUBTS])}."
     alone = errors.get("physics alone")
-    use = "It is the physics alone: no learner earns its place beside it."
+    use = "It is the physics alone: no learner improves on it."
     if best != "physics alone" and alone is not None and error is not None:
         learns = error / alone if alone else 1.0
-        use = f"Its error on {part} is {number(learns, 2)} of that of physics alone ({percent(alone)})"
+        use = (
+            f"Its error on {part} is {number(learns, 2)} of that of physics alone "
+            f"({percent(alone)})"
+        )
         use += f", and its learner {_word(row)}." if row.validation else "."
     return PageVerdict(level, trust, use, _after_comparison(result, row))
 
 
-def _taken(rows: Sequence[RowResult], errors: Mapping[str, float]) -> str:
-    """The model of the lowest error; of such that are as good, one whose θ means something."""
+def _best_model(rows: Sequence[RowResult], errors: Mapping[str, float]) -> str:
+    """Return the model of the lowest error.
+
+    Among equally good ones, one whose θ has a meaning.
+    """
     best = min(errors, key=errors.__getitem__)
-    earns = [row.name for row in rows if row.validation is None or row.validation.verdict == "helps"]
+    earns = [
+        row.name for row in rows if row.validation is None or row.validation.verdict == "helps"
+    ]
     tied = [name for name in _TIED if name in earns and errors[name] <= _ALIKE * errors[best]]
     return next(iter(tied), best)
 
@@ -114,18 +142,26 @@ def _after_comparison(result: CompareResult, row: RowResult) -> str:
     if row.residuals is not None and row.residuals.changes:
         return f"An option, not tried here: {_change(row.residuals.changes[0])}."
     if not result.data.tests and not result.data.validation:
-        return "Hold out a test part, on which the models can be judged."
+        return "Hold out a test part, so that the models can be judged."
     if not result.data.validation:
-        return "Hold out a validation part (`[data.validation]`), so that the choice is not made on what judges it."
-    return f"Fit it alone with `orthaug fit` and structure “{row.name}”, whose report has its residuals and bias."
+        return (
+            "Hold out a validation part (`[data.validation]`), so that the choice is not made "
+            "on what judges it."
+        )
+    return (
+        f"Fit it alone with `orthaug fit` and structure “{row.name}”, whose report has its "
+        "residuals and bias."
+    )
 
 
 def _word(row: RowResult) -> str:
     assert row.validation is not None
-    return {"helps": "helps", "no_help": "does not help", "hurts": "hurts"}.get(row.validation.verdict, "–")
+    return {"helps": "helps", "no_help": "does not help", "hurts": "hurts"}.get(
+        row.validation.verdict, "–"
+    )
 
 
-def _told_error(error: float, part: str) -> str:
+def _error_text(error: float, part: str) -> str:
     return f"{_on(part)} its free run leaves {percent(error)} of the output's deviation"
 
 
@@ -134,7 +170,7 @@ def _on(part: str) -> str:
 
 
 def _worse(scores: dict[str, PartScores]) -> tuple[float, str] | None:
-    """How many times as large as in training the free run's error on a held-out part is, where that is a lot."""
+    """Return the free run's error on a held-out part over that in training, where it is large."""
     found = {}
     trained = scores["train"].simulation.rmse if "train" in scores else None
     for part, score in scores.items():
@@ -147,7 +183,9 @@ def _worse(scores: dict[str, PartScores]) -> tuple[float, str] | None:
 
 
 def _worst(scores: dict[str, PartScores], kind: str = "simulation") -> tuple[float | None, str]:
-    """NRMSE of the free run on the held-out part where it is largest, RMS over outputs; of training if none is.
+    """Return the NRMSE of the free run on the held-out part where it is largest, RMS over outputs.
+
+    On the training data where none is held out.
 
     Args:
         kind: `prediction` for that of one step ahead.
@@ -163,8 +201,15 @@ def _worst(scores: dict[str, PartScores], kind: str = "simulation") -> tuple[flo
 
 
 def _code(result: FitResult | RowResult) -> str | None:
-    """The verdict on the learner; None without one, and where the model is the physics alone that was taken for it."""
-    return None if result.validation is None or _warned(result, "physics_alone") else result.validation.verdict
+    """Return the verdict on the learner.
+
+    None without one, or where physics alone was chosen.
+    """
+    return (
+        None
+        if result.validation is None or _warned(result, "physics_alone")
+        else result.validation.verdict
+    )
 
 
 def _warned(result: FitResult | RowResult, code: str) -> bool:
@@ -172,57 +217,87 @@ def _warned(result: FitResult | RowResult, code: str) -> bool:
 
 
 def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
-    """What speaks against the model, the gravest first."""
+    """Yield the objections to the model, the gravest first."""
     runaway = [w.text.split(":")[0] for w in result.warnings if w.code == _RAN_AWAY]
     if runaway:
-        yield f"its free run diverges on {_joined(runaway)}"
+        yield f"its free run diverges on {_join(runaway)}"
     if _code(result) == "hurts":
         yield "its learner makes the free run worse than physics alone"
-    if not data.tests and not data.validation and not (result.validation and result.validation.trials):
-        yield "it was never tried on data that it was not fitted to"
+    if (
+        not data.tests
+        and not data.validation
+        and not (result.validation and result.validation.trials)
+    ):
+        yield "it was not tested on data that it was not fitted to"
     if (result.status if isinstance(result, RowResult) else result.status.code) in _STOPPED:
         yield "training stopped before it converged"
     if _warned(result, "spectral_radius_above_one"):
-        yield "it is not proved stable, for its local spectral radius is above 1 on a part of its free run"
+        yield (
+            "it is not proved stable, for its local spectral radius is above 1 on a part of "
+            "its free run"
+        )
     biased = [row.name for row in _rows(result) if _biased(row)]
     if biased:
         one = len(biased) == 1
         carry = _size_of_bias([row for row in _rows(result) if _biased(row)])
-        guessed = any(row.bias and (row.bias.share or 0.0) < SURE_SHARE for row in _rows(result) if _biased(row))
-        carry = f"probably {carry}" if guessed and getattr(result, "motion", None) is None else carry
-        yield f"the estimate{'' if one else 's'} of {_joined(biased)} {carry}"
+        guessed = any(
+            row.bias and (row.bias.share or 0.0) < SURE_SHARE
+            for row in _rows(result)
+            if _biased(row)
+        )
+        carry = (
+            f"probably {carry}" if guessed and getattr(result, "motion", None) is None else carry
+        )
+        yield f"the estimate{'' if one else 's'} of {_join(biased)} {carry}"
     if result.residuals is not None and result.residuals.verdict in ("unmodelled", "sensor_noise"):
         coarse = list(result.residuals.steps or {})
         yield {
-            "unmodelled": f"its one-step residual has the size of the steps of {_joined(coarse)}"
+            "unmodelled": f"its one-step residual has the size of the steps of {_join(coarse)}"
             if coarse
             else "its residual is not noise alone",
             "sensor_noise": "noise on the measured output biases its one-step estimates",
         }[result.residuals.verdict]
     if _warned(result, "closed_loop"):
-        yield "its data look recorded under feedback, which biases it"
+        yield "its data were probably recorded under feedback, which biases the estimates"
     worse = _worse(result.scores)
     if worse is not None:
         times = number(worse[0], 2)
-        yield f"its error on {worse[1]} is {times} times that on the training data, so the band is too narrow"
+        yield (
+            f"its error on {worse[1]} is {times} times that on the training data, so the band "
+            "is too narrow"
+        )
     if result.validation is not None and result.validation.extrapolation:
         left = dict.fromkeys(entry.part for entry in result.validation.extrapolation)
-        yield f"{_joined(list(left))} {'leaves' if len(left) == 1 else 'leave'} the range of the training data"
+        yield (
+            f"{_join(list(left))} {'leaves' if len(left) == 1 else 'leave'} the range of the "
+            "training data"
+        )
 
 
 def _size_of_bias(rows: Sequence[ParameterResult]) -> str:
-    """How large the biases are; in figures where one is far larger than its standard error."""
+    """Return a text on the size of the biases.
+
+    With figures where one is far larger than its standard error.
+    """
     one = len(rows) == 1
     worst = max(rows, key=_errors_of)
     if _errors_of(worst) < _FAR or worst.bias is None:
-        return "carries a bias larger than its standard error" if one else "carry biases larger than their errors"
-    share = "" if not worst.value else f", {percent(abs((worst.bias.value or 0.0) / worst.value))} of its value"
+        return (
+            "carries a bias larger than its standard error"
+            if one
+            else "carry biases larger than their errors"
+        )
+    share = (
+        ""
+        if not worst.value
+        else f", {percent(abs((worst.bias.value or 0.0) / worst.value))} of its value"
+    )
     size = f"{plain_number(_errors_of(worst))} standard errors{share}"
     return f"carries a bias of {size}" if one else f"carry biases, that of {worst.name} of {size}"
 
 
 def _errors_of(row: ParameterResult) -> float:
-    """The size of its bias in standard errors."""
+    """Return the size of its bias in standard errors."""
     return abs(row.bias.value or 0.0) / row.std if row.bias and row.std else 0.0
 
 
@@ -235,7 +310,7 @@ def _biased(row: ParameterResult) -> bool:
     return row.bias is not None and bool(row.std) and abs(row.bias.value or 0.0) > (row.std or 0.0)
 
 
-def _use(result: FitResult, level: str) -> str:
+def _use_text(result: FitResult, level: str) -> str:
     rows = _rows(result)
     sure = [row.name for row in rows if _known(row)]
     known = sure if _noise_alone(result) else []
@@ -245,62 +320,84 @@ def _use(result: FitResult, level: str) -> str:
     predicts = ahead is not None and ahead <= (_GOOD if level == "bad" else _POOR)
     if level == "bad" and ahead is not None and ahead > _POOR:
         return (
-            "Use it for nothing but to look for what is missing: not even its prediction of the next sample holds, "
-            f"which leaves {percent(ahead)} of the output's deviation {_on(part)}."
+            "Use it only to look for what is missing: its one-step prediction, too, leaves "
+            f"{percent(ahead)} of the output's deviation {_on(part)}."
         )
     if level == "bad" and not (known and predicts):
-        return "Use it for nothing but to look for what is missing."
+        return "Use it only to look for what is missing."
     if level == "bad":
-        told = "predict the next sample"
+        text = "predict the next sample"
     else:
-        told = f"simulate{' and predict' if predicts else ''} within the range of its training data"
-    told += f" and to read {_joined(known)} as physics" if known else ""
+        text = f"simulate{' and predict' if predicts else ''} within the range of its training data"
+    text += f" and to read {_join(known)} as physics" if known else ""
     if sure and not known:
         cover = "interval does" if len(sure) == 1 else "intervals do"
-        told += f", but do not read {_joined(sure)} as physics yet: the {cover} not cover what the residual still holds"
-    told += f"; {_joined(others)} {_is(others)} too uncertain or biased to be read so" if others else ""
+        text += (
+            f", but do not read {_join(sure)} as physics yet: the {cover} not cover what the "
+            "residual still holds"
+        )
+    text += (
+        f"; {_join(others)} {_is(others)} too uncertain or biased to be read so" if others else ""
+    )
     if shared:
-        told += f"; {_joined(shared)} {_is(shared)} what the physics nearest to the data has, for the learner could"
-        told += f" imitate {'it' if len(shared) == 1 else 'them'}"
-    return f"Use it to {told}."
+        text += (
+            f"; {_join(shared)} {_is(shared)} taken from the physics nearest to the data, "
+            "for the learner could"
+        )
+        text += f" imitate {'it' if len(shared) == 1 else 'them'}"
+    return f"Use it to {text}."
 
 
 def _noise_alone(result: FitResult) -> bool:
-    """Whether the residual shows nothing that would bias the parameters."""
-    return result.residuals is None or result.residuals.verdict not in ("unmodelled", "sensor_noise")
+    """Return whether the residual shows nothing that would bias the parameters."""
+    return result.residuals is None or result.residuals.verdict not in (
+        "unmodelled",
+        "sensor_noise",
+    )
 
 
 def _known(row: ParameterResult) -> bool:
-    """Whether a parameter may be read as physics."""
+    """Return whether a parameter may be read as physics."""
     sure = row.std is not None and row.value is not None and 0 < row.std <= _SURE * abs(row.value)
     return sure and not row.shared and not _biased(row)
 
 
 def _quoted(names: list[str]) -> str:
-    return _joined([f"“{name}”" for name in names])
+    return _join([f"“{name}”" for name in names])
 
 
 def _is(names: list[str]) -> str:
     return "is" if len(names) == 1 else "are"
 
 
-def _then(result: FitResult) -> str:
-    """Return the first thing to do: a change that bettered the free run in a trial; else an option, named as one."""
+def _next_step(result: FitResult) -> str:
+    """Return the first thing to do: a change that lowered the free run's error in a trial.
+
+    Otherwise an option, named as one.
+    """
     if result.advice:
         return result.advice[0].text
     option = _option(result)
     if option is not None:
         return f"An option, not tried here: {option}."
     if result.advice_trials is not None and result.advice_trials.tried:
-        text = "None of the changes that were tried betters the free run; export it (`orthaug export`), or design the"
+        text = (
+            "None of the changes that were tried improves the free run; export it (`orthaug "
+            "export`), or design the"
+        )
         return f"{text} next experiment."
-    return "Nothing further is predicted to help; export it (`orthaug export`) or design the next experiment."
+    return (
+        "No further change is predicted to help; export it (`orthaug export`) or design the next "
+        "experiment."
+    )
 
 
 def _option(result: FitResult) -> str | None:
-    """Return what may help and was not tried, as the middle of a sentence."""
+    """Return a change that may help and was not tried, as the middle of a sentence."""
     if _code(result) == "hurts":
-        return 'physics alone (`learner.kind = "none"`), or a learner of other inputs or fewer neurons'
+        return (
+            'physics alone (`learner.kind = "none"`), or a learner of other inputs or fewer neurons'
+        )
     predicted = None if result.advice_trials is not None else _predicted(result)
     if predicted is not None:
         return predicted
@@ -313,57 +410,85 @@ def _option(result: FitResult) -> str | None:
     if result.validation is not None and result.validation.extrapolation:
         entry = result.validation.extrapolation[0]
         low, high = entry.found
-        return f"training data that reach {entry.regressor} from {number(low, 3)} to {number(high, 3)}"
+        return (
+            f"training data that reach {entry.regressor} from {number(low, 3)} to {number(high, 3)}"
+        )
     if _warned(result, _RAN_AWAY):
         return "data over the range that the free run leaves"
     if _warned(result, "closed_loop"):
-        return "data with the reference recorded, to model the whole loop, with more of its motion, or in open loop"
+        return (
+            "data with the reference recorded, to model the whole loop, with more of its "
+            "motion, or in open loop"
+        )
     if _undecided(result):
-        return "the learner (`training.fallback = false`), for cross-validation leaves undecided if it helps"
+        return (
+            "the learner (`training.fallback = false`), for cross-validation does not decide "
+            "whether it helps"
+        )
     if result.residuals is not None and result.residuals.steps:
-        steps = _joined(list(result.residuals.steps))
-        return f"fewer samples, or a finer measurement, for the steps of {steps} are as large as the one-step residual"
+        steps = _join(list(result.residuals.steps))
+        return (
+            f"fewer samples, or a finer measurement, for the steps of {steps} are as large as "
+            "the one-step residual"
+        )
     if not _noise_alone(result):
-        return "physics of your own for what the residual still follows (residual tests; `[[suspects]]` tests a form)"
+        return (
+            "your own physics for what the residual still depends on (residual tests; "
+            "`[[suspects]]` tests a form)"
+        )
     worse = _worse(result.scores)
-    return None if worse is None else f"more training data of the kind of {worse[1]}, on which the error is larger"
+    return (
+        None
+        if worse is None
+        else f"more training data like {worse[1]}, on which the error is larger"
+    )
 
 
 def _predicted(result: FitResult) -> str | None:
-    """Return the change with the largest gain that findings predict, where none was tried."""
+    """Return the change with the largest predicted gain, where none was tried."""
     causes = [row.bias for row in _rows(result) if _biased(row) and row.bias]
     cause = max(causes, key=lambda bias: bias.share or 0.0, default=None)
-    missing = result.residuals.missing.terms if result.residuals and result.residuals.missing else []
+    missing = (
+        result.residuals.missing.terms if result.residuals and result.residuals.missing else []
+    )
     if missing and result.residuals is not None and result.residuals.verdict == "unmodelled":
         return f"the term {missing[0].expression} in the equation of {missing[0].equation}"
     if cause is not None and (cause.share or 0.0) > _NAMED:
         return _cause_option(cause, result.learns)
     tried = result.validation is not None and _code(result) != "helps"
-    changes = [c for c in result.residuals.changes if c.kind != "learner" or not tried] if result.residuals else []
+    changes = (
+        [c for c in result.residuals.changes if c.kind != "learner" or not tried]
+        if result.residuals
+        else []
+    )
     if changes:
         return _change(changes[0])
     return None if cause is None else _cause_option(cause, result.learns)
 
 
 def _cause_option(cause: BiasResult, learned: bool) -> str:
-    """Return a cause of what was learned, or of what the free run leaves, as a term of the physics."""
+    """Return a term that explains the learned part or the residual, for the physics."""
     looks = "looks most like it" if (cause.share or 0.0) < SURE_SHARE and learned else "is that"
     what = "what was learned" if learned else "what the free run leaves"
     return f"“{cause.cause}” in the physics, for {percent(cause.share)} of {what} {looks}"
 
 
 def _undecided(result: FitResult) -> bool:
-    """Whether physics alone was handed over although the learner may help."""
+    """Return whether physics alone was handed over although the learner may help."""
     ratio = None if result.validation is None else result.validation.ratio
-    return _warned(result, "physics_alone") and ratio is not None and (ratio.value or 1.0) < 1 < (ratio.high or 0.0)
+    return (
+        _warned(result, "physics_alone")
+        and ratio is not None
+        and (ratio.value or 1.0) < 1 < (ratio.high or 0.0)
+    )
 
 
 def _change(change: object) -> str:
-    """Return a change with what it is predicted to gain, as the middle of a sentence."""
-    told = {key: getattr(change, key) for key in ("kind", "what", "fall", "of", "output")}
-    predicted = Change(**{**told, "fall": told["fall"] or 0.0})
+    """Return a change with its predicted gain, as the middle of a sentence."""
+    text = {key: getattr(change, key) for key in ("kind", "what", "fall", "of", "output")}
+    predicted = Change(**{**text, "fall": text["fall"] or 0.0})
     return f"{predicted.name}, with which {predicted.prediction}"
 
 
-def _joined(words: list[str]) -> str:
+def _join(words: list[str]) -> str:
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"

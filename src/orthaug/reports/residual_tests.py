@@ -1,4 +1,4 @@
-"""Tests of residuals as results hold them."""
+"""Tests of residuals in results."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from orthaug.reports.fields import Content, Flag, Number, Numbers, Whole, Wholes
 
 
 class LjungBoxResult(Content):
-    """Whether the residual is white."""
+    """Ljung-Box test of whether the residual is white."""
 
     statistic: Number
     freedom: Whole
@@ -14,7 +14,7 @@ class LjungBoxResult(Content):
 
 
 class NormalityResult(Content):
-    """Whether the whitened residual is normal."""
+    """Test of whether the whitened residual is normal."""
 
     statistic: Number
     p: Number
@@ -67,19 +67,21 @@ class ResidualTestResult(Content):
 
     @property
     def crossed(self) -> dict[str, CrossResult]:
-        """The inputs that it was held against."""
+        """Inputs that the residual was compared with."""
         return {name: cross for name, cross in self.cross.items() if cross is not None}
 
     @property
     def cross_band(self) -> float:
-        """The widest band of theirs."""
+        """Widest of their bands."""
         return max((cross.band or 0.0 for cross in self.crossed.values()), default=0.0)
 
     @property
     def most_telling(self) -> dict[str, RegressorResult]:
-        """The regressor over which it is most surely curved, or that explains most of it where it is flat over all.
+        """Regressor on which the residual depends most clearly.
 
-        By its name; none where none was looked at.
+        It is the one of the most certain curvature, or that explains most where none has any.
+
+        By its name; empty where none was tested.
         """
         curves = {name: curve for name, curve in self.regressors.items() if curve is not None}
         curved = [name for name in self.curved_regressors if name in curves]
@@ -90,8 +92,10 @@ class ResidualTestResult(Content):
 
     @property
     def strongest_acf(self) -> float | None:
-        """The autocorrelation that is the largest in size, with its sign."""
-        return max((value for value in (self.acf or [])[1:] if value is not None), key=abs, default=None)
+        """Autocorrelation that is largest in size, with its sign."""
+        return max(
+            (value for value in (self.acf or [])[1:] if value is not None), key=abs, default=None
+        )
 
 
 class RunningTestResult(Content):

@@ -1,4 +1,4 @@
-"""The content of result.json, and of what other commands print as JSON. Text, page and plots read it."""
+"""Content of result.json, and of other commands' JSON; text, page and plots read it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,16 @@ from pydantic import BeforeValidator, Field
 from orthaug import __version__
 from orthaug.physics.baseline import Parameter
 from orthaug.physics.parameters import PhysicalParameter
-from orthaug.reports.fields import ByName, Content, Flag, Number, Numbers, WarningResult, Whole
+from orthaug.reports.fields import (
+    ByName,
+    Content,
+    Flag,
+    IntervalsResult,
+    Number,
+    Numbers,
+    WarningResult,
+    Whole,
+)
 from orthaug.reports.findings import (
     AdviceResult,
     AdviceTrialsResult,
@@ -37,10 +46,12 @@ if TYPE_CHECKING:
 SCHEMA = 2
 
 
-class Headed(Content):
-    """What every result begins with."""
+class ResultHeader(Content):
+    """The fields that every result begins with."""
 
-    schema_number: Literal[2] = Field(SCHEMA, validation_alias="schema", serialization_alias="schema")
+    schema_number: Literal[2] = Field(
+        SCHEMA, validation_alias="schema", serialization_alias="schema"
+    )
     orthaug: str = __version__
 
 
@@ -53,7 +64,7 @@ class FileResult(Content):
 
 
 class PreparedResult(Content):
-    """A step of preparation: `samples` were marked as missing or reconstructed in all files of the training data."""
+    """A step of preparation: `samples` marked as missing or reconstructed in all training files."""
 
     step: str
     options: dict[str, Any]
@@ -62,7 +73,7 @@ class PreparedResult(Content):
 
 
 class DataResult(Content):
-    """The files of each part, and what all parts went through."""
+    """The files of each part, and the steps of preparation common to all parts."""
 
     absent: ClassVar = frozenset({"validation", "tests", "prepare"})
 
@@ -73,13 +84,13 @@ class DataResult(Content):
 
     @property
     def parts(self) -> dict[str, list[FileResult]]:
-        """Every part by its name."""
+        """Files of every part, by its name."""
         held_out = {} if self.validation is None else {"validation": self.validation}
         return {"train": self.train, **held_out, **(self.tests or {})}
 
 
 class StatusResult(Content):
-    """How training ended."""
+    """The status: how training ended."""
 
     code: str
     message: str
@@ -107,12 +118,14 @@ class RestartResult(Content):
 class ParameterResult(Content):
     """A parameter with its interval."""
 
-    absent: ClassVar = frozenset({"derived_unit", "one_step", "profile95", "plain_std", "shared", "ci95_counts"})
+    absent: ClassVar = frozenset(
+        {"derived_unit", "one_step", "profile95", "plain_std", "shared", "ci95_counts"}
+    )
 
     name: str
     unit: str
     derived_unit: str | None = None
-    """What the channels' units ask for, where the spec gives none."""
+    """The unit implied by those of the channels, where the spec gives none."""
     initial: Number
     value: Number
     one_step: Number = None
@@ -120,7 +133,7 @@ class ParameterResult(Content):
     plain_std: Number = None
     ci95: Numbers | None = None
     ci95_counts: Literal["noise only"] | None = None
-    """What the interval counts, where the model leaves more than noise."""
+    """What the interval counts, where the residual shows more than noise."""
     profile95: Numbers | None = None
     shared: Flag | None = None
     bias: BiasResult | None = None
@@ -128,11 +141,11 @@ class ParameterResult(Content):
 
     @property
     def shown_unit(self) -> str:
-        """The unit of the spec, or in brackets the one that follows from those of the channels."""
+        """Unit of the spec, or in brackets the one that follows from those of the channels."""
         return self.unit or (f"({self.derived_unit})" if self.derived_unit else "–")
 
-    def told(self, shared: bool | None, bias: ParameterBias | None) -> ParameterResult:
-        """The same with whether the learner could imitate it, and its bias."""
+    def with_bias(self, shared: bool | None, bias: ParameterBias | None) -> ParameterResult:
+        """Return the parameter with its bias, and with whether the learner could imitate it."""
         found: dict[str, object] = {"shared": shared}
         if bias is not None:
             interval = None if bias.ci95 is None else list(bias.ci95)
@@ -141,7 +154,7 @@ class ParameterResult(Content):
 
 
 class ConsistencyResult(Content):
-    """Whether θ̂ obeys what the physics fixes among θ."""
+    """Test of whether θ̂ obeys the relations that the physics fixes among θ."""
 
     chi2: Number
     df: Whole
@@ -160,20 +173,20 @@ class MeasureResult(Content):
 
     @classmethod
     def of_motion(cls, split: MotionSplit) -> MeasureResult:
-        """Of a motion, which has neither a condition of Φ nor a price."""
+        """Return the measure of a motion, which has neither a condition of Φ nor a price."""
         own = {"name": split.name, "points": len(split.field.x), "support": split.support}
         return cls.model_validate({**own, "condition": None, "price": None})
 
 
 class OutputWeightsResult(Content):
-    """How the outputs are weighed against each other: errors e count as ‖matrix · e‖²."""
+    """Weights of the outputs against each other: errors e count as ‖matrix · e‖²."""
 
     kind: str
     matrix: list[Numbers]
 
 
 class ExcitationResult(Content):
-    """How well the data tell the parameters apart."""
+    """Excitation: how well the data identify the parameters."""
 
     rank: Whole
     columns: Whole
@@ -181,13 +194,13 @@ class ExcitationResult(Content):
 
 
 class GroupedExcitation(ExcitationResult):
-    """The same, with the groups that the data do not tell apart."""
+    """Excitation, with the groups of parameters that the data do not separate."""
 
     collinear: list[list[str]]
 
 
 class IdentifiabilityResult(Content):
-    """Whether any data could tell the parameters apart."""
+    """Identifiability: whether any data could separate the parameters."""
 
     identifiable: Flag = Field(validation_alias="full_rank")
     rank: Whole
@@ -196,7 +209,7 @@ class IdentifiabilityResult(Content):
 
 
 def _where_any(values: Any) -> Any:
-    """None instead of a list where no output has a score."""
+    """Return None instead of a list where no output has a score."""
     return None if isinstance(values, np.ndarray) and np.isnan(values).all() else values
 
 
@@ -221,7 +234,7 @@ class PartScores(Content):
 
     @property
     def kinds(self) -> dict[str, ScoreResult]:
-        """By horizon: one step ahead, and the free run."""
+        """Scores by horizon: one step ahead, and the free run."""
         return {"prediction": self.prediction, "simulation": self.simulation}
 
 
@@ -245,7 +258,10 @@ class EquationResult(Content):
 
 
 class FocusCandidateResult(Content):
-    """A model whose free run was compared where nothing was fitted; `error` in standard deviations of the output."""
+    """A model whose free run was compared on validation data.
+
+    `error` in standard deviations of the output.
+    """
 
     focus: str
     learner: Flag
@@ -253,7 +269,7 @@ class FocusCandidateResult(Content):
 
 
 class FocusResult(Content):
-    """Whether the fit was trained one step ahead or on the free run, where that was left to the data, and why."""
+    """The criterion that the data chose, one step ahead or free run, and the reason."""
 
     chosen: str
     text: str
@@ -261,15 +277,17 @@ class FocusResult(Content):
 
 
 class PhysicsAloneResult(Content):
-    """The physics without a learner that stands beside the model."""
+    """The physics without a learner beside the model."""
 
     scores: dict[str, PartScores]
 
 
-class FitResult(Headed):
-    """What `orthaug fit` leaves."""
+class FitResult(ResultHeader):
+    """The result of `orthaug fit`."""
 
-    absent: ClassVar = frozenset({"motion", "terms", "equation", "unexplained", "standard_errors_by"})
+    absent: ClassVar = frozenset(
+        {"motion", "terms", "equation", "unexplained", "standard_errors_by", "intervals"}
+    )
 
     spec: dict[str, Any]
     data: DataResult
@@ -278,7 +296,8 @@ class FitResult(Headed):
     parameters: list[ParameterResult]
     standard_errors: str | None
     standard_errors_by: str | None = None
-    """How they were made, a key of `fitting.estimates.STD_KINDS`; None for those of white and even errors."""
+    """Kind of the standard errors, a key of `fitting.estimates.STD_KINDS`; None for white noise.
+    """
     physical_parameters: list[ParameterResult] | None
     physical_consistency: ConsistencyResult | None
     sensitivities: dict[str, ByName] | None
@@ -301,23 +320,28 @@ class FitResult(Headed):
     motion: MotionFitResult | None = None
     terms: list[TermResult] | None = None
     equation: EquationResult | None = None
+    intervals: IntervalsResult | None = None
+    """Where those of chosen terms come from; None where the spec says no rows that chose."""
     advice: list[AdviceResult] = []
     advice_trials: AdviceTrialsResult | None = None
     warnings: list[WarningResult]
 
     @property
     def noise_only(self) -> bool:
-        """Whether the intervals count noise only: the model leaves more than that."""
+        """Whether the intervals count noise only, although the residual shows more than that."""
         return any(row.ci95_counts for row in (*self.parameters, *(self.physical_parameters or ())))
 
     @property
     def learns(self) -> bool:
-        """Whether biases are of what a learner found; of a motion without one they are of what the free run leaves."""
+        """Whether the biases are due to a learned part.
+
+        Without one, those of a motion are due to the residual of the free run.
+        """
         return self.motion is None or self.shared is not None
 
 
-class CheckResult(Headed):
-    """What `orthaug check` tells."""
+class CheckResult(ResultHeader):
+    """The result of `orthaug check`."""
 
     absent: ClassVar = frozenset({"motion"})
 
@@ -334,7 +358,7 @@ class CheckResult(Headed):
 
 
 class RowResult(Content):
-    """One way of modelling in a comparison."""
+    """One model in a comparison."""
 
     name: str
     status: str
@@ -349,8 +373,8 @@ class RowResult(Content):
     validation: ValidationResult | None
 
 
-class CompareResult(Headed):
-    """What `orthaug compare` leaves."""
+class CompareResult(ResultHeader):
+    """The result of `orthaug compare`."""
 
     spec: dict[str, Any]
     data: DataResult
@@ -360,8 +384,8 @@ class CompareResult(Headed):
     warnings: list[WarningResult]
 
 
-class SplitResult(Headed):
-    """What `orthaug split` tells."""
+class SplitResult(ResultHeader):
+    """The result of `orthaug split`."""
 
     parameters: list[ParameterResult]
     theta_aux: Numbers
@@ -382,7 +406,7 @@ class CandidateResult(Content):
 
 
 class DesignResult(Content):
-    """What `orthaug design` tells."""
+    """The result of `orthaug design`."""
 
     kind: str
     relative_error: Number
@@ -395,8 +419,11 @@ class DesignResult(Content):
 
     @classmethod
     def of(cls, design: Design) -> DesignResult:
-        """The content of a design, without its signal."""
-        by_name = {key: dict(zip(design.names, getattr(design, key), strict=True)) for key in ("bias", "std")}
+        """Return the content of a design, without its signal."""
+        by_name = {
+            key: dict(zip(design.names, getattr(design, key), strict=True))
+            for key in ("bias", "std")
+        }
         return cls.model_validate({**vars(design), **by_name, "samples": len(design.signal)})
 
 
@@ -408,7 +435,7 @@ def parameter_rows(
     one_step: Any = None,
     plain_std: Any = None,
 ) -> list[ParameterResult]:
-    """θ as results list it; what stands at a bound has no interval."""
+    """Return θ as results list it; a parameter at a bound has no interval."""
     return [
         ParameterResult.model_validate(
             {
@@ -429,8 +456,18 @@ def parameter_rows(
 def physical_rows(
     estimate: PhysicalEstimate, profiles: dict[str, tuple[float, float]] | None = None
 ) -> list[ParameterResult]:
-    """The physical parameters as results list them, with the profile intervals that were made."""
-    columns = (estimate.names, estimate.units, estimate.initial, estimate.value, estimate.std, estimate.ci95)
+    """Return the physical parameters as results list them, with their profile intervals."""
+    columns = (
+        estimate.names,
+        estimate.units,
+        estimate.initial,
+        estimate.value,
+        estimate.std,
+        estimate.ci95,
+    )
     keys = ("name", "unit", "initial", "value", "std", "ci95")
     rows = [dict(zip(keys, row, strict=True)) for row in zip(*columns, strict=True)]
-    return [ParameterResult.model_validate(row | {"profile95": (profiles or {}).get(row["name"])}) for row in rows]
+    return [
+        ParameterResult.model_validate(row | {"profile95": (profiles or {}).get(row["name"])})
+        for row in rows
+    ]

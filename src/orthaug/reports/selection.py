@@ -1,14 +1,20 @@
-"""What `orthaug select` leaves: as JSON, and in words."""
+"""Result of `orthaug select`: as JSON, and in words."""
 
 from __future__ import annotations
 
 from typing import Any
 
 from orthaug._base.lines import fold
-from orthaug.reports.fields import Content, Flag, Number, WarningResult, Whole
-from orthaug.reports.result import DataResult, Headed
+from orthaug.reports.fields import Content, Flag, IntervalsResult, Number, WarningResult, Whole
+from orthaug.reports.result import DataResult, ResultHeader
 
 _SHOWN = 12  # models of a stage in the text
+_EXPLAINED = (
+    "chosen: share of random halves that choose the term; left: of its norm, beside physics "
+    "and other terms; rate: the least rate of false discoveries at which it stays.",
+    "p, q: of the term on rows that had no say in the choice, and the rate of false "
+    "discoveries among the chosen ones.",
+)
 
 
 class OrdersResult(Content):
@@ -20,7 +26,7 @@ class OrdersResult(Content):
 
 
 class DelayResult(Content):
-    """The delay of an input in samples: by its cross-correlation with the output, by the fit, by that of its square."""
+    """The delay of an input in samples, by three estimates."""
 
     input: str
     correlation: int | None
@@ -29,7 +35,7 @@ class DelayResult(Content):
 
 
 class NonlinearityResult(Content):
-    """Whether anything nonlinear is missing beside physics and linear lags."""
+    """Test of whether physics and linear lags lack something nonlinear."""
 
     p: Number
     regressors: dict[str, Number]
@@ -38,15 +44,25 @@ class NonlinearityResult(Content):
 
 
 class TermShareResult(Content):
-    """A chosen term, how often it is chosen over random halves of the data, and what the other columns leave of it."""
+    """A chosen term: its stability, its uniqueness and its significance.
+
+    `rate` is the least rate of false discoveries at which the choice keeps it, on the rows that
+    chose; `p` and `q` are those of the rows that had no say. `rivals` are candidates that it may
+    replace. `chosen` is the share of random halves that choose it, `left` the share of it that the
+    other columns leave.
+    """
 
     term: str
     chosen: Number
     left: Number = None
+    rate: Number = None
+    p: Number = None
+    q: Number = None
+    rivals: list[str] = []
 
 
 class ShiftResult(Content):
-    """A parameter of physics alone and with the chosen terms, and what these leave of its regressor."""
+    """A parameter without and with the chosen terms, and the share of its regressor left."""
 
     parameter: str
     unit: str | None
@@ -58,7 +74,7 @@ class ShiftResult(Content):
     moved: Flag
 
 
-class JudgedResult(Content):
+class SelectionRowResult(Content):
     """A model that was judged: a row of the table."""
 
     stage: str
@@ -71,8 +87,8 @@ class JudgedResult(Content):
     seconds: Number
 
 
-class SelectResult(Headed):
-    """What `orthaug select` leaves."""
+class SelectResult(ResultHeader):
+    """The result of `orthaug select`."""
 
     data: DataResult
     orders: OrdersResult
@@ -81,30 +97,42 @@ class SelectResult(Headed):
     learner: dict[str, Any] | None
     focus: str
     terms: list[TermShareResult] | None
+    intervals: IntervalsResult
+    level: Number
     physics: list[ShiftResult] | None = None
     condition: Number = None
-    models: list[JudgedResult]
+    models: list[SelectionRowResult]
     seconds: Number
     stopped: Flag
     warnings: list[WarningResult]
 
 
 def selection_text(result: SelectResult) -> str:
-    """A page: what was chosen, why, and the models beside it."""
+    """Return a page of text: what was chosen, why, and the models beside it."""
     from orthaug.selection.orders import Delay, Orders
 
     orders = Orders(result.orders.na, tuple(result.orders.nb), tuple(result.orders.nk))
     lines = [f"orders       {orders}"]
     lines += [
-        f"delay        {Delay(delay.input, delay.correlation, delay.fitted, delay.square)}" for delay in result.delays
+        f"delay        {Delay(delay.input, delay.correlation, delay.fitted, delay.square)}"
+        for delay in result.delays
     ]
     if result.nonlinearity is not None:
         lines.append(f"nonlinear    {result.nonlinearity.text}")
     lines.append(f"learner      {_learner(result)}")
+    lines.append(f"intervals    {result.intervals.source}: {result.intervals.text}")
     if result.terms:
         width = max(len(term.term) for term in result.terms)
-        lines += ["", f"{'term':<{width}}  chosen over random halves of the data, left beside physics and other terms"]
-        lines += [f"{t.term:<{width}}  {_percent(t.chosen):>5}  {_percent(t.left):>6}" for t in result.terms]
+        lines += [
+            "",
+            f"{'term':<{width}}  {'chosen':>6}  {'left':>6}  {'rate':>8}  {'p':>8}  {'q':>8}",
+        ]
+        lines += [
+            f"{t.term:<{width}}  {_percent(t.chosen):>6}  {_percent(t.left):>6}  "
+            f"{_small(t.rate)}  {_small(t.p)}  {_small(t.q)}"
+            for t in result.terms
+        ]
+        lines += ["", *_EXPLAINED]
         lines += _physics(result)
     for stage in dict.fromkeys(row.stage for row in result.models):
         lines += ["", *_table(stage, [row for row in result.models if row.stage == stage])]
@@ -113,8 +141,14 @@ def selection_text(result: SelectResult) -> str:
     return "\n".join(fold(lines))
 
 
+def _small(p: float | None) -> str:
+    return f"{'–' if p is None else f'{p:.2g}':>8}"
+
+
 def _percent(share: float | None) -> str:
-    return "–" if share is None else f"{100 * share:.2g} %"
+    return (
+        "–" if share is None else f"{100 * share:.0f} %" if share > 0.1 else f"{100 * share:.2g} %"
+    )
 
 
 def _physics(result: SelectResult) -> list[str]:
@@ -122,11 +156,20 @@ def _physics(result: SelectResult) -> list[str]:
     if not result.physics:
         return []
     width = max(9, *(len(shift.parameter) for shift in result.physics))
-    lines = ["", f"{'parameter':<{width}}  {'physics alone':>22}  {'with the terms':>22}  {'left':>6}"]
+    lines = [
+        "",
+        f"{'parameter':<{width}}  {'physics alone':>22}  {'with the terms':>22}  {'left':>6}",
+    ]
     for shift in result.physics:
-        before, after = _figure(shift.before, shift.before_std), _figure(shift.after, shift.after_std)
+        before, after = (
+            _figure(shift.before, shift.before_std),
+            _figure(shift.after, shift.after_std),
+        )
         mark = "  moves by more than its standard errors allow" if shift.moved else ""
-        lines.append(f"{shift.parameter:<{width}}  {before:>22}  {after:>22}  {_percent(shift.left):>6}{mark}")
+        lines.append(
+            f"{shift.parameter:<{width}}  {before:>22}  {after:>22}  "
+            f"{_percent(shift.left):>6}{mark}"
+        )
     condition = "infinite" if result.condition is None else f"{result.condition:.3g}"
     return [*lines, f"condition number of physics and terms together: {condition}"]
 
@@ -139,14 +182,14 @@ def _figure(value: float | None, std: float | None) -> str:
 def _learner(result: SelectResult) -> str:
     learner = result.learner
     if learner is None:
-        return "none: on the blocks that were held out nothing beside the physics lowers the error"
+        return "none: nothing beside the physics lowers the error on the held-out blocks"
     if learner["kind"] == "terms":
         return f"{len(learner['terms'])} terms"
     seen = ", ".join(learner.get("inputs") or ["all lags"])
     return f"{learner['hidden'][0]} neurons of {seen}"
 
 
-def _table(stage: str, rows: list[JudgedResult]) -> list[str]:
+def _table(stage: str, rows: list[SelectionRowResult]) -> list[str]:
     chosen = next((i for i, row in enumerate(rows) if row.chosen), 0)
     first = max(0, min(chosen - _SHOWN // 2, len(rows) - _SHOWN))
     shown = rows[first : first + _SHOWN]
@@ -157,5 +200,8 @@ def _table(stage: str, rows: list[JudgedResult]) -> list[str]:
         score = "runs away" if row.score is None else f"{row.score:.5g}"
         error = "–" if row.standard_error is None else f"{row.standard_error:.2g}"
         mark = "→" if row.chosen else " "
-        lines.append(f"{mark:<8} {row.size:5d}  {score:>11}  {error:>10}  {row.seconds or 0:6.1f}   {row.model}")
+        lines.append(
+            f"{mark:<8} {row.size:5d}  {score:>11}  {error:>10}  {row.seconds or 0:6.1f}   "
+            f"{row.model}"
+        )
     return lines

@@ -35,11 +35,13 @@ ADVISED = 2  # changes that a text advises at most; result.json has all
 
 
 def fit_text(fit: Estimate | MotionEstimate, result: FitResult) -> str:
-    """Parameters, scores on every part, what the residual says, whether the learner earns its place, warnings."""
+    """Return parameters, scores on every part, residual tests, the verdict and warnings."""
     if not fit.status.ok:
         return ""
-    lines = [_as_doubted(line, result) for line in fit.lines()]
+    lines = [_mark_noise_only(line, result) for line in fit.lines()]
     blocks = [[w.text.capitalize() for w in result.warnings if w.code == "one_step_only"], lines]
+    if result.intervals is not None and result.intervals.source != "none":  # else a warning says it
+        blocks.append([f"{result.intervals.text[0].upper()}{result.intervals.text[1:]}"])
     if result.focus is not None and result.focus.candidates:
         blocks.append([f"{result.focus.text[0].upper()}{result.focus.text[1:]}"])
     if result.physical_parameters:
@@ -50,29 +52,41 @@ def fit_text(fit: Estimate | MotionEstimate, result: FitResult) -> str:
     blocks.append(_bias_lines(result))
     findings = [result.residuals, result.missing_lags, result.validation]
     findings += [result.stability] if result.motion is not None else []
-    told = [finding.text for finding in findings if finding]
-    blocks += [told, warning_lines(w for w in dict.fromkeys(result.warnings) if w.text not in told)]
+    parts = [finding.text for finding in findings if finding]
+    blocks += [
+        parts,
+        warning_lines(w for w in dict.fromkeys(result.warnings) if w.text not in parts),
+    ]
     blocks.append(_advice_lines(result))
     return "\n\n".join("\n".join(fold(lines)) for lines in blocks if lines)
 
 
-def _as_doubted(line: str, result: FitResult) -> str:
-    """Return a line of a fit with intervals that say that they count noise only, and without withdrawn claims."""
+def _mark_noise_only(line: str, result: FitResult) -> str:
+    """Return a line of a fit whose intervals count noise only, without withdrawn claims.
+
+    The line says so.
+    """
     if result.noise_only:
         line = line.replace(f"{'95 % interval':^29}", f"{'95 %, noise only':^29}")
     if result.shared is not None and result.shared.doubt and line.startswith("shared "):
-        line = f"{line.partition('; told by the fit: ')[0]}; told by the fit: none, see below"
+        line = (
+            f"{line.partition('; determined by the fit: ')[0]}; determined by the fit: none, "
+            "see below"
+        )
     return line
 
 
 def _advice_lines(result: FitResult) -> list[str]:
-    """Changes of the spec that bettered the free run in a trial, and an account of all trials."""
-    lines = [f"{'Next: ' if i == 0 else 'Or: '}{advice.text}" for i, advice in enumerate(result.advice[:ADVISED])]
+    """Return the changes that lowered the free run's error, and a count of all trials."""
+    lines = [
+        f"{'Next: ' if i == 0 else 'Or: '}{advice.text}"
+        for i, advice in enumerate(result.advice[:ADVISED])
+    ]
     return lines + ([result.advice_trials.text] if result.advice_trials is not None else [])
 
 
 def check_text(result: CheckResult) -> str:
-    """Excitation, identifiability, and what would bias the parameters."""
+    """Return excitation, identifiability, and possible biases of the parameters."""
     data, physics = result.excitation, result.identifiability
     condition = f"{data.condition:.4g}" if data.condition is not None else "infinite"
     moves = result.motion is not None
@@ -84,7 +98,11 @@ def check_text(result: CheckResult) -> str:
         f"usable rows      {result.rows}",
         f"excitation       rank {data.rank} of {data.columns} on the data, condition {condition}",
         f"identifiability  rank {physics.rank} of {physics.columns} {where}: "
-        + ("the parameters can be told apart" if physics.identifiable else "no data can tell the parameters apart"),
+        + (
+            "the parameters can be distinguished"
+            if physics.identifiable
+            else "no data can distinguish the parameters"
+        ),
     ]
     for group in physics.inseparable:
         lines.append(f"  inseparable by any data: {', '.join(group)}")
@@ -98,21 +116,26 @@ def check_text(result: CheckResult) -> str:
     if result.bias:
         lines += [
             "",
-            "Bias of each parameter if a term is missing from the physics. Size: its share of the output's deviation, "
-            "1 % where no coefficient is given. Removed by: a measure, if some weighting of these points leaves none; "
-            "the learner, if it sees the term, from what it could not imitate.",
+            "Bias of each parameter if a term is missing from the physics. Size: its share of "
+            "the output's deviation, 1 % where no coefficient is given. Removed by: a measure, "
+            "if some weighting of these points leaves none; the learner, if it sees the term, "
+            "from what it could not imitate.",
             *_suspect_lines(result.bias),
         ]
     return "\n".join(fold([*lines, *warning_lines(result.warnings)]))
 
 
 def _shared_lines(shared: SharedResult) -> list[str]:
-    """What the learner could imitate, and a table of what other inputs would make of it."""
+    """Return the physics that the learner could imitate, and a table of other learner inputs."""
     lines = [shared.text]
     if shared.alternatives:
         head = ["with learner.inputs", "shared directions", "determined beside it"]
         rows = [
-            [", ".join(other.inputs), str(other.shared), ", ".join([*other.determined, *(other.physical or [])]) or "–"]
+            [
+                ", ".join(other.inputs),
+                str(other.shared),
+                ", ".join([*other.determined, *(other.physical or [])]) or "–",
+            ]
             for other in shared.alternatives
         ]
         lines += [f"  {line}" for line in table([head, *rows])]
@@ -120,36 +143,46 @@ def _shared_lines(shared: SharedResult) -> list[str]:
 
 
 def compare_text(result: CompareResult, verdicts: Mapping[str, Verdict]) -> str:
-    """Two tables, parameters with standard errors and scores on every part; then the verdicts on each row."""
+    """Return two tables, parameters with standard errors and scores on every part.
+
+    The verdicts on each row follow.
+    """
     lines = [*table(_parameter_cells(result)), "", *table(_score_cells(result.comparison))]
     if result.chosen:
         lines += ["", "* chosen on the validation part"]
-    told = [f"{row.name}: {row.residuals.text}" for row in result.comparison if row.residuals is not None]
-    lines += ["", *told] if told else []
-    told = [f"{kind}: {verdict.summary}" for kind, verdict in verdicts.items()]
+    parts = [
+        f"{row.name}: {row.residuals.text}"
+        for row in result.comparison
+        if row.residuals is not None
+    ]
+    lines += ["", *parts] if parts else []
+    parts = [f"{kind}: {verdict.summary}" for kind, verdict in verdicts.items()]
     beyond = dict.fromkeys(f"{e}." for verdict in verdicts.values() for e in verdict.extrapolation)
-    lines += ["", *told, *beyond] if told else []
+    lines += ["", *parts, *beyond] if parts else []
     lines.append("")
     lines += [f"left out: {kind}: {why}" for kind, why in result.left_out.items()]
     lines += warning_lines(result.warnings)
     for row in result.comparison:
-        lines += [f"warning: {row.name}: {w.text}" for w in row.warnings if w not in result.warnings]
+        lines += [
+            f"warning: {row.name}: {w.text}" for w in row.warnings if w not in result.warnings
+        ]
     return "\n".join(fold(lines)).rstrip()
 
 
 def split_text(result: SplitResult) -> str:
-    """θ under the measure, with intervals."""
+    """Return θ under the measure, with intervals."""
     detail = result.measure_detail
     support = "–" if detail.support is None else f"{100 * detail.support:.0f} %"
     lines = [
-        f"measure     {result.measure}, {detail.points} points, {support} of it within reach of the data",
+        f"measure     {result.measure}, {detail.points} points, {support} of it within the "
+        "range of the data",
         *parameter_table("parameter", result.parameters),
     ]
     return "\n".join(fold([*lines, *warning_lines(result.warnings)]))
 
 
 def parameter_table(name: str, rows: Sequence[ParameterResult]) -> list[str]:
-    """Parameters with standard errors and intervals, under a head that begins with `name`."""
+    """Return parameters with standard errors and intervals; the head begins with `name`."""
     width = _width(rows)
     return [
         f"{name:<{width}}  {'value':>14}  {'std':>11}  {'95 % interval':^29}  unit",
@@ -158,11 +191,13 @@ def parameter_table(name: str, rows: Sequence[ParameterResult]) -> list[str]:
 
 
 def design_text(result: DesignResult) -> str:
-    """The design and what else was tried."""
+    """Return the design, and the signals that were tried beside it."""
     rows = [["signal", "error", "bias", "std", "condition"]]
     for signal in result.candidates[:SHOWN]:
         error = None if signal.cost is None else float(np.sqrt(signal.cost))
-        rows.append([signal.name, *map(_or_infinite, (error, signal.bias, signal.std, signal.condition))])
+        rows.append(
+            [signal.name, *map(_or_infinite, (error, signal.bias, signal.std, signal.condition))]
+        )
     lines = [
         f"input       {result.kind}",
         f"predicted   relative error of θ {_or_infinite(result.relative_error)}, "
@@ -185,35 +220,52 @@ def _or_infinite(value: float | None, digits: int = 4) -> str:
 
 
 def warning_lines(warnings: Iterable[WarningResult]) -> list[str]:
-    """A line for each warning."""
+    """Return a line for each warning."""
     return [f"warning: {warning.text}" for warning in warnings]
 
 
 def _suspect_lines(suspects: Sequence[SuspectResult]) -> list[str]:
-    """What each suspect does, biases in per cent."""
+    """Return the effect of each suspect, with biases in per cent."""
     rows = [["suspect", "size", *suspects[0].percent, "cosine", "removed by"]]
     for suspect in suspects:
         guess = suspect.coefficient
         cosine = "–" if suspect.cosine is None else f"{suspect.cosine:.3f}"
-        size = "1 %" if guess is None else "–" if suspect.size is None else percent(abs(guess) * suspect.size)
+        size = (
+            "1 %"
+            if guess is None
+            else "–"
+            if suspect.size is None
+            else percent(abs(guess) * suspect.size)
+        )
         biases = (
-            "–" if share is None else percent(_rounded(share) / 100, sign="+") for share in suspect.percent.values()
+            "–" if share is None else percent(_rounded(share) / 100, sign="+")
+            for share in suspect.percent.values()
         )
         rows.append([suspect.name, size, *biases, cosine, suspect.removed_by or "–"])
     return table(rows)
 
 
 def _bias_lines(result: FitResult) -> list[str]:
-    """The bias of every parameter by what the learner found, and the interval that covers it."""
+    """Return the bias of every parameter by the learned part, and the interval that covers it."""
     rows = [*result.parameters, *(result.physical_parameters or ())]
     lines, width, causes = [], _width([row for row in rows if row.bias]), biased_by(rows)
-    what = ("learner found" if result.learns else "free run leaves") + (" in one equation" if len(causes) > 1 else "")
+    what = ("learner found" if result.learns else "free run leaves") + (
+        " in one equation" if len(causes) > 1 else ""
+    )
     for (cause, share), own in causes.items():
         if result.learns and share < SURE_SHARE:
-            lines.append(f"What the {what} looks most like {cause}: {percent(share)} of it. The bias if it is that:")
+            lines.append(
+                f"What the {what} looks most like {cause}: {percent(share)} of it. The bias in "
+                "that case:"
+            )
         else:
-            lines.append(f"{100 * share:.0f} % of what the {what} is {cause}. The bias that implies:")
-        head = f"{'parameter':<{width}}  {'bias':>11}  {'of std':>7}  {'of value':>9}  {'95 % interval with it':^29}"
+            lines.append(
+                f"{100 * share:.0f} % of what the {what} is {cause}. The bias that implies:"
+            )
+        head = (
+            f"{'parameter':<{width}}  {'bias':>11}  {'of std':>7}  {'of value':>9}  "
+            f"{'95 % interval with it':^29}"
+        )
         lines += [head, *(_bias_line(row, width) for row in own if row.value is not None)]
     return lines
 
@@ -229,7 +281,7 @@ def _bias_line(row: ParameterResult, width: int) -> str:
 
 
 def _rounded(share: float) -> float:
-    """Zero for what is rounding of zero."""
+    """Return a number, zero where it is only the rounding error of zero."""
     return 0.0 if abs(share) < 1e-9 else share
 
 
@@ -237,7 +289,9 @@ def _physical_lines(result: FitResult) -> list[str]:
     rows = result.physical_parameters or []
     width = _width(rows)
     between = "95 %, noise only" if result.noise_only else "95 % interval"
-    lines = [f"{'physical':<{width}}  {'value':>14}  {'std':>11}  {between:^29}  {'initial':>11}  unit"]
+    lines = [
+        f"{'physical':<{width}}  {'value':>14}  {'std':>11}  {between:^29}  {'initial':>11}  unit"
+    ]
     for row in rows:
         cells = _value_cells(row, row.profile95 or row.ci95, width)
         lines.append(f"{cells}  {row.initial:11.5g}  {row.unit}".rstrip())
@@ -251,9 +305,11 @@ def _width(rows: Sequence[ParameterResult]) -> int:
 
 
 def _value_cells(row: ParameterResult, interval: Sequence[float | None] | None, width: int) -> str:
-    """Name, value, standard error and interval."""
+    """Return name, value, standard error and interval."""
     spread = f"{row.std:11.4g}" if row.std is not None else f"{'–':>11}"
-    reach = f"[{_limit(interval[0])}, {_limit(interval[1])}]" if interval is not None else f"{'–':^29}"
+    reach = (
+        f"[{_limit(interval[0])}, {_limit(interval[1])}]" if interval is not None else f"{'–':^29}"
+    )
     return f"{row.name:<{width}}  {row.value:14.8g}  {spread}  {reach}"
 
 
@@ -262,19 +318,24 @@ def _limit(value: float | None) -> str:
 
 
 def _score_lines(fit: Estimate | MotionEstimate, result: FitResult) -> list[str]:
-    """The scores as a table, one line per part, kind and output."""
+    """Return the scores as a table, one line per part, kind and output."""
     rows = [["part", "horizon", "output", "RMSE", "NRMSE", "FIT %"]]
     for part, scores in result.scores.items():
         for kind, score in scores.kinds.items():
             for i, channel in enumerate(fit.model.outputs):
-                cells = (None if values is None else values[i] for values in (score.rmse, score.nrmse, score.fit))
+                cells = (
+                    None if values is None else values[i]
+                    for values in (score.rmse, score.nrmse, score.fit)
+                )
                 rmse, nrmse, percent = ("–" if c is None else f"{c:.6g}" for c in cells)
-                rows.append([part, kind, channel.name, f"{rmse} {channel.unit}".strip(), nrmse, percent])
+                rows.append(
+                    [part, kind, channel.name, f"{rmse} {channel.unit}".strip(), nrmse, percent]
+                )
     return [*table(rows), *_residual_lines(result)] if len(rows) > 1 else []
 
 
 def _residual_lines(result: FitResult) -> list[str]:
-    """How much the one-step residual follows its own past and the inputs, where all rows were looked at."""
+    """Return the correlations of the one-step residual, where all rows were looked at."""
     lines = []
     for part, scores in result.scores.items():
         for test in scores.residual or ():
@@ -284,20 +345,26 @@ def _residual_lines(result: FitResult) -> list[str]:
             found = ((name, cross) for name, cross in test.cross.items() if cross is not None)
             largest += [(f"{name} by {cross.values[len(acf) - 1 + cross.lag]:.2g} at lag {cross.lag}", cross.band)
                         for name, cross in found]  # fmt: skip
-            told = ", ".join(f"{words} (band {band:.1g})" for words, band in largest)
-            lines.append(f"{part}: over all {test.n} rows the one-step residual of {test.name} follows {told}.")
+            parts = ", ".join(f"{words} (band {band:.1g})" for words, band in largest)
+            lines.append(
+                f"{part}: over all {test.n} rows the one-step residual of {test.name} follows "
+                f"{parts}."
+            )
     return lines
 
 
 def response_text(response: Response) -> str:
-    """Scores of a response where its outputs were measured and it has a value on every row; otherwise nothing."""
+    """Return the scores of a response where its outputs were measured and every row has a value.
+
+    Otherwise empty.
+    """
     if any(t.measured is None or t.diverged for t in response.trajectories):
         return ""
     return scores_text(response.scores(), response.outputs, response.horizon)
 
 
 def scores_text(scored: Scores, outputs: Sequence[Channel], horizon: int | None) -> str:
-    """Scores of each output; `horizon` in steps, None for a free run."""
+    """Return the scores of each output; `horizon` in steps, None for a free run."""
     kind = "free run" if horizon is None else f"{horizon} step{'s' * (horizon > 1)} ahead"
     rows = [[f"{kind}, {scored.samples} rows", "RMSE", "NRMSE", "FIT %"]]
     for channel, *numbers in zip(outputs, scored.rmse, scored.nrmse, scored.fit, strict=True):
@@ -307,7 +374,9 @@ def scores_text(scored: Scores, outputs: Sequence[Channel], horizon: int | None)
 
 
 def _parameter_cells(result: CompareResult) -> list[list[str]]:
-    names = list(dict.fromkeys(parameter.name for row in result.comparison for parameter in row.parameters))
+    names = list(
+        dict.fromkeys(parameter.name for row in result.comparison for parameter in row.parameters)
+    )
     rows = [["structure", *names, "‖QᵀF̃‖/‖F‖", "‖F̃‖/‖Φθ̂‖", "weights", "time [s]"]]
     for row in result.comparison:
         defect, share = row.orthogonality_defect, row.learner_to_physics

@@ -1,22 +1,22 @@
-"""What `orthaug track` tells, and its text."""
+"""Result of `orthaug track`, and its text."""
 
 from __future__ import annotations
 
 from orthaug._base.lines import fold
 from orthaug.reports.fields import Content, Flag, Number, WarningResult, Whole
-from orthaug.reports.result import FileResult, Headed, ParameterResult
+from orthaug.reports.result import FileResult, ParameterResult, ResultHeader
 from orthaug.reports.text import parameter_table, warning_lines
 
 
 class AlarmResult(Content):
-    """The residual left its band."""
+    """An alarm: the residual left its band."""
 
     row: Whole
     time: Number
 
 
-class TrackResult(Headed):
-    """What `orthaug track` tells."""
+class TrackResult(ResultHeader):
+    """The result of `orthaug track`."""
 
     files: list[FileResult]
     model: str
@@ -35,17 +35,21 @@ class TrackResult(Headed):
 
 
 def track_text(result: TrackResult) -> str:
-    """Rows, memory, alarms, and the parameters at the end."""
+    """Return rows, memory, alarms, and the parameters at the end."""
     memory = "everything" if result.memory is None else f"{result.memory:.4g} s"
     lines = [
         f"rows        {result.rows}, {result.time:g} s",
-        f"memory      {memory} (forgetting {result.forgetting:.8g}), worth {result.effective_rows:.0f} rows",
+        f"memory      {memory} (forgetting {result.forgetting:.8g}), worth "
+        f"{result.effective_rows:.0f} rows",
     ]
-    told = [f"the residual has left its band at {alarm.time:g} s (row {alarm.row})" for alarm in result.alarms]
-    lines += [f"alarm       {sentence}" for sentence in told] or ["alarm       none"]
-    if told:
-        stands = "is still out of it" if result.alarmed else "has come back"
-        lines.append(f"            it {stands}, at {result.alarm_level:.2g} of its limit")
+    alarms = [
+        f"the residual has left its band at {alarm.time:g} s (row {alarm.row})"
+        for alarm in result.alarms
+    ]
+    lines += [f"alarm       {sentence}" for sentence in alarms] or ["alarm       none"]
+    if alarms:
+        state = "is still out of it" if result.alarmed else "has come back"
+        lines.append(f"            it {state}, at {result.alarm_level:.2g} of its limit")
     blocks = [lines, parameter_table("parameter", result.parameters)]
     if result.physical_parameters:
         blocks.append(parameter_table("physical", result.physical_parameters))

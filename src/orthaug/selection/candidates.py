@@ -1,4 +1,4 @@
-"""Which terms of a library can be chosen at all on these data, and of very many those that are worth a closer look."""
+"""Terms of a library that can be chosen on given data, shortlisted where there are very many."""
 
 from __future__ import annotations
 
@@ -27,63 +27,78 @@ _NAMED = 6
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """Terms that can be chosen, and what is told of the others."""
+    """Terms that can be chosen, and warnings on the others."""
 
     library: TermLibrary
     notes: tuple[Warning, ...]
+    considered: int
+    """Number of terms that could have been chosen, those that promise little included."""
 
 
 def candidates(problem: Problem, library: TermLibrary) -> Candidates:
-    """The terms that the physics does not express already, of more than `SHORTLIST` the most promising.
+    """Return the terms that the physics does not express, of many the `SHORTLIST` most promising.
 
-    A term is promising by what it lowers the error one step ahead, beside the physics and beside those that are picked
-    between rounds of looking through all (iterated screening). Nothing of the size rows × terms is kept.
+    A term is promising by what it lowers the error one step ahead, beside the physics and beside
+    those that are picked between rounds of looking through all (iterated screening). Nothing of the
+    size rows × terms is kept.
 
     Raises:
         InputError: no term is left.
     """
     runs = TermRuns.of(problem, library, Prediction())
-    known = _Known.of(runs)
+    known = _ModelColumns.of(runs)
     norms, left, _ = known.weigh(runs)
     finite = np.isfinite(norms)
     own = finite & (left > DEPENDENT * norms) & (norms > 0)
     notes = _notes(library, finite, own)
     if not own.any():
-        raise InputError("the physics expresses all candidate terms already; give other functions, or a higher degree.")
+        raise InputError(
+            "the physics expresses all candidate terms already; give other functions, or a "
+            "higher degree."
+        )
     kept = np.flatnonzero(own)
     if len(kept) > SHORTLIST:
         kept = _promising(runs, known, kept)
-        text = f"of {own.sum()} terms the {len(kept)} that promise most one step ahead were looked at on the free run."
+        text = (
+            f"of {own.sum()} terms the {len(kept)} that promise most one step ahead were "
+            "looked at on the free run."
+        )
         notes.append(Warning("terms_shortlisted", text))
-    return Candidates(library.picked(kept), tuple(notes))
+    return Candidates(library.picked(kept), tuple(notes), int(own.sum()))
 
 
 @dataclass(frozen=True, eq=False)
-class _Known:
-    """What is in the model: an orthonormal basis Q of its columns over the rows, and the error that it leaves."""
+class _ModelColumns:
+    """Columns of the model: their orthonormal basis Q over the rows, and the error left."""
 
     q: Float[np.ndarray, "N k"]
     left: Vector
 
     @classmethod
-    def of(cls, runs: TermRuns) -> _Known:
-        """Of the physics alone."""
-        every = (runs.physics(*runs.rows(experiment)) for experiment in runs.problem.record.experiments)
+    def of(cls, runs: TermRuns) -> _ModelColumns:
+        """Return the columns of the physics without terms."""
+        every = (
+            runs.physics(*runs.rows(experiment)) for experiment in runs.problem.record.experiments
+        )
         phi, target = zip(*every, strict=True)
-        return cls(np.zeros((sum(map(len, target)), 0)), np.concatenate(target)).beside(np.concatenate(phi))
+        return cls(np.zeros((sum(map(len, target)), 0)), np.concatenate(target)).beside(
+            np.concatenate(phi)
+        )
 
-    def beside(self, columns: Float[np.ndarray, "N m"]) -> _Known:
-        """With further columns."""
+    def beside(self, columns: Float[np.ndarray, "N m"]) -> _ModelColumns:
+        """Return the columns with further ones."""
         size = np.linalg.norm(columns, axis=0)
         columns = columns / np.where(size > 0, size, 1.0)
         for _ in range(2):  # twice is enough
             columns = columns - self.q @ (self.q.T @ columns)
         u, sigma, _ = np.linalg.svd(columns, full_matrices=False)
         u = u[:, sigma > 1e-10]
-        return _Known(np.column_stack([self.q, u]), self.left - u @ (u.T @ self.left))
+        return _ModelColumns(np.column_stack([self.q, u]), self.left - u @ (u.T @ self.left))
 
-    def weigh(self, runs: TermRuns, chosen: Sequence[int] | np.ndarray | None = None) -> tuple[Vector, Vector, Vector]:
-        """Of each term its squared norm, what of that the model leaves, and its product with the error."""
+    def weigh(
+        self, runs: TermRuns, chosen: Sequence[int] | np.ndarray | None = None
+    ) -> tuple[Vector, Vector, Vector]:
+        """Return each term's squared norm, its part outside the model, and product with error."""
         every = np.arange(len(runs.library)) if chosen is None else np.asarray(chosen)
         norms, left, right = (np.zeros(len(every)) for _ in range(3))
         for a in range(0, len(every), _BLOCK):
@@ -98,7 +113,9 @@ class _Known:
         return norms, left, right
 
 
-def _chunks(runs: TermRuns, chosen: Sequence[int] | np.ndarray) -> Iterator[tuple[slice, Float[np.ndarray, "K m"]]]:
+def _chunks(
+    runs: TermRuns, chosen: Sequence[int] | np.ndarray
+) -> Iterator[tuple[slice, Float[np.ndarray, "K m"]]]:
     numbers, begin = runs.library.numbers[np.asarray(chosen, dtype=int)], 0
     for experiment in runs.problem.record.experiments:
         factors = runs.factors(experiment)
@@ -108,8 +125,8 @@ def _chunks(runs: TermRuns, chosen: Sequence[int] | np.ndarray) -> Iterator[tupl
         begin += factors.shape[1]
 
 
-def _promising(runs: TermRuns, known: _Known, among: np.ndarray) -> np.ndarray:
-    """The terms that promise most, in rounds: a look through all, and picks among the best of it."""
+def _promising(runs: TermRuns, known: _ModelColumns, among: np.ndarray) -> np.ndarray:
+    """Return the most promising terms, in rounds: one look through all, then picks of the best."""
     found: dict[int, None] = {}
     for _ in range(_ROUNDS):
         norms, left, right = known.weigh(runs, among)
@@ -121,7 +138,9 @@ def _promising(runs: TermRuns, known: _Known, among: np.ndarray) -> np.ndarray:
         columns = np.concatenate([terms for _, terms in _chunks(runs, new)], axis=1).T
         rest = columns - known.q @ (known.q.T @ columns)
         square = float(known.left @ known.left)
-        picks = forward(Equations(rest.T @ rest, rest.T @ known.left, square, len(rest)), (), _PICKED)
+        picks = forward(
+            Equations(rest.T @ rest, rest.T @ known.left, square, len(rest)), (), _PICKED
+        )
         known = known.beside(columns[:, [pick.column for pick in picks]])
     return np.array(sorted(found))
 
@@ -130,14 +149,16 @@ def _notes(library: TermLibrary, finite: np.ndarray, own: np.ndarray) -> list[Wa
     texts, notes = library.texts, []
     infinite = [texts[i] for i in np.flatnonzero(~finite)]
     if infinite:
-        text = f"left out, for they are not finite on these data: {_named(infinite)}."
+        text = f"terms that are not finite on these data were left out: {_named(infinite)}."
         notes.append(Warning("terms_not_finite", text))
     known = [texts[i] for i in np.flatnonzero(finite & ~own)]
     if known:
-        text = f"left out, for the physics expresses them already: {_named(known)}."
+        text = f"terms that the physics expresses already were left out: {_named(known)}."
         notes.append(Warning("terms_are_physics", text))
     return notes
 
 
 def _named(texts: list[str]) -> str:
-    return ", ".join(texts[:_NAMED]) + (f" and {len(texts) - _NAMED} more" if len(texts) > _NAMED else "")
+    return ", ".join(texts[:_NAMED]) + (
+        f" and {len(texts) - _NAMED} more" if len(texts) > _NAMED else ""
+    )

@@ -1,8 +1,9 @@
-"""What has a learner found? Its output over data, regressed on suspected terms and on products of what it sees.
+"""Regression of a learner's output over data on suspected terms and on products of its inputs.
 
-Forward orthogonal regression: the physics is projected out first where the learner shares directions with it, then the
-term that explains most beside those that are in comes next, or a pair that explains more than it and one that is in
-(replacement). Widths, of a Stribeck curve say, are refined with all others in.
+Forward orthogonal regression: the physics is projected out first where the learner shares
+directions with it, then the term that explains most beside those that are in comes next, or a pair
+that explains more than it and one that is in (replacement). Widths, of a Stribeck curve say, are
+refined with all others in.
 """
 
 from __future__ import annotations
@@ -13,27 +14,148 @@ from typing import Any
 
 import numpy as np
 import scipy.optimize
+import scipy.special
 from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
 from orthaug.analysis.suspects import ODD_JUMPS, WIDTHS, changes_sign, is_level, written
 from orthaug.data.terms import CONSTANT, TermLibrary, outside_brackets
-from orthaug.selection.as_shown import Shown, basis_of, least_squares, without
-from orthaug.selection.explained_ground import Ground
+from orthaug.selection.learned_linearization import LearnedLinearization
+
+_RANK = 1e-9  # of the largest singular value
+_ROUNDING = 1e-8  # of the largest variance
+
+
+@dataclass(frozen=True, eq=False)
+class LearnerTarget:
+    """Target for terms from a learner: values `target` (r,) and their `covariance` (r, r).
+
+    Values are its output in a space where its errors are known.
+
+    `view` (P, r) takes whitened values over all points to that; None where the learner has no
+    tangent space: then they are taken as they are, less the physics. `size` is the norm of the
+    learner with all that physics expresses.
+    """
+
+    linearization: LearnedLinearization
+    q: Float[np.ndarray, "R s"]
+    view: Float[np.ndarray, "P r"] | None
+    target: Vector
+    covariance: Matrix | None
+    size: float
+
+    @classmethod
+    def of(cls, linearization: LearnedLinearization) -> LearnerTarget:
+        """Return the target in the learner's tangent space over the points, where it has one."""
+        q = basis_of(linearization.physics_moves.T)
+        raw = linearization.fitted(linearization.learner)
+        rest, size, tangent = without(raw, q), float(np.linalg.norm(raw)), linearization.tangent
+        if tangent is None:
+            return cls(linearization, q, None, rest, None, size)
+        ridge: Any = np.broadcast_to(np.asarray(tangent.ridge, dtype=float), tangent.weights.shape)
+        u, sigma, vt = np.linalg.svd(without(tangent.jacobian, q), full_matrices=False)
+        kept = sigma > _RANK * sigma.max(initial=0.0)
+        u, sigma, v = u[:, kept], sigma[kept], vt[kept].T
+        # with U, Σ, V of J: S = U Σ (Σ² + VᵀλV)⁻¹ Σ Uᵀ
+        inner = np.linalg.inv(np.diag(sigma**2) + v.T @ (ridge[:, None] * v))
+        smooth = sigma[:, None] * inner * sigma
+        target = smooth @ (u.T @ rest) + sigma * (inner @ (v.T @ (ridge * tangent.weights)))
+        covariance = None
+        if tangent.joint is not None:
+            k = sigma[:, None] * (inner @ (sigma[:, None] ** 2 * v.T + v.T * ridge))
+            covariance = tangent.joint.of(
+                np.concatenate([np.zeros((len(k), tangent.joint.nt)), k], axis=1)
+            )
+        view = u @ smooth.T
+        view = view if linearization.response is None else linearization.response.adjoint(view)
+        return cls(linearization, q, view, target, covariance, size)
+
+    @property
+    def noise(self) -> float:
+        """The variance of the learner's errors in a direction, on average.
+
+        0 where it is not known.
+        """
+        return (
+            0.0
+            if self.covariance is None
+            else float(np.trace(self.covariance)) / max(len(self.target), 1)
+        )
+
+    @property
+    def p(self) -> float | None:
+        """P-value of the learner being only its own errors, beside the physics (Wald's test).
+
+        None if not known.
+        """
+        if self.covariance is None:
+            return None
+        values, vectors = np.linalg.eigh(self.covariance)
+        kept = values > _ROUNDING * values.max(initial=0.0)
+        square = float(np.sum((vectors[:, kept].T @ self.target) ** 2 / values[kept]))
+        return float(scipy.special.chdtrc(max(int(kept.sum()), 1), square))
+
+    def unit(self, column: Vector) -> Vector:
+        """Return a column over the points (P,), of unit size, as the learner would show it."""
+        with np.errstate(all="ignore"):
+            column = column / np.linalg.norm(column)
+        if not np.isfinite(column).all():
+            return np.full(len(self.target), np.nan)
+        if self.view is None:
+            return without(self.linearization.fitted(column), self.q)
+        return self.view.T @ column
+
+
+def without(values: np.ndarray, basis: Float[np.ndarray, "R k"]) -> np.ndarray:
+    """Return values less the part that an orthonormal basis expresses, projected twice."""
+    for _ in range(2 if basis.size else 0):
+        values = values - basis @ (basis.T @ values)
+    return values
+
+
+def basis_of(columns: Sequence[Vector] | Matrix) -> Float[np.ndarray, "R k"]:
+    """Return an orthonormal basis of columns, each taken as of size 1."""
+    if not len(columns):
+        return np.zeros((0, 0))
+    table = np.asarray(columns, dtype=float)
+    size = np.linalg.norm(table, axis=1)
+    u, sigma, _ = np.linalg.svd((table[size > 0] / size[size > 0, None]).T, full_matrices=False)
+    return u[:, sigma > 1e-10 * sigma.max(initial=0.0)]
+
+
+def least_squares(table: Float[np.ndarray, "R s"], values: Vector) -> Vector:
+    """Return coefficients (s,) of the columns that express values best, each taken as of size 1."""
+    size = np.linalg.norm(table, axis=0)
+    unit = 1 / np.where(size > 0, size, 1.0)
+    return unit * np.linalg.lstsq(table * unit, values, rcond=1e-10)[0]
+
 
 MOST_CANDIDATES = 3000
 TERM = "term"
 """The kind of a product of what the learner sees."""
 _PLAIN = ("coulomb", "quadratic_drag", "cubic", "square_root")
-_WIDE = tuple(kind for kind in ("stribeck", "stribeck_gauss", "dead_zone", "saturation") if kind in WIDTHS)
-_WIDTHS = tuple(2.0 ** (i / 2) for i in range(-8, 3))  # times the median size of what a term acts on
+_WIDE = tuple(
+    kind for kind in ("stribeck", "stribeck_gauss", "dead_zone", "saturation") if kind in WIDTHS
+)
+_WIDTHS = tuple(
+    2.0 ** (i / 2) for i in range(-8, 3)
+)  # times the median size of what a term acts on
 _REFINED = 2.0  # how far, as a factor, a width is moved from where it was found
-_COMPLEXITY = dict.fromkeys(_PLAIN, 1) | {"stribeck": 3, "stribeck_gauss": 3, "dead_zone": 4, "saturation": 4}
+_COMPLEXITY = dict.fromkeys(_PLAIN, 1) | {
+    "stribeck": 3,
+    "stribeck_gauss": 3,
+    "dead_zone": 4,
+    "saturation": 4,
+}
 _OWN = 1e-4  # of a candidate's squared norm: what physics, learner and other terms must leave of it
-_TIE, _TIE_UNKNOWN = 2e-4, 2e-3  # share of the learner: within this of the best the simpler term is taken
-_PART = 0.1  # of what even the best leaves: less tells no two terms apart either
-_DRAWS = 10.0  # variances of the noise in one direction: what two terms with widths differ by at random
+_TIE, _TIE_UNKNOWN = (
+    2e-4,
+    2e-3,
+)  # share of the learner: within this of the best the simpler term is taken
+_PART = 0.1  # of what even the best leaves: less does not separate two terms either
+# Variances of the noise in one direction: what two terms with widths differ by at random
+_DRAWS = 10.0
 _ROUGH, _FINE = 0.03, 1e-3  # of its logarithm
 _TRIED = 10  # kinds of terms, or pairs of kinds, that are refined before the choice
 _BLOCK, _LOOKED = 256, 200  # candidates whose pairs are looked at together, and pairs of them
@@ -42,7 +164,7 @@ _T = 3.0  # standard errors that a coefficient must differ from 0: the term was 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A term that could explain the learner in one output or equation: `kind` of `on` with its `width`, written out."""
+    """A term that could explain the learner in one output or equation: `kind` of `on`, `width`."""
 
     kind: str
     on: str | None
@@ -51,7 +173,7 @@ class Candidate:
     text: str
 
     def wide(self, width: float) -> Candidate:
-        """The same with another width, of four digits."""
+        """Return the candidate with another width, of four digits."""
         width = float(f"{width:.4g}")
         return replace(self, width=width, text=_written(self.kind, self.on, width))
 
@@ -62,30 +184,33 @@ class Candidate:
 
     @property
     def complexity(self) -> int:
-        """Of terms that explain as much the simplest is taken. A learner is smooth: clipping imitates jumps last."""
+        """Complexity of the term: of terms that explain as much the simplest is taken.
+
+        A learner is smooth: clipping imitates jumps last.
+        """
         return _COMPLEXITY.get(self.kind, 2 + self.text.replace("**", "").count("*"))
 
     @property
     def identity(self) -> tuple[str, str, int]:
-        """What it is whatever its width."""
+        """Key of the term without its width."""
         return self.kind, self.text if self.on is None else self.on, self.place
 
     @property
     def form(self) -> tuple[str, str, int]:
-        """The same, both kinds of a peak alike."""
+        """Key of the term without its width, with both kinds of a peak alike."""
         return self.kind.removesuffix("_gauss"), *self.identity[1:]
 
 
 @dataclass(frozen=True, eq=False)
 class Space:
-    """Candidates as the learner would show them, beside the physics: `columns` (K, r), and the learner, `target` (r,).
+    """Candidates as a learner would show them beside the physics, (K, r), and the `target` (r,).
 
-    The target has norm 1, so that squares are shares of what the learner adds; `norm` is what it had. `tie` is the
-    share by which two terms cannot be told apart.
+    The target has norm 1, so that squares are shares of what the learner adds; `norm` is what it
+    had. `tie` is the share within which two terms count as equal.
     """
 
-    ground: Ground
-    shown: Shown
+    linearization: LearnedLinearization
+    shown: LearnerTarget
     target: Vector
     norm: float
     candidates: tuple[Candidate, ...]
@@ -93,13 +218,18 @@ class Space:
     tie: float
 
     @classmethod
-    def of(cls, ground: Ground, candidates: Sequence[Candidate]) -> Space:
-        """Candidates without a value on some point, and those that physics expresses or no learner shows, are out."""
-        shown = Shown.of(ground)
+    def of(cls, linearization: LearnedLinearization, candidates: Sequence[Candidate]) -> Space:
+        """Return the space without candidates that have no value, or that the physics expresses.
+
+        Candidates that no learner could show are out, too.
+        """
+        shown = LearnerTarget.of(linearization)
         norm = float(np.linalg.norm(shown.target))
         kept, columns = [], []
         for candidate in candidates:
-            column = shown.unit(ground.column(ground.parse(candidate.text), candidate.place))
+            column = shown.unit(
+                linearization.column(linearization.parse(candidate.text), candidate.place)
+            )
             if np.isfinite(column).all() and column @ column > _OWN:
                 kept.append(candidate)
                 columns.append(column)
@@ -107,35 +237,42 @@ class Space:
         target = shown.target / norm if norm > 1e-9 * shown.size else 0.0 * shown.target
         tie = _TIE_UNKNOWN if shown.covariance is None else _TIE
         tie = max(tie, _DRAWS * shown.noise / norm**2) if norm > 0 else tie
-        return cls(ground, shown, target, norm, tuple(kept), table, tie)
+        return cls(linearization, shown, target, norm, tuple(kept), table, tie)
 
     @property
     def empty(self) -> bool:
-        """Whether the learner adds nothing beside the physics, or nothing could explain it."""
+        """True if the learner adds nothing beside the physics, or nothing could explain it."""
         return not self.target.any() or not self.candidates
 
     def column(self, candidate: Candidate) -> Vector:
-        """A candidate as the learner would show it, (r,)."""
-        return self.shown.unit(self.ground.column(self.ground.parse(candidate.text), candidate.place))
+        """Return a candidate as the learner would show it, (r,)."""
+        return self.shown.unit(
+            self.linearization.column(self.linearization.parse(candidate.text), candidate.place)
+        )
 
     def gains(self, chosen: Sequence[Vector]) -> Vector:
-        """Share of the learner that each candidate would explain beside those that are chosen (K,)."""
+        """Return the share of the learner that each candidate adds to the `chosen` ones (K,)."""
         basis = basis_of(chosen)
         left = np.einsum("kr,kr->k", self.columns, self.columns)
         if basis.size:
             left = left - np.sum((self.columns @ basis) ** 2, axis=1)
         able = left > _OWN
-        return np.where(able, (self.columns @ without(self.target, basis)) ** 2 / np.where(able, left, 1.0), 0.0)
+        return np.where(
+            able, (self.columns @ without(self.target, basis)) ** 2 / np.where(able, left, 1.0), 0.0
+        )
 
     def explained(self, chosen: Sequence[Vector]) -> float:
-        """Share of the learner that chosen columns explain together."""
+        """Return the share of the learner that chosen columns explain together."""
         return float(np.sum((basis_of(chosen).T @ self.target) ** 2)) if len(chosen) else 0.0
 
 
 def candidates_of(
-    ground: Ground, degree: int, functions: Sequence[str], suspects: Sequence[tuple[str, int]]
+    linearization: LearnedLinearization,
+    degree: int,
+    functions: Sequence[str],
+    suspects: Sequence[tuple[str, int]],
 ) -> tuple[Candidate, ...]:
-    """What could explain the learner, simple terms first.
+    """Return the candidates that could explain the learner, simple ones first.
 
     Args:
         degree, functions: of products of what the learner sees (`TermLibrary`).
@@ -144,44 +281,59 @@ def candidates_of(
     Raises:
         InputError: more than can be kept in memory.
     """
-    library = TermLibrary.of(ground.signals[: ground.seen], degree, functions)
-    plain = [(kind, on) for kind in _PLAIN for on in ground.signals if _likely(ground, kind, on)]
+    library = TermLibrary.of(linearization.signals[: linearization.seen], degree, functions)
+    plain = [
+        (kind, on)
+        for kind in _PLAIN
+        for on in linearization.signals
+        if _likely(linearization, kind, on)
+    ]
     known = {_written(kind, on) for kind, on in plain}
     texts = [text for text in library.texts if text != CONSTANT and text not in known]
-    wide = [(kind, on) for kind in _WIDE for on in ground.signals if _likely(ground, kind, on)]
-    wide = [(kind, on, width) for kind, on in wide for width in _grid(ground, on)]
-    places = range(len(ground.places))
+    wide = [
+        (kind, on)
+        for kind in _WIDE
+        for on in linearization.signals
+        if _likely(linearization, kind, on)
+    ]
+    wide = [(kind, on, width) for kind, on in wide for width in _grid(linearization, on)]
+    places = range(len(linearization.places))
     count = (len(texts) + len(wide)) * len(places)
     if count > MOST_CANDIDATES:
         raise InputError(
-            f"{ground.seen} signals to the degree {degree} make {count} candidate terms; at most {MOST_CANDIDATES} are "
-            "looked at. Lower the degree, or give fewer functions."
+            f"{linearization.seen} signals to the degree {degree} make {count} candidate "
+            f"terms; at most {MOST_CANDIDATES} are looked at. Lower the degree, or give fewer "
+            "functions."
         )
     found = [Candidate(TERM, None, None, place, text) for text, place in suspects]
     for place in places:
         found += [Candidate(kind, on, None, place, _written(kind, on)) for kind, on in plain]
         found += [Candidate(TERM, None, None, place, CONSTANT)]
         found += [Candidate(TERM, None, None, place, text) for text in texts]
-        found += [Candidate(kind, on, width, place, _written(kind, on, width)) for kind, on, width in wide]
+        found += [
+            Candidate(kind, on, width, place, _written(kind, on, width)) for kind, on, width in wide
+        ]
     return tuple(found)
 
 
-def _likely(ground: Ground, kind: str, on: str) -> bool:
-    """Friction only of what changes its sign, a root only of what has one."""
+def _likely(linearization: LearnedLinearization, kind: str, on: str) -> bool:
+    """Return whether a kind suits a variable: friction needs both signs, a root a positive one."""
     if kind not in (*ODD_JUMPS, "square_root"):
         return True
-    values = _values(ground, on)
-    return bool(np.isfinite(values).all()) and (is_level if kind == "square_root" else changes_sign)(values)
+    values = _values(linearization, on)
+    return bool(np.isfinite(values).all()) and (
+        is_level if kind == "square_root" else changes_sign
+    )(values)
 
 
-def _values(ground: Ground, on: str) -> Vector:
+def _values(linearization: LearnedLinearization, on: str) -> Vector:
     with np.errstate(all="ignore"):
-        return np.asarray(ground.evaluate(ground.parse(on)), dtype=float)
+        return np.asarray(linearization.evaluate(linearization.parse(on)), dtype=float)
 
 
-def _grid(ground: Ground, on: str) -> Iterator[float]:
-    """Widths that the data could tell; none for what is zero, or has no value somewhere."""
-    size = np.abs(_values(ground, on))
+def _grid(linearization: LearnedLinearization, on: str) -> Iterator[float]:
+    """Yield widths that the data can resolve; none for what is zero, or has no value somewhere."""
+    size = np.abs(_values(linearization, on))
     if np.isfinite(size).all() and np.any(size > 0):
         yield from (float(f"{share * np.median(size[size > 0]):.4g}") for share in _WIDTHS)
 
@@ -193,7 +345,7 @@ def _written(kind: str, on: str | None, width: float | None = None) -> str:
 
 
 def select(space: Space, most: int, least: float) -> list[Candidate]:
-    """The terms, in the order in which they explain most.
+    """Return the terms, in the order in which they explain most.
 
     Args:
         most: at most so many.
@@ -213,10 +365,13 @@ def _share(space: Space, chosen: Sequence[Candidate]) -> float:
 
 
 def _grown(space: Space, chosen: list[Candidate]) -> list[Candidate]:
-    """One term more: beside all that are in, or a pair beside all but one; widths refined, the simplest of the best.
+    """Return one term more: beside all that are in, or a pair beside all but one.
 
-    Friction has the sum of a jump and of a peak, neither of which is the best term alone. Two peaks on one variable, or
-    two widths of another kind, are the difference of nearly the same, and no law.
+    Widths refined, the simplest of the best.
+
+    Friction has the sum of a jump and of a peak, neither of which is the best term alone. Two peaks
+    on one variable, or two widths of another kind, are the difference of nearly the same, and no
+    law.
     """
     trials = [[*chosen, one] for one in _best_single(space, chosen)]
     for i in range(len(chosen)):
@@ -228,7 +383,9 @@ def _grown(space: Space, chosen: list[Candidate]) -> list[Candidate]:
     best = max(shares, default=0.0)
     tie = max(space.tie, _PART * (1 - best))
     able = [i for i, share in enumerate(shares) if share >= best - tie]
-    taken = min(able, key=lambda i: (sum(one.complexity for one in trials[i]), -shares[i]), default=None)
+    taken = min(
+        able, key=lambda i: (sum(one.complexity for one in trials[i]), -shares[i]), default=None
+    )
     return [] if taken is None else _refined(space, trials[taken])
 
 
@@ -243,7 +400,7 @@ def _best_single(space: Space, chosen: Sequence[Candidate]) -> list[Candidate]:
 
 
 def _best_pairs(space: Space, others: Sequence[Candidate]) -> list[tuple[Candidate, Candidate]]:
-    """The pairs that explain most together beside others, of each two kinds the best."""
+    """Return the pairs that explain most together beside others, of each two kinds the best."""
     basis = basis_of([space.column(one) for one in others])
     x, y = space.columns, without(space.target, basis)
     if basis.size:
@@ -256,8 +413,14 @@ def _best_pairs(space: Space, others: Sequence[Candidate]) -> list[tuple[Candida
         rows = slice(begin, begin + _BLOCK)
         across = x[rows] @ x.T
         left = np.outer(size[rows], size) - across**2
-        gain = along[rows, None] ** 2 * size + along**2 * size[rows, None] - 2 * np.outer(along[rows], along) * across
-        gain = np.where(left > _OWN * np.outer(size[rows], size), gain / np.where(left > 0, left, 1.0), 0.0)
+        gain = (
+            along[rows, None] ** 2 * size
+            + along**2 * size[rows, None]
+            - 2 * np.outer(along[rows], along) * across
+        )
+        gain = np.where(
+            left > _OWN * np.outer(size[rows], size), gain / np.where(left > 0, left, 1.0), 0.0
+        )
         gain = np.where(np.arange(len(able)) > begin + np.arange(len(gain))[:, None], gain, 0.0)
         best = np.argpartition(-gain, min(_LOOKED, gain.size - 1), axis=None)[:_LOOKED]
         for flat in best[np.argsort(-gain.ravel()[best], kind="stable")]:
@@ -276,24 +439,30 @@ def _refined(space: Space, chosen: list[Candidate], within: float = _FINE) -> li
             continue
         others = [space.column(one) for one in chosen[:i] + chosen[i + 1 :]]
 
-        def missed(log: float, candidate: Candidate = candidate, others: list[Vector] = others) -> float:
+        def missed(
+            log: float, candidate: Candidate = candidate, others: list[Vector] = others
+        ) -> float:
             return -space.explained([*others, space.column(candidate.wide(float(np.exp(log))))])
 
         centre = float(np.log(candidate.width))
         around = (centre - np.log(_REFINED), centre + np.log(_REFINED))
         options: Any = {"xatol": within}
-        best = scipy.optimize.minimize_scalar(missed, bounds=around, method="bounded", options=options)
+        best = scipy.optimize.minimize_scalar(
+            missed, bounds=around, method="bounded", options=options
+        )
         if best.fun < missed(centre) - 1e-6:
             chosen = [*chosen[:i], candidate.wide(float(np.exp(best.x))), *chosen[i + 1 :]]
     return chosen
 
 
 def _pruned(space: Space, chosen: list[Candidate], least: float) -> list[Candidate]:
-    """Without terms that the others make superfluous."""
+    """Return the chosen terms less those that the others make superfluous."""
     while len(chosen) > 1:
         columns = [space.column(one) for one in chosen]
         whole = space.explained(columns)
-        losses = [whole - space.explained(columns[:i] + columns[i + 1 :]) for i in range(len(columns))]
+        losses = [
+            whole - space.explained(columns[:i] + columns[i + 1 :]) for i in range(len(columns))
+        ]
         weakest = int(np.argmin(losses))
         if losses[weakest] >= least:
             break
@@ -302,7 +471,7 @@ def _pruned(space: Space, chosen: list[Candidate], least: float) -> list[Candida
 
 
 def _ordered(space: Space, chosen: list[Candidate]) -> list[Candidate]:
-    """Each next the one that explains most beside those before it."""
+    """Return each next the one that explains most beside those before it."""
     left, order = list(chosen), []
     while left:
         known = [space.column(one) for one in order]
@@ -313,14 +482,14 @@ def _ordered(space: Space, chosen: list[Candidate]) -> list[Candidate]:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Chosen terms fitted beside the physics: how far that moves (s,), coefficients (k,) and their Cov or None."""
+    """Chosen terms fitted beside the physics: its shift (s,), coefficients (k,), Cov or None."""
 
     along: Vector
     coefficients: Vector
     covariance: Matrix | None
 
     def doubtful(self) -> int | None:
-        """The number of the term that stands out least from the learner's own errors, where one does not."""
+        """Return the number of the least significant term, None where all are significant."""
         if self.covariance is None or not len(self.coefficients):
             return None
         std = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
@@ -329,21 +498,33 @@ class Fit:
 
 
 def fit_terms(space: Space, chosen: Sequence[Candidate]) -> Fit:
-    """Least squares of the learner on the terms as it would show them; the physics takes what they do not express."""
-    ground, shown = space.ground, space.shown
-    raw = [ground.column(ground.parse(one.text), one.place) for one in chosen]
+    """Fit the terms to the learner by least squares, as it would show them.
+
+    The physics takes what they do not express.
+    """
+    linearization, shown = space.linearization, space.shown
+    raw = [linearization.column(linearization.parse(one.text), one.place) for one in chosen]
     size = np.array([np.linalg.norm(column) for column in raw])
     inverse = np.zeros((0, len(shown.target)))
     if chosen:
-        inverse = np.linalg.pinv(np.column_stack([shown.unit(column) for column in raw])) / size[:, None]
+        inverse = (
+            np.linalg.pinv(np.column_stack([shown.unit(column) for column in raw])) / size[:, None]
+        )
     coefficients = inverse @ shown.target
-    rest = ground.learner - sum((b * c for b, c in zip(coefficients, raw, strict=True)), 0.0)
+    rest = linearization.learner - sum((b * c for b, c in zip(coefficients, raw, strict=True)), 0.0)
     covariance = None if shown.covariance is None else inverse @ shown.covariance @ inverse.T
-    return Fit(least_squares(ground.physics_moves, ground.fitted(rest)), coefficients, covariance)
+    return Fit(
+        least_squares(linearization.physics_moves, linearization.fitted(rest)),
+        coefficients,
+        covariance,
+    )
 
 
 def settled(space: Space, chosen: list[Candidate]) -> tuple[list[Candidate], Fit, bool]:
-    """The terms whose coefficients stand out from the learner's own errors; and whether any other was dropped."""
+    """Return the terms whose coefficients are significant against the learner's own errors.
+
+    The last value is whether any other was dropped.
+    """
     fit, dropped = fit_terms(space, chosen), False
     while (weak := fit.doubtful()) is not None:
         chosen, dropped = chosen[:weak] + chosen[weak + 1 :], True
@@ -351,8 +532,10 @@ def settled(space: Space, chosen: list[Candidate]) -> tuple[list[Candidate], Fit
     return chosen, fit, dropped
 
 
-def rivals(space: Space, chosen: Sequence[Candidate], number: int, most: int = 3) -> tuple[str, ...]:
-    """Other terms that could stand in the place of one and explain nearly as much."""
+def rivals(
+    space: Space, chosen: Sequence[Candidate], number: int, most: int = 3
+) -> tuple[str, ...]:
+    """Return other terms that could replace one and explain nearly as much."""
     columns = [space.column(one) for one in chosen]
     others = columns[:number] + columns[number + 1 :]
     gains = space.gains(others) + space.explained(others)
@@ -364,7 +547,7 @@ def rivals(space: Space, chosen: Sequence[Candidate], number: int, most: int = 3
 
 
 def alone(space: Space, most: int) -> list[tuple[Candidate, float]]:
-    """The terms that explain most if each is the only one, the best width of each."""
+    """Return the terms that explain most if each is the only one, the best width of each."""
     gains, found = space.gains([]), []
     for i in np.argsort(-gains, kind="stable"):
         candidate = space.candidates[int(i)]

@@ -1,33 +1,29 @@
-"""`explain`: the terms that a learner has found, what they explain of it, and what to write into the physics."""
+"""The verb `explain`: terms that a learner has found, their share, and the lines of a new spec."""
 
 from __future__ import annotations
 
+import json
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from orthaug._base.checks import check_count, check_type, is_number
+from orthaug._base.checks import Vector, check_count, check_type, is_number
 from orthaug._base.errors import InputError, Warning, shown
 from orthaug._base.lines import percent
 from orthaug.analysis.motion_suspects import MotionSuspect
 from orthaug.analysis.suspects import Suspect
+from orthaug.data.expressions import FUNCTIONS, SAMPLING_TIME, Expression
 from orthaug.data.record import Record
 from orthaug.data.terms import CONSTANT
 from orthaug.data.writing import coefficient_unit
 from orthaug.models.model import Model
 from orthaug.models.motion_model import MotionModel
-from orthaug.physics.baseline import Baseline
+from orthaug.physics.baseline import Baseline, Term
 from orthaug.physics.motion import Motion
-from orthaug.selection.added_physics import (
-    Added,
-    added_to_baseline,
-    added_to_motion,
-    baseline_lines,
-    names_for,
-)
-from orthaug.selection.explained_ground import Ground, ground_of
+from orthaug.physics.parameters import PhysicalParameter
 from orthaug.selection.explaining import (
     TERM,
     Candidate,
@@ -39,27 +35,240 @@ from orthaug.selection.explaining import (
     select,
     settled,
 )
+from orthaug.selection.learned_linearization import LearnedLinearization, linearization_of
+
+_DIVIDED = re.compile(r"\((?P<inner>.+)\)\s*/\s*(?P<by>[A-Za-z_]\w*)")
+
+
+@dataclass(frozen=True)
+class NewTerm:
+    """A term to add: its parameter's `name`, the `text` with its `width` as a number, its place.
+
+    `scale` is the expression whose unit the term has; None for one without a known unit.
+    `template` has `{width}` in the width's place, None without one.
+    """
+
+    name: str
+    text: str
+    added_to: str
+    coefficient: float
+    unit: str | None
+    width: float | None = None
+    width_unit: str | None = None
+    template: str | None = None
+    scale: Expression | None = None
+
+
+def names_for(kinds: Sequence[str], taken: Sequence[str]) -> list[str]:
+    """Return a parameter's name for each kind of term, none of which is taken."""
+    used, names = {*taken, *FUNCTIONS, SAMPLING_TIME, "k"}, []
+    for kind in kinds:
+        name, number = kind, 1
+        while name in used:
+            number += 1
+            name = f"{kind}{number}"
+        used.add(name)
+        names.append(name)
+    return names
+
+
+def added_to_baseline(
+    baseline: Baseline, values: Vector, added: Sequence[NewTerm], several: bool
+) -> Baseline | None:
+    """Return a baseline with terms, starting from these parameter values.
+
+    None if it is a function.
+    """
+    if baseline.function is not None:
+        return None
+    low, high = baseline.bounds
+    start = dict(zip(baseline.names, np.clip(values, low, high), strict=True))
+    old = [
+        term if term.fixed else replace(term, initial=float(start[term.parameter]))
+        for term in baseline.terms
+    ]
+    new = [
+        Term(
+            one.name,
+            one.text,
+            initial=one.coefficient,
+            unit=one.unit or "",
+            output=one.added_to if several else None,
+        )
+        for one in added
+    ]
+    return Baseline.from_terms([*old, *new], dict(baseline.constants))
+
+
+def baseline_lines(added: Sequence[NewTerm], several: bool) -> str:
+    """Return the terms as tables of a spec."""
+    blocks = []
+    for one in added:
+        entries = {"parameter": one.name, "regressor": one.text, "initial": _short(one.coefficient)}
+        entries |= {"unit": one.unit} if one.unit else {}
+        entries |= {"output": one.added_to} if several else {}
+        blocks.append(
+            "\n".join(
+                [
+                    "[[baseline.terms]]",
+                    *(f"{key} = {_toml(value)}" for key, value in entries.items()),
+                ]
+            )
+        )
+    return "\n\n".join(blocks)
+
+
+@dataclass(frozen=True, eq=False)
+class ChangedMotion:
+    """A motion with added terms, the new parameters, and the changed equations by their keys."""
+
+    motion: Motion
+    parameters: tuple[PhysicalParameter, ...]
+    equations: tuple[tuple[str, str, str], ...]
+
+    def lines(self) -> str:
+        """Return the lines to change in a spec."""
+        blocks = [f"[{table}]\n{key} = {_toml(text)}" for table, key, text in self.equations]
+        rows = []
+        for one in self.parameters:
+            entries = {"initial": _short(one.initial)} | ({"unit": one.unit} if one.unit else {})
+            entries |= {"min": one.min} if np.isfinite(one.min) else {}
+            rows.append(
+                f"{one.name} = {{ "
+                f"{', '.join(f'{key} = {_toml(value)}' for key, value in entries.items())} }}"
+            )
+        return "\n\n".join([*blocks, "\n".join(["[motion.parameters]", *rows])])
+
+
+def added_to_motion(
+    motion: Motion, values: Vector, added: Sequence[NewTerm], units: dict[str, str]
+) -> Any:
+    """Return a `ChangedMotion` that starts from these parameter values.
+
+    None if the equations are functions.
+
+    A term of an equation `(…)/m` goes inside, so that its coefficient is a force. A width becomes a
+    parameter.
+    """
+    if motion.functions is not None:
+        return None
+    start = dict(zip(motion.names, values, strict=True))
+    texts = {state.name: str(state.derivative) for state in motion.states}
+    texts |= {output.name: str(output.expression) for output in motion.outputs}
+    new: list[PhysicalParameter] = []
+    taken = [*motion.known, *(one.name for one in added)]
+    for one in added:
+        text, unit, coefficient = texts[one.added_to], one.unit, one.coefficient
+        product = one.text
+        if one.template is not None and one.width is not None:
+            width = names_for([f"{one.name}_width"], taken)[0]
+            new.append(PhysicalParameter(width, float(one.width), one.width_unit or "", min=0))
+            product = one.template.format(width=width)
+        inside = _DIVIDED.fullmatch(text.strip())
+        if inside and _balanced(inside["inner"]) and inside["by"] in start:
+            coefficient, unit = (
+                coefficient * start[inside["by"]],
+                _unit_inside(inside["inner"], one, units),
+            )
+        sign, factor = ("-", -1.0) if coefficient < 0 else ("+", 1.0)
+        summand = f" {sign} {one.name}" + ("" if product == "1" else f"*{_closed(product)}")
+        if inside and _balanced(inside["inner"]) and inside["by"] in start:
+            texts[one.added_to] = f"({inside['inner']}{summand})/{inside['by']}"
+        else:
+            texts[one.added_to] = f"{text}{summand}"
+        new.append(PhysicalParameter(one.name, factor * coefficient, unit or ""))
+    changed = Motion.from_equations(
+        states=[replace(state, derivative=texts[state.name]) for state in motion.states],
+        outputs=[replace(output, expression=texts[output.name]) for output in motion.outputs],
+        parameters=[*(replace(p, initial=float(start[p.name])) for p in motion.parameters), *new],
+        inputs=motion.inputs,
+        constants=dict(motion.constants),
+        define={name: str(expression) for name, expression in motion.definitions},
+        integrator=motion.integrator,
+        substeps=motion.substeps,
+        hold=motion.hold,
+    )
+    own = "next" if motion.integrator == "discrete" else "derivative"
+    states = {state.name for state in motion.states}
+    places = dict.fromkeys(one.added_to for one in added)
+    equations = tuple(
+        (f"motion.states.{name}", own, texts[name])
+        if name in states
+        else (f"motion.outputs.{name}", "expression", texts[name])
+        for name in places
+    )
+    return ChangedMotion(changed, tuple(new), equations)
+
+
+def _unit_inside(inner: str, added: NewTerm, units: dict[str, str]) -> str:
+    """Return the unit of a term's coefficient within a sum.
+
+    None where the sum's or the term's is unknown.
+    """
+    unit = _unit_of_first(inner, units)
+    if not unit or added.scale is None:
+        return unit
+    return coefficient_unit(unit, added.scale, units) or ""
+
+
+def _unit_of_first(inner: str, units: dict[str, str]) -> str:
+    """Return the unit of a sum by its first summand, where that is a name with a unit."""
+    first = re.match(r"\s*([A-Za-z_]\w*)\s*(?=[-+]|$)", inner)
+    return units.get(first[1], "") if first else ""
+
+
+def _closed(text: str) -> str:
+    depth = 0
+    for i, character in enumerate(text):
+        depth += (character in "([") - (character in ")]")
+        if depth == 0 and character in "+-" and text[i - 1 : i] not in ("e", "*", "("):
+            return f"({text})"
+    return text
+
+
+def _balanced(text: str) -> bool:
+    depth = 0
+    for character in text:
+        depth += (character == "(") - (character == ")")
+        if depth < 0:
+            return False
+    return depth == 0
+
+
+def _short(value: float) -> float:
+    """Return the value to six digits, as accurate as the learner is."""
+    return float(f"{value:.6g}")
+
+
+def _toml(value: Any) -> str:
+    return json.dumps(value, ensure_ascii=False) if isinstance(value, str) else repr(value)
+
 
 LEAST = 0.005
 _HALF = 0.5  # of the learner, less its own errors: terms that explain less are none to be added
 _LEVEL = 0.01  # at which the learner is something beside its own errors
 _ENDED = ("converged", "exact")
 _SHOWN = 8  # terms, each as the only one
-_OUTSIDE = 0.05  # share of rows beyond the training data that is told of
+_OUTSIDE = 0.05  # share of rows beyond the training data that is reported
 _CONDITIONAL = (
-    "the terms were chosen on these data: intervals of a fit with them to the same data are conditional on the choice; "
-    "a fit to other data has intervals that are not."
+    "the terms were chosen on these data: intervals of a fit with them to the same data are "
+    "conditional on the choice; a fit to other data has intervals that are not."
 )
-_NAMES = {"coulomb": "coulomb", "quadratic_drag": "drag", "stribeck_gauss": "stribeck", TERM: "term"}
+_NAMES = {
+    "coulomb": "coulomb",
+    "quadratic_drag": "drag",
+    "stribeck_gauss": "stribeck",
+    TERM: "term",
+}
 
 
 @dataclass(frozen=True)
 class ExplainingTerm:
     """A term to add to the physics.
 
-    `coefficient` is in `unit`, None where that is not told; `std` is its standard error by the learner's, None if not
-    known. `share` is what it adds to the terms before it, `alone` what it explains as the only one. `rivals` would
-    explain nearly as much in its place.
+    `coefficient` is in `unit`, None where that is unknown; `std` is its standard error by the
+    learner's, None if not known. `share` is what it adds to the terms before it, `alone` what it
+    explains as the only one. `rivals` would explain nearly as much in its place.
     """
 
     parameter: str
@@ -98,12 +307,13 @@ class MovedParameter:
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """What a learner has found.
+    """Terms that a learner has found.
 
-    `share` is what the `terms` explain together of the mean square that the learner adds beside the physics, `noise`
-    the share that is its own error as far as training tells, `p` that of the learner being nothing else; None if not
-    known. `physics` is the baseline or motion with the terms added, None where there are none or it is a function;
-    `spec` the same as lines of a spec file.
+    `share` is what the `terms` explain together of the mean square that the learner adds beside the
+    physics, `noise` the share that is its own error as far as training shows, `p` that of the
+    learner being nothing else; None if not known. `physics` is the baseline or motion with the
+    terms added, None where there are none or it is a function; `spec` the same as lines of a spec
+    file.
     """
 
     terms: tuple[ExplainingTerm, ...]
@@ -120,7 +330,7 @@ class Explanation:
 
     @property
     def found(self) -> bool:
-        """Whether there are terms to add."""
+        """True if there are terms to add."""
         return bool(self.terms)
 
     def __repr__(self) -> str:
@@ -137,15 +347,16 @@ def explain(
     most: int = 6,
     least: float = LEAST,
 ) -> Explanation:
-    """Which terms a learner has found: its output over a record, regressed on suspects and on products.
+    """Find the terms that a learner holds: its output over a record on suspects and products.
 
-    Friction, drag, hardening, dead zones and saturations of everything that the learner sees are tried, and products of
-    it. Each is taken as the learner would show it, for a smooth one shows no jumps (`selection.as_shown`).
+    Friction, drag, hardening, dead zones and saturations of everything that the learner sees are
+    tried, and products of it. Each is taken as the learner would show it, for a smooth one shows no
+    jumps (`selection.as_shown`).
 
     Args:
         model: a model with a learner, or what `estimate` returned.
-        record: best the one that it was trained on; may be left out for an estimate. Outputs are needed but for a
-            motion, whose free run then starts from 0.
+        record: best the one that it was trained on; may be left out for an estimate. Outputs are
+            needed but for a motion, whose free run then starts from 0.
         suspects: further terms to try.
         degree, functions: of the products, as in `Terms`.
         most: terms at most.
@@ -158,102 +369,148 @@ def explain(
     if not isinstance(model, Model | MotionModel):
         model = getattr(fit, "model", None)
         if not isinstance(model, Model | MotionModel):
-            raise InputError(f"`model` must be a model or what `estimate` returns; got {shown(fit)}.")
-        record = getattr(getattr(fit, "problem", None), "record", None) if record is None else record
+            raise InputError(
+                f"`model` must be a model or what `estimate` returns; got {shown(fit)}."
+            )
+        record = (
+            getattr(getattr(fit, "problem", None), "record", None) if record is None else record
+        )
     check_type(record, Record, "record", "the Record that the model was trained on")
     assert record is not None
-    degree, most = check_count(degree, "degree", of="factors"), check_count(most, "most", of="terms")
+    degree, most = (
+        check_count(degree, "degree", of="factors"),
+        check_count(most, "most", of="terms"),
+    )
     if not is_number(least) or not 0 < least < 1:
         raise InputError(f"`least` must be a share between 0 and 1; got {shown(least)}.")
     if isinstance(functions, str) or any(not isinstance(name, str) for name in functions):
-        raise InputError(f"`functions` must be a list of names, such as ['abs']; got {shown(functions)}.")
-    ground = ground_of(model, record)
-    space = Space.of(ground, candidates_of(ground, degree, functions, _declared(suspects, ground)))
+        raise InputError(
+            f"`functions` must be a list of names, such as ['abs']; got {shown(functions)}."
+        )
+    linearization = linearization_of(model, record)
+    space = Space.of(
+        linearization,
+        candidates_of(linearization, degree, functions, _declared(suspects, linearization)),
+    )
     chosen, fitted, dropped = settled(space, select(space, most, least))
-    told = _told(space, chosen, fitted, dropped)
+    explanation = _explanation(space, chosen, fitted, dropped)
     code = getattr(getattr(fit, "status", None), "code", "converged")
     if code not in _ENDED:
-        text = "training did not end at a minimum: the learner may show terms otherwise than they are; train longer."
-        told = replace(told, warnings=(*told.warnings, Warning("not_converged", text)))
-    return told
+        text = (
+            "training did not end at a minimum: the learner may show terms otherwise than they "
+            "are; train longer."
+        )
+        explanation = replace(
+            explanation, warnings=(*explanation.warnings, Warning("not_converged", text))
+        )
+    return explanation
 
 
-def _declared(suspects: Sequence[Any], ground: Ground) -> list[tuple[str, int]]:
-    """Expressions of suspects with the number of their output or equation."""
-    names, found = [name for name, _ in ground.places], []
+def _declared(
+    suspects: Sequence[Any], linearization: LearnedLinearization
+) -> list[tuple[str, int]]:
+    """Return expressions of suspects with the number of their output or equation."""
+    names, found = [name for name, _ in linearization.places], []
     for suspect in suspects:
-        check_type(suspect, Suspect | MotionSuspect, "suspects", "a list of Suspects, or of MotionSuspects of a motion")
+        check_type(
+            suspect,
+            Suspect | MotionSuspect,
+            "suspects",
+            "a list of Suspects, or of MotionSuspects of a motion",
+        )
         where = suspect.equation if isinstance(suspect, MotionSuspect) else suspect.output
         if where is not None and where not in names:
             raise InputError(
-                f"suspect '{suspect.name}': the learner adds nothing to '{where}', but to {', '.join(names)}."
+                f"suspect '{suspect.name}': the learner adds nothing to '{where}', but to "
+                f"{', '.join(names)}."
             )
-        ground.evaluate(ground.parse(suspect.expression))
+        linearization.evaluate(linearization.parse(suspect.expression))
         found.append((suspect.expression, 0 if where is None else names.index(where)))
     return found
 
 
-def _told(space: Space, chosen: list[Candidate], fitted: Fit, dropped: bool) -> Explanation:
-    ground, noise, p = space.ground, None, space.shown.p
+def _explanation(space: Space, chosen: list[Candidate], fitted: Fit, dropped: bool) -> Explanation:
+    linearization, noise, p = space.linearization, None, space.shown.p
     if space.shown.covariance is not None and space.norm > 0:
         noise = min(float(np.trace(space.shown.covariance)) / space.norm**2, 1.0)
     singles = tuple(
-        SingleTerm(one.name, one.text, ground.places[one.place][0], share) for one, share in alone(space, _SHOWN)
+        SingleTerm(one.name, one.text, linearization.places[one.place][0], share)
+        for one, share in alone(space, _SHOWN)
     )
     share = space.explained([space.column(one) for one in chosen])
     real = p is None or p < _LEVEL
     if space.empty or not real or share < _HALF * (1 - (noise or 0.0)):
         chosen, text = [], _why_nothing(space, real, dropped, share, singles)
     terms = _terms(space, chosen, fitted)
-    moved = ground.moved(fitted.along) if chosen else ground.values
+    moved = linearization.moved(fitted.along) if chosen else linearization.values
     parameters = tuple(
         MovedParameter(p.name, p.unit, float(now), float(then))
-        for p, now, then in zip(ground.parameters, ground.values, moved, strict=True)
+        for p, now, then in zip(linearization.parameters, linearization.values, moved, strict=True)
     )
-    physics, spec = _physics(ground, terms, moved) if terms else (None, None)
+    physics, spec = _physics(linearization, terms, moved) if terms else (None, None)
     share = share if chosen else 0.0
     if terms:
         named = " and ".join(term.expression for term in terms) if len(terms) < 3 else ""
         what = named or f"{len(terms)} terms"
         verb = "explains" if len(terms) == 1 else "explain"
         text = f"{what} {verb} {percent(share, 3)} of what the learner adds beside the physics."
-    told = []
-    if ground.outside > _OUTSIDE:
-        reach = f"{100 * ground.outside:.0f} % of the rows lie beyond what the learner saw in training"
-        told.append(Warning("beyond_training", f"{reach}: there it shows how it extrapolates."))
+    warnings = []
+    if linearization.outside > _OUTSIDE:
+        reach = (
+            f"{100 * linearization.outside:.0f} % of the rows lie beyond what the learner saw "
+            "in training"
+        )
+        warnings.append(Warning("beyond_training", f"{reach}: its values there are extrapolated."))
     if terms:
-        told.append(Warning("conditional_on_selection", _CONDITIONAL))
-    points = len(ground.target)
-    return Explanation(terms, share, noise, p, singles, parameters, physics, spec, points, text, tuple(told))
+        warnings.append(Warning("conditional_on_selection", _CONDITIONAL))
+    points = len(linearization.target)
+    return Explanation(
+        terms, share, noise, p, singles, parameters, physics, spec, points, text, tuple(warnings)
+    )
 
 
-def _why_nothing(space: Space, real: bool, dropped: bool, share: float, singles: Sequence[SingleTerm]) -> str:
+def _why_nothing(
+    space: Space, real: bool, dropped: bool, share: float, singles: Sequence[SingleTerm]
+) -> str:
     if not space.target.any():
         return (
-            "the learner adds nothing over these data that the physics could not express; there is nothing to explain."
+            "the learner adds nothing over these data that the physics could not express; "
+            "there is nothing to explain."
         )
     if not space.candidates:
         return "nothing explains the learner: the physics expresses all candidate terms already."
     if not real:
-        return "what the learner adds does not stand out from its own errors; there is nothing to explain."
-    best = f"the best single term, {singles[0].expression}, explains {percent(singles[0].share)} of it"
+        return (
+            "what the learner adds is not significant against its own errors; there is nothing "
+            "to explain."
+        )
+    best = (
+        f"the best single term, {singles[0].expression}, explains {percent(singles[0].share)} of it"
+    )
     if dropped and share < _HALF:
-        return f"no term stands out from the learner's own errors; {best}. Keep the learner."
-    return f"no few terms explain half of what the learner adds; {best}. Keep the learner, or try other suspects."
+        return f"no term is significant against the learner's own errors; {best}. Keep the learner."
+    return (
+        f"a few terms do not explain half of what the learner adds; {best}. Keep the learner, or "
+        "try other suspects."
+    )
 
 
 def _terms(space: Space, chosen: Sequence[Candidate], fitted: Fit) -> tuple[ExplainingTerm, ...]:
-    ground, before, found = space.ground, 0.0, []
-    taken = [*ground.units, *(p.name for p in ground.parameters)]
-    if isinstance(ground.physics, Motion):
-        taken += list(ground.physics.known)
+    linearization, before, found = space.linearization, 0.0, []
+    taken = [*linearization.units, *(p.name for p in linearization.parameters)]
+    if isinstance(linearization.physics, Motion):
+        taken += list(linearization.physics.known)
     else:
-        taken += [name for name, _ in ground.physics.constants] + [term.parameter for term in ground.physics.terms]
+        taken += [name for name, _ in linearization.physics.constants] + [
+            term.parameter for term in linearization.physics.terms
+        ]
     names = names_for([_base_name(one) for one in chosen], taken)
     columns = [space.column(one) for one in chosen]
-    std = None if fitted.covariance is None else np.sqrt(np.maximum(np.diag(fitted.covariance), 0.0))
+    std = (
+        None if fitted.covariance is None else np.sqrt(np.maximum(np.diag(fitted.covariance), 0.0))
+    )
     for i, one in enumerate(chosen):
-        place, unit = ground.places[one.place]
+        place, unit = linearization.places[one.place]
         whole = space.explained(columns[: i + 1])
         scale = _scale(one.kind, one.on, one.text)
         found.append(
@@ -265,7 +522,7 @@ def _terms(space: Space, chosen: Sequence[Candidate], fitted: Fit) -> tuple[Expl
                 width=one.width,
                 added_to=place,
                 coefficient=float(fitted.coefficients[i]),
-                unit=coefficient_unit(unit, ground.parse(scale), ground.units),
+                unit=coefficient_unit(unit, linearization.parse(scale), linearization.units),
                 std=None if std is None else float(std[i]),
                 share=whole - before,
                 alone=space.explained([columns[i]]),
@@ -277,7 +534,7 @@ def _terms(space: Space, chosen: Sequence[Candidate], fitted: Fit) -> tuple[Expl
 
 
 def _scale(kind: str, on: str | None, text: str) -> str:
-    """The expression whose unit a term has."""
+    """Return the expression whose unit a term has."""
     return on if kind in ("dead_zone", "saturation") and on is not None else text
 
 
@@ -286,24 +543,24 @@ def _base_name(candidate: Candidate) -> str:
 
 
 def _physics(
-    ground: Ground, terms: Sequence[ExplainingTerm], moved: Any
+    linearization: LearnedLinearization, terms: Sequence[ExplainingTerm], moved: Any
 ) -> tuple[Baseline | Motion | None, str | None]:
-    """The physics with the terms added, and the lines that say so in a spec."""
-    several = len(ground.places) > 1
-    added = [_added(ground, term) for term in terms]
-    if isinstance(ground.physics, Motion):
-        changed = added_to_motion(ground.physics, moved, added, ground.units)
+    """Return the physics with the terms added, and the lines that say so in a spec."""
+    several = len(linearization.places) > 1
+    added = [_added(linearization, term) for term in terms]
+    if isinstance(linearization.physics, Motion):
+        changed = added_to_motion(linearization.physics, moved, added, linearization.units)
         return (None, None) if changed is None else (changed.motion, changed.lines())
-    baseline = added_to_baseline(ground.physics, moved, added, several)
+    baseline = added_to_baseline(linearization.physics, moved, added, several)
     return (None, None) if baseline is None else (baseline, baseline_lines(added, several))
 
 
-def _added(ground: Ground, term: ExplainingTerm) -> Added:
+def _added(linearization: LearnedLinearization, term: ExplainingTerm) -> NewTerm:
     template = unit = None
     if term.width is not None:
         template = term.expression.replace(repr(term.width), "{width}")
-        unit = coefficient_unit("1", ground.parse(str(term.on)), ground.units)
-        unit = None if unit is None else ground.units.get(str(term.on), "")
+        unit = coefficient_unit("1", linearization.parse(str(term.on)), linearization.units)
+        unit = None if unit is None else linearization.units.get(str(term.on), "")
     where = (term.added_to, term.coefficient, term.unit)
-    scale = ground.parse(_scale(term.kind, term.on, term.expression))
-    return Added(term.parameter, term.expression, *where, term.width, unit, template, scale)
+    scale = linearization.parse(_scale(term.kind, term.on, term.expression))
+    return NewTerm(term.parameter, term.expression, *where, term.width, unit, template, scale)

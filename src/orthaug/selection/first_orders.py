@@ -1,4 +1,4 @@
-"""Orders of a first linear model, quickly: least squares one step ahead, judged by the free run on rows held out."""
+"""Orders of a first linear model: least squares, judged by the free run on held-out rows."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ LOOKED_AT = 40_000
 """Rows of a longer record that orders are found on, in windows spread over it."""
 _FITTED = 0.7  # share of the rows that a candidate is fitted to
 _AS_GOOD = 1.05  # free-run error over the best, up to which fewer lags are taken
-_BETTER = 1.2  # free-run error over that from another first lag, up to which the lag that a test found is kept
+# Free-run error over that from another first lag, up to which the lag that a test found is kept
+_BETTER = 1.2
 _RANK = 1e-9  # singular value over the largest
 PERSISTENCE = 20  # the highest order of excitation that is looked for
 _EXCITED = 1e-6  # singular value over the largest
@@ -34,19 +35,22 @@ class FirstModel:
     offset: bool
     """Whether the signals have a level, so that the physics needs a constant."""
     delays: tuple[int | None, ...]
-    """First lag of each input that is significant beside the output's own past; None where none is."""
+    """First lag of each input that is significant beside the output's own past; None where none is.
+    """
     persistence: tuple[int, ...]
-    """Up to which order each input excites; `PERSISTENCE` stands for that or more."""
+    """Up to which order each input excites; `PERSISTENCE` means that or more."""
     free_run: tuple[float, ...]
-    """Error of the free run on rows held out over the output's standard deviation, for each output."""
+    """Error of the free run on rows held out over the output's standard deviation, for each output.
+    """
 
 
 def first_model(record: Record) -> FirstModel | None:
-    """Delays, excitation and orders for a record; None where it has too few rows for any model.
+    """Return delays, excitation and orders for a record; None for too few rows.
 
-    The orders are the smallest whose free run is within 5 % of the best of up to 4 lags a channel. The first lags are
-    the significant ones, unless from 1 or 0 on the best free run is clearly better. Every model that is tried has a
-    constant: without one, lags that are not there stand in for the level of the signals.
+    The orders are the smallest whose free run is within 5 % of the best of up to 4 lags a channel.
+    The first lags are the significant ones, unless from 1 or 0 on the best free run is clearly
+    better. Every model that is tried has a constant: without one, further lags make up
+    for the level of the signals.
     """
     record = _spread(record)
     signals = np.concatenate([np.hstack([e.outputs, e.inputs]) for e in record.experiments])
@@ -55,7 +59,9 @@ def first_model(record: Record) -> FirstModel | None:
     excited = tuple(_persistence(record, i) for i in range(len(record.inputs)))
     usual = [tuple(late if delay is None else delay for delay in delays) for late in (1, 0)]
     chosen: tuple[float, Orders, tuple[float, ...]] | None = None
-    for nk in dict.fromkeys([*usual, *((late,) * len(delays) for late in (1, 0))]):  # a test may miss the first lags
+    for nk in dict.fromkeys(
+        [*usual, *((late,) * len(delays) for late in (1, 0))]
+    ):  # a test may miss the first lags
         found = _smallest(record, excited, nk)
         if found is not None and (chosen is None or found[0] * _BETTER < chosen[0]):
             chosen = found
@@ -67,7 +73,10 @@ def first_model(record: Record) -> FirstModel | None:
 def _smallest(
     record: Record, excited: tuple[int, ...], nk: tuple[int, ...]
 ) -> tuple[float, Orders, tuple[float, ...]] | None:
-    """From these first lags on: the least error of all orders, and the smallest that come near it with theirs."""
+    """Return the least error of all orders from these first lags on, and the smallest near it.
+
+    The error of the smallest orders comes with them.
+    """
     tried: list[tuple[float, int, Orders, tuple[float, ...]]] = []
     for na, n in product(range(_MOST + 1), range(1, _MOST + 1) if record.inputs else [0]):
         orders = Orders(na, tuple(max(1, min(n, order)) for order in excited), nk)
@@ -83,17 +92,17 @@ def _smallest(
 
 
 def _spread(record: Record) -> Record:
-    """The record, or windows that are spread over it where it is long."""
+    """Return the record, or windows that are spread over it where it is long."""
     if len(record) <= LOOKED_AT:
         return record
     return witness(RecordSource(record, 0), LOOKED_AT)
 
 
 def _delay(record: Record, number: int) -> int | None:
-    """The first lag at which an input acts on any output, beside the output's past and all other lags of the inputs.
+    """Return the first lag of an input with an effect beside past outputs and all other lags.
 
-    Where rows or excitation do not allow that, by the cross-correlation with the input made white; where none is
-    significant, by that of the input's square.
+    Where rows or excitation do not allow that, by the cross-correlation with the input made white;
+    where none is significant, by that of the input's square.
     """
     found = []
     long = tuple(e for e in record.experiments if len(e) > 2 * _DELAY)
@@ -109,7 +118,10 @@ def _delay(record: Record, number: int) -> int | None:
 
 
 def _tested_delay(record: Record, number: int) -> int | None:
-    """By t-tests, at 5 % for all lags together; None where none is significant or the lags cannot be told apart."""
+    """Return the delay by t-tests, at 5 % for all lags together.
+
+    None where none is significant or the lags cannot be separated.
+    """
     orders = Orders(_MOST, (_DELAY + 1,) * len(record.inputs), (0,) * len(record.inputs))
     phi = np.concatenate([_rows(e, 0, orders, _DELAY) for e in record.experiments])
     y = np.concatenate([e.outputs[_DELAY:, 0] for e in record.experiments])
@@ -126,7 +138,7 @@ def _tested_delay(record: Record, number: int) -> int | None:
 
 
 def _persistence(record: Record, number: int) -> int:
-    """Rank of the matrix of an input's lags, its mean removed."""
+    """Return the rank of the matrix of an input's lags, its mean removed."""
     longest = max(record.experiments, key=len).inputs[:, number]
     n = min(PERSISTENCE, len(longest) // 3)
     if n < 1:
@@ -137,7 +149,10 @@ def _persistence(record: Record, number: int) -> int:
 
 
 def _errors(record: Record, orders: Orders) -> tuple[float, ...] | None:
-    """Error of the free run on the last rows for each output; None where it cannot be fitted, or runs away."""
+    """Return the error of the free run on the last rows for each output.
+
+    None where it cannot be fitted, or runs away.
+    """
     first = max([orders.na, *(nb + nk - 1 for nb, nk in zip(orders.nb, orders.nk, strict=True))])
     usable = [e for e in record.experiments if len(e) > first + 1]
     rows = sum(len(e) - first for e in usable)
@@ -154,11 +169,11 @@ def _errors(record: Record, orders: Orders) -> tuple[float, ...] | None:
             return None
         theta = theta / scale
         if record.inputs:
-            flown = np.concatenate([_free_run(e, j, theta, orders, first) for e in usable])
+            simulated = np.concatenate([_free_run(e, j, theta, orders, first) for e in usable])
         else:
-            flown = phi @ theta
+            simulated = phi @ theta
         with np.errstate(all="ignore"):  # one that is not stable overflows
-            wrong = float(np.sqrt(np.mean((flown[cut:] - y[cut:]) ** 2)))
+            wrong = float(np.sqrt(np.mean((simulated[cut:] - y[cut:]) ** 2)))
         if not np.isfinite(wrong):
             return None
         found.append(wrong / max(float(y.std()), 1e-300))
@@ -166,7 +181,7 @@ def _errors(record: Record, orders: Orders) -> tuple[float, ...] | None:
 
 
 def _rows(e: Experiment, j: int, orders: Orders, first: int) -> Matrix:
-    """Own past, inputs from their delays on, and 1."""
+    """Return the rows of own past, inputs from their delays on, and 1."""
     count = len(e) - first
     columns = [e.outputs[first - i : first - i + count, j] for i in range(1, orders.na + 1)]
     for i, (nb, nk) in enumerate(zip(orders.nb, orders.nk, strict=True)):
@@ -175,11 +190,13 @@ def _rows(e: Experiment, j: int, orders: Orders, first: int) -> Matrix:
 
 
 def _free_run(e: Experiment, j: int, theta: np.ndarray, orders: Orders, first: int) -> np.ndarray:
-    """The output from its first measured rows on."""
+    """Return the output from its first measured rows on."""
     from scipy.signal import lfilter, lfiltic
 
     driven = _rows(e, j, orders, first)[:, orders.na :] @ theta[orders.na :]
     taps = np.concatenate([[1.0], -theta[: orders.na]])
     with np.errstate(all="ignore"):
-        start = lfiltic([1.0], taps, e.outputs[first - 1 :: -1, j][: orders.na] if first else np.empty(0))
+        start = lfiltic(
+            [1.0], taps, e.outputs[first - 1 :: -1, j][: orders.na] if first else np.empty(0)
+        )
         return lfilter([1.0], taps, driven, zi=start)[0]

@@ -1,7 +1,10 @@
-"""Forward orthogonal least squares on normal equations: which column lowers the error most, beside those that are in.
+"""Forward orthogonal least squares on normal equations.
 
-Chen, Billings and Luo (1989), on Gram matrices: each pick is projected out of all others, so what a column would lower
-the squared error by is its right-hand side squared over what is left of its norm (the error-reduction ratio).
+Each pick is the column that lowers the error most beside those chosen before.
+
+Chen, Billings and Luo (1989), on Gram matrices: each pick is projected out of all others, so what a
+column would lower the squared error by is its right-hand side squared over what is left of its norm
+(the error-reduction ratio).
 """
 
 from __future__ import annotations
@@ -14,21 +17,25 @@ import numpy as np
 from orthaug._base.checks import Matrix, Vector
 
 DEPENDENT = 1e-9
-"""Share of a column's squared norm: where less of it is left beside the others, it is a combination of them."""
+"""Share of a column's squared norm: where less of it is left beside the others, it is a combination
+of them.
+"""
 
 
 COLLINEAR = 0.05
-"""Share of a column's deviation: where less is left beside the others, it lies within their span, near enough.
+"""Share of a column's deviation: where less is left beside the others, it lies within their span,
+near enough.
 
-One column widens the standard error of another by at most one over what is left of it, here twenty times. On records of
-a slow plant with a persistent input (`benchmarks/selection.py collinear`) terms widened a standard error up to 46 times
-without a limit, 28 with this one and 11 with twice as much, at 0.78, 0.79 and 0.80 of the error of physics alone on the
-blocks; but with twice as much the free run on Silverbox's arrow errs by a sixth more.
+One column widens the standard error of another by at most one over what is left of it, here twenty
+times. On records of a slow plant with a persistent input (`benchmarks/selection.py collinear`)
+terms widened a standard error up to 46 times without a limit, 28 with this one and 11 with twice as
+much, at 0.78, 0.79 and 0.80 of the error of physics alone on the blocks; but with twice as much the
+free run on Silverbox's arrow errs by a sixth more.
 """
 
 
 class Equations(NamedTuple):
-    """Normal equations `H p = b` of `‖y − S p‖²` over some rows: `H = SᵀS`, `b = Sᵀy`, `square = ‖y‖²`."""
+    """Normal equations `H p = b` of `‖y − S p‖²`: `H = SᵀS`, `b = Sᵀy`, `square = ‖y‖²`."""
 
     hessian: Matrix
     right: Vector
@@ -37,39 +44,48 @@ class Equations(NamedTuple):
 
     @classmethod
     def sum_of(cls, parts: Iterable[Equations]) -> Equations:
-        """Over the rows of all."""
+        """Return the equations over the rows of all parts."""
         hessian, right, square, rows = (sum(part) for part in zip(*parts, strict=True))
         return cls(np.asarray(hessian), np.asarray(right), float(square), int(rows))
 
     def of(self, columns: Sequence[int]) -> Equations:
-        """Of some of the columns, in that order."""
+        """Return the equations of some of the columns, in that order."""
         picked = np.asarray(columns, dtype=int)
         return self._replace(hessian=self.hessian[np.ix_(picked, picked)], right=self.right[picked])
 
     def among(self, columns: Sequence[int], count: int) -> Equations:
-        """As these of `count` columns, of which the others are zero."""
-        picked, hessian, right = np.asarray(columns, dtype=int), np.zeros((count, count)), np.zeros(count)
+        """Return the equations as these of `count` columns, of which the others are zero."""
+        picked, hessian, right = (
+            np.asarray(columns, dtype=int),
+            np.zeros((count, count)),
+            np.zeros(count),
+        )
         hessian[np.ix_(picked, picked)], right[picked] = self.hessian, self.right
         return self._replace(hessian=hessian, right=right)
 
     def scaled(self) -> Equations:
-        """With columns of unit norm."""
+        """Return the equations with columns of unit norm."""
         size = np.sqrt(np.maximum(np.diag(self.hessian), 0.0))
         unit = 1 / np.where(size > 0, size, 1.0)
         return self._replace(hessian=self.hessian * np.outer(unit, unit), right=self.right * unit)
 
     def solve(self) -> Vector:
-        """p, the shortest where columns depend on each other."""
+        """Return p, the shortest where columns depend on each other."""
         size = np.sqrt(np.maximum(np.diag(self.hessian), 0.0))
         unit = 1 / np.where(size > 0, size, 1.0)
-        return unit * np.linalg.lstsq(self.hessian * np.outer(unit, unit), unit * self.right, rcond=1e-14)[0]
+        return (
+            unit
+            * np.linalg.lstsq(self.hessian * np.outer(unit, unit), unit * self.right, rcond=1e-14)[
+                0
+            ]
+        )
 
     def miss(self, p: Vector) -> float:
-        """`‖y − S p‖²`."""
+        """Return `‖y − S p‖²`."""
         return float(self.square - 2 * p @ self.right + p @ self.hessian @ p)
 
 
-class Pick(NamedTuple):
+class ForwardStep(NamedTuple):
     """A column that was picked, and the share of the squared error left that it takes away."""
 
     column: int
@@ -84,13 +100,15 @@ def forward(
     least: float = 0.0,
     within: float = 0.0,
     constant: int | None = None,
-) -> list[Pick]:
+) -> list[ForwardStep]:
     """Pick up to `most` columns, one after another, beside those that are `known`.
 
     Args:
         least: share of the squared error left that a column must take away.
-        within: share of a column's deviation; one of which less is left lies within the span of those that are in.
-        constant: the column of a constant, beside which a column's deviation is what is left; None for its norm.
+        within: share of a column's deviation; one of which less is left lies within the span of
+            those that are in.
+        constant: the column of a constant, beside which a column's deviation is what is left; None
+            for its norm.
     """
     gram, right, square, _ = equations.scaled()
     gram, right, square = gram.copy(), right.copy(), float(square)
@@ -112,7 +130,7 @@ def forward(
 
     for column in known:
         project_out(column)
-    picks: list[Pick] = []
+    picks: list[ForwardStep] = []
     while len(picks) < most:
         left = np.diag(gram)
         able = (left > np.maximum(DEPENDENT * size, deviation)) & (left > 0) & ~out
@@ -120,7 +138,7 @@ def forward(
         best, before = int(np.argmax(gains)), max(square, 1e-300)
         if not able.any() or gains[best] <= least * before or gains[best] <= 0:
             break
-        picks.append(Pick(best, float(min(project_out(best) / before, 1.0))))
+        picks.append(ForwardStep(best, float(min(project_out(best) / before, 1.0))))
     return picks
 
 
@@ -134,11 +152,15 @@ def _deviations(gram: Matrix, constant: int | None) -> Vector:
     return beside
 
 
-def spanned(equations: Equations, known: Sequence[int], within: float, constant: int | None) -> list[int]:
-    """Return the columns of which less than `within` of the deviation is left beside the `known` ones."""
+def spanned(
+    equations: Equations, known: Sequence[int], within: float, constant: int | None
+) -> list[int]:
+    """Return the columns with less than `within` of their deviation outside the `known` ones."""
     gram = equations.scaled().hessian
     size, known = np.diag(gram), list(known)
     across = gram[known]
-    left = size - np.einsum("ij,ij->j", across, np.linalg.pinv(gram[np.ix_(known, known)], hermitian=True) @ across)
+    left = size - np.einsum(
+        "ij,ij->j", across, np.linalg.pinv(gram[np.ix_(known, known)], hermitian=True) @ across
+    )
     inside = (left < within**2 * _deviations(gram, constant)) & (size > 0)
     return [i for i in np.flatnonzero(inside).tolist() if i not in set(known)]

@@ -1,8 +1,9 @@
-"""Whether the chosen terms leave the physics its parameters: θ of physics alone beside θ with the terms.
+"""Comparison of θ of physics alone with θ beside the chosen terms.
 
-A term within the span of the physics takes over a part of it: the sum predicts as before, and θ means nothing any more.
-So each parameter is compared before and after, in units of what the two standard errors allow, and of each column the
-share is given that the others leave: one over it is the factor by which they widen its standard error.
+A term within the span of the physics takes over a part of it: the sum predicts as before, and θ
+means nothing any more. So each parameter is compared before and after, in units of what the two
+standard errors allow, and of each column the share is given that the others leave: one over it is
+the factor by which they widen its standard error.
 """
 
 from __future__ import annotations
@@ -18,14 +19,18 @@ from orthaug.selection.term_runs import Able, Point, TermRuns
 
 MOVED, SPANNED = "physics_moved", "terms_within_span"
 _SURE = 1.96  # standard errors
+_DETERMINED = (
+    1e-14  # of the largest eigenvalue: columns whose smallest is below depend on each other
+)
 
 
 @dataclass(frozen=True)
 class Shift:
     """A parameter of physics alone, and with the chosen terms.
 
-    Standard errors are those of the search's criterion, `None` where the data do not determine the parameter. `left` is
-    the share of the parameter's regressor, of its norm, that the other columns of the model leave.
+    Standard errors are those of the search's criterion, `None` where the data do not determine the
+    parameter. `left` is the share of the parameter's regressor, of its norm, that the other columns
+    of the model leave.
     """
 
     parameter: str
@@ -46,7 +51,7 @@ class Shift:
 
     @property
     def moved(self) -> bool:
-        """Whether the parameter moves by more than its standard errors allow."""
+        """True if the parameter moves by more than its standard errors allow."""
         return self.times is None or self.times > 1
 
     def __str__(self) -> str:
@@ -55,8 +60,8 @@ class Shift:
 
 
 @dataclass(frozen=True, eq=False)
-class KeptPhysics:
-    """How the physics fares beside the chosen terms."""
+class PhysicsComparison:
+    """Comparison of the physics without and beside the chosen terms."""
 
     shifts: tuple[Shift, ...]
     left: dict[str, float]
@@ -76,29 +81,36 @@ class KeptPhysics:
         if moved and self.left:
             times = max((shift.times for shift in moved if shift.times is not None), default=None)
             allowed = (
-                "more" if times is None else f"up to {times:.2g} times" if len(moved) > 1 else f"{times:.2g} times"
+                "more"
+                if times is None
+                else f"up to {times:.2g} times"
+                if len(moved) > 1
+                else f"{times:.2g} times"
             )
             least = min(moved, key=lambda shift: shift.left)
             text = (
-                f"the chosen terms move {'; '.join(map(str, moved))}: {allowed} what the standard errors allow. Beside "
-                f"the terms {100 * least.left:.2g} % of the regressor of {least.parameter} is left. Either physics "
-                "alone was biased by what the terms now explain, or the terms took over a part of the physics: compare "
-                "both values with what is known of the parameters, and where the first is right, put the missing "
-                "effect into the physics or `exclude` the terms that stand in for it."
+                f"the chosen terms move {'; '.join(map(str, moved))}: {allowed} what the "
+                f"standard errors allow. The terms leave {100 * least.left:.2g} % of the "
+                f"regressor of {least.parameter}. Either physics alone was biased by the effect "
+                "of the terms, or the terms took over a part of the physics. Compare both values "
+                "with what is known of the parameters. Where the first is right, put the missing "
+                "effect into the physics, or `exclude` the terms that replace it."
             )
             notes.append(Warning(MOVED, text))
         if self.excluded:
             beside = "physics and the chosen terms" if self.left else "the physics"
             text = (
-                f"{self.excluded} of {self.candidates} candidate terms lie within the span of {beside} and were not "
-                f"taken: less than {100 * self.collinear:g} % of each is left beside these, whose condition number is "
-                f"{self.condition:.3g}."
+                f"{self.excluded} of {self.candidates} candidate terms lie within the span of "
+                f"{beside} and were not taken: less than {100 * self.collinear:g} % of each is "
+                f"left beside these, whose condition number is {self.condition:.3g}."
             )
             notes.append(Warning(SPANNED, text))
         return notes
 
 
-def kept_physics(runs: TermRuns, alone: Point, chosen: Point, able: Able = None) -> KeptPhysics:
+def kept_physics(
+    runs: TermRuns, alone: Point, chosen: Point, able: Able = None
+) -> PhysicsComparison:
     """Compare θ of physics alone with θ beside the chosen terms, both trained on the criterion.
 
     Args:
@@ -107,29 +119,55 @@ def kept_physics(runs: TermRuns, alone: Point, chosen: Point, able: Able = None)
     physics, nt, texts = runs.problem.baseline, len(alone.c), runs.library.texts
     columns = [*range(nt), *(nt + i for i in chosen.chosen)]
     every = runs.equations(chosen, able)
-    before_std, _, _ = _statistics(runs, alone, runs.equations(alone, ()).of(range(nt)))
-    after_std, left, condition = _statistics(runs, chosen, every.of(columns))
+    before_std, _ = standard_errors(runs, alone, runs.equations(alone, ()).of(range(nt)))
+    after_std, _ = standard_errors(runs, chosen, every.of(columns))
+    left, condition = _what_is_left(every.of(columns))
     shifts = tuple(
-        Shift(p.name, p.unit, float(alone.c[i]), before_std[i], float(chosen.c[i]), after_std[i], float(left[i]))
+        Shift(
+            p.name,
+            p.unit,
+            float(alone.c[i]),
+            before_std[i],
+            float(chosen.c[i]),
+            after_std[i],
+            float(left[i]),
+        )
         for i, p in enumerate(physics.parameters)
     )
     within = spanned(every, columns, runs.collinear, runs.constant) if columns else []
     terms = dict(zip((texts[i] for i in chosen.chosen), map(float, left[nt:]), strict=True))
-    return KeptPhysics(shifts, terms, condition, len(within), len(texts), runs.collinear)
+    return PhysicsComparison(shifts, terms, condition, len(within), len(texts), runs.collinear)
 
 
-def _statistics(runs: TermRuns, point: Point, own: Equations) -> tuple[list[float | None], Vector, float]:
-    """Return standard errors of all columns, what the others leave of each, and the condition of their Gram matrix."""
+def standard_errors(
+    runs: TermRuns, point: Point, own: Equations
+) -> tuple[list[float | None], float]:
+    """Return standard errors of all columns of a model, None where the rows do not determine them, and the freedom."""
+    size, inverse, values = _inverse(own)
+    share = runs.independent_share(point)
+    freedom = max(own.rows - len(size), 1)
+    variance = max(own.miss(own.solve()), 0.0) / freedom / share
+    stds = np.sqrt(variance * np.diag(inverse)) / size
+    determined = bool(values[0] > _DETERMINED * values[-1])
+    found = [float(std) if determined and np.isfinite(std) else None for std in stds]
+    return found, max(share * own.rows - len(size), 1.0)
+
+
+def _what_is_left(own: Equations) -> tuple[Vector, float]:
+    """Return the share of each column's norm that the others leave, and the condition number of all."""
+    _, inverse, values = _inverse(own)
+    left = 1 / np.sqrt(np.maximum(np.diag(inverse), 1.0))
+    return left, float(np.sqrt(values[-1] / values[0])) if values[0] > _DETERMINED * values[
+        -1
+    ] else np.inf
+
+
+def _inverse(own: Equations) -> tuple[Vector, Matrix, Vector]:
+    """Return the norms of the columns, and of their Gram matrix at norm 1 the inverse and the eigenvalues."""
     size = np.sqrt(np.maximum(np.diag(own.hessian), 1e-300))
     gram: Matrix = own.hessian / np.outer(size, size)
     values = np.linalg.eigvalsh(gram) if len(gram) else np.ones(1)
-    inverse = np.linalg.pinv(gram, rcond=1e-14, hermitian=True)
-    left = 1 / np.sqrt(np.maximum(np.diag(inverse), 1.0))
-    determined = bool(values[0] > 1e-14 * values[-1])
-    variance = max(own.miss(own.solve()), 0.0) / max(own.rows - len(gram), 1) / runs.independent_share(point)
-    stds = np.sqrt(variance * np.diag(inverse)) / size
-    condition = float(np.sqrt(values[-1] / values[0])) if determined else np.inf
-    return [float(std) if determined and np.isfinite(std) else None for std in stds], left, condition
+    return size, np.linalg.pinv(gram, rcond=1e-14, hermitian=True), values
 
 
 def _figure(value: float, std: float | None) -> str:

@@ -1,11 +1,12 @@
-"""Is anything nonlinear missing, before a learner is trained? A test of what linear lags leave one step ahead.
+"""Test for a missing nonlinearity before a learner is trained, on the residual of linear lags.
 
-Squares, cubes and sizes of each regressor, less what physics and linear lags express of them, are multiplied by what
-these leave of the output. Their sums over blocks of rows change sign at random if nothing is missing, so the
-statistic is compared with itself under random signs, a wild bootstrap by blocks (Liu 1988, Shao 2010): its level does
-not rest on white or normal errors. A block is three times as long as the products remember each other, and a
-twentieth of the rows at least. What physics and linear lags leave of a block is too small, for the block has helped
-to fit them: it is divided by what it did not use, `(I − H_bb)⁻¹e_b` with H their projector (Bell and McCaffrey 2002),
+Squares, cubes and sizes of each regressor, less what physics and linear lags express of them, are
+multiplied by what these leave of the output. Their sums over blocks of rows change sign at random
+if nothing is missing, so the statistic is compared with itself under random signs, a wild bootstrap
+by blocks (Liu 1988, Shao 2010): its level does not rest on white or normal errors. A block is three
+times as long as the products remember each other, and a twentieth of the rows at least. What
+physics and linear lags leave of a block is too small, for the block has helped to fit them: it is
+divided by what it did not use, `(I − H_bb)⁻¹e_b` with H their projector (Bell and McCaffrey 2002),
 as HC3 does for a row.
 """
 
@@ -26,7 +27,9 @@ from orthaug.selection.forward import DEPENDENT
 from orthaug.selection.term_runs import TermRuns
 
 LEVEL = 0.05
-_BLOCKS = 20  # at most: 40 blocks of 1000 rows reject 7 to 13 % under a held input, `benchmarks/coverage_noise.py`
+# At most: 40 blocks of 1000 rows reject 7 to 13 % under a held input,
+# `benchmarks/coverage_noise.py`
+_BLOCKS = 20
 _FEWEST_BLOCKS = 8  # whose signs can make 256 sums
 _MEMORIES = 3  # times as long a block as the products remember each other
 _FEWEST_ROWS = 160
@@ -36,9 +39,10 @@ _SEED = 20_261_123
 
 @dataclass(frozen=True)
 class Nonlinearity:
-    """Whether functions of the regressors explain what linear lags leave; `p` is the p-value.
+    """Test that functions of regressors explain the residual of linear lags; `p` is its p-value.
 
-    `regressors` are the p-values of the functions of each regressor alone, multiplied by their number (Bonferroni).
+    `regressors` are the p-values of the functions of each regressor alone, multiplied by their
+    number (Bonferroni).
     """
 
     p: float
@@ -46,7 +50,7 @@ class Nonlinearity:
 
     @property
     def found(self) -> bool:
-        """Whether something nonlinear is missing, at the level of 5 %."""
+        """True if a nonlinear term is missing, at the level of 5 %."""
         return self.p < LEVEL
 
     @property
@@ -56,7 +60,10 @@ class Nonlinearity:
 
     def __str__(self) -> str:
         if not self.found:
-            return f"nothing nonlinear is missing beside physics and linear lags, as far as is seen (p = {self.p:.2g})."
+            return (
+                "nothing nonlinear is missing beside physics and linear lags, as far as is "
+                f"seen (p = {self.p:.2g})."
+            )
         named = ", ".join(self.matter)
         where = f" in {named}" if named else "; no single regressor shows it"
         return f"something nonlinear is missing (p = {self.p:.2g}){where}."
@@ -68,7 +75,9 @@ def nonlinearity(problem: Problem, lags: Sequence[str], draws: int = _DRAWS) -> 
     Args:
         draws: of random signs.
     """
-    squares = [f"{lag}**{power}" for lag in lags for power in (2, 3)] + [f"abs({lag})" for lag in lags]
+    squares = [f"{lag}**{power}" for lag in lags for power in (2, 3)] + [
+        f"abs({lag})" for lag in lags
+    ]
     library = TermLibrary.of((), 0, (), [*lags, *squares])
     runs = TermRuns.of(problem, library, Prediction())
     known, functions, target = _rows(runs, len(lags))
@@ -79,7 +88,9 @@ def nonlinearity(problem: Problem, lags: Sequence[str], draws: int = _DRAWS) -> 
     size = np.linalg.norm(functions, axis=0)
     functions = functions / np.where(size > 0, size, 1.0)
     functions = functions - q @ (q.T @ functions)
-    own = np.flatnonzero(np.isfinite(functions).all(axis=0) & (np.sum(functions**2, axis=0) > DEPENDENT))
+    own = np.flatnonzero(
+        np.isfinite(functions).all(axis=0) & (np.sum(functions**2, axis=0) > DEPENDENT)
+    )
     if not len(own):
         return None
     count = _blocks(_basis(functions[:, own]) * error[:, None])
@@ -95,14 +106,18 @@ def nonlinearity(problem: Problem, lags: Sequence[str], draws: int = _DRAWS) -> 
         statistic = float(np.sum((basis.T @ error) ** 2))
         return float((1 + np.sum(np.sum((signs @ sums) ** 2, axis=1) >= statistic)) / (1 + draws))
 
-    names = {i: lags[i // 2] for i in range(2 * len(lags))} | {2 * len(lags) + i: lag for i, lag in enumerate(lags)}
+    names = {i: lags[i // 2] for i in range(2 * len(lags))} | {
+        2 * len(lags) + i: lag for i, lag in enumerate(lags)
+    }
     single = {lag: np.array([i for i in own if names[int(i)] == lag], dtype=int) for lag in lags}
     single = {lag: columns for lag, columns in single.items() if len(columns)}
-    return Nonlinearity(p_value(own), {lag: min(1.0, p_value(c) * len(single)) for lag, c in single.items()})
+    return Nonlinearity(
+        p_value(own), {lag: min(1.0, p_value(c) * len(single)) for lag, c in single.items()}
+    )
 
 
 def _blocks(products: Matrix) -> int:
-    """Return how many blocks remember little of each other: none where the products remember for too long."""
+    """Return the number of blocks that hardly depend on each other; 0 where memory is too long."""
     lengths = [correlation_length(column[None]) for column in products.T]
     if any(length is None for length in lengths):
         return 0
@@ -111,7 +126,7 @@ def _blocks(products: Matrix) -> int:
 
 
 def _without_own_block(error: Vector, q: Matrix, blocks: Vector) -> Vector:
-    """Return the residual of each block for a fit that did not use it, `(I − q_b q_bᵀ)⁻¹e_b`, by Woodbury's formula."""
+    """Return each block's residual for a fit without it, `(I − q_b q_bᵀ)⁻¹e_b` (Woodbury)."""
     parts = []
     for e, own in zip(np.split(error, blocks[1:]), np.split(q, blocks[1:]), strict=True):
         values, vectors = np.linalg.eigh(np.eye(q.shape[1]) - own.T @ own)
@@ -121,7 +136,7 @@ def _without_own_block(error: Vector, q: Matrix, blocks: Vector) -> Vector:
 
 
 def _rows(runs: TermRuns, linear: int) -> tuple[Matrix, Matrix, Vector]:
-    """Physics and linear lags, their functions, and what the fixed terms leave of the output."""
+    """Return physics and linear lags, their functions, and the output less the fixed terms."""
     known, functions, targets = [], [], []
     for experiment in runs.problem.record.experiments:
         (phi, target), terms = runs.physics(*runs.rows(experiment)), runs.factors(experiment).T

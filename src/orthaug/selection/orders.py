@@ -1,7 +1,7 @@
-"""Orders and delays: na, nb and nk of linear lags beside the physics, judged by free runs on held-out blocks.
+"""Orders and delays na, nb and nk beside the physics, judged by free runs on held-out blocks.
 
-From the orders up to the largest, lags are taken away as long as what is left is as good; also a past output together
-with an input, for pole and zero go in pairs where both are superfluous.
+Starting from the largest orders, lags are removed as long as the rest is as good; also a
+past output together with an input, for pole and zero go in pairs where both are superfluous.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from orthaug.data.record import Record
 from orthaug.data.terms import TermLibrary
 from orthaug.fitting.criteria import Criterion
 from orthaug.physics.problem import Problem
-from orthaug.selection.term_path import Blocks, Rung, Search, Told, judge_all
+from orthaug.selection.term_path import Blocks, OnModel, PathModel, Search, judge_all
 from orthaug.selection.term_runs import TermRuns
 
 _SURE = 1.96  # standard errors of a cross-correlation of white signals
@@ -43,7 +43,10 @@ class Orders:
         return self.na + sum(self.nb)
 
     def smaller(self, least: Orders) -> Iterator[Orders]:
-        """One lag less: the oldest output, the oldest or the newest of an input; or an output and an input at once."""
+        """Yield one lag less: the oldest output, the oldest or the newest of an input.
+
+        An output and an input may also go at once.
+        """
         shorter = [replace(self, na=self.na - 1)] if self.na > least.na else []
         yield from shorter
         for base in (self, *shorter):
@@ -53,16 +56,21 @@ class Orders:
                     if nb > 1 or least.nb[i] == 0:
                         yield replace(base, nb=fewer)
                     if nb > 1 and (not least.nb[i] or self.nk[i] < least.nk[i]):
-                        yield replace(base, nb=fewer, nk=tuple(n + (j == i) for j, n in enumerate(self.nk)))
+                        yield replace(
+                            base, nb=fewer, nk=tuple(n + (j == i) for j, n in enumerate(self.nk))
+                        )
 
 
 @dataclass(frozen=True, eq=False)
 class Delay:
-    """The delay of an input: by its cross-correlation with the output, both filtered until the input is white.
+    """Delay of an input, by its cross-correlation with the output under whitening.
 
-    `correlation` is None where no lag is significant; `fitted` is the first lag that the choice of orders kept, None
-    where it kept none. `square` is that of the cross-correlation of the input's square, which is looked at where the
-    input itself does not correlate: an even nonlinearity has no linear correlation.
+    Both signals are filtered until the input is white.
+
+    `correlation` is None where no lag is significant; `fitted` is the first lag that the choice of
+    orders kept, None where it kept none. `square` is that of the cross-correlation of the input's
+    square, which is looked at where the input itself does not correlate: an even nonlinearity has
+    no linear correlation.
     """
 
     input: str
@@ -73,7 +81,9 @@ class Delay:
     def __str__(self) -> str:
         seen = "no lag is significant" if self.correlation is None else f"{self.correlation}"
         fitted = "the orders keep no lag" if self.fitted is None else f"{self.fitted} by the fit"
-        squared = "" if self.square is None else f"; {self.square} by cross-correlation of its square"
+        squared = (
+            "" if self.square is None else f"; {self.square} by cross-correlation of its square"
+        )
         return f"{self.input}: {seen} by cross-correlation, {fitted}{squared}"
 
     @classmethod
@@ -105,12 +115,13 @@ def search_orders(
     largest: Orders,
     least: Orders,
     blocks: int,
-    told: Told = lambda rung: None,
+    report: OnModel = lambda rung: None,
     runner: Any = Threads(),  # noqa: B008  (it holds nothing)
 ) -> OrderSearch:
     """Judge orders from `largest` down, never below `least`, what the physics reads already.
 
-    Every model has a constant: without one, lags that are not there stand in for the level of the signals.
+    Every model has a constant: without one, further lags would make up for the level of the
+    signals.
 
     Raises:
         InputError: too few rows for so many blocks.
@@ -122,10 +133,12 @@ def search_orders(
         for i in range(nk, nk + nb):
             place[name, i] = len(lags)
             lags.append(f"{name}[k-{i}]" if i else f"{name}[k]")
-    runs = TermRuns.of(problem, TermLibrary(tuple(lags), (*((i,) for i in range(len(lags))), ())), criterion)
+    runs = TermRuns.of(
+        problem, TermLibrary(tuple(lags), (*((i,) for i in range(len(lags))), ())), criterion
+    )
     level = [len(lags)] if runs.constant == len(problem.baseline.names) + len(lags) else []
     known = {str(lag) for term in problem.baseline.terms for lag in [term.regressor]}
-    found: dict[Orders, Rung] = {}
+    found: dict[Orders, PathModel] = {}
     with one_blas_thread():
         folds = Blocks(runs, blocks, runner)
 
@@ -137,15 +150,20 @@ def search_orders(
 
         def judge(several: Iterable[Orders]) -> None:
             new = [orders for orders in dict.fromkeys(several) if orders not in found]
-            for orders, (point, held, seconds) in zip(new, folds.fitted(list(map(chosen, new))), strict=True):
-                found[orders] = Rung(point, (str(orders),), held, seconds, orders.size)
-                told(found[orders])
+            for orders, (point, held, seconds) in zip(
+                new, folds.fitted(list(map(chosen, new))), strict=True
+            ):
+                found[orders] = PathModel(point, (str(orders),), held, seconds, orders.size)
+                report(found[orders])
 
         try:
             shorter = []
             for na in range(max(least.na, min(1, largest.na)), largest.na + 1):
                 fewer = largest.na - na
-                nb = tuple(max(n - fewer, low, min(n, 1)) for n, low in zip(largest.nb, least.nb, strict=True))
+                nb = tuple(
+                    max(n - fewer, low, min(n, 1))
+                    for n, low in zip(largest.nb, least.nb, strict=True)
+                )
                 shorter.append(Orders(na, nb, largest.nk))
             judge(shorter)
             _shrink(found, judge, least)
@@ -156,13 +174,17 @@ def search_orders(
         if not level:
             return search
         point, held, seconds = next(folds.fitted([chosen(search.chosen, [])]))
-        without = Rung(point, (), held, seconds, search.chosen.size)
-        needed = not judge_all((without, replace(search.rungs[search.place], size=without.size + 1)))[0].within
+        without = PathModel(point, (), held, seconds, search.chosen.size)
+        needed = not judge_all(
+            (without, replace(search.rungs[search.place], size=without.size + 1))
+        )[0].within
         return replace(search, constant=needed)
 
 
-def _shrink(found: dict[Orders, Rung], judge: Callable[[Iterable[Orders]], None], least: Orders) -> None:
-    """From the best on, as long as one lag less is as good as the best."""
+def _shrink(
+    found: dict[Orders, PathModel], judge: Callable[[Iterable[Orders]], None], least: Orders
+) -> None:
+    """Remove one lag after another from the best orders, as long as the rest is as good."""
     current = min(found, key=lambda orders: found[orders].score)
     while True:
         smaller = list(current.smaller(least))
@@ -174,11 +196,15 @@ def _shrink(found: dict[Orders, Rung], judge: Callable[[Iterable[Orders]], None]
         current = min(able, key=lambda orders: found[orders].score)
 
 
-def correlated_delay(record: Record, number: int, most: int, *, squared: bool = False) -> int | None:
-    """The first lag at which an input, made white, acts on the output; None where none is significant.
+def correlated_delay(
+    record: Record, number: int, most: int, *, squared: bool = False
+) -> int | None:
+    """Return the first lag at which an input, made white, acts on the output.
 
-    Both signals go through the filter that makes the input white (Box and Jenkins); a lag counts from 1.96/√N on, for
-    all `most` lags together.
+    None where none is significant.
+
+    Both signals go through the filter that makes the input white (Box and Jenkins); a lag counts
+    from 1.96/√N on, for all `most` lags together.
 
     Args:
         number: of the input.
@@ -191,7 +217,11 @@ def correlated_delay(record: Record, number: int, most: int, *, squared: bool = 
         n = min(_WHITENING, len(u) // 10)
         u, y = u - u.mean(), y - y.mean()
         u = u**2 - np.mean(u**2) if squared else u
-        past = np.column_stack([u[n - i : len(u) - i] for i in range(1, n + 1)]) if n else np.zeros((len(u), 0))
+        past = (
+            np.column_stack([u[n - i : len(u) - i] for i in range(1, n + 1)])
+            if n
+            else np.zeros((len(u), 0))
+        )
         filtered = np.linalg.lstsq(past, u[n:], rcond=1e-8)[0] if n else np.zeros(0)
         taps = np.concatenate([[1.0], -filtered])
         white, out = (np.convolve(part, taps)[n : len(part)] for part in (u, y))

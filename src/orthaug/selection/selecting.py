@@ -1,20 +1,29 @@
-"""The verb that finds structure: orders and delay, whether anything is nonlinear, and terms or a network."""
+"""The verb `select`: orders and delay, a test for nonlinearity, and terms or a network."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from itertools import islice
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import scipy.special
 
 from orthaug._base.checks import check_count, check_number, check_type
 from orthaug._base.errors import InputError, Warning
+from orthaug.analysis.robustness import robust_where_asked
 from orthaug.data.expressions import Lag
 from orthaug.data.record import Record
 from orthaug.data.regressors import Lags, in_order
 from orthaug.data.terms import CONSTANT
 from orthaug.fitting.criteria import Criterion, Simulation
 from orthaug.fitting.estimation import estimate
+from orthaug.fitting.held_out import blocked, mean_square, squared_errors
+from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.models.learners import MLP, Learner
 from orthaug.models.rows import Engine, InMemory
 from orthaug.models.tasks import runs_on
@@ -22,18 +31,137 @@ from orthaug.models.terms import Terms
 from orthaug.physics.baseline import Baseline
 from orthaug.physics.problem import Problem, pose, regressor_of
 from orthaug.selection.candidates import candidates
+from orthaug.selection.false_discoveries import LEVEL, Control, false_discovery_rates
 from orthaug.selection.forward import COLLINEAR
-from orthaug.selection.kept_physics import KeptPhysics, kept_physics
-from orthaug.selection.learner_search import LearnerSearch, search_learners
+from orthaug.selection.kept_physics import PhysicsComparison, kept_physics
 from orthaug.selection.nonlinearity import Nonlinearity, nonlinearity
 from orthaug.selection.orders import Delay, Orders, OrderSearch, search_orders
-from orthaug.selection.term_path import Judged, TermPath, climb
-from orthaug.selection.term_runs import TermRuns
+from orthaug.selection.parts import (
+    AS_DECLARED,
+    CONDITIONAL,
+    NONE,
+    SPLIT,
+    Intervals,
+    Parts,
+    of_parts,
+    parted,
+)
+from orthaug.selection.rivals import rivals
+from orthaug.selection.term_path import (
+    OnModel,
+    PathModel,
+    RankedModel,
+    Search,
+    TermPath,
+    climb,
+    from_both_starts,
+)
+from orthaug.selection.term_runs import Point, TermRuns
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from orthaug.fitting.estimates import Estimate
+
+_ITERATIONS = 40  # of a network on a fold
+
+
+@dataclass(frozen=True, eq=False)
+class LearnerSearch(Search):
+    """Networks, physics alone first."""
+
+    learners: tuple[MLP | None, ...]
+
+    @property
+    def chosen(self) -> MLP | None:
+        """Network of the choice; None for physics alone."""
+        return self.learners[self.place]
+
+
+def search_learners(
+    problem: Problem,
+    lags: Lags,
+    tested: Nonlinearity | None,
+    learner: MLP,
+    widths: Sequence[int],
+    criterion: Criterion,
+    blocks: int,
+    report: OnModel,
+    runner: Any,
+) -> LearnerSearch:
+    """Judge every width on all lags, and on those whose functions matter by themselves.
+
+    Raises:
+        InputError: too few rows for so many blocks.
+    """
+    record, baseline = problem.record, problem.baseline
+    seen: list[tuple[str, ...] | None] = [learner.inputs]
+    if tested is not None and tested.matter and learner.inputs is None:
+        seen.append(tested.matter)
+    tried: list[MLP | None] = [None]
+    tried += [
+        replace(learner, hidden=(width,), inputs=inputs) for inputs in seen for width in widths
+    ]
+    folds = blocked(record, blocks, max(problem.first_row, _largest(lags)))
+    names = (
+        tuple(channel.name for channel in record.outputs),
+        tuple(channel.name for channel in record.inputs),
+    )
+    given, rungs = (baseline, lags, criterion, folds), []
+    found = runner.map(_on_fold, given, [(one, i) for one in tried for i in range(len(folds))])
+    for one in tried:
+        held, seconds = zip(*islice(found, len(folds)), strict=True)
+        nz = (
+            0 if one is None else len(one.inputs if one.inputs is not None else lags.layout(*names))
+        )
+        size = 0 if one is None else one.weights(nz, 1)
+        words = (
+            ()
+            if one is None
+            else (f"{one.hidden[0]} neurons of {', '.join(one.inputs or ('all lags',))}",)
+        )
+        rungs.append(
+            PathModel(
+                Point((), np.zeros(0), np.zeros(0)), words, np.array(held), sum(seconds), size
+            )
+        )
+        try:
+            report(rungs[-1])
+        except KeyboardInterrupt:
+            break
+    return LearnerSearch(tuple(rungs), tuple(tried[: len(rungs)]))
+
+
+def _largest(lags: Lags) -> int:
+    nb, nk = (np.atleast_1d(part) for part in (lags.nb, lags.nk))
+    return int(max(np.max(lags.na, initial=0), np.max(nb + nk - 1, initial=0)))
+
+
+def _on_fold(
+    given: Any, item: tuple[MLP | None, int], report: Callable[..., None]
+) -> tuple[float, float]:
+    """Return the mean squared error of free runs on a block that was held out, and seconds.
+
+    The error is infinite without a model.
+    """
+    began, (learner, number), (baseline, lags, criterion, folds) = time.monotonic(), item, given
+    kept, held = folds[number]
+    options = {
+        "solver": LevenbergMarquardt(_ITERATIONS),
+        "blocks": 0,
+        "fallback": False,
+        "criterion": criterion,
+    }
+    if learner is not None:
+        options |= {"lags": lags, "regularization": "evidence"}
+    error = np.inf
+    with suppress(InputError):  # the block took away what the physics needs
+        fit = estimate(kept, baseline, learner=learner, **options)
+        error = (
+            mean_square(squared_errors(fit.model.simulate(held), 1.0)) if fit.status.ok else np.inf
+        )
+    return error, time.monotonic() - began
+
 
 MOST = 60
 """Terms on the path forward."""
@@ -41,24 +169,47 @@ LARGEST = (4, 5)
 """na and nb up to which orders are searched where nothing is said."""
 WIDTHS = (4, 8, 16)
 """Hidden neurons that are tried where nothing is said."""
-_CONDITIONAL = (
-    "intervals of a fit on these data are conditional on the choice, which was made on them; with `halves` one half of "
-    "the data chooses and the other is fitted."
+_RIVALS = (
+    "may stand in: {}. Beside the other, the chosen term is not significant on the rows that "
+    "are fitted. Its coefficient and interval are those of a model without the other; more "
+    "varied inputs tell them apart."
 )
-Told = Callable[[str, Any], None]
-"""Called with the stage and each model that was judged; it may raise KeyboardInterrupt to keep what there is."""
+_NOT_CONFIRMED = (
+    "not confirmed on the rows that had no say in the choice: {}. The q-value there is above "
+    "{:g} %: the term does nothing, or too little for so many rows. Its interval holds either "
+    "way."
+)
+OnStage = Callable[[str, Any], None]
+"""Called with the stage and each model that was judged; it may raise KeyboardInterrupt to keep what
+there is.
+"""
 
 
 def _unheard(stage: str, rung: Any) -> None:
-    """Nobody listens."""
+    """Ignore a model; used where nobody listens."""
+
+
+@dataclass(frozen=True)
+class Confirmed:
+    """A chosen term on the rows that had no say in the choice.
+
+    `p` is its p-value beside physics and the other terms, and `q` the least rate of false
+    discoveries at which it is one among the chosen terms (Benjamini and Hochberg 1995).
+    """
+
+    p: float
+    q: float
 
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """What `select` returns. Print `selection.summary()`; take `selection.table`; go on with `selection.estimate()`."""
+    """Result of `select`.
+
+    Print `selection.summary()`; take `selection.table`; go on with `selection.estimate()`.
+    """
 
     record: Record = field(repr=False)
-    """What `estimate` fits: the record, or the half that the choice was not made on."""
+    """What `estimate` fits: rows that had no say in the choice, where these suffice."""
     baseline: Baseline
     criterion: Criterion
     delays: tuple[Delay, ...]
@@ -69,14 +220,22 @@ class Selection:
     notes: tuple[Warning, ...]
     stopped: bool = False
     """Whether the search was stopped before its end; what it had found by then was chosen from."""
-    physics: KeptPhysics | None = None
-    """θ of physics alone beside θ with the chosen terms; None where no terms were searched, or there is no physics."""
+    physics: PhysicsComparison | None = None
+    """θ of physics alone beside θ with the chosen terms; None where no terms were searched, or
+    there is no physics.
+    """
     reach: Orders | None = None
-    """The orders that were chosen, with lags of inputs that act by a nonlinear function alone; None for no such."""
+    """The orders that were chosen, with lags of inputs that act by a nonlinear function alone; None
+    for no such.
+    """
+    intervals: Intervals = Intervals.none("all rows chose")
+    """Where intervals of a fit of the choice come from."""
+    level: float = LEVEL
+    """The rate of false discoveries that was allowed."""
 
     @property
     def lags(self) -> Lags:
-        """The orders that were chosen, and lags of inputs that have no linear effect but a nonlinear one."""
+        """Chosen orders, and lags of inputs that have only a nonlinear effect."""
         chosen = self.reach or self.orders.chosen
         return Lags(chosen.na, chosen.nb, chosen.nk)
 
@@ -93,27 +252,88 @@ class Selection:
 
     @cached_property
     def shares(self) -> dict[str, float]:
-        """Of every chosen term, how often it is chosen over random halves of the data."""
+        """Of every chosen term, how often it is chosen over random halves of the rows that chose.
+
+        Empty where no terms were chosen from a library; linear lags are chosen as orders, and a
+        network as a whole.
+        """
         return {} if self.terms is None else self.terms.shares()
+
+    @cached_property
+    def confirmed(self) -> dict[str, Confirmed]:
+        """Every chosen term on the rows that had no say in the choice.
+
+        Empty where there are no such rows.
+
+        Its standard error is the one that the errors ask for, robust against colour and uneven
+        size.
+        """
+        if self.intervals.source != SPLIT or not isinstance(self.learner, Terms):
+            return {}
+        fit = self.estimate(blocks=0)
+        if not fit.status.ok:
+            return {}
+        table = robust_where_asked(fit, fit.model.predict(self.record)).terms
+        tested = table[table["std"] > 0]
+        freedom = max(fit.model.statistics.freedom, 1.0)
+        p = 2 * scipy.special.stdtr(
+            freedom, -np.abs(np.asarray(tested["coefficient"] / tested["std"], dtype=float))
+        )
+        q = false_discovery_rates(p)
+        return {
+            str(term): Confirmed(float(a), float(b))
+            for term, a, b in zip(tested.index, p, q, strict=True)
+        }
+
+    @property
+    def unconfirmed(self) -> tuple[str, ...]:
+        """The chosen terms whose q-value on the rows that had no say is above the level."""
+        return tuple(term for term, one in self.confirmed.items() if one.q > self.level)
 
     @property
     def options(self) -> dict[str, Any]:
-        """What `estimate` is to be called with, beside record and baseline."""
-        judged = {"regularization": "none", "fallback": False} if isinstance(self.learner, Terms) else {}
+        """Arguments for `estimate`, beside record and baseline."""
+        judged = (
+            {"regularization": "none", "fallback": False} if isinstance(self.learner, Terms) else {}
+        )
         lags = None if isinstance(self.learner, Terms | None) else self.lags
         return {"learner": self.learner, "lags": lags, "criterion": self.criterion} | judged
 
+    @cached_property
+    def rivals(self) -> dict[str, tuple[str, ...]]:
+        """Of a chosen term the candidates for which it may stand in, on the rows that `estimate` fits.
+
+        Beside one of these the term is not significant, so these rows do not tell which of the two
+        acts.
+        """
+        if self.terms is None or not isinstance(self.learner, Terms):
+            return {}
+        runs = self.terms.runs
+        if self.intervals.source != SPLIT:
+            return rivals(runs, self.terms.chosen.point)
+        own = TermRuns.of(
+            runs.problem.on(self.record), runs.library, runs.criterion, None, runs.collinear
+        )
+        return rivals(own, from_both_starts(own, self.terms.chosen.point.chosen))
+
     def estimate(self, **options: Any) -> Estimate:
-        """The fit of the choice; `options` of `estimate` beside it."""
-        return estimate(self.record, self.baseline, **(self.options | options))
+        """Return the fit of the choice to `record`; `options` of `estimate` beside it.
+
+        It has no standard errors and no intervals where the rows that are fitted chose the terms.
+        """
+        fit = estimate(self.record, self.baseline, **(self.options | options))
+        if self.intervals.source != NONE:
+            return fit
+        return fit.withheld("chosen", Warning("conditional_on_selection", self.intervals.text))
 
     @property
     def table(self) -> pd.DataFrame:
         """A row for each model that was judged, in order.
 
-        `stage` is orders, terms or learner; `size` the number of lags, terms or weights; `score` the RMS error of free
-        runs on held-out blocks in the output's unit, `standard_error` its own; `within` whether it is as good as the
-        best of its stage; `seconds` what it took (of orders and learners the sum over its fits).
+        `stage` is orders, terms or learner; `size` the number of lags, terms or weights; `score`
+        the RMS error of free runs on held-out blocks in the output's unit, `standard_error` its
+        own; `within` whether it is as good as the best of its stage; `seconds` what it took (of
+        orders and learners the sum over its fits).
         """
         import pandas as pd
 
@@ -134,8 +354,8 @@ class Selection:
                 )
         return pd.DataFrame(rows)
 
-    def _stages(self) -> list[tuple[str, Sequence[Judged]]]:
-        stages: list[tuple[str, Sequence[Judged]]] = [("orders", self.orders.judged())]
+    def _stages(self) -> list[tuple[str, Sequence[RankedModel]]]:
+        stages: list[tuple[str, Sequence[RankedModel]]] = [("orders", self.orders.judged())]
         if self.terms is not None:
             stages.append(("terms", self.terms.judged()))
         if self.learners is not None:
@@ -143,18 +363,34 @@ class Selection:
         return stages
 
     def summary(self) -> str:
-        """A page of text."""
+        """Return a page of text."""
         lines = [f"orders      {self.orders.chosen}"]
         lines += [f"delay       {delay}" for delay in self.delays]
         if self.nonlinearity is not None:
             lines.append(f"nonlinear   {self.nonlinearity}")
-        lines.append(f"learner     {self.learner or 'none: nothing helps on the blocks that were held out'}")
-        lines += [f"physics     {shift}" for shift in self.physics.shifts] if self.physics and self.shares else []
+        lines.append(
+            f"learner     {self.learner or 'none: nothing helps on the blocks that were held out'}"
+        )
+        lines.append(f"intervals   {self.intervals.source}: {self.intervals.text}")
+        lines += (
+            [f"physics     {shift}" for shift in self.physics.shifts]
+            if self.physics and self.shares
+            else []
+        )
         if self.shares:
             width = max(len(term) for term in self.shares)
-            lines += ["", f"{'term':<{width}}  chosen over halves of the data"]
-            lines += [f"{term:<{width}}  {100 * share:3.0f} %" for term, share in self.shares.items()]
-        return "\n".join([*lines, *(["", *(f"note: {note}" for note in self.notes)] if self.notes else [])])
+            lines += [
+                "",
+                f"{'term':<{width}}  chosen over halves of the data, p and q on the rows that "
+                "had no say",
+            ]
+            for term, share in self.shares.items():
+                one = self.confirmed.get(term)
+                tested = "" if one is None else f"  {one.p:8.2g}  {one.q:8.2g}"
+                lines.append(f"{term:<{width}}  {100 * share:3.0f} %{tested}")
+        return "\n".join(
+            [*lines, *(["", *(f"note: {note}" for note in self.notes)] if self.notes else [])]
+        )
 
 
 def select(
@@ -167,34 +403,44 @@ def select(
     widths: Sequence[int] = WIDTHS,
     most: int = MOST,
     blocks: int = 5,
-    halves: bool = False,
-    progress: Told = _unheard,
+    halves: bool | Parts | None = None,
+    fitted: Record | None = None,
+    progress: OnStage = _unheard,
     engine: Engine | None = None,
     collinear: float = COLLINEAR,
+    level: float = LEVEL,
 ) -> Selection:
-    """Choose orders and delay, and terms or a network, by free runs on blocks of the data that are held out.
+    """Choose orders and delay, and terms or a network, by free runs on held-out blocks of the data.
 
-    Terms are picked by what they lower the error by beside the physics, which is projected out (forward orthogonal
-    regression on the sensitivities of the free run). The choice is the smallest model within one standard error of the
-    best, or within 2 % of its error.
+    Terms are picked by what they lower the error by beside the physics, which is projected out
+    (forward orthogonal regression on the sensitivities of the free run). The choice is the smallest
+    model within one standard error of the best, or within 2 % of its error.
 
     Args:
         record: measured inputs and one output.
         baseline: the physics, which is always in the model; None for none.
-        learner: `Terms(…)`, whose library is chosen from; `MLP(…)`, whose width and inputs are chosen; None to choose
-            linear lags only.
-        lags: the largest orders, and the smallest delay; by default na = 4, nb = 5 from the first lag of an input that
-            the physics reads, or from 1.
+        learner: `Terms(…)`, whose library is chosen from; `MLP(…)`, whose width and inputs are
+            chosen; None to choose linear lags only.
+        lags: the largest orders, and the smallest delay; by default na = 4, nb = 5 from the first
+            lag of an input that the physics reads, or from 1.
         criterion: what models are trained on; None for the free run.
         widths: hidden neurons that are tried.
         most: terms at most.
         blocks: held out in turn.
-        halves: choose on the first half of the record, and keep the other for the fit (`Selection.estimate`), whose
-            intervals are then not conditional on the choice.
+        halves: choose on the first half of the record, or of its experiments, and keep the other
+            for the fit (`Selection.estimate`), whose intervals then hold as if the terms had been
+            declared. None does so where either half has 200 usable rows, and where no network is
+            chosen; `Parts` are halves that were cut already. Without halves all rows choose and are
+            fitted, and there are no intervals after a choice of terms.
+        fitted: other data for the fit, instead of halves: `record` chooses, and these have no say.
         progress: called with the stage and each model that was judged.
-        engine: `Dask(client)` has the workers of a cluster judge the models; None for this machine's cores.
-        collinear: share of a term's deviation that physics and the terms before it must leave: a term of which less is
-            left lies within their span and is not taken, for it would take over a part of the physics. 0 takes all.
+        engine: `Dask(client)` has the workers of a cluster judge the models; None for this
+            machine's cores.
+        collinear: share of a term's deviation that physics and the terms before it must leave: a
+            term of which less is left lies within their span and is not taken, for it would take
+            over a part of the physics. 0 takes all.
+        level: the expected share of spurious terms among the chosen ones that is allowed; 1 takes
+            any.
 
     Raises:
         InputError: several outputs, too few rows, terms that are none.
@@ -204,60 +450,203 @@ def select(
     most, blocks = check_count(most, "most", least=0), check_count(blocks, "blocks", least=2)
     collinear = check_number(collinear, "collinear")
     if len(record.outputs) != 1:
-        raise InputError(f"structure is chosen for one output; the record has {len(record.outputs)}: choose for each.")
+        raise InputError(
+            f"structure is chosen for one output; the record has {len(record.outputs)}: choose "
+            "for each."
+        )
     baseline = Baseline(()) if baseline is None else baseline
     if baseline.function is not None:
-        raise InputError("structure is chosen beside physics that are terms; of a Python function nothing is known.")
+        raise InputError(
+            "structure is chosen beside physics that are terms; of a Python function nothing "
+            "is known."
+        )
     criterion = Simulation() if criterion is None else criterion
-    record, kept = record.split(0.5) if halves else (record, record)
-    problem, heard, runner = pose(record, baseline), _Listener(progress), runs_on(engine or InMemory())
+    if check_number(level, "level", positive=True) > 1:
+        raise InputError(f"`level` is a share of the chosen terms, 1 or less; got {level:g}.")
+    whole, heard, runner = record, _Listener(progress), runs_on(engine or InMemory())
+    problem = pose(record, baseline)
     largest, least = _reach(problem, lags)
+    parts = _parts(record, fitted, baseline, largest, halves, network=isinstance(learner, MLP))
+    if parts.chooses is not record:
+        record = parts.chooses
+        problem = pose(record, baseline)
     orders = search_orders(problem, criterion, largest, least, blocks, heard.of("orders"), runner)
     names = [channel.name for channel in record.inputs]
-    delays = tuple(Delay.of(record, i, largest.nk[i] + largest.nb[i], orders.chosen) for i in range(len(names)))
+    delays = tuple(
+        Delay.of(record, i, largest.nk[i] + largest.nb[i], orders.chosen) for i in range(len(names))
+    )
     layout = partial(_layout, problem.outputs, names)
     asked = _with_every_input(orders.chosen, largest)
     tested = nonlinearity(problem, [str(lag) for lag in layout(asked)]) if layout(asked) else None
     reach = _reached(orders.chosen, asked, tested, names)
-    path = found = physics = None
-    notes: list[Warning] = []
-    if isinstance(learner, Terms) and not heard.stopped:
-        runs, notes = _terms(problem, learner, largest, criterion, collinear)
-        near, linear = [baseline.lags, layout(reach)], _beside(orders, record, baseline)
-        at_most = min(most, len(problem.rows) // 10)
-        path = climb(runs, blocks, at_most, heard.of("terms"), runner, near, linear)
-        if not path.chosen.point.chosen:
-            notes.append(Warning("nothing_helps", "no term lowers the error on blocks without which it was picked."))
-        physics = kept_physics(runs, path.rungs[0].point, path.chosen.point) if baseline.names else None
-        notes += physics.notes if physics else []
-    elif isinstance(learner, MLP) and not heard.stopped:
-        told = heard.of("learner")
-        lags = Lags(reach.na, reach.nb, reach.nk)
-        found = search_learners(problem, lags, tested, learner, widths, criterion, blocks, told, runner)
+    search = _Search(problem, criterion, largest, blocks, collinear, level, heard, runner)
+    path, found, physics, notes = search.beyond(learner, orders, reach, tested, widths, most)
     if heard.stopped:
-        notes.append(Warning("stopped", "the search was stopped; the choice is among the models judged by then."))
-    if not halves:
-        notes.append(Warning("conditional_on_selection", _CONDITIONAL))
-    return Selection(
-        kept, baseline, criterion, delays, orders, tested, path, found, tuple(notes), heard.stopped, physics, reach
+        notes.append(
+            Warning(
+                "stopped", "the search was stopped; the choice is among the models judged by then."
+            )
+        )
+    chosen = (
+        parts.fitted,
+        baseline,
+        criterion,
+        delays,
+        orders,
+        tested,
+        path,
+        found,
+        tuple(notes),
+        heard.stopped,
     )
+    selection = Selection(*chosen, physics, reach, parts.intervals, level)
+    return _noted(selection, whole if fitted is None else fitted)
+
+
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """What the rows that choose are searched with, beyond linear lags."""
+
+    problem: Problem
+    criterion: Criterion
+    largest: Orders
+    blocks: int
+    collinear: float
+    level: float
+    heard: _Listener
+    runner: Any
+
+    def beyond(
+        self,
+        learner: Learner | None,
+        orders: OrderSearch,
+        reach: Orders,
+        tested: Nonlinearity | None,
+        widths: Sequence[int],
+        most: int,
+    ) -> tuple[TermPath | None, LearnerSearch | None, PhysicsComparison | None, list[Warning]]:
+        """Search terms or networks, whichever the learner is.
+
+        Nothing where the search was stopped before.
+        """
+        problem, criterion, lags = self.problem, self.criterion, Lags(reach.na, reach.nb, reach.nk)
+        if isinstance(learner, MLP) and not self.heard.stopped:
+            told = self.heard.of("learner")
+            beside = (learner, widths, criterion, self.blocks, told, self.runner)
+            return None, search_learners(problem, lags, tested, *beside), None, []
+        if not isinstance(learner, Terms) or self.heard.stopped:
+            return None, None, None, []
+        baseline, names = problem.baseline, [channel.name for channel in problem.record.inputs]
+        runs, notes, considered = _terms(problem, learner, self.largest, criterion, self.collinear)
+        near = [baseline.lags, _layout(problem.outputs, names, reach)]
+        linear, at_most = (
+            _beside(orders, problem.record, baseline),
+            min(most, len(problem.rows) // 10),
+        )
+        control = Control(self.level, considered) if self.level < 1 else None
+        path = climb(
+            runs, self.blocks, at_most, self.heard.of("terms"), self.runner, near, linear, control
+        )
+        if not path.chosen.point.chosen:
+            notes.append(
+                Warning(
+                    "nothing_helps",
+                    "no term lowers the error on blocks without which it was picked.",
+                )
+            )
+        physics = (
+            kept_physics(runs, path.rungs[0].point, path.chosen.point) if baseline.names else None
+        )
+        return path, None, physics, notes + (physics.notes if physics else [])
+
+
+def _parts(
+    record: Record,
+    fitted: Record | None,
+    baseline: Baseline,
+    largest: Orders,
+    halves: bool | Parts | None,
+    *,
+    network: bool,
+) -> Parts:
+    """Return the rows that choose and those that are fitted."""
+    lags = _lagged(largest)
+    if isinstance(halves, Parts):
+        return halves
+    if fitted is not None:
+        return Parts(
+            record, fitted, of_parts(sum(max(len(e) - lags, 0) for e in fitted.experiments))
+        )
+    if halves:
+        return parted(record, baseline, lags, least=1)
+    if network:
+        return Parts(record, record, CONDITIONAL)
+    if halves is not None:
+        return Parts(record, record, Intervals.none("`halves` is false"))
+    try:
+        return parted(record, baseline, lags)
+    except InputError as error:
+        return Parts(record, record, Intervals.none(str(error)))
+
+
+def lagged_rows(problem: Problem, lags: Lags | None) -> int:
+    """Return how many leading rows of an experiment are lags of the largest orders that are looked at."""
+    return _lagged(_reach(problem, lags)[0])
+
+
+def _lagged(largest: Orders) -> int:
+    return max(
+        [largest.na, *(nk + nb - 1 for nk, nb in zip(largest.nk, largest.nb, strict=True) if nb)]
+    )
+
+
+def _noted(found: Selection, declared: Record) -> Selection:
+    """Return the selection with what is to be said of its intervals.
+
+    Of all rows where nothing was chosen.
+    """
+    if found.learner is None:
+        return replace(found, record=declared, intervals=AS_DECLARED)
+    notes = []
+    if found.intervals.source in (NONE, CONDITIONAL.source):
+        notes.append(Warning("conditional_on_selection", found.intervals.text))
+    if isinstance(found.learner, Terms) and not found.shares:
+        why = (
+            "too few rows chose"
+            if found.terms
+            else "linear lags are chosen as orders, not out of a library"
+        )
+        notes.append(
+            Warning(
+                "shares_unknown", f"how often a term is chosen over halves is not known: {why}."
+            )
+        )
+    if found.rivals:
+        listed = "; ".join(
+            f"{term} for {' or '.join(others)}" for term, others in found.rivals.items()
+        )
+        notes.append(Warning("terms_have_rivals", _RIVALS.format(listed)))
+    if found.unconfirmed:
+        text = _NOT_CONFIRMED.format(", ".join(found.unconfirmed), 100 * found.level)
+        notes.append(Warning("terms_not_confirmed", text))
+    return replace(found, notes=(*found.notes, *notes))
 
 
 class _Listener:
     """Hands on what was judged, and remembers whether it was asked to stop."""
 
-    def __init__(self, progress: Told) -> None:
+    def __init__(self, progress: OnStage) -> None:
         self.progress, self.stopped = progress, False
 
     def of(self, stage: str) -> Callable[[Any], None]:
-        def told(rung: Any) -> None:
+        def report(rung: Any) -> None:
             try:
                 self.progress(stage, rung)
             except KeyboardInterrupt:
                 self.stopped = True
                 raise
 
-        return told
+        return report
 
 
 def _layout(outputs: Sequence[str], inputs: Sequence[str], orders: Orders) -> tuple[Lag, ...]:
@@ -266,7 +655,9 @@ def _layout(outputs: Sequence[str], inputs: Sequence[str], orders: Orders) -> tu
 
 def _beside(orders: OrderSearch, record: Record, baseline: Baseline) -> list[str]:
     """Return the linear lags of the choice, and its constant, that the physics does not have."""
-    outputs, inputs = ([channel.name for channel in group] for group in (record.outputs, record.inputs))
+    outputs, inputs = (
+        [channel.name for channel in group] for group in (record.outputs, record.inputs)
+    )
     own = {term.regressor for term in baseline.terms}
     linear = [str(lag) for lag in _layout(outputs, inputs, orders.chosen)]
     return [text for text in [*linear, *([CONSTANT] * orders.constant)] if text not in own]
@@ -275,20 +666,29 @@ def _beside(orders: OrderSearch, record: Record, baseline: Baseline) -> list[str
 def _with_every_input(chosen: Orders, largest: Orders) -> Orders:
     """Return the chosen orders, and of inputs that they keep no lag of all that are allowed.
 
-    An even function of an input has no linear correlation with it, so no linear lag of the input helps.
+    An even function of an input has no linear correlation with it, so no linear lag of the input
+    helps.
     """
     nb = tuple(n or most for n, most in zip(chosen.nb, largest.nb, strict=True))
-    nk = tuple(k if n else first for n, k, first in zip(chosen.nb, chosen.nk, largest.nk, strict=True))
+    nk = tuple(
+        k if n else first for n, k, first in zip(chosen.nb, chosen.nk, largest.nk, strict=True)
+    )
     return replace(chosen, nb=nb, nk=nk)
 
 
-def _reached(chosen: Orders, asked: Orders, tested: Nonlinearity | None, names: Sequence[str]) -> Orders:
-    """Return the chosen orders with the inputs whose functions matter although no linear lag of them does."""
+def _reached(
+    chosen: Orders, asked: Orders, tested: Nonlinearity | None, names: Sequence[str]
+) -> Orders:
+    """Return the chosen orders with the inputs that have only a nonlinear effect."""
     nb, nk = list(chosen.nb), list(chosen.nk)
     for i, name in enumerate(names):
         if chosen.nb[i] or tested is None or not tested.found:
             continue
-        own = [k for k in range(asked.nk[i], asked.nk[i] + asked.nb[i]) if str(Lag(name, k)) in tested.matter]
+        own = [
+            k
+            for k in range(asked.nk[i], asked.nk[i] + asked.nb[i])
+            if str(Lag(name, k)) in tested.matter
+        ]
         if own or not tested.matter:
             nk[i] = min(own, default=asked.nk[i])
             nb[i] = max(own) - nk[i] + 1 if own else asked.nb[i]
@@ -297,8 +697,8 @@ def _reached(chosen: Orders, asked: Orders, tested: Nonlinearity | None, names: 
 
 def _terms(
     problem: Problem, learner: Terms, largest: Orders, criterion: Criterion, collinear: float
-) -> tuple[TermRuns, list[Warning]]:
-    """The library of terms laid out, and what is to be told of it."""
+) -> tuple[TermRuns, list[Warning], int]:
+    """Return the library of terms laid out, what is to be told of it, and how many terms could be chosen."""
     outputs, inputs = problem.outputs, tuple(channel.name for channel in problem.record.inputs)
     lags = Lags(largest.na, largest.nb, largest.nk).layout(outputs, inputs)
     known = regressor_of(problem.baseline, None, None, outputs, inputs)[0]
@@ -307,13 +707,16 @@ def _terms(
     able = candidates(problem, library)
     notes = list(able.notes)
     if len(library) > rows:
-        text = f"there are {len(library)} candidate terms and {rows} rows; at most a tenth as many terms are chosen."
+        text = (
+            f"there are {len(library)} candidate terms and {rows} rows; at most a tenth as "
+            "many terms are chosen."
+        )
         notes.append(Warning("more_terms_than_rows", text))
-    return TermRuns.of(problem, able.library, criterion, None, collinear), notes
+    return TermRuns.of(problem, able.library, criterion, None, collinear), notes, able.considered
 
 
 def _reach(problem: Problem, lags: Lags | None) -> tuple[Orders, Orders]:
-    """The largest orders that are looked at, and those that the physics reads already."""
+    """Return the largest orders that are looked at, and those that the physics reads already."""
     output, inputs = problem.outputs[0], [channel.name for channel in problem.record.inputs]
     read: dict[str, list[int]] = {name: [] for name in (output, *inputs)}
     for lag in problem.baseline.lags:
@@ -328,10 +731,17 @@ def _reach(problem: Problem, lags: Lags | None) -> tuple[Orders, Orders]:
         largest = Orders(max(LARGEST[0], least.na), tuple(max(LARGEST[1], n) for n in least.nb), nk)
     else:
         places = lags.layout((output,), inputs)
-        own = {name: [lag.lag for lag in places if lag.channel == name] for name in (output, *inputs)}
+        own = {
+            name: [lag.lag for lag in places if lag.channel == name] for name in (output, *inputs)
+        }
         own = {name: [*found, *read[name]] for name, found in own.items()}
         nk = tuple(min(own[name], default=1) for name in inputs)
-        nb = tuple(max(own[name], default=0) - n + 1 if own[name] else 0 for name, n in zip(inputs, nk, strict=True))
+        nb = tuple(
+            max(own[name], default=0) - n + 1 if own[name] else 0
+            for name, n in zip(inputs, nk, strict=True)
+        )
         largest = Orders(max(own[output], default=0), nb, nk)
-    unread = tuple(k if not n else m for k, n, m in zip(largest.nk, least.nb, least.nk, strict=True))
+    unread = tuple(
+        k if not n else m for k, n, m in zip(largest.nk, least.nb, least.nk, strict=True)
+    )
     return largest, replace(least, nk=unread)

@@ -1,4 +1,4 @@
-"""Shared by the studies of the paper: what an entry of `orthaug reproduce` is, its pipelines, structures and records.
+"""Shared parts of the paper's studies: entries of `orthaug reproduce`, pipelines, records.
 
 An entry has its runs, its figures, and its numbers beside those of the paper and of its scripts.
 """
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from orthaug.studies.references import Spread
 
-# Okabe-Ito, told apart by every reader; each structure keeps its colour and marker in all figures
+# Okabe-Ito, distinct for every reader; each structure keeps its colour and marker in all figures
 COLOURS = {
     "orthogonal": "#0072B2",
     "additive": "#E69F00",
@@ -57,7 +57,10 @@ LABELS = {
 }
 ORTHOGONAL = Orthogonal()
 STRUCTURES = {"orthogonal": ORTHOGONAL, "additive": Additive()}
-PIPELINES = {"static": (500, 1000), "mass_spring_damper": (2500, 500)}  # the paper's Adam and L-BFGS iterations
+PIPELINES = {
+    "static": (500, 1000),
+    "mass_spring_damper": (2500, 500),
+}  # the paper's Adam and L-BFGS iterations
 LARGEST_TRAINED = {
     "ours": 65_536,
     "paper": 16_384,
@@ -65,16 +68,21 @@ LARGEST_TRAINED = {
 }  # samples up to which a learner is trained: the run is to end
 _NODES = np.polynomial.legendre.leggauss(64)
 UNIFORM = Samples({"u[k]": 0.6 * _NODES[0]}, weights=_NODES[1], name="uniform")
-"""Uniform on [−0.6, 0.6]: `measures.Uniform` with fewer nodes, which changes no digit shown and is quicker."""
+"""Uniform on [−0.6, 0.6]: `measures.Uniform` with fewer nodes, which changes no digit shown and is
+quicker.
+"""
 
 
 class Finding(NamedTuple):
-    """A quantity, each counted once, beside what the paper prints and what its scripts gave when they were run."""
+    """A quantity, with the paper's number and those of its scripts.
+
+    Each is counted once.
+    """
 
     quantity: str
     ours: str
     verdict: str
-    """What the numbers say, in words."""
+    """Meaning of the numbers, in words."""
     published: str = ""
     scripts: str = ""
     as_published: bool | None = None
@@ -84,12 +92,18 @@ class Finding(NamedTuple):
 
     @property
     def beyond(self) -> bool:
-        """Whether there is nothing to compare with, so that the row is neither met nor missed."""
+        """True if there is nothing to compare with.
+
+        Such a row is neither met nor missed.
+        """
         return self.as_published is None and self.as_scripts is None
 
 
 class Counts(NamedTuple):
-    """Comparisons that are met, and all of them, apart by what ours is compared with; rows beyond the paper."""
+    """Numbers of comparisons that are met, and of all.
+
+    They are counted apart by what ours is compared with; rows beyond the paper apart from both.
+    """
 
     published_met: int
     published: int
@@ -102,7 +116,9 @@ class Counts(NamedTuple):
         rows = list(findings)
         paper = [row.as_published for row in rows if row.as_published is not None]
         scripts = [row.as_scripts for row in rows if row.as_scripts is not None]
-        return cls(sum(paper), len(paper), sum(scripts), len(scripts), sum(row.beyond for row in rows))
+        return cls(
+            sum(paper), len(paper), sum(scripts), len(scripts), sum(row.beyond for row in rows)
+        )
 
 
 class Drawing(NamedTuple):
@@ -117,8 +133,9 @@ class Drawing(NamedTuple):
 class Reproduction:
     """One entry of `orthaug reproduce`.
 
-    `study(pipeline, small)` declares the runs: `pipeline` is one of `reproduction.PIPELINES`; `small` for the reduced
-    size of the tests. `figures(table)` draws, by file name; `findings(table)` compares. `text` says what is run.
+    `study(pipeline, small)` declares the runs: `pipeline` is one of `reproduction.PIPELINES`;
+    `small` for the reduced size of the tests. `figures(table)` draws, by file name;
+    `findings(table)` compares. `text` says what is run.
     """
 
     name: str
@@ -139,46 +156,67 @@ def trained(
     iterations: int = 300,
     regularization: str = "none",
 ) -> Estimate:
-    """One fit of an example by a pipeline; `which` names the paper's iterations.
+    """Return one fit of an example by a pipeline; `which` names the paper's iterations.
 
     Args:
-        pipeline: "ours", Levenberg-Marquardt with `iterations` and `regularization`; "paper", Adam and L-BFGS on
-            normalised data; "scripts", the published scripts' own.
+        pipeline: "ours", Levenberg-Marquardt with `iterations` and `regularization`; "paper", Adam
+            and L-BFGS on normalised data; "scripts", the published scripts' own.
     """
     if pipeline == "scripts":
         return published.train(example, structure, PIPELINES[which], seed)
-    solver = AdamLBFGS(*PIPELINES[which]) if pipeline == "paper" else LevenbergMarquardt(iterations, longest=iterations)
-    options: dict[str, Any] = {"structure": structure, "solver": solver, "regularization": regularization}
+    solver = (
+        AdamLBFGS(*PIPELINES[which])
+        if pipeline == "paper"
+        else LevenbergMarquardt(iterations, longest=iterations)
+    )
+    options: dict[str, Any] = {
+        "structure": structure,
+        "solver": solver,
+        "regularization": regularization,
+    }
     return estimate(example.train, example.baseline, seed=seed, **options)
 
 
 def drawn(data_set: int, *, samples: int = 1024, draw: int = 0, noise: bool = False) -> Example:
-    """The static example's training record drawn anew; `draw` 0 is the paper's own, as `synthetic.static` has it."""
+    """Return the static example's training record drawn anew.
+
+    `draw` 0 is the paper's own, as `synthetic.static` has it.
+    """
     example = static(data_set, noise=noise, samples=samples)
     if not draw:
         return example
     rng = np.random.default_rng([10, draw])
     half = 0.3 * rng.standard_normal(samples // 2 if data_set == 1 else samples)
     u = np.concatenate([half, -half]) if data_set == 1 else half - (0.01 if data_set == 3 else 0.0)
-    y = 0.01 + u - 0.5 * u**2 + 0.1 * u**3 + (rng.normal(0.0, NOISE_30_DB, len(u)) if noise else 0.0)
+    y = (
+        0.01
+        + u
+        - 0.5 * u**2
+        + 0.1 * u**3
+        + (rng.normal(0.0, NOISE_30_DB, len(u)) if noise else 0.0)
+    )
     return Example(Record.from_arrays(u, y), example.test, example.baseline, example.theta)
 
 
 def rows_of(table: pd.DataFrame, **values: Any) -> pd.DataFrame:
-    """The rows of a table that have these values in the columns of these names, in the table's order."""
+    """Return the rows of a table with these values in these columns, in the table's order."""
     for column, value in values.items():
         table = table.loc[table[column] == value]
     return table
 
 
 def mean_errors(rows: pd.DataFrame) -> pd.DataFrame:
-    """The mean error of θ per number of samples."""
+    """Return the mean error of θ per number of samples."""
     return rows.groupby("samples").theta_error.mean().reset_index()
 
 
 def slope(samples: Any, errors: Any) -> float:
-    """The exponent p of errors ∝ Nᵖ, by least squares over logarithms."""
-    return float(np.polyfit(np.log(np.asarray(samples, dtype=float)), np.log(np.asarray(errors, dtype=float)), 1)[0])
+    """Return the exponent p of errors ∝ Nᵖ, by least squares over logarithms."""
+    return float(
+        np.polyfit(
+            np.log(np.asarray(samples, dtype=float)), np.log(np.asarray(errors, dtype=float)), 1
+        )[0]
+    )
 
 
 def panels(
@@ -190,7 +228,7 @@ def panels(
     sharey: bool = False,
     rows: bool = False,
 ) -> tuple[Figure, list[Axes]]:
-    """Axes side by side at column width, or one above the other."""
+    """Return axes side by side at column width, or one above the other."""
     figure = Figure(figsize=(width, height), layout="constrained")
     shape = (count, 1) if rows else (1, count)
     axes = list(np.atleast_1d(figure.subplots(*shape, sharex=sharex, sharey=sharey)))
@@ -202,17 +240,24 @@ def panels(
 
 
 def legend(figure: Figure, axes: Axes | Iterable[Axes], ncols: int = 4) -> None:
-    """One legend for all panels, above them."""
+    """Draw one legend for all panels, above them."""
     unique = {}
     for axis in [axes] if isinstance(axes, Axes) else axes:
         handles, labels = axis.get_legend_handles_labels()
         unique.update(dict(zip(labels, handles, strict=True)))
     ncols = min(ncols, len(unique))
-    figure.legend(unique.values(), unique.keys(), loc="outside upper center", ncols=ncols, frameon=False, fontsize=8)
+    figure.legend(
+        unique.values(),
+        unique.keys(),
+        loc="outside upper center",
+        ncols=ncols,
+        frameon=False,
+        fontsize=8,
+    )
 
 
 def against_samples(axis: Axes, title: str) -> None:
-    """Both axes logarithmic, over N."""
+    """Make both axes logarithmic, over N."""
     axis.set_xscale("log")
     axis.set_yscale("log")
     axis.set_xlabel("samples N")
@@ -220,12 +265,17 @@ def against_samples(axis: Axes, title: str) -> None:
 
 
 def extremes(rows: pd.DataFrame, by: str, column: str) -> pd.DataFrame:
-    """Per value of `by` the median, the smallest and the largest of a column."""
+    """Return median, smallest and largest value of a column, per value of `by`."""
     return rows.groupby(by)[column].agg(["median", "min", "max"]).reset_index()
 
 
-def whiskers(axis: Axes, x: Any, of: pd.DataFrame, name: str, *, label: str = "", **style: Any) -> None:
-    """Medians with bars from the smallest to the largest value, which a logarithmic axis shows whole."""
+def whiskers(
+    axis: Axes, x: Any, of: pd.DataFrame, name: str, *, label: str = "", **style: Any
+) -> None:
+    """Draw medians with bars from the smallest to the largest value.
+
+    A logarithmic axis shows such bars whole.
+    """
     reach = np.stack([of["median"] - of["min"], of["max"] - of["median"]])
     style = {
         "color": COLOURS[name],
@@ -238,26 +288,42 @@ def whiskers(axis: Axes, x: Any, of: pd.DataFrame, name: str, *, label: str = ""
 
 
 def scripts_bars(axis: Axes, x: Any, spreads: Sequence[Spread], name: str, **style: Any) -> None:
-    """What the scripts gave: a cross at each mean with a bar from the smallest to the largest run."""
-    low, mean, high = (np.array([getattr(spread, part) for spread in spreads]) for part in ("low", "mean", "high"))
-    style = {"marker": "x", "markersize": 5.0, "linewidth": 0.0, "elinewidth": 0.8, "capsize": 2.5} | style
+    """Draw the results of the scripts: a cross at each mean, a bar over all runs.
+
+    The bar goes from the smallest to the largest run.
+    """
+    low, mean, high = (
+        np.array([getattr(spread, part) for spread in spreads]) for part in ("low", "mean", "high")
+    )
+    style = {
+        "marker": "x",
+        "markersize": 5.0,
+        "linewidth": 0.0,
+        "elinewidth": 0.8,
+        "capsize": 2.5,
+    } | style
     style["label"] = f"scripts, {LABELS[name]}"
-    axis.errorbar(x, mean, np.stack([mean - low, high - mean]), color=COLOURS[name], alpha=0.6, **style)
+    axis.errorbar(
+        x, mean, np.stack([mean - low, high - mean]), color=COLOURS[name], alpha=0.6, **style
+    )
 
 
 def signed(exponent: float) -> str:
-    """Two decimals with a true minus."""
+    """Return two decimals with a true minus."""
     return f"{exponent:.2f}".replace("-", "−")
 
 
 def agreement(values: Any) -> str:
-    """How far rows of values, one per start, lie apart."""
+    """Return a text on the largest difference between starts, one row of values each."""
     apart = float(np.ptp(np.asarray(values, dtype=float), axis=0).max())
     return f"starts agree within {apart:.1g}" if apart else "the same number for every start"
 
 
 def span(values: Any) -> str:
-    """`mean (smallest … largest)` in three digits, one number where they agree in all of them."""
+    """Return `mean (smallest … largest)` in three digits.
+
+    It is one number where they agree in all of them.
+    """
     values = np.asarray(values, dtype=float)
     if np.ptp(values) <= 1e-6 * abs(values.mean()):
         return f"{values.mean():.5g}"

@@ -1,6 +1,7 @@
-"""What the authors' published scripts gave when they were run: per configuration mean, smallest and largest value.
+"""Results of the authors' published scripts: mean, smallest and largest per configuration.
 
-`python tests/test_references.py FOLDER` makes `references.json` from the single runs, and says how they were measured.
+`python tests/test_references.py FOLDER` makes `references.json` from the single runs, and says how
+they were measured.
 """
 
 from __future__ import annotations
@@ -30,14 +31,16 @@ class Spread(NamedTuple):
     runs: int
 
     def __str__(self) -> str:
-        digits = 3 if self.high - self.low > 0.01 * self.mean else 6  # as many as tell the ends apart
+        digits = (
+            3 if self.high - self.low > 0.01 * self.mean else 6
+        )  # as many as make low and high differ
         return f"{self.mean:.{digits}g} ({self.low:.{digits}g} … {self.high:.{digits}g})"
 
     def scaled(self, factor: float) -> Spread:
         return Spread(factor * self.mean, factor * self.low, factor * self.high, self.runs)
 
     def beside(self, values: Any, *, smaller_is_better: bool = False) -> tuple[bool, str]:
-        """Whether the mean of our runs lies between the smallest and the largest of theirs, and that in words.
+        """Return whether the mean of our runs is within the range of theirs, and a text on it.
 
         Three digits count, as they are shown.
 
@@ -47,7 +50,9 @@ class Spread(NamedTuple):
         ours = float(np.mean(np.asarray(values, dtype=float)))
         if self.low <= ours <= self.high:
             return True, f"mean within the scripts' smallest and largest of {self.runs} runs"
-        side, which, end = ("below", "smallest", self.low) if ours < self.low else ("above", "largest", self.high)
+        side, which, end = (
+            ("below", "smallest", self.low) if ours < self.low else ("above", "largest", self.high)
+        )
         if f"{ours:.3g}" == f"{end:.3g}":
             return True, f"mean, in three digits, equal to the scripts' {which} of {self.runs} runs"
         text = f"mean {side} the scripts' {which} of {self.runs} runs ({_ratio(ours, end)})"
@@ -61,23 +66,31 @@ def _ratio(ours: float, end: float) -> str:
 
 @cache
 def _tables() -> dict[str, dict[tuple[Any, ...], Mapping[str, Any]]]:
-    content = json.loads(files("orthaug.studies").joinpath("references.json").read_text(encoding="utf-8"))
-    return {name: {tuple(row[axis] for axis in axes): row for row in content[name]} for name, axes in _AXES.items()}
+    content = json.loads(
+        files("orthaug.studies").joinpath("references.json").read_text(encoding="utf-8")
+    )
+    return {
+        name: {tuple(row[axis] for axis in axes): row for row in content[name]}
+        for name, axes in _AXES.items()
+    }
 
 
 def static(data_set: int, structure: str, quantity: str, *, noise: bool = False) -> Spread:
-    """`test_rmse`, `test_sse`, `theta_error` or `seconds` of Sect. 5.1."""
+    """Return `test_rmse`, `test_sse`, `theta_error` or `seconds` of Sect. 5.1."""
     return _spread(_tables()["static"][data_set, noise, structure], quantity)
 
 
 def mass_spring_damper(structure: str, weight: float, quantity: str) -> Spread | None:
-    """`test_rmse` [m], `theta_error` (relative) or `seconds` of Sect. 5.2; None for a weight that was not run."""
+    """Return `test_rmse` [m], `theta_error` (relative) or `seconds` of Sect. 5.2.
+
+    None for a weight that was not run.
+    """
     row = _tables()["mass_spring_damper"].get((structure, weight))
     return None if row is None else _spread(row, quantity)
 
 
 def seconds(example: str) -> tuple[float, float]:
-    """The shortest and the longest run of an example, compilation included."""
+    """Return the shortest and the longest run of an example, compilation included."""
     spreads = [_spread(row, "seconds") for row in _tables()[example].values()]
     return min(spread.low for spread in spreads), max(spread.high for spread in spreads)
 

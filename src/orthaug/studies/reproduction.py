@@ -1,4 +1,4 @@
-"""`orthaug reproduce`: the paper's studies run, drawn, put beside the published numbers, and gathered on one page."""
+"""`orthaug reproduce`: run and draw the paper's studies, and compare them on one page."""
 
 from __future__ import annotations
 
@@ -45,24 +45,30 @@ PIPELINES = {  # name, and how the page says who trained
 HYPHEN = "\N{NON-BREAKING HYPHEN}"  # a line of the page never ends within 1e-6
 WIDTH = 100  # characters of a line in a terminal
 MARK = "reproduction.json"
-StudiesTell = Callable[[str, int, int], None]
+StudiesProgress = Callable[[str, int, int], None]
 """Called with the study's title, the runs done and all of them."""
 
 
 @dataclass(frozen=True, eq=False)
-class Reproduced:
-    """One study with its table, figures and findings."""
+class StudyOutcome:
+    """One study with its table, figures and findings.
+
+    Args:
+        whole: how many runs the study has at its full size.
+        small: whether it was run at the reduced size.
+    """
 
     entry: Reproduction
     runs: list[Run]
     table: pd.DataFrame
     figures: dict[str, Drawing]
     findings: list[Finding]
+    whole: int
     small: bool = False
 
 
 def catalogue() -> dict[str, Reproduction]:
-    """The paper's figures and tables, one file each, in its order."""
+    """Return the paper's figures and tables, one file each, in its order."""
     modules: list[Any] = [
         static_errors,
         data_length,
@@ -77,7 +83,7 @@ def catalogue() -> dict[str, Reproduction]:
 
 
 def chosen(name: str | None) -> list[Reproduction]:
-    """The studies to run: one by name, or all.
+    """Return the studies to run: one by name, or all.
 
     Raises:
         InputError: no study of that name.
@@ -86,7 +92,9 @@ def chosen(name: str | None) -> list[Reproduction]:
     if name is None:
         return list(known.values())
     if name not in known:
-        raise InputError(f"there is no study '{name}'{nearest(name, known) or '.'} There are {', '.join(known)}.")
+        raise InputError(
+            f"there is no study '{name}'{nearest(name, known) or '.'} There are {', '.join(known)}."
+        )
     return [known[name]]
 
 
@@ -96,14 +104,14 @@ def reproduce(
     pipeline: str = "ours",
     small: bool = False,
     store: Path | None = None,
-    progress: StudiesTell | None = None,
+    progress: StudiesProgress | None = None,
     client: Any = None,
-) -> list[Reproduced]:
+) -> list[StudyOutcome]:
     """Run the studies; what a store holds already is not run again.
 
     Args:
-        pipeline: "ours", "paper" for Adam and L-BFGS with the published iterations on normalised data, or "scripts"
-            for what the published scripts do, un-normalised and from θ⁰.
+        pipeline: "ours", "paper" for Adam and L-BFGS with the published iterations on normalised
+            data, or "scripts" for what the published scripts do, un-normalised and from θ⁰.
         small: at the reduced size of the tests.
         store: where results are kept as they are made; None for the user's cache folder.
         client: a `distributed.Client` whose workers make the runs.
@@ -112,10 +120,16 @@ def reproduce(
     store = Path(platformdirs.user_cache_dir("orthaug")) / "studies" if store is None else store
     reproduced = []
     for entry in entries:
-        tell = None if progress is None else lambda done, total, e=entry: progress(e.title, done, total)
-        done = runs(entry.study(pipeline, small), store=store, progress=tell, client=client)
+        report = (
+            None
+            if progress is None
+            else lambda done, total, e=entry: progress(e.title, done, total)
+        )
+        done = runs(entry.study(pipeline, small), store=store, progress=report, client=client)
         table = as_table(done)
-        reproduced.append(Reproduced(entry, done, table, dict(entry.figures(table)), entry.findings(table), small))
+        whole = len(entry.study(pipeline, False).cases())
+        shown = dict(entry.figures(table)), entry.findings(table)
+        reproduced.append(StudyOutcome(entry, done, table, *shown, whole, small))
     return reproduced
 
 
@@ -124,8 +138,13 @@ def check_output(folder: Path, *, force: bool = False) -> None:
     check_replaceable(folder, force=force)
 
 
-def write(reproduced: Sequence[Reproduced], folder: Path, pipeline: str, *, force: bool = False) -> None:
-    """index.html, and for each study its figures as PNG and its runs as CSV; whole or not at all."""
+def write(
+    reproduced: Sequence[StudyOutcome], folder: Path, pipeline: str, *, force: bool = False
+) -> None:
+    """Write index.html, and for each study its figures as PNG and its runs as CSV.
+
+    The folder is written whole or not at all.
+    """
     with whole_folder(folder, force=force) as partial:
         for study in reproduced:
             place = partial / study.entry.name
@@ -137,24 +156,55 @@ def write(reproduced: Sequence[Reproduced], folder: Path, pipeline: str, *, forc
             "orthaug": __version__,
             "pipeline": pipeline,
             "counts": _counts(reproduced)._asdict(),
+            "size": _size(reproduced),
             "findings": as_rows(reproduced),
             "runs": {study.entry.name: when(study.runs) for study in reproduced},
         }
-        (partial / MARK).write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        (partial / MARK).write_text(
+            json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8"
+        )
         (partial / "index.html").write_text(_page(reproduced, pipeline), encoding="utf-8")
 
 
-def as_rows(reproduced: Sequence[Reproduced]) -> list[dict[str, Any]]:
-    """The findings as plain rows, each with its study."""
-    return [{"study": study.entry.name, **finding._asdict()} for study in reproduced for finding in study.findings]
+def as_rows(reproduced: Sequence[StudyOutcome]) -> list[dict[str, Any]]:
+    """Return the findings as plain rows, each with its study."""
+    return [
+        {"study": study.entry.name, **finding._asdict()}
+        for study in reproduced
+        for finding in study.findings
+    ]
 
 
-def _counts(reproduced: Sequence[Reproduced]) -> Counts:
+def _counts(reproduced: Sequence[StudyOutcome]) -> Counts:
     return Counts.of(finding for study in reproduced for finding in study.findings)
 
 
+def reduced(reproduced: Sequence[StudyOutcome]) -> str:
+    """Return what the reduced size means for the comparisons; empty at full size."""
+    some = [study for study in reproduced if study.small]
+    if not some:
+        return ""
+    made, whole = sum(len(study.runs) for study in some), sum(study.whole for study in some)
+    return (
+        f"small: {made} of {whole} runs. At this size differences from the paper and its "
+        "scripts are expected; without --small it is seen which of them stay."
+    )
+
+
+def _size(reproduced: Sequence[StudyOutcome]) -> dict[str, Any]:
+    """Return the reduced size in words, null at full size, and each study's runs of all."""
+    studies = {
+        study.entry.name: {"runs": len(study.runs), "of": study.whole} for study in reproduced
+    }
+    return {
+        "small": any(study.small for study in reproduced),
+        "text": reduced(reproduced) or None,
+        "studies": studies,
+    }
+
+
 def when(done: Sequence[Run]) -> str:
-    """How many runs were made now and how many came from a store, when those were made, and their seconds."""
+    """Return how many runs were made now or read from a store, when, and their seconds."""
     parts = []
     for stored in (False, True):
         some = [run for run in done if run.stored is stored]
@@ -162,12 +212,14 @@ def when(done: Sequence[Run]) -> str:
             days = sorted({run.made[:10] for run in some})
             dates = days[0] if len(days) == 1 else f"{days[0]} to {days[-1]}"
             origin = "read from the store, made on" if stored else "made now, on"
-            parts.append(f"{len(some)} {origin} {dates} in {sum(run.seconds for run in some):.3g} s")
+            parts.append(
+                f"{len(some)} {origin} {dates} in {sum(run.seconds for run in some):.3g} s"
+            )
     return f"{len(done)} run{'s' * (len(done) != 1)}: {'; '.join(parts)}, summed over runs"
 
 
-def text(reproduced: Sequence[Reproduced]) -> str:
-    """A table per study, in lines for a terminal, and what is met."""
+def text(reproduced: Sequence[StudyOutcome]) -> str:
+    """Return a table per study, in lines for a terminal, and what is met."""
     from rich import box
     from rich.console import Console
     from rich.table import Table
@@ -175,13 +227,33 @@ def text(reproduced: Sequence[Reproduced]) -> str:
     buffer = io.StringIO()
     console = Console(file=buffer, width=WIDTH, color_system=None, legacy_windows=False)
     for study in reproduced:
-        table = Table(title=study.entry.title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1), expand=True)
-        for name, ratio in (("quantity", 24), ("published", 14), ("scripts", 18), ("ours", 18), ("verdict", 26)):
+        table = Table(
+            title=study.entry.title,
+            title_justify="left",
+            box=box.SIMPLE_HEAD,
+            padding=(0, 1),
+            expand=True,
+        )
+        for name, ratio in (
+            ("quantity", 24),
+            ("published", 14),
+            ("scripts", 18),
+            ("ours", 18),
+            ("verdict", 26),
+        ):
             table.add_column(name, ratio=ratio, overflow="fold")
         for row in study.findings:
-            marked = (_marked(row.published, row.as_published), _marked(row.scripts, row.as_scripts))
+            references = ((row.published, row.as_published), (row.scripts, row.as_scripts))
+            marked = (_marked(*pair, study.small) for pair in references)
             table.add_row(row.quantity, *marked, row.ours, row.verdict)
         console.print(table, markup=False, highlight=False)
+        if study.small:
+            console.print(
+                f"small: {len(study.runs)} of {study.whole} runs\n", markup=False, highlight=False
+            )
+    note = reduced(reproduced)
+    if note:
+        console.print(note, markup=False, highlight=False)
     counts = _counts(reproduced)
     console.print(
         f"met against the printed paper: {counts.published_met} of {counts.published}\n"
@@ -193,15 +265,19 @@ def text(reproduced: Sequence[Reproduced]) -> str:
     return "\n".join(line.rstrip() for line in buffer.getvalue().splitlines())
 
 
-def _marked(reference: str, met: bool | None) -> str:
+def _marked(reference: str, met: bool | None, small: bool) -> str:
     if met is None:
         return reference or "–"
-    return f"{reference} ({'met' if met else 'differs'})"
+    return f"{reference} ({'met' if met else 'differs at small size' if small else 'differs'})"
 
 
-def _page(reproduced: Sequence[Reproduced], pipeline: str) -> str:
-    source = files("orthaug.studies").joinpath("templates/reproduction.html").read_text(encoding="utf-8")
-    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
+def _page(reproduced: Sequence[StudyOutcome], pipeline: str) -> str:
+    source = (
+        files("orthaug.studies").joinpath("templates/reproduction.html").read_text(encoding="utf-8")
+    )
+    environment = jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True
+    )
     environment.filters["whole"] = lambda words: words.replace("e-", f"e{HYPHEN}")
     studies = [
         {
@@ -210,6 +286,8 @@ def _page(reproduced: Sequence[Reproduced], pipeline: str) -> str:
             "figures": [(drawing, _inline(drawing.figure)) for drawing in study.figures.values()],
             "counts": Counts.of(study.findings),
             "when": when(study.runs),
+            "small": study.small,
+            "size": f"{len(study.runs)} of {study.whole} runs",
         }
         for study in reproduced
     ]
@@ -218,7 +296,7 @@ def _page(reproduced: Sequence[Reproduced], pipeline: str) -> str:
         theory=THEORY,
         trained=PIPELINES[pipeline],
         version=__version__,
-        small=any(study.small for study in reproduced),
+        reduced=reduced(reproduced),
         counts=_counts(reproduced),
     )
 

@@ -15,7 +15,16 @@ from orthaug.fitting.structures import Orthogonal
 from orthaug.models.learners import MLP
 from orthaug.physics.problem import pose
 from orthaug.studies import references
-from orthaug.studies.common import PIPELINES, Drawing, Finding, Reproduction, extremes, legend, panels, rows_of
+from orthaug.studies.common import (
+    PIPELINES,
+    Drawing,
+    Finding,
+    Reproduction,
+    extremes,
+    legend,
+    panels,
+    rows_of,
+)
 from orthaug.studies.study import Study
 from orthaug.studies.synthetic import mass_spring_damper, static
 
@@ -34,7 +43,10 @@ NOISY = 1.25  # the slowest over the fastest start, per iteration, from which a 
 
 
 def declared(name: str, example: str, share: float) -> Any:
-    """A solver with a share of its iterations: the paper's numbers for gradient solvers, 300 for ours."""
+    """Return a solver with a share of its iterations.
+
+    Gradient solvers have the paper's numbers, ours 300.
+    """
     adam, lbfgs = PIPELINES[example]
     total = adam + lbfgs
     if name == "levenberg-marquardt":
@@ -44,7 +56,10 @@ def declared(name: str, example: str, share: float) -> Any:
 
 
 def one(example: str, solver: str, share: float, seed: int) -> dict[str, Any]:
-    """A run's seconds and mean squared error; run once before, so that nothing is compiled in it."""
+    """Return a run's seconds and mean squared error.
+
+    Run once before, so that nothing is compiled in it.
+    """
     given = static(1) if example == "static" else mass_spring_damper()
     task = OneStepTask.of(pose(given.train, given.baseline), MLP())
     assert task.bound is not None
@@ -55,7 +70,10 @@ def one(example: str, solver: str, share: float, seed: int) -> dict[str, Any]:
 
 
 def study(pipeline: str, small: bool) -> Study:
-    """Examples × solvers × shares of the iterations × starts, one after the other; the same under every pipeline."""
+    """Return examples × solvers × shares of the iterations × starts, one after the other.
+
+    The same under every pipeline.
+    """
     grid = {
         "example": ("static",) if small else tuple(EXAMPLES),
         "solver": tuple(SOLVERS)[:2] if small else tuple(SOLVERS),
@@ -66,7 +84,7 @@ def study(pipeline: str, small: bool) -> Study:
 
 
 def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
-    """Figure "loss": training error over seconds."""
+    """Draw "loss": training error over seconds."""
     examples = table.example.unique()
     figure, axes = panels(len(examples), height=3.6)
     for axis, example in zip(axes, examples, strict=True):
@@ -83,24 +101,37 @@ def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
     return {
         "loss": Drawing(
             figure,
-            "Training error of each solver against its seconds, when stopped at a share of its iterations: "
-            f"{' and '.join(EXAMPLES[example] for example in examples)}.",
-            f"Marks are medians over {table.seed.nunique()} initial weights; bars go from the smallest to the largest, "
-            "sideways for seconds. The axis of errors is logarithmic for the static example and linear for the "
-            "mass-spring-damper, whose errors lie close together. Times that the table marks as noisy are no results.",
+            "Training error of each solver against its seconds, when stopped at a share of its "
+            f"iterations: {' and '.join(EXAMPLES[example] for example in examples)}.",
+            f"Marks are medians over {table.seed.nunique()} initial weights; bars go from the "
+            "smallest to the largest, sideways for seconds. The axis of errors is logarithmic "
+            "for the static example and linear for the mass-spring-damper, whose errors lie "
+            "close together. Times that the table marks as noisy are no results.",
         )
     }
 
 
 def _line(axis: Axes, rows: pd.DataFrame, label: str, colour: str, marker: str) -> None:
     seconds, error = (extremes(rows, "share", column) for column in ("seconds", "error"))
-    sideways, upwards = (np.stack([of["median"] - of["min"], of["max"] - of["median"]]) for of in (seconds, error))
-    style = {"color": colour, "marker": marker, "linewidth": 1.0, "elinewidth": 0.7, "markersize": 4, "label": label}
+    sideways, upwards = (
+        np.stack([of["median"] - of["min"], of["max"] - of["median"]]) for of in (seconds, error)
+    )
+    style = {
+        "color": colour,
+        "marker": marker,
+        "linewidth": 1.0,
+        "elinewidth": 0.7,
+        "markersize": 4,
+        "label": label,
+    }
     axis.errorbar(seconds["median"], error["median"], xerr=sideways, yerr=upwards, **style)
 
 
 def findings(table: pd.DataFrame) -> list[Finding]:
-    """Each solver at its full length, medians over starts; a time that differs from start to start is marked."""
+    """Return each solver at its full length, medians over starts.
+
+    A time that differs from start to start is marked.
+    """
     compared = []
     full = rows_of(table, share=table.share.max())
     full = full.assign(error=np.sqrt(full.loss), each=full.seconds / full.iterations)
@@ -115,21 +146,35 @@ def findings(table: pd.DataFrame) -> list[Finding]:
             why = f"{error / best:.4g} times the error of Levenberg-Marquardt"
             if solver == "levenberg-marquardt":
                 least = float(rows.groupby("solver").error.median().min())
-                why = "the smallest error" if best == least else f"{best / least:.4g} times the smallest error"
+                why = (
+                    "the smallest error"
+                    if best == least
+                    else f"{best / least:.4g} times the smallest error"
+                )
             if ratio > NOISY:
                 text += " (time noisy)"
-                why += f"; no result in time: an iteration takes up to {ratio:.2g} times as long from start to start"
-            scripts = f"{shortest:.2g} to {longest:.2g} s, compilation included" if solver == "adam-lbfgs" else ""
-            compared.append(Finding(f"{EXAMPLES[example]}, {SOLVERS[solver][0]}", text, why, scripts=scripts))
+                why += (
+                    f"; no result in time: an iteration takes up to {ratio:.2g} times as long "
+                    "from start to start"
+                )
+            scripts = (
+                f"{shortest:.2g} to {longest:.2g} s, compilation included"
+                if solver == "adam-lbfgs"
+                else ""
+            )
+            compared.append(
+                Finding(f"{EXAMPLES[example]}, {SOLVERS[solver][0]}", text, why, scripts=scripts)
+            )
     return compared
 
 
 REPRODUCTION = Reproduction(
     "solver_times",
     "Time and loss of the solvers",
-    "The same normalised problem and initial weights for every solver, the orthogonal structure, stopped at 3, 10, 30 "
-    "and 100 % of its iterations: the paper's numbers for gradient solvers, 300 for Levenberg-Marquardt. Times are of "
-    "this machine when the run was made, one run at a time, compiled before.",
+    "Every solver has the same normalised problem, the same initial weights and the orthogonal "
+    "structure. It is stopped at 3, 10, 30 and 100 % of its iterations. Gradient solvers have "
+    "the paper's number of iterations, Levenberg-Marquardt 300. Times are of this machine when "
+    "the run was made, one run at a time, compiled before.",
     study,
     figures,
     findings,

@@ -1,4 +1,6 @@
-"""Studies: one function over a grid of arguments and seeds, its results in a table. An interrupted study goes on.
+"""Studies: one function over a grid of arguments and seeds, its results in a table.
+
+An interrupted study goes on.
 
 A study is a declaration, so anyone's Monte Carlo is a function and a grid:
 
@@ -30,7 +32,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 Case = dict[str, Any]
-CasesTell = Callable[[int, int], None]
+CasesProgress = Callable[[int, int], None]
 """Called after each run with the runs done and all of them."""
 
 
@@ -40,9 +42,12 @@ class Study:
 
     Args:
         name: of its folder in a store.
-        one: takes one value of each axis as keyword arguments, gives a mapping of plain values: numbers, texts, lists.
-        grid: axes by name, each with its values; all combinations run, the last axis fastest. Slow cases go first.
-        version: raise it when `one` computes something else, so that stored results no longer count.
+        one: takes one value of each axis as keyword arguments, gives a mapping of plain values:
+            numbers, texts, lists.
+        grid: axes by name, each with its values; all combinations run, the last axis fastest. Slow
+            cases go first.
+        version: raise it when `one` computes something else, so that stored results no longer
+            count.
         where: of all combinations, those that run; takes what `one` takes. None for all.
         workers: cases at a time; 1 for a study that measures time, None for the machine's cores.
     """
@@ -55,14 +60,24 @@ class Study:
     workers: int | None = None
 
     def cases(self) -> list[Case]:
-        """Every combination that runs, as keyword arguments of plain values."""
-        axes = [[_value(self, axis, value) for value in values] for axis, values in self.grid.items()]
+        """Return every combination that runs, as keyword arguments of plain values."""
+        axes = [
+            [_value(self, axis, value) for value in values] for axis, values in self.grid.items()
+        ]
         combinations = (dict(zip(self.grid, values, strict=True)) for values in product(*axes))
         return [case for case in combinations if self.where is None or self.where(**case)]
 
     def key(self, case: Case) -> str:
-        """The key of a stored result: a hash of study, version, arguments, function and this package's code."""
-        declared = {"study": self.name, "version": self.version, "case": case, "code": _text(self.one)}
+        """Return the key of a stored result.
+
+        It is a hash of study, version, arguments, function and this package's code.
+        """
+        declared = {
+            "study": self.name,
+            "version": self.version,
+            "case": case,
+            "code": _text(self.one),
+        }
         declared["orthaug"] = _sources()
         return hashlib.sha256(json.dumps(declared, sort_keys=True).encode()).hexdigest()[:24]
 
@@ -86,7 +101,7 @@ class Run:
 
 @cache
 def _sources() -> str:
-    """A digest of this package's code: results of older code do not count."""
+    """Return a digest of this package's code: results of older code do not count."""
     digest = hashlib.sha256()
     for path in sorted(Path(__file__).parents[1].rglob("*.py")):
         digest.update(path.read_bytes())
@@ -105,7 +120,7 @@ def run(
     *,
     store: Path | None = None,
     workers: int | None = None,
-    progress: CasesTell | None = None,
+    progress: CasesProgress | None = None,
     client: Any = None,
 ) -> pd.DataFrame:
     """Run what the store does not hold yet, several cases at a time; a row per case, axes first.
@@ -113,7 +128,8 @@ def run(
     Args:
         store: a folder that keeps each result as it is made; None to keep nothing.
         workers: cases at a time; by default the study's own number, or the machine's cores.
-        client: a `distributed.Client`; its workers make the cases of a study that does not measure time.
+        client: a `distributed.Client`; its workers make the cases of a study that does not measure
+            time.
 
     Raises:
         InputError: a result that is not plain values; a store that cannot be written.
@@ -122,7 +138,10 @@ def run(
 
 
 def as_table(done: Sequence[Run]) -> pd.DataFrame:
-    """A row per run, axes first. It does not tell stored results from those made now."""
+    """Return a row per run, axes first.
+
+    Stored results and those made now are not distinguished.
+    """
     import pandas as pd
 
     return pd.DataFrame([{**run.case, **run.result} for run in done])
@@ -133,10 +152,10 @@ def runs(
     *,
     store: Path | None = None,
     workers: int | None = None,
-    progress: CasesTell | None = None,
+    progress: CasesProgress | None = None,
     client: Any = None,
 ) -> list[Run]:
-    """`run`, with the time of every result instead of a table."""
+    """Return the runs as `run` makes them, with the time of every result instead of a table."""
     cases = study.cases()
     found = [_read(store, study, case) for case in cases]
     todo = [i for i, run in enumerate(found) if run is None]
@@ -144,7 +163,10 @@ def runs(
     if progress is not None:
         progress(done, len(cases))
 
-    wanted, elsewhere = study.workers if workers is None else workers, client is not None and study.workers != 1
+    wanted, elsewhere = (
+        study.workers if workers is None else workers,
+        client is not None and study.workers != 1,
+    )
     if elsewhere:
         wanted = places(client)
 
@@ -172,20 +194,26 @@ def _path(store: Path, study: Study, case: Case) -> Path:
 
 
 def _read(store: Path | None, study: Study, case: Case) -> Run | None:
-    """A stored result; None where there is none, or where it was cut or altered."""
+    """Return a stored result; None where there is none, or where it was cut or altered."""
     if store is None:
         return None
     try:
         content = json.loads(_path(store, study, case).read_text(encoding="utf-8"))
         if content.pop("sha256") != _checksum(study, case, content):
             return None
-        return Run(case, dict(content["result"]), str(content["made"]), float(content["seconds"]), stored=True)
+        return Run(
+            case,
+            dict(content["result"]),
+            str(content["made"]),
+            float(content["seconds"]),
+            stored=True,
+        )
     except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
         return None
 
 
 def _checksum(study: Study, case: Case, content: dict[str, Any]) -> str:
-    """A digest of a record and the case it belongs to."""
+    """Return a digest of a record and the case it belongs to."""
     written = json.dumps([study.key(case), content], sort_keys=True, allow_nan=False)
     return hashlib.sha256(written.encode()).hexdigest()
 
@@ -198,7 +226,7 @@ def _write(store: Path | None, study: Study, run: Run) -> None:
     path = _path(store, study, run.case)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with whole_file(path, force=True) as partial:
+        with whole_file(path, force=True, result=False) as partial:
             partial.write_text(json.dumps(content, allow_nan=False), encoding="utf-8")
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror}).") from None
@@ -209,7 +237,7 @@ def _plain(study: Study, result: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _value(study: Study, key: str, value: Any) -> Any:
-    """The value as JSON has it; None for a number that is not finite."""
+    """Return the value as JSON has it; None for a number that is not finite."""
     if hasattr(value, "tolist"):
         value = value.tolist()
     if isinstance(value, list | tuple):
@@ -218,4 +246,7 @@ def _value(study: Study, key: str, value: Any) -> Any:
         return finite_or_none(value)
     if value is None or isinstance(value, bool | int | str):
         return value
-    raise InputError(f"study '{study.name}': '{key}' is a {type(value).__name__}; expected numbers, texts or lists.")
+    raise InputError(
+        f"study '{study.name}': '{key}' is a {type(value).__name__}; expected numbers, texts "
+        "or lists."
+    )

@@ -28,7 +28,7 @@ class Example:
 
 
 def static(data_set: int = 1, *, noise: bool = False, samples: int = 1024) -> Example:
-    """Sect. 5.1: `y = 0.01 + u − 0.5u² + 0.1u³ + e` with the baseline `θ₁u + θ₃u³`.
+    """Return the example of Sect. 5.1: `y = 0.01 + u − 0.5u² + 0.1u³ + e`, baseline `θ₁u + θ₃u³`.
 
     Args:
         data_set: 1 symmetric (`u` and `−u`), 2 drawn at random, 3 drawn with mean −0.01.
@@ -47,9 +47,14 @@ def static(data_set: int = 1, *, noise: bool = False, samples: int = 1024) -> Ex
     y = _static_map(u)
     if noise:
         y = y + rng.normal(0.0, NOISE_30_DB, y.shape)
-    baseline = Baseline.from_terms([Term("theta1", "u[k]", initial=0.8), Term("theta3", "u[k]**3", initial=0.03)])
+    baseline = Baseline.from_terms(
+        [Term("theta1", "u[k]", initial=0.8), Term("theta3", "u[k]**3", initial=0.03)]
+    )
     return Example(
-        Record.from_arrays(u, y), Record.from_arrays(u_test, _static_map(u_test)), baseline, np.array([1.0, 0.1])
+        Record.from_arrays(u, y),
+        Record.from_arrays(u_test, _static_map(u_test)),
+        baseline,
+        np.array([1.0, 0.1]),
     )
 
 
@@ -59,7 +64,10 @@ def _static_map(u: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class MassSpringDamper:
-    """Sect. 5.2: mass [kg], damping [Ns/m], stiffness [N/m], Stribeck friction [N, N, m/s], sampling time [s]."""
+    """The mass-spring-damper of Sect. 5.2.
+
+    Mass [kg], damping [Ns/m], stiffness [N/m], Stribeck friction [N, N, m/s], sampling time [s].
+    """
 
     m: float = 1.0
     cd: float = 100.0
@@ -70,30 +78,39 @@ class MassSpringDamper:
     sampling_time: float = 0.01
 
     def paper_theta(self) -> Vector:
-        """θ as printed in the paper and its scripts; backward Euler has `2m + cd Ts` in the first entry."""
+        """Return θ as printed in the paper and its scripts.
+
+        Backward Euler has `2m + cd Ts` in the first entry.
+        """
         ts = self.sampling_time
         gamma = self.m + self.cd * ts + self.ks * ts**2
         return np.array([2 * self.m - self.cd * ts, -self.m, ts**2]) / gamma
 
     def friction(self, velocity: np.ndarray | float) -> np.ndarray | float:
-        """The Stribeck curve [N] of a velocity [m/s]."""
+        """Return the Stribeck curve [N] of a velocity [m/s]."""
         decay = np.exp(-np.abs(velocity) / self.stribeck)
         return (self.coulomb + (self.static - self.coulomb) * decay) * np.sign(velocity)
 
     def simulate(self, force: Vector, theta: Vector, noise: Vector | None = None) -> Vector:
-        """Position [m] under `force` [N], at rest before; `noise` enters the equation."""
+        """Return the position [m] under `force` [N] from rest; `noise` enters the equation."""
         y = np.zeros(len(force))
         e = np.zeros(len(force)) if noise is None else np.concatenate([[0.0, 0.0], noise])
         for k in range(2, len(force)):
             velocity = (y[k - 1] - y[k - 2]) / self.sampling_time
             y[k] = (
-                theta[0] * y[k - 1] + theta[1] * y[k - 2] + theta[2] * (force[k - 1] - self.friction(velocity)) + e[k]
+                theta[0] * y[k - 1]
+                + theta[1] * y[k - 2]
+                + theta[2] * (force[k - 1] - self.friction(velocity))
+                + e[k]
             )
         return y
 
 
 def mass_spring_damper() -> Example:
-    """Sect. 5.2, the paper's record: 10⁴ noisy training samples, 1000 noise-free test samples."""
+    """Return the paper's record of Sect. 5.2.
+
+    It has 10⁴ noisy training samples and 1000 noise-free test samples.
+    """
     system = MassSpringDamper()
     theta = system.paper_theta()
     rng = np.random.RandomState(12345)
@@ -101,7 +118,11 @@ def mass_spring_damper() -> Example:
     force = np.concatenate([half, -half])
     position = system.simulate(force, theta, rng.normal(scale=0.00018, size=len(force) - 2))
     force_test = rng.uniform(-100.0, 100.0, 1000)
-    names = {"inputs": [Channel("force", "N")], "outputs": [Channel("position", "m")], "sampling_time": 0.01}
+    names = {
+        "inputs": [Channel("force", "N")],
+        "outputs": [Channel("position", "m")],
+        "sampling_time": 0.01,
+    }
     baseline = Baseline.from_terms(
         [
             Term("theta1", "position[k-1]", initial=0.61),

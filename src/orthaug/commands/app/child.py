@@ -1,8 +1,8 @@
-"""The command line as a child of the page: it ends with whoever started it, however that ended.
+"""The command line as a child of the page: it ends with the process that started it.
 
-Whoever started it holds its standard input open. Where that is closed, the child is interrupted as by Ctrl-C, which
-keeps or removes what is partial; that is also how the page stops it. A line `enough` on it ends training with what
-it has reached.
+The parent keeps its standard input open. Where that is closed, the child is interrupted as by
+Ctrl-C, which keeps or removes partial files; the page stops it in the same way. A line `enough`
+on it ends training with the result reached so far.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ _PATIENCE = 5.0  # s for what an interrupt is to remove
 
 
 def main() -> None:
-    """Run the command that the arguments say."""
+    """Run the command that the arguments give."""
     from orthaug.commands.entry import main as program
 
     watched()
@@ -30,10 +30,10 @@ def watched() -> None:
 
 
 def _wait() -> None:
-    while told := os.read(0, 4096):
+    while received := os.read(0, 4096):
         from orthaug.commands.bars import ENOUGH, ENOUGH_LINE
 
-        if ENOUGH_LINE in told:
+        if ENOUGH_LINE in received:
             ENOUGH.set()
     if os.name == "posix":
         os.kill(os.getpid(), signal.SIGINT)

@@ -1,4 +1,4 @@
-"""Who may use the page: whoever knows the token, from this machine, through a page of this server."""
+"""Access to the page: by a secret token, from this machine, through a page of this server only."""
 
 from __future__ import annotations
 
@@ -13,11 +13,14 @@ if TYPE_CHECKING:
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 _NAMES = ("127.0.0.1", "localhost")
-PLAIN = "<!doctype html><html lang='en'><title>orthaug</title><body style='font:1rem system-ui;margin:3rem'>"
-"""How a page begins that only says something."""
+PLAIN = (
+    "<!doctype html><html lang='en'><title>orthaug</title><body style='font:1rem "
+    "system-ui;margin:3rem'>"
+)
+"""The beginning of a page that shows a message only."""
 _REFUSED = (
-    f"{PLAIN}<h1>This page needs its token</h1><p>Open the address that <code>orthaug app</code> printed in the "
-    "terminal. It ends in <code>?token=…</code>.</p></body></html>"
+    f"{PLAIN}<h1>This page needs its token</h1><p>Open the address that <code>orthaug "
+    "app</code> printed in the terminal. It ends in <code>?token=…</code>.</p></body></html>"
 )
 _HEADERS = {
     "referrer-policy": "no-referrer",
@@ -25,35 +28,38 @@ _HEADERS = {
     "x-frame-options": "SAMEORIGIN",
     "cross-origin-resource-policy": "same-origin",
     "content-security-policy": (
-        "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; frame-ancestors 'self'; form-action 'self'; "
-        "base-uri 'self'; object-src 'none'"
+        "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; frame-ancestors 'self'; "
+        "form-action 'self'; base-uri 'self'; object-src 'none'"
     ),
 }
 
 
 class Gate:
-    """Stands before an application: requests and websockets without the token never reach it.
+    """A guard before an application: requests and websockets without the token never reach it.
 
-    The token comes in the query of the first request, which is sent on without it; from then on a secret of its own in
-    a cookie opens the gate. A ticket is a token for one request: who finds it afterwards finds nothing. Names
-    of the host other than this machine's are refused, so that no foreign name can be made to lead here, and so are
-    requests that a page of another origin makes.
+    The first request has the token in its query and is redirected without it; after that a separate
+    secret in a cookie gives access. A ticket is a token for one request and useless afterwards.
+    Other host names than this machine's are refused, so that no foreign name can be pointed here.
+    Requests by pages of other origins are refused too.
     """
 
     def __init__(self, app: ASGIApp, port: int, token: str | None = None) -> None:
         self.app, self.port = app, port
         self.token = secrets.token_urlsafe(32) if token is None else token
         self.cookie = f"orthaug-{port}"  # cookies know no ports
-        self._secret = secrets.token_urlsafe(32)  # of the cookie: it stands in no address
+        self._secret = secrets.token_urlsafe(32)  # of the cookie: no address contains it
         self._tickets: set[str] = set()
 
     @property
     def url(self) -> str:
-        """Where the page is, with the token."""
+        """Address of the page, with the token."""
         return f"http://127.0.0.1:{self.port}/?token={self.token}"
 
     def ticket(self) -> str:
-        """Return an address that opens the page once: every user of the machine reads a browser's arguments."""
+        """Return an address that opens the page once.
+
+        Every user of the machine can read the arguments of a browser.
+        """
         token = secrets.token_urlsafe(32)
         self._tickets.add(token)
         return f"http://127.0.0.1:{self.port}/?token={token}"
@@ -62,12 +68,17 @@ class Gate:
         if scope["type"] not in ("http", "websocket"):
             await self.app(scope, receive, send)
             return
-        headers = {name.decode("latin-1").lower(): value.decode("latin-1") for name, value in scope["headers"]}
+        headers = {
+            name.decode("latin-1").lower(): value.decode("latin-1")
+            for name, value in scope["headers"]
+        }
         query = parse_qsl(scope.get("query_string", b"").decode("latin-1"), keep_blank_values=True)
         given = dict(query).get("token")
         comes = scope["type"] == "http" and scope["method"] in ("GET", "HEAD")
         allowed = self._from_here(headers) and (
-            _same(given, self.token) or _same(self._kept(headers), self._secret) or (comes and self._spend(given))
+            _same(given, self.token)
+            or _same(self._kept(headers), self._secret)
+            or (comes and self._spend(given))
         )
         if not allowed:
             await _refuse(scope, send)
@@ -81,7 +92,9 @@ class Gate:
     def _from_here(self, headers: Mapping[str, str]) -> bool:
         hosts = {f"{name}:{self.port}" for name in _NAMES}
         origin = headers.get("origin")
-        return headers.get("host", "") in hosts and (origin is None or origin in {f"http://{host}" for host in hosts})
+        return headers.get("host", "") in hosts and (
+            origin is None or origin in {f"http://{host}" for host in hosts}
+        )
 
     def _kept(self, headers: Mapping[str, str]) -> str | None:
         try:
@@ -91,7 +104,7 @@ class Gate:
         return None if morsel is None else morsel.value
 
     def _spend(self, token: str | None) -> bool:
-        """Take a ticket: whether it was one that nobody had used."""
+        """Take a ticket; return whether it was still unused."""
         found = next((ticket for ticket in self._tickets if _same(token, ticket)), None)
         self._tickets.discard(found or "")
         return found is not None
@@ -99,7 +112,11 @@ class Gate:
     async def _sent_on(self, place: str, send: Send) -> None:
         cookie = f"{self.cookie}={self._secret}; HttpOnly; SameSite=Strict; Path=/"
         headers = [(b"location", place.encode()), (b"set-cookie", cookie.encode())]
-        headers += [(b"cache-control", b"no-store"), (b"referrer-policy", b"no-referrer"), (b"content-length", b"0")]
+        headers += [
+            (b"cache-control", b"no-store"),
+            (b"referrer-policy", b"no-referrer"),
+            (b"content-length", b"0"),
+        ]
         await send({"type": "http.response.start", "status": 303, "headers": headers})
         await send({"type": "http.response.body", "body": b""})
 
@@ -113,13 +130,25 @@ async def _refuse(scope: Scope, send: Send) -> None:
         await send({"type": "websocket.close", "code": 1008})
         return
     body = _REFUSED.encode()
-    headers = [(b"content-type", b"text/html; charset=utf-8"), (b"content-length", str(len(body)).encode())]
-    await send({"type": "http.response.start", "status": 403, "headers": [*headers, (b"cache-control", b"no-store")]})
+    headers = [
+        (b"content-type", b"text/html; charset=utf-8"),
+        (b"content-length", str(len(body)).encode()),
+    ]
+    await send(
+        {
+            "type": "http.response.start",
+            "status": 403,
+            "headers": [*headers, (b"cache-control", b"no-store")],
+        }
+    )
     await send({"type": "http.response.body", "body": body})
 
 
 def _with_headers(send: Send) -> Send:
-    """Every answer says that it is for this page alone; what an answer says itself stands."""
+    """Return a sender that marks every answer as one for this page only.
+
+    Headers that an answer has already are kept.
+    """
 
     async def sending(message: Message) -> None:
         if message["type"] == "http.response.start":

@@ -14,26 +14,26 @@ for (const name of ["dragover", "dragenter", "dragleave", "drop"]) {
 }
 
 function take(file) {
-  const told = document.getElementById("drop-told"), bar = document.getElementById("drop-bar");
+  const message = document.getElementById("drop-message"), bar = document.getElementById("drop-bar");
   const request = new XMLHttpRequest();
   request.open("PUT", `${location.pathname}/file/${encodeURIComponent(file.name)}`);
   request.upload.onprogress = (event) => {
     bar.hidden = false;
     bar.value = event.total ? event.loaded / event.total : 0;
-    told.textContent = `${file.name}: ${Math.round(100 * bar.value)} %`;
+    message.textContent = `${file.name}: ${Math.round(100 * bar.value)} %`;
   };
   request.onload = () => {
     bar.hidden = true;
     let answer = {};
-    try { answer = JSON.parse(request.responseText); } catch { /* told below */ }
-    told.textContent = answer.refused ?? (answer.kept ? answer.note || `${answer.kept} is here` : "the file could not be taken in");
-    told.classList.toggle("refused", !answer.kept);
+    try { answer = JSON.parse(request.responseText); } catch { /* the message is below */ }
+    message.textContent = answer.refused ?? (answer.kept ? answer.note || `${answer.kept} is here` : "the file could not be taken in");
+    message.classList.toggle("refused", !answer.kept);
     document.getElementById("dropped").value = "";
   };
   request.onerror = () => {
     bar.hidden = true;
-    told.textContent = "the server does not answer; is orthaug app still running?";
-    told.classList.add("refused");
+    message.textContent = "the server does not answer; is orthaug app still running?";
+    message.classList.add("refused");
   };
   request.send(file);
 }

@@ -1,4 +1,4 @@
-"""Processes of the page: commands with their progress, and questions that are answered by a process of their own."""
+"""Processes of the page: commands with their progress, and workers that answer questions."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from orthaug._base.errors import InputError
-from orthaug.commands.bars import ENOUGH_LINE, TOLD_AS
+from orthaug.commands.bars import ENOUGH_LINE, PROGRESS_VARIABLE
 
 _LONGEST = 2**26  # bytes of a line of an answer
 _LINES = 400  # of a command that are kept
@@ -22,7 +22,7 @@ _AT_ONCE = 2  # questions
 
 
 class Run(NamedTuple):
-    """A run of training, as lines of progress tell of it: empty or 0 what they leave out."""
+    """A run of training, as a line of progress describes it; what the line omits is empty or 0."""
 
     number: int
     structure: str = ""
@@ -30,8 +30,8 @@ class Run(NamedTuple):
     regularization: str = ""
 
     @classmethod
-    def told(cls, line: Mapping[str, Any]) -> Run:
-        """That of a line."""
+    def of(cls, line: Mapping[str, Any]) -> Run:
+        """Return the run that a line of progress describes."""
         kind = str(line.get("regularization", ""))
         return cls(line["run"], line.get("structure", ""), line.get("start", 0), kind)
 
@@ -43,38 +43,40 @@ class Command:
     arguments: Sequence[str]
     changed: Callable[[], None]
     progress: dict[str, Any] = field(default_factory=dict)
-    """The last that was told: `run`, `runs`, `iteration`, `loss`, `done` (share)."""
+    """The last progress: `run`, `runs`, `iteration`, `loss`, `done` (share)."""
     losses: list[tuple[Run, int, float | None]] = field(default_factory=list)
-    """(run, iteration, loss) as told."""
+    """(run, iteration, loss) of each line of progress."""
     lines: list[str] = field(default_factory=list)
     began: float = 0.0
     ended: float | None = None
     code: int | None = None
     stopping: bool = False
     ending: bool = False
-    """Whether it was asked to end with what it has."""
+    """Whether it was asked to end with the result reached so far."""
     process: asyncio.subprocess.Process | None = None
 
     @property
     def running(self) -> bool:
-        """Whether it has not ended yet."""
+        """Whether the process still runs."""
         return self.code is None
 
     @property
     def seconds(self) -> float:
-        """Since it began, or that it took."""
+        """Seconds since it began, or those that it took."""
         return (time.monotonic() if self.ended is None else self.ended) - self.began
 
     @property
     def complaint(self) -> str:
-        """What it said last where it failed."""
-        told = [line for line in self.lines if line.strip()]
-        known = [line for line in told if line.startswith(("error:", "training failed:", "interrupted"))]
-        last = (known or ["it ended without a word; is there enough memory?"])[-1]
+        """The last message of a command that failed."""
+        lines = [line for line in self.lines if line.strip()]
+        known = [
+            line for line in lines if line.startswith(("error:", "training failed:", "interrupted"))
+        ]
+        last = (known or ["it ended without a message; is there enough memory?"])[-1]
         return last.removeprefix("error:").strip()
 
     async def run(self) -> None:
-        """Start it and follow it to its end; one that cannot start has failed."""
+        """Start the command and follow it to its end; one that cannot start counts as failed."""
         self.began = time.monotonic()
         try:
             self.code = await self._followed()
@@ -84,7 +86,7 @@ class Command:
         self.changed()
 
     async def _followed(self) -> int:
-        """The code that it ended with."""
+        """Return the exit code of the command."""
         program = [sys.executable, "-m", "orthaug.commands.app.child", *self.arguments]
         self.process = await asyncio.create_subprocess_exec(
             *program,
@@ -92,7 +94,12 @@ class Command:
             stdout=asyncio.subprocess.DEVNULL,
             stderr=asyncio.subprocess.PIPE,
             limit=_LONGEST,
-            env={**os.environ, TOLD_AS: "json", "PYTHONIOENCODING": "utf-8", "NO_COLOR": "1"},
+            env={
+                **os.environ,
+                PROGRESS_VARIABLE: "json",
+                "PYTHONIOENCODING": "utf-8",
+                "NO_COLOR": "1",
+            },
         )
         assert self.process.stderr is not None
         if self.stopping:
@@ -101,29 +108,29 @@ class Command:
             self.finish()
         async for raw in self.process.stderr:
             line = raw.decode("utf-8", "replace").rstrip()
-            told = _progress(line)
-            if told is None:
+            progress = _progress(line)
+            if progress is None:
                 self.lines = [*self.lines, line][-_LINES:]
             else:
-                self.progress = told
-                self.losses.append((Run.told(told), told["iteration"], told["loss"]))
+                self.progress = progress
+                self.losses.append((Run.of(progress), progress["iteration"], progress["loss"]))
             self.changed()
         return await self.process.wait()
 
     def stop(self) -> None:
-        """Interrupt it: it keeps or removes what is partial, and ends."""
+        """Interrupt the command: it keeps or removes partial files, and ends."""
         self.stopping = True
         if self.process is not None and self.process.stdin is not None:
             self.process.stdin.close()
 
     def finish(self) -> None:
-        """Ask training to end with what it has reached."""
+        """Ask training to end with the result reached so far."""
         self.ending = True
         if self.process is not None and self.process.stdin is not None:
             self.process.stdin.write(ENOUGH_LINE)
 
     async def end(self) -> None:
-        """Stop it, and wait until it has ended."""
+        """Stop the command, and wait until it has ended."""
         self.stop()
         if self.process is not None and self.process.returncode is None:
             try:
@@ -138,8 +145,10 @@ def _progress(line: str) -> dict[str, Any] | None:
     return None
 
 
-class Desk:
-    """Answers questions in processes of their own, so that the page neither waits nor holds the data.
+class WorkerPool:
+    """Workers that answer questions in their own processes.
+
+    So the page neither waits nor holds the data.
 
     One process waits with its modules imported for the next question.
     """
@@ -151,10 +160,10 @@ class Desk:
         self._room = asyncio.Semaphore(_AT_ONCE)
 
     async def ask(self, question: str, **given: Any) -> dict[str, Any]:
-        """The answer of a worker. A caller that is cancelled ends the worker.
+        """Return the answer of a worker. A caller that is cancelled ends the worker.
 
         Raises:
-            InputError: what the question is refused with.
+            InputError: the question was refused.
         """
         async with self._room:
             process = await self._taken()
@@ -174,7 +183,7 @@ class Desk:
         return answer
 
     def prepare(self) -> None:
-        """Let a process wait for the next question."""
+        """Start a process that waits for the next question."""
         if self._coming is None and not self._idle:
             self._coming = asyncio.ensure_future(_started())
 
@@ -192,7 +201,7 @@ class Desk:
             self._coming = self._coming or coming  # for the next one
             raise
         except OSError as error:
-            raise InputError(f"no process can be started for that ({error.strerror}).") from None
+            raise InputError(f"no process can be started ({error.strerror}).") from None
 
     async def close(self) -> None:
         coming: list[asyncio.subprocess.Process] = []
@@ -216,7 +225,9 @@ async def _started() -> asyncio.subprocess.Process:
     )
 
 
-async def _answered(process: asyncio.subprocess.Process, question: dict[str, Any]) -> dict[str, Any]:
+async def _answered(
+    process: asyncio.subprocess.Process, question: dict[str, Any]
+) -> dict[str, Any]:
     assert process.stdin is not None and process.stdout is not None
     try:
         process.stdin.write(json.dumps(question, default=str).encode() + b"\n")
@@ -224,7 +235,9 @@ async def _answered(process: asyncio.subprocess.Process, question: dict[str, Any
         line = await process.stdout.readline()
         return json.loads(line)
     except (OSError, ValueError):
-        raise InputError("the data could not be looked at: the process ended early. Is there enough memory?") from None
+        raise InputError(
+            "the data could not be read: the process ended early. Is there enough memory?"
+        ) from None
 
 
 def _kill(process: asyncio.subprocess.Process) -> None:

@@ -1,4 +1,4 @@
-"""What the server answers: the page of a session, files that are dropped, files that are taken away."""
+"""Routes of the server: the page of a session, uploads and downloads."""
 
 from __future__ import annotations
 
@@ -28,25 +28,30 @@ from orthaug.commands.app.view_results import ExportView, ReportView
 from orthaug.commands.app.view_training import TrainingView
 from orthaug.commands.app.widgets import sentence, text
 
-LARGEST = 2 * 2**30  # bytes of a file that is dropped: it lies once more in a temporary folder
-_TOO_LARGE = "the file is larger than {}, the most that this page takes in; name its path instead, and it stays there."
+LARGEST = 2 * 2**30  # bytes of an upload: there is a second copy in a temporary folder
+_TOO_LARGE = "the file is larger than {}, the limit of this page; give its path instead."
 _OFTEN = 0.25  # s between looks at what has changed
 _PARTS = ("Data", "Model", "Training", "Report", "Export")
 MARK = (
-    "<svg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 32 32'><rect width='32' height='32' rx='7' fill='#0550ae'/>"
-    "<path d='M9 7v16h16' stroke='#fff' stroke-width='3.4' fill='none' stroke-linecap='round'/>"
-    "<path d='M9 17h6v6' stroke='#9cc8ff' stroke-width='2.2' fill='none'/></svg>"
+    "<svg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 32 32'><rect width='32' height='32' "
+    "rx='7' fill='#0550ae'/><path d='M9 7v16h16' stroke='#fff' stroke-width='3.4' fill='none' "
+    "stroke-linecap='round'/><path d='M9 17h6v6' stroke='#9cc8ff' stroke-width='2.2' "
+    "fill='none'/></svg>"
 )
-"""The mark of the program, as a picture."""
+"""The icon of the program."""
 
 
 class Page:
-    """What one browser tab shows of a session. Several may show the same."""
+    """The view of a session in one browser tab; several tabs may show the same session."""
 
     def __init__(self, session: Session) -> None:
         self.session = session
         self.data, self.model = DataView(session), ModelView(session)
-        self.training, self.report, self.export = TrainingView(session), ReportView(session), ExportView(session)
+        self.training, self.report, self.export = (
+            TrainingView(session),
+            ReportView(session),
+            ExportView(session),
+        )
         self.seen = dict(session.versions)
 
     def draw(self) -> None:
@@ -58,7 +63,11 @@ class Page:
             ui.html(MARK, sanitize=False, tag="span").classes("logo").props("aria-hidden=true")
             text("orthaug", "h1")
             self.title = text("", "p", "hint")
-        with ui.tabs().props("no-caps align=left active-color=tab indicator-color=tab dense").classes("tabs") as tabs:
+        with (
+            ui.tabs()
+            .props("no-caps align=left active-color=tab indicator-color=tab dense")
+            .classes("tabs") as tabs
+        ):
             for name in _PARTS:
                 ui.tab(name)
         start = "Training" if self.session.commands else "Data"
@@ -72,24 +81,26 @@ class Page:
         ui.timer(_OFTEN, self.follow)
 
     def _keep_history(self, tabs: ui.tabs, start: str) -> None:
-        """Let Back and Forward of the browser go through the parts, and a reload show the same one."""
+        """Let the browser's Back, Forward and reload lead to the part that was shown."""
 
         def go(event: Any) -> None:
             if event.args in _PARTS:
                 tabs.set_value(event.args)
 
         def reopen(event: Any) -> None:
-            if tabs.value == start:  # else somebody was faster
+            if tabs.value == start:  # otherwise another page was faster
                 go(event)
 
         ui.on("part", go)
         ui.on("reopened", reopen)
-        tabs.on_value_change(lambda event: ui.run_javascript(f"shown({json.dumps(str(event.value))}, false)"))
+        tabs.on_value_change(
+            lambda event: ui.run_javascript(f"shown({json.dumps(str(event.value))}, false)")
+        )
         opened = "location.hash ? emitEvent('reopened', location.hash.slice(1)) : shown({}, true)"
         ui.timer(_OFTEN, lambda: ui.run_javascript(opened.format(json.dumps(start))), once=True)
 
     def follow(self) -> None:
-        """Let each part see what has changed since the last look."""
+        """Let each part of the page redraw what has changed since it was last drawn."""
         now, seen = dict(self.session.versions), self.seen
         self.seen = now
 
@@ -102,7 +113,10 @@ class Page:
         if moved("spec"):
             authors = set(self.session.authors[seen.get("spec", 0) :])
             author = authors.pop() if len(authors) == 1 else ""
-            looks += [partial(self.data.follow_spec, author), partial(self.model.follow_spec, author)]
+            looks += [
+                partial(self.data.follow_spec, author),
+                partial(self.model.follow_spec, author),
+            ]
         if moved("check"):
             looks += [self.data.follow_check, self.model.follow_check]
         if moved("work") or moved("spec") or moved("data") or self.session.running is not None:
@@ -116,7 +130,7 @@ class Page:
         for look in looks:
             try:
                 look()
-            except Exception as error:  # a part that fails keeps no other from what is new
+            except Exception as error:  # a part that fails does not stop the others
                 LOG.exception("a part of the page failed")
                 self._complain(error)
 
@@ -124,12 +138,16 @@ class Page:
         self.title.set_content(escape(self.session.title or "from data to a model"))
 
     def _complain(self, error: Exception) -> None:
-        told = str(error) if isinstance(error, InputError) else f"this did not work ({type(error).__name__})."
-        ui.notify(sentence(told), type="negative")
+        message = (
+            str(error)
+            if isinstance(error, InputError)
+            else f"this did not work ({type(error).__name__})."
+        )
+        ui.notify(sentence(message), type="negative")
 
 
 def application(sessions: Sessions, spec: Path | None) -> FastAPI:
-    """All routes, with the pages of NiceGUI behind them."""
+    """Return the application with all its routes, and the pages of NiceGUI behind them."""
     app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
 
     @app.get("/")
@@ -137,7 +155,7 @@ def application(sessions: Sessions, spec: Path | None) -> FastAPI:
         try:
             session = sessions.new(spec)
         except InputError as error:
-            return _told(str(error), 503)
+            return _error_page(str(error), 503)
         return RedirectResponse(f"/session/{session.key}", 303)
 
     @app.put("/session/{key}/file/{name}")
@@ -149,10 +167,10 @@ def application(sessions: Sessions, spec: Path | None) -> FastAPI:
         session = sessions.find(key)
         try:
             if session is None:
-                raise InputError("this work is not open any more.")
+                raise InputError("this session has ended.")
             file = session.download(what)
         except InputError as error:
-            return _told(str(error), 404)
+            return _error_page(str(error), 404)
         if show and file.suffix == ".html":  # else a spec could be read as a page of this origin
             return FileResponse(file, headers={"cache-control": "no-store"}, media_type="text/html")
         return FileResponse(file, filename=what, headers={"cache-control": "no-store"})
@@ -161,10 +179,13 @@ def application(sessions: Sessions, spec: Path | None) -> FastAPI:
     def work(key: str) -> Response | None:
         session = sessions.find(key)
         if session is None:
-            return _told("This work is not open any more. Its spec is offered where something new begins.", 404)
+            return _error_page(
+                "This session has ended. Its spec is offered at the start of a new one.",
+                404,
+            )
         Page(session).draw()
 
-    pages.on_exception(lambda error: None)  # each page tells of its own
+    pages.on_exception(lambda error: None)  # each page reports its own errors
     ui.run_with(
         app,
         title="orthaug",
@@ -180,10 +201,10 @@ def application(sessions: Sessions, spec: Path | None) -> FastAPI:
 
 
 async def _kept(sessions: Sessions, key: str, name: str, request: Request) -> Response:
-    """A file as it comes, a piece at a time, and looked at once it is whole."""
+    """Return the answer to an upload: the file is written piece by piece, then examined."""
     session = sessions.find(key)
     if session is None:
-        return _refused("this work is not open any more; open the page anew.", 404)
+        return _refused("this session has ended; open the page anew.", 404)
     partial: Path | None = None
     declared = request.headers.get("content-length", "")
     if declared.isdecimal() and int(declared) > LARGEST:
@@ -200,7 +221,7 @@ async def _kept(sessions: Sessions, key: str, name: str, request: Request) -> Re
     except InputError as error:
         return _refused(str(error), 422)
     except ClientDisconnect:
-        return _refused("the file came only in part.", 400)
+        return _refused("only a part of the file arrived.", 400)
     except OSError as error:
         return _refused(f"the file cannot be kept ({error.strerror}).", 507)
     finally:
@@ -215,5 +236,7 @@ def _refused(text: str, code: int) -> Response:
     return JSONResponse({"refused": text}, code)
 
 
-def _told(text: str, code: int) -> Response:
-    return HTMLResponse(f"{PLAIN}<p>{escape(text)}</p><p><a href='/'>Begin anew</a></p></body></html>", code)
+def _error_page(text: str, code: int) -> Response:
+    return HTMLResponse(
+        f"{PLAIN}<p>{escape(text)}</p><p><a href='/'>Begin anew</a></p></body></html>", code
+    )

@@ -1,4 +1,4 @@
-"""The server of the page: on this machine only, behind a token, ended by Ctrl-C with all that it started."""
+"""The server of the page: local only, behind a token, ended by Ctrl-C with all that it started."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _LOOK = 0.2  # s between looks at whether Ctrl-C came
 
 
 def free_port(wanted: int | None) -> socket.socket:
-    """A socket that listens on this machine alone, on the wanted port or a free one.
+    """Return a socket that listens on this machine only, on the wanted port or a free one.
 
     Raises:
         InputError: a port that is taken or not allowed.
@@ -38,7 +38,9 @@ def free_port(wanted: int | None) -> socket.socket:
     except (OSError, OverflowError) as error:
         listening.close()
         why = getattr(error, "strerror", None) or error
-        raise InputError(f"--port: cannot listen on port {wanted} ({why}); leave it out for a free one.") from None
+        raise InputError(
+            f"--port: cannot listen on port {wanted} ({why}); leave it out for a free one."
+        ) from None
     return listening
 
 
@@ -48,13 +50,17 @@ def check_installed() -> None:
         import nicegui  # noqa: F401
     except ImportError:
         raise InputError(
-            "the page is drawn by NiceGUI, which is not installed; pip install 'orthaug[app]', or pip install nicegui."
+            "the page is drawn by NiceGUI, which is not installed; pip install 'orthaug[app]', "
+            "or pip install nicegui."
         ) from None
 
 
 @contextlib.contextmanager
 def private_folder() -> Iterator[Path]:
-    """A folder that only this user may read, gone with the program; what a killed one left goes with the next."""
+    """Yield a folder that only this user can read; it is removed at the end.
+
+    The folder of a killed program is removed by the next one.
+    """
     before = os.umask(0o077)
     folder = PARTIALS.folder(Path(tempfile.gettempdir()))
     try:
@@ -72,7 +78,9 @@ def serve(spec: Path | None, *, port: int | None = None, browser: bool = True) -
     """
     listening = free_port(port)
     with listening, private_folder() as folder:
-        os.environ["NICEGUI_STORAGE_PATH"] = str(folder / "storage")  # else it would keep one in the working folder
+        os.environ["NICEGUI_STORAGE_PATH"] = str(
+            folder / "storage"
+        )  # else it would keep one in the working folder
         check_installed()
         from orthaug.commands.app.spec_text import in_file
 
@@ -86,7 +94,7 @@ def serve(spec: Path | None, *, port: int | None = None, browser: bool = True) -
 
 @contextlib.contextmanager
 def _asked_to_end() -> Iterator[threading.Event]:
-    """An event that Ctrl-C sets; a second one ends the program at once."""
+    """Yield an event that Ctrl-C sets; a second Ctrl-C ends the program at once."""
     if WATCH.active:
         with WATCH.asking() as event:
             yield event
@@ -97,16 +105,24 @@ def _asked_to_end() -> Iterator[threading.Event]:
 
 
 async def _serve(
-    sessions: Sessions, listening: socket.socket, spec: Path | None, asked: threading.Event, browser: bool
+    sessions: Sessions,
+    listening: socket.socket,
+    spec: Path | None,
+    asked: threading.Event,
+    browser: bool,
 ) -> None:
     import uvicorn
 
     from orthaug.commands.app.routes import application
 
     gate = Gate(application(sessions, spec), listening.getsockname()[1])
-    options: dict[str, Any] = {"log_level": "critical", "access_log": False, "timeout_graceful_shutdown": 1}
+    options: dict[str, Any] = {
+        "log_level": "critical",
+        "access_log": False,
+        "timeout_graceful_shutdown": 1,
+    }
     server = uvicorn.Server(uvicorn.Config(gate, lifespan="on", ws_max_size=2**26, **options))
-    server.capture_signals = contextlib.nullcontext  # type: ignore[method-assign]  # the program has its own way
+    server.capture_signals = contextlib.nullcontext  # type: ignore[method-assign]
     sessions.desk.prepare()
     serving = asyncio.ensure_future(server.serve([listening]))
     while not (server.started or serving.done()):

@@ -1,4 +1,7 @@
-"""Work on the page: file, spec, check, training, results. It lives on the server; a page only shows it."""
+"""Work on the page: file, spec, check, training, results.
+
+It lives on the server; a page only shows it.
+"""
 
 from __future__ import annotations
 
@@ -19,8 +22,17 @@ from typing import Any
 from orthaug._base.errors import InputError
 from orthaug._base.folders import file_digest
 from orthaug._base.progress import LOG
-from orthaug.commands.app.processes import Command, Desk
-from orthaug.commands.app.spec_text import absolute, files, in_file, keep, kept_title, plain, section, with_value
+from orthaug.commands.app.processes import Command, WorkerPool
+from orthaug.commands.app.spec_text import (
+    absolute,
+    files,
+    in_file,
+    keep,
+    kept_title,
+    plain,
+    section,
+    with_value,
+)
 from orthaug.data.tables import KNOWN
 
 _SESSIONS = 50  # that are kept at once
@@ -29,9 +41,12 @@ KINDS = ("fit", "compare")
 
 
 class Session:
-    """State and actions. `versions` counts the changes of `data`, `spec`, `check` and `work`, for pages to follow."""
+    """State and actions of one user's work.
 
-    def __init__(self, key: str, folder: Path, desk: Desk) -> None:
+    `versions` counts the changes of `data`, `spec`, `check` and `work`, for pages to follow.
+    """
+
+    def __init__(self, key: str, folder: Path, desk: WorkerPool) -> None:
         self.key, self.folder, self.desk = key, folder, desk
         self.versions: Counter[str] = Counter()
         self.title = ""
@@ -47,9 +62,11 @@ class Session:
         """Why the chosen channels make no spec."""
         self.spec = ""
         self.kept_as = ""
-        """The title under which its spec is kept when the server ends; empty until there is something to keep."""
+        """The title under which its spec is kept when the server ends; empty until there is
+        something to keep.
+        """
         self.authors: list[str] = []
-        """Who made each change of the spec: a part of a page, which need not be told of its own."""
+        """Author of each change of the spec: a part of a page, which ignores its own changes."""
         self.checked: dict[str, Any] | None = None
         self.refused = ""
         """Why the spec cannot be trained."""
@@ -70,22 +87,22 @@ class Session:
 
     @property
     def untouched(self) -> bool:
-        """Whether nobody has done anything in it yet."""
+        """Whether the session has not been used yet."""
         return not self.commands and self.data is None and set(self.authors) <= {"file"}
 
     def changed(self, what: str) -> None:
-        """Let every page of the session see it."""
+        """Mark the session as changed, so that every page of it redraws."""
         self.versions[what] += 1
 
     def start(self, work: Awaitable[Any]) -> asyncio.Task[Any]:
-        """Let something run without waiting for it."""
+        """Start a coroutine without waiting for it."""
         task = asyncio.ensure_future(work)
         self._tasks.add(task)
         task.add_done_callback(self._ended)
         return task
 
     def _ended(self, task: asyncio.Task[Any]) -> None:
-        """Let no task fail without a word."""
+        """Report the error of a task that has failed."""
         self._tasks.discard(task)
         if not task.cancelled() and (error := task.exception()) is not None:
             LOG.error("a task of the page failed", exc_info=error)
@@ -94,13 +111,17 @@ class Session:
 
     @property
     def first_step(self) -> str:
-        """What begins the work, where there is no spec yet."""
-        return "It begins with a data file." if self.found is None else "Choose the channels in Data first."
+        """The first step of the work, where there is no spec yet."""
+        return (
+            "It begins with a data file."
+            if self.found is None
+            else "Choose the channels in Data first."
+        )
 
     # Data
 
     def place_for(self, name: str) -> Path:
-        """Where a file of that name that was dropped is kept.
+        """Return the path under which an uploaded file of that name is kept.
 
         Raises:
             InputError: an ending of no data file.
@@ -108,11 +129,15 @@ class Session:
         plain_name = _as_name(re.split(r"[/\\]", name)[-1])
         ending = Path(plain_name).suffix.lower()
         if ending not in KNOWN or not Path(plain_name).stem:
-            raise InputError(f"'{plain_name}': no data file that is known; known are {', '.join(KNOWN)}.")
+            raise InputError(
+                f"'{plain_name}': unknown type of data file; expected one of {', '.join(KNOWN)}."
+            )
         return self.folder / plain_name
 
     def begin_file(self, name: str) -> Path:
-        """Return a file to write what is dropped under that name into; `keep_file` gives it its place.
+        """Return the path of a partial file for an upload of that name.
+
+        `keep_file` moves it to its place.
 
         Raises:
             InputError: an ending of no data file.
@@ -121,9 +146,9 @@ class Session:
         return self.folder / f"{secrets.token_hex(8)}.partial"
 
     def keep_file(self, partial: Path, name: str) -> tuple[Path, str]:
-        """Give a dropped file its place and return that, with what the page says of it.
+        """Move an uploaded file to its place; return that place and a message for the page.
 
-        Nothing that is there is replaced: another content under the same name gets a number.
+        No file is replaced: other content under the same name gets a number.
         """
         first = self.place_for(name)
         place, number, digest = first, 1, file_digest(partial)
@@ -131,10 +156,15 @@ class Session:
             number += 1
             place = first.with_name(f"{first.stem}-{number}{first.suffix}")
         os.replace(partial, place)
-        return place, f"another file called {first.name} is here, so this one is {place.name}" if number > 1 else ""
+        return (
+            place,
+            f"another file called {first.name} is here, so this one is {place.name}"
+            if number > 1
+            else "",
+        )
 
     def open_file(self, path: Path) -> None:
-        """Look at a data file, and begin a spec for it where its columns tell what they are."""
+        """Look at a data file; begin a spec for it where its columns show their roles."""
         self.data, self.found = Path(os.path.abspath(path)), None
         self.title = (self.spec.strip() and self.title) or path.name
         self._look_again(None, None, None)
@@ -156,7 +186,9 @@ class Session:
         self.changed("data")
         place = self.folder / "spec.toml"
         try:
-            found = await self.desk.ask("look", path=self.data, out=place, inputs=inputs, outputs=outputs, step=step)
+            found = await self.desk.ask(
+                "look", path=self.data, out=place, inputs=inputs, outputs=outputs, step=step
+            )
             if self.found is not None and found["spec"] is None:
                 self.unfit = found["open"]
             else:
@@ -176,29 +208,32 @@ class Session:
 
     @property
     def _may_begin(self) -> bool:
-        """Whether looking at a file may begin the spec: there is none, or one that it began and nobody worked on."""
+        """Whether looking at a file may begin the spec.
+
+        It may where there is no spec, or one that an earlier look began and nobody has edited.
+        """
         return not self.spec.strip() or (set(self.authors) <= {"look"} and not self.apart)
 
     def _begin(self, spec: str) -> None:
         assert self.data is not None
         if self.title != self.data.name:  # the earlier work keeps its name
             self.title, self.kept_as = self.data.name, ""
-        own = self.data.parent == self.folder  # a file that was dropped stands beside the spec
+        own = self.data.parent == self.folder  # an uploaded file is in the same folder as the spec
         self.write(spec if own else absolute(spec, self.folder), "look")
 
     @property
     def apart(self) -> bool:
-        """Whether the file that was looked at is one that the spec does not name."""
+        """Whether the spec does not name the file that was looked at."""
         return self.data is not None and bool(self.spec.strip()) and not self.names(self.data)
 
     def names(self, file: Path) -> bool:
-        """Whether the spec names a file, or has a pattern for it."""
+        """Return whether the spec names a file, or has a pattern that matches it."""
         whole = os.path.abspath(file)
         named = [os.path.abspath(self.folder / name) for name in files(self.content())]
         return any(whole == name or fnmatch(whole, name) for name in named)
 
     def add_test(self) -> None:
-        """Let the file that was looked at be a test of the spec."""
+        """Add the file that was looked at to the tests of the spec."""
         assert self.data is not None
         file = self.data.name if self.data.parent == self.folder else self.data.as_posix()
         taken, name = section(self.content(), "data", "tests"), re.sub(r"\W", "_", self.data.stem)
@@ -208,12 +243,18 @@ class Session:
         self.changed("data")
 
     def open_spec(self, path: Path, *, kept: bool = False) -> None:
-        """Take a spec that stands somewhere, or one of earlier work that was kept; it is read, and never written.
+        """Open a spec from a file, or one of earlier work that was kept.
+
+        The file is read, and never written.
 
         Raises:
             InputError: a file that cannot be read, or broken TOML.
         """
-        text = path.read_text(encoding="utf-8") if kept else absolute(in_file(path), path.absolute().parent)
+        text = (
+            path.read_text(encoding="utf-8")
+            if kept
+            else absolute(in_file(path), path.absolute().parent)
+        )
         self.title = kept_title(path) if kept else path.name
         self.write(text, "file")
         self.changed("data")
@@ -221,7 +262,7 @@ class Session:
     # Spec
 
     def write(self, text: str, author: str) -> None:
-        """Take a spec, and check it when nobody has changed it for a moment."""
+        """Take a new text of the spec; check it when it has not changed for a moment."""
         if text == self.spec:
             return
         self.spec = text
@@ -233,7 +274,7 @@ class Session:
         self._check_soon()
 
     def edit(self, author: str, change: Callable[..., str], *given: Any) -> None:
-        """Take the spec after a change of `spec_text`, which is given the rest."""
+        """Replace the spec by the result of a function of `spec_text` with these arguments."""
         self.write(change(self.spec, *given), author)
 
     def _check_soon(self) -> None:
@@ -265,29 +306,39 @@ class Session:
 
     @property
     def units(self) -> dict[str, str]:
-        """What the channels ask for as units of parameters, of the spec as it is; nothing until it is checked."""
+        """Units of parameters that follow from the channels of the present spec.
+
+        Empty until the spec is checked.
+        """
         if self.checked is None or self.checking or self.stale:
             return {}
         return {name: asked or "1" for name, _, asked in self.checked["units"] if asked is not None}
 
     def content(self) -> dict[str, Any]:
-        """The spec as dictionaries; empty while its TOML is broken."""
+        """Return the spec as dictionaries; empty while its TOML is invalid."""
         try:
             return plain(self.spec)
         except InputError:
             return {}
 
     def worded(self, text: Any) -> str:
-        """A message without the session's own folder and file names."""
-        text = str(text).removeprefix(f"{self.folder / 'check.toml'}: ").removeprefix(f"{self.folder / 'spec.toml'}: ")
+        """Return a message without the session's own folder and file names."""
+        text = (
+            str(text)
+            .removeprefix(f"{self.folder / 'check.toml'}: ")
+            .removeprefix(f"{self.folder / 'spec.toml'}: ")
+        )
         return text.replace(f"{self.folder}/", "").replace(f"{self.folder}\\", "")
 
     # Training
 
     @property
     def running(self) -> Command | None:
-        """The training that goes on."""
-        return next((command for kind in KINDS if (command := self.commands.get(kind)) and command.running), None)
+        """The training that runs now."""
+        return next(
+            (command for kind in KINDS if (command := self.commands.get(kind)) and command.running),
+            None,
+        )
 
     def train(self, kind: str) -> None:
         """Run `orthaug fit` or `orthaug compare` on the spec."""
@@ -310,7 +361,7 @@ class Session:
         self.changed("work")
 
     async def _read_result(self, kind: str) -> None:
-        """The result that lies in the folder, and the verdict that its report begins with."""
+        """Read the result in the folder, and the verdict that its report begins with."""
         place = self.folder / kind / "result.json"
         self.verdicts.pop(kind, None)
         with suppress(OSError, ValueError):  # InputError among them
@@ -318,25 +369,32 @@ class Session:
             self.verdicts[kind] = await self.desk.ask("verdict", path=place, kind=kind)
 
     def stop(self) -> None:
-        """Interrupt the training that goes on."""
+        """Interrupt the training that runs now."""
         if self.running is not None:
             self.running.stop()
             self.changed("work")
 
     def finish(self) -> None:
-        """Let the training that goes on end with what it has reached."""
+        """Let the training that runs now end with the result reached so far."""
         if self.running is not None:
             self.running.finish()
             self.changed("work")
 
-    # What can be taken away
+    # Downloads
 
     def export(self, target: str, name: str) -> None:
         """Run `orthaug export` on the model."""
         self.start(self._exported(target, name))
 
     async def _exported(self, target: str, name: str) -> None:
-        arguments = ("export", str(self.folder / "fit"), "--to", target, "--out", str(self.folder / "export" / target))
+        arguments = (
+            "export",
+            str(self.folder / "fit"),
+            "--to",
+            target,
+            "--out",
+            str(self.folder / "export" / target),
+        )
         (self.folder / "export").mkdir(exist_ok=True)
         command = Command((*arguments, "--name", name, "--force"), lambda: None)
         self.exports[target] = "…"
@@ -347,7 +405,7 @@ class Session:
             self.changed("work")
 
     def download(self, what: str) -> Path:
-        """The file that is handed out under a name: from a list, never a path.
+        """Return the file to download under a name: from a fixed list, never a path.
 
         Raises:
             InputError: nothing there.
@@ -359,7 +417,9 @@ class Session:
         single = {"report.html": "fit/report.html", "result.json": "fit/result.json"}
         single["comparison.html"] = "compare/report.html"
         folders = {"model.zip": "fit/model", "result.zip": "fit", "comparison.zip": "compare"}
-        folders |= {f"{target}.zip": f"export/{target}" for target, why in self.exports.items() if not why}
+        folders |= {
+            f"{target}.zip": f"export/{target}" for target, why in self.exports.items() if not why
+        }
         if what in single and (self.folder / single[what]).is_file():
             return self.folder / single[what]
         if what in folders and (self.folder / folders[what]).is_dir():
@@ -374,15 +434,15 @@ class Session:
 
 
 class Sessions:
-    """All work that goes on, by keys that cannot be guessed."""
+    """All sessions, by keys that cannot be guessed."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder, self.desk = folder, Desk()
+        self.folder, self.desk = folder, WorkerPool()
         self._open: dict[str, Session] = {}
         self._made = 0
 
     def new(self, spec: Path | None = None) -> Session:
-        """A session in a folder of its own, which nobody else may read.
+        """Return a session in a folder of its own, which nobody else can read.
 
         Raises:
             InputError: too many sessions, or a spec that cannot be read.
@@ -391,7 +451,7 @@ class Sessions:
         if len(self._open) >= _SESSIONS and untouched:
             del self._open[untouched[0].key]
         if len(self._open) >= _SESSIONS:
-            raise InputError(f"{_SESSIONS} pieces of work are open; end orthaug app, and start it again.")
+            raise InputError(f"{_SESSIONS} sessions are open; end orthaug app, and start it again.")
         key = secrets.token_urlsafe(12)
         self._made += 1
         folder = self.folder / f"work-{self._made}"
@@ -405,11 +465,13 @@ class Sessions:
         return self._open.get(key)
 
     async def close(self) -> None:
-        await asyncio.gather(self.desk.close(), *(session.close() for session in self._open.values()))
+        await asyncio.gather(
+            self.desk.close(), *(session.close() for session in self._open.values())
+        )
 
 
 def _as_name(text: str) -> str:
-    """What any system takes as the name of a file."""
+    """Return a name that any system accepts as the name of a file."""
     return re.sub(r"[^\w. -]", "_", text).strip(" .")[-60:]
 
 

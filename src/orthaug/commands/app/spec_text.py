@@ -1,4 +1,7 @@
-"""A spec as text that forms change, one key or table at a time, comments and order kept; and where it stands."""
+"""A spec as text that forms change, one key or table at a time, comments and order kept.
+
+And the files where specs are kept.
+"""
 
 from __future__ import annotations
 
@@ -16,13 +19,19 @@ from tomlkit.items import AoT
 from orthaug._base.errors import InputError
 from orthaug.data.tables import check_readable
 
-_WORDS = ("parameter", "regressor", "output", "unit", "channel")  # keys whose values are text, digits or not
+_WORDS = (
+    "parameter",
+    "regressor",
+    "output",
+    "unit",
+    "channel",
+)  # keys whose values are text, digits or not
 _KEPT = 20  # specs of earlier work
 _MARK = 7  # letters behind the title in the name of one
 
 
 def opened(text: str) -> tomlkit.TOMLDocument:
-    """The document.
+    """Return the document.
 
     Raises:
         InputError: broken TOML.
@@ -34,7 +43,7 @@ def opened(text: str) -> tomlkit.TOMLDocument:
 
 
 def in_file(path: Path) -> str:
-    """The text of a spec that stands somewhere.
+    """Return the text of a spec in a file.
 
     Raises:
         InputError: a file that cannot be read, or broken TOML.
@@ -53,7 +62,10 @@ def in_file(path: Path) -> str:
 
 
 def keep(title: str, key: str, spec: str) -> None:
-    """Write the spec of a piece of work anew, whole or not at all; nothing where the folder cannot be written."""
+    """Write the spec of a session anew, whole or not at all.
+
+    It does nothing where the folder cannot be written.
+    """
     place = _folder() / f"{title}-{key[: _MARK - 1]}.toml"
     with suppress(OSError):
         place.parent.mkdir(parents=True, exist_ok=True)
@@ -65,14 +77,16 @@ def keep(title: str, key: str, spec: str) -> None:
 
 
 def earlier() -> list[Path]:
-    """The specs that are kept, the latest first."""
+    """Return the specs that are kept, the latest first."""
     with suppress(OSError):
-        return sorted(_folder().glob("*.toml"), key=lambda place: place.stat().st_mtime, reverse=True)
+        return sorted(
+            _folder().glob("*.toml"), key=lambda place: place.stat().st_mtime, reverse=True
+        )
     return []
 
 
 def kept_title(place: Path) -> str:
-    """What it was called."""
+    """Return the title under which a spec was kept."""
     return place.stem[:-_MARK]
 
 
@@ -81,7 +95,7 @@ def _folder() -> Path:
 
 
 def absolute(text: str, folder: Path) -> str:
-    """The same spec with whole paths for files that it names from `folder` on, so that it may stand anywhere."""
+    """Return the spec with absolute paths for the files that it names relative to `folder`."""
     document = opened(text)
     for entry in _with_files(document):
         entry["files"] = [_whole(folder, file) for file in entry["files"]]
@@ -89,7 +103,7 @@ def absolute(text: str, folder: Path) -> str:
 
 
 def _whole(folder: Path, file: Any) -> Any:
-    """Not resolved: links and patterns stay what they are."""
+    """Return a path as an absolute one, not resolved: links and patterns remain what they are."""
     return Path(os.path.abspath(folder / file)).as_posix() if isinstance(file, str) else file
 
 
@@ -102,19 +116,27 @@ def _with_files(document: Mapping[str, Any]) -> Iterator[Any]:
 
 
 def files(content: Mapping[str, Any]) -> list[str]:
-    """Every data file that a spec names, the training data first, each once."""
-    return list(dict.fromkeys(file for entry in _with_files(content) for file in names(entry, "files")))
+    """Return every data file that a spec names, the training data first, each once."""
+    return list(
+        dict.fromkeys(file for entry in _with_files(content) for file in names(entry, "files"))
+    )
 
 
 def columns(content: Mapping[str, Any]) -> dict[str, str]:
-    """Of the columns of a file that hold the channels: whether each is an `input` or an `output`."""
+    """Return the use, `input` or `output`, of each column of a file that holds a channel."""
     data = section(content, "data")
     kinds = {name: kind for kind in ("input", "output") for name in names(data, f"{kind}s")}
-    return {str(section(data, "channels", name).get("column") or name): kind for name, kind in kinds.items()}
+    return {
+        str(section(data, "channels", name).get("column") or name): kind
+        for name, kind in kinds.items()
+    }
 
 
 def section(content: Mapping[str, Any], *path: str) -> Mapping[str, Any]:
-    """The table at the end of the path; an empty one where there is none, or something else in its place."""
+    """Return the table at the end of the path.
+
+    Empty where there is no table.
+    """
     for key in path:
         found = content.get(key)
         content = found if isinstance(found, Mapping) else {}
@@ -122,18 +144,27 @@ def section(content: Mapping[str, Any], *path: str) -> Mapping[str, Any]:
 
 
 def names(table: Mapping[str, Any], key: str) -> list[str]:
-    """The strings of a list, such as `outputs`; none where there is no such list."""
+    """Return the strings of a list, such as `outputs`; none where there is no such list."""
     found = table.get(key)
     return [name for name in found if isinstance(name, str)] if isinstance(found, list) else []
 
 
 def shown(value: Any) -> str:
-    """A value as a field shows it."""
-    return "" if value is None else ", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
+    """Return a value as a field shows it."""
+    return (
+        ""
+        if value is None
+        else ", ".join(map(str, value))
+        if isinstance(value, list | tuple)
+        else str(value)
+    )
 
 
 def read(key: str, value: str) -> Any:
-    """What a field says: a number, names, or text; None for nothing. The spec's own check says what is wrong."""
+    """Return the value of a field's text: a number, names, or text; None for nothing.
+
+    Errors are left to the check of the spec.
+    """
     value = value.strip()
     if not value:
         return None
@@ -148,7 +179,7 @@ def read(key: str, value: str) -> Any:
 
 
 def _made(document: Any, path: Sequence[str]) -> Any:
-    """The table at the end of the path, made where there is none."""
+    """Return the table at the end of the path; it is made where there is none."""
     for key in path:
         if not isinstance(document.get(key), Mapping):
             document[key] = tomlkit.table()
@@ -157,7 +188,7 @@ def _made(document: Any, path: Sequence[str]) -> Any:
 
 
 def plain(text: str) -> dict[str, Any]:
-    """The content in plain dictionaries and lists.
+    """Return the content in plain dictionaries and lists.
 
     Raises:
         InputError: broken TOML.
@@ -166,7 +197,7 @@ def plain(text: str) -> dict[str, Any]:
 
 
 def changed(text: str, change: Callable[[Any], None]) -> str:
-    """The text after a change of its document.
+    """Return the text after a change of its document.
 
     Raises:
         InputError: broken TOML, or TOML in which the change cannot be written.
@@ -175,18 +206,26 @@ def changed(text: str, change: Callable[[Any], None]) -> str:
     change(document)
     written = tomlkit.dumps(document)
     if plain(written) != document.unwrap():
-        raise InputError("a form cannot write this change into the spec as it is laid out; make it in the text.")
+        raise InputError(
+            "a form cannot write this change into the spec in its present layout; make it in "
+            "the text."
+        )
     return written
 
 
 def with_value(text: str, path: Sequence[str], value: Any) -> str:
-    """With a key of a table set, or without it where the value is None; tables on the way are made."""
+    """Return the text with a key of a table set, or removed where the value is None.
+
+    Missing tables on the path are added.
+    """
 
     def change(document: Any) -> None:
         table = _made(document, path[:-1])
         if value is None:
             table.pop(path[-1], None)
-        elif isinstance(value, Mapping):  # inline: a table of its own would land elsewhere beside dotted keys
+        elif isinstance(
+            value, Mapping
+        ):  # inline: beside dotted keys a separate table would be written elsewhere
             table[path[-1]] = tomlkit.inline_table()
             table[path[-1]].update(value)
         else:
@@ -196,13 +235,18 @@ def with_value(text: str, path: Sequence[str], value: Any) -> str:
 
 
 def rows_of(text: str, path: Sequence[str]) -> list[dict[str, Any]]:
-    """The tables of a list of tables, such as `data.prepare`; none where there is no such list."""
+    """Return the tables of a list of tables, such as `data.prepare`.
+
+    Empty where there is no such list.
+    """
     found = section(plain(text), *path[:-1]).get(path[-1])
-    return [dict(row) for row in found if isinstance(row, Mapping)] if isinstance(found, list) else []
+    return (
+        [dict(row) for row in found if isinstance(row, Mapping)] if isinstance(found, list) else []
+    )
 
 
 def with_row(text: str, path: Sequence[str], row: Mapping[str, Any]) -> str:
-    """With a table more at the end of a list of tables."""
+    """Return the text with one more table at the end of a list of tables."""
 
     def change(document: Any) -> None:
         table = _made(document, path[:-1])
@@ -219,11 +263,11 @@ def with_row(text: str, path: Sequence[str], row: Mapping[str, Any]) -> str:
     return changed(text, change)
 
 
-def with_told(text: str, path: Sequence[str], index: int, key: str, told: str) -> str:
-    """With a key of one table of a list as a field says it, or without it where that says nothing."""
+def with_field(text: str, path: Sequence[str], index: int, key: str, entered: str) -> str:
+    """Return the text with a key of one table of a list set; an empty field removes it."""
 
     def change(document: Any) -> None:
-        row, value = _at(document, path)[index], read(key, told)
+        row, value = _at(document, path)[index], read(key, entered)
         if value is None:
             row.pop(key, None)
         else:
@@ -233,7 +277,7 @@ def with_told(text: str, path: Sequence[str], index: int, key: str, told: str) -
 
 
 def without_row(text: str, path: Sequence[str], index: int) -> str:
-    """Without one table of a list."""
+    """Return the text without one table of a list."""
 
     def change(document: Any) -> None:
         rows = _at(document, path)
@@ -250,8 +294,12 @@ def _at(document: Any, path: Sequence[str]) -> Any:
     return document
 
 
-_OF_TERMS = ("linear difference equations", "sees the lags that the physics reads", 'focus = "simulation"')
-"""What comments of `orthaug init` that equations of motion make untrue have in them."""
+_OF_TERMS = (
+    "linear difference equations",
+    "sees the lags that the physics reads",
+    'focus = "simulation"',
+)
+"""Phrases of comments by `orthaug init` that do not hold for equations of motion."""
 MOTION = """
 [motion]
 [motion.states]
@@ -267,31 +315,42 @@ k = {{ initial = 1.0{k}, min = 0 }}
 
 
 def as_motion(text: str) -> str:
-    """With the equations of a mass, a spring and a damper in place of the baseline, for a person to change.
+    """Return the spec with the equations of a mass, spring and damper in place of the baseline.
 
-    Comments about the baseline go with it; the parameters get units where force and output have theirs.
+    The user is to change them.
+
+    Comments on the baseline are removed; parameters get units where force and output have units.
     """
     data = section(plain(text), "data")
     inputs, outputs = names(data, "inputs") or ["0"], names(data, "outputs") or ["y"]
-    force, output = (section(data, "channels", name).get("unit") for name in (inputs[0], outputs[0]))
-    units = _motion_units(force, output) if isinstance(force, str) and isinstance(output, str) else {}
+    force, output = (
+        section(data, "channels", name).get("unit") for name in (inputs[0], outputs[0])
+    )
+    units = (
+        _motion_units(force, output) if isinstance(force, str) and isinstance(output, str) else {}
+    )
     given = {name: f', unit = "{units[name]}"' if name in units else "" for name in "xvmck"}
 
     def change(document: Any) -> None:
         for key in ("baseline", "lags", "physics", "motion", "suspects"):
             document.pop(key, None)
-        document["motion"] = tomlkit.parse(MOTION.format(output=outputs[0], force=inputs[0], **given))["motion"]
+        document["motion"] = tomlkit.parse(
+            MOTION.format(output=outputs[0], force=inputs[0], **given)
+        )["motion"]
         _made(document, ["learner"])["inputs"] = ["v"]
 
     return changed(_without_comments(text, _OF_TERMS), change)
 
 
-def _without_comments(text: str, told: Sequence[str]) -> str:
-    """Without the comments that have one of these in them; a line that holds nothing else goes too."""
+def _without_comments(text: str, phrases: Sequence[str]) -> str:
+    """Return the text without the comments that contain one of these phrases.
+
+    A line without other content is removed too.
+    """
     kept = []
     for line in text.splitlines(keepends=True):
         before, mark, comment = line.partition("# ")
-        if mark and any(one in comment for one in told):
+        if mark and any(one in comment for one in phrases):
             if not before.strip():
                 continue
             line = before.rstrip() + "\n"
@@ -300,7 +359,10 @@ def _without_comments(text: str, told: Sequence[str]) -> str:
 
 
 def _motion_units(force: str, output: str) -> dict[str, str]:
-    """Of states and parameters in `force = m dv/dt + c v + k x`, x in the unit of the output."""
+    """Return the units of states and parameters in `force = m dv/dt + c v + k x`.
+
+    `x` has the unit of the output.
+    """
     if not force or not output or set('"\\') & {*force, *output}:
         return {}
     own = f"({output})" if set(" */") & set(output) else output

@@ -34,8 +34,11 @@ from orthaug.data.record import check_step
 
 _STEPS = ("data", "prepare")
 _LISTED = 40  # columns
-_COLUMNS = ("input ", "output ")  # begins of lines of an account that tell of columns, which stand by themselves
-_DRAFT = ("first physics", "test:")  # of lines that tell of a spec for the file
+_COLUMNS = (
+    "input ",
+    "output ",
+)  # beginnings of lines on columns, which the page shows elsewhere
+_DRAFT = ("first physics", "test:")  # of lines on a spec for the file
 _OFFERED = 5  # specs of earlier work
 _USES = {"": "leave out", "input": "input", "output": "output"}
 _SUMMARIES = {
@@ -49,21 +52,26 @@ _SUMMARIES = {
     "shift": "shift an input in time",
 }
 _FIRST = {"factor": 2, "samples": 1}  # what a step begins with where it has no default
-_LABELS = {"cutoff": "cutoff in Hz", "sampling_time": "step in s", "most": "rows at most", "window": "rows each side"}
+_LABELS = {
+    "cutoff": "cutoff in Hz",
+    "sampling_time": "step in s",
+    "most": "rows at most",
+    "window": "rows each side",
+}
 _CUTOFF = 0.1  # the first cutoff, as a share of the sampling frequency
 _KNOWN = "CSV, TSV, TXT, DAT, Parquet, Excel, MATLAB, NumPy or HDF5; it stays on this machine"
 _DROP = """
 <label class="drop" id="drop">
   <input type="file" id="dropped" class="unseen" accept="{endings}">
   <span class="drop-title">Drop a data file here, or choose one</span>
-  <span class="hint" id="drop-told" role="status">{told}</span>
+  <span class="hint" id="drop-message" role="status">{message}</span>
   <progress id="drop-bar" max="1" value="0" hidden aria-label="file taken in"></progress>
 </label>
 """
 
 
 class DataView:
-    """Draws the data of a session, and follows them."""
+    """The view of a session's data."""
 
     def __init__(self, session: Session) -> None:
         self.session = session
@@ -80,14 +88,20 @@ class DataView:
         with ui.element("div").classes("columns wide-right"):
             with ui.element("div").classes("stack"):
                 with card("Data file"):
-                    ui.html(_DROP.format(endings=",".join(KNOWN), told=_KNOWN), sanitize=False)
+                    ui.html(_DROP.format(endings=",".join(KNOWN), message=_KNOWN), sanitize=False)
                     with ui.element("div").classes("fields"):
-                        self.path = ui.input("or its path on this machine").props("outlined dense stack-label")
+                        self.path = ui.input("or its path on this machine").props(
+                            "outlined dense stack-label"
+                        )
                         self.path.classes("grow").on("keydown.enter", self.name_file)
                         button("Open", self.name_file)
                     self.status = ui.element("div")
-                self.columns = card("Channels", "Say what each column is; the spec begins with that.")
-                self.cleaning = card("Preparation", "Every part of the data goes through these steps, in this order.")
+                self.columns = card(
+                    "Channels", "Say what each column is; the spec begins with that."
+                )
+                self.cleaning = card(
+                    "Preparation", "Every part of the data goes through these steps, in this order."
+                )
                 with self.columns:
                     self.column_rows = ui.element("div")
                     self.unfit = ui.element("div")
@@ -105,7 +119,7 @@ class DataView:
             self.session.open_file(Path(given).expanduser().absolute())
 
     def follow_data(self) -> None:
-        """What was seen in the file."""
+        """Draw what was found in the file."""
         session, found = self.session, self.session.found
         self._draw_status()
         self.columns.set_visibility(found is not None)
@@ -128,16 +142,22 @@ class DataView:
             elif session.trouble:
                 note(session.trouble, "bad")
             elif found is not None and session.data is not None:
-                lines = found["account"].splitlines() or [f"{session.data.name}: {found['rows']} rows"]
+                lines = found["account"].splitlines() or [
+                    f"{session.data.name}: {found['rows']} rows"
+                ]
                 text(lines[0], "p", "strong")
                 with ui.element("ul").classes("account"):
-                    untold = _COLUMNS if session.data in self._trained() or not session.spec else (*_COLUMNS, *_DRAFT)
+                    untold = (
+                        _COLUMNS
+                        if session.data in self._trained() or not session.spec
+                        else (*_COLUMNS, *_DRAFT)
+                    )
                     for line in [one for one in lines[1:] if not one.startswith(untold)]:
                         text(line, "li")
                 if self._apart:
                     self._offer_test(found)
             elif not session.spec and (kept := spec_text.earlier()[:_OFFERED]):
-                text("Or go on with the spec of earlier work:", "p", "hint")
+                text("Or continue with an earlier spec:", "p", "hint")
                 with ui.element("div").classes("fields"):
                     for place in kept:
                         when = datetime.fromtimestamp(place.stat().st_mtime)
@@ -145,42 +165,51 @@ class DataView:
                         button(label, partial(session.open_spec, place, kept=True))
 
     def _offer_test(self, found: Mapping[str, Any]) -> None:
-        """What may be done with a file that the spec does not name."""
-        told, lacking = "The spec is kept as it is", self._lacking(found)
+        """Offer to use a file that the spec does not name as a test."""
+        message, lacking = "The spec is kept as it is", self._lacking(found)
         if trained := self._trained():
-            told += f"; it trains on {', '.join(file.name for file in trained)}"
+            message += f"; it trains on {', '.join(file.name for file in trained)}"
         if lacking:
-            told += f". This file has no column {', '.join(lacking)}, which the spec reads"
-        note(f"{told}. Take this file as a test of it, or begin anew below.", "care")
-        button("Take it as a test", self.session.add_test, main=not lacking)
+            message += f". This file has no column {', '.join(lacking)}, which the spec reads"
+        note(f"{message}. Use this file as a test of it, or begin anew below.", "care")
+        button("Use it as a test", self.session.add_test, main=not lacking)
 
     def _trained(self) -> list[Path]:
-        """The files that the spec trains on."""
+        """Return the files that the spec trains on."""
         train = spec_text.section(self.session.content(), "data", "train")
         return [self.session.folder / file for file in spec_text.names(train, "files")]
 
     def _lacking(self, found: Mapping[str, Any]) -> list[str]:
-        """The columns that the spec reads and the file does not have."""
+        """Return the columns that the spec reads and the file lacks."""
         heads = {column["header"] for column in found["columns"]}
-        return [column for column in spec_text.columns(self.session.content()) if column not in heads]
+        return [
+            column for column in spec_text.columns(self.session.content()) if column not in heads
+        ]
 
     def _of_spec(self, found: Mapping[str, Any]) -> dict[str, str]:
-        """The use of each column in the spec; empty where there is none, or where the file lacks one of them."""
+        """Return the use of each column in the spec.
+
+        Empty without a spec, or where the file lacks one of its columns.
+        """
         return {} if self._lacking(found) else spec_text.columns(self.session.content())
 
     def _take_uses(self, found: Mapping[str, Any]) -> None:
-        """The use of each column: what the spec makes of it, otherwise what was chosen or what the file says."""
+        """Set the use of each column: from the spec, or as chosen, or as the file suggests."""
         data, before, _ = self._drawn
         if found is before:
             return
         if data is not self.session.data:
             self.step = ""
         inputs, outputs = found.get("inputs"), found.get("outputs")
-        self.uses = {column["header"]: column["kind"] for column in found["columns"] if column["usable"]}
+        self.uses = {
+            column["header"]: column["kind"] for column in found["columns"] if column["usable"]
+        }
         if of_spec := self._of_spec(found):
             self.uses = {h: of_spec.get(h, "") for h in self.uses}
         elif inputs is not None and outputs is not None:
-            self.uses = {h: "input" if h in inputs else "output" if h in outputs else "" for h in self.uses}
+            self.uses = {
+                h: "input" if h in inputs else "output" if h in outputs else "" for h in self.uses
+            }
 
     def _draw_columns(self, found: Mapping[str, Any]) -> None:
         usable = [column for column in found["columns"] if column["usable"]]
@@ -189,32 +218,57 @@ class DataView:
                 with ui.element("div").classes("entry"):
                     with ui.element("div").classes("grow"):
                         text(column["header"], "p", "strong")
-                        text(column["told"], "p", "hint")
+                        text(column["description"], "p", "hint")
                     head = column["header"]
-                    choice(f"use of {head}", _USES, self.uses[head], partial(self.uses.__setitem__, head), "bare")
+                    choice(
+                        f"use of {head}",
+                        _USES,
+                        self.uses[head],
+                        partial(self.uses.__setitem__, head),
+                        "bare",
+                    )
             if found["timed"]:
                 text(found["timed"], "p", "hint")
             left = [c for c in found["columns"] if not c["usable"] and not c["timed"]]
             if left:
-                text("Not usable: " + ", ".join(f"{c['header']} ({c['told']})" for c in left[:_LISTED]), "p", "hint")
+                text(
+                    "Not usable: "
+                    + ", ".join(f"{c['header']} ({c['description']})" for c in left[:_LISTED]),
+                    "p",
+                    "hint",
+                )
             if not usable:
-                note("No column of this file is a signal that changes: there is nothing to fit.", "bad")
+                note(
+                    "No column of this file is a signal that changes: there is nothing to fit.",
+                    "bad",
+                )
                 return
             if found["spec"] is None and not self._of_spec(found):
-                names = "The names of the columns do not say which are inputs and outputs: choose them here."
+                names = (
+                    "The names of the columns do not show which are inputs and outputs: choose "
+                    "them here."
+                )
                 note(found["open"] or names, "care")
             with ui.element("div").classes("fields"):
                 step = "" if found["step"] is None else f"{found['step']:g}"
                 label = "sampling time in s"
                 self.step_field = field(
-                    label, self.step, partial(setattr, self, "step"), classes="medium", hint=step or "1"
+                    label,
+                    self.step,
+                    partial(setattr, self, "step"),
+                    classes="medium",
+                    hint=step or "1",
                 )
                 first = found["spec"] is None and not self.session.spec
-                begin = button(f"Begin {'' if first else 'anew '}with these channels", self.choose, main=first)
+                begin = button(
+                    f"Begin {'' if first else 'anew '}with these channels", self.choose, main=first
+                )
                 begin.props("data-place=begin")
 
     def choose(self) -> None:
-        chosen = {kind: [h for h, use in self.uses.items() if use == kind] for kind in ("input", "output")}
+        chosen = {
+            kind: [h for h, use in self.uses.items() if use == kind] for kind in ("input", "output")
+        }
         try:
             step = _seconds(self.step)
         except InputError as error:
@@ -227,7 +281,7 @@ class DataView:
         self.session.choose(chosen["input"], chosen["output"], step)
 
     def follow_spec(self, author: str) -> None:
-        """The steps of preparation, as the spec has them, and whether it names the file that was looked at."""
+        """Draw the steps of preparation in the spec, and whether it names the file looked at."""
         if self.session.apart != self._apart:
             self._draw_status()
         if author == "steps":
@@ -249,7 +303,9 @@ class DataView:
 
     def _draw_step(self, index: int, step: Mapping[str, Any]) -> None:
         kind = str(step.get("step"))
-        with named(ui.element("div").classes("entry step").props("role=group"), f"step {index + 1}"):
+        with named(
+            ui.element("div").classes("entry step").props("role=group"), f"step {index + 1}"
+        ):
             with ui.element("div").classes("grow"):
                 text(f"{index + 1}. {_SUMMARIES.get(kind, kind)}", "p", "strong")
                 with ui.element("div").classes("fields"):
@@ -258,7 +314,14 @@ class DataView:
                         field(
                             _LABELS.get(own.name, own.name),
                             spec_text.shown(step.get(own.name)),
-                            partial(self.session.edit, "steps", spec_text.with_told, _STEPS, index, own.name),
+                            partial(
+                                self.session.edit,
+                                "steps",
+                                spec_text.with_field,
+                                _STEPS,
+                                index,
+                                own.name,
+                            ),
                             classes="short",
                             hint="" if own.default is MISSING else usual,
                         )
@@ -278,7 +341,7 @@ class DataView:
         self.session.edit("more steps", spec_text.with_row, _STEPS, {"step": kind, **first})
 
     def _whole_file(self) -> tuple[str, Mapping[str, Any]]:
-        """A file and its curves: of the training data that were checked, the file looked at where there are none."""
+        """Return a file and its curves: of the checked training data or the file looked at."""
         session, checked = self.session, self.session.checked
         if checked is None:
             if session.found is None or session.data is None:
@@ -289,7 +352,10 @@ class DataView:
         return ("", {}) if place is None else (place.name, session.raw.get(place, {}))
 
     def follow_check(self) -> None:
-        """Curves of the file, and of the training data after preparation; why they cannot be drawn."""
+        """Draw the curves of the file, and of the training data after preparation.
+
+        Where they cannot be drawn, it shows the reason.
+        """
         session, checked = self.session, self.session.checked
         with redrawn(self.refusal):
             if session.stale:
@@ -300,17 +366,26 @@ class DataView:
         rows = []
         shown = [curve["column"] for curve in prepared.values()] or list(raw)
         for name in shown:
-            drawn = [{**raw[name], "name": "as measured", "raw": bool(prepared)}] if name in raw else []
+            drawn = (
+                [{**raw[name], "name": "as measured", "raw": bool(prepared)}] if name in raw else []
+            )
             unit = ""
             for channel, curve in prepared.items():
                 if curve["column"] == name:
-                    told = "prepared, training" if cleaned else "training"
-                    drawn.append({**curve, "name": told})
+                    message = "prepared, training" if cleaned else "training"
+                    drawn.append({**curve, "name": message})
                     unit, name = curve["unit"], channel
             if drawn:
                 rows.append((f"{name} [{unit}]" if unit else name, drawn))
-        other = f"; {session.data.name} is no part of them" if session.apart and session.data else ""
-        state = (rows, cleaned, whole, other, checked and checked["prepared"], checked and checked["rows"])
+        other = f"; {session.data.name} is not among them" if session.apart and session.data else ""
+        state = (
+            rows,
+            cleaned,
+            whole,
+            other,
+            checked and checked["prepared"],
+            checked and checked["rows"],
+        )
         if state == self._curves:
             return
         self._curves = state
@@ -318,29 +393,33 @@ class DataView:
             if not rows:
                 text("The curves of a file are drawn here, once there is one.", "p", "hint")
                 return
-            plot(curves_figure(rows), f"Curves of {', '.join(label for label, _ in rows)} over time.")
-            told = f"All of {whole}"
+            plot(
+                curves_figure(rows), f"Curves of {', '.join(label for label, _ in rows)} over time."
+            )
+            message = f"All of {whole}"
             if prepared:
                 grey = f", in grey all of {whole}" * bool(raw)
-                told = f"In colour the training data{', after preparation' * cleaned}{grey}{other}"
-            text(f"{told}. Drag to zoom, double-click for all.", "p", "hint")
+                message = (
+                    f"In colour the training data{', after preparation' * cleaned}{grey}{other}"
+                )
+            text(f"{message}. Drag to zoom, double-click for all.", "p", "hint")
             for done in (checked or {}).get("prepared", ()):
                 text(f"Done: {done}", "p", "hint")
             if checked and session.spec:
                 table(("part", "rows"), list(checked["rows"].items()), "Rows that are used")
 
 
-def _seconds(told: str) -> float | None:
-    """A sampling time; None where nothing is told.
+def _seconds(message: str) -> float | None:
+    """Return a sampling time; None for an empty field.
 
     Raises:
         InputError: no positive number.
     """
-    told = told.strip()
-    if not told:
+    message = message.strip()
+    if not message:
         return None
     try:
-        step = float(told)
+        step = float(message)
     except ValueError:
-        raise InputError(f"it must be a number of seconds, such as 0.01; got {told}.") from None
+        raise InputError(f"it must be a number of seconds, such as 0.01; got {message}.") from None
     return check_step(step)

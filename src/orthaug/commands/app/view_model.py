@@ -1,4 +1,4 @@
-"""The part of the page for the model: forms for physics, learner and training, the spec, and what checking says."""
+"""The part of the page for the model: forms, the text of the spec, and the result of its check."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ from orthaug.commands.app.widgets import (
 _TERMS = ("baseline", "terms")
 _LEARNERS = {"mlp": "a network", "terms": "a sum of terms", "none": "none: physics alone"}
 _FOCUS = {"prediction": "one step ahead", "simulation": "the free run"}
-_MULTIPLE = 1e5  # % from which a change is told in words
-_ROUNDING = 1e-7  # % below which it is none
+_MULTIPLE = 1e5  # % from which a change is given in words
+_ROUNDING = 1e-7  # % below which it counts as none
 _STRUCTURES = {
     "orthogonal": "orthogonal",
     "additive": "additive",
@@ -39,7 +39,7 @@ _STRUCTURES = {
 
 
 class ModelView:
-    """Draws the spec of a session as forms and as text, and follows it."""
+    """The view of a session's spec, as forms and as text."""
 
     def __init__(self, session: Session) -> None:
         self.session = session
@@ -51,18 +51,28 @@ class ModelView:
                     self.physics = ui.element("div")
                 with card("Learner and training"):
                     self.learner = ui.element("div")
-                hint = "What the forms write; forms and text change each other. Every key: orthaug schema keys."
+                hint = (
+                    "What the forms write; forms and text change each other. Every key: "
+                    "orthaug schema keys."
+                )
                 with card("Spec", hint):
-                    self.editor = ui.textarea("spec in TOML", value=self.session.spec).classes("editor")
-                    self.editor.props("outlined stack-label spellcheck=false autocapitalize=off autogrow debounce=250")
-                    self.editor.on_value_change(lambda event: self.session.write(event.value or "", "editor"))
+                    self.editor = ui.textarea("spec in TOML", value=self.session.spec).classes(
+                        "editor"
+                    )
+                    self.editor.props(
+                        "outlined stack-label spellcheck=false autocapitalize=off autogrow "
+                        "debounce=250"
+                    )
+                    self.editor.on_value_change(
+                        lambda event: self.session.write(event.value or "", "editor")
+                    )
             with card("Check", classes="sticky"):
                 self.check = ui.element("div")
         self.follow_spec("")
         self.follow_check()
 
     def follow_spec(self, author: str) -> None:
-        """Forms after a change of the text, the text after a change in a form."""
+        """Update the forms after a change of the text, and the text after a change in a form."""
         if author != "editor" and self.editor.value != self.session.spec:
             self.editor.set_value(self.session.spec)
         if author != "form":
@@ -72,7 +82,7 @@ class ModelView:
                 self._draw_learner(content)
 
     def follow_data(self) -> None:
-        """What comes first, while there is no spec."""
+        """Show the first step while there is no spec."""
         if not self.session.spec.strip():
             self._draw_physics({})
 
@@ -86,7 +96,11 @@ class ModelView:
                 self._draw_motion(content)
                 return
             outputs = spec_text.names(spec_text.section(content, "data"), "outputs")
-            text(" and ".join(f"{name}[k] = Σ parameter · regressor" for name in outputs), "p", "hint formula")
+            text(
+                " and ".join(f"{name}[k] = Σ parameter · regressor" for name in outputs),
+                "p",
+                "hint formula",
+            )
             for i, term in enumerate(spec_text.rows_of(self.session.spec, _TERMS)):
                 self._draw_term(i, term, several=len(outputs) > 1)
             with ui.element("div").classes("fields"):
@@ -95,17 +109,23 @@ class ModelView:
 
     def _draw_term(self, index: int, term: Mapping[str, Any], *, several: bool) -> None:
         keys = ("parameter", "regressor", *(("output",) if several else ()), "initial", "unit")
-        with named(ui.element("div").classes("entry term").props("role=group"), f"term {index + 1}"):
+        with named(
+            ui.element("div").classes("entry term").props("role=group"), f"term {index + 1}"
+        ):
             with ui.element("div").classes("fields grow"):
                 for key in keys:
                     wide = "" if key in ("parameter", "regressor") else "short"
-                    change = partial(self.session.edit, "form", spec_text.with_told, _TERMS, index, key)
+                    change = partial(
+                        self.session.edit, "form", spec_text.with_field, _TERMS, index, key
+                    )
                     field(key, term.get(key), change, classes=f"{wide} {key}")
             remove = partial(self.session.edit, "more terms", spec_text.without_row, _TERMS, index)
             named(button("Remove", remove), f"Remove term {index + 1}")
 
     def _add(self) -> None:
-        taken = {str(term.get("parameter")) for term in spec_text.rows_of(self.session.spec, _TERMS)}
+        taken = {
+            str(term.get("parameter")) for term in spec_text.rows_of(self.session.spec, _TERMS)
+        }
         name = next(name for i in range(1, 1000) if (name := f"p{i}") not in taken)
         data = spec_text.section(self.session.content(), "data")
         inputs, outputs = spec_text.names(data, "inputs"), spec_text.names(data, "outputs")
@@ -126,22 +146,34 @@ class ModelView:
             text(f"d{name}/dt = {equation}{learned}", "p", "formula")
         for name, row in spec_text.section(motion, "parameters").items():
             if isinstance(row, Mapping):
-                with named(ui.element("div").classes("entry term").props("role=group"), f"parameter {name}"):
+                with named(
+                    ui.element("div").classes("entry term").props("role=group"), f"parameter {name}"
+                ):
                     text(name, "p", "strong name")
                     with ui.element("div").classes("fields grow"):
                         for key in ("initial", "unit", "min", "max"):
-                            field(key, row.get(key), self._value("motion", "parameters", name, key), classes="short")
+                            field(
+                                key,
+                                row.get(key),
+                                self._value("motion", "parameters", name, key),
+                                classes="short",
+                            )
 
     def _value(self, *path: str) -> Callable[[str], None]:
-        """Takes what a field says as the value of a key."""
-        return lambda told: self.session.edit("form", spec_text.with_value, path, spec_text.read(path[-1], told))
+        """Return a callback that stores the value of a field under a key."""
+        return lambda checked: self.session.edit(
+            "form", spec_text.with_value, path, spec_text.read(path[-1], checked)
+        )
 
     def _draw_learner(self, content: Mapping[str, Any]) -> None:
-        learner, training = spec_text.section(content, "learner"), spec_text.section(content, "training")
+        learner, training = (
+            spec_text.section(content, "learner"),
+            spec_text.section(content, "training"),
+        )
         moves = "motion" in content
         with redrawn(self.learner):
             if not content:
-                text("A learner finds what the physics does not say.", "p", "hint")
+                text("A learner finds what the physics lacks.", "p", "hint")
                 return
             kind = str(learner.get("kind", "mlp"))
             with ui.element("div").classes("fields"):
@@ -150,17 +182,33 @@ class ModelView:
                     hidden = learner.get("hidden", [16])
                     field("neurons", spec_text.shown(hidden), self._set_hidden, classes="short")
                 if kind == "terms":
-                    field("highest degree", learner.get("degree"), self._value("learner", "degree"), classes="short")
+                    field(
+                        "highest degree",
+                        learner.get("degree"),
+                        self._value("learner", "degree"),
+                        classes="short",
+                    )
                 seen = learner.get("inputs")
                 change = self._value("learner", "inputs")
-                field("what it sees", spec_text.shown(seen), change, hint="all that the physics reads")
+                field(
+                    "what it sees", spec_text.shown(seen), change, hint="all that the physics reads"
+                )
             with ui.element("div").classes("fields"):
                 structure = str(spec_text.section(content, "structure").get("kind", "orthogonal"))
                 choice("structure", _STRUCTURES, structure, self._value("structure", "kind"))
                 focus = str(training.get("focus", "simulation" if moves else "prediction"))
                 choice("trained on", _FOCUS, focus, self._value("training", "focus"))
-                for label, key, hint in (("starts", "restarts", "1"), ("iterations", "iterations", "")):
-                    field(label, training.get(key), self._value("training", key), classes="short", hint=hint)
+                for label, key, hint in (
+                    ("starts", "restarts", "1"),
+                    ("iterations", "iterations", ""),
+                ):
+                    field(
+                        label,
+                        training.get(key),
+                        self._value("training", key),
+                        classes="short",
+                        hint=hint,
+                    )
 
     def _set_kind(self, kind: str) -> None:
         spec = spec_text.with_value(self.session.spec, ("learner", "kind"), kind)
@@ -173,16 +221,23 @@ class ModelView:
         try:
             hidden = [int(part) for part in value.replace(";", ",").split(",") if part.strip()]
         except ValueError:
-            ui.notify("Neurons are whole numbers, such as 16, or 8, 8 for two layers.", type="warning")
+            ui.notify(
+                "Neurons are whole numbers, such as 16, or 8, 8 for two layers.", type="warning"
+            )
             return
         self.session.edit("form", spec_text.with_value, ("learner", "hidden"), hidden or None)
 
     def follow_check(self) -> None:
-        """What checking says of the spec as it is."""
+        """Show the result of checking the present spec."""
         session = self.session
         with redrawn(self.check):
             if not session.spec.strip():
-                text("Rank, units, what the learner could take from the physics, and what would bias it.", "p", "hint")
+                text(
+                    "Rank, units, what the learner could imitate of the physics, and possible "
+                    "biases.",
+                    "p",
+                    "hint",
+                )
                 return
             if session.checking:
                 note("Checking …", "busy")
@@ -190,74 +245,98 @@ class ModelView:
                 note(sentence(session.refused), "bad")
             else:
                 note("This spec can be trained.", "good")
-            told = None if session.checked is None else session.checked["check"]
+            checked = None if session.checked is None else session.checked["check"]
             stale = session.checking or session.stale
-            if told is not None:
+            if checked is not None:
                 if stale:
                     text("As the spec was before:", "p", "hint")
                 with ui.element("div").classes("stale" if stale else ""):
-                    _units((session.checked or {})["units"], moves=bool(told.get("motion")))
-                    _findings(told, (session.checked or {})["bias"])
+                    _units((session.checked or {})["units"], moves=bool(checked.get("motion")))
+                    _findings(checked, (session.checked or {})["bias"])
             elif session.checking and session.checked is not None:
-                text("The equations are run to see what they determine; that takes a while.", "p", "hint")
+                text(
+                    "The equations are run to see what they determine; that takes a while.",
+                    "p",
+                    "hint",
+                )
 
 
-def _findings(told: Mapping[str, Any], bias: Sequence[Mapping[str, Any]]) -> None:
-    """The account of `orthaug check`."""
-    data, physics = told["excitation"], told["identifiability"]
+def _findings(checked: Mapping[str, Any], bias: Sequence[Mapping[str, Any]]) -> None:
+    """Draw the findings of `orthaug check`."""
+    data, physics = checked["excitation"], checked["identifiability"]
     condition = "infinite" if data["condition"] is None else number(data["condition"], 3)
     rows = [
-        ("parameters", ", ".join(told["parameters"]) or "none"),
-        ("usable rows", told["rows"]),
+        ("parameters", ", ".join(checked["parameters"]) or "none"),
+        ("usable rows", checked["rows"]),
         ("rank on these data", f"{data['rank']} of {data['columns']}, condition {condition}"),
         ("rank on any data", f"{physics['rank']} of {physics['columns']}"),
     ]
     table(("what", "found"), rows)
     for group in physics["inseparable"]:
-        note(f"No data can tell apart: {', '.join(group)}.", "care")
+        note(f"No data can distinguish {', '.join(group)}.", "care")
     for group in data["collinear"] if physics["identifiable"] else ():
         note(f"These data do not excite separately: {', '.join(group)}.", "care")
-    if told.get("motion"):
-        text(told["motion"]["text"], "p", "small")
-    if told["shared"]:
+    if checked.get("motion"):
+        text(checked["motion"]["text"], "p", "small")
+    if checked["shared"]:
         text("Shared with the learner", "h3")
-        text(told["shared"]["text"], "p", "small")
+        text(checked["shared"]["text"], "p", "small")
         rows = [
             (", ".join(o["inputs"]), o["shared"], ", ".join(o["determined"]) or "–")
-            for o in told["shared"]["alternatives"] or ()
+            for o in checked["shared"]["alternatives"] or ()
         ]
         if rows:
             table(("if it sees only", "shared", "determined"), rows)
     if bias:
         text("What would bias the parameters", "h3")
-        hint = "If such a term is missing from the physics; its size 1 % of the output's, or as the spec says."
+        hint = (
+            "If such a term is missing from the physics; its size 1 % of the output's, or as "
+            "the spec says."
+        )
         text(hint, "p", "hint")
         rows = [(one["name"], _biases(one["percent"]), one["removed_by"] or "–") for one in bias]
         table(("missing term", "change of each parameter", "removed by"), rows)
-    for warning in told["warnings"]:
+    for warning in checked["warnings"]:
         note(warning["text"], "care")
 
 
 def _units(units: Sequence[tuple[str, str, str | None]], *, moves: bool) -> None:
-    """What the spec says of units, where it is not what the regressors ask for; both are written in one way here."""
+    """Show where the spec's units differ from those that the regressors imply.
+
+    Both are written in one way here.
+    """
     for name, given, asked in units:
         if asked is not None and given not in (asked, ""):
-            note(f"Unit of {name}: the spec says {given}, output and regressor ask for {asked}.", "care")
-    wanted = [f"{name} in {asked}" for name, given, asked in units if asked not in (None, "1") and not given]
+            note(
+                f"Unit of {name}: the spec says {given}, output and regressor ask for {asked}.",
+                "care",
+            )
+    wanted = [
+        f"{name} in {asked}"
+        for name, given, asked in units
+        if asked not in (None, "1") and not given
+    ]
     if wanted:
         text(f"Units, from those of the channels: {', '.join(wanted)}.", "p", "hint")
     bare = [name for name, given, _ in units if moves and not given]
     if bare:
-        text(f"No unit is given for {', '.join(bare)}, and none can be told from the channels.", "p", "hint")
+        text(
+            f"No unit is given for {', '.join(bare)}, and the channels do not determine it.",
+            "p",
+            "hint",
+        )
 
 
 def _biases(percents: Mapping[str, float | None]) -> str:
-    """All on a line that breaks between the parameters only."""
+    """Return all biases on a line that breaks between the parameters only."""
     return ", ".join(f"{name}\u00a0{_percent(value)}" for name, value in percents.items())
 
 
 def _percent(value: float | None) -> str:
-    """A change in per cent; of a parameter near zero no number says more than that it is a multiple."""
+    """Return a change in per cent.
+
+    Near zero the change is a multiple of the parameter, and no number is of use.
+    """
     if value is None:
         return "–"
     if abs(value) >= _MULTIPLE:

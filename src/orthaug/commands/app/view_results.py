@@ -10,16 +10,26 @@ from nicegui import ui
 
 from orthaug.commands.app.session import Session
 from orthaug.commands.app.spec_text import files
-from orthaug.commands.app.widgets import button, card, choice, field, link, named, note, redrawn, text
+from orthaug.commands.app.widgets import (
+    button,
+    card,
+    choice,
+    field,
+    link,
+    named,
+    note,
+    redrawn,
+    text,
+)
 
 _REPORTS = {"report.html": "of the fit", "comparison.html": "of the comparison"}
 _FILES = (
-    ("spec", "spec.toml", "Spec", "the command line runs it to the same numbers"),
+    ("spec", "spec.toml", "Spec", "the command line gives the same numbers"),
     ("fit", "model.zip", "Model", "for orthaug simulate, predict, linearize, track"),
     ("fit", "report.html", "Report", "one file, needs no network"),
     ("fit", "result.json", "Numbers", "result.json"),
-    ("fit", "result.zip", "All of the fit", "result folder"),
-    ("compare", "comparison.zip", "All of the comparison", "result folder"),
+    ("fit", "result.zip", "The whole fit", "result folder"),
+    ("compare", "comparison.zip", "The whole comparison", "result folder"),
 )
 _TARGETS = {
     "c": "C99 without libraries",
@@ -33,7 +43,7 @@ _TARGETS = {
 
 
 class ReportView:
-    """Shows report.html."""
+    """The view of report.html."""
 
     def __init__(self, session: Session) -> None:
         self.session, self.shown = session, "report.html"
@@ -44,10 +54,14 @@ class ReportView:
         self.follow_work()
 
     def follow_work(self) -> None:
-        """The report of the last result."""
+        """Show the report of the last result."""
         session = self.session
         kinds = {"fit": "report.html", "compare": "comparison.html"}
-        marks = {name: session.commands[kind].began for kind, name in kinds.items() if kind in session.results}
+        marks = {
+            name: session.commands[kind].began
+            for kind, name in kinds.items()
+            if kind in session.results
+        }
         there = list(marks)
         if marks == self._state:
             return
@@ -55,15 +69,31 @@ class ReportView:
         with redrawn(self.place):
             if not there:
                 with card("Report"):
-                    text("The report of a fit or of a comparison is read here, once there is one.", "p", "hint")
+                    text(
+                        "The report of a fit or of a comparison is read here, once there is one.",
+                        "p",
+                        "hint",
+                    )
                 return
             self.shown = self.shown if self.shown in there else there[0]
             with ui.element("div").classes("fields report-line"):
                 if len(there) > 1:
-                    choice("report", {name: _REPORTS[name] for name in there}, self.shown, self._show, "bare")
+                    choice(
+                        "report",
+                        {name: _REPORTS[name] for name in there},
+                        self.shown,
+                        self._show,
+                        "bare",
+                    )
                 link("Download", f"/session/{session.key}/get/{self.shown}")
-            frame = ui.element("iframe").classes("report").props('sandbox="allow-scripts" title="report"')
-            place = f"/session/{session.key}/get/{self.shown}?show=true&n={session.versions['work']}"
+            frame = (
+                ui.element("iframe")
+                .classes("report")
+                .props('sandbox="allow-scripts" title="report"')
+            )
+            place = (
+                f"/session/{session.key}/get/{self.shown}?show=true&n={session.versions['work']}"
+            )
             frame.props(f'data-src="{place}"')  # page.js loads it once the frame has its width
 
     def _show(self, name: str) -> None:
@@ -72,7 +102,7 @@ class ReportView:
 
 
 class ExportView:
-    """Hands out files, and lets the model be written as code."""
+    """The view of downloads, and of the export of the model as code."""
 
     def __init__(self, session: Session) -> None:
         self.session, self.name = session, "model"
@@ -82,13 +112,20 @@ class ExportView:
         with ui.element("div").classes("columns"):
             with card("Files"):
                 self.files = ui.element("div")
-            with card("Model as code", "Needs no orthaug; each folder has a README and test vectors."):
+            with card(
+                "Model as code", "Needs no orthaug; each folder has a README and test vectors."
+            ):
                 self.code = ui.element("div")
         self.follow_work()
 
     def follow_work(self) -> None:
         session = self.session
-        state = (bool(session.spec), tuple(session.results), tuple(session.exports.items()), self._beside())
+        state = (
+            bool(session.spec),
+            tuple(session.results),
+            tuple(session.exports.items()),
+            self._beside(),
+        )
         if state == self._state:
             return
         self._state = state
@@ -108,17 +145,17 @@ class ExportView:
                     text(hint, "p", "hint")
                 link(name, f"/session/{session.key}/get/{name}")
         if not files:
-            text("There is nothing to take yet.", "p", "hint")
+            text("There is nothing to download yet.", "p", "hint")
             return
         text("The same on the command line:", "p", "small")
         text("orthaug fit spec.toml --out result", "pre")
         if beside := self._beside():
             them = "the two" if len(beside) == 1 else "them and the spec"
             named = " and ".join(", ".join(beside).rsplit(", ", 1))
-            text(f"The spec names {named}: let {them} stand in one folder.", "p", "hint")
+            text(f"The spec names {named}: keep {them} in one folder.", "p", "hint")
 
     def _beside(self) -> list[str]:
-        """The files that the spec names without a folder, since they were dropped."""
+        """Return the files that the spec names without a folder, since they were uploaded."""
         return [file for file in files(self.session.content()) if not Path(file).is_absolute()]
 
     def _draw_code(self) -> None:
@@ -138,7 +175,10 @@ class ExportView:
                 if why == "":
                     made = link(f"{target}.zip", f"/session/{session.key}/get/{target}.zip")
                 else:
-                    made = named(button("Write", partial(session.export, target, self.name)), f"Write {target}")
+                    made = named(
+                        button("Write", partial(session.export, target, self.name)),
+                        f"Write {target}",
+                    )
                     made.props("loading" if why == "…" else "")
                 made.props(f"data-place={target}")
 
@@ -148,4 +188,7 @@ class ExportView:
             self.session.exports.clear()
             self.session.changed("work")
         else:
-            ui.notify("A name has letters, digits and underscores, and begins with a letter.", type="warning")
+            ui.notify(
+                "A name has letters, digits and underscores, and begins with a letter.",
+                type="warning",
+            )

@@ -31,7 +31,7 @@ _TITLES = {"fit": "Training", "compare": "Comparison"}
 
 
 class TrainingView:
-    """Draws what runs and what came of it, and follows both."""
+    """The view of a training and of its results."""
 
     def __init__(self, session: Session) -> None:
         self.session = session
@@ -40,38 +40,55 @@ class TrainingView:
         self._state: Any = None
 
     def draw(self) -> None:
-        with card("Train", "Runs orthaug fit on the spec, or orthaug compare: physics alone and every structure."):
+        with card(
+            "Train",
+            "Runs orthaug fit on the spec, or orthaug compare: physics alone and every structure.",
+        ):
             with ui.element("div").classes("fields"):
                 self.begin = button("Train", lambda: self.session.train("fit"), main=True)
                 self.compare = button("Compare structures", lambda: self.session.train("compare"))
                 self.finish = button("Stop and keep the best so far", self.session.finish)
                 self.end = button("Stop", self.session.stop, classes="stop")
             self.state = ui.element("div")
-            self.bar = ui.element("progress").props('max=1 value=0 aria-label="progress of training"')
+            self.bar = ui.element("progress").props(
+                'max=1 value=0 aria-label="progress of training"'
+            )
             self.losses = ui.element("div")
         self.results = ui.element("div")
         self.follow_work()
 
     def follow_check(self) -> None:
-        able = bool(self.session.spec.strip()) and self.session.running is None and not self.session.refused
+        able = (
+            bool(self.session.spec.strip())
+            and self.session.running is None
+            and not self.session.refused
+        )
         for made in (self.begin, self.compare):
             made.set_enabled(able)
 
     def follow_work(self) -> None:
-        """How far it is, and what came of it."""
+        """Show the progress of training, and its result."""
         session, running = self.session, self.session.running
         self.follow_check()
         self.end.set_visibility(running is not None)
         self.end.set_enabled(running is not None and not running.stopping)
-        able = running is not None and running.arguments[0] == "fit"  # half a comparison compares nothing
+        able = (
+            running is not None and running.arguments[0] == "fit"
+        )  # half a comparison compares nothing
         self.finish.set_visibility(able)
         self.finish.set_enabled(
-            running is not None and bool(running.progress) and not (running.stopping or running.ending)
+            running is not None
+            and bool(running.progress)
+            and not (running.stopping or running.ending)
         )
         shown = running or max(session.commands.values(), key=lambda c: c.began, default=None)
         with redrawn(self.state):
             if shown is None:
-                text("Nothing has been trained yet." if session.spec else session.first_step, "p", "hint")
+                text(
+                    "Nothing has been trained yet." if session.spec else session.first_step,
+                    "p",
+                    "hint",
+                )
             else:
                 self._tell(shown)
         self.bar.set_visibility(running is not None)
@@ -89,29 +106,32 @@ class TrainingView:
         figure = loss_figure(losses[:: max(1, len(losses) // _MOST)])
         if self._curve is None or not losses or not self._told:
             with redrawn(self.losses):
-                told = "Loss of every run over its iterations, on a logarithmic axis."
-                self._curve = plot(figure, told) if losses else None
+                progress = "Loss of every run over its iterations, on a logarithmic axis."
+                self._curve = plot(figure, progress) if losses else None
                 self.caption = text("", "p", "hint")
         else:
             self._curve.update_figure(figure)
         if losses:
-            self.caption.set_content(escape(_runs_told({run for run, _, _ in losses})))
+            self.caption.set_content(escape(_runs_caption({run for run, _, _ in losses})))
         self._told = len(losses)
 
     def _tell(self, command: Command) -> None:
-        told, what = command.progress, _TITLES.get(command.arguments[0], "")
+        progress, what = command.progress, _TITLES.get(command.arguments[0], "")
         took = f"{command.seconds:.0f} s"
         if command.running:
             now = "reading and compiling"
-            if told:
-                name = run_name(Run.told(told), of_structure=command.arguments[0] == "compare")
-                name = f" ({name})" if told.get("structure") else ""
-                now = f"run {told['run']} of {told['runs']}{name}, iteration {told['iteration']}"
-                now += f", loss {number(told['loss'], 4)}"
+            if progress:
+                name = run_name(Run.of(progress), of_structure=command.arguments[0] == "compare")
+                name = f" ({name})" if progress.get("structure") else ""
+                now = (
+                    f"run {progress['run']} of {progress['runs']}{name}, iteration "
+                    f"{progress['iteration']}"
+                )
+                now += f", loss {number(progress['loss'], 4)}"
             if command.stopping or command.ending:
                 now = "stopping …" if command.stopping else "ending with the best so far …"
             note(f"{what}: {now} · {took}", "busy")
-            self.bar.props(f"value={told.get('done', 0)}")
+            self.bar.props(f"value={progress.get('done', 0)}")
         elif command.stopping and command.code != 0:
             note(f"{what} was stopped after {took}; nothing was kept of it.", "care")
         elif command.code == 0 and command.ending:
@@ -124,29 +144,34 @@ class TrainingView:
     def _draw_results(self) -> None:
         session = self.session
         with redrawn(self.results):
-            kinds = (("fit", "Result", "trained", _fit), ("compare", "Comparison", "compared", _compare))
+            kinds = (
+                ("fit", "Result", "trained", _fit),
+                ("compare", "Comparison", "compared", _compare),
+            )
             for kind, title, done, draw in kinds:
                 if (result := session.results.get(kind)) is None:
                     continue
                 with card(title):
                     same = session.trained[kind] == session.spec
                     if not same:
-                        note(f"The spec has changed since this was {done}.", "care")
-                    if (verdict := session.verdicts.get(kind)) is not None:  # that the report begins with
+                        note(f"The spec has changed since it was {done}.", "care")
+                    if (
+                        verdict := session.verdicts.get(kind)
+                    ) is not None:  # that the report begins with
                         note(" ".join(verdict["sentences"]), verdict["level"])
                     draw(result, session.units if same else {})
 
 
-def _runs_told(runs: set[Run]) -> str:
-    """What the curves are."""
-    told = "Each curve is a run: one training"
+def _runs_caption(runs: set[Run]) -> str:
+    """Return a sentence that explains the curves."""
+    caption = "Each curve is a run: one training"
     if any(run.start for run in runs):
         kinds = ", ".join(sorted({run.regularization for run in runs if run.start}))
-        told += " from one start, which is first weights of the learner drawn at random"
-        told += f", with one regularization of them ({kinds})" if kinds else ""
+        caption += " from one start, which is first weights of the learner drawn at random"
+        caption += f", with one regularization of them ({kinds})" if kinds else ""
     if of_several(runs):
-        told += ". The colour tells the structure; point at a curve for its run"
-    return f"{told}."
+        caption += ". The colour shows the structure; point at a curve for its run"
+    return f"{caption}."
 
 
 def _fit(result: Mapping[str, Any], units: Mapping[str, str]) -> None:
@@ -163,9 +188,11 @@ def _fit(result: Mapping[str, Any], units: Mapping[str, str]) -> None:
 
 
 def _parameters(
-    caption: str, models: Sequence[tuple[str, Sequence[Mapping[str, Any]]]], units: Mapping[str, str]
+    caption: str,
+    models: Sequence[tuple[str, Sequence[Mapping[str, Any]]]],
+    units: Mapping[str, str],
 ) -> None:
-    """Of one model, or of several that are named; `units` are those that the channels ask for."""
+    """Draw the parameters of one model, or of several by name; `units` are the implied ones."""
     named, cells = any(name for name, _ in models), []
     for name, rows in models:
         for row in rows:
@@ -174,14 +201,23 @@ def _parameters(
             own = (number(row["value"], 6), number(row["std"], 3), reach)
             unit = row["unit"] or units.get(row["name"]) or "–"
             cells.append((*([name] if named else []), row["name"], *own, unit))
-    head = (*(["model"] if named else []), "parameter", "value", "standard error", "95 % interval", "unit")
+    head = (
+        *(["model"] if named else []),
+        "parameter",
+        "value",
+        "standard error",
+        "95 % interval",
+        "unit",
+    )
     table(head, cells, caption)
 
 
 def _output_units(result: Mapping[str, Any]) -> str:
-    """The units of the outputs behind `RMSE`, in brackets; nothing where none has one."""
+    """Return the units of the outputs behind `RMSE`, in brackets; nothing where none has one."""
     data = section(result["spec"], "data")
-    units = [str(section(data, "channels", name).get("unit") or "–") for name in names(data, "outputs")]
+    units = [
+        str(section(data, "channels", name).get("unit") or "–") for name in names(data, "outputs")
+    ]
     return f" [{', '.join(units)}]" if set(units) - {"–"} else ""
 
 
@@ -190,7 +226,12 @@ def _scores(models: Sequence[tuple[str, Mapping[str, Any]]], unit: str) -> None:
     for name, scores in models:
         for part, kinds in scores.items():
             one, free = kinds["prediction"], kinds["simulation"]
-            own = [_numbers(one["nrmse"]), _numbers(free["nrmse"]), _numbers(free["rmse"]), _numbers(free["fit"], 4)]
+            own = [
+                _numbers(one["nrmse"]),
+                _numbers(free["nrmse"]),
+                _numbers(free["rmse"]),
+                _numbers(free["fit"], 4),
+            ]
             rows.append((name or part, *([part] if name else []), *own))
     head = (*(("model", "part") if models and models[0][0] else ("part",)), "NRMSE, one step")
     table((*head, "NRMSE, free run", f"RMSE, free run{unit}", "FIT %, free run"), rows, "Scores")
@@ -213,7 +254,9 @@ def _compare(result: Mapping[str, Any], units: Mapping[str, str]) -> None:
             text(f"{row['name']}: {row['validation']['text']}", "p", "small")
     for kind, why in result["left_out"].items():
         text(f"Left out: {kind}: {why}", "p", "small")
-    told = [warning["text"] for warning in result["warnings"]]
-    told += [f"{row['name']}: {warning['text']}" for row in models for warning in row["warnings"]]
-    for one in dict.fromkeys(told):
+    progress = [warning["text"] for warning in result["warnings"]]
+    progress += [
+        f"{row['name']}: {warning['text']}" for row in models for warning in row["warnings"]
+    ]
+    for one in dict.fromkeys(progress):
         note(one, "care")

@@ -1,4 +1,7 @@
-"""Building blocks of the page: headings, fields, tables, curves; plain HTML where that is all it takes."""
+"""Building blocks of the page: headings, fields, tables, curves.
+
+Plain HTML where that is enough.
+"""
 
 from __future__ import annotations
 
@@ -11,36 +14,36 @@ from typing import Any, TypeVar
 from nicegui import ui
 
 from orthaug.commands.app.processes import Run
-from orthaug.commands.job import ALONE
+from orthaug.commands.job import PHYSICS_ONLY
 
 Drawn = TypeVar("Drawn", bound=ui.element)
-_SHORT = 12  # letters that stand on one line
+_SHORT = 12  # letters that fit on one line
 _WIDE = 5  # columns of a table that may be wider than its place
 
 
 def named(element: Drawn, label: str) -> Drawn:
-    """With what is read aloud in its place; as it is, never as a piece of markup."""
+    """Return a widget with its accessible name, which is plain text and never markup."""
     element.props["aria-label"] = label
     return element
 
 
 def text(what: Any, tag: str = "p", classes: str = "") -> ui.html:
-    """Text in an element; never read as HTML."""
+    """Return an element with text that is never read as HTML."""
     return ui.html(_whole(what), sanitize=False, tag=tag).classes(classes)
 
 
 def _whole(what: Any) -> str:
-    """Escaped, with lags that no line breaks at their minus."""
+    """Return escaped text in which no line breaks at the minus of a lag."""
     return re.sub(r"\[k-\d+\]", r"<span class='n'>\g<0></span>", escape(str(what)))
 
 
-def sentence(told: str) -> str:
-    """A message as it begins on a page; the name of a file stays as it is."""
-    return told if "." in told.partition(" ")[0] else told[:1].upper() + told[1:]
+def sentence(message: str) -> str:
+    """Return a message with a capital first letter, unless it begins with the name of a file."""
+    return message if "." in message.partition(" ")[0] else message[:1].upper() + message[1:]
 
 
 def card(title: str, hint: str = "", classes: str = "") -> ui.element:
-    """A section with a heading."""
+    """Return a section with a heading."""
     section = ui.element("section").classes(f"card {classes}")
     if "sticky" in classes:  # it scrolls by itself, by keys too
         named(section.props("tabindex=0 role=region"), title)
@@ -59,10 +62,14 @@ def redrawn(place: ui.element) -> Any:
         yield
 
 
-def field(label: str, value: Any, changed: Callable[[str], None], *, classes: str = "", hint: str = "") -> ui.input:
-    """A line of text; told when it is left, or by Enter."""
+def field(
+    label: str, value: Any, changed: Callable[[str], None], *, classes: str = "", hint: str = ""
+) -> ui.input:
+    """Return a line of text; `on_change` is called when it is left, or by Enter."""
     made = (
-        ui.input(label, value="" if value is None else str(value)).props("outlined dense stack-label").classes(classes)
+        ui.input(label, value="" if value is None else str(value))
+        .props("outlined dense stack-label")
+        .classes(classes)
     )
     if hint:
         made.props["placeholder"] = hint
@@ -71,15 +78,19 @@ def field(label: str, value: Any, changed: Callable[[str], None], *, classes: st
 
 
 def refuse(made: ui.input, why: str) -> None:
-    """Say under a field what is wrong with it; nothing takes that back."""
+    """Show an error under a field."""
     made.props["error"], made.props["error-message"] = bool(why), why
     made.update()
 
 
 def choice(
-    label: str, options: Mapping[str, str], value: str, changed: Callable[[str], None], classes: str = ""
+    label: str,
+    options: Mapping[str, str],
+    value: str,
+    changed: Callable[[str], None],
+    classes: str = "",
 ) -> ui.element:
-    """A list to choose from, as every phone knows it; the label is above."""
+    """Return a native list to choose from, with its label above."""
     with ui.element("label").classes(f"choice {classes}"):
         text(label, "span")
         made = named(ui.element("select"), label)
@@ -90,24 +101,31 @@ def choice(
                 if key == value:
                     option.props("selected")
 
-        def told(event: Any) -> None:
+        def emit_change(event: Any) -> None:
             changed(str(event.args))
 
-        made.on("change", told, js_handler="(event) => emit(event.target.value)")
+        made.on("change", emit_change, js_handler="(event) => emit(event.target.value)")
     return made
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[Any]], caption: str = "") -> None:
-    """A table; on a phone each row of more than two cells is a block with the heads beside them."""
-    kinds = ["w" if any(str(row[i])[:1].isalpha() for row in rows) else "" for i in range(len(head))]  # words, numbers
+    """Draw a table; on a phone each row of more than two cells is a labelled block."""
+    kinds = [
+        "w" if any(str(row[i])[:1].isalpha() for row in rows) else "" for i in range(len(head))
+    ]  # words, numbers
     lines = ["<table>", f"<caption>{escape(caption)}</caption>" if caption else "", "<thead><tr>"]
-    lines += [f"<th scope='col' class='{kind}'>{escape(name)}</th>" for name, kind in zip(head, kinds, strict=True)]
+    lines += [
+        f"<th scope='col' class='{kind}'>{escape(name)}</th>"
+        for name, kind in zip(head, kinds, strict=True)
+    ]
     lines.append("</tr></thead><tbody>")
     for row in rows:
         lines.append(f"<tr><th scope='row'>{_whole(row[0])}</th>")
         for name, value, kind in zip(head[1:], map(str, row[1:]), kinds[1:], strict=True):
             kind += " n" if len(value) <= _SHORT else ""
-            lines.append(f"<td class='{kind}' data-label='{escape(name, True)}'>{_whole(value)}</td>")
+            lines.append(
+                f"<td class='{kind}' data-label='{escape(name, True)}'>{_whole(value)}</td>"
+            )
         lines.append("</tr>")
     made = ui.html("".join([*lines, "</tbody></table>"]), sanitize=False).classes("table")
     made.classes("cards" if len(head) > 2 else "")
@@ -116,25 +134,29 @@ def table(head: Sequence[str], rows: Sequence[Sequence[Any]], caption: str = "")
 
 
 def number(value: Any, digits: int = 5) -> str:
-    """A number as it is read; a dash where there is none."""
+    """Return a number as text; a dash where there is none."""
     return "–" if value is None else f"{value:.{digits}g}"
 
 
-def button(label: str, clicked: Callable[[], Any], *, main: bool = False, classes: str = "") -> ui.button:
-    """A button; the main one of its place is filled."""
-    made = ui.button(label, on_click=clicked, color=None).props("no-caps unelevated" if main else "no-caps outline")
+def button(
+    label: str, clicked: Callable[[], Any], *, main: bool = False, classes: str = ""
+) -> ui.button:
+    """Return a button; the main one of a card is filled."""
+    made = ui.button(label, on_click=clicked, color=None).props(
+        "no-caps unelevated" if main else "no-caps outline"
+    )
     return made.classes(("main " if main else "plain ") + classes)
 
 
 def link(label: str, place: str) -> ui.element:
-    """A file to take, as a link that looks like a button."""
+    """Return a link to a file for download that looks like a button."""
     made = text(label, "a", "download").props("download")
     made.props["href"] = place
     return made
 
 
 def note(what: str, kind: str = "") -> ui.html:
-    """A sentence that must be seen: `bad`, `care` or `good`."""
+    """Return a highlighted note: `bad`, `care` or `good`."""
     return text(what, "p", f"note {kind}").props("role=alert" if kind == "bad" else "role=status")
 
 
@@ -143,8 +165,13 @@ _ENTRY = 19  # px of one
 _COLORS = ("#3b82d0", "#d9730d", "#159a7c", "#9a5fd6", "#c2498a", "#8a7a12")
 
 
-def curves_figure(rows: Sequence[tuple[str, Sequence[Mapping[str, Any]]]], unit: str = "time in s") -> dict[str, Any]:
-    """Curves below one another on one axis of time: of each row a label, and traces `x`, `y`, `name`, `raw`."""
+def curves_figure(
+    rows: Sequence[tuple[str, Sequence[Mapping[str, Any]]]], unit: str = "time in s"
+) -> dict[str, Any]:
+    """Return a figure of curves below one another on a common time axis.
+
+    Each row has a label, and traces with `x`, `y`, `name` and `raw`.
+    """
     traces: list[dict[str, Any]] = []
     layout = _layout(70 + 130 * len(rows))
     layout["xaxis"] |= {"title": _small(unit), "anchor": f"y{len(rows)}" if len(rows) > 1 else "y"}
@@ -152,19 +179,38 @@ def curves_figure(rows: Sequence[tuple[str, Sequence[Mapping[str, Any]]]], unit:
     for i, (label, drawn) in enumerate(rows):
         axis, top = (f"y{i + 1}" if i else "y"), 1 - i / len(rows)
         layout[f"yaxis{i + 1 if i else ''}"] = {
-            **{"domain": [max(0.0, top - 1 / len(rows) + gap), top - gap / 2], "zeroline": False, "automargin": True},
+            **{
+                "domain": [max(0.0, top - 1 / len(rows) + gap), top - gap / 2],
+                "zeroline": False,
+                "automargin": True,
+            },
             **{"title": _small(label), "nticks": 5, "anchor": "x"},
         }
         for curve in drawn:
             raw = curve.get("raw", False)
             line = {"width": 1.2, "color": "#8b949e" if raw else _COLORS[i % len(_COLORS)]}
-            own = {"name": curve["name"], "x": curve["x"], "y": curve["y"], "line": line, "opacity": 0.6 if raw else 1}
-            traces.append({**own, "type": "scatter", "mode": "lines", "xaxis": "x", "yaxis": axis, "showlegend": False})
+            own = {
+                "name": curve["name"],
+                "x": curve["x"],
+                "y": curve["y"],
+                "line": line,
+                "opacity": 0.6 if raw else 1,
+            }
+            traces.append(
+                {
+                    **own,
+                    "type": "scatter",
+                    "mode": "lines",
+                    "xaxis": "x",
+                    "yaxis": axis,
+                    "showlegend": False,
+                }
+            )
     return {"data": traces, "layout": layout, "config": _CONFIG}
 
 
 def run_name(run: Run, *, of_structure: bool = False, of_regularization: bool = True) -> str:
-    """What is known of a run; its number where that is nothing."""
+    """Return a description of a run; its number where nothing else is known."""
     words = [run.structure] if of_structure and run.structure else []
     words += [f"start {run.start}"] if run.start else []
     if of_regularization and run.regularization:
@@ -173,19 +219,22 @@ def run_name(run: Run, *, of_structure: bool = False, of_regularization: bool = 
 
 
 def of_several(runs: Iterable[Run]) -> bool:
-    """Whether they are of more structures than one."""
+    """Return whether the runs are of more than one structure."""
     return len({run.structure for run in runs if run.structure}) > 1
 
 
 def loss_figure(losses: Sequence[tuple[Run, int, float | None]]) -> dict[str, Any]:
-    """The loss of every run over its iterations: each named below the axis, of several structures each one."""
+    """Return a figure of the loss of every run over its iterations.
+
+    Each run has a name below the axis; of several structures, each structure has one.
+    """
     runs: dict[Run, tuple[list[int], list[float | None]]] = {}
     for run, iteration, loss in losses:
         x, y = runs.setdefault(run, ([], []))
         x.append(iteration)
         y.append(loss)
     several = of_several(runs)
-    differ = len({run.regularization for run in runs if run.structure != ALONE}) > 1
+    differ = len({run.regularization for run in runs if run.structure != PHYSICS_ONLY}) > 1
     names = {run: run_name(run, of_structure=several, of_regularization=differ) for run in runs}
     groups = {run: (run.structure or "run made again") if several else names[run] for run in runs}
     entries = list(dict.fromkeys(groups[run] for run in sorted(runs)))
@@ -197,15 +246,34 @@ def loss_figure(losses: Sequence[tuple[Run, int, float | None]]) -> dict[str, An
         "legend": {"yref": "container", "y": 0, "yanchor": "bottom", "x": 0, "tracegroupgap": 0},
     }
     layout["margin"]["b"] += _ENTRY * len(entries) * shown
-    layout["yaxis"] = {"type": "log", "title": _small("loss"), "automargin": True, "exponentformat": "e", "nticks": 5}
+    layout["yaxis"] = {
+        "type": "log",
+        "title": _small("loss"),
+        "automargin": True,
+        "exponentformat": "e",
+        "nticks": 5,
+    }
     own = {"type": "scatter", "mode": "lines+markers", "marker": {"size": 4}}
     traces, named = [], set[str]()
     for run, (x, y) in sorted(runs.items()):
         group = groups[run]
         color = _COLORS[entries.index(group) % len(_COLORS)]
         hover = f"{escape(names[run])}<br>iteration %{{x}}, loss %{{y:.4g}}<extra></extra>"
-        told = {"name": escape(group), "legendgroup": group, "showlegend": shown and group not in named}
-        traces.append({**own, **told, "x": x, "y": y, "hovertemplate": hover, "line": {"width": 1.5, "color": color}})
+        entry = {
+            "name": escape(group),
+            "legendgroup": group,
+            "showlegend": shown and group not in named,
+        }
+        traces.append(
+            {
+                **own,
+                **entry,
+                "x": x,
+                "y": y,
+                "hovertemplate": hover,
+                "line": {"width": 1.5, "color": color},
+            }
+        )
         named.add(group)
     return {"data": traces, "layout": layout, "config": _CONFIG}
 
@@ -218,11 +286,22 @@ def _small(title: str) -> dict[str, Any]:
 
 
 def _layout(height: int) -> dict[str, Any]:
-    plain: dict[str, Any] = {"paper_bgcolor": "rgba(0,0,0,0)", "plot_bgcolor": "rgba(0,0,0,0)", "height": height}
-    plain |= {"margin": {"l": 56, "r": 12, "t": 8, "b": 40}, "font": {"size": 12}, "hovermode": "x unified"}
-    return plain | {"xaxis": {"zeroline": False, "automargin": True}, "legend": {"orientation": "h", "y": 1.12}}
+    plain: dict[str, Any] = {
+        "paper_bgcolor": "rgba(0,0,0,0)",
+        "plot_bgcolor": "rgba(0,0,0,0)",
+        "height": height,
+    }
+    plain |= {
+        "margin": {"l": 56, "r": 12, "t": 8, "b": 40},
+        "font": {"size": 12},
+        "hovermode": "x unified",
+    }
+    return plain | {
+        "xaxis": {"zeroline": False, "automargin": True},
+        "legend": {"orientation": "h", "y": 1.12},
+    }
 
 
 def plot(figure: dict[str, Any], label: str) -> ui.plotly:
-    """A figure, with a sentence that is read aloud in its place."""
+    """Return a figure with a text for screen readers."""
     return named(ui.plotly(figure).classes("plot").props("role=img"), label)

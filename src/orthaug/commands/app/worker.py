@@ -1,7 +1,7 @@
-"""A process that answers questions of the page: what is in a file, which spec to start with, what a spec is worth.
+"""A process that answers questions of the page: columns of a file, a first spec, a check.
 
-A question is a line of JSON on standard input, its answer one on standard output: `refused` where there is none, and
-`last` where the process ends with it.
+A question is a line of JSON on standard input, its answer one on standard output: `refused` where
+there is none, and `last` where the process ends with it.
 """
 
 from __future__ import annotations
@@ -34,7 +34,10 @@ _DRAWN = 12  # columns of a file whose curves are
 
 
 def main() -> None:
-    """Answer questions until nobody asks any more; end where a question took much memory, which would be kept."""
+    """Answer questions until the standard input ends.
+
+    Also end after a question that took much memory, which the process would keep.
+    """
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # what a library prints is no answer
     asked: queue.Queue[str] = queue.Queue()
@@ -49,7 +52,7 @@ def main() -> None:
 
 
 def _listen(asked: queue.Queue[str]) -> None:
-    """Questions as they come, also while one is answered: where there are no more, nobody waits for that either."""
+    """Read questions, also while one is answered; end the process where there are no more."""
     for line in sys.stdin:
         asked.put(line)
     os._exit(0)
@@ -61,15 +64,23 @@ def _answer(given: dict[str, Any]) -> dict[str, Any]:
     except InputError as error:
         return {"refused": str(error)}
     except MemoryError:
-        return {"refused": "there is not enough memory to look at these data; take fewer rows, or every n-th."}
+        return {
+            "refused": "there is not enough memory to look at these data; take fewer rows, or every "
+            "n-th."
+        }
     except OSError as error:
-        return {"refused": f"{error.filename or 'a file'}: cannot be read ({error.strerror or error})."}
+        return {
+            "refused": f"{error.filename or 'a file'}: cannot be read ({error.strerror or error})."
+        }
     except Exception as error:  # a page shows no traceback
-        return {"refused": f"this cannot be told: {type(error).__name__}: {' '.join(str(error).split())[:300]}"}
+        return {
+            "refused": f"this question has no answer: {type(error).__name__}: "
+            f"{' '.join(str(error).split())[:300]}"
+        }
 
 
 def peak() -> float:
-    """Bytes that this process has held at most; 0 where the system does not say."""
+    """Return the peak memory of this process in bytes; 0 where the system does not report it."""
     try:
         import resource
     except ImportError:
@@ -78,20 +89,22 @@ def peak() -> float:
     return float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss) * unit
 
 
-def look(path: str, out: str, inputs: str | None, outputs: str | None, step: float | None) -> dict[str, Any]:
-    """The columns of a file, their curves, and the first spec for it where its channels are known.
+def look(
+    path: str, out: str, inputs: str | None, outputs: str | None, step: float | None
+) -> dict[str, Any]:
+    """Return the columns of a file, their curves, and a first spec where its channels are known.
 
     Args:
-        out: where the spec will stand.
-        inputs: columns of the inputs, separated by commas; None for what their names say.
+        out: the path that the spec will have.
+        inputs: columns of the inputs, separated by commas; None for those that the names show.
         outputs: the same of the outputs.
-        step: sampling time in s where a person said it.
+        step: sampling time in s where the user gave it.
     """
     found = starting.look(Path(path))
     answer: dict[str, Any] = {
         "columns": [_column(found, column) for column in found.columns],
         "rows": max(column.filled for column in found.columns),
-        "timed": _timed(found),
+        "timed": _time_text(found),
         "step": found.clock.step,
         "spec": None,
         "account": "",
@@ -101,29 +114,42 @@ def look(path: str, out: str, inputs: str | None, outputs: str | None, step: flo
         roles = starting.assign(found, inputs, outputs, None if step is None else check_step(step))
         if roles is not None:
             draft = starting.draft(found, roles, Path(out))
-            names = {"inputs": [c.header for c in roles.inputs], "outputs": [c.header for c in roles.outputs]}
+            names = {
+                "inputs": [c.header for c in roles.inputs],
+                "outputs": [c.header for c in roles.outputs],
+            }
             answer |= {"spec": draft.spec, "account": draft.account, **names}
     except InputError as error:
         answer["open"] = str(error).removeprefix(f"{path}: ")
     return answer | {"curves": _curves(found)}
 
 
-def _timed(found: Survey) -> str:
-    """Which column gives the time, in words; nothing where none does."""
+def _time_text(found: Survey) -> str:
+    """Return a sentence on the column that gives the time; empty where none does."""
     clock = found.clock
     if clock.column is None or clock.step is None:
         return ""
     if not clock.instants:
         return f"{clock.column.header} gives the sampling time, {clock.step:g} s."
-    return f"{clock.column.header} gives the instants, {'every' if clock.even else 'mostly every'} {clock.step:g} s."
+    return (
+        f"{clock.column.header} gives the instants, "
+        f"{'every' if clock.even else 'mostly every'} {clock.step:g} s."
+    )
 
 
 def _column(found: Survey, column: Column) -> dict[str, Any]:
     usable = column in found.signals
-    told = starting.as_seen(column, spikes=column.kind != "input") if usable else found.why_not(column)
+    described = (
+        starting.as_seen(column, spikes=column.kind != "input") if usable else found.why_not(column)
+    )
     head = column.name + (f" = column '{column.header}'" if column.header != column.name else "")
-    own = {"header": column.header, "kind": column.kind, "usable": usable, "timed": column is found.clock.column}
-    return own | {"told": told.removeprefix(f"{head}: ")}
+    own = {
+        "header": column.header,
+        "kind": column.kind,
+        "usable": usable,
+        "timed": column is found.clock.column,
+    }
+    return own | {"description": described.removeprefix(f"{head}: ")}
 
 
 def _curves(found: Survey) -> dict[str, Any]:
@@ -139,14 +165,15 @@ def _curves(found: Survey) -> dict[str, Any]:
 
 
 def examine(path: str, whole: bool) -> dict[str, Any]:
-    """What `orthaug check` tells of a spec, and its training data as they are after preparation.
+    """Return the findings of `orthaug check` for a spec, and its prepared training data.
 
     Args:
-        whole: run equations of motion too; without, `check` is None for them, since that takes its time.
+        whole: run equations of motion too; without, `check` is None for them, since that takes its
+            time.
     """
     job = open_job(Path(path), require_full_rank=False)
     moves = job.spec.motion is not None
-    told: dict[str, Any] = {"check": None, "refusal": None, "bias": []}
+    answer: dict[str, Any] = {"check": None, "refusal": None, "bias": []}
     if whole or not moves:
         if moves:
             from orthaug._base.jax import use_compilation_cache
@@ -154,10 +181,13 @@ def examine(path: str, whole: bool) -> dict[str, Any]:
             use_compilation_cache()
         result = kind_of(job).checked(job)
         refused = kind_of(job).refused(job, result)
-        bias = [{"name": one.name, "removed_by": one.removed_by, "percent": one.percent} for one in result.bias or ()]
-        told = {"check": json.loads(result.to_json()), "bias": bias}
-        told["refusal"] = None if refused is None else str(refused)
-    return told | {
+        bias = [
+            {"name": one.name, "removed_by": one.removed_by, "percent": one.percent}
+            for one in result.bias or ()
+        ]
+        answer = {"check": json.loads(result.to_json()), "bias": bias}
+        answer["refusal"] = None if refused is None else str(refused)
+    return answer | {
         "rows": {part.name: len(part.record) for part in job.parts},
         "files": [os.path.abspath(job.path.parent / entry.file) for entry in job.train.files],
         "step": job.train.record.sampling_time,
@@ -168,7 +198,7 @@ def examine(path: str, whole: bool) -> dict[str, Any]:
 
 
 def verdict(path: str, kind: str) -> dict[str, Any]:
-    """What the report of a result begins with: `level`, and three `sentences`.
+    """Return the verdict that the report of a result begins with: `level`, and three `sentences`.
 
     Args:
         kind: fit or compare, of which `path` is the result.json.
@@ -178,16 +208,21 @@ def verdict(path: str, kind: str) -> dict[str, Any]:
 
     text = Path(path).read_text(encoding="utf-8")
     if kind == "fit":
-        told = fit_verdict(FitResult.model_validate_json(text))
+        found = fit_verdict(FitResult.model_validate_json(text))
     else:
-        told = compare_verdict(CompareResult.model_validate_json(text))
-    return {"level": told.level, "sentences": told.sentences}
+        found = compare_verdict(CompareResult.model_validate_json(text))
+    return {"level": found.level, "sentences": found.sentences}
 
 
 def _units(job: Job) -> list[tuple[str, str, str | None]]:
-    """Of each parameter: its name, the unit that the spec gives, and what its regressor asks for if it has one."""
+    """Return for each parameter its name, the unit in the spec and the one its regressor implies.
+
+    The last is None where the regressor implies none.
+    """
     if job.spec.motion is not None:
-        return [(name, entry.unit or "", None) for name, entry in job.spec.motion.parameters.items()]
+        return [
+            (name, entry.unit or "", None) for name, entry in job.spec.motion.parameters.items()
+        ]
     if job.spec.baseline is None:
         return []
     record, baseline = job.train.record, job.problem.baseline
@@ -198,7 +233,7 @@ def _units(job: Job) -> list[tuple[str, str, str | None]]:
 
 
 def _prepared_curves(job: Job) -> dict[str, Any]:
-    """By channel, of the training data; experiments are apart."""
+    """Return the curves by channel of the training data, with gaps between experiments."""
     record = job.train.record
     channels: Sequence[Channel] = (*record.inputs, *record.outputs)
     curves = {}
@@ -210,12 +245,17 @@ def _prepared_curves(job: Job) -> dict[str, Any]:
             share = max(8, MOST * len(e) // max(len(record), 1))
             curve = thinned(e.start_time + record.sampling_time * np.arange(len(e)), values, share)
             x, y = [*x, *curve["x"], None], [*y, *curve["y"], None]
-        curves[channel.name] = {"x": x[:-1], "y": y[:-1], "unit": channel.unit, "column": channel.file_column}
+        curves[channel.name] = {
+            "x": x[:-1],
+            "y": y[:-1],
+            "unit": channel.unit,
+            "column": channel.file_column,
+        }
     return curves
 
 
 def thinned(time: Vector, values: Vector, most: int = MOST) -> dict[str, list[float | None]]:
-    """A curve of at most about `most` points: of each stretch the least and the largest value, in their order.
+    """Return a curve of at most about `most` points: minimum and maximum of each stretch, in order.
 
     Examples:
         >>> thinned(np.arange(6.0), np.array([0.0, 5.0, 1.0, 2.0, -1.0, 0.0]), 4)
@@ -228,7 +268,11 @@ def thinned(time: Vector, values: Vector, most: int = MOST) -> dict[str, list[fl
         for a, b in zip(edges[:-1], edges[1:], strict=True):
             piece = there[a:b]
             known = np.isfinite(piece).any()
-            kept += sorted({a + int(np.nanargmin(piece)), a + int(np.nanargmax(piece))}) if known else [a]
+            kept += (
+                sorted({a + int(np.nanargmin(piece)), a + int(np.nanargmax(piece))})
+                if known
+                else [a]
+            )
         time, values = time[kept], values[kept]
     return {"x": _plain(time), "y": _plain(values)}
 
@@ -237,7 +281,11 @@ def _plain(values: Vector) -> list[float | None]:
     return [float(f"{v:.7g}") if np.isfinite(v) else None for v in values]
 
 
-QUESTIONS: dict[str, Callable[..., dict[str, Any]]] = {"look": look, "examine": examine, "verdict": verdict}
+QUESTIONS: dict[str, Callable[..., dict[str, Any]]] = {
+    "look": look,
+    "examine": examine,
+    "verdict": verdict,
+}
 
 if __name__ == "__main__":
     main()

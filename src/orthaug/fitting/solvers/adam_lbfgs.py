@@ -1,7 +1,8 @@
-"""The paper's pipeline: Adam, then L-BFGS, over θ and the learner's weights together, compiled whole.
+"""The paper's solver: Adam, then L-BFGS, over θ and weights together, compiled whole.
 
-θ starts at θ⁰ in units of its columns, the weights where the caller says. L-BFGS is optax's, in one compiled
-loop. SciPy's L-BFGS-B, called back from Python, took 3 to 6 times longer on both of the paper's examples.
+θ starts at θ⁰ in units of its columns, the weights where the caller says. L-BFGS is optax's, in one
+compiled loop. SciPy's L-BFGS-B, called back from Python, took 3 to 6 times longer on both of the
+paper's examples.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from annotated_types import Ge, Gt
 from jaxtyping import Float
 
 from orthaug._base.jax import Array, jax, jnp, training_clock
-from orthaug._base.progress import Enough, RunTell, quiet
+from orthaug._base.progress import RunProgress, StopTraining, quiet
 from orthaug._base.registry import check_fields
 from orthaug.fitting.paper_criterion import PaperCriterion, Physics
 from orthaug.fitting.solvers.compiled import burst_length
@@ -26,7 +27,7 @@ _SMALL = 1e-14  # a relative decrease below this, five steps in a row, is roundi
 
 
 class GradientRun(NamedTuple):
-    """Where one run ended: θ's unknowns and the weights."""
+    """The end of one run: θ's unknowns and the weights."""
 
     v: Float[Array, "nt"]
     w: Float[Array, "nw"]
@@ -68,7 +69,7 @@ class AdamLBFGS:
         return self.adam_iterations + self.lbfgs_iterations
 
     def at_most(self, iterations: int) -> AdamLBFGS:
-        """Itself: the pipeline is run whole."""
+        """Return itself: the pipeline is run whole."""
         return self
 
     def minimise(
@@ -78,9 +79,12 @@ class AdamLBFGS:
         chunks: Chunk,
         physics: Physics,
         *,
-        progress: RunTell = quiet,
+        progress: RunProgress = quiet,
     ) -> GradientRun:
-        """Minimise the joint criterion from θ⁰ and `w`; the loss told to `progress` is a mean square."""
+        """Minimise the joint criterion from θ⁰ and `w`.
+
+        The loss that `progress` receives is a mean square.
+        """
         import optax
 
         began = training_clock()
@@ -96,26 +100,36 @@ class AdamLBFGS:
             begun = {"iteration": jnp.asarray(0), "small": jnp.asarray(0)}
             state = state._replace(optimizer=optimizer.init(state.unknowns), **begun)
             burst, second = 1, optimizer is phases[1][1]
-            while int(state.iteration) < limit and bool(_going(state)) and not enough:
+            while int(state.iteration) < limit and bool(_goes_on(state)) and not enough:
                 tick = training_clock()
                 stop = jnp.asarray(min(int(state.iteration) + burst, limit))
                 advance = _lbfgs if second else _adam
-                state = jax.block_until_ready(advance(criterion, state, chunks, physics, self.learning_rate, stop))
+                state = jax.block_until_ready(
+                    advance(criterion, state, chunks, physics, self.learning_rate, stop)
+                )
                 burst = burst_length(burst, training_clock() - tick)
                 try:
-                    progress(done + int(state.iteration), float(state.loss) * float(physics.samples))
-                except Enough:
+                    progress(
+                        done + int(state.iteration), float(state.loss) * float(physics.samples)
+                    )
+                except StopTraining:
                     enough = True
             done += int(state.iteration)
         finite = bool(jnp.isfinite(state.loss))
         still = Ending.STOPPED if enough else Ending.RUNNING
-        ending = Ending.NON_FINITE if not finite else Ending.CONVERGED if int(state.small) >= 5 else still
+        ending = (
+            Ending.NON_FINITE
+            if not finite
+            else Ending.CONVERGED
+            if int(state.small) >= 5
+            else still
+        )
         v, w = state.unknowns
         return GradientRun(v, w, done, ending, training_clock() - began)
 
 
-def _going(state: _GradientState) -> Any:
-    """Whether another step makes sense: the loss is finite and still falls."""
+def _goes_on(state: _GradientState) -> Any:
+    """Return whether another step makes sense: the loss is finite and still falls."""
     return jnp.isfinite(state.loss) & (state.small < 5)
 
 
@@ -126,7 +140,12 @@ def _value(criterion: PaperCriterion, unknowns: Any, chunks: Chunk, physics: Phy
 
 @partial(jax.jit, static_argnames="criterion")
 def _adam(
-    criterion: PaperCriterion, state: _GradientState, chunks: Chunk, physics: Physics, rate: Any, stop: Any
+    criterion: PaperCriterion,
+    state: _GradientState,
+    chunks: Chunk,
+    physics: Physics,
+    rate: Any,
+    stop: Any,
 ) -> _GradientState:
     import optax
 
@@ -138,12 +157,17 @@ def _adam(
         unknowns: Any = optax.apply_updates(s.unknowns, update)
         return _GradientState(unknowns, inner, loss, s.iteration + 1, s.small)
 
-    return jax.lax.while_loop(lambda s: (s.iteration < stop) & _going(s), step, state)
+    return jax.lax.while_loop(lambda s: (s.iteration < stop) & _goes_on(s), step, state)
 
 
 @partial(jax.jit, static_argnames="criterion")
 def _lbfgs(
-    criterion: PaperCriterion, state: _GradientState, chunks: Chunk, physics: Physics, rate: Any, stop: Any
+    criterion: PaperCriterion,
+    state: _GradientState,
+    chunks: Chunk,
+    physics: Physics,
+    rate: Any,
+    stop: Any,
 ) -> _GradientState:
     import optax
 
@@ -156,10 +180,12 @@ def _lbfgs(
 
     def step(s: _GradientState) -> _GradientState:
         loss, gradient = value_and_grad(s.unknowns, state=s.optimizer)
-        update, inner = optimizer.update(gradient, s.optimizer, s.unknowns, value=loss, grad=gradient, value_fn=value)
+        update, inner = optimizer.update(
+            gradient, s.optimizer, s.unknowns, value=loss, grad=gradient, value_fn=value
+        )
         unknowns: Any = optax.apply_updates(s.unknowns, update)
         reached = optax.tree.get(inner, "value")
         small = jnp.where(loss - reached <= _SMALL * loss, s.small + 1, 0)
         return _GradientState(unknowns, inner, reached, s.iteration + 1, small)
 
-    return jax.lax.while_loop(lambda s: (s.iteration < stop) & _going(s), step, state)
+    return jax.lax.while_loop(lambda s: (s.iteration < stop) & _goes_on(s), step, state)

@@ -1,11 +1,13 @@
-"""The Levenberg-Marquardt loop that the host drives, for any objective that can be tried and linearised.
+"""The Levenberg-Marquardt loop driven by the host, for any objective with a linearisation.
 
-The step solves `(H + αE + μ D) d = g − αE p` with Nielsen's update of μ (Madsen, Nielsen and Tingleff 2004, algorithm
-3.16). The ridge α acts on the weights alone (E). One step ahead D is the identity, which converges from Xavier starts
-on normalised data; on the free run D is diag H (Marquardt's scaling). A trial costs one evaluation. Only an accepted
-trial is linearised. A trial that is not finite is rejected like one that does not descend.
+The step solves `(H + αE + μ D) d = g − αE p` with Nielsen's update of μ (Madsen, Nielsen and
+Tingleff 2004, algorithm 3.16). The ridge α acts on the weights alone (E). One step ahead D is the
+identity, which converges from Xavier starts on normalised data; on the free run D is diag H
+(Marquardt's scaling). A trial costs one evaluation. Only an accepted trial is linearised. A trial
+that is not finite is rejected like one that does not descend.
 
-Where the rows of a one-step criterion are in memory, the loop is compiled whole instead (`compiled`).
+Where the rows of a one-step criterion are in memory, the loop is compiled whole instead
+(`compiled`).
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ from jaxtyping import Bool
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.jax import training_clock
-from orthaug._base.progress import Enough, RunTell, quiet
+from orthaug._base.progress import RunProgress, StopTraining, quiet
 from orthaug.fitting.solvers.limit import Limit, Tail
 from orthaug.fitting.status import Ending
 
@@ -30,19 +32,24 @@ _SMALLEST_CURVATURE = 1e-14  # of the largest: it damps a direction that does no
 
 
 class Damping(NamedTuple):
-    """The first μ and the largest, in units of the largest curvature; with Marquardt's scaling in units of 1."""
+    """The first μ and the largest, in units of the largest curvature.
+
+    With Marquardt's scaling in units of 1.
+    """
 
     first: float
     largest: float
     diagonal: bool
 
 
-IDENTITY = Damping(1e-5, 1e12, diagonal=False)  # docs/design.md has the comparison of first dampings
+IDENTITY = Damping(
+    1e-5, 1e12, diagonal=False
+)  # docs/design.md has the comparison of first dampings
 MARQUARDT = Damping(1e-3, 1e16, diagonal=True)
 
 
 @runtime_checkable
-class Tried(Protocol):
+class Trial(Protocol):
     """A trial: an objective at p."""
 
     @property
@@ -55,7 +62,7 @@ class Tried(Protocol):
 
 
 @runtime_checkable
-class Linearised(Protocol):
+class LinearModel(Protocol):
     """An objective and its derivative about an accepted trial."""
 
     @property
@@ -70,36 +77,42 @@ class Linearised(Protocol):
 
     @property
     def start(self) -> Any:
-        """What the next trial starts from beside p; the objective's own affair."""
+        """The start of the next trial beside p, in a form that only the objective reads."""
         ...
 
 
 @runtime_checkable
 class SquaredResiduals(Protocol):
-    """The objective `‖r(p)‖²` of p = (θ, w), θ in front. Its functions are pure: a rejected trial leaves no trace."""
+    """The objective `‖r(p)‖²` of p = (θ, w), θ in front.
+
+    Its functions are pure: a rejected trial leaves no trace.
+    """
 
     @property
     def physics(self) -> int:
-        """How many leading entries of p are θ: they have bounds and no ridge."""
+        """Number of leading entries of p that are θ: they have bounds and no ridge."""
         ...
 
-    def fly(self, p: Vector, start: Any) -> Any:
-        """A trial (`Tried`) at p, from the `start` that the last accepted one left."""
+    def evaluate(self, p: Vector, start: Any) -> Any:
+        """Return a trial (`Trial`) at p, from the `start` that the last accepted one left."""
         ...
 
-    def linearise(self, flown: Any) -> Any:
-        """The derivative (`Linearised`) about a trial."""
+    def linearise(self, point: Any) -> Any:
+        """Return the derivative (`LinearModel`) about a trial."""
         ...
 
-    def samples(self, flown: Any) -> tuple[float, float]:
-        """Number of residuals of a trial, and the share of them that is independent."""
+    def samples(self, point: Any) -> tuple[float, float]:
+        """Return the number of residuals of a trial, and the share that is independent."""
         ...
 
 
 class Descent(NamedTuple):
-    """Where a run ended: the last accepted trial and its derivative, which is None where the start has none."""
+    """The end of a run: the last accepted trial and its derivative.
 
-    flown: Any
+    The derivative is None where the start has none.
+    """
+
+    point: Any
     linear: Any | None
     ridge: float
     effective: float
@@ -113,9 +126,9 @@ class Descent(NamedTuple):
 
 
 class Pause(NamedTuple):
-    """A descent between two steps, in arrays: it goes on from there at the same bits."""
+    """A descent between two steps, in arrays, from which it resumes at the same bits."""
 
-    flown: Any
+    point: Any
     """What the objective needs to make the last accepted trial again."""
     ridge: Any
     damping: Any
@@ -128,7 +141,9 @@ class Pause(NamedTuple):
 
 
 class _Counts(NamedTuple):
-    """Steps that were tried, accepted ones before the last, whether evidence has begun, and two losses.
+    """Counts of tried and accepted steps, whether evidence has begun, and two losses.
+
+    Accepted steps are counted before the last.
 
     These are the loss of the start, and where the last window of the limit began.
     """
@@ -141,9 +156,9 @@ class _Counts(NamedTuple):
 
 
 class _Iterate(NamedTuple):
-    """An accepted trial, and what the rest of the run knows of the way there."""
+    """An accepted trial, and the state of the rest of the run."""
 
-    flown: Any
+    point: Any
     linear: Any
     ridge: float
     damping: float
@@ -151,11 +166,13 @@ class _Iterate(NamedTuple):
     small: int = 0
     path: tuple[Vector, ...] = ()
     coloured: bool = False
-    """Whether the colour of the errors counts. It does once they no longer fall fast; before, misfit colours them."""
+    """Whether the colour of the errors counts. It does once they no longer fall fast; before,
+    misfit colours them.
+    """
 
     @property
     def settled(self) -> bool:
-        """Whether the objective falls slowly, after a few steps."""
+        """True once the objective falls slowly, after a few steps."""
         return self.coloured and len(self.path) > _FIRST_STEPS
 
 
@@ -172,7 +189,7 @@ def descend(
     evidence_settled: bool = False,
     ceiling: float = np.inf,
     bounds: tuple[Vector, Vector] | None = None,
-    progress: RunTell = quiet,
+    progress: RunProgress = quiet,
     kept: Any = None,
 ) -> Descent:
     """Minimise `‖r‖² + α‖w‖²` from p.
@@ -180,9 +197,9 @@ def descend(
     Args:
         start: handed to the first trial.
         ridge: α; with `evidence` where it starts.
-        evidence_settled: whether α waits until the weights have lowered the loss and the objective falls slowly, or no
-            longer; otherwise until the first accepted step. From weights that do nothing yet, evidence would find that
-            none are needed (w = 0 is its fixed point).
+        evidence_settled: whether α waits until the weights have lowered the loss and the objective
+            falls slowly, or no longer; otherwise until the first accepted step. From weights that
+            do nothing yet, evidence would find that none are needed (w = 0 is its fixed point).
         ceiling: a trial with a larger `‖r‖²` is rejected.
         bounds: of θ, each (physics,); the start is moved inside.
         kept: where pauses are kept; a descent goes on from the last one.
@@ -192,77 +209,107 @@ def descend(
     if bounds is not None:
         for whole, side in zip(limits, bounds, strict=True):
             whole[: objective.physics] = side
-    paused = None if kept is None else kept.state()
+    paused = None if kept is None else kept.state(np.shape(p))
     if paused is not None:
-        iterate, (done, taken, begun, first_loss, mark), ending = _resumed(objective, paused)
+        iterate, (done, taken, begun, first_loss, mark), ending = _resume(objective, paused)
     else:
-        flown = objective.fly(np.clip(p, *limits), start)
-        linear = objective.linearise(flown) if np.isfinite(flown.loss) else None
+        point = objective.evaluate(np.clip(p, *limits), start)
+        linear = objective.linearise(point) if np.isfinite(point.loss) else None
         if linear is None or not np.isfinite(linear.hessian).all():
-            return Descent(flown, None, ridge, 0.0, 0, Ending.NON_FINITE, training_clock() - began)
+            return Descent(point, None, ridge, 0.0, 0, Ending.NON_FINITE, training_clock() - began)
         largest = 1.0 if damping.diagonal else float(np.diag(linear.hessian).max(initial=1e-300))
-        iterate, first_loss = _Iterate(flown, linear, ridge, damping.first * largest, path=(flown.p,)), flown.loss
+        iterate, first_loss = (
+            _Iterate(point, linear, ridge, damping.first * largest, path=(point.p,)),
+            point.loss,
+        )
         ending, done, taken, begun, mark = Ending.RUNNING, 0, 1, not evidence_settled, first_loss
-    while ending is Ending.RUNNING and not limit.reached(done, mark, iterate.flown.loss):
+    while ending is Ending.RUNNING and not limit.reached(done, mark, iterate.point.loss):
         iterate, ending = _trial(objective, iterate, limits, tolerance, damping, ceiling)
         if evidence and not begun:
-            lower = iterate.flown.loss < LEARNED * first_loss or iterate.small > 0
+            lower = iterate.point.loss < LEARNED * first_loss or iterate.small > 0
             begun = iterate.settled and lower or ending is Ending.CONVERGED
-            if begun and ending is Ending.CONVERGED:  # under the first ridge; not yet under the one that follows
+            if (
+                begun and ending is Ending.CONVERGED
+            ):  # under the first ridge; not yet under the one that follows
                 iterate, ending, taken = iterate._replace(small=0), Ending.RUNNING, 0
         if evidence and begun and len(iterate.path) > taken:
             iterate = iterate._replace(ridge=_next_ridge(objective, iterate))
         taken = len(iterate.path)
         done += 1
-        mark = iterate.flown.loss if limit.begins_window(done) else mark
+        mark = iterate.point.loss if limit.begins_window(done) else mark
         try:
-            progress(done, iterate.flown.loss)
-        except Enough:
+            progress(done, iterate.point.loss)
+        except StopTraining:
             ending = Ending.STOPPED if ending is Ending.RUNNING else ending
             break
         if kept is not None:
             counts = _Counts(done, taken, begun, first_loss, mark)
-            kept.keep(partial(_paused, objective, iterate, counts, ending), ended=ending is not Ending.RUNNING)
+            kept.keep(
+                partial(_pause, objective, iterate, counts, ending),
+                ended=ending is not Ending.RUNNING,
+            )
     effective = effective_weights(iterate.linear.hessian, iterate.ridge, objective.physics)
     converged = ending not in (Ending.RUNNING, Ending.STOPPED)
-    tail, seconds = Tail.of(limit, done, mark, iterate.flown.loss, converged=converged), training_clock() - began
-    return Descent(iterate.flown, iterate.linear, iterate.ridge, effective, done, ending, seconds, iterate.path, tail)
+    tail, seconds = (
+        Tail.of(limit, done, mark, iterate.point.loss, converged=converged),
+        training_clock() - began,
+    )
+    return Descent(
+        iterate.point,
+        iterate.linear,
+        iterate.ridge,
+        effective,
+        done,
+        ending,
+        seconds,
+        iterate.path,
+        tail,
+    )
 
 
-def _paused(objective: Any, iterate: _Iterate, counts: _Counts, ending: Ending) -> Pause:
+def _pause(objective: Any, iterate: _Iterate, counts: _Counts, ending: Ending) -> Pause:
     own = (iterate.ridge, iterate.damping, iterate.growth, iterate.small)
-    held = (objective.kept(iterate.flown), *own, np.stack(iterate.path), iterate.coloured)
+    held = (objective.kept(iterate.point), *own, np.stack(iterate.path), iterate.coloured)
     return Pause(*held, np.array(counts, dtype=float), int(ending))
 
 
-def _resumed(objective: Any, paused: Pause) -> tuple[_Iterate, _Counts, Ending]:
-    flown = objective.again(paused.flown)
+def _resume(objective: Any, paused: Pause) -> tuple[_Iterate, _Counts, Ending]:
+    point = objective.again(paused.point)
     ridge, damping, growth = (float(paused[i]) for i in (1, 2, 3))
     path, done = tuple(paused.path), paused.counts.tolist()
-    iterate = _Iterate(flown, objective.linearise(flown), ridge, damping, growth, int(paused.small), path)
+    iterate = _Iterate(
+        point, objective.linearise(point), ridge, damping, growth, int(paused.small), path
+    )
     counts = _Counts(int(done[0]), int(done[1]), bool(done[2]), done[3], done[4])
     return iterate._replace(coloured=bool(paused.coloured)), counts, Ending(int(paused.ending))
 
 
 def _trial(
-    objective: SquaredResiduals, iterate: _Iterate, limits: Any, tolerance: float, damping: Damping, ceiling: float
+    objective: SquaredResiduals,
+    iterate: _Iterate,
+    limits: Any,
+    tolerance: float,
+    damping: Damping,
+    ceiling: float,
 ) -> tuple[_Iterate, Ending]:
-    """One damped step: accept it, or damp more."""
-    flown, linear, ridge = iterate.flown, iterate.linear, iterate.ridge
-    p = flown.p
+    """Return one damped step: accept it, or damp more."""
+    point, linear, ridge = iterate.point, iterate.linear, iterate.ridge
+    p = point.p
     penalty = np.concatenate([np.zeros(objective.physics), np.ones(len(p) - objective.physics)])
     downhill = linear.gradient - ridge * penalty * p
-    step, expected = _step(linear.hessian + ridge * np.diag(penalty), downhill, iterate.damping, p, limits, damping)
+    step, expected = _step(
+        linear.hessian + ridge * np.diag(penalty), downhill, iterate.damping, p, limits, damping
+    )
     moves = bool(np.isfinite(step).all() and step.any())
-    tried = objective.fly(p + step, linear.start) if moves else None
-    before = flown.loss + ridge * float(penalty @ p**2)
+    tried = objective.evaluate(p + step, linear.start) if moves else None
+    before = point.loss + ridge * float(penalty @ p**2)
     after = np.nan if tried is None else tried.loss + ridge * float(penalty @ (p + step) ** 2)
     lower = tried is not None and tried.loss <= ceiling and np.isfinite(after) and after < before
     followed = objective.linearise(tried) if lower else None
     if tried is not None and followed is not None and np.isfinite(followed.hessian).all():
         gain = (before - after) / expected if expected > 0 else 1.0
         iterate = _Iterate(
-            flown=tried,
+            point=tried,
             linear=followed,
             ridge=ridge,
             damping=iterate.damping * max(1 / 3, 1 - (2 * gain - 1) ** 3),
@@ -281,44 +328,60 @@ def _trial(
 
 def _next_ridge(objective: SquaredResiduals, iterate: _Iterate) -> float:
     effective = effective_weights(iterate.linear.hessian, iterate.ridge, objective.physics)
-    return evidence_ridge(objective, iterate.flown, effective, coloured=iterate.coloured)
+    return evidence_ridge(objective, iterate.point, effective, coloured=iterate.coloured)
 
 
-def evidence_ridge(objective: SquaredResiduals, flown: Any, effective: float, *, coloured: bool = True) -> float:
-    """Return MacKay's fixed point `α = γσ²/(κ‖w‖²)`, κ the share of the residuals that is independent.
+def evidence_ridge(
+    objective: SquaredResiduals, point: Any, effective: float, *, coloured: bool = True
+) -> float:
+    """Return MacKay's fixed point `α = γσ²/(κ‖w‖²)`.
 
-    Residuals of a free run are coloured: N of them say as much as κN independent ones. So the data weigh less against
-    the prior.
+    κ is the share of the residuals that is independent.
+
+    Residuals of a free run are coloured: N of them say as much as κN independent ones. So the data
+    weigh less against the prior.
 
     Args:
         objective: that the weights minimise.
-        flown: the trial at the weights.
+        point: the trial at the weights.
         effective: number γ of effective weights there.
         coloured: whether the colour of the residuals counts.
     """
-    count, share = objective.samples(flown)
+    count, share = objective.samples(point)
     share = share if coloured else 1.0
-    variance = flown.loss / max(count - effective / share, 1.0)
-    size = float(np.sum(flown.p[objective.physics :] ** 2))
+    variance = point.loss / max(count - effective / share, 1.0)
+    size = float(np.sum(point.p[objective.physics :] ** 2))
     return float(np.clip(effective * variance / (share * max(size, 1e-300)), 1e-12, 1e12))
 
 
 def _step(
-    hessian: Matrix, downhill: Vector, damping: float, p: Vector, bounds: tuple[Vector, Vector], kind: Damping
+    hessian: Matrix,
+    downhill: Vector,
+    damping: float,
+    p: Vector,
+    bounds: tuple[Vector, Vector],
+    kind: Damping,
 ) -> tuple[Vector, float]:
-    """The damped step inside the bounds, and the decrease that the quadratic model expects of it."""
+    """Return the damped step inside the bounds, and its predicted decrease.
+
+    The quadratic model predicts it.
+    """
     free = np.flatnonzero(~_held(p, downhill, *bounds))
     curvature = np.diag(hessian)[free] if kind.diagonal else np.ones(len(free))
     scale = np.maximum(curvature, _SMALLEST_CURVATURE * curvature.max(initial=0.0))
     scale = np.where(scale > 0, scale, 1.0)
-    unit = 1 / np.sqrt(scale)  # solved with a unit diagonal: columns of very different size keep their digits
+    unit = 1 / np.sqrt(
+        scale
+    )  # solved with a unit diagonal: columns of very different size keep their digits
     matrix = hessian[np.ix_(free, free)] * np.outer(unit, unit) + damping * np.eye(len(free))
     step = np.zeros(len(p))
     if not len(free):
         return step, 0.0
     try:
         factor = scipy.linalg.cho_factor(matrix, check_finite=False)
-        step[free] = unit * scipy.linalg.cho_solve(factor, unit * downhill[free], check_finite=False)
+        step[free] = unit * scipy.linalg.cho_solve(
+            factor, unit * downhill[free], check_finite=False
+        )
     except np.linalg.LinAlgError:  # curvature lost to rounding: more damping mends it
         return np.full(len(p), np.nan), 0.0
     step = np.clip(p + step, *bounds) - p
@@ -326,19 +389,28 @@ def _step(
 
 
 def _held(p: Vector, downhill: Vector, lower: Vector, upper: Vector) -> Bool[np.ndarray, "n"]:
-    """Which entries stand at a bound that the descent would leave."""
+    """Return a mask of the entries at a bound that the descent would leave."""
     return ((p <= lower) & (downhill < 0)) | ((p >= upper) & (downhill > 0))
 
 
-def _level(hessian: Matrix, downhill: Vector, objective: float, held: Bool[np.ndarray, "n"]) -> bool:
-    """Residual and Jacobian are orthogonal to rounding in every free entry: the start is a minimum."""
+def _level(
+    hessian: Matrix, downhill: Vector, objective: float, held: Bool[np.ndarray, "n"]
+) -> bool:
+    """Return whether the start is a minimum.
+
+    There, residual and Jacobian are orthogonal to rounding in every free entry.
+    """
     flat = np.abs(downhill) <= 1e-7 * np.sqrt(np.maximum(np.diag(hessian), 0.0) * objective)
     return bool(np.all(flat | held))
 
 
 def weights_hessian(hessian: Matrix, physics: int) -> Matrix:
-    """The Hessian of the weights with θ eliminated, (nw, nw)."""
-    h_tt, h_tw, h_ww = hessian[:physics, :physics], hessian[:physics, physics:], hessian[physics:, physics:]
+    """Return the Hessian of the weights with θ eliminated, (nw, nw)."""
+    h_tt, h_tw, h_ww = (
+        hessian[:physics, :physics],
+        hessian[:physics, physics:],
+        hessian[physics:, physics:],
+    )
     size = np.diag(h_tt)
     unit = np.sqrt(np.where(size > 1e-300 * size.max(initial=0.0), size, 1.0))
     inner = np.linalg.lstsq(h_tt / np.outer(unit, unit), h_tw / unit[:, None], rcond=1e-14)[0]
@@ -347,7 +419,7 @@ def weights_hessian(hessian: Matrix, physics: int) -> Matrix:
 
 
 def effective_weights(hessian: Matrix, ridge: float, physics: int) -> float:
-    """tr(H (H + αI)⁻¹) of the weights. Directions that are rounding count as absent."""
+    """Return tr(H (H + αI)⁻¹) of the weights. Directions that are rounding count as absent."""
     if len(hessian) == physics:
         return 0.0
     values = np.linalg.eigvalsh(weights_hessian(hessian, physics))

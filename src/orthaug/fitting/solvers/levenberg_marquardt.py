@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Vector, check_count, check_number
 from orthaug._base.jax import Array
-from orthaug._base.registry import LIBRARY_ONLY, InSpec, check_fields
+from orthaug._base.registry import LIBRARY_ONLY, SpecLimit, check_fields
 from orthaug.fitting.normal_equations import Normal
 from orthaug.fitting.solvers import compiled
 from orthaug.fitting.solvers.compiled import Settings, TrainingRun
@@ -27,15 +27,16 @@ class LevenbergMarquardt:
     """Declaration of the solver.
 
     Args:
-        iterations: trial steps at most. Only the default, 300, is a limit that a run passes where the loss still falls
-            noticeably (`solvers/limit.py`), up to ten times.
-        tolerance: two successive steps that lower the objective by less than this fraction end the run.
+        iterations: trial steps at most. Only the default, 300, is a limit that a run passes where
+            the loss still falls noticeably (`solvers/limit.py`), up to ten times.
+        tolerance: two successive steps that lower the objective by less than this fraction end the
+            run.
         longest: trial steps at most where the loss still falls; None for what `iterations` says.
     """
 
     gauss_newton = True
 
-    iterations: Annotated[int, Ge(0), InSpec(Ge(1))] = _ITERATIONS
+    iterations: Annotated[int, Ge(0), SpecLimit(Ge(1))] = _ITERATIONS
     tolerance: Annotated[float, Ge(0)] = field(default=1e-6, metadata=LIBRARY_ONLY)
     longest: int | None = field(default=None, metadata=LIBRARY_ONLY)
 
@@ -46,17 +47,17 @@ class LevenbergMarquardt:
             check_count(self.longest, "longest", least=self.iterations)
 
     def at_most(self, iterations: int) -> LevenbergMarquardt:
-        """Return the same with fewer iterations, a limit that no run passes."""
+        """Return the solver with fewer iterations, a limit that no run passes."""
         iterations = min(self.iterations, iterations)
         return replace(self, iterations=iterations, longest=iterations)
 
     @property
     def within_limit(self) -> LevenbergMarquardt:
-        """Return the same without iterations past the limit, for runs that only lead to others."""
+        """The solver without iterations past the limit, for runs that only lead to others."""
         return self.at_most(self.iterations)
 
     def after(self, done: int) -> LevenbergMarquardt:
-        """Return the same with the iterations that are left after `done` of them."""
+        """Return the solver with the iterations that are left after `done` of them."""
         limit = self.limit()
         left = max(limit.iterations - done, 0)
         return replace(self, iterations=left, longest=max(limit.longest - done, left))
@@ -77,17 +78,32 @@ class LevenbergMarquardt:
         overlap: Overlap,
         **options: Any,
     ) -> TrainingRun:
-        """`‖r(w)‖² + α‖w‖²` from `w`, compiled whole: the rows are in memory; see `compiled.minimise`."""
+        """Minimise `‖r(w)‖² + α‖w‖²` from `w`, compiled whole: the rows are in memory.
+
+        See `compiled.minimise`.
+        """
         return compiled.minimise(criterion, w, arguments, overlap, self._settings(**options))
 
     def drive(
-        self, normal_at: Callable[[Any, Overlap], Normal], w: Float[Array, "nw"], overlap: Overlap, **options: Any
+        self,
+        normal_at: Callable[[Any, Overlap], Normal],
+        w: Float[Array, "nw"],
+        overlap: Overlap,
+        **options: Any,
     ) -> TrainingRun:
-        """The same, pass by pass: the rows are elsewhere; see `compiled.driven`."""
+        """Minimise the same pass by pass, for rows elsewhere; see `compiled.driven`."""
         return compiled.driven(normal_at, w, overlap, self._settings(**options))
 
     def descend(
-        self, objective: SquaredResiduals, p: Vector, start: Any, *, noticeable: float = 0.0, **options: Any
+        self,
+        objective: SquaredResiduals,
+        p: Vector,
+        start: Any,
+        *,
+        noticeable: float = 0.0,
+        **options: Any,
     ) -> Descent:
-        """`‖r(p)‖² + α‖w‖²` from p, driven by the host; see `descent.descend`."""
-        return descend(objective, p, start, limit=self.limit(noticeable), tolerance=self.tolerance, **options)
+        """Minimise `‖r(p)‖² + α‖w‖²` from p, driven by the host; see `descent.descend`."""
+        return descend(
+            objective, p, start, limit=self.limit(noticeable), tolerance=self.tolerance, **options
+        )

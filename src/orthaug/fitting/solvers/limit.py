@@ -1,9 +1,10 @@
-"""The limit of a run's iterations, and how far past it a run goes while its loss still falls noticeably.
+"""The limit of a run's iterations, and its extension while the loss still falls noticeably.
 
-A run that has not converged at its limit is judged by the last quarter of the limit: did the loss fall there by more
-than the `noticeable` fraction? For residuals of variance σ² the parameters are at most `√(N d)` standard errors from
-the minimum when the loss is the fraction d above it, since `N d` is what χ² has still to fall by. What is still to fall
-is about what fell last, so a fall of `1/(4 N)` means half a standard error: `noticeable_in(N)`.
+A run that has not converged at its limit is judged by the last quarter of the limit: did the loss
+fall there by more than the `noticeable` fraction? For residuals of variance σ² the parameters are
+at most `√(N d)` standard errors from the minimum when the loss is the fraction d above it, since `N
+d` is what χ² has still to fall by. What is still to fall is about what fell last, so a fall of
+`1/(4 N)` means half a standard error: `noticeable_in(N)`.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ class Limit(NamedTuple):
     Args:
         iterations: the limit.
         longest: the limit while the loss still falls noticeably; `iterations` for none beyond.
-        noticeable: a relative fall of the loss over the last quarter of the limit that is worth going on for.
+        noticeable: a relative fall of the loss over the last quarter of the limit that is worth
+            going on for.
     """
 
     iterations: int
@@ -30,7 +32,7 @@ class Limit(NamedTuple):
 
     @property
     def window(self) -> int:
-        """Return the number of last steps over which the fall of the loss is judged."""
+        """Number of last steps over which the fall of the loss is judged."""
         return max(self.iterations // 4, min(_FEWEST, self.iterations), 1)
 
     def reached(self, done: int, before: float, loss: float) -> bool:
@@ -56,12 +58,16 @@ class Limit(NamedTuple):
 
     def begins_window(self, done: int) -> bool:
         """Return whether a window begins after `done` steps."""
-        end = min((done // self.iterations + 1) * self.iterations, self.longest) if self.iterations else 0
+        end = (
+            min((done // self.iterations + 1) * self.iterations, self.longest)
+            if self.iterations
+            else 0
+        )
         return done == end - self.window
 
 
 def relative_fall(before: float, loss: float) -> float:
-    """Return by what fraction of itself the loss changed; with evidence it may also rise."""
+    """Return the relative change of the loss; with evidence it may also rise."""
     return abs(before - loss) / loss if loss > 0 else 0.0
 
 
@@ -86,19 +92,27 @@ class Tail(NamedTuple):
     def of(cls, limit: Limit, done: int, before: float, loss: float, *, converged: bool) -> Tail:
         """Return the tail of a run with that limit; `before` and `loss` as in `Limit.reached`."""
         noticeable = not converged and limit.iterations > 0 and limit.falls(before, loss)
-        return cls(done, limit.iterations, min(limit.window, done), relative_fall(before, loss), noticeable)
+        return cls(
+            done, limit.iterations, min(limit.window, done), relative_fall(before, loss), noticeable
+        )
 
     @property
     def prolonged(self) -> bool:
-        """Return whether the run went on past its limit."""
+        """True where the run went on past its limit."""
         return 0 < self.limit < self.done
 
 
 def longest_of(iterations: int, default: int) -> int:
-    """Return how far a run may go: ten times the default limit; a limit that somebody chose is not passed."""
+    """Return the largest number of steps of a run: ten times the default limit.
+
+    A limit that somebody chose is not passed.
+    """
     return _PROLONGED * iterations if iterations == default else iterations
 
 
 def noticeable_in(residuals: float) -> float:
-    """Return the fall of the loss over N residuals by which parameters still move by half a standard error."""
+    """Return the noticeable fall of a loss over N residuals.
+
+    At that fall, parameters still move by half a standard error.
+    """
     return _HALF_AN_ERROR / max(residuals, 1.0)

@@ -1,7 +1,7 @@
-"""What is to be explained: a learner's output over data, beside what the parameters of the physics could do.
+"""Linearization of a learner's output over data, beside the physics' own parameters.
 
-Of a lagged model over the rows of a record, of a motion over the states and inputs of its free run there, by what it
-does to the outputs.
+For a lagged model the data are the rows of a record; for a motion the states and inputs of its free
+run, where the output counts by its effect on the outputs.
 """
 
 from __future__ import annotations
@@ -25,20 +25,22 @@ from orthaug.models.dynamics import Numbers
 from orthaug.models.model import Model
 from orthaug.models.motion_field import labels_of, parts_at
 from orthaug.models.motion_model import MotionModel
-from orthaug.models.moving import Moving
+from orthaug.models.moving import MotionDynamics
 from orthaug.models.statistics import JointCovariance
 from orthaug.physics.baseline import Baseline, Parameter
 from orthaug.physics.motion import Motion
 from orthaug.physics.parameters import PhysicalParameter
 
 MOST_CELLS = 10_000
-"""Values of the learner that are looked at: a smooth function needs no more, and candidates are kept beside them."""
+"""Values of the learner that are looked at: a smooth function needs no more, and candidates are
+kept beside them.
+"""
 FEWEST = 20  # of them
 MOST_WEIGHTS = 2000  # of a learner whose tangent is looked at
 
 
 class Tangent(NamedTuple):
-    """What the learner's weights w do to what is fitted, whitened, and what training left of the weights."""
+    """Derivatives by the learner's weights w, whitened, and the covariance of w after training."""
 
     jacobian: Float[np.ndarray, "R nw"]
     weights: Vector
@@ -47,12 +49,12 @@ class Tangent(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Ground:
+class LearnedLinearization:
     """The learner over M points in nl outputs or equations (`places`: name and unit).
 
-    `target` is the learner in their units, `physics_moves` what the parameters, and starts of runs, do to what is
-    fitted. `weight` (nl, nl) whitens a row of a lagged model. `outside` is the share of the points beyond the training
-    data.
+    `target` is the learner in their units, `physics_moves` what the parameters, and starts of runs,
+    do to what is fitted. `weight` (nl, nl) whitens a row of a lagged model. `outside` is the share
+    of the points beyond the training data.
     """
 
     target: Float[np.ndarray, "M nl"]
@@ -64,7 +66,7 @@ class Ground:
     signals: tuple[str, ...]
     """What the learner sees, as expressions, and rates of change that follow from it."""
     seen: int
-    """How many of the signals the learner sees as they stand."""
+    """Number of signals that the learner sees as they are."""
     units: dict[str, str]
     parse: Callable[[str], Expression]
     evaluate: Callable[[Expression], Any]
@@ -78,13 +80,15 @@ class Ground:
     outside: float
 
     def column(self, expression: Expression, place: int) -> Vector:
-        """A term with coefficient 1, whitened, all points and places below each other (M·nl,)."""
+        """Return a term with coefficient 1, whitened, all points and places stacked (M·nl,)."""
         with np.errstate(all="ignore"):
-            values = np.broadcast_to(np.asarray(self.evaluate(expression), dtype=float), (len(self.target),))
+            values = np.broadcast_to(
+                np.asarray(self.evaluate(expression), dtype=float), (len(self.target),)
+            )
         return (values[:, None] * self.weight[:, place]).ravel()
 
     def fitted(self, columns: Float[np.ndarray, "P *k"]) -> np.ndarray:
-        """What columns over the points do to what was fitted (R, …)."""
+        """Return the effect of columns over the points on the fitted values (R, …)."""
         return columns if self.response is None else self.response.forward(columns)
 
     @property
@@ -93,23 +97,26 @@ class Ground:
         return np.einsum("oi,mi->mo", self.weight, self.target).ravel()
 
 
-def ground_of(model: Model | MotionModel, record: Record) -> Ground:
-    """The learner of a model over a record.
+def linearization_of(model: Model | MotionModel, record: Record) -> LearnedLinearization:
+    """Return the learner of a model over a record.
 
     Raises:
         InputError: a model without a learner, other channels, too few rows, or none with a value.
     """
     if model.form.bound is None:
         raise InputError("the model is physics alone: it has no learner that could be explained.")
-    ground = _of_motion(model, record) if isinstance(model, MotionModel) else _of_lagged(model, record)
-    if len(ground.target) < FEWEST:
+    linearization = (
+        _of_motion(model, record) if isinstance(model, MotionModel) else _of_lagged(model, record)
+    )
+    if len(linearization.target) < FEWEST:
         raise InputError(
-            f"the learner has a value at {len(ground.target)} rows of the data; at least {FEWEST} are needed."
+            f"the learner has a value at {len(linearization.target)} rows of the data; at "
+            f"least {FEWEST} are needed."
         )
-    return ground
+    return linearization
 
 
-def _of_lagged(model: Model, record: Record) -> Ground:
+def _of_lagged(model: Model, record: Record) -> LearnedLinearization:
     form = model.form
     if form.states and not record.outputs:
         names = ", ".join(channel.name for channel in model.outputs)
@@ -118,14 +125,20 @@ def _of_lagged(model: Model, record: Record) -> Ground:
     x = (
         stack_rows(record, form.layout).x
         if record.outputs
-        else np.concatenate([lag_matrix(e, form.layout, record, form.first_row) for e in record.experiments])
+        else np.concatenate(
+            [lag_matrix(e, form.layout, record, form.first_row) for e in record.experiments]
+        )
     )
     x = x[:: max(1, -(-len(x) * len(form.outputs) // MOST_CELLS))]
     with np.errstate(all="ignore"):
         target = model.learner_at(x) if len(x) else np.zeros((0, len(form.outputs)))
         phi = np.asarray(form.baseline.phi(x, form.layout, form.outputs, np))
         z = np.asarray(form.features.evaluate(x, form.layout, np))
-    finite = np.isfinite(target).all(axis=1) & np.isfinite(phi).all(axis=(1, 2)) & np.isfinite(z).all(axis=1)
+    finite = (
+        np.isfinite(target).all(axis=1)
+        & np.isfinite(phi).all(axis=(1, 2))
+        & np.isfinite(z).all(axis=1)
+    )
     x, target, phi, z = x[finite], target[finite], phi[finite], z[finite]
     constants = {SAMPLING_TIME: model.sampling_time} | dict(form.baseline.constants)
     for entry in form.features.entries:
@@ -133,7 +146,7 @@ def _of_lagged(model: Model, record: Record) -> Ground:
     columns = {lag: x[:, j] for j, lag in enumerate(form.layout)}
     own = tuple(dict.fromkeys(str(entry) for entry in form.features.entries))
     c = model.theta - model.theta_aux
-    return Ground(
+    return LearnedLinearization(
         target=target,
         physics_moves=_stacked(np.einsum("oi,mit->mot", model.weight, phi)),
         weight=np.asarray(model.weight),
@@ -141,7 +154,8 @@ def _of_lagged(model: Model, record: Record) -> Ground:
         places=tuple((channel.name, channel.unit) for channel in model.outputs),
         signals=(*own, *_rates_of_change(form.outputs, own)),
         seen=len(own),
-        units={channel.name: channel.unit for channel in (*model.outputs, *model.inputs)} | {SAMPLING_TIME: "s"},
+        units={channel.name: channel.unit for channel in (*model.outputs, *model.inputs)}
+        | {SAMPLING_TIME: "s"},
         parse=lambda text: parse(text, constants),
         evaluate=lambda expression: expression.evaluate(columns, np),
         moved=lambda along: c + along,
@@ -153,7 +167,7 @@ def _of_lagged(model: Model, record: Record) -> Ground:
     )
 
 
-def _of_motion(model: MotionModel, record: Record) -> Ground:
+def _of_motion(model: MotionModel, record: Record) -> LearnedLinearization:
     form, numbers, motion = model.form, model.numbers, model.form.motion
     record = model.fitting(record, need_outputs=False)
     run = _Run.of(model, record)
@@ -169,7 +183,7 @@ def _of_motion(model: MotionModel, record: Record) -> Ground:
     z = np.asarray(form.seen(x.T, u.T, np)).T
     units = {channel.name: channel.unit for channel in (*model.outputs, *model.inputs)}
     units |= {parameter.name: parameter.unit for parameter in motion.parameters}
-    return Ground(
+    return LearnedLinearization(
         target=target,
         physics_moves=np.concatenate([linear.forward(slopes), linear.starts()], axis=1),
         weight=np.eye(len(learned)),
@@ -191,11 +205,14 @@ def _of_motion(model: MotionModel, record: Record) -> Ground:
 
 @dataclass(frozen=True, eq=False)
 class MotionResponse:
-    """The tangent system along a free run: from terms at M points in all equations and outputs to whitened outputs.
+    """Tangent system along a free run: from terms at M points to whitened outputs.
 
-    `s_{k+1} = A_k s_k + h/2 (A_k t_k + t_{k+1})`, `y_k = C_k s_k + o_k` for terms t in the equations and o in the
-    outputs, h the sampling time; A, `steps`, and C, `outputs`, are derivatives of the fitted motion. A segment of
-    training starts anew, from a state that was estimated beside everything else: `begins` (M,) tells where.
+    Terms are those in all equations and outputs.
+
+    `s_{k+1} = A_k s_k + h/2 (A_k t_k + t_{k+1})`, `y_k = C_k s_k + o_k` for terms t in the
+    equations and o in the outputs, h the sampling time; A, `steps`, and C, `outputs`, are
+    derivatives of the fitted motion. A segment of training starts anew, from a state that was
+    estimated beside everything else: `begins` (M,) marks where.
     """
 
     steps: Float[np.ndarray, "M nx nx"]
@@ -207,15 +224,22 @@ class MotionResponse:
 
     @classmethod
     def of(
-        cls, form: Moving, numbers: Numbers, x: Matrix, u: Matrix, rows: Matrix, begins: Any, weight: Matrix
+        cls,
+        form: MotionDynamics,
+        numbers: Numbers,
+        x: Matrix,
+        u: Matrix,
+        rows: Matrix,
+        begins: Any,
+        weight: Matrix,
     ) -> MotionResponse:
-        """Along states x (M, nx) and inputs u (M, nu), with the rows that steps read."""
+        """Return the system along states x (M, nx) and inputs u (M, nu), with the steps' rows."""
         steps, outputs = (np.asarray(part) for part in _derivatives(form, numbers, x, u, rows))
         half = 0.0 if form.motion.integrator == "discrete" else form.sampling_time / 2
         return cls(np.nan_to_num(steps), weight @ np.nan_to_num(outputs), begins, weight, half)
 
     def forward(self, terms: Float[np.ndarray, "M n k"]) -> Float[np.ndarray, "R k"]:
-        """Of terms in all equations and then all outputs (n = nx + ny)."""
+        """Return outputs for terms in all equations and then all outputs (n = nx + ny)."""
         count, nx, _ = self.steps.shape
         moved, direct = terms[:, :nx], np.einsum("oi,mik->mok", self.weight, terms[:, nx:])
         s, found = np.zeros((nx, terms.shape[2])), np.zeros_like(direct)
@@ -230,7 +254,7 @@ class MotionResponse:
         return found.reshape(-1, terms.shape[2])
 
     def adjoint(self, values: Float[np.ndarray, "R k"]) -> Float[np.ndarray, "M n k"]:
-        """The transpose of `forward`."""
+        """Return the transpose of `forward`."""
         count, nx, _ = self.steps.shape
         w = values.reshape(count, -1, values.shape[1])
         direct = np.einsum("oi,mok->mik", self.weight, w)
@@ -248,7 +272,7 @@ class MotionResponse:
         return np.concatenate([found, direct], axis=1)
 
     def starts(self) -> Float[np.ndarray, "R s"]:
-        """What the states at the begin of each segment do."""
+        """Return the effect of the states at the beginning of each segment."""
         count, nx, _ = self.steps.shape
         places = np.flatnonzero(self.begins)
         found = np.zeros((count, self.outputs.shape[1], nx * len(places)))
@@ -261,8 +285,10 @@ class MotionResponse:
 
 
 @partial(jax.jit, static_argnames="form")
-def _derivatives(form: Moving, numbers: Numbers, x: Any, u: Any, rows: Any) -> tuple[Any, Any]:
-    """∂(next state)/∂x and ∂y/∂x at points."""
+def _derivatives(
+    form: MotionDynamics, numbers: Numbers, x: Any, u: Any, rows: Any
+) -> tuple[Any, Any]:
+    """Return ∂(next state)/∂x and ∂y/∂x at points."""
     numbers = form.prepared(numbers)
     steps = jax.vmap(lambda x, row: jax.jacfwd(lambda s: form.step(numbers, s, row)[0])(x))(x, rows)
     return steps, jax.vmap(lambda x, u: jax.jacfwd(lambda s: form.observed(numbers, s, u))(x))(x, u)
@@ -277,7 +303,7 @@ class Response:
     equations: int
 
     def forward(self, columns: Float[np.ndarray, "P *k"]) -> np.ndarray:
-        """Of columns over all points and places, to whitened outputs."""
+        """Return whitened outputs for columns over all points and places."""
         single = columns.ndim == 1
         table = columns.reshape(-1, len(self.learned), 1 if single else columns.shape[1])
         terms = np.zeros((len(table), self.equations, table.shape[2]))
@@ -286,12 +312,15 @@ class Response:
         return found[:, 0] if single else found
 
     def adjoint(self, values: Float[np.ndarray, "R k"]) -> Float[np.ndarray, "P k"]:
-        """The transpose."""
+        """Return the transpose."""
         return _stacked(self.linear.adjoint(values)[:, list(self.learned)])
 
 
 class _Run(NamedTuple):
-    """States, inputs, and the rows that steps read, along free runs where they have values; where segments begin."""
+    """States, inputs, and the rows that steps read, along free runs where they have values.
+
+    Where segments begin.
+    """
 
     x: Matrix
     u: Matrix
@@ -300,7 +329,7 @@ class _Run(NamedTuple):
 
     @classmethod
     def of(cls, model: MotionModel, record: Record) -> _Run:
-        """Of a long record the first rows."""
+        """Return the run of a record, of a long one over its first rows."""
         states = model.states(record, initial="measured" if record.outputs else "zero")
         states = states[list(model.form.motion.names_of_states)].to_numpy()
         length = model.trained.segment if model.trained is not None else 0
@@ -318,21 +347,23 @@ class _Run(NamedTuple):
 
 
 def _stacked(values: Float[np.ndarray, "M n *k"]) -> np.ndarray:
-    """All points and places below each other."""
+    """Return all points and places below each other."""
     return values.reshape(values.shape[0] * values.shape[1], *values.shape[2:])
 
 
 def _places(model: MotionModel) -> tuple[tuple[str, str], ...]:
-    """Name and unit of every learned equation, by its state, and of every learned output."""
+    """Return name and unit of every learned equation, by its state, and of every learned output."""
     motion = model.form.motion
     states, outputs = motion.learned
     names = [motion.states[i].name for i in states] + [motion.outputs[i].name for i in outputs]
-    units = [unit for _, unit in labels_of(model.form)][: len(states)] + [model.outputs[i].unit for i in outputs]
+    units = [unit for _, unit in labels_of(model.form)][: len(states)] + [
+        model.outputs[i].unit for i in outputs
+    ]
     return tuple(zip(names, units, strict=True))
 
 
 def _moved(motion: Motion, q: Vector, along: Vector, x: Matrix, u: Matrix) -> Vector:
-    """The parameters after a step of their coordinates q (np,), along a line of the parameters themselves.
+    """Return the parameters after a step of their coordinates q (np,), along a straight line.
 
     A step of logarithms where that would end at a zero that the equations divide by.
     """
@@ -345,7 +376,7 @@ def _moved(motion: Motion, q: Vector, along: Vector, x: Matrix, u: Matrix) -> Ve
 
 
 def _rates_of_change(outputs: Sequence[str], seen: Sequence[str]) -> list[str]:
-    """The velocity of each output of which the learner sees two lags, one after the other."""
+    """Return the velocity of each output of which the learner reads two successive lags."""
     found = []
     for name in outputs:
         lags = [lag for lag in range(1, len(seen) + 2) if f"{name}[k-{lag}]" in seen]
@@ -356,14 +387,14 @@ def _rates_of_change(outputs: Sequence[str], seen: Sequence[str]) -> list[str]:
 
 
 def _beyond(model: Any, z: Matrix) -> float:
-    """Share of the points at which a feature lies outside those of training."""
+    """Return the share of the points with a feature outside its training range."""
     if not model.form.bound.differentiable or not len(z):
         return 0.0
     return float(np.mean(model.beyond(z)))
 
 
 def _tangent(model: Any, z: Matrix, weight: Matrix, response: Response | None) -> Tangent | None:
-    """The learner's derivatives at its features z (M, nz)."""
+    """Return the learner's derivatives at its features z (M, nz)."""
     bound, numbers, statistics = model.form.bound, model.numbers, model.statistics
     if not bound.differentiable or numbers.tilt is not None or not 0 < bound.size <= MOST_WEIGHTS:
         return None

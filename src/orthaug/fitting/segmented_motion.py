@@ -1,4 +1,4 @@
-"""The course of a motion: its record laid out in segments whose starts are unknown states."""
+"""A motion's record in segments whose initial states are unknowns."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.jax import Array, jax
-from orthaug.fitting.course import Course, Layout
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.initial_states import InitialStates
 from orthaug.fitting.objective import RUNAWAY, FreeRunObjective, errors_of
 from orthaug.fitting.segment_sums import SegmentSums
-from orthaug.fitting.segments import Segments, begins_of, lay_segments
+from orthaug.fitting.segmented_problem import Layout, SegmentedProblem
+from orthaug.fitting.segments import Segments, begins_of, build_segments
 from orthaug.fitting.structures import Structure
 from orthaug.models.dynamics import Numbers
 from orthaug.models.learners import Bound, Scaling
 from orthaug.models.motion_model import FIRST_ROWS
-from orthaug.models.moving import Moving
+from orthaug.models.moving import MotionDynamics
 from orthaug.models.settling import LOOSE, Windows, settle
 from orthaug.physics.motion_problem import MotionProblem
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MotionObjective(FreeRunObjective):
-    """`‖r‖²` of the free run, with starts that hardly cost anything."""
+    """`‖r‖²` of the free run, with initial states that have almost no prior."""
 
     loose: Vector
 
@@ -38,10 +38,13 @@ class MotionObjective(FreeRunObjective):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class MotionCourse(Course):
-    """A motion's record laid out in segments. `loose` (nx,) is how far a start may be from its guess."""
+class SegmentedMotion(SegmentedProblem):
+    """A motion's record in segments.
 
-    dynamics: Moving
+    `loose` (nx,) is how far a start may be from its guess.
+    """
+
+    dynamics: MotionDynamics
     problem: MotionProblem
     loose: Vector
 
@@ -51,21 +54,21 @@ class MotionCourse(Course):
         problem: MotionProblem,
         bound: Bound | None,
         criterion: Criterion,
-        like: MotionCourse | None = None,
+        like: SegmentedMotion | None = None,
         sums: SegmentSums | None = None,
-    ) -> MotionCourse:
-        """Lay a record out as a criterion of several steps declares, for the motion with a learner of unit scaling.
+    ) -> SegmentedMotion:
+        """Lay out a record as a criterion declares, for a motion and a learner of unit scaling.
 
-        With `like` in the shapes of another course, and with its substeps.
+        With `like` in the shapes of another layout, and with its substeps.
 
         Raises:
             InputError: nothing would be scored.
         """
-        record, flown = problem.record, criterion.flown
-        assert flown is not None, "a motion has no criterion one step ahead"
+        record, free_run = problem.record, criterion.free_run
+        assert free_run is not None, "a motion has no criterion one step ahead"
         features = () if bound is None else problem.features
         substeps = problem.substeps if like is None else like.dynamics.substeps
-        dynamics = Moving(problem.motion, features, bound, record.sampling_time, substeps)
+        dynamics = MotionDynamics(problem.motion, features, bound, record.sampling_time, substeps)
         nz, nl = len(features), 0 if bound is None else bound.ny
         shares = 1 if sums is None else sums.engine.shares
         return cls(
@@ -73,7 +76,7 @@ class MotionCourse(Course):
             dynamics=dynamics,
             **Layout.of(record, dynamics, criterion, like, shares)._asdict(),
             criterion=criterion,
-            flown=flown,
+            free_run=free_run,
             rms=1.0,
             deviation=problem.deviation,
             output_weights=problem.weight.choice,
@@ -89,33 +92,46 @@ class MotionCourse(Course):
         return self.dynamics.bound
 
     @property
-    def alone(self) -> MotionCourse:
-        """The same segments without a learner."""
+    def alone(self) -> SegmentedMotion:
+        """The problem without a learner."""
         nothing = Scaling(np.zeros(0), np.ones(0))
         return replace(self, dynamics=self.dynamics.alone, scaling=nothing, unit=np.ones(0))
 
-    def over(self, segment: int) -> MotionCourse:
-        """The same over segments of another length, without washout; 0 for whole experiments."""
-        segments = lay_segments(self.record, self.dynamics, segment, 0, shares=self.shares)
-        return replace(self, segments=segments, flown=replace(self.flown, segment=segment, washout=0))
+    def over(self, segment: int) -> SegmentedMotion:
+        """Return the problem in segments of another length, without washout.
 
-    def refined(self, substeps: int) -> MotionCourse:
-        """The same with other substeps of the integrator."""
+        0 for whole experiments.
+        """
+        segments = build_segments(self.record, self.dynamics, segment, 0, shares=self.shares)
+        return replace(
+            self, segments=segments, free_run=replace(self.free_run, segment=segment, washout=0)
+        )
+
+    def refined(self, substeps: int) -> SegmentedMotion:
+        """Return the problem with other substeps of the integrator."""
         dynamics = replace(self.dynamics, substeps=substeps)
         finer = replace(self, dynamics=dynamics)
-        if dynamics.motion.hold != "spline":  # otherwise steps read the input at the points of the substeps
+        if (
+            dynamics.motion.hold != "spline"
+        ):  # otherwise steps read the input at the points of the substeps
             return finer
-        laid = Layout.of(self.record, dynamics, self.criterion, self, self.shares)
-        segments = laid.segments if self.flown == self.criterion.flown else finer.over(self.flown.steps).segments
+        layout = Layout.of(self.record, dynamics, self.criterion, self, self.shares)
+        segments = (
+            layout.segments
+            if self.free_run == self.criterion.free_run
+            else finer.over(self.free_run.steps).segments
+        )
         start = np.asarray(self.segments.start)
-        return replace(finer, segments=segments._replace(start=start), whole=laid.whole, colour=laid.colour)
+        return replace(
+            finer, segments=segments._replace(start=start), whole=layout.whole, colour=layout.colour
+        )
 
-    def from_states(self, states: Float[np.ndarray, "k n0 m"]) -> MotionCourse:
-        """The same with segments that start there."""
+    def from_states(self, states: Float[np.ndarray, "k n0 m"]) -> SegmentedMotion:
+        """Return the problem with segments that start at these states."""
         return replace(self, segments=self.segments._replace(start=np.asarray(states)))
 
     def objective(self, structure: Structure | None = None) -> MotionObjective:
-        """The criterion as a function of the parameters' coordinates and the weights."""
+        """Return the criterion as a function of the parameters' coordinates and the weights."""
         return MotionObjective(
             dynamics=self.dynamics,
             numbers=self.numbers,
@@ -133,11 +149,13 @@ class MotionCourse(Course):
 
     @property
     def weight(self) -> Matrix:
-        """(ny, ny), multiplies errors: they are then in the unit of what physics alone leaves."""
+        """The matrix (ny, ny) that gives errors in the unit of the residual of physics alone."""
         return self.problem.weight.matrix / self.rms
 
-    def settled(self, c: Vector, w: Any = (), segments: Segments | None = None, iterations: int = 12) -> np.ndarray:
-        """The starts (k, n0, m) by which the segments follow the outputs best."""
+    def settled(
+        self, c: Vector, w: Any = (), segments: Segments | None = None, iterations: int = 12
+    ) -> np.ndarray:
+        """Return the initial states (k, n0, m) by which segments follow the outputs best."""
         segments = self.segments if segments is None else segments
         numbers, states = self.numbers(c, np.asarray(w)), []
         for start, inputs, target, scored in zip(*map(np.asarray, segments), strict=True):
@@ -147,7 +165,11 @@ class MotionCourse(Course):
         return np.stack(states)
 
     def mean_square(self, c: Vector, w: Any, tilt: Any = None) -> float:
-        """Mean of squared errors over whole experiments, in deviations of the outputs; NaN where it diverges.
+        """Return the mean of squared errors over whole experiments.
+
+        Outputs in their deviations.
+
+        NaN where it diverges.
 
         A whole experiment starts where a free run follows its first rows best.
         """
@@ -162,21 +184,21 @@ class MotionCourse(Course):
         return mean if mean < RUNAWAY else np.nan
 
     def runs(self, c: Vector, w: Any, states: Any) -> Float[np.ndarray, "k T n0 m"]:
-        """The states along every segment from these starts."""
+        """Return the states along every segment from these starts."""
         return np.asarray(_states(self.dynamics, self.numbers(c, w), self.segments, states))
 
     def trajectory(self, c: Vector, w: Any, states: Any) -> tuple[Matrix, Matrix]:
-        """States (N, nx) and inputs (N, nu) of the segments' runs from these starts, on the rows that are scored."""
+        """Return states (N, nx) and inputs (N, nu) of the segments' runs, on scored rows."""
         runs = self.runs(c, w, states)
         scored = np.moveaxis(np.asarray(self.segments.scored), -1, 1)
         inputs = np.moveaxis(np.asarray(self.segments.inputs), -1, 1)[scored]
         return np.moveaxis(runs, -1, 1)[scored], self.dynamics.now(inputs)
 
     def states_by_row(self, c: Vector, w: Any, states: Any) -> list[Matrix]:
-        """The states (N, nx) of every experiment, put together from the segments' runs."""
+        """Return the states (N, nx) of every experiment, joined from the segments' runs."""
         runs = np.moveaxis(self.runs(c, w, states), -1, 1)
         rows, place, found = runs.reshape(-1, *runs.shape[2:]), 0, []
-        steps, washout = self.segments.steps, min(self.flown.washout, self.segments.steps - 1)
+        steps, washout = self.segments.steps, min(self.free_run.washout, self.segments.steps - 1)
         for experiment in self.record.experiments:
             own = np.zeros((len(experiment), self.dynamics.states))
             for begin in begins_of(len(experiment), steps, washout):
@@ -187,9 +209,9 @@ class MotionCourse(Course):
             found.append(own)
         return found
 
-    def starting_from(self, rows: list[Matrix]) -> MotionCourse:
-        """The same with segments that start at the states (N, nx) given for every row of every experiment."""
-        steps, washout = self.segments.steps, min(self.flown.washout, self.segments.steps - 1)
+    def starting_from(self, rows: list[Matrix]) -> SegmentedMotion:
+        """Return the problem with segments that start at given states (N, nx) of all rows."""
+        steps, washout = self.segments.steps, min(self.free_run.washout, self.segments.steps - 1)
         starts = []
         for experiment, own in zip(self.record.experiments, rows, strict=True):
             starts.append(own[begins_of(len(experiment), steps, washout)])
@@ -201,14 +223,16 @@ class MotionCourse(Course):
 
 
 def sizes(problem: MotionProblem) -> Vector:
-    """How large each state is (nx,): of its guesses; 1 where nothing is known."""
+    """Return the size of each state (nx,), from its guesses; 1 where none is known."""
     size = np.abs(problem.looked_at[0]).max(axis=1)
     return np.where(size > 0, size, 1.0)
 
 
 @partial(jax.jit, static_argnames="form")
-def _states(form: Moving, numbers: Numbers, segments: Segments, states: Float[Array, "k n0 m"]) -> Any:
-    """The states (k, T, n0, m) of every segment's run."""
+def _states(
+    form: MotionDynamics, numbers: Numbers, segments: Segments, states: Float[Array, "k n0 m"]
+) -> Any:
+    """Return the states (k, T, n0, m) of every segment's run."""
     numbers = form.prepared(numbers)
     side_by_side = jax.vmap(lambda state, row: form.step(numbers, state, row)[0], -1, -1)
 

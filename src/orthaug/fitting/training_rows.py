@@ -1,4 +1,4 @@
-"""Rows laid out for an engine, with the learner that is trained on them: what both say of each other are sums (F4)."""
+"""Rows prepared for an engine, and the learner trained on them by sums over rows (F4)."""
 
 from __future__ import annotations
 
@@ -9,28 +9,39 @@ import numpy as np
 from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug.fitting.learned import Learned
+from orthaug.fitting.learned import TrainedLearner
 from orthaug.fitting.normal_equations import Blocks
 from orthaug.inference.covariance import mixing
 from orthaug.models.learners import Bound, Scaling
-from orthaug.models.rows import Engine, LearnerSums, MixedGram, Overlap, ResidualGram, from_chunks, row_values
+from orthaug.models.rows import (
+    Engine,
+    LearnerSums,
+    MixedGram,
+    Overlap,
+    ResidualGram,
+    from_chunks,
+    row_values,
+)
 from orthaug.physics.problem import Problem
 from orthaug.physics.streamed import StreamedProblem
 
 
 class Share(NamedTuple):
-    """The learner's values F over the rows, in whitened outputs: QᵀF (nθ,), its part in the physics, and ‖F‖²."""
+    """The learner's values F over the rows: QᵀF (nθ,), its part in the physics, and ‖F‖².
+
+    In whitened outputs.
+    """
 
     coordinates: Vector
     square: float
 
 
 @dataclass(frozen=True, eq=False)
-class LaidRows:
+class TrainingRows:
     """A problem with its learner (None for physics alone), scaled for training.
 
-    `unit` (ny,) is the learner's output unit in the outputs' units. `rms` is the RMS of the baseline's whitened
-    residual, the unit of the criterion's rows. The engine keeps these rows.
+    `unit` (ny,) is the learner's output unit in the outputs' units. `rms` is the RMS of the
+    baseline's whitened residual, the unit of the criterion's rows. The engine keeps these rows.
     """
 
     problem: Problem
@@ -42,17 +53,20 @@ class LaidRows:
     rows: Any
 
     @property
-    def _nothing(self) -> Overlap:
-        """No overlap known yet."""
+    def _no_overlap(self) -> Overlap:
+        """The overlap before any pass."""
         nt, size = len(self.problem.baseline.names), self.bound.size if self.bound else 0
         return Overlap(np.zeros((nt, size)), np.zeros(nt))
 
     def mean_square(self, loss: Any) -> float:
-        """The criterion's `‖r‖²` as the mean of squared errors with each output in its standard deviation."""
+        """Return the criterion's `‖r‖²` as a mean of squared errors.
+
+        Each output counts in its standard deviation.
+        """
         return float(loss) * self.rms**2 / self.problem.samples
 
-    def share(self, learned: Learned) -> Share:
-        """QᵀF, refined once, and ‖F‖²; not finite where the learner is not."""
+    def share(self, learned: TrainedLearner) -> Share:
+        """Return QᵀF, refined once, and ‖F‖²; not finite where the learner is not."""
         f = np.zeros(len(self.problem.baseline.names))
         if learned.bound is None:
             return Share(f, 0.0)
@@ -61,51 +75,60 @@ class LaidRows:
             f = f + rest
         return Share(f, square)
 
-    def left_share(self, learned: Learned, theta: Vector) -> Vector:
-        """Qᵀ(F − Φθ) (nθ,), in whitened outputs."""
+    def left_share(self, learned: TrainedLearner, theta: Vector) -> Vector:
+        """Return Qᵀ(F − Φθ) (nθ,), in whitened outputs."""
         return self._sums(learned, self.problem.projection.to_coordinates @ theta)[0]
 
-    def residual_gram(self, learned: Learned, c: Vector) -> Matrix:
-        """Σ r rᵀ (ny, ny) of the residual r = Y − F − Φc, in whitened outputs."""
+    def residual_gram(self, learned: TrainedLearner, c: Vector) -> Matrix:
+        """Return Σ r rᵀ (ny, ny) of the residual r = Y − F − Φc, in whitened outputs."""
         problem = self.problem
         physics = problem.target_coordinates - problem.projection.to_coordinates @ c
-        total = self.engine.sum(ResidualGram(learned.bound), self.rows, *self._weights(learned), physics / self.rms)
+        total = self.engine.sum(
+            ResidualGram(learned.bound), self.rows, *self._weights(learned), physics / self.rms
+        )
         return np.asarray(total) * self.rms**2
 
-    def _sums(self, learned: Learned, shift: Vector) -> tuple[Vector, float]:
+    def _sums(self, learned: TrainedLearner, shift: Vector) -> tuple[Vector, float]:
         summed = LearnerSums(learned.bound)
         rest, square = self.engine.sum(summed, self.rows, *self._weights(learned), shift / self.rms)
         return np.asarray(rest) * self.rms, float(square) * self.rms**2
 
     def values(self, w: Any) -> Float[np.ndarray, "N ny"]:
-        """f at the training rows, in the outputs' units; the rows are in memory."""
+        """Return f at the training rows in memory, in the outputs' units."""
         if self.bound is None:
             return np.zeros_like(self.problem.target)
-        return from_chunks(row_values(self.bound, w, self.rows.z), len(self.problem.rows)) * self.unit
+        return (
+            from_chunks(row_values(self.bound, w, self.rows.z), len(self.problem.rows)) * self.unit
+        )
 
     def share_of(self, w: Vector) -> Vector:
-        """QᵀF (nθ,) of the learner with the weights w, in whitened outputs."""
+        """Return QᵀF (nθ,) of the learner with the weights w, in whitened outputs."""
         if not self.engine.resident or isinstance(self.problem, StreamedProblem):
-            sums = self.engine.sum(LearnerSums(self.bound), self.rows, w, None, self._nothing.values)
+            sums = self.engine.sum(
+                LearnerSums(self.bound), self.rows, w, None, self._no_overlap.values
+            )
             return np.asarray(sums[0]) * self.rms
         return self.problem.projection.coordinates(self.problem.weight.rows(self.values(w)))
 
     def share_slope(self, w: Vector) -> Matrix:
-        """QᵀJ (nθ, nw) of the learner with the weights w, in whitened outputs."""
+        """Return QᵀJ (nθ, nw) of the learner with the weights w, in whitened outputs."""
         nt = len(self.problem.baseline.names)
         if self.bound is None:
             return np.zeros((nt, 0))
-        total = self.engine.sum(Blocks(self.bound), self.rows, w, self._nothing)
+        total = self.engine.sum(Blocks(self.bound), self.rows, w, self._no_overlap)
         return np.asarray(total[:nt, nt + 1 :]) * self.rms
 
-    def _weights(self, learned: Learned) -> tuple[Any, Any]:
-        """Weights and tilt of a learned function, the tilt in the coordinates of the rows."""
+    def _weights(self, learned: TrainedLearner) -> tuple[Any, Any]:
+        """Return weights and tilt of a learned function, the tilt in the rows' coordinates."""
         if learned.tilt is None:
             return learned.weights, None
         return learned.weights, learned.tilt @ self.problem.projection.to_coordinates.T / self.rms
 
     def middle(self, w: Any, noise: Matrix) -> Matrix:
-        """ΣψᵀΣ_eψ of `[Φ J]` for the noise covariance of whitened outputs; one pass over the rows."""
+        """Return ΣψᵀΣ_eψ of `[Φ J]` for the noise covariance of whitened outputs.
+
+        One pass over the rows.
+        """
         mix = mixing(noise)
         total = np.asarray(self.engine.sum(MixedGram(self.bound), self.rows, w, mix))
         to_phi = self.problem.projection.to_coordinates
@@ -115,5 +138,5 @@ class LaidRows:
         return change.T @ total @ change
 
     def physics_middle(self, noise: Matrix) -> Matrix:
-        """ΣqᵀΣ_eq (nθ, nθ) of the rows q of Q, for the noise covariance of whitened outputs."""
+        """Return ΣqᵀΣ_eq (nθ, nθ) of the rows q of Q, for whitened noise covariance."""
         return np.asarray(self.engine.sum(MixedGram(None), self.rows, np.zeros(0), mixing(noise)))

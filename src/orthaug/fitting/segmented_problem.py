@@ -1,4 +1,4 @@
-"""A record laid out in segments for a criterion of several steps, and a descent over them, of any dynamics."""
+"""A record in segments for a criterion of several steps, and a descent over them."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug._base.progress import RunTell, quiet
+from orthaug._base.progress import RunProgress, quiet
 from orthaug.data.record import Record
-from orthaug.fitting.checkpoints import OF_DESCENT, Checkpoints, Kept
+from orthaug.fitting.checkpoints import OF_DESCENT, Checkpoints, RunCheckpoint
 from orthaug.fitting.criteria import Criterion, Simulation
 from orthaug.fitting.initial_states import Start
-from orthaug.fitting.objective import RUNAWAY, Flown, FreeRunObjective, errors_of
+from orthaug.fitting.objective import RUNAWAY, FreeRunObjective, TrialPoint, errors_of
 from orthaug.fitting.rules import check_scored
 from orthaug.fitting.segment_sums import SegmentSums
-from orthaug.fitting.segments import Segments, lay_segments
+from orthaug.fitting.segments import Segments, build_segments
 from orthaug.fitting.solvers.descent import MARQUARDT, Descent
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.solvers.limit import noticeable_in
@@ -29,7 +29,7 @@ COLOURED_STEPS = 256  # shorter segments do not show how long the errors remembe
 COLOUR_ROWS = 4096  # of each experiment: they show it instead
 
 
-class Flight(NamedTuple):
+class FreeRunFit(NamedTuple):
     """A finished run on the free-run criterion."""
 
     objective: FreeRunObjective
@@ -48,16 +48,16 @@ class Flight(NamedTuple):
         return self.end.effective
 
 
-class Looked(NamedTuple):
-    """A trial whose segments are in memory, to be looked at, and how its states follow (c, w)."""
+class TrialInMemory(NamedTuple):
+    """A trial with segments in memory, and the derivative of its states by (c, w)."""
 
     objective: FreeRunObjective
-    flown: Flown
+    point: TrialPoint
     slope: Any
 
 
 class Layout(NamedTuple):
-    """Segments of a record: to train on, to compare runs over, and to see the colour of the errors by."""
+    """Segments of a record: for training, for comparing runs, for the colour of errors."""
 
     segments: Segments
     whole: Segments
@@ -65,45 +65,58 @@ class Layout(NamedTuple):
 
     @classmethod
     def of(
-        cls, record: Record, dynamics: Dynamics, criterion: Criterion, like: Course | None = None, shares: int = 1
+        cls,
+        record: Record,
+        dynamics: Dynamics,
+        criterion: Criterion,
+        like: SegmentedProblem | None = None,
+        shares: int = 1,
     ) -> Layout:
-        """As a criterion of several steps declares; padded to the shapes of another course where that is larger.
+        """Return the layout that a criterion of several steps declares.
+
+        Padded to the shapes of another layout where that is larger.
 
         Raises:
             InputError: nothing would be scored.
         """
-        flown = criterion.flown
-        assert flown is not None, "one step ahead is `OneStepTask`'s"
+        free_run = criterion.free_run
+        assert free_run is not None, "one step ahead is `OneStepTask`'s"
         longest = max(len(e) for e in record.experiments) - dynamics.first_row
         check_scored(criterion, longest)
         shapes = (None, None) if like is None else (like.segments, like.whole)
-        segments = lay_segments(record, dynamics, flown.steps, flown.washout, shapes[0], shares)
-        if not (criterion.simulates and flown.steps):
+        segments = build_segments(
+            record, dynamics, free_run.steps, free_run.washout, shapes[0], shares
+        )
+        if not (criterion.simulates and free_run.steps):
             return cls(segments, segments, None)
-        whole, colour = lay_segments(record, dynamics, 0, flown.washout, shapes[1]), None
+        whole, colour = build_segments(record, dynamics, 0, free_run.washout, shapes[1]), None
         if segments.steps < COLOURED_STEPS <= longest:
             first = tuple(e.rows(0, COLOUR_ROWS) for e in record.experiments)
-            colour = lay_segments(replace(record, experiments=first), dynamics, 0, flown.washout)
+            colour = build_segments(
+                replace(record, experiments=first), dynamics, 0, free_run.washout
+            )
         return cls(segments, whole, colour)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Course:
-    """A record laid out in segments for a criterion.
+class SegmentedProblem:
+    """A record in segments for a criterion.
 
-    `rms` is the unit of the errors. `deviation` (ny,) is that of the outputs, `output_weights` how they are weighed
-    against each other; `scaling` and `unit` are the learner's.
+    `rms` is the unit of the errors. `deviation` (ny,) is that of the outputs, `output_weights` how
+    they are weighed against each other; `scaling` and `unit` are the learner's.
     """
 
     record: Record
     dynamics: Dynamics
     segments: Segments
     whole: Segments
-    """Segments over which runs are compared: whole experiments; for a prediction h steps ahead its own segments."""
+    """Segments over which runs are compared: whole experiments; for a prediction h steps ahead its
+    own segments.
+    """
     colour: Segments | None
     """Segments that show the colour of the errors, where the others are too short for that."""
     criterion: Criterion
-    flown: Simulation
+    free_run: Simulation
     rms: float
     deviation: Vector
     output_weights: str | tuple[float, ...]
@@ -116,90 +129,127 @@ class Course:
 
     @property
     def shares(self) -> int:
-        """How many sum over segments at a time."""
+        """Number of parts that sum over segments at a time."""
         return 1 if self.sums is None else self.sums.engine.shares
 
     @property
     def residuals(self) -> int:
-        """How many errors are scored."""
+        """Number of scored errors."""
         return self.segments.count * len(self.dynamics.outputs)
 
     def numbers(self, c: Vector, w: Any, tilt: Any = None) -> Numbers:
-        """The model's numbers before the split."""
+        """Return the model's numbers before the split."""
         scaling = self.scaling
-        return Numbers(c, np.zeros_like(c), np.asarray(w), scaling.centre, scaling.halfwidth, self.unit, tilt)
+        return Numbers(
+            c, np.zeros_like(c), np.asarray(w), scaling.centre, scaling.halfwidth, self.unit, tilt
+        )
 
     def descend(
         self,
         objective: FreeRunObjective,
         p: Vector,
         solver: LevenbergMarquardt,
-        tell: RunTell = quiet,
+        progress: RunProgress = quiet,
         states: Any = None,
         **options: Any,
-    ) -> Flight:
-        """From p to the end; several outputs are weighted by their errors' covariance in a second leg.
+    ) -> FreeRunFit:
+        """Descend from p to the end of the run.
+
+        Several outputs are weighted by their errors' covariance in a second leg.
 
         Args:
             states: of the segments' starts at p; None for the measured ones.
             options: of `descent.descend`.
         """
         ny = len(self.dynamics.outputs)
-        options |= {"bounds": objective.bounds, "damping": MARQUARDT, "noticeable": noticeable_in(self.residuals)}
+        options |= {
+            "bounds": objective.bounds,
+            "damping": MARQUARDT,
+            "noticeable": noticeable_in(self.residuals),
+        }
         two_legs = ny > 1 and self.output_weights in ("auto", "covariance")
         first = solver.at_most(solver.iterations // 2) if two_legs else solver
         start = Start(objective.initial.measured if states is None else states)
-        kept = self._kept(objective, p, start, options)
-        end = first.descend(objective, p, start, progress=tell, kept=kept, **options)
+        kept = self._checkpoint(objective, p, start, options)
+        end = first.descend(objective, p, start, progress=progress, kept=kept, **options)
         noise = self.noise(objective, end) if two_legs and end.ending.usable else None
         white = None if noise is None else whitening(noise)
         if noise is not None and white is not None:
-            size = np.trace(objective.weight @ noise @ objective.weight.T) / ny  # so that the ridge keeps its place
+            size = (
+                np.trace(objective.weight @ noise @ objective.weight.T) / ny
+            )  # so that the ridge keeps its place
             objective = replace(objective, weight=np.sqrt(size) * white)
             done = end.iterations
-            begun, options = Start(end.flown.states), options | {"ridge": end.ridge, "ceiling": np.inf}
+            begun, options = (
+                Start(end.point.states),
+                options | {"ridge": end.ridge, "ceiling": np.inf},
+            )
             again = solver.after(done).descend(
                 objective,
-                end.flown.p,
+                end.point.p,
                 begun,
-                progress=lambda i, loss: tell(done + i, loss),
-                kept=self._kept(objective, end.flown.p, begun, options),
+                progress=lambda i, loss: progress(done + i, loss),
+                kept=self._checkpoint(objective, end.point.p, begun, options),
                 **options,
             )
             path = (*end.path, *again.path)
             spent = {"iterations": done + again.iterations, "seconds": end.seconds + again.seconds}
-            tail = again.tail and again.tail._replace(done=spent["iterations"], limit=solver.iterations)
+            tail = again.tail and again.tail._replace(
+                done=spent["iterations"], limit=solver.iterations
+            )
             end = again._replace(path=path, tail=tail, **spent)
-        mean_square = self.mean_square(end.flown.c, end.flown.w)
-        return Flight(objective, end, mean_square, end.iterations, end.seconds)
+        mean_square = self.mean_square(end.point.c, end.point.w)
+        return FreeRunFit(objective, end, mean_square, end.iterations, end.seconds)
 
-    def _kept(self, objective: FreeRunObjective, p: Vector, start: Start, options: dict[str, Any]) -> Kept | None:
-        """Where the pauses of a descent from there are kept."""
+    def _checkpoint(
+        self, objective: FreeRunObjective, p: Vector, start: Start, options: dict[str, Any]
+    ) -> RunCheckpoint | None:
+        """Return the checkpoint of a descent from this start."""
         if self.checkpoints is None:
             return None
-        chosen = [options.get(name) for name in ("ridge", "evidence", "evidence_settled", "ceiling")]
-        size = (self.segments.steps, self.segments.count, objective.weight, objective.dynamics.unknowns)
-        return self.checkpoints.of_run("flight", p, np.asarray(start.values), *size, *chosen, form=OF_DESCENT)
+        chosen = [
+            options.get(name) for name in ("ridge", "evidence", "evidence_settled", "ceiling")
+        ]
+        size = (
+            self.segments.steps,
+            self.segments.count,
+            objective.weight,
+            objective.dynamics.unknowns,
+        )
+        return self.checkpoints.of_run(
+            "flight", p, np.asarray(start.values), *size, *chosen, form=OF_DESCENT
+        )
 
-    def looked_at(self, objective: FreeRunObjective, end: Descent) -> Looked:
-        """Where a run ended, on segments in memory; its end has a derivative."""
+    def looked_at(self, objective: FreeRunObjective, end: Descent) -> TrialInMemory:
+        """Return the end of a run with segments in memory; it has a derivative."""
         assert end.linear is not None
-        return Looked(objective, end.flown, objective.slope(end.linear.start))
+        return TrialInMemory(objective, end.point, objective.slope(end.linear.start))
 
     def noise(self, objective: FreeRunObjective, end: Descent) -> Matrix | None:
-        """Covariance (ny, ny) of the errors, in the outputs' units."""
-        squares, ny = objective.squares(end.flown), len(objective.weight)
+        """Return the covariance (ny, ny) of the errors, in the outputs' units."""
+        squares, ny = objective.squares(end.point), len(objective.weight)
         used = (objective.physics + end.effective) / ny
-        return None if squares is None else noise_covariance(squares, np.full(ny, self.segments.count - used))
+        return (
+            None
+            if squares is None
+            else noise_covariance(squares, np.full(ny, self.segments.count - used))
+        )
 
     def mean_square(self, c: Vector, w: Any, tilt: Any = None) -> float:
-        """Mean of squared errors over whole experiments, in deviations of the outputs; NaN where it diverges."""
+        """Return the mean of squared errors over whole experiments.
+
+        Outputs in their deviations.
+
+        NaN where it diverges.
+        """
         with np.errstate(all="ignore"):
             if self.sums is not None and self.whole is self.segments:
                 squares = self.sums.squares(self.dynamics, self.numbers(c, w, tilt), self.segments)
                 total = float(np.sum(np.diag(squares) / self.deviation**2))
             else:
-                errors = errors_of(self.dynamics, self.numbers(c, w, tilt), self.whole.start, self.whole)
+                errors = errors_of(
+                    self.dynamics, self.numbers(c, w, tilt), self.whole.start, self.whole
+                )
                 total = float(np.sum((errors / self.deviation[:, None]) ** 2))
             mean = total / (self.whole.count * len(self.dynamics.outputs))
         return mean if mean < RUNAWAY else np.nan

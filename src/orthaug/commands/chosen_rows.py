@@ -1,0 +1,152 @@
+"""Training rows that chose terms: recorded in a spec, and checked when it is fitted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from orthaug._base.errors import InputError, Warning
+from orthaug.commands.parts import expanded
+from orthaug.models.terms import Terms
+from orthaug.physics.baseline import Baseline
+from orthaug.selection.parts import CONDITIONAL, Intervals, Parts, of_parts, parted
+
+if TYPE_CHECKING:
+    from orthaug.commands.data_sections import PartSection
+    from orthaug.commands.lagged_job import LaggedJob
+    from orthaug.commands.spec import Spec
+    from orthaug.data.record import Record
+
+_CONDITIONAL = (
+    "no standard errors and no intervals: [selection.chosen_on] says that the terms were "
+    "chosen on rows that are among these, which look surer there than they are. Fit other rows "
+    "for intervals; `orthaug select` keeps a half for that where the rows suffice."
+)
+_MOVES_ROWS = {"decimate", "resample", "shift"}
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Files and row ranges of a part of a spec; no ranges are all rows."""
+
+    files: tuple[str, ...]
+    ranges: tuple[tuple[int, int], ...]
+
+    @classmethod
+    def of(cls, files: Sequence[str], rows: Any) -> Rows:
+        """Return those that a section gives."""
+        ranges = [] if rows is None else [rows] if isinstance(rows[0], int) else rows
+        return cls(tuple(files), tuple((int(a), int(b)) for a, b in ranges))
+
+    @property
+    def declared(self) -> dict[str, Any]:
+        """The keys of a section."""
+        ranges = [list(one) for one in self.ranges]
+        rows = {"rows": ranges[0] if len(ranges) == 1 else ranges} if ranges else {}
+        return {"files": list(self.files), **rows}
+
+    def meets(self, other: Rows, folder: Path) -> bool:
+        """Return whether a row is in both."""
+        paths = [{(folder / file).resolve() for file in one.files} for one in (self, other)]
+        if not paths[0] & paths[1]:
+            return False
+        if not self.ranges or not other.ranges:
+            return True
+        return any(a < d and c < b for a, b in self.ranges for c, d in other.ranges)
+
+
+def parts_of(
+    job: LaggedJob, baseline: Baseline, lags: int, halves: bool | None, *, network: bool
+) -> Parts:
+    """Cut the training data of a job so that its spec can say how.
+
+    Raises:
+        InputError: halves that were asked for, of data that a spec cannot cut.
+    """
+    record, section, path = job.train.record, job.spec.data.train, job.path
+    if network and not halves:
+        return Parts(record, record, CONDITIONAL)
+    if halves is False:
+        return Parts(record, record, Intervals.none("`selection.halves` is false"))
+    files, ranges = expanded(path, section.files, "train"), Rows.of((), section.rows).ranges
+    fault = _not_cut(job, len(files) * max(len(ranges), 1))
+    by = None
+    if len(files) > 1:
+        by = "rows" if len(ranges) > 1 else "experiments"
+    try:
+        if fault:
+            raise InputError(fault)
+        return parted(record, baseline, lags, by=by, **({"least": 1} if halves else {}))
+    except InputError as error:
+        if halves:
+            raise InputError(f"{path}: 'selection.halves': {error}.") from None
+        return Parts(record, record, Intervals.none(str(error)))
+
+
+def _not_cut(job: LaggedJob, expected: int) -> str:
+    """Return why a spec cannot say how the training data are cut; nothing where it can."""
+    if any(step.step in _MOVES_ROWS for step in job.spec.data.prepare):
+        return (
+            "`data.prepare` changes the rows, so no range of rows in the files is a half of "
+            "the data"
+        )
+    if len(job.train.record.experiments) != expected:
+        return (
+            "the files hold stretches of rows, so no range of rows in the files is a half of "
+            "the data"
+        )
+    return ""
+
+
+def cut(job: LaggedJob, parts: Parts) -> tuple[Rows, Rows]:
+    """Return the rows that chose and those that are fitted, as a spec says them."""
+    section, record = job.spec.data.train, job.train.record
+    files = expanded(job.path, section.files, "train")
+    whole = Rows.of(files, section.rows)
+    if parts.fitted is record:
+        return whole, whole
+    count = len(record.experiments) - len(parts.fitted.experiments)
+    if count:
+        if len(files) > 1:
+            return Rows(whole.files[:count], whole.ranges), Rows(whole.files[count:], whole.ranges)
+        return Rows(whole.files, whole.ranges[:count]), Rows(whole.files, whole.ranges[count:])
+    ranges = whole.ranges or ((0, _rows_of(section, record)),)
+    lengths = [len(one) for one in parts.chooses.experiments]
+    places = [first + section.every * lengths[i] for i, (first, _) in enumerate(ranges)]
+    first = tuple((a, place) for (a, _), place in zip(ranges, places, strict=True))
+    second = tuple((place, b) for (_, b), place in zip(ranges, places, strict=True))
+    return Rows(whole.files, first), Rows(whole.files, second)
+
+
+def _rows_of(section: PartSection, record: Record) -> int:
+    return section.every * len(record)
+
+
+def intervals_of(job: Any, fit: Any) -> Intervals | None:
+    """Return where the intervals of a fit come from whose terms were chosen.
+
+    None where the spec says no such.
+    """
+    spec: Spec = job.spec
+    chosen, bound = spec.selection.chosen_on, fit.model.form.bound
+    if (
+        chosen is None
+        or spec.motion is not None
+        or bound is None
+        or not isinstance(bound.learner, Terms)
+    ):
+        return None
+    train = Rows.of(expanded(job.path, spec.data.train.files, "train"), spec.data.train.rows)
+    if Rows.of(chosen.files, chosen.rows).meets(train, job.path.parent):
+        return Intervals("none", _CONDITIONAL)
+    return of_parts(job.problem.count)
+
+
+def after_choice(job: Any, fit: Any) -> tuple[Any, Intervals | None]:
+    """Return a fit and the source of its intervals; without these where its rows chose its terms."""
+    found = intervals_of(job, fit) if fit.status.ok else None
+    if found is None or found.source != "none":
+        return fit, found
+    return fit.withheld("chosen", Warning("conditional_on_selection", found.text)), found
