@@ -48,7 +48,12 @@ ABSENT = Note("absent")
 
 
 def differences(
-    before: Any, after: Any, where: str = "", beside: float = 0.0, relative: float = RELATIVE, floor: float = ROUNDING
+    before: Any,
+    after: Any,
+    where: str = "",
+    beside: float = 0.0,
+    relative: float = RELATIVE,
+    floor: float = ROUNDING,
 ) -> Iterator[Difference]:
     """What differs by more than `relative`, or `floor` of `beside`, the largest number next to it, with its place."""
     key = where.rpartition(".")[2]
@@ -56,27 +61,25 @@ def differences(
         return
     if key == "warnings" and isinstance(before, list) and isinstance(after, list):
         before, after = (
-            [w["text"] if isinstance(w, dict) else w for w in warnings]
+            [w.get("text", w) if isinstance(w, dict) else w for w in warnings]
             for warnings in (before, after)
         )
     if isinstance(before, dict) and isinstance(after, dict):
-        yield from (f"{where}.{name}: only in one of them" for name in before.keys() ^ after.keys())
-        for name in (name for name in before if name in after):
-            yield from differences(
-                before[name], after[name], f"{where}.{name}" if where else name, largest(before)
+        for name in {**before, **after}:
+            place, pair = (
+                f"{where}.{name}" if where else name,
+                [d.get(name, ABSENT) for d in (before, after)],
             )
+            yield from differences(*pair, place, scale(before, name), relative, floor)
+    elif isinstance(before, list) and isinstance(after, list) and len(before) == len(after):
+        for i, pair in enumerate(zip(before, after, strict=True)):
+            yield from differences(*pair, f"{where}[{i}]", largest(before), relative, floor)
     elif isinstance(before, list) and isinstance(after, list):
-        if len(before) != len(after):
-            yield f"{where}: {len(before)} entries, then {len(after)}"
-        for i, (one, other) in enumerate(zip(before, after, strict=False)):
-            yield from differences(one, other, f"{where}[{i}]", largest(before))
-    elif not same(
-        before,
-        after,
-        allowed(where, beside),
-        SEARCH if "stability.contraction" in where else RELATIVE,
-    ):
-        yield f"{where}: {before!r}, then {after!r}"
+        yield Difference(where, Note(f"{len(before)} entries"), Note(len(after)))
+    else:
+        allowed = SEARCH if "stability.contraction" in where else relative
+        if not same(before, after, rounding(where, beside, floor), allowed):
+            yield Difference(where, before, after, apart(before, after))
 
 
 def is_number(value: Any) -> bool:
@@ -103,7 +106,13 @@ def largest(values: Any) -> float:
 
 def scale(entries: dict, name: str) -> float:
     """What an entry of a mapping is large or small beside: one for a share, the RMS for a mean."""
-    return 1.0 if name in SHARES else float(entries.get("rms") or 0.0) if name == "mean" else largest(entries)
+    return (
+        1.0
+        if name in SHARES
+        else float(entries.get("rms") or 0.0)
+        if name == "mean"
+        else largest(entries)
+    )
 
 
 def rounding(where: str, beside: float, floor: float) -> float:
@@ -126,9 +135,9 @@ def main(before: str, after: str) -> int:
         json.loads((Path(folder) / "result.json").read_text(encoding="utf-8"))
         for folder in (before, after)
     )
-    told = list(differences(*results))
-    print("\n".join(told) or "equal")
-    return 1 if told else 0
+    found = list(differences(*results))
+    print("\n".join(map(str, found)) or "equal")
+    return 1 if found else 0
 
 
 if __name__ == "__main__":

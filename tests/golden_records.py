@@ -82,7 +82,10 @@ def cascaded_tanks(rows: int, seed: int) -> pd.DataFrame:
                 fill = 0.05 * u[k] - out[0]
                 spill = max(fill, 0.0) if x[0] > 10 else 0.0
                 x = x + 0.5 * np.array([fill - spill, out[0] - out[1] + 0.3 * spill])
-        table |= {f"u{part}": u, f"y{part}": np.minimum(found, 10) + 0.02 * random.normal(size=rows)}
+        table |= {
+            f"u{part}": u,
+            f"y{part}": np.minimum(found, 10) + 0.02 * random.normal(size=rows),
+        }
     return pd.DataFrame(table)
 
 
