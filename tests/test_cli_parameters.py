@@ -547,7 +547,7 @@ def test_a_split_of_other_files_is_warned_of(inside, files):
         told["code"] == "other_training_data"
         and "trained on run.csv; the checksums" in told["text"]
     )
-    assert f"given ({', '.join(files)})" in told["text"]
+    assert f"differ from those of {', '.join(files)}" in told["text"]
     Path("copy.csv").write_bytes(Path("run.csv").read_bytes())
     assert finite_json(run("split", "out", "copy.csv", "--json").out)["warnings"] == []
 

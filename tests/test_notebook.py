@@ -230,7 +230,7 @@ def test_the_page_of_a_fit(fit, tmp_path):
 )
 def test_pages_that_cannot_be_made(fit, options, message, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("orthaug.commands.library.judged", lambda fitted: fitted)
+    monkeypatch.setattr("orthaug.commands.library.with_verdict", lambda fitted: fitted)
     monkeypatch.setattr("orthaug.commands.library.report_of", lambda job, fit: fit)
     monkeypatch.setattr("orthaug.commands.library.fit_report", lambda fitted, origin: "")
     with pytest.raises(oa.InputError, match=message):
